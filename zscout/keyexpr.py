@@ -211,6 +211,7 @@ class Keys:
     frame = _rc_key("frame")
     load = _host_key("load")
     confirm_any = _host_key("confirm/*/*")
+    history_any = _host_key("history/*/*")
     notice = _sender_key("client", "/notice")
     requests = _sender_key("client", "/requests")
     behavior = _sender_key("client", "/behavior")
@@ -231,6 +232,14 @@ class Keys:
     def confirm(self, host: str, sender: Sender) -> str:
         """Where all RCs of a host's processes are asked at once whether they know of a grant."""
         return f"{self.base}/host/{check_name(host, 'host')}/confirm/{_sender(sender)}"
+
+    def history(self, host: str, sender: Sender) -> str:
+        """Where a candidate is asked for what its journal keeps."""
+        return f"{self.base}/host/{check_name(host, 'host')}/history/{_sender(sender)}"
+
+    def histories(self, sender: Sender) -> str:
+        """Where all candidates are."""
+        return f"{self.base}/host/*/history/{_sender(sender)}"
 
     def placer(self, sender: Sender) -> str:
         """Where the component placer is asked."""
@@ -322,7 +331,7 @@ def _sender_of(keys: Keys, key: str) -> Sender:
             | ["client", host, client, "notice" | "requests" | "behavior"]
             | ["building", host, client, "plan" | "poses"]
             | ["placer", "component", host, client]
-            | ["host", _, "component" | "confirm", host, client]
+            | ["host", _, "component" | "confirm" | "history", host, client]
         ):
             return Sender(check_name(host, "host"), check_name(client, "client"))
     raise BadName(f"{key[:200]!r} does not name its sender")
@@ -377,6 +386,7 @@ ACCESS: Final = (
     Access("host/{at}/load", publish=NODES, subscribe=_ALL),
     Access("host/{at}/component/{by}/*", ask=_ALL, serve=NODES),
     Access("host/{at}/confirm/{by}/*", ask=USERS, serve=NODES),
+    Access("host/{at}/history/{by}/*", ask=_ALL, serve=_MANAGERS),
     Access("balancer/rank", ask=_ALL, serve=_MANAGERS),
     Access("placer/component/{by}/*", ask=_ALL, serve=_MANAGERS),
     Access("placer/placements", publish=_MANAGERS, subscribe=_ALL),

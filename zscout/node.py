@@ -37,6 +37,7 @@ from zscout.mesh import Mesh, MeshError, ZenohMesh
 from zscout.mesh.supervision import StallWatch
 from zscout.messages import LoadReport
 from zscout.services.authority import Authority
+from zscout.services.journal.journal import Journal
 from zscout.services.metrics.node_figures import NodeFigures
 from zscout.services.node.component_host import ComponentHost
 from zscout.services.node.load_reporter import LoadReporter
@@ -137,7 +138,12 @@ async def run_services(
         figures = NodeFigures(node, mesh, rcs)
         listeners: list[HoldListener] = [figures.holds] if node.metrics is not None else []
         if node.candidate:
-            candidate = Candidate(mesh, node.fleet, kept, authority, _places_key(node.fleet), listeners)
+            journal = None
+            if kept is not None and node.fleet.may_lead(me.host) and not node.journal.off:
+                journal = Journal(mesh, kept, node.journal, node.fleet.silence / SECOND)
+                journal.start()
+                stack.push_async_callback(journal.stop)
+            candidate = Candidate(mesh, node.fleet, kept, authority, _places_key(node.fleet), listeners, journal)
             if node.notify is not None:
                 notifier = _notifier(node.notify, node.fleet.name, candidate)
                 listeners.append(notifier.holds)

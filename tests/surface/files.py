@@ -144,6 +144,11 @@ NODE: Final[Mapping[str, Mapping[str, Key]]] = {
         "kinds": Key(None, ("[]", '["counter"]'), ('["a/b"]', '"counter"')),
         "max": _number("64", "1", "256", "0", "257"),
     },
+    "journal": {
+        "off": Key("false", ("true",), TRUTH),
+        "max_age": _number("7776000.0", "3600", "315_360_000", "3599", "315_360_001"),
+        "max_size": _number("64", "1", "10_000", "0", "10_001"),
+    },
 }
 LEAST: Final[Mapping[str, tuple[str, ...]]] = {"notify": ('users = { bob = ["json://localhost/bob"] }',)}
 """What a table can't be without, but where that is tried."""

@@ -168,6 +168,14 @@ class Fleet(Struct, frozen=True):
         """ARCs of this priority and above are an operator's."""
         return self.scheduling.operator_priority
 
+    @property
+    def silence(self) -> Ns:
+        """A leader that published nothing for so long hangs, or is gone: longer than a few heartbeats and a lease."""
+        return max(4 * self.timing.heartbeat, round(self.mesh.lease * SECOND))
+
+    def may_lead(self, host: str) -> bool:
+        return not self.candidates or host in self.candidates
+
 
 # The file as it is written
 

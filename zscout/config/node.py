@@ -26,9 +26,10 @@ from zscout.config.fleet import (
 )
 from zscout.config.notify import NotifyConfig, NotifyTable, read_notify
 from zscout.config.packages import check_installed
-from zscout.config.strict import Where, check_name, check_names, check_unique, key, quoted, read_toml
+from zscout.config.strict import Where, check_name, check_names, check_unique, key, quoted, read_toml, seconds
 from zscout.keyexpr import MACHINES, valid_name
 from zscout.messages import MAX_LABELS
+from zscout.types import SECOND, Ns
 
 MAX_RCS: Final = 1_000
 """RCs in one node file."""
@@ -79,6 +80,16 @@ class ComponentsConfig(Struct, frozen=True, forbid_unknown_fields=True):
     max: Annotated[int, key("Components that run at one time.", 1, MAX_STARTED)] = 64
 
 
+class JournalConfig(Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [journal]: what a candidate keeps of the holds that are over, in the folder `state`."""
+
+    off: Annotated[bool, key("Whether it keeps none.")] = False
+    max_age: Annotated[Ns, seconds("3600", "315360000", "Holds that ended longer ago are forgotten.")] = (
+        90 * 86_400 * SECOND
+    )
+    max_size: Annotated[int, key("Of the file; what ended longest ago goes first.", 1, 10_000, unit="MB")] = 64
+
+
 class Node(Struct, frozen=True):
     """What one host does in its fleet."""
 
@@ -96,6 +107,7 @@ class Node(Struct, frozen=True):
     """None: it serves no figures."""
     notify: NotifyConfig | None = None
     """None: it tells nobody."""
+    journal: JournalConfig = JournalConfig()
     state: Path | None = None
     """The folder of what must outlive the node (`state_folder.py`); None: where such folders usually are."""
 
@@ -163,6 +175,7 @@ class NodeFile(Struct, frozen=True, forbid_unknown_fields=True):
     components: ComponentsConfig = ComponentsConfig()
     metrics: MetricsTable | None = None
     notify: NotifyTable | None = None
+    journal: JournalConfig = JournalConfig()
 
 
 def load_node(path: Path) -> Node:
@@ -216,6 +229,7 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
         components=file.components,
         metrics=None if file.metrics is None else _metrics(file.metrics, top / "metrics"),
         notify=None if file.notify is None else read_notify(file.notify, folder, top / "notify"),
+        journal=file.journal,
         state=None if file.node.state is None else _folder(file.node.state, folder, top / "node" / "state", STATE),
     )
 

@@ -9,5 +9,6 @@ from zscout.messages.base import *
 from zscout.messages.behaviors import *
 from zscout.messages.components import *
 from zscout.messages.controllers import *
+from zscout.messages.history import *
 from zscout.messages.hosts import *
 from zscout.messages.scheduling import *

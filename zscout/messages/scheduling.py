@@ -262,6 +262,9 @@ class Grants(Message, frozen=True):
     rcs: dict[str, list[Holder]] = {}
     revoked: list[Revocation] = []
     instances: dict[str, str] = {}
+    begun: list[tuple[int, Elapsed]] = []
+    """Of each grant of this term that begins with it: its seq, and the seconds for which its ARC was queued. Nobody
+    obeys this: journals keep it."""
 
 
 class StateAsk(Message, frozen=True):

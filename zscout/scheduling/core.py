@@ -458,8 +458,9 @@ class Core:
         grant = Grant(self.term, self.number())
         now, state = self._state.now, self._state
         hold = Hold(grant, now, now + arc.request.min_runtime, state.protected_below(arc), state.longest(now))
+        waited = 0 if arc.state is ArcState.NEW else now - arc.since
         self._state.start(arc, hold)
-        self._effects.append(self._granted(arc, hold))
+        self._effects.append(self._granted(arc, hold, waited))
 
     def preempt(self, arc: Arc, by: Arc) -> bool:
         done = arc.past_min_runtime(self._state.now)
@@ -509,10 +510,10 @@ class Core:
         self.seq += 1
         return self.seq
 
-    def _granted(self, arc: Arc, hold: Hold) -> model.Granted:
+    def _granted(self, arc: Arc, hold: Hold, waited: Ns | None = None) -> model.Granted:
         end = None if arc.request.keep else hold.end
         rcs = tuple(sorted(arc.needs))
-        return model.Granted(arc.id, arc.request.client, hold.grant, rcs, hold.start, end)
+        return model.Granted(arc.id, arc.request.client, hold.grant, rcs, hold.start, end, waited)
 
     def _revocation(self, arc: Arc, hold: Hold, outcome: Outcome, reason: Reason, *, requeued: bool) -> model.HoldEnded:
         self.number()

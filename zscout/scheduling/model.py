@@ -463,6 +463,8 @@ class Granted(Struct, frozen=True):
     rcs: tuple[RcName, ...]
     start: Ns
     end: Ns | None
+    waited: Ns | None = None
+    """How long its ARC was queued before; None: no hold begins here, one that stood goes on."""
 
 
 class HoldEnded(Struct, frozen=True):

@@ -83,6 +83,8 @@ def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str,
             ]
         case Role.CANDIDATE | Role.RECORDER:
             found = [("hear", own.grants, "who holds what"), ("hear", own.placements, "how components stand")]
+            if token.role == Role.CANDIDATE:
+                found.append(("query", own.history_any(token.host), "holds that are over, if it keeps a journal"))
         case _:
             found = []
     return [{"how": how, "key": key, "what": what} for how, key, what in found]

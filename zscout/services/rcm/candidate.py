@@ -20,6 +20,7 @@ from zscout.mesh.supervision import StallWatch, Supervisor, done_within
 from zscout.mesh.terms import LastTerms
 from zscout.messages import MAX_COUNTER, ClientRequests, Grants, RcAsk, RcState, absurd, disbelieved
 from zscout.services.authority import Authority
+from zscout.services.journal.journal import Journal
 from zscout.services.placement.component_placer import ComponentPlacer
 from zscout.services.placement.ledger import PlacementLedger
 from zscout.services.placement.load_balancer import LoadBalancer
@@ -55,9 +56,11 @@ class Candidate:
         authority: Authority | None = None,
         places_key: bytes | None = None,
         listeners: Sequence[HoldListener] = (),
+        journal: Journal | None = None,
     ) -> None:
         """`folder`: where it keeps what it must know after a restart; None: it does not. `places_key`: that by which
-        the managers of a fleet seal places. `listeners` are told of holds while it leads."""
+        the managers of a fleet seal places. `listeners` are told of holds while it leads, `journal` of publications."""
+        self._journal = journal
         self._places_key = places_key
         self._authority = authority or Authority(fleet)
         self.mesh, self.fleet = mesh, fleet
@@ -95,8 +98,7 @@ class Candidate:
         """Becomes a candidate, the first time or again: others see its token from now on."""
         keys, mesh = self.mesh.keys, self.mesh
         self._again, self._since = None, mesh.now()
-        # A leader is silent for as long as this when its program hangs but its session lives.
-        silence = max(4 * self.fleet.timing.heartbeat, round(self.fleet.mesh.lease * SECOND))
+        silence = self.fleet.silence
         self.election = Election(mesh.me.host, self.fleet.candidates, silence=silence, now=self._since)
         self._supervisor = Supervisor("the candidate", self._failed)
         self._last_terms = LastTerms(mesh, self._supervisor, self._learn, timeout=self._timeout)
@@ -151,6 +153,8 @@ class Candidate:
         known = grants.term == self.known and (self.rcm is None or self.rcm.term == self.known)
         if known or self._see(grants.term):
             self.election.published(grants.term, self.mesh.now())
+            if self._journal is not None:
+                self._journal.hear(grants)
 
     def _on_leader(self, token: Token, alive: bool) -> None:
         if self.rcm is None or token.instance != self.rcm.term.rcm:

@@ -334,7 +334,12 @@ class Rcm:
         self._named |= dict.fromkeys(names, number)
         holders = {name: holders_of(self.core.holders(name), name, now) for name in names}
         instances = {rc: instance for rc, (instance, _) in self.membership.named(names).items()}
-        self._put(number, holders, revoked, instances)
+        begun = [
+            (effect.grant.seq, effect.waited / SECOND)
+            for effect in changed
+            if isinstance(effect, Granted) and effect.waited is not None
+        ]
+        self._put(number, holders, revoked, instances, begun)
 
     def _is_own(self, effect: HoldEnded) -> bool:
         """Whether its own client has given this hold back, and its program is gone, in the burst that is decided."""
@@ -355,6 +360,7 @@ class Rcm:
         rcs: dict[RcName, list[messages.Holder]],
         revoked: list[messages.Revocation],
         instances: dict[RcName, str],
+        begun: Sequence[tuple[int, float]] = (),
     ) -> None:
         every = self._heartbeat / SECOND
         if (rcs or revoked) and trace.enabled():
@@ -366,7 +372,7 @@ class Rcm:
             trace.write(
                 self.mesh.now(), "publish", term=self.term, seq=number, rcs=holders, instances=instances, ends=ends
             )
-        self._grants.put(messages.Grants(self.term, number, self.seq, every, rcs, revoked, instances))
+        self._grants.put(messages.Grants(self.term, number, self.seq, every, rcs, revoked, instances, [*begun]))
         self.seq, self._published = number, self.mesh.now()
 
     # Out: proposals, and ballots in

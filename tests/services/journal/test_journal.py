@@ -1,0 +1,252 @@
+"""The journals of candidates on a mesh: fed by what their leader publishes, asked by anybody."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.mesh.kit import run, until
+from tests.services.journal.kit import holder, published
+from tests.services.rcm.kit import FakeFleet
+from tests.services.rcm.test_candidate import open_request
+from zscout.config.node import JournalConfig
+from zscout.keyexpr import Sender
+from zscout.lab.faults.memory import MemoryMesh
+from zscout.messages import UNHEARD, History, HistoryAsk, Release, Who
+from zscout.services.journal import journal as journal_module
+from zscout.services.journal.journal import Journal
+from zscout.services.journal.store import FILE
+from zscout.services.rcm.candidate import Candidate
+from zscout.types import SECOND
+
+START = 1_700_000_000.0
+"""The wall clock when the story begins."""
+
+
+class Told:
+    """Candidates with journals."""
+
+    def __init__(self, folder: Path, *hosts: str) -> None:
+        self.fleet = FakeFleet(*hosts)
+        self.folder = folder
+        self.journals: dict[str, Journal] = {}
+        self.candidates: dict[str, Candidate] = {}
+        for host in hosts:
+            self.start(host)
+
+    def start(self, host: str, config: JournalConfig = JournalConfig()) -> MemoryMesh:  # noqa: B008 - it is frozen
+        mesh, folder = self.fleet.mesh(host), self.folder / host
+        folder.mkdir(exist_ok=True)
+        silent = self.fleet.fleet.silence / SECOND
+        journal = self.journals[host] = Journal(mesh, folder, config, silent, wall=lambda: START + mesh.now() / SECOND)
+        journal.start()
+        candidate = self.candidates[host] = Candidate(mesh, self.fleet.fleet, journal=journal)
+        candidate.start()
+        return mesh
+
+    async def end(self, host: str) -> None:
+        await self.candidates.pop(host).stop()
+        await self.journals.pop(host).stop()
+
+    async def close(self) -> None:
+        for host in [*self.candidates]:
+            await self.end(host)
+
+    async def ask(self, host: str = "x", **asked: Any) -> History:
+        mesh = self.fleet.watcher
+        key = mesh.keys.history(host, mesh.me)
+        reply = await mesh.ask_one(key, HistoryAsk(**asked), History, timeout=5)
+        assert reply is not None
+        assert reply.message is not None, reply.problem
+        return reply.message
+
+    async def tells(self, condition: Callable[[History], object], host: str = "x", **asked: Any) -> History:
+        """What a journal tells as soon as it is so."""
+        answer: History | None = None
+        try:
+            async with asyncio.timeout(60):
+                while answer is None or not condition(answer):
+                    await asyncio.sleep(0.1)
+                    answer = await self.ask(host, **asked)
+        except TimeoutError:
+            raise AssertionError(f"waited in vain; last {answer}") from None
+        return answer
+
+
+def test_each_candidate_keeps_who_held_what_and_who_took_it(tmp_path: Path) -> None:
+    async def story() -> None:
+        told = Told(tmp_path, "x", "y")
+        rc = told.fleet.rc("robot/a")
+        await until(lambda: told.candidates["x"].rcm)
+        await told.fleet.joined(rc)
+        one, two = told.fleet.client("one"), told.fleet.client("two", "ws2")
+        await one.ask("survey", "robot/a", seconds=600, who=Who("alice", "ws1", "./survey.py"))
+        await asyncio.sleep(10)
+        await two.ask("take", "robot/a", priority=10, who=Who("bob"))
+        await asyncio.sleep(5)
+        await two.do(Release("take"))
+        await until(lambda: rc.arcs == ["survey"])
+        for host in ("x", "y"):
+            answer = await told.tells(lambda answer: len(answer.holds) == 3, host)
+            again, take, first = answer.holds
+            assert (first.arc, first.client, first.rcs, first.outcome) == (
+                "survey",
+                "desk/one",
+                ["robot/a"],
+                "preempted",
+            )
+            assert first.ended is not None
+            assert first.ended - first.began == pytest.approx(10, abs=0.1)
+            assert (first.waited, first.min_runtime, first.priority) == (0.0, 600.0, 0)
+            assert first.who == Who("alice", "ws1", "./survey.py")
+            assert first.by is not None
+            assert (first.by.arc, first.by.client, first.by.who) == ("take", "ws2/two", Who("bob"))
+            assert (take.outcome, take.priority, take.waited) == ("released", 10, 0.0)
+            assert (again.ended, again.outcome) == (None, "")
+            assert again.waited == pytest.approx(5, abs=0.1)
+            assert answer.gaps == []
+            assert answer.since is not None
+            assert START <= answer.since <= first.began
+        await told.close()
+
+    run(story())
+
+
+def test_a_takeover_loses_nothing_and_a_restart_is_a_gap(tmp_path: Path) -> None:
+    async def story() -> None:
+        told = Told(tmp_path, "x", "y")
+        robots = [told.fleet.rc(f"robot/{name}") for name in "ab"]
+        await until(lambda: told.candidates["x"].rcm)
+        await told.fleet.joined(*robots)
+        one = told.fleet.client("one")
+        one.open = [
+            open_request(await one.ask(arc, need, seconds=600))
+            for arc, need in (("kept", "robot/a"), ("ends", "robot/b"))
+        ]
+        await told.tells(lambda answer: len(answer.holds) == 2, "y")
+        # The leader dies with its journal: kill -9.
+        told.fleet.network.kill(told.candidates.pop("x").mesh)
+        told.journals.pop("x")
+        await until(lambda: told.candidates["y"].rcm)
+        await asyncio.sleep(60)
+        answer = await told.ask("y")
+        assert {hold.arc for hold in answer.holds} == {"kept", "ends"}
+        assert answer.gaps == []
+        await one.do(Release("ends"))
+        await told.tells(lambda answer: any(hold.outcome == "released" for hold in answer.holds), "y")
+        # It missed the minute, and one end in it; the other hold goes on.
+        told.start("x")
+        answer = await told.tells(lambda answer: any(hold.outcome for hold in answer.holds))
+        ends = {hold.arc: (hold.outcome, hold.ended) for hold in answer.holds}
+        (gap,) = answer.gaps
+        assert gap.cause == "off"
+        assert gap.ended is not None
+        assert 59 < gap.ended - gap.began < 100
+        assert ends == {"kept": ("", None), "ends": (UNHEARD, gap.began)}
+        await told.close()
+
+    run(story())
+
+
+def test_what_was_heard_is_on_disk_when_a_node_stops(tmp_path: Path) -> None:
+    async def story() -> None:
+        told = Told(tmp_path, "x")
+        rc = told.fleet.rc("robot/a")
+        await until(lambda: told.candidates["x"].rcm)
+        await told.fleet.joined(rc)
+        one = told.fleet.client("one")
+        await one.ask("short", "robot/a", seconds=600)
+        await one.do(Release("short"))
+        await told.end("x")
+        assert not [*(tmp_path / "x").glob("*-wal")]
+        told.start("x")
+        (hold,) = (await told.tells(lambda answer: answer.holds)).holds
+        assert (hold.arc, hold.outcome) == ("short", "released")
+        await told.close()
+
+    run(story())
+
+
+def test_no_rcm_heard_is_a_gap_that_lasts(tmp_path: Path) -> None:
+    async def story() -> None:
+        fleet = FakeFleet("x")
+        mesh = fleet.mesh("x")
+        journal = Journal(mesh, tmp_path, JournalConfig(), 2.0, wall=lambda: START + mesh.now() / SECOND)
+        journal.start()
+        journal.hear(published(1, [holder(1, "robot/a")], begun={1: 0.0}))
+        await asyncio.sleep(10)
+        reply = await fleet.watcher.ask_one(
+            mesh.keys.history("x", Sender("all", "watcher")), HistoryAsk(), History, timeout=5
+        )
+        assert reply is not None
+        assert reply.message is not None
+        (gap,) = reply.message.gaps
+        assert (gap.cause, gap.ended) == ("silent", None)
+        await journal.stop()
+
+    run(story())
+
+
+def test_more_than_can_be_kept_is_a_gap(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(journal_module, "MAX_GATHERED", 20)
+
+    async def story() -> None:
+        told = Told(tmp_path, "x")
+        await until(lambda: told.candidates["x"].rcm)
+        await told.tells(lambda answer: answer.since is not None)
+        journal, rcm = told.journals["x"], told.candidates["x"].rcm
+        assert rcm is not None
+        for number in range(1, 31):
+            journal.hear(published(rcm.seq + number, term=rcm.term))
+        answer = await told.tells(lambda answer: answer.gaps)
+        (count,) = [gap.count for gap in answer.gaps if gap.cause == "dropped"]
+        assert count >= 10
+        await told.close()
+
+    run(story())
+
+
+def test_a_disk_that_fails_stops_nothing_and_is_told_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def story() -> None:
+        (tmp_path / "x" / FILE).mkdir(parents=True)
+        told = Told(tmp_path, "x")
+        rc = told.fleet.rc("robot/a")
+        await until(lambda: told.candidates["x"].rcm)
+        await told.fleet.joined(rc)
+        client = told.fleet.client("one")
+        await client.ask("survey", "robot/a", seconds=600)
+        await asyncio.sleep(120)
+        mesh = told.fleet.watcher
+        reply = await mesh.ask_one(mesh.keys.history("x", mesh.me), HistoryAsk(), History, timeout=5)
+        assert reply is not None
+        assert reply.problem is not None
+        assert reply.problem.code == "no_journal"
+        (tmp_path / "x" / FILE).rmdir()
+        # Nothing was lost meanwhile.
+        (hold,) = (await told.tells(lambda answer: answer.holds)).holds
+        assert hold.arc == "survey"
+        await told.close()
+
+    with caplog.at_level(logging.WARNING):
+        run(story())
+    assert [record.message for record in caplog.records if "can't be kept" in record.message][1:] == []
+
+
+def test_bad_questions_are_refused(tmp_path: Path) -> None:
+    async def story() -> None:
+        told = Told(tmp_path, "x")
+        mesh = told.fleet.watcher
+        key = mesh.keys.history("x", mesh.me)
+        for asked, code in ((HistoryAsk(rc="robot"), "bad_name"), (HistoryAsk(limit=0), "malformed")):
+            reply = await mesh.ask_one(key, asked, History, timeout=5)
+            assert reply is not None
+            assert reply.problem is not None
+            assert reply.problem.code == code
+        await told.close()
+
+    run(story())

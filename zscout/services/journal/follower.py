@@ -1,0 +1,228 @@
+"""What a candidate hears, as changes of its journal: pure; times are passed in.
+
+A publication tells that holds begin and end. Where some were missed, the RCM's state is read: what stands there and is
+not known began unheard, what is known and does not stand there has ended unheard."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from decimal import Decimal
+from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
+
+from zscout.messages import (
+    MAX_COUNTER,
+    MAX_WHO,
+    Grants,
+    Holder,
+    HoldView,
+    JournalGap,
+    PastHold,
+    RcmState,
+    ReasonParty,
+    Revocation,
+    Who,
+)
+from zscout.types import NO_TERM, Grant, clean
+
+N = TypeVar("N", int, Decimal)
+
+MAX_OPEN: Final = 20_000
+"""Holds that are followed at one time. More are kept, but may be written again and again."""
+MAX_TEXT: Final = 200
+"""Characters that are kept of a name or a reason."""
+MAX_RCS: Final = 1_000
+"""RCs that are kept of one hold: no fleet allows more."""
+MAX_NUMBER: Final = 10**9
+"""Of a priority or a duration."""
+MAX_SEQ: Final = 2**63 - 1
+
+
+class PublicationHeard(NamedTuple):
+    """A publication, `silence` seconds after the one before (heartbeats included)."""
+
+    at: float
+    """Seconds since 1970, UTC."""
+    silence: float
+    grants: Grants
+
+
+class StateRead(NamedTuple):
+    """The RCM's state, read when publications had been missed."""
+
+    at: float
+    state: RcmState
+
+
+class HoldSeen(NamedTuple):
+    """A hold stands; it may be known already."""
+
+    hold: PastHold
+
+
+class HoldOver(NamedTuple):
+    """A hold is over; `hold` has all that is to be kept of it if it is not known yet."""
+
+    hold: PastHold
+
+
+class EndUnheard(NamedTuple):
+    """A hold is over, since `at` or later."""
+
+    grant: Grant
+    at: float
+
+
+class GapSeen(NamedTuple):
+    """Time of which not all is known."""
+
+    gap: JournalGap
+
+
+Change: TypeAlias = HoldSeen | HoldOver | EndUnheard | GapSeen
+
+
+class Follower:
+    """Follows one fleet. `silent`: seconds without a heartbeat after which no RCM was heard."""
+
+    def __init__(self, silent: float, open_holds: Iterable[Grant] = (), heard: float | None = None) -> None:
+        """`open_holds` and `heard`: what stood, and when the last publication came, as the journal was left."""
+        self._silent = silent
+        self._open: dict[Grant, None] = dict.fromkeys(open_holds)
+        self._term, self._seq = NO_TERM, 0
+        self._left = heard
+        """When the journal was left, until something is heard again."""
+        self._doubt: float | None = None
+        """Since when ends may have been missed."""
+        self.must_read = False
+        """Whether the RCM's state is to be read, and told with a `StateRead`."""
+
+    def take(self, event: PublicationHeard | StateRead) -> Iterator[Change]:
+        """What is to be kept of it; nothing of what an RCM of an earlier term says."""
+        if isinstance(event, PublicationHeard):
+            return self._heard(event)
+        return self._read(event)
+
+    def _heard(self, event: PublicationHeard) -> Iterator[Change]:
+        at, grants = event.at, event.grants
+        if grants.term < self._term or not _is_sane(Grant(grants.term, grants.seq)):
+            return
+        if (gap := self._gap_before(event)) is not None:
+            self._doubt = gap.began if self._doubt is None else min(self._doubt, gap.began)
+            yield GapSeen(gap)
+        # A new term may begin with ends that nobody publishes.
+        self.must_read |= gap is not None or grants.term != self._term
+        self._seq = max(self._seq, grants.seq) if grants.term == self._term else grants.seq
+        self._term, self._left = grants.term, None
+        waited = dict(grants.begun)
+        for holders in grants.rcs.values():
+            for holder in holders:
+                if holder.grant not in self._open and _is_sane(holder.grant):
+                    ours = holder.grant.term == grants.term
+                    yield self._stands(_held(holder, at, waited.get(holder.grant.seq) if ours else None, grants))
+        for revoked in grants.revoked:
+            if _is_sane(revoked.grant):
+                self._open.pop(revoked.grant, None)
+                yield HoldOver(_over(revoked, at))
+
+    def _gap_before(self, event: PublicationHeard) -> JournalGap | None:
+        at, grants = event.at, event.grants
+        if self._left is not None:
+            return JournalGap(min(self._left, at), at, "off")
+        if self._term == NO_TERM:
+            return None
+        before = self._seq if grants.term == self._term else 0
+        if event.silence > self._silent:
+            return JournalGap(at - event.silence, at, "silent")
+        if grants.prev > before:
+            return JournalGap(at - event.silence, at, "missed", _number(grants.prev - before))
+        return None
+
+    def _read(self, event: StateRead) -> Iterator[Change]:
+        at, state = event.at, event.state
+        # Only what an RCM publishes is believed of its term; what is older is read again.
+        if state.term != self._term or not self._seq <= state.seq <= MAX_SEQ:
+            return
+        self._seq = state.seq
+        since, self._doubt, self.must_read = self._doubt, None, False
+        stands = {hold.grant for hold in state.holds}
+        for grant in [grant for grant in self._open if grant not in stands]:
+            del self._open[grant]
+            yield EndUnheard(grant, at if since is None else since)
+        for hold in state.holds:
+            if hold.grant not in self._open and _is_sane(hold.grant):
+                yield self._stands(_viewed(hold, at))
+
+    def lost(self, gap: JournalGap) -> Iterator[Change]:
+        """Changes could not be kept: ends may be among them."""
+        self._doubt, self.must_read = gap.began if self._doubt is None else min(self._doubt, gap.began), True
+        yield GapSeen(gap)
+
+    def _stands(self, hold: PastHold) -> HoldSeen:
+        if len(self._open) < MAX_OPEN:
+            self._open[hold.grant] = None
+        return HoldSeen(hold)
+
+
+def _is_sane(grant: Grant) -> bool:
+    """Whether a grant can be kept: numbers of the mesh have any size."""
+    (counter, rcm), seq = grant
+    return 0 <= seq <= MAX_SEQ and 0 <= counter <= MAX_COUNTER and _text(rcm) == rcm
+
+
+def _held(holder: Holder, at: float, waited: float | None, grants: Grants) -> PastHold:
+    known = waited is not None or (holder.grant.term == grants.term and grants.prev < holder.grant.seq <= grants.seq)
+    return PastHold(
+        **_names(holder.id, holder.arc, holder.client, holder.grant, holder.rcs),
+        began=at,
+        late=not known,
+        priority=_number(holder.priority),
+        min_runtime=float(_number(holder.min_runtime)),
+        waited=waited,
+        who=_user(holder.who),
+    )
+
+
+def _viewed(hold: HoldView, at: float) -> PastHold:
+    return PastHold(
+        **_names(hold.id, hold.arc, hold.client, hold.grant, sorted(hold.needs)),
+        began=max(0.0, at - max(0.0, hold.held)),
+        priority=_number(hold.priority),
+        min_runtime=float(_number(hold.min_runtime)),
+        who=_user(hold.who),
+    )
+
+
+def _over(revoked: Revocation, at: float) -> PastHold:
+    by = revoked.why.by[0] if revoked.by is not None and revoked.why is not None and revoked.why.by else None
+    if by is not None:
+        by = ReasonParty(_text(by.id), _text(by.arc), _text(by.client), _number(by.priority), _user(by.who))
+    return PastHold(
+        **_names(revoked.id, revoked.arc, revoked.client, revoked.grant, revoked.rcs),
+        began=at,
+        late=True,
+        ended=at,
+        outcome=_text(revoked.outcome),
+        reason=_text(revoked.reason),
+        by=by,
+    )
+
+
+def _names(number: str, arc: str, client: str, grant: Grant, rcs: list[str]) -> dict[str, Any]:
+    kept = [_text(rc) for rc in rcs[:MAX_RCS]]
+    return {"grant": grant, "id": _text(number), "arc": _text(arc), "client": _text(client), "rcs": kept}
+
+
+def _user(who: Who | None) -> Who | None:
+    """Without the comment, which is of no use later."""
+    if who is None or not (who.user or who.host or who.command):
+        return None
+    return Who(clean(who.user)[:MAX_WHO], clean(who.host)[:MAX_WHO], clean(who.command)[:MAX_WHO])
+
+
+def _text(text: str) -> str:
+    return clean(text[:MAX_TEXT])
+
+
+def _number(number: N) -> N:
+    """One that others can read in an answer."""
+    return max(min(number, type(number)(MAX_NUMBER)), type(number)(-MAX_NUMBER))

@@ -1,0 +1,214 @@
+"""A candidate's journal: gathers what its leader publishes, commits it in a thread, answers questions.
+
+The event loop only appends. Once a second, at most, a thread works out what has changed and commits it as one."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from msgspec.structs import replace
+
+from zscout.config.node import JournalConfig
+from zscout.keyexpr import check_need
+from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError, Refused
+from zscout.mesh.supervision import Supervisor, done_within
+from zscout.messages import Grants, HistoryAsk, JournalGap, Problem, RcmState, StateAsk
+from zscout.services.journal.follower import Change, Follower, PublicationHeard, StateRead
+from zscout.services.journal.store import Damaged, JournalStore, Unwritable
+from zscout.types import NO_TERM, SECOND, Ns, Term
+
+log = logging.getLogger(__name__)
+
+COMMIT_EVERY: Final = 1.0
+"""Seconds that what is heard is gathered before it is on disk."""
+HEARD_EVERY: Final = 30.0
+"""Seconds after which it is noted that an RCM was heard, though it told nothing new."""
+READ_EVERY: Final = 2.0
+"""Seconds from one question for the RCM's state to the next, while it is needed."""
+AGAIN_AFTER: Final = 30.0
+"""Seconds until a disk that failed is tried again."""
+MAX_GATHERED: Final = 100_000
+"""Holders and ends that wait to be committed: more are dropped, and the journal has a gap."""
+MAX_ASKING: Final = 16
+"""Questions that are answered at one time."""
+ENDS_WITHIN: Final = 5.0
+MEGABYTE: Final = 1_000_000
+
+
+class Journal:
+    """The journal of one node. `silent`: seconds after which a leader that publishes nothing is not heard any more."""
+
+    def __init__(
+        self, mesh: Mesh, folder: Path, config: JournalConfig, silent: float, wall: Callable[[], float] = time.time
+    ) -> None:
+        """`wall`: seconds since 1970, UTC."""
+        self._mesh, self._silent, self._wall = mesh, silent, wall
+        self._store = JournalStore(folder, config.max_age / SECOND, config.max_size * MEGABYTE)
+        self._supervisor = Supervisor("the journal", lambda _: log.error("no journal is kept until this node restarts"))
+        self._gathered: list[PublicationHeard | StateRead] = []
+        self._weight = 0
+        """Of what is gathered."""
+        self._number: tuple[Term, int] = NO_TERM, 0
+        self._at: Ns | None = None
+        """When the last publication was heard, by the mesh's clock."""
+        self._first = self._heard = 0.0
+        """When the first one was that this journal may know of, and the last."""
+        self._committed = 0.0
+        """Up to when it is noted that it heard."""
+        self._dropped, self._dropped_since = 0, 0.0
+        self._follower: Follower | None = None
+        """None: the file is not open."""
+        self._pending: list[Change] = []
+        """Worked out, and not written yet."""
+        self._troubled: str | None = None
+        self._not_before: Ns = 0
+        self._read_at: Ns = 0
+        self._asking = 0
+        self._ending = asyncio.Event()
+        self._served: Declaration | None = None
+
+    def start(self) -> None:
+        mesh = self._mesh
+        self._served = mesh.serve(
+            mesh.keys.history_any(mesh.me.host), HistoryAsk, self._supervisor.guard(self._on_asked)
+        )
+        self._keeping = self._supervisor.spawn(self._keep())
+
+    async def stop(self) -> None:
+        """What was heard until now is on disk on return."""
+        if self._served is not None:
+            self._served.close()
+        self._ending.set()
+        await asyncio.wait([self._keeping], timeout=ENDS_WITHIN)
+        await self._supervisor.close()
+
+    # In
+
+    def hear(self, grants: Grants) -> None:
+        """What the leader publishes: called for each publication, heartbeats included. Raises nothing: a candidate
+        leads without a journal as well."""
+        try:
+            if self._supervisor.active:
+                self._hear(grants)
+        except Exception as error:  # noqa: BLE001 - it is logged there
+            self._supervisor.fail(error)
+
+    def _hear(self, grants: Grants) -> None:
+        now, at, number = self._mesh.now(), self._wall(), (grants.term, grants.seq)
+        silence = 0.0 if self._at is None else (now - self._at) / SECOND
+        self._at, self._heard, self._first = now, at, self._first or at
+        if grants.rcs or grants.revoked or number != self._number or silence > self._silent:
+            self._gather(PublicationHeard(at, silence, grants))
+        self._number = number
+
+    def _gather(self, event: PublicationHeard | StateRead) -> None:
+        if self._weight + len(self._pending) + (weight := _weight(event)) > MAX_GATHERED:
+            self._dropped_since = self._dropped_since if self._dropped else event.at
+            self._dropped += 1
+            return
+        self._weight += weight
+        self._gathered.append(event)
+
+    # To disk
+
+    async def _keep(self) -> None:
+        while not self._ending.is_set():
+            await done_within(COMMIT_EVERY, self._ending.wait())
+            now = self._mesh.now()
+            news = self._gathered or self._pending or self._dropped or self._heard - self._committed > HEARD_EVERY
+            last = self._ending.is_set() and self._heard > self._committed
+            # It is opened before anything is heard: what is asked is answered.
+            if last or (now >= self._not_before and (news or self._follower is None)):
+                await self._commit()
+            if self._follower is not None and self._follower.must_read and now - self._read_at > READ_EVERY * SECOND:
+                self._read_at = now
+                self._supervisor.spawn(self._read())
+        await asyncio.to_thread(self._store.close)
+
+    async def _commit(self) -> None:
+        try:
+            if self._follower is None:
+                stood, left = await asyncio.to_thread(self._store.open)
+                self._follower = Follower(self._silent, stood, left)
+            await self._write(self._follower)
+        except Unwritable as error:
+            self._trouble(error)
+        else:
+            if self._troubled is not None:
+                log.info("the journal is kept again")
+                self._troubled = None
+
+    async def _write(self, follower: Follower) -> None:
+        """All that is gathered and pending. Raises Unwritable."""
+        events, self._gathered, self._weight = self._gathered, [], 0
+        dropped, self._dropped = self._dropped, 0
+        gap = JournalGap(self._dropped_since, self._wall(), "dropped", dropped) if dropped else None
+        heard = self._heard
+
+        def write() -> None:
+            for event in events:
+                self._pending += follower.take(event)
+            if gap is not None:
+                self._pending += follower.lost(gap)
+            if heard:
+                self._store.commit(self._pending, self._first, heard, self._wall())
+
+        await asyncio.to_thread(write)
+        self._pending, self._committed = [], heard
+
+    def _trouble(self, error: Unwritable) -> None:
+        """What is pending is tried again later, with what is gathered until then."""
+        if isinstance(error, Damaged):
+            # The new file knows nothing of what stood, nor of what was pending.
+            self._follower, self._pending, self._first = None, [], self._wall()
+            return
+        self._not_before = self._mesh.now() + round(AGAIN_AFTER * SECOND)
+        if self._troubled != str(error):
+            self._troubled = str(error)
+            log.warning("the journal can't be kept: %s; tried again every %g s", error, AGAIN_AFTER)
+
+    async def _read(self) -> None:
+        try:
+            asked = StateAsk(holds_only=True)
+            replies = await self._mesh.ask(self._mesh.keys.rcm_state, asked, RcmState, timeout=READ_EVERY)
+        except MeshError as error:
+            log.debug("the RCM's state was not read: %s", error)
+            return
+        for state in (reply.message for reply in replies if reply.message is not None):
+            self._gather(StateRead(self._wall(), state))
+
+    # Questions
+
+    def _on_asked(self, query: IncomingQuery[HistoryAsk]) -> None:
+        if query.message.rc is not None:
+            check_need(query.message.rc)
+        if self._asking >= MAX_ASKING:
+            raise Refused("busy", "this journal has many questions to answer; ask again")
+        self._asking += 1
+        self._supervisor.spawn(self._answer(query))
+
+    async def _answer(self, query: IncomingQuery[HistoryAsk]) -> None:
+        asked, now = query.message, self._wall()
+        try:
+            answer = await asyncio.to_thread(self._store.answer, self._mesh.me.host, asked, now)
+        except Unwritable as error:
+            query.refuse(Problem("no_journal", str(error)))
+            return
+        finally:
+            self._asking -= 1
+        silent_for = 0.0 if self._at is None else (self._mesh.now() - self._at) / SECOND
+        if asked.before is None and silent_for > self._silent:
+            answer = replace(answer, gaps=[*answer.gaps, JournalGap(self._heard, None, "silent")])
+        query.answer(answer)
+
+
+def _weight(event: PublicationHeard | StateRead) -> int:
+    """About how much there is to be kept of it."""
+    if isinstance(event, StateRead):
+        return 1 + len(event.state.holds)
+    return 1 + sum(map(len, event.grants.rcs.values())) + len(event.grants.revoked)

@@ -1,0 +1,89 @@
+"""What several journals tell of one fleet, as one: pure.
+
+Each candidate writes by its own clock, and has its own gaps. A hold is one by its grant; of what several know of it the
+one who knows most is believed, whole, so that its times are of one clock."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import reduce
+from typing import NamedTuple
+
+from zscout.messages import UNHEARD, History, PastHold
+from zscout.types import HostName
+
+
+class Span(NamedTuple):
+    """A time: seconds since 1970, UTC."""
+
+    began: float
+    ended: float
+
+
+def merged(journals: Iterable[Iterable[PastHold]]) -> list[PastHold]:
+    """Each hold once, in the order in which they began."""
+    best: dict[object, PastHold] = {}
+    for hold in (hold for journal in journals for hold in journal):
+        known = best.get(hold.grant)
+        if known is None or _knowledge(hold) > _knowledge(known):
+            best[hold.grant] = hold
+    return sorted(best.values(), key=lambda hold: (hold.began, hold.grant))
+
+
+def _knowledge(hold: PastHold) -> tuple[int, bool, bool]:
+    """How it ended, or that it stands; when it began; how long it was waited for."""
+    ending = 1 if hold.outcome == UNHEARD else 0 if hold.ended is not None and not hold.outcome else 2
+    return ending + (hold.ended is not None and ending == 2), not hold.late, hold.waited is not None
+
+
+def unknown_to(journal: History, window: Span) -> list[Span]:
+    """The times of a window of which a journal does not know all, in order and apart."""
+    since = window.ended if journal.since is None else journal.since
+    spans = [Span(window.began, since)]
+    spans += [Span(gap.began, window.ended if gap.ended is None else gap.ended) for gap in journal.gaps]
+    return _apart(Span(max(one.began, window.began), min(one.ended, window.ended)) for one in spans)
+
+
+def unknown_to_all(journals: Sequence[History], window: Span) -> list[Span]:
+    """The times of a window of which no journal knows all."""
+    return reduce(_both, (unknown_to(one, window) for one in journals), [window])
+
+
+def enough(journals: Mapping[HostName, History], window: Span) -> list[HostName]:
+    """Hosts whose journals together know what all know of a window: the least known first left out."""
+    unknown = {host: unknown_to(one, window) for host, one in journals.items()}
+    chosen: list[HostName] = []
+    left = [window]
+    for host in sorted(unknown, key=lambda host: (_length(unknown[host]), host)):
+        rest = _both(left, unknown[host])
+        if not chosen or _length(rest) < _length(left):
+            chosen.append(host)
+            left = rest
+    return chosen
+
+
+def _apart(spans: Iterable[Span]) -> list[Span]:
+    found: list[Span] = []
+    for span in sorted(span for span in spans if span.ended > span.began):
+        if found and span.began <= found[-1].ended:
+            found[-1] = Span(found[-1].began, max(found[-1].ended, span.ended))
+        else:
+            found.append(span)
+    return found
+
+
+def _both(some: Sequence[Span], others: Sequence[Span]) -> list[Span]:
+    """What is in both; each in order and apart."""
+    found, at = [], 0
+    for one in some:
+        while at < len(others) and others[at].ended <= one.began:
+            at += 1
+        for other in others[at:]:
+            if other.began >= one.ended:
+                break
+            found.append(Span(max(one.began, other.began), min(one.ended, other.ended)))
+    return found
+
+
+def _length(spans: Iterable[Span]) -> float:
+    return sum(span.ended - span.began for span in spans)

@@ -1,0 +1,359 @@
+"""A candidate's journal on disk: one SQLite file, bounded in size and age.
+
+All of it blocks, and is called from threads, one call at a time. The file is in WAL mode with a sync at each commit:
+what is committed outlives the process and the host."""
+
+from __future__ import annotations
+
+import logging
+import sqlite3
+import threading
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from zscout.keyexpr import check_need, is_pattern, matcher
+from zscout.messages import (
+    MAX_GAPS,
+    MAX_TOLD_BYTES,
+    UNHEARD,
+    Cursor,
+    History,
+    HistoryAsk,
+    JournalGap,
+    PastHold,
+    ReasonParty,
+    Who,
+)
+from zscout.services.journal.follower import Change, EndUnheard, GapSeen, HoldOver, HoldSeen
+from zscout.types import Grant, Term
+
+log = logging.getLogger(__name__)
+
+FILE: Final = "journal.sqlite"
+ASIDE: Final = "journal.damaged.sqlite"
+"""What could not be read: of several the last, so that they do not fill the disk."""
+FORMAT: Final = 1
+"""`user_version` of the file."""
+PRUNED_AT_ONCE: Final = 5_000
+"""Holds that one commit removes: more would keep the next waiting."""
+ROOM: Final = 0.95
+"""Of the size that is allowed: what is left after a commit that removed holds."""
+MAX_KEPT_GAPS: Final = 10_000
+WAL: Final = 4_000_000
+"""Bytes that the log beside the file has at most between commits."""
+_DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+
+_SCHEMA: Final = """
+CREATE TABLE holds (
+    id INTEGER PRIMARY KEY, term INTEGER NOT NULL, rcm TEXT NOT NULL, seq INTEGER NOT NULL,
+    request TEXT NOT NULL, arc TEXT NOT NULL, client TEXT NOT NULL, owner TEXT NOT NULL, rcs TEXT NOT NULL,
+    began REAL NOT NULL, late INTEGER NOT NULL, ended REAL, outcome TEXT NOT NULL, reason TEXT NOT NULL, taken_for TEXT,
+    priority INTEGER NOT NULL, min_runtime REAL, waited REAL, user TEXT, host TEXT, command TEXT,
+    UNIQUE (term, rcm, seq)
+);
+CREATE INDEX holds_began ON holds (began);
+CREATE INDEX holds_ended ON holds (ended);
+CREATE TABLE gaps (began REAL NOT NULL, ended REAL NOT NULL, cause TEXT NOT NULL, count INTEGER NOT NULL);
+CREATE TABLE facts (name TEXT PRIMARY KEY, at REAL NOT NULL);
+"""
+_COLUMNS: Final = (
+    "term, rcm, seq, request, arc, client, owner, rcs, began, late, ended, outcome, reason, taken_for, priority, "
+    "min_runtime, waited, user, host, command"
+)
+_INSERT: Final = (
+    f"INSERT INTO holds ({_COLUMNS}) VALUES ({', '.join('?' * 20)}) ON CONFLICT (term, rcm, seq) DO UPDATE SET "  # noqa: S608 - constants
+)
+# What was taken for over, or known by its end alone, is told in full now.
+_BEGAN: Final = f"""{_INSERT}
+    arc = excluded.arc, began = min(began, excluded.began), late = min(late, excluded.late),
+    priority = excluded.priority, min_runtime = excluded.min_runtime, waited = coalesce(excluded.waited, waited),
+    user = excluded.user, host = excluded.host, command = excluded.command,
+    ended = CASE outcome WHEN '{UNHEARD}' THEN NULL ELSE ended END,
+    outcome = CASE outcome WHEN '{UNHEARD}' THEN '' ELSE outcome END"""
+_ENDED: Final = f"""{_INSERT}
+    ended = max(holds.began, excluded.ended), outcome = excluded.outcome, reason = excluded.reason,
+    taken_for = excluded.taken_for
+    WHERE holds.ended IS NULL OR holds.outcome = '{UNHEARD}'"""
+_UNHEARD: Final = f"""
+    UPDATE holds SET ended = max(began, ?), outcome = '{UNHEARD}'
+    WHERE term = ? AND rcm = ? AND seq = ? AND ended IS NULL"""  # noqa: S608 - a constant
+_PARTY: Final = msgspec.json.Decoder(ReasonParty)
+
+
+class Unwritable(Exception):
+    """The journal can't be kept at present; the message says why. What was to be committed may be tried again."""
+
+
+class Damaged(Unwritable):
+    """Nor read: the file has been set aside, and what it told is gone."""
+
+
+class JournalStore:
+    """The file in `folder`. `max_age` in seconds, `max_size` in bytes."""
+
+    def __init__(self, folder: Path, max_age: float, max_size: int) -> None:
+        self.path = folder / FILE
+        self._max_age, self._max_size = max_age, max_size
+        self._db: sqlite3.Connection | None = None
+        self._one = threading.Lock()
+
+    def open(self) -> tuple[list[Grant], float | None]:
+        """What stood when it was left, and when something was heard last. A file that can't be read is set aside, and a
+        new one begun. Raises Unwritable."""
+        with self._one:
+            try:
+                db = self._opened()
+            except Damaged:
+                db = self._opened()
+            rows = db.execute("SELECT term, rcm, seq FROM holds WHERE ended IS NULL ORDER BY id")
+            return [Grant(Term(term, rcm), seq) for term, rcm, seq in rows], self._fact("heard")
+
+    def commit(self, changes: Iterable[Change], first: float, heard: float, now: float) -> None:
+        """Keeps these changes, all or none, and that something was heard last at `heard`; removes what is too old or
+        too much. A new journal begins at `first`. Raises Unwritable."""
+        with self._one:
+            try:
+                db = self._opened()
+                with _transaction(db):
+                    for change in changes:
+                        _apply(db, change)
+                    db.execute("INSERT INTO facts VALUES ('since', ?) ON CONFLICT DO NOTHING", (first,))
+                    db.execute("INSERT OR REPLACE INTO facts VALUES ('heard', ?)", (heard,))
+                    self._prune(db, now)
+                db.execute("PRAGMA incremental_vacuum(1000)").fetchall()
+            except sqlite3.Error as error:
+                raise self._failed(error) from None
+
+    def answer(self, host: str, asked: HistoryAsk, now: float) -> History:
+        """A page. Raises Unwritable, BadName for a pattern that is none."""
+        with self._one:
+            try:
+                return self._answer(host, asked, now)
+            except sqlite3.Error as error:
+                raise self._failed(error) from None
+
+    def size(self) -> int:
+        """Bytes of the file that are in use."""
+        with self._one:
+            return _used(self._opened())
+
+    def close(self) -> None:
+        with self._one:
+            self._forget()
+
+    # The file
+
+    def _opened(self) -> sqlite3.Connection:
+        if self._db is None:
+            try:
+                self._db = self._open()
+            except sqlite3.Error as error:
+                raise self._failed(error) from None
+        return self._db
+
+    def _open(self) -> sqlite3.Connection:
+        db = sqlite3.connect(self.path, timeout=1.0, isolation_level=None, check_same_thread=False)
+        try:
+            (version,) = db.execute("PRAGMA user_version").fetchone()
+            if version == 0:
+                db.execute("PRAGMA auto_vacuum = INCREMENTAL")
+            db.execute("PRAGMA journal_mode = WAL")
+            db.execute("PRAGMA synchronous = FULL")
+            db.execute(f"PRAGMA journal_size_limit = {WAL}")
+            if version == 0:
+                db.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version = {FORMAT}; COMMIT;")
+            elif version != FORMAT:
+                raise _damaged(f"it is of format {version}, not {FORMAT}")
+            (sound,) = db.execute("PRAGMA quick_check(1)").fetchone()
+            if sound != "ok":
+                raise _damaged(sound)
+            db.create_function("any_rc", 2, _any_rc, deterministic=True)
+        except BaseException:
+            db.close()
+            raise
+        self.path.chmod(0o600)
+        return db
+
+    def _failed(self, error: sqlite3.Error) -> Unwritable:
+        """What to raise; a file that is damaged has been set aside then."""
+        if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
+            self._forget()
+            aside = self.path.with_name(ASIDE)
+            try:
+                for end in ("", "-wal", "-shm"):
+                    with suppress(FileNotFoundError):
+                        self.path.with_name(FILE + end).replace(aside.with_name(ASIDE + end))
+            except OSError as stays:
+                return Unwritable(f"{self.path} is damaged, and stays: {stays.strerror}")
+            log.warning("%s is damaged (%s): set aside as %s, a new one begins", self.path, error, aside.name)
+            return Damaged(f"{self.path}: {error}")
+        return Unwritable(f"{self.path}: {error}")
+
+    def _forget(self) -> None:
+        db, self._db = self._db, None
+        if db is not None:
+            with suppress(sqlite3.Error):
+                db.close()
+
+    def _fact(self, name: str) -> float | None:
+        row = self._opened().execute("SELECT at FROM facts WHERE name = ?", (name,)).fetchone()
+        return None if row is None else float(row[0])
+
+    def _prune(self, db: sqlite3.Connection, now: float) -> None:
+        """Removes what ended longest ago; what stands is kept. The journal knows nothing before that any more."""
+        oldest = now - self._max_age
+        over = "SELECT id, ended FROM holds WHERE ended IS NOT NULL"
+        gone = db.execute(f"{over} AND ended < ? ORDER BY ended LIMIT ?", (oldest, PRUNED_AT_ONCE)).fetchall()
+        if not gone and (used := _used(db)) > self._max_size:
+            (count,) = db.execute("SELECT count(*) FROM holds").fetchone()
+            many = round(count * (1 - ROOM * self._max_size / used)) + 1
+            gone = db.execute(f"{over} ORDER BY ended LIMIT ?", (min(many, PRUNED_AT_ONCE),)).fetchall()
+        if gone:
+            db.executemany("DELETE FROM holds WHERE id = ?", [(one,) for one, _ in gone])
+            oldest = max(oldest, gone[-1][1])
+        db.execute("UPDATE facts SET at = ? WHERE name = 'since' AND at < ?", (oldest, oldest))
+        db.execute("DELETE FROM gaps WHERE ended < ?", (oldest,))
+        kept = "SELECT rowid FROM gaps ORDER BY rowid DESC LIMIT 1 OFFSET ?"
+        db.execute(f"DELETE FROM gaps WHERE rowid <= ({kept})", (MAX_KEPT_GAPS,))  # noqa: S608 - a constant
+
+    # Questions
+
+    def _answer(self, host: str, asked: HistoryAsk, now: float) -> History:
+        db = self._opened()
+        low = 0.0 if asked.since is None else now - asked.since
+        high, since = now - asked.until, self._fact("since")
+        where = ["began <= ?", "(ended IS NULL OR ended >= ?)"]
+        conditions: list[Any] = [high, low]
+        if asked.before is not None:
+            where.append("(began, id) < (?, ?)")
+            conditions += asked.before
+        if asked.arc is not None:
+            where.append("(arc = ? OR request = ? OR client || '/' || request = ?)")
+            conditions += [asked.arc] * 3
+        if asked.who:
+            names = ", ".join("?" * len(asked.who))
+            where.append(f"(user IN ({names}) OR owner IN ({names}))")
+            conditions += [*asked.who, *asked.who]
+        if asked.rc is not None:
+            check_need(asked.rc)
+            pattern = is_pattern(asked.rc)
+            where.append("any_rc(?, rcs)" if pattern else "instr(char(10) || rcs || char(10), ?)")
+            conditions.append(asked.rc if pattern else f"\n{asked.rc}\n")
+        sql = f"SELECT id, {_COLUMNS} FROM holds WHERE {' AND '.join(where)} ORDER BY began DESC, id DESC LIMIT ?"  # noqa: S608 - texts of this function
+        holds: list[PastHold] = []
+        last: Cursor = (0.0, 0)
+        more: Cursor | None = None
+        size = 0
+        for row in db.execute(sql, (*conditions, asked.limit + 1)):
+            if len(holds) == asked.limit or size > MAX_TOLD_BYTES:
+                more = last
+                break
+            hold = _hold(row[1:])
+            holds.append(hold)
+            last = (hold.began, row[0])
+            size += 400 + len(row[8]) + len(row[13]) + len(row[14] or "")
+        return History(host, now, since, holds, more, [] if asked.before is not None else _gaps(db, low, high))
+
+
+def _gaps(db: sqlite3.Connection, low: float, high: float) -> list[JournalGap]:
+    sql = "SELECT began, ended, cause, count FROM gaps WHERE ended >= ? AND began <= ? ORDER BY rowid DESC LIMIT ?"
+    rows = db.execute(sql, (low, high, MAX_GAPS)).fetchall()
+    return [JournalGap(*row) for row in reversed(rows)]
+
+
+def _used(db: sqlite3.Connection) -> int:
+    (pages,), (free,), (size,) = (
+        db.execute(f"PRAGMA {name}").fetchone() for name in ("page_count", "freelist_count", "page_size")
+    )
+    return int((pages - free) * size)
+
+
+def _apply(db: sqlite3.Connection, change: Change) -> None:
+    match change:
+        case HoldSeen(hold):
+            db.execute(_BEGAN, _row(hold))
+        case HoldOver(hold):
+            db.execute(_ENDED, _row(hold))
+        case EndUnheard(Grant(term, seq), at):
+            db.execute(_UNHEARD, (at, term.counter, term.rcm, seq))
+        case GapSeen(gap):
+            db.execute("INSERT INTO gaps VALUES (?, ?, ?, ?)", (gap.began, gap.ended, gap.cause, gap.count))
+
+
+def _row(hold: PastHold) -> tuple[object, ...]:
+    who = hold.who or Who()
+    return (
+        hold.grant.term.counter,
+        hold.grant.term.rcm,
+        hold.grant.seq,
+        hold.id,
+        hold.arc,
+        hold.client,
+        hold.client.partition("/")[0],
+        "\n".join(hold.rcs),
+        hold.began,
+        hold.late,
+        hold.ended,
+        hold.outcome,
+        hold.reason,
+        None if hold.by is None else msgspec.json.encode(hold.by).decode(),
+        hold.priority,
+        hold.min_runtime,
+        hold.waited,
+        who.user or None,
+        who.host or None,
+        who.command or None,
+    )
+
+
+def _hold(row: tuple[Any, ...]) -> PastHold:
+    (term, rcm, seq, number, arc, client, _, rcs, began, late, ended, outcome, reason, by, priority, runtime) = row[:16]
+    waited, user, host, command = row[16:]
+    return PastHold(
+        Grant(Term(term, rcm), seq),
+        number,
+        arc,
+        client,
+        rcs.split("\n") if rcs else [],
+        began,
+        bool(late),
+        ended,
+        outcome,
+        reason,
+        None if by is None else _PARTY.decode(by),
+        priority,
+        runtime,
+        waited,
+        Who(user or "", host or "", command or "") if user or host or command else None,
+    )
+
+
+def _any_rc(pattern: str, rcs: str) -> bool:
+    return any(map(matcher(pattern), rcs.split("\n")))
+
+
+class _transaction:  # noqa: N801 - reads as a statement
+    """All or nothing."""
+
+    def __init__(self, db: sqlite3.Connection) -> None:
+        self._db = db
+
+    def __enter__(self) -> None:
+        self._db.execute("BEGIN IMMEDIATE")
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
+            self._db.execute("COMMIT")
+        else:
+            with suppress(sqlite3.Error):
+                self._db.execute("ROLLBACK")
+
+
+def _damaged(why: str) -> sqlite3.DatabaseError:
+    error = sqlite3.DatabaseError(why)
+    error.sqlite_errorcode = sqlite3.SQLITE_CORRUPT
+    return error
