@@ -237,10 +237,6 @@ class Keys:
         """Where a candidate is asked for what its journal keeps."""
         return f"{self.base}/host/{check_name(host, 'host')}/history/{_sender(sender)}"
 
-    def histories(self, sender: Sender) -> str:
-        """Where all candidates are."""
-        return f"{self.base}/host/*/history/{_sender(sender)}"
-
     def placer(self, sender: Sender) -> str:
         """Where the component placer is asked."""
         return self._asked("placer/component", sender)

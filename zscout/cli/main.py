@@ -33,6 +33,8 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "cancel": ("requests.cancel", "End an ARC, running or waiting."),
     "status": ("fleet.status", "Show devices, holders, the queue and the hosts."),
     "why": ("requests.why", "Tell the story of an ARC: what it waits for, and who is in its way."),
+    "history": ("fleet.history", "List who held what, from the journals of the candidates."),
+    "usage": ("fleet.usage", "Sum up who held what for how long, by user, group or RC."),
     "start": ("components.start", "Have a component run on the best host, and keep it running."),
     "stop": ("components.start", "End components for good."),
     "components": ("components.components", "List components: where each runs, and what it uses."),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from typing import Any, Final
 
 import click
@@ -10,9 +11,11 @@ from msgspec import structs
 from zscout import terminal
 from zscout.behaviors.client.client import Client
 from zscout.cli import common
-from zscout.cli.requests.options import arc_argument
+from zscout.cli.fleet.journals import ask_journals, ending, local
+from zscout.cli.fleet.journals import hold_json as past_json
+from zscout.cli.requests.options import MAX_ARC_NAME, arc_argument
 from zscout.cli.requests.waiting import NeedContention, contention_of, hold_json, hold_words, reason_text
-from zscout.messages import HoldView, RcAsk, RcmState, RcState, WaitView
+from zscout.messages import HistoryAsk, HoldView, RcAsk, RcmState, RcState, WaitView
 from zscout.scheduling.reason import named
 
 MAX_DESCRIBED: Final = 20
@@ -31,7 +34,8 @@ async def why(arc: str, as_json: bool) -> None:
     """Tell what became of ARC, and why it waits if it does.
 
     ARC is its name, its id, or HOST/CLIENT/ID. Of each RC that it needs: who holds it, with which priority,
-    since when, for how long yet. An ARC that has ended is known for as long as the RCM remembers it.
+    since when, for how long yet. Of an ARC that has ended the RCM remembers the story for a while; after that the
+    journals of the candidates tell who held what for how long, and how that ended.
 
     \b
     Examples:
@@ -42,11 +46,11 @@ async def why(arc: str, as_json: bool) -> None:
         state = await common.state_of(client, arc, forecast=True)
         views: list[View] = [*state.holds, *state.queue]
         same = [view for view in views if arc in (view.arc, view.id, _full(view))]
-        if not same and not state.story:
-            raise common.unknown("ARC", arc, [view.arc for view in views], "and none is open", "open", state.more)
+        unknown = common.unknown("ARC", arc, [view.arc for view in views], "and none is open", "open", state.more)
+        past = [] if same or state.story else await _past_holds(client, arc, unknown)
         found = [await _described(client, view, state) for view in same[:MAX_DESCRIBED]]
         if not same:
-            found = [{"arc": arc, "state": "ended", "story": list(map(structs.asdict, state.story))}]
+            found = [{"arc": arc, "state": "ended", "story": list(map(structs.asdict, state.story)), "holds": past}]
     if as_json:
         more = max(0, len(same) - MAX_DESCRIBED)
         terminal.print_json({"fleet": client.fleet.name, "asked": arc, "arcs": found, "more": more})
@@ -55,6 +59,20 @@ async def why(arc: str, as_json: bool) -> None:
         if number:
             terminal.print_line("")
         _print(one)
+
+
+async def _past_holds(client: Client, arc: str, unknown: common.Failed) -> list[dict[str, Any]]:
+    """The latest holds of an ARC that the RCM does not know any more, as `zscout history --json` prints them, oldest
+    first. Raises `unknown` where no journal knows it either."""
+    if len(arc) > MAX_ARC_NAME:
+        raise unknown
+    try:
+        told = await ask_journals(client, HistoryAsk(arc=arc), MAX_DESCRIBED)
+    except common.Failed:
+        raise unknown from None
+    if not told.holds:
+        raise unknown
+    return [past_json(hold, told.window.ended) | {"end": ending(hold)} for hold in told.holds]
 
 
 async def _described(client: Client, view: View, state: RcmState) -> dict[str, Any]:
@@ -97,6 +115,9 @@ def _say(text: str, **style: Any) -> None:
 def _print(arc: dict[str, Any]) -> None:
     if arc["state"] == "ended":
         _say(f"{arc['arc']} is not open any more", bold=True)
+        if arc["holds"]:
+            _print_holds(arc["holds"])
+            return
     else:
         _print_standing(arc)
         _say("Holds" if arc["state"] == "running" else "Needs", bold=True)
@@ -107,6 +128,16 @@ def _print(arc: dict[str, Any]) -> None:
     width = max(map(len, spans), default=0)
     for span, line in zip(spans, arc["story"], strict=True):
         _say(f"  {span:>{width}}  {line['text']}")
+
+
+def _print_holds(holds: list[dict[str, Any]]) -> None:
+    _say("Holds, as the candidates' journals have them", bold=True)
+    for hold in holds:
+        whose = named(hold["who"], hold["client"], hold["arc"])
+        waited = "" if hold["waited"] is None else f" after {terminal.span(hold['waited'])} in the queue"
+        began = local(datetime.fromisoformat(hold["began"]).timestamp())
+        _say(f"  {began}  {whose}, priority {hold['priority']}, held {', '.join(hold['rcs'])}")
+        _say(f"    for {terminal.span(hold['held'])}{waited}: {hold['end']}")
 
 
 def _print_standing(arc: dict[str, Any]) -> None:

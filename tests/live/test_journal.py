@@ -1,0 +1,154 @@
+"""Journals of real nodes: what `zscout history`, `usage` and `why` tell, also after a node was killed."""
+
+from __future__ import annotations
+
+import asyncio
+import csv
+import io
+import json
+import signal
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.cli.tools import zscout_soon
+from tests.hang import HANG
+from tests.live.lab import Lab
+from zscout.keyexpr import Role
+from zscout.services.journal.store import ASIDE, FILE
+
+pytestmark = pytest.mark.live
+
+
+async def told(lab: Lab, until: Callable[[dict[str, Any]], object], *args: str) -> dict[str, Any]:
+    """What `zscout history --json` tells as soon as it is so."""
+    async with asyncio.timeout(HANG):
+        while True:
+            done = await zscout_soon("history", "--json", *args, env=lab.env)
+            if done.returncode == 0 and until(found := json.loads(done.stdout)):
+                return dict(found)
+
+
+def file_of(lab: Lab, host: str) -> Path:
+    return lab.folder / "state" / lab.fleet.name / host / FILE
+
+
+def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path, lease=1.0, candidates=("anvil", "bellows")) as lab:
+            lab.node("anvil", "robot/a")
+            lab.node("bellows", "robot/b")
+            client = await lab.client("program")
+            await lab.ready(client, "robot/a", "robot/b")
+            await lab.candidates(client, "anvil", "bellows")
+            survey = await client.request("survey", {"robot/b": {}}, min_runtime=600)
+            await lab.held_by(client, "robot/b", "survey")
+            take = await client.request("take", {"robot/b": {}}, priority=10, min_runtime=600)
+            await lab.held_by(client, "robot/b", "take")
+            both = {"anvil", "bellows"}
+            first = await told(
+                lab,
+                lambda found: (
+                    [hold["outcome"] for hold in found["holds"]] == ["preempted", ""]
+                    and {one["host"] for one in found["candidates"] if one["gaps"] is not None} == both
+                ),
+            )
+            assert first["holds"][0]["by"]["arc"] == "take"
+
+            # The leader is killed, with what it has committed; the other goes on, with its own journal.
+            assert (await lab.state(client, lambda _: True)).host == "anvil"
+            lab.signal("anvil", signal.SIGKILL)
+            lab.nodes["anvil"].wait()
+            await lab.living(client, Role.RCM, lambda hosts: hosts == ["bellows"])
+            await client.end(take)
+            await lab.held_by(client, "robot/b", "survey")
+            later = await told(
+                lab, lambda found: [one["outcome"] for one in found["holds"]] == ["preempted", "cancelled", ""]
+            )
+            assert later["holds"][0] == first["holds"][0]
+
+            # Its file opens again with all that was committed, and it knows since when it was away.
+            with sqlite3.connect(file_of(lab, "anvil")) as db:
+                assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+                assert db.execute("SELECT arc, outcome FROM holds ORDER BY id").fetchall()[0] == ("survey", "preempted")
+            lab.node("anvil", "robot/a")
+            again = await told(
+                lab,
+                lambda found: any(
+                    gap["cause"] == "off"
+                    for one in found["candidates"]
+                    if one["host"] == "anvil"
+                    for gap in one["gaps"] or ()
+                ),
+            )
+            assert [hold["outcome"] for hold in again["holds"]] == ["preempted", "cancelled", ""]
+            # No time is unknown: one of the two always ran.
+            assert again["gaps"] == []
+
+            # In a pipe: a line for each hold, newest last.
+            plain = (await zscout_soon("history", "--rc", "robot/*", env=lab.env)).stdout.splitlines()
+            assert plain[0].startswith("Holds since ")
+            assert plain[1].split() == ["BEGAN", "HELD", "ARC", "WHO", "PRIORITY", "WAITED", "END", "RCS"]
+            assert [line.split()[-1] for line in plain[2:5]] == ["robot/b"] * 3
+            assert "preempted by take" in plain[2]
+            assert "stands" in plain[4]
+            rows = [*csv.DictReader(io.StringIO((await zscout_soon("history", "--csv", env=lab.env)).stdout))]
+            assert [(row["arc"], row["outcome"], row["rcs"]) for row in rows] == [
+                ("survey", "preempted", "robot/b"),
+                ("take", "cancelled", "robot/b"),
+                ("survey", "", "robot/b"),
+            ]
+            assert (await zscout_soon("history", "--rc", "robot/a", env=lab.env)).stdout.startswith("no holds since ")
+
+            by_rc = json.loads((await zscout_soon("usage", "--by", "rc", "--json", env=lab.env)).stdout)
+            (account,) = by_rc["accounts"]
+            assert (account["key"], account["holds"], account["preempted"]) == ("robot/b", 3, 1)
+            assert account["thrown_away"] == account["preempted_seconds"] == pytest.approx(first["holds"][0]["held"])
+            by_user = (await zscout_soon("usage", env=lab.env)).stdout.splitlines()
+            assert by_user[1].split()[:2] == ["USER", "HOLDS"]
+            assert by_user[2].split()[1] == "3"
+
+            # The RCM of this term does not remember it; the journals do.
+            why = await zscout_soon("why", take.id, env=lab.env)
+            assert why.returncode == 0
+            assert f"{take.id} is not open any more" in why.stdout
+            await client.end(survey)
+
+    asyncio.run(story())
+
+
+def test_a_journal_that_is_damaged_is_set_aside_and_the_node_runs(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            file = file_of(lab, "anvil")
+            file.parent.mkdir(parents=True)
+            file.write_bytes(b"this is no journal\n" * 1_000)
+            lab.node("anvil", "robot/a")
+            client = await lab.client("program")
+            await lab.ready(client, "robot/a")
+            request = await client.request("survey", {"robot/a": {}}, min_runtime=600)
+            await client.end(request)
+            await told(lab, lambda found: [hold["outcome"] for hold in found["holds"]] == ["cancelled"])
+            assert lab.log("anvil").count("is damaged") == 1
+            assert file.with_name(ASIDE).exists()
+
+    asyncio.run(story())
+
+
+def test_a_fleet_without_a_journal_says_so(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("anvil", "robot/a", extra="[journal]\noff = true")
+            client = await lab.client("program")
+            await lab.ready(client, "robot/a")
+            for command in ("history", "usage"):
+                done = await zscout_soon(command, env=lab.env)
+                assert done.returncode == 1
+                assert "has no journal that could be asked" in done.stderr
+                assert done.stderr.count("\n") == 1
+            assert not file_of(lab, "anvil").exists()
+
+    asyncio.run(story())

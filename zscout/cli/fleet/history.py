@@ -1,0 +1,109 @@
+"""`zscout history`: who held what, from the journals of the candidates."""
+
+from __future__ import annotations
+
+import time
+
+import click
+
+from zscout import terminal
+from zscout.cli import common, completion
+from zscout.cli.fleet import journals
+from zscout.messages import HistoryAsk, PastHold
+from zscout.services.journal.merging import Span
+
+MAX_LIMIT = 100_000
+COLUMNS = (
+    *("began", "ended", "held", "waited", "arc", "id", "client", "user", "host", "command", "priority", "min_runtime"),
+    *("rcs", "outcome", "reason", "by_arc", "by_client", "by_user", "late"),
+)
+
+
+@click.command()
+@click.option("--rc", type=journals.RC, shell_complete=completion.needs, help="Only of this RC, or pattern of RCs.")
+@click.option("--user", "users", type=journals.WHO, multiple=True, help="Only of this user, person or host.")
+@click.option("--group", help="Only of the names of this group of the fleet file.")
+@click.option("--arc", type=journals.ARC, help="Only of this ARC: its name or id.")
+@click.option("--since", type=journals.PAST, help="Not what ended before: a time ago (7d) or a date.")
+@click.option("--until", type=journals.PAST, default="0s", help="Not what began after.")
+@click.option("--limit", type=click.IntRange(1, MAX_LIMIT), default=100, show_default=True, help="The latest so many.")
+@journals.formats
+@common.runs
+async def history(
+    rc: str | None,
+    users: tuple[str, ...],
+    group: str | None,
+    arc: str | None,
+    since: float | None,
+    until: float,
+    limit: int,
+    as_json: bool,
+    as_csv: bool,
+) -> None:
+    """List the holds that were and are, newest last: who held which RCs for how long, and how that ended.
+
+    Every node that may lead keeps a journal; all that are there are asked, and a hold that several know is shown once.
+    Times are by the clocks of those hosts. Lines tell of what times no journal knows all. What was granted in the last
+    second may be missing, and a request that never held anything is not listed.
+
+    \b
+    Examples:
+      zscout history --since 7d
+      zscout history --rc 'robot/*' --user alice --limit 20
+      zscout history --since 2026-11-01 --until 2026-12-01 --limit 100000 --csv > november.csv
+      zscout history --json | jq -r '.holds[] | select(.outcome == "preempted") | .by.arc'
+    """
+    journals.check_formats(as_json=as_json, as_csv=as_csv)
+    journals.check_window(since, until)
+    who = journals.names_of(common.the_fleet(), users, group)
+    async with common.connected("history") as client:
+        asked = HistoryAsk(arc=arc, rc=rc, who=who, since=since, until=until)
+        told = await journals.ask_journals(client, asked, limit)
+        fleet = client.fleet
+    now = time.time()
+    if as_json:
+        terminal.print_json(
+            {
+                "fleet": fleet.name,
+                **_window(told.window),
+                "holds": [journals.hold_json(hold, now) for hold in told.holds],
+                "more": told.more,
+                "gaps": told.gaps_json(),
+                "candidates": told.candidates_json(),
+            }
+        )
+    elif as_csv:
+        journals.print_csv(COLUMNS, (_cells(hold, now) for hold in told.holds))
+        journals.print_remarks(told, err=True)
+    else:
+        title = f"Holds since {journals.local(told.window.began)}"
+        title += f", the latest {limit}: see --limit" if told.more else ""
+        if not told.holds:
+            terminal.print_line(f"no holds since {journals.local(told.window.began)}")
+        else:
+            journals.holds_table(title, told, told.holds, proven=fleet.security is not None).print()
+        journals.print_remarks(told)
+
+
+def _window(window: Span) -> dict[str, str]:
+    return {"since": journals.utc(window.began), "until": journals.utc(window.ended)}
+
+
+def _cells(hold: PastHold, now: float) -> tuple[object, ...]:
+    who, by = hold.who, hold.by
+    ended = "" if hold.ended is None else journals.utc(hold.ended)
+    return (
+        *(
+            journals.utc(hold.began),
+            ended,
+            round(journals.held(hold, now), 3),
+            hold.waited,
+            hold.arc,
+            hold.id,
+            hold.client,
+        ),
+        *((who.user, who.host, who.command) if who is not None else ("", "", "")),
+        *(hold.priority, hold.min_runtime, " ".join(hold.rcs), hold.outcome, hold.reason),
+        *((by.arc, by.client, by.who.user if by.who is not None else "") if by is not None else ("", "", "")),
+        int(hold.late),
+    )

@@ -1,0 +1,114 @@
+"""`zscout usage`: accounts of who held what for how long, from the journals of the candidates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, fields
+
+import click
+
+from zscout import terminal
+from zscout.cli import common
+from zscout.cli.fleet import journals
+from zscout.config.fleet import Fleet
+from zscout.config.strict import BadInput
+from zscout.messages import HistoryAsk, PastHold
+from zscout.services.journal.accounts import Account, accounts
+from zscout.terminal import Table, span
+
+MAX_HOLDS = 200_000
+"""That are added up; of more the latest."""
+NO_GROUP = "(no group)"
+
+
+@click.command()
+@click.option(
+    "--by", type=click.Choice(["user", "group", "rc"]), default="user", show_default=True, help="Whose accounts."
+)
+@click.option("--since", type=journals.PAST, default="7d", show_default=True, help="A time ago (7d) or a date.")
+@click.option("--until", type=journals.PAST, default="0s", help="Likewise.")
+@journals.formats
+@common.runs
+async def usage(by: str, since: float, until: float, as_json: bool, as_csv: bool) -> None:
+    """Sum up who held what for how long. Spans are counted within the time that is asked for, and told in seconds by
+    --json and --csv.
+
+    \b
+    HOLDS        holds that stood at some time of it
+    HELD         for how long, two at one time counted twice
+    RC TIME      the same for each RC of them: 3 RCs for 10 s are 30 s
+    WAITED       in the queue before those that began in it; of requests that never held anything nothing is known
+    PREEMPTED    how many were taken for another ARC before their minimum runtime was over, and how long they had stood
+    THROWN AWAY  for how long those had stood that ended before their minimum runtime, preempted or by a lost RC
+
+    A user is the name of the certificate in a secured fleet, else what programs say; who is in several groups is
+    counted in each. What was done with a device while it was held is not published, so nothing is told of it.
+
+    \b
+    Examples:
+      zscout usage --since 7d
+      zscout usage --by rc --since 2026-11-01 --until 2026-12-01 --csv > november.csv
+      zscout usage --by group --since 30d --json | jq '.accounts[] | {key, held}'
+    """
+    journals.check_formats(as_json=as_json, as_csv=as_csv)
+    journals.check_window(since, until)
+    keys = _keys(common.the_fleet(), by)
+    async with common.connected("usage") as client:
+        told = await journals.ask_journals(client, HistoryAsk(since=since, until=until), MAX_HOLDS)
+    found = accounts(told.holds, keys, told.window, by_rc=by == "rc")
+    names = [field.name for field in fields(Account)]
+    if as_json:
+        terminal.print_json(
+            {
+                "fleet": client.fleet.name,
+                "by": by,
+                "since": journals.utc(told.window.began),
+                "until": journals.utc(told.window.ended),
+                "accounts": [_rounded(one) for one in found],
+                "more": told.more,
+                "gaps": told.gaps_json(),
+                "candidates": told.candidates_json(),
+            }
+        )
+    elif as_csv:
+        journals.print_csv([by, *names[1:]], ([*_rounded(one).values()] for one in found))
+        _print_remarks(told, err=True)
+    else:
+        _table(found, by, told).print()
+        _print_remarks(told)
+
+
+def _keys(fleet: Fleet, by: str) -> Callable[[PastHold], Iterable[str]]:
+    """Raises BadInput."""
+    proven = fleet.security is not None
+    if by == "rc":
+        return lambda hold: hold.rcs
+    if by == "user":
+        return lambda hold: [journals.person(hold, proven=proven)]
+    if not fleet.access.groups:
+        raise BadInput("--by group: the fleet file has no [groups]; name some there, or write --by user")
+    return lambda hold: fleet.access.groups_of(journals.person(hold, proven=proven)) or [NO_GROUP]
+
+
+def _rounded(account: Account) -> dict[str, object]:
+    return {name: round(value, 3) if isinstance(value, float) else value for name, value in asdict(account).items()}
+
+
+def _table(found: list[Account], by: str, told: journals.Told) -> Table:
+    rows = [
+        (
+            *(one.key, str(one.holds), span(one.held), span(one.rc_seconds), span(one.waited)),
+            f"{one.preempted} ({span(one.preempted_seconds)})" if one.preempted else "-",
+            span(one.thrown_away) if one.thrown_away else "-",
+        )
+        for one in found
+    ]
+    columns = (by.upper(), "HOLDS", "HELD", "RC TIME", "WAITED", "PREEMPTED", "THROWN AWAY")
+    title = f"Usage from {journals.local(told.window.began)} to {journals.local(told.window.ended)}"
+    return Table(title, columns, rows)
+
+
+def _print_remarks(told: journals.Told, *, err: bool = False) -> None:
+    if told.more:
+        click.secho(f"only the latest {MAX_HOLDS} holds are counted; ask for less time", fg="yellow", err=err)
+    journals.print_remarks(told, err=err)
