@@ -1,0 +1,75 @@
+"""What people ask journals for, and how what they tell is shown."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from tests.cli.tools import zscout_here
+from tests.services.journal.kit import past
+from zscout.cli.fleet import journals
+from zscout.config.strict import BadInput
+from zscout.messages import UNHEARD, History, JournalGap, ReasonParty, Who
+from zscout.services.journal.merging import Span
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("history --since soon", '--since: "soon" is no time; write a number of seconds'),
+        ("history --since 2999-01-01", "is in the future"),
+        ("history --since 1h --until 2h", "--since: it is not before --until"),
+        ("history --rc robot", "write kind/name, like robot/scout33"),
+        ("history --user ''", "is no name"),
+        ("history --group arms", '--group: "arms" is no group of the fleet file that has members; it has none'),
+        ("history --limit 0", "0 is not in the range"),
+        ("history --json --csv", "--json and --csv: write one of them"),
+        ("usage --by weekday", "'weekday' is not one of"),
+        ("usage --by group", "the fleet file has no [groups]"),
+        ("usage --until 30d", "--since: it is not before --until"),
+    ],
+)
+def test_bad_input_is_one_line(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert zscout_here(*(word if word != "''" else "" for word in words.split())) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert said in told.err
+    assert told.err.count("\n") == 1
+
+
+def test_times_ago_are_durations_or_dates() -> None:
+    assert journals.parse_past("7d", "--since") == 7 * 86_400
+    assert journals.parse_past("2020-01-01T00:00:00+00:00", "--since") > 5 * 365 * 86_400
+    with pytest.raises(BadInput, match="too long ago"):
+        journals.parse_past("1900-01-01", "--since")
+
+
+def test_a_user_is_what_is_proven_or_what_was_told() -> None:
+    hold = past(1, 10.0, client="ada/one", who=Who("alice"))
+    assert journals.person(hold, proven=False) == "alice"
+    assert journals.person(hold, proven=True) == "ada"
+    assert journals.person(past(1, 10.0, client="ada/one"), proven=False) == "ada"
+
+
+def test_an_end_in_words() -> None:
+    by = ReasonParty("i", "take", "desk/two", 10, Who("bob"))
+    assert journals.ending(past(1, 10.0)) == "stands"
+    assert journals.ending(past(1, 10.0, 20.0, UNHEARD)) == "end not heard"
+    assert journals.ending(past(1, 10.0, 20.0, "preempted", by=by)) == "preempted by take of bob"
+
+
+def test_what_is_not_known_is_told_with_why() -> None:
+    anvil = History("anvil", 200.0, 50.0, gaps=[JournalGap(120.0, 140.0, "off"), JournalGap(130.0, 135.0, "silent")])
+    bellows = History("bellows", 200.0, 130.0)
+    told = journals.Told(Span(100.0, 200.0), [], False, {"anvil": anvil, "bellows": bellows}, ["forge"])
+    assert told.unknown == [Span(120.0, 130.0)]
+    first, second = told.remarks()
+    assert first.endswith("not all is known: anvil did not run; bellows has nothing of then")
+    assert second == "no journal of forge: off, older than 0.3.0, or too slow"
+
+
+def test_no_spreadsheet_computes_what_others_wrote(capsys: pytest.CaptureFixture[str]) -> None:
+    journals.print_csv(["arc", "held"], [["=cmd()", 1.5], ["two\nlines", -1.0]])
+    sys.stdout.flush()
+    assert capsys.readouterr().out == "arc,held\n'=cmd(),1.5\ntwo lines,-1.0\n"
