@@ -7,8 +7,9 @@ import time
 import click
 
 from zscout import terminal
-from zscout.cli import common, completion
-from zscout.cli.fleet import journals
+from zscout.cli import common, completion, journals
+from zscout.cli.requests.options import MAX_ARC_NAME
+from zscout.config.strict import BadInput, quoted
 from zscout.messages import HistoryAsk, PastHold
 from zscout.services.journal.merging import Span
 
@@ -19,11 +20,21 @@ COLUMNS = (
 )
 
 
+def parse_arc(text: str, option: str) -> str:
+    """The name or id of an ARC. Raises BadInput."""
+    if not 1 <= len(text) <= MAX_ARC_NAME:
+        raise BadInput(f"{option}: {quoted(text)} names no ARC; write 1 to {MAX_ARC_NAME} characters")
+    return text
+
+
+ARC = common.Parsed("text", parse_arc)
+
+
 @click.command()
 @click.option("--rc", type=journals.RC, shell_complete=completion.needs, help="Only of this RC, or pattern of RCs.")
 @click.option("--user", "users", type=journals.WHO, multiple=True, help="Only of this user, person or host.")
 @click.option("--group", help="Only of the names of this group of the fleet file.")
-@click.option("--arc", type=journals.ARC, help="Only of this ARC: its name or id.")
+@click.option("--arc", type=ARC, help="Only of this ARC: its name or id.")
 @click.option("--since", type=journals.PAST, help="Not what ended before: a time ago (7d) or a date.")
 @click.option("--until", type=journals.PAST, default="0s", help="Not what began after.")
 @click.option("--limit", type=click.IntRange(1, MAX_LIMIT), default=100, show_default=True, help="The latest so many.")

@@ -8,8 +8,7 @@ from dataclasses import asdict, fields
 import click
 
 from zscout import terminal
-from zscout.cli import common
-from zscout.cli.fleet import journals
+from zscout.cli import common, journals
 from zscout.config.fleet import Fleet
 from zscout.config.strict import BadInput
 from zscout.messages import HistoryAsk, PastHold

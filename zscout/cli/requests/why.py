@@ -11,8 +11,8 @@ from msgspec import structs
 from zscout import terminal
 from zscout.behaviors.client.client import Client
 from zscout.cli import common
-from zscout.cli.fleet.journals import ask_journals, ending, local
-from zscout.cli.fleet.journals import hold_json as past_json
+from zscout.cli.journals import ask_journals, ending, local
+from zscout.cli.journals import hold_json as past_json
 from zscout.cli.requests.options import MAX_ARC_NAME, arc_argument
 from zscout.cli.requests.waiting import NeedContention, contention_of, hold_json, hold_words, reason_text
 from zscout.messages import HistoryAsk, HoldView, RcAsk, RcmState, RcState, WaitView

@@ -14,12 +14,10 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 from msgspec import structs
 
-from zscout.cli.common import F, Failed, Parsed
-from zscout.cli.fleet.fleet_view import FleetView
-from zscout.cli.requests.options import MAX_ARC_NAME
-from zscout.config.fleet import Fleet
+from zscout.cli.common import F, Failed, Parsed, until
+from zscout.config.fleet import MAX_CANDIDATES, Fleet
 from zscout.config.strict import DURATIONS, BadInput, parse_duration, quoted
-from zscout.keyexpr import MAX_NAME, Role, check_need
+from zscout.keyexpr import MAX_NAME, Role, Token, check_need
 from zscout.messages import MAX_ASKED_NAMES, MAX_PAGE, History, HistoryAsk, PastHold
 from zscout.services.journal.merging import Span, enough, merged, unknown_to, unknown_to_all
 from zscout.terminal import Table, clean, many, span
@@ -30,6 +28,8 @@ if TYPE_CHECKING:
 
 ASK: Final = 5.0
 """Seconds that a candidate has for a page."""
+QUIET: Final = 0.3
+"""Seconds without another candidate after which all are seen."""
 AT_ONCE: Final = 16
 """Candidates that are asked at one time."""
 MAX_AGO: Final = 1e9
@@ -71,13 +71,6 @@ def parse_who(text: str, option: str) -> str:
     return text
 
 
-def parse_arc(text: str, option: str) -> str:
-    """The name or id of an ARC. Raises BadInput."""
-    if not 1 <= len(text) <= MAX_ARC_NAME:
-        raise BadInput(f"{option}: {quoted(text)} names no ARC; write 1 to {MAX_ARC_NAME} characters")
-    return text
-
-
 def parse_rc_pattern(text: str, _option: str) -> str:
     """An RC, or a pattern. Raises BadName."""
     return check_need(text)
@@ -85,7 +78,6 @@ def parse_rc_pattern(text: str, _option: str) -> str:
 
 WHO: Final = Parsed("text", parse_who)
 RC: Final = Parsed("text", parse_rc_pattern)
-ARC: Final = Parsed("text", parse_arc)
 
 
 def formats(command: F) -> F:
@@ -182,9 +174,7 @@ async def ask_journals(client: Client, asked: HistoryAsk, most: int) -> Told:
     """The latest holds, `most` at most, from as few journals as know all that any knows. Raises Failed where none
     answers."""
     mesh = client.mesh
-    with FleetView(client) as view:
-        await view.quiet()
-        hosts = sorted({one.host for one in view.tokens(Role.CANDIDATE) if client.fleet.may_lead(one.host)})
+    hosts = await _candidates(client)
     slots = asyncio.Semaphore(AT_ONCE)
 
     async def page(host: HostName, question: HistoryAsk) -> History | None:
@@ -220,6 +210,27 @@ async def ask_journals(client: Client, asked: HistoryAsk, most: int) -> Told:
     holds = merged(some for some, _ in found)
     more = len(holds) > most or any(left for _, left in found)
     return Told(window, holds[-most:], more, journals, [host for host in hosts if host not in journals])
+
+
+async def _candidates(client: Client) -> list[HostName]:
+    """Those that are there: links are made one after another, so until no more come into sight."""
+    hosts: set[HostName] = set()
+    changed = asyncio.Event()
+
+    def seen(token: Token, alive: bool) -> None:
+        if alive and client.fleet.may_lead(token.host):
+            hosts.add(token.host)
+            changed.set()
+
+    watch = client.mesh.watch(client.mesh.keys.alive_any(Role.CANDIDATE), seen)
+    try:
+        known = -1
+        while known < len(hosts) <= MAX_CANDIDATES:
+            known = len(hosts)
+            await until(lambda: len(hosts) > known, changed, QUIET)  # noqa: B023 - awaited
+    finally:
+        watch.close()
+    return sorted(hosts)[:MAX_CANDIDATES]
 
 
 # Words

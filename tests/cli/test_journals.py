@@ -8,7 +8,7 @@ import pytest
 
 from tests.cli.tools import zscout_here
 from tests.services.journal.kit import past
-from zscout.cli.fleet import journals
+from zscout.cli import journals
 from zscout.config.strict import BadInput
 from zscout.messages import UNHEARD, History, JournalGap, ReasonParty, Who
 from zscout.services.journal.merging import Span
