@@ -8,8 +8,9 @@ import gc
 import logging
 import random
 import re
+import tempfile
 from collections.abc import Callable, Coroutine, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -25,7 +26,7 @@ from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.behaviors.client.request import OpenArc
 from zscout.behaviors.components.component import Component, ComponentContext
 from zscout.config.fleet import default_fleet
-from zscout.config.node import ComponentsConfig
+from zscout.config.node import ComponentsConfig, JournalConfig
 from zscout.drivers.generic import CapacityDriver, ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
@@ -35,6 +36,7 @@ from zscout.lab.faults.virtual_time import Process, VirtualTimeLoop
 from zscout.mesh.supervision import StallWatch
 from zscout.mesh.transport import Collector, Quality, TransportQuery
 from zscout.messages import ComponentSpec, Problem, Recorded
+from zscout.services.journal.journal import Journal
 from zscout.services.node.component_host import ComponentHost
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.recorder.recorder import Recorder
@@ -42,6 +44,8 @@ from zscout.services.recorder.timeline import Timeline
 from zscout.types import SECOND
 
 T = TypeVar("T")
+START: Final = 1_700_000_000.0
+"""The wall clock when a fleet begins."""
 
 ROWS: Final = read_rows(PROTOCOL.read_text())
 KIND: Final = "worker"
@@ -148,6 +152,8 @@ class Fleet:
         self.held: OpenArc | None = None
         self._asked = 0
         self.stranger: Stranger
+        self._folders = ExitStack()
+        """Of journals."""
 
     # Processes, also those of components
 
@@ -180,6 +186,7 @@ class Fleet:
     def kill(self) -> None:
         for name in tuple(self.running):
             self.end_process(name)
+        self._folders.close()
 
     async def start(self, recording: Path | None) -> None:
         loop = asyncio.get_running_loop()
@@ -214,7 +221,12 @@ class Fleet:
                 mesh, name, driver, hold_lease=lease, settle=1.0, stall=stall, on_failure=self._failed
             )
             await rc.start()
-        candidate = Candidate(mesh, self.fleet)
+        folder = Path(self._folders.enter_context(tempfile.TemporaryDirectory(prefix="zscout-fuzz-")))
+        journal = Journal(
+            mesh, folder, JournalConfig(), self.fleet.silence / SECOND, lambda: START + mesh.now() / SECOND
+        )
+        journal.start()
+        candidate = Candidate(mesh, self.fleet, journal=journal)
         candidate.start()
         self.candidates.append(candidate)
         components = ComponentHost(

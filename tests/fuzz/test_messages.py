@@ -111,9 +111,10 @@ def test_every_key_of_the_key_space_has_a_row() -> None:
         "command": ("k/n", sender),
         "component": ("h", sender),
         "confirm": ("h", sender),
+        "history": ("h", sender),
         "served_placer": (),
         **dict.fromkeys(("vote", "command_any", "rc_state", "frame"), ("k/n",)),
-        **dict.fromkeys(("load", "served_component", "confirm_any"), ("h",)),
+        **dict.fromkeys(("load", "served_component", "confirm_any", "history_any"), ("h",)),
     }
     no_keys = {"fleet", "closed", "base", "everything"}
     built: dict[str, str] = {}

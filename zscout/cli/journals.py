@@ -54,6 +54,8 @@ def parse_past(text: str, option: str) -> float:
             ago = time.time() - datetime.fromisoformat(text).astimezone().timestamp()
         except (ValueError, OverflowError):
             raise BadInput(f"{option}: {quoted(text)} is no time; write {PAST_FORMS}") from None
+    if option == "--until":
+        ago = max(0.0, ago)  # up to now
     if not 0 <= ago <= MAX_AGO:
         raise BadInput(
             f"{option}: {quoted(text)} is {'in the future' if ago < 0 else 'too long ago'}; write {PAST_FORMS}"

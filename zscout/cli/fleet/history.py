@@ -61,7 +61,7 @@ async def history(
     Examples:
       zscout history --since 7d
       zscout history --rc 'robot/*' --user alice --limit 20
-      zscout history --since 2026-11-01 --until 2026-12-01 --limit 100000 --csv > november.csv
+      zscout history --since 2025-11-01 --until 2025-12-01 --limit 100000 --csv > november.csv
       zscout history --json | jq -r '.holds[] | select(.outcome == "preempted") | .by.arc'
     """
     journals.check_formats(as_json=as_json, as_csv=as_csv)

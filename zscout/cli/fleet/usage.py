@@ -46,7 +46,7 @@ async def usage(by: str, since: float, until: float, as_json: bool, as_csv: bool
     \b
     Examples:
       zscout usage --since 7d
-      zscout usage --by rc --since 2026-11-01 --until 2026-12-01 --csv > november.csv
+      zscout usage --by rc --since 2025-11-01 --until 2025-12-01 --csv > november.csv
       zscout usage --by group --since 30d --json | jq '.accounts[] | {key, held}'
     """
     journals.check_formats(as_json=as_json, as_csv=as_csv)
