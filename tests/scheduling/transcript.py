@@ -9,6 +9,8 @@
     standing ARC ... grant=TERM.N start=S      waiting ARC ...              for the `lead` that follows
     adopt ARC ... grant=TERM.N start=S         place ARC TERM.N             unconfirmed ARC TERM.N RC,...
     lead TERM
+    book ID NEED,... start=S [runtime=S] [patience=S] [priority=N] [since=S]      unbook ID
+    strategy NAME [patience=S]                 a new core; without it, it is `priority`
 
 A NEED is `kind/name`, with parameters `kind/name{rate=5 width=0.1}`; a TERM is `COUNTER:RCM`.
 """
@@ -16,15 +18,19 @@ A NEED is `kind/name`, with parameters `kind/name{rate=5 width=0.1}`; a TERM is 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
 from tests.scheduling.validate import validate
 from tests.transcripts import ns, seconds, settings
+from zscout.config.scheduling_policy import DEFAULT
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     Adopted,
     ArcRequest,
+    Booked,
+    Booking,
+    BookingChanged,
     Cancelled,
     ClientLost,
     Dropped,
@@ -45,11 +51,13 @@ from zscout.scheduling.model import (
     Released,
     Requested,
     Tick,
+    Unbooked,
     Unconfirmed,
     Vote,
     VoteOverdue,
     WakeAt,
 )
+from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import Grant, Ns, Params, Place, Term
 
 _NEED = re.compile(r"([\w.-]+/[\w.-]+)(?:\{([^}]*)\})?")
@@ -129,6 +137,20 @@ class CorePlayer:
                 return RcReported(first, rules_changed=True)
             case "ended":
                 return RcReported(first, ended=tuple(second.split(",")))
+            case "book":
+                request, options = _request(rest)
+                start, patience = ns(options["start"]), ns(options.get("patience", "5"))
+                since = ns(options["since"]) if "since" in options else self.now
+                return Booked(
+                    Booking(first, request.needs, request.priority, start, request.min_runtime, patience, since)
+                )
+            case "unbook":
+                return Unbooked(first)
+            case "strategy":
+                options = settings(second.split(), "patience")
+                policy = replace(DEFAULT, patience=ns(options["patience"]) if options else DEFAULT.patience)
+                self.core = Core(STRATEGIES[first](), policy)
+                return None
             case "tick":
                 return Tick()
             case _:
@@ -157,7 +179,8 @@ def _request(text: str) -> tuple[ArcRequest, dict[str, str]]:
         pairs = (pair.split("=") for pair in (match[2] or "").split())
         wanted[match[1]] = {key: Fraction(value) for key, value in pairs}
     words = (word for word in rest if word != "keep")
-    options = settings(words, "priority", "runtime", "client", "place", "grant", "start")
+    known = ("priority", "runtime", "client", "place", "grant", "start", "booking", "patience", "since")
+    options = settings(words, *known)
     request = ArcRequest(
         arc=arc,
         client=options.get("client", "host/" + arc),
@@ -165,6 +188,7 @@ def _request(text: str) -> tuple[ArcRequest, dict[str, str]]:
         priority=int(options.get("priority", "0")),
         min_runtime=ns(options.get("runtime", "10")),
         keep="keep" in rest,
+        booking=options.get("booking", ""),
     )
     return request, options
 
@@ -206,6 +230,8 @@ def _print(effect: Effect) -> str:
             return f"queued {arc}: {reason}" + ("" if settled else " (not settled)")
         case Dropped(arc=arc, outcome=outcome, reason=reason):
             return f"dropped {arc} {outcome.value}: {reason}"
+        case BookingChanged(booking=booking, state=state, arc=arc):
+            return f"booking {booking} {state.value}" + (f" by {arc}" if arc is not None else "")
         case WakeAt(at=at):
             return "wake " + ("never" if at is None else f"at {seconds(at)}")
 

@@ -26,7 +26,18 @@ def validate(core: Core) -> None:
         assert arc.reason is not None, f"{arc.id} waits without a reason"
     for rc, holders in state.votes.proposals.values():
         assert state.rc(rc).present, f"a proposal is out at {rc}, which is absent"
-        assert all(state.arc(arc) for arc in holders), f"a proposal at {rc} names an ARC that ended"
+        assert all(state.voter(arc) for arc in holders), f"a proposal at {rc} names an ARC that ended"
+    for claim in state.claims.values():
+        assert state.now < claim.booking.end, f"{claim.booking.id} is over"
+        arc = claim.arc
+        if claim.is_taken:
+            assert state.arc(arc.id) is arc, f"{claim.booking.id} is taken up by what ended"
+        else:
+            assert arc.state is ArcState.NEW, f"what stands for {claim.booking.id} is {arc.state}"
+            assert state.now < claim.booking.lapses, f"{claim.booking.id} has lapsed"
+        assert arc.mask & ~state.claimed == 0, f"what is kept for {claim.booking.id} is not known to be"
+    for arc in (*state.queued.values(), *state.held_back.values(), *state.running.values()):
+        assert arc.claim is None or state.claims.get(arc.claim.booking.id) is arc.claim, f"{arc.id}: no such booking"
 
 
 def _check_state(state: SchedulerState) -> None:

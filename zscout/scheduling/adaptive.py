@@ -117,7 +117,7 @@ class Adaptive(Strategy):
         return line
 
     def run_pass(self, state: SchedulerState, actions: Actions) -> None:
-        if self._reserved is None and not self._searches and _one_without_choice(state):
+        if self._reserved is None and not state.claims and not self._searches and _one_without_choice(state):
             priority.run_pass(state, actions)
             return
         self._work, self._steps = WORK, SLICE
@@ -137,7 +137,7 @@ class Adaptive(Strategy):
         """What is reserved for the starving ARCs in this pass. Where a reservation has ended or changed, the
         ARCs that it held back are checked again."""
         patience = state.policy.patience
-        if patience is None:
+        if patience is None and not state.claims and self._reserved is None:
             return None
         before = self._reserved
         reserved = reservations(state, patience, before)

@@ -28,6 +28,9 @@ from zscout.scheduling.model import (
     Arc,
     ArcState,
     ArcStatus,
+    Booking,
+    BookingState,
+    Claim,
     Hold,
     Outcome,
     Rc,
@@ -36,6 +39,7 @@ from zscout.scheduling.model import (
 )
 from zscout.scheduling.priority import AdmissionCheck, Priority, reasons_of_now
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
+from zscout.scheduling.slots import Slots, slots
 from zscout.scheduling.state import SchedulerState, Strategy
 from zscout.scheduling.votes import HolderSet
 from zscout.types import NO_TERM, ArcId, ClientId, Grant, Ns, Place, RcName, Term
@@ -75,6 +79,7 @@ class Core:
         self._effects = []
         self._run_again = False
         self._expire()
+        self._expire_claims()
         self._state.let_in()
         if len(events) == 1 and isinstance(events[0], model.Requested):
             self._ask(events[0], alone=True)
@@ -203,9 +208,18 @@ class Core:
             for arc in state.running.values()
             if arc.hold is not None
         )
+        joined += [model.Booked(claim.booking) for claim in state.claims.values()]
         queued = (*state.queued.values(), *state.held_back.values())
         waiting = tuple(model.Requested(arc.request, arc.place, arc.since) for arc in queued)
         return joined, model.LeadTaken(term, recovered_holds, waiting)
+
+    def slots(self, wanted: Booking, until: Ns, limit: int) -> Slots:
+        """The first `limit` stretches of time, from the start of `wanted` to `until`, in which it would be kept."""
+        return slots(self._state, wanted, self._stand_in(wanted), until, limit)
+
+    def bookings(self) -> list[tuple[Booking, ArcId | None]]:
+        """Those that are not over, with the ARC that has taken each up."""
+        return [(one.booking, one.arc.id if one.is_taken else None) for one in self._state.claims.values()]
 
     def expects_yes(self, rc: RcName, holders: HolderSet) -> bool:
         """Whether an RC would accept these holders, by the votes that it has given; True if unknown."""
@@ -275,6 +289,11 @@ class Core:
                 self._take_lead(event)
             case model.Adopted(held):
                 self._adopt(held)
+            case model.Booked(booking):
+                self._book(booking)
+            case model.Unbooked(booking):
+                if (claim := self._state.claims.get(booking)) is not None:
+                    self._end_claim(claim, BookingState.UNBOOKED)
             case model.Tick():
                 pass
 
@@ -289,7 +308,11 @@ class Core:
             self.start(arc)
             return
         since = self._state.now if asked.since is None else min(asked.since, self._state.now)
-        self._state.enqueue(arc, since)
+        claim = self._state.claims.get(asked.request.booking)
+        if claim is None or claim.is_taken:
+            self._state.enqueue(arc, since)
+        else:
+            self._take_up_claim(claim, arc, since)
 
     def _new_arc(self, request: model.ArcRequest, place: Place | None) -> Arc:
         if place is None:
@@ -308,6 +331,75 @@ class Core:
             self._state.bind(arc, {})
         return arc
 
+    def _book(self, booking: Booking) -> None:
+        if booking.id in self._state.claims:
+            return
+        if booking.lapses <= self._state.now:
+            self._effects.append(model.BookingChanged(booking.id, BookingState.LAPSED))
+        else:
+            self._state.claim(Claim(booking, self._stand_in(booking)))
+
+    def _stand_in(self, booking: Booking) -> Arc:
+        """What stands for a booking before it is taken up."""
+        request = model.ArcRequest(
+            booking.id,
+            f"{booking.owner}/",
+            booking.needs,
+            booking.priority,
+            booking.runtime,
+            label=booking.label,
+            who=booking.who,
+        )
+        arc = self._new_arc(request, Place(NO_TERM, 0))
+        if arc.patterns:
+            self._state.bind(arc, booking.bound)
+        return arc
+
+    def _take_up_claim(self, claim: Claim, arc: Arc, since: Ns) -> None:
+        """An ARC stands for its booking from now on. It waits for the date."""
+        self._state.enqueue(arc, since)
+        self._link(claim, arc)
+        if claim.booking.start > self._state.now and arc.id in self._state.queued:
+            self._state.hold_back(arc, claim.booking.start, ())
+            self.wait(arc, Reason(ReasonCode.NOT_YET))
+
+    def _link(self, claim: Claim, arc: Arc) -> None:
+        for rc in self._state.possible_sharables(claim.arc):
+            self._votes.rename_arc(rc.name, claim.arc.id, arc.id)
+        claim.arc, arc.claim = arc, claim
+        self._state.claims_changed()
+        self._effects.append(model.BookingChanged(claim.booking.id, BookingState.TAKEN, arc.id))
+
+    def _give_up_claim(self, arc: Arc, outcome: Outcome, *, had_it: bool) -> None:
+        """An ARC is over. What it had taken up is open again if its program is gone, or gave up before it had it."""
+        claim = arc.claim
+        if claim is None:
+            return
+        again = (outcome is Outcome.CLIENT_LOST or not had_it) and self._state.now < claim.booking.lapses
+        if not again:
+            self._end_claim(claim, BookingState.USED)
+            return
+        arc.claim = None
+        claim.arc = self._stand_in(claim.booking)
+        self._state.claims_changed()
+        self._effects.append(model.BookingChanged(claim.booking.id, BookingState.OPEN, arc.id))
+
+    def _end_claim(self, claim: Claim, state: BookingState) -> None:
+        arc = claim.arc if claim.is_taken else None
+        for rc in [] if arc is not None else list(self._state.possible_sharables(claim.arc)):
+            self._votes.forget_arc(rc.name, claim.arc.id)
+        self._state.unclaim(claim)
+        self._effects.append(model.BookingChanged(claim.booking.id, state, None if arc is None else arc.id))
+        if arc is not None and arc.held_back is not None and not arc.held_back[1]:
+            self._state.consider_again(arc)
+
+    def _expire_claims(self) -> None:
+        for claim in self._state.claims_over():
+            if claim.booking.end <= self._state.now:
+                self._end_claim(claim, BookingState.USED if claim.is_taken else BookingState.LAPSED)
+            elif not claim.is_taken:
+                self._end_claim(claim, BookingState.LAPSED)
+
     def _end_request(self, arc_id: ArcId, outcome: Outcome, reason: Reason) -> None:
         arc = self._state.arc(arc_id)
         if arc is None:
@@ -320,6 +412,7 @@ class Core:
         self._state.dequeue(arc)
         self._forget(arc)
         self._effects.append(model.Dropped(arc.id, arc.request.client, outcome, reason))
+        self._give_up_claim(arc, outcome, had_it=False)
 
     def _lose_rc(self, name: str, reason: str) -> None:
         """An RC is gone: each gang it was part of ends as a whole and is queued with its place."""
@@ -441,6 +534,9 @@ class Core:
             self._effects.append(self._revocation(arc, hold, outcome, broken, requeued=not over))
         else:
             self._state.start(arc, hold)
+        claim = self._state.claims.get(held.request.booking)
+        if claim is not None and not claim.is_taken and self._state.arc(arc.id) is arc:
+            self._link(claim, arc)
         return arc
 
     def _expire(self) -> None:
@@ -457,7 +553,7 @@ class Core:
     def start(self, arc: Arc) -> None:
         grant = Grant(self.term, self.number())
         now, state = self._state.now, self._state
-        hold = Hold(grant, now, now + arc.request.min_runtime, state.protected_below(arc), state.longest(now))
+        hold = Hold(grant, now, arc.ends(now), state.protected_below(arc), state.longest(now))
         waited = 0 if arc.state is ArcState.NEW else now - arc.since
         self._state.start(arc, hold)
         self._effects.append(self._granted(arc, hold, waited))
@@ -479,7 +575,7 @@ class Core:
         number = self._votes.propose(rc.name, holders, self._state.now)
         if number is None:
             return
-        arcs = (self._state.arc(holder) for holder in sorted(holders))
+        arcs = (self._state.voter(holder) for holder in sorted(holders))
         params = {arc.id: self._state.params(arc, rc) for arc in arcs if arc is not None}
         self._effects.append(model.Propose(number, rc.name, params))
 
@@ -499,6 +595,7 @@ class Core:
             self._state.enqueue(arc, self._state.now)
         else:
             self._forget(arc)
+            self._give_up_claim(arc, outcome, had_it=True)
 
     def _forget(self, arc: Arc) -> None:
         self._state.forget(arc)
@@ -525,8 +622,9 @@ class Core:
 
     def _set_wake(self) -> None:
         at = min((arc.held_back[0] for arc in self._state.held_back.values() if arc.held_back), default=None)
-        if (end := self._state.next_end()) is not None:
-            at = end if at is None else min(at, end)
+        for end in (self._state.next_end(), self._state.next_claim_over()):
+            if end is not None:
+                at = end if at is None else min(at, end)
         if self._state.queued:
             at = min(self._state.now + QUANTUM, at) if at is not None else self._state.now + QUANTUM
         if self._run_again:

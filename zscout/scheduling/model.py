@@ -51,6 +51,8 @@ class ArcRequest(Struct, frozen=True):
     """What people call it; the core only prints it."""
     direct: bool = False
     """Whether its program touches devices past their RCs; the core only keeps it."""
+    booking: str = ""
+    """The booking that it takes up; its needs and its priority are that booking's."""
     who: Who | None = None
     """Who asked, as people are told; the core only prints it."""
 
@@ -172,6 +174,8 @@ class Arc:
     bound: Mapping[Need, RcName] = field(default_factory=dict)
     """The RC that each pattern is bound to (`patterns.py`): while it runs, and for the time of a check. Empty
     if there is none for some pattern."""
+    claim: Claim | None = None
+    """The booking that it has taken up, until that is over."""
     owner: str = field(init=False)
     """Whose quota it counts against: its client's host."""
     id: ArcId = field(init=False)
@@ -195,6 +199,11 @@ class Arc:
         self.owner = request.client.partition("/")[0]
         self.rank = (-self.priority, request.min_runtime, self.place, self.id)
         self.party = Party(self.id, request.label or self.id, self.priority, request.who)
+
+    def ends(self, start: Ns) -> Ns:
+        """When its minimum runtime is over if it starts then: with a booking, when that is over."""
+        end = start + self.request.min_runtime
+        return end if self.claim is None or start >= self.claim.booking.end else self.claim.booking.end
 
     def move_to(self, state: ArcState) -> None:
         """Raises ValueError for a move that is not in `TRANSITIONS`."""
@@ -230,6 +239,55 @@ class Arc:
     def protected_below(self, now: Ns) -> int | None:
         """The priority below which nobody preempts its hold now; None: any higher priority does."""
         return self.hold.protected_below if self.hold is not None and now < self.hold.end else None
+
+
+class Booking(Struct, frozen=True):
+    """All of `needs` at once, from `start` on for `runtime` ns: a claim with a date, which its owner's request takes up,
+    or which lapses when nobody has within `patience` ns from the date.
+
+    Raises ValueError as `ArcRequest` does."""
+
+    id: str
+    """Unlike any ARC's."""
+    needs: Mapping[Need, Params]
+    priority: int
+    start: Ns
+    runtime: Ns
+    patience: Ns
+    since: Ns
+    """When it was made: of promises to equals the older stands."""
+    bound: Mapping[Need, RcName] = {}
+    """The RC that is kept for each pattern of its needs."""
+    owner: str = ""
+    """The host or person whose quotas count."""
+    label: str = ""
+    who: Who | None = None
+
+    def __post_init__(self) -> None:
+        # It must be one that can be taken up.
+        ArcRequest(self.id, self.owner, self.needs, self.priority, self.runtime)
+
+    @property
+    def end(self) -> Ns:
+        return self.start + self.runtime
+
+    @property
+    def lapses(self) -> Ns:
+        """When it is over if nobody takes it up."""
+        return min(self.start + self.patience, self.end)
+
+
+@dataclass(slots=True, eq=False)
+class Claim:
+    """A booking that is not over."""
+
+    booking: Booking
+    arc: Arc
+    """Who has taken it up; before, an ARC that stands for it in reservations and votes, and never waits nor runs."""
+
+    @property
+    def is_taken(self) -> bool:
+        return self.arc.claim is self
 
 
 @dataclass(slots=True, eq=False)
@@ -402,6 +460,18 @@ class Adopted(Struct, frozen=True):
     held: RecoveredHold
 
 
+class Booked(Struct, frozen=True):
+    """A booking that was made, by this RCM or an earlier one."""
+
+    booking: Booking
+
+
+class Unbooked(Struct, frozen=True):
+    """A booking is given up. Who has taken it up goes on as if it had asked without."""
+
+    booking: str
+
+
 class Tick(Struct, frozen=True):
     """Time has passed: holds may be over, the quantum may be."""
 
@@ -422,6 +492,8 @@ Event: TypeAlias = (
     | HandedOver
     | LeadTaken
     | Adopted
+    | Booked
+    | Unbooked
     | Tick
 )
 
@@ -500,13 +572,32 @@ class Dropped(Struct, frozen=True):
     reason: Reason
 
 
+class BookingState(StrEnum):
+    OPEN = "open"
+    """Nobody has taken it up, or who had is gone before its patience was over."""
+    TAKEN = "taken"
+    USED = "used"
+    """Its ARC is over, or its time."""
+    LAPSED = "lapsed"
+    """Nobody took it up in time."""
+    UNBOOKED = "unbooked"
+
+
+class BookingChanged(Struct, frozen=True):
+    """A booking is in another state; `arc` has taken it up, or had."""
+
+    booking: str
+    state: BookingState
+    arc: ArcId | None = None
+
+
 class WakeAt(Struct, frozen=True):
     """Send a `Tick` at this time, or earlier; a later effect replaces it. None: nothing to wait for."""
 
     at: Ns | None
 
 
-Effect: TypeAlias = Propose | Granted | HoldEnded | Queued | Dropped | WakeAt
+Effect: TypeAlias = Propose | Granted | HoldEnded | Queued | Dropped | BookingChanged | WakeAt
 
 
 # The state after the last batch of events

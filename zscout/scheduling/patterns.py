@@ -46,7 +46,7 @@ def bind(state: SchedulerState, arc: Arc, reserved: Reservations | None, *, with
         options[need] = sorted((*_fitness(state, arc, rc, reserved, claimed), rc.bit, rc) for rc in matching)
     for worst in Fitness:
         allowed = {need: [rc for fitness, _, _, rc in found if fitness <= worst] for need, found in options.items()}
-        if all(allowed.values()) and (chosen := _distinct(allowed)) is not None:
+        if all(allowed.values()) and (chosen := distinct(allowed)) is not None:
             state.bind(arc, {need: rc.name for need, rc in chosen.items()})
             return True
     return False
@@ -92,7 +92,7 @@ def no_match(state: SchedulerState, arc: Arc) -> Reason:
     return of_rcs(ReasonCode.NO_MATCH, short, absences(dict.fromkeys(lost)))
 
 
-def _distinct(allowed: dict[Need, list[Rc]]) -> dict[Need, Rc] | None:
+def distinct(allowed: dict[Need, list[Rc]]) -> dict[Need, Rc] | None:
     """An RC of its own for each need, each the best that leaves one for the others; None: there is none."""
     owner: dict[int, Need] = {}
     chosen: dict[Need, Rc] = {}

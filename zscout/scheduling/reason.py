@@ -34,6 +34,10 @@ class ReasonCode(StrEnum):
     """`rcs` do not answer proposals."""
     RESERVED = "reserved"
     """The RC is reserved for `by`, which has waited too long."""
+    BOOKED = "booked"
+    """The RC is booked by `by` before this would be over."""
+    NOT_YET = "not_yet"
+    """It has taken up a booking, whose time is still to come."""
     QUOTA = "quota"
     """`detail`, its host, has its quota of ARCs running: `number`."""
     RC_QUOTA = "rc_quota"
@@ -210,6 +214,8 @@ _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
     ReasonCode.RESERVED: lambda one: (
         f"{one.rcs[0]} is kept for {one.by[0]}, whose time to wait is over before this ends"
     ),
+    ReasonCode.BOOKED: lambda one: f"{one.rcs[0]} is booked by {one.by[0]} before this would be over",
+    ReasonCode.NOT_YET: lambda _: "the time of its booking is still to come",
     ReasonCode.QUOTA: lambda one: f"host {one.detail} has {one.number} ARCs running, its quota",
     ReasonCode.RC_QUOTA: lambda one: f"{one.detail} may hold {one.number} RCs at one time",
     ReasonCode.VOTING: lambda _: "votes are out",

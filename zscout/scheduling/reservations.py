@@ -10,15 +10,19 @@ the earliest time, from when it is due, at which its RCs are free of the holders
 the ARCs that were starving before it. An ARC of equal or lower priority that shares an RC with it may start only if it
 is over by then, or if the RC is sharable and accepts it beside everyone concerned.
 
+A booking is reserved its RCs for its own time, likewise. Promises to equals are made in the order of their age: a
+booking that is older than an ARC's wait is gone round, and one that is younger is not seen.
+
 `docs/scheduling.md` states the promise that follows, and what else was tried.
 """
 
 from __future__ import annotations
 
 import math
+from operator import itemgetter
 from typing import Final, NamedTuple
 
-from zscout.scheduling.model import Arc, Rc, union
+from zscout.scheduling.model import Arc, Claim, Rc, union
 from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.state import SchedulerState
 from zscout.scheduling.votes import HolderSet
@@ -33,6 +37,8 @@ class Reservation(NamedTuple):
 
     arc: Arc
     start: Ns
+    booked: Ns | None = None
+    """When that is over, if it is booked."""
 
 
 class Inadmissible(NamedTuple):
@@ -43,34 +49,71 @@ class Inadmissible(NamedTuple):
     proposal: HolderSet | None = None
 
 
-def reservations(state: SchedulerState, patience: Ns, last: Reservations | None) -> Reservations:
+def reservations(state: SchedulerState, patience: Ns | None, last: Reservations | None) -> Reservations:
     """What is reserved now: the `last` that was found, if nothing has changed that it depends on.
 
     Passing time alone does not change the RCs or their order; for an ARC already due no backfill is possible."""
-    state.index.mark_starving(state.now - patience // 2, state.queued)
+    if patience is not None:
+        state.index.mark_starving(state.now - patience // 2, state.queued)
     if last is not None and last.made_of == _versions(state):
         return last
     return Reservations(state, patience)
 
 
-def _versions(state: SchedulerState) -> tuple[int, int, int]:
-    return state.version, state.votes.version, state.index.starving_version
+def _versions(state: SchedulerState) -> tuple[int, ...]:
+    # A booking whose time has come is kept for as long only as all that it needs is there.
+    begun = sum(claim.booking.start <= state.now for claim in state.claims.values())
+    return state.version, state.votes.version, state.index.starving_version, state.claims_version, begun
 
 
 class Reservations:
-    """What is reserved for whom, of those starving."""
+    """What is reserved for whom: for those starving, and for bookings."""
 
-    def __init__(self, state: SchedulerState, patience: Ns) -> None:
+    def __init__(self, state: SchedulerState, patience: Ns | None) -> None:
+        """Without a patience nobody starves."""
         self._state, self._votes, self._patience = state, state.votes, patience
         self.by_rc: dict[int, list[Reservation]] = {}
-        """By bit of the RC, the first that starved first; of an exclusive RC only the first."""
+        """By bit of the RC, the oldest promise first; of those that starve for an exclusive RC only the first."""
         self.bits = 0
         """RCs with reservations."""
         self._free: dict[int, Ns] = {}
         """By bit: when the earlier reservations of the RC end."""
         self.made_of = _versions(state)
-        for _, _, arc in state.index.starving[:MAX_STARVING]:
-            self._reserve(state.queued[arc])
+        starving = state.index.starving[:MAX_STARVING]
+        if not state.claims:
+            for _, _, arc in starving:
+                self._reserve(state.queued[arc])
+            return
+        promised: list[tuple[tuple[int, Ns, str], Arc | Claim]] = [(key, state.queued[key[-1]]) for key in starving]
+        for claim in state.claims.values():
+            booking = claim.booking
+            promised.append(((-state.band(booking.priority), booking.since, booking.id), claim))
+        for _, one in sorted(promised, key=itemgetter(0)):
+            if isinstance(one, Claim):
+                self._keep(one)
+            elif one.claim is None:
+                self._reserve(one)
+
+    def _keep(self, claim: Claim) -> None:
+        """Reserves what is booked. Once its time has come, what is left of it is not kept while some of it is away."""
+        booking, arc = claim.booking, claim.arc
+        rcs = list(self._state.rcs_in(arc.mask))
+        if arc.hold is not None or (booking.start <= self._state.now and not all(rc.present for rc in rcs)):
+            return
+        for rc in rcs:
+            self.by_rc.setdefault(rc.bit, []).append(Reservation(arc, booking.start, booking.end))
+            self.bits |= rc.bit
+
+    def _beside_bookings(self, arc: Arc, rcs: list[Rc], start: Ns) -> Ns:
+        """From `start` on, the earliest time from which `arc` finds nothing booked for as long as it needs."""
+        booked = [(rc, one) for rc in rcs for one in self.by_rc.get(rc.bit, ()) if one.booked is not None]
+        # Each is passed once: time goes forward only.
+        for rc, one in sorted(booked, key=lambda item: item[1].booked or 0):
+            if one.booked is None or one.booked <= start or one.start >= arc.ends(start):
+                continue
+            if not (rc.sharable and self._votes.accepts(rc.name, frozenset((one.arc.id, arc.id)))):
+                return self._beside_bookings(arc, rcs, one.booked)
+        return start
 
     def _reserve(self, arc: Arc) -> None:
         rcs = self._rcs(arc)
@@ -79,12 +122,12 @@ class Reservations:
         start = max(self._within_quota(arc), *(self._free_from(rc, arc) for rc in rcs))
         if math.isinf(start):
             return
-        reservation = Reservation(arc, max(int(start), self.due(arc)))
+        reservation = Reservation(arc, self._beside_bookings(arc, rcs, max(int(start), self.due(arc))))
         for rc in rcs:
             reserved = self.by_rc.setdefault(rc.bit, [])
-            if rc.sharable or not reserved:
+            if rc.sharable or all(one.booked is not None for one in reserved):
                 reserved.append(reservation)
-            self._free[rc.bit] = max(self._free.get(rc.bit, 0), reservation.start + arc.request.min_runtime)
+            self._free[rc.bit] = max(self._free.get(rc.bit, 0), arc.ends(reservation.start))
             self.bits |= rc.bit
 
     def _rcs(self, arc: Arc) -> list[Rc]:
@@ -126,13 +169,14 @@ class Reservations:
 
     def due(self, arc: Arc) -> Ns:
         """When its patience is over."""
-        return arc.since + self._patience
+        return arc.since + (self._patience or 0)
 
     def goes_first(self, arc: Arc) -> bool:
         """Whether `arc` goes before its equals that could start as well. A sharable RC may accept each
         backfilled ARC alone but not all together, so a due ARC goes first there."""
         state = self._state
-        return arc.starving and bool(arc.mask & state.sharable) and self.due(arc) <= state.now
+        due = arc.claim is not None or (arc.starving and self.due(arc) <= state.now)
+        return due and bool(arc.mask & state.sharable)
 
     def conflict(self, arc: Arc) -> Inadmissible | None:
         """What `arc` would be in the way of if it started now."""
@@ -144,12 +188,15 @@ class Reservations:
             for reservation in self.by_rc[rc.bit]:
                 if reservation.arc is arc:
                     break
+                if reservation.booked is not None and reservation.start >= arc.ends(self._state.now):
+                    continue
                 before.append(reservation.arc)
                 if blocking is None and self._delays(arc, reservation):
                     blocking = reservation
             if blocking is None:
                 continue
-            reason = Reason(ReasonCode.RESERVED, (rc.name,), (blocking.arc.party,))
+            code = ReasonCode.RESERVED if blocking.booked is None else ReasonCode.BOOKED
+            reason = Reason(code, (rc.name,), (blocking.arc.party,))
             if not rc.sharable:
                 return Inadmissible(rc, reason)
             together = frozenset((*rc.holders, arc.id, *(one.id for one in before)))
@@ -168,7 +215,7 @@ class Reservations:
         band = self._state.band
         return (
             band(arc.priority) <= band(reservation.arc.priority)
-            and self._state.now + arc.request.min_runtime > reservation.start
+            and arc.ends(self._state.now) > reservation.start
         )
 
     def changed(self, earlier: Reservations) -> int:

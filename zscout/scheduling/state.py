@@ -17,7 +17,7 @@ from msgspec import structs
 
 from zscout.config.scheduling_policy import DEFAULT, RcQuota, SchedulingPolicy, StrategyName
 from zscout.keyexpr import matcher
-from zscout.scheduling.model import Arc, ArcState, Hold, Rank, Rc, union
+from zscout.scheduling.model import Arc, ArcState, Claim, Hold, Rank, Rc, union
 from zscout.scheduling.reason import Reason
 from zscout.scheduling.votes import HolderSet, Votes
 from zscout.types import ArcId, ClientId, Need, Ns, Params, Place, RcName
@@ -133,6 +133,14 @@ class SchedulerState:
         self.running: dict[ArcId, Arc] = {}
         self.held_back: dict[ArcId, Arc] = {}
         """ARCs that are queued, but not considered for a while, or as long as another has their place."""
+        self.claims: dict[str, Claim] = {}
+        """Bookings that are not over, by id."""
+        self.claimed = 0
+        """Bits of the RCs that are booked, at whatever time."""
+        self.claims_version = 0
+        """Grows with all that changes what is booked, and by whom it is taken up."""
+        self._claim_ends: list[tuple[Ns, str]] = []
+        """A heap of when bookings lapse or end. Those that are over by then are skipped."""
         self._at_place: dict[Place, Arc] = {}
         """By place: who is considered, or runs. Two clients may claim one ARC, which has to run once."""
         self.present = 0
@@ -242,7 +250,7 @@ class SchedulerState:
     def is_free(self, arc: Arc) -> bool:
         """Whether a new ARC finds all that it needs there, exclusive and free, and nobody waits: the usual case where
         nothing is scarce. Who is bound by a quota or a pattern is not looked at so closely."""
-        if self.queued or self.held_back or arc.patterns or arc.place in self._at_place:
+        if self.queued or self.held_back or arc.patterns or arc.place in self._at_place or arc.mask & self.claimed:
             return False
         bound = self.policy.max_running_per_host is not None or self.policy.rc_quotas
         return not bound and not arc.mask & ~self.present and not arc.mask & (self.busy | self.sharable)
@@ -319,6 +327,41 @@ class SchedulerState:
         arc.move_to(ArcState.ENDED)
         self._forget_client(arc)
         self.leave_place(arc)
+
+    def claim(self, claim: Claim) -> None:
+        """A booking is made."""
+        booking = claim.booking
+        self.claims[booking.id] = claim
+        for at in (booking.lapses, booking.end):
+            heapq.heappush(self._claim_ends, (at, booking.id))
+        self.claims_changed()
+
+    def unclaim(self, claim: Claim) -> None:
+        """A booking is over."""
+        del self.claims[claim.booking.id]
+        claim.arc.claim = None
+        self.claims_changed()
+
+    def claims_changed(self) -> None:
+        """Bookings, or by whom they are taken up, or the RCs that are kept for them, are not what they were."""
+        self.claimed = union(claim.arc.mask for claim in self.claims.values())
+        self.claims_version += 1
+
+    def claims_over(self) -> Iterator[Claim]:
+        """Bookings whose time is over by now, or whose owner's is to take them up; each may come twice."""
+        while self._claim_ends and self._claim_ends[0][0] <= self.now:
+            _, booking = heapq.heappop(self._claim_ends)
+            if (claim := self.claims.get(booking)) is not None:
+                yield claim
+
+    def next_claim_over(self) -> Ns | None:
+        while self._claim_ends and self._claim_ends[0][1] not in self.claims:
+            heapq.heappop(self._claim_ends)
+        return self._claim_ends[0][0] if self._claim_ends else None
+
+    def voter(self, arc: ArcId) -> Arc | None:
+        """Who is meant by an id in a set of holders: an ARC, or what stands for a booking."""
+        return self.arc(arc) or (self.claims[arc].arc if arc in self.claims else None)
 
     def _know(self, arc: Arc) -> None:
         self._clients.setdefault(arc.request.client, {})[arc.id] = arc

@@ -1,0 +1,149 @@
+"""When all of these can be had together: times at which a booking would be kept.
+
+What is in the way: other bookings, whatever their priority; holds that would not be over, or not be preempted; and what
+starving ARCs of equal or higher priority are reserved. Whoever else is queued goes round a booking. Sharable RCs are
+asked about all who would be there at once. What is found is exact for the RCs that earlier bookings were given for their
+patterns; it does not try to give those others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import Final, NamedTuple
+
+from zscout.scheduling.model import Arc, Booking, Rc
+from zscout.scheduling.patterns import distinct
+from zscout.scheduling.reservations import Reservations
+from zscout.scheduling.state import SchedulerState
+from zscout.scheduling.votes import HolderSet
+from zscout.types import ArcId, Need, Ns, RcName
+
+MAX_TRIED: Final = 4_000
+"""Times that one question looks at."""
+
+
+class Slot(NamedTuple):
+    """From `start` to `latest` it may begin at any time; `bound` has the RC for each pattern."""
+
+    start: Ns
+    latest: Ns
+    bound: Mapping[Need, RcName]
+
+
+@dataclass(slots=True)
+class Slots:
+    found: list[Slot] = field(default_factory=list)
+    """The earliest, first."""
+    unknown: list[tuple[Rc, HolderSet]] = field(default_factory=list)
+    """Votes that have to be known before the next one can be told."""
+    complete: bool = True
+    """False: there was more to look at than one question may."""
+
+
+class _Taken(NamedTuple):
+    """An RC is not to be had in this time, or if it is sharable, has this holder."""
+
+    start: Ns
+    end: float
+    arc: ArcId
+
+
+def slots(state: SchedulerState, wanted: Booking, arc: Arc, until: Ns, limit: int) -> Slots:
+    """The first `limit` stretches of time in which `wanted` might start, from its own start to `until`; `arc` stands
+    for it."""
+    search, result = _Search(state, wanted, arc), Slots()
+    latest: Ns = wanted.start - 1
+    for tried, start in enumerate(search.starts(until)):
+        if start <= latest:
+            continue
+        if tried >= MAX_TRIED:
+            result.complete = False
+            break
+        fit = search.fit(start)
+        if isinstance(fit, list):
+            result.unknown = fit
+            break
+        if fit is None:
+            continue
+        latest = min(until, search.latest(start, fit.values()))
+        result.found.append(Slot(start, latest, fit))
+        if len(result.found) == limit:
+            break
+    return result
+
+
+class _Search:
+    def __init__(self, state: SchedulerState, wanted: Booking, arc: Arc) -> None:
+        self._state, self._wanted, self._arc = state, wanted, arc
+        self._named = list(state.rcs_in(arc.named_mask))
+        barred = state.barred(arc) | arc.named_mask
+        self._choices: dict[Need, list[Rc]] = {}
+        for need in arc.patterns:
+            known = [rc for rc in state.matching(need) if not rc.bit & barred]
+            # One that is away may be back by then, but nobody counts on it.
+            self._choices[need] = [rc for rc in known if rc.present] or known
+        self._taken: dict[int, list[_Taken]] = {}
+        for rc in {rc.bit: rc for rc in chain(self._named, *self._choices.values())}.values():
+            self._taken[rc.bit] = sorted(self._taken_of(rc))
+        self._add_reserved()
+
+    def _taken_of(self, rc: Rc) -> Iterable[_Taken]:
+        now = self._state.now
+        for holder in rc.non_preemptible_holders(self._arc, now):
+            yield _Taken(now, holder.known_end(self._arc), holder.id)
+        for claim in self._state.claims.values():
+            if claim.arc.mask & rc.bit and claim.arc.hold is None and claim.booking.id != self._wanted.id:
+                yield _Taken(claim.booking.start, claim.booking.end, claim.arc.id)
+
+    def _add_reserved(self) -> None:
+        state = self._state
+        if state.policy.patience is None:
+            return
+        for bit, reserved in Reservations(state, state.policy.patience).by_rc.items():
+            for one in reserved if bit in self._taken else ():
+                if one.booked is None and state.band(one.arc.priority) >= state.band(self._wanted.priority):
+                    self._taken[bit].append(_Taken(one.start, one.arc.ends(one.start), one.arc.id))
+
+    def starts(self, until: Ns) -> list[Ns]:
+        """Times at which something comes free."""
+        first = self._wanted.start
+        ends = {int(one.end) for taken in self._taken.values() for one in taken if first < one.end <= until}
+        return sorted({first, *ends})
+
+    def fit(self, start: Ns) -> Mapping[Need, RcName] | list[tuple[Rc, HolderSet]] | None:
+        """How its patterns are met if it starts then; None: it can't; or the votes that decide."""
+        unknown: list[tuple[Rc, HolderSet]] = []
+        for rc in self._named:
+            free = self._is_free(rc, start)
+            if free is False:
+                return None
+            unknown += [] if free is True else [(rc, free)]
+        allowed: dict[Need, list[Rc]] = {}
+        for need, choices in self._choices.items():
+            found = {rc.bit: self._is_free(rc, start) for rc in choices}
+            allowed[need] = [rc for rc in choices if found[rc.bit] is True]
+            if len(allowed[need]) < len(self._choices):
+                # With enough that are free without it nobody is asked.
+                unknown += [(rc, free) for rc in choices if not isinstance(free := found[rc.bit], bool)]
+        chosen = distinct(allowed)
+        if unknown and chosen is not None and not any(rc in self._named for rc, _ in unknown):
+            unknown = []
+        if unknown:
+            return unknown
+        return None if chosen is None else {need: rc.name for need, rc in chosen.items()}
+
+    def _is_free(self, rc: Rc, start: Ns) -> bool | HolderSet:
+        """Whether `rc` is to be had from then on for long enough; or the holders on which its vote is not known."""
+        end = start + self._wanted.runtime
+        there = frozenset(one.arc for one in self._taken[rc.bit] if one.start < end and one.end > start)
+        if not rc.sharable:
+            return not there
+        answer = self._state.votes.known(rc.name, there | {self._arc.id})
+        return there | {self._arc.id} if answer is None else answer.accept
+
+    def latest(self, start: Ns, bound: Iterable[RcName]) -> Ns:
+        """Until when it may start as well, on the same RCs."""
+        rcs = (*self._named, *(self._state.rc(name) for name in bound))
+        coming = (one.start for rc in rcs for one in self._taken[rc.bit] if one.start > start)
+        return max(start, min(coming, default=start + (1 << 62)) - self._wanted.runtime)
