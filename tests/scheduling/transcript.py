@@ -149,7 +149,7 @@ class CorePlayer:
             case "strategy":
                 options = settings(second.split(), "patience")
                 policy = replace(DEFAULT, patience=ns(options["patience"]) if options else DEFAULT.patience)
-                self.core = Core(STRATEGIES[first](), policy)
+                self.core = Core(STRATEGIES[cast("StrategyName", first)](), policy)
                 return None
             case "tick":
                 return Tick()

@@ -35,7 +35,7 @@ def validate(core: Core) -> None:
         else:
             assert arc.state is ArcState.NEW, f"what stands for {claim.booking.id} is {arc.state}"
             assert state.now < claim.booking.lapses, f"{claim.booking.id} has lapsed"
-        assert arc.mask & ~state.claimed == 0, f"what is kept for {claim.booking.id} is not known to be"
+        assert claim.kept & ~state.claimed == 0, f"what is kept for {claim.booking.id} is not known to be"
     for arc in (*state.queued.values(), *state.held_back.values(), *state.running.values()):
         assert arc.claim is None or state.claims.get(arc.claim.booking.id) is arc.claim, f"{arc.id}: no such booking"
 

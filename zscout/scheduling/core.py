@@ -337,7 +337,8 @@ class Core:
         if booking.lapses <= self._state.now:
             self._effects.append(model.BookingChanged(booking.id, BookingState.LAPSED))
         else:
-            self._state.claim(Claim(booking, self._stand_in(booking)))
+            arc = self._stand_in(booking)
+            self._state.claim(Claim(booking, arc, arc.mask))
 
     def _stand_in(self, booking: Booking) -> Arc:
         """What stands for a booking before it is taken up."""
@@ -421,6 +422,17 @@ class Core:
             self._end_hold(arc, Outcome.LOST, Reason(ReasonCode.RC_LOST, (name,), detail=reason))
         self._state.leave(name)
         self._votes.forget_rc(name)
+        self._keep_others(rc)
+
+    def _keep_others(self, lost: Rc) -> None:
+        """Bookings that any RC of a pattern would do for are kept another one, where there is one that is free then."""
+        for claim in self._state.claims.values():
+            if not claim.kept & lost.bit & ~claim.arc.named_mask or claim.arc.hold is not None:
+                continue
+            arc, start = self._stand_in(claim.booking), claim.booking.start
+            if found := slots(self._state, claim.booking, arc, start, 1).found:
+                claim.kept = arc.named_mask | self._state.mask(found[0].bound.values())
+                self._state.claims_changed()
 
     def _show_place(self, arc_id: ArcId, place: Place) -> None:
         arc = self._state.arc(arc_id)

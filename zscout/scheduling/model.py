@@ -284,6 +284,8 @@ class Claim:
     booking: Booking
     arc: Arc
     """Who has taken it up; before, an ARC that stands for it in reservations and votes, and never waits nor runs."""
+    kept: int
+    """Bits of the RCs that are kept for it; who has taken it up may choose others for its patterns."""
 
     @property
     def is_taken(self) -> bool:

@@ -97,7 +97,7 @@ class Reservations:
     def _keep(self, claim: Claim) -> None:
         """Reserves what is booked. Once its time has come, what is left of it is not kept while some of it is away."""
         booking, arc = claim.booking, claim.arc
-        rcs = list(self._state.rcs_in(arc.mask))
+        rcs = list(self._state.rcs_in(claim.kept))
         if arc.hold is not None or (booking.start <= self._state.now and not all(rc.present for rc in rcs)):
             return
         for rc in rcs:

@@ -344,7 +344,7 @@ class SchedulerState:
 
     def claims_changed(self) -> None:
         """Bookings, or by whom they are taken up, or the RCs that are kept for them, are not what they were."""
-        self.claimed = union(claim.arc.mask for claim in self.claims.values())
+        self.claimed = union(claim.kept for claim in self.claims.values())
         self.claims_version += 1
 
     def claims_over(self) -> Iterator[Claim]:

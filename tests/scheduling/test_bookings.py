@@ -1,0 +1,269 @@
+"""Bookings: one that is taken up in time starts at its date, and `slots` finds what exhaustive search finds."""
+
+from __future__ import annotations
+
+import itertools
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from fractions import Fraction
+
+import pytest
+from msgspec import structs
+
+from tests.scheduling.validate import validate
+from tests.thorough import times
+from zscout.config.scheduling_policy import SchedulingPolicy
+from zscout.keyexpr import is_pattern, matcher
+from zscout.scheduling.adaptive import Adaptive
+from zscout.scheduling.capacity import excess
+from zscout.scheduling.core import Core
+from zscout.scheduling.forecast import play_instant
+from zscout.scheduling.model import (
+    ArcRequest,
+    Booked,
+    Booking,
+    BookingChanged,
+    BookingState,
+    ClientLost,
+    Effect,
+    Event,
+    Granted,
+    Propose,
+    RcJoined,
+    RcLost,
+    Released,
+    Requested,
+    Tick,
+    Vote,
+    WakeAt,
+)
+from zscout.scheduling.slots import Slot
+from zscout.types import Ns, Params, RcName
+
+RUNS = times(1_000)
+PARTS = 10
+PATIENCE = 40
+POLICY = SchedulingPolicy(patience=PATIENCE)
+CAPACITY = {"rate": Fraction(4)}
+RADIO: RcName = "radio/rf"
+ROBOTS = ["robot/a", "robot/b", "robot/c"]
+
+
+@dataclass
+class Fleet:
+    """A core whose RCs vote at once."""
+
+    core: Core = field(default_factory=lambda: Core(Adaptive(), POLICY))
+    now: Ns = 0
+    effects: list[Effect] = field(default_factory=list)
+    wake: Ns | None = None
+    served: dict[str, tuple[Ns, Ns]] = field(default_factory=dict)
+    """By ARC: since when it had waited, and when it was granted last."""
+
+    def send(self, *events: Event) -> list[Effect]:
+        """All that comes of one instant."""
+        since = {arc.id: arc.since for arc in self.core._state.all_arcs() if arc.hold is None}
+        came = list(itertools.chain.from_iterable(play_instant(self.core, self.now, events, vote)))
+        for effect in came:
+            if isinstance(effect, WakeAt):
+                self.wake = effect.at
+            elif isinstance(effect, Granted):
+                self.served[effect.arc] = since.get(effect.arc, self.now), self.now
+        validate(self.core)
+        self.effects += came
+        return came
+
+    def until(self, now: Ns) -> None:
+        """Time passes, and the core is woken as it asked."""
+        while self.wake is not None and self.wake < now:
+            self.now = max(self.now + 1, self.wake)
+            if self.now >= now:
+                break
+            self.send(Tick())
+        self.now = now
+
+    def slots(self, wanted: Booking, until: Ns, limit: int) -> list[Slot]:
+        """Asked until all votes are known."""
+        while True:
+            told = self.core.slots(wanted, until, limit)
+            if not told.unknown:
+                return told.found
+            votes = self.core._state.votes
+            for rc, holders in told.unknown:
+                number = votes.propose(rc.name, holders, self.now)
+                assert number is not None
+                arcs = ((one, self.core._state.voter(one)) for one in sorted(holders))
+                params = {one: wanted.needs[rc.name] if arc is None else arc.needs[rc.name] for one, arc in arcs}
+                reason = excess(CAPACITY, params.items())
+                votes.answer(number, accept=not reason, reason=reason)
+
+
+def vote(asked: Propose) -> Vote:
+    reason = excess(CAPACITY, asked.holders.items())
+    return Vote(asked.proposal, accept=not reason, reason=reason)
+
+
+def needs(draw: random.Random, *, patterns: bool = False) -> dict[str, Params]:
+    wanted: dict[str, Params] = {rc: {} for rc in draw.sample(ROBOTS, draw.randint(1, 2))}
+    if patterns and draw.random() < 0.4:
+        wanted = {"robot/*": {}} | ({"robot/*#2": {}} if draw.random() < 0.3 else {})
+    if draw.random() < 0.4:
+        wanted[RADIO] = {"rate": Fraction(draw.randint(1, 4))}
+    return wanted
+
+
+def booking(draw: random.Random, number: int, now: Ns) -> Booking:
+    start, runtime = now + draw.randint(0, 30), draw.randint(1, 20)
+    patience = draw.randint(1, 10)
+    return Booking(f"b{number}", needs(draw, patterns=True), draw.randint(0, 2), start, runtime, patience, now)
+
+
+def excused(fleet: Fleet, one: Booking) -> bool:
+    """Whether what the promise leaves out keeps a booking from its start: a lost RC, a higher rank, an older promise."""
+    state = fleet.core._state
+    arc = state.claims[one.id].arc
+    choices = [rc for need in arc.patterns for rc in state.matching(need)]
+    concerned = [*state.rcs_in(arc.named_mask), *choices]
+    if not all(rc.present for rc in concerned):
+        return True
+    rivals = [*state.running.values(), *state.queued.values()]
+    names = {rc.name for rc in concerned}
+    for rival in rivals:
+        if rival is arc or not names & {*rival.needs, *(rc.name for need in rival.patterns for rc in state.matching(need))}:
+            continue
+        if rival.priority > one.priority:
+            return True
+        # Who waited for long before the booking was made had its promise first.
+        if rival.hold is None and rival.starving and rival.since <= one.since:
+            return True
+        waited, granted = fleet.served.get(rival.id, (fleet.now, fleet.now))
+        if rival.hold is not None and waited <= one.since and granted >= waited + PATIENCE // 2:
+            return True
+        if rival.claim is not None and rival.claim.booking.since <= one.since:
+            return True
+    return False
+
+
+def story(seed: int) -> Iterator[tuple[Fleet, Booking, bool]]:
+    """A random run: after each instant, the bookings that are taken up and whose date has come, and whether they run."""
+    draw = random.Random(seed)  # noqa: S311
+    fleet = Fleet()
+    fleet.send(*(RcJoined(rc, sharable=False) for rc in ROBOTS), RcJoined(RADIO, sharable=True))
+    made: dict[str, Booking] = {}
+    asked = 0
+    for number in range(60):
+        fleet.until(fleet.now + draw.randint(0, 6))
+        what = draw.random()
+        events: list[Event] = [Tick()]
+        open_ones = [one for one, arc in fleet.core.bookings() if arc is None]
+        if what < 0.35:
+            asked += 1
+            wanted = needs(draw, patterns=True)
+            keep = draw.random() < 0.2
+            request = ArcRequest(f"a{asked}", f"h/c{asked}", wanted, draw.randint(0, 2), draw.randint(1, 25), keep)
+            events = [Requested(request)]
+        elif what < 0.55:
+            one = booking(draw, number, fleet.now)
+            if found := fleet.slots(one, one.start + 30, 1):
+                made[one.id] = structs.replace(one, start=found[0].start, bound=found[0].bound)
+                events = [Booked(made[one.id])]
+        elif what < 0.85 and open_ones:
+            one = draw.choice(open_ones)
+            asked += 1
+            request = ArcRequest(
+                f"a{asked}", f"h/c{asked}", one.needs, one.priority, one.runtime, draw.random() < 0.2, booking=one.id
+            )
+            events = [Requested(request)]
+        elif what < 0.92 and fleet.core.arcs():
+            arc = draw.choice(fleet.core.arcs())
+            events = [Released(arc) if draw.random() < 0.5 else ClientLost(f"h/c{arc[1:]}")]
+        elif what < 0.95:
+            rc = draw.choice(ROBOTS)
+            there = fleet.core._state.rc(rc).present
+            events = [RcLost(rc) if there else RcJoined(rc, sharable=False)]
+        fleet.send(*events)
+        for one, arc_id in fleet.core.bookings():
+            if arc_id is not None and one.start <= fleet.now:
+                yield fleet, one, fleet.core.is_running(arc_id)
+
+
+@pytest.mark.parametrize("part", range(PARTS))
+def test_what_is_taken_up_starts_at_its_date(part: int) -> None:
+    started = 0
+    for seed in range(part, RUNS, PARTS):
+        for fleet, one, runs in story(seed):
+            started += runs
+            assert runs or excused(fleet, one), (seed, fleet.now, one, fleet.core.arc(fleet.core._state.claims[one.id].arc.id))
+    assert started > RUNS // PARTS
+
+
+def exhaustive(fleet: Fleet, wanted: Booking, until: Ns) -> Ns | None:
+    """The first time at which it could be kept, found by trying all, with what is known of all others."""
+    state = fleet.core._state
+    arc = fleet.core._stand_in(wanted)
+
+    def others(rc: RcName, start: Ns, end: Ns) -> list[Fraction]:
+        """What each of those asks of the RC that have it then."""
+        there = [
+            holder
+            for holder in state.rc(rc).holders.values()
+            if not holder.preemptible_by(arc, state.now) and holder.known_end(arc) > start
+        ]
+        for claim in state.claims.values():
+            one = claim.booking
+            if claim.arc.hold is None and claim.kept & state.rc(rc).bit and one.start < end and one.end > start:
+                there.append(claim.arc)
+        return [Fraction(one.needs[rc].get("rate", 0)) for one in there]
+
+    def free(rc: RcName, need: str, start: Ns) -> bool:
+        there = others(rc, start, start + wanted.runtime)
+        if rc != RADIO:
+            return not there
+        return sum(there) + wanted.needs[need].get("rate", 0) <= CAPACITY["rate"]
+
+    rcs = [*ROBOTS, RADIO]
+    choices = [[rc for rc in rcs if matcher(need)(rc)] if is_pattern(need) else [need] for need in wanted.needs]
+    for start in range(wanted.start, until + 1):
+        for chosen in itertools.product(*choices):
+            if len({*chosen}) == len(chosen) and all(
+                free(rc, need, start) for rc, need in zip(chosen, wanted.needs, strict=True)
+            ):
+                return start
+    return None
+
+
+@pytest.mark.parametrize("part", range(PARTS))
+def test_slots_are_those_of_exhaustive_search(part: int) -> None:
+    found = none = 0
+    for seed in range(part, RUNS, PARTS):
+        draw = random.Random(f"slots {seed}")  # noqa: S311
+        fleet = Fleet(Core(Adaptive(), SchedulingPolicy(patience=None)))
+        fleet.send(*(RcJoined(rc, sharable=False) for rc in ROBOTS), RcJoined(RADIO, sharable=True))
+        for number in range(6):
+            wanted, runtime = needs(draw, patterns=True), draw.randint(1, 15)
+            fleet.send(Requested(ArcRequest(f"a{number}", f"h/{number}", wanted, draw.randint(0, 2), runtime)))
+            one = booking(draw, number, fleet.now)
+            expected = exhaustive(fleet, one, fleet.now + 40)
+            told = fleet.slots(one, fleet.now + 40, 3)
+            assert (told[0].start if told else None) == expected, (seed, number, one)
+            for slot in told:
+                for start in {slot.start, slot.latest}:
+                    assert exhaustive(fleet, structs.replace(one, start=start), start) == start
+            found, none = found + len(told), none + (not told)
+            if told:
+                fleet.send(Booked(structs.replace(one, start=told[0].start, bound=told[0].bound)))
+            fleet.until(fleet.now + draw.randint(0, 5))
+    assert found > RUNS // PARTS
+    assert none > 0
+
+
+def test_one_that_nobody_takes_up_lapses_and_is_told_once() -> None:
+    fleet = Fleet()
+    fleet.send(RcJoined("robot/a", sharable=False))
+    one = Booking("b", {"robot/a": {}}, 0, 10, 10, 5, 0)
+    fleet.send(Booked(one))
+    fleet.until(30)
+    told = [effect for effect in fleet.effects if isinstance(effect, BookingChanged)]
+    assert told == [BookingChanged("b", BookingState.LAPSED)]
+    assert not [effect for effect in fleet.effects if isinstance(effect, Granted)]
