@@ -60,6 +60,8 @@ class Fleet:
     wake: Ns | None = None
     served: dict[str, tuple[Ns, Ns]] = field(default_factory=dict)
     """By ARC: since when it had waited, and when it was granted last."""
+    away: dict[str, Ns] = field(default_factory=dict)
+    """By RC: when it was away last."""
 
     def send(self, *events: Event) -> list[Effect]:
         """All that comes of one instant."""
@@ -70,6 +72,7 @@ class Fleet:
                 self.wake = effect.at
             elif isinstance(effect, Granted):
                 self.served[effect.arc] = since.get(effect.arc, self.now), self.now
+        self.away |= {rc.name: self.now for rc in self.core.status(0).rcs if not rc.present}
         validate(self.core)
         self.effects += came
         return came
@@ -120,17 +123,20 @@ def booking(draw: random.Random, number: int, now: Ns) -> Booking:
 
 
 def excused(fleet: Fleet, one: Booking) -> bool:
-    """Whether what the promise leaves out keeps a booking from its start: a lost RC, a higher rank, an older promise."""
+    """Whether what the promise leaves out keeps it from its start: a lost RC, a higher rank, an older promise."""
     state = fleet.core._state
     arc = state.claims[one.id].arc
     choices = [rc for need in arc.patterns for rc in state.matching(need)]
     concerned = [*state.rcs_in(arc.named_mask), *choices]
-    if not all(rc.present for rc in concerned):
+    if any(fleet.away.get(rc.name, -1) >= one.start for rc in concerned):
         return True
     rivals = [*state.running.values(), *state.queued.values()]
     names = {rc.name for rc in concerned}
     for rival in rivals:
-        if rival is arc or not names & {*rival.needs, *(rc.name for need in rival.patterns for rc in state.matching(need))}:
+        if rival is arc or not names & {
+            *rival.needs,
+            *(rc.name for need in rival.patterns for rc in state.matching(need)),
+        }:
             continue
         if rival.priority > one.priority:
             return True
@@ -146,7 +152,7 @@ def excused(fleet: Fleet, one: Booking) -> bool:
 
 
 def story(seed: int) -> Iterator[tuple[Fleet, Booking, bool]]:
-    """A random run: after each instant, the bookings that are taken up and whose date has come, and whether they run."""
+    """A random run: after each instant, the bookings that are taken up and whose date has come; do they run?"""
     draw = random.Random(seed)  # noqa: S311
     fleet = Fleet()
     fleet.send(*(RcJoined(rc, sharable=False) for rc in ROBOTS), RcJoined(RADIO, sharable=True))
@@ -194,7 +200,12 @@ def test_what_is_taken_up_starts_at_its_date(part: int) -> None:
     for seed in range(part, RUNS, PARTS):
         for fleet, one, runs in story(seed):
             started += runs
-            assert runs or excused(fleet, one), (seed, fleet.now, one, fleet.core.arc(fleet.core._state.claims[one.id].arc.id))
+            assert runs or excused(fleet, one), (
+                seed,
+                fleet.now,
+                one,
+                fleet.core.arc(fleet.core._state.claims[one.id].arc.id),
+            )
     assert started > RUNS // PARTS
 
 

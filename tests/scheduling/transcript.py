@@ -20,6 +20,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
+from typing import TYPE_CHECKING, cast
 
 from tests.scheduling.validate import validate
 from tests.transcripts import ns, seconds, settings
@@ -59,6 +60,9 @@ from zscout.scheduling.model import (
 )
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import Grant, Ns, Params, Place, Term
+
+if TYPE_CHECKING:
+    from zscout.config.scheduling_policy import StrategyName
 
 _NEED = re.compile(r"([\w.-]+/[\w.-]+)(?:\{([^}]*)\})?")
 

@@ -342,16 +342,7 @@ class Core:
 
     def _stand_in(self, booking: Booking) -> Arc:
         """What stands for a booking before it is taken up."""
-        request = model.ArcRequest(
-            booking.id,
-            f"{booking.owner}/",
-            booking.needs,
-            booking.priority,
-            booking.runtime,
-            label=booking.label,
-            who=booking.who,
-        )
-        arc = self._new_arc(request, Place(NO_TERM, 0))
+        arc = self._new_arc(booking.request(), Place(NO_TERM, 0))
         if arc.patterns:
             self._state.bind(arc, booking.bound)
         return arc

@@ -2,7 +2,7 @@
 
 The forecast runs the very core and strategy that decide. RCs are taken to vote as they have voted; a proposal
 that was never made is taken to be a yes. Higher priority that comes later makes it wrong, of course, and so
-does who releases early: it is an estimate, and is shown as one.
+does who releases early: it is an estimate, and is shown as one. Bookings are taken to be taken up at their dates.
 """
 
 from __future__ import annotations
@@ -64,6 +64,8 @@ def forecast(core: Core, now: Ns, newcomer: ArcRequest | None = None) -> Forecas
     joined, lead = core.as_events(Term(core.term.counter + 1, "forecast"))
     result = Forecast()
     ends = {held.request.arc: held.end for held in lead.recovered_holds}
+    dates = sorted((one.start, one.id, arc is None) for one, arc in core.bookings() if one.start > now)
+    booked = {one.id: one for one, _ in core.bookings()}
     unserved = {one.request.arc for one in lead.waiting}
     """ARCs that are queued and have not started within what was played."""
 
@@ -97,10 +99,14 @@ def forecast(core: Core, now: Ns, newcomer: ArcRequest | None = None) -> Forecas
         asking = copy.arc(newcomer.arc)
         result.reason = asking.reported if asking is not None else None
     checks = 0
-    while ends and unserved:
+    while (ends or dates) and unserved:
         checks += copy.waiting
         if checks > MAX_CHECKS:
             break
-        now = max(now, min(ends.values()))
-        step([Tick()])
+        now = max(now, min((*ends.values(), *(date for date, _, _ in dates[:1]))))
+        events: list[Event] = [Tick()]
+        while dates and dates[0][0] <= now:
+            _, name, is_open = dates.pop(0)
+            events += [Requested(booked[name].request())] if is_open else []
+        step(events)
     return result

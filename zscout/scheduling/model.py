@@ -242,8 +242,8 @@ class Arc:
 
 
 class Booking(Struct, frozen=True):
-    """All of `needs` at once, from `start` on for `runtime` ns: a claim with a date, which its owner's request takes up,
-    or which lapses when nobody has within `patience` ns from the date.
+    """All of `needs` at once, from `start` on for `runtime` ns: a claim with a date. Its owner's request takes it
+    up, or it lapses when nobody has within `patience` ns from the date.
 
     Raises ValueError as `ArcRequest` does."""
 
@@ -264,8 +264,14 @@ class Booking(Struct, frozen=True):
     who: Who | None = None
 
     def __post_init__(self) -> None:
-        # It must be one that can be taken up.
-        ArcRequest(self.id, self.owner, self.needs, self.priority, self.runtime)
+        self.request()
+
+    def request(self) -> ArcRequest:
+        """One by which its owner takes it up."""
+        client, booking = f"{self.owner}/", self.id
+        return ArcRequest(
+            self.id, client, self.needs, self.priority, self.runtime, label=self.label, booking=booking, who=self.who
+        )
 
     @property
     def end(self) -> Ns:

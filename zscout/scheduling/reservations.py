@@ -213,10 +213,7 @@ class Reservations:
     def _delays(self, arc: Arc, reservation: Reservation) -> bool:
         """Whether `arc`, started now, would hold what is reserved when the time comes, and must not."""
         band = self._state.band
-        return (
-            band(arc.priority) <= band(reservation.arc.priority)
-            and arc.ends(self._state.now) > reservation.start
-        )
+        return band(arc.priority) <= band(reservation.arc.priority) and arc.ends(self._state.now) > reservation.start
 
     def changed(self, earlier: Reservations) -> int:
         """Bits of the RCs at which the reservations differ from the `earlier` ones."""
