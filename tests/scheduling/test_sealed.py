@@ -27,6 +27,8 @@ SURFACE = {
     "could_have_issued",
     "reasons_changed",
     "tell_reasons",
+    "slots",
+    "bookings",
 }
 SURFACE |= {"as_events", "expects_yes", "number", "batches", "term", "seq", "strategy", "policy"}
 ACTIONS = {"start", "preempt", "wait", "propose", "run_again"}
