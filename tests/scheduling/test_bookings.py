@@ -223,7 +223,7 @@ def exhaustive(fleet: Fleet, wanted: Booking, until: Ns) -> Ns | None:
         ]
         for claim in state.claims.values():
             one = claim.booking
-            if claim.arc.hold is None and claim.kept & state.rc(rc).bit and one.start < end and one.end > start:
+            if claim.mask & state.rc(rc).bit and one.start < end and one.end > start and claim.arc not in there:
                 there.append(claim.arc)
         return [Fraction(one.needs[rc].get("rate", 0)) for one in there]
 

@@ -297,6 +297,11 @@ class Claim:
     def is_taken(self) -> bool:
         return self.arc.claim is self
 
+    @property
+    def mask(self) -> int:
+        """Bits of the RCs that it holds, or that are kept for it."""
+        return self.kept if self.arc.hold is None else self.arc.mask
+
 
 @dataclass(slots=True, eq=False)
 class Rc:

@@ -95,10 +95,11 @@ class Reservations:
                 self._reserve(one)
 
     def _keep(self, claim: Claim) -> None:
-        """Reserves what is booked. Once its time has come, what is left of it is not kept while some of it is away."""
+        """Reserves what is booked, while it is held as well: it may be preempted in this very pass. Once its time has
+        come, what is left of it is not kept while some of it is away."""
         booking, arc = claim.booking, claim.arc
-        rcs = list(self._state.rcs_in(claim.kept))
-        if arc.hold is not None or (booking.start <= self._state.now and not all(rc.present for rc in rcs)):
+        rcs = list(self._state.rcs_in(claim.mask))
+        if booking.start <= self._state.now and not all(rc.present for rc in rcs):
             return
         for rc in rcs:
             self.by_rc.setdefault(rc.bit, []).append(Reservation(arc, booking.start, booking.end))

@@ -93,7 +93,7 @@ class _Search:
         for holder in rc.non_preemptible_holders(self._arc, now):
             yield _Taken(now, holder.known_end(self._arc), holder.id)
         for claim in self._state.claims.values():
-            if claim.kept & rc.bit and claim.arc.hold is None and claim.booking.id != self._wanted.id:
+            if claim.mask & rc.bit and claim.booking.id != self._wanted.id:
                 yield _Taken(claim.booking.start, claim.booking.end, claim.arc.id)
 
     def _add_reserved(self) -> None:
