@@ -110,7 +110,7 @@ def vote(asked: Propose) -> Vote:
 def needs(draw: random.Random, *, patterns: bool = False) -> dict[str, Params]:
     wanted: dict[str, Params] = {rc: {} for rc in draw.sample(ROBOTS, draw.randint(1, 2))}
     if patterns and draw.random() < 0.4:
-        wanted = {"robot/*": {}} | ({"robot/*#2": {}} if draw.random() < 0.3 else {})
+        wanted = {need: {} for need in ("robot/*", "robot/*#2")[: 2 if draw.random() < 0.3 else 1]}
     if draw.random() < 0.4:
         wanted[RADIO] = {"rate": Fraction(draw.randint(1, 4))}
     return wanted
