@@ -39,7 +39,7 @@ from zscout.scheduling.model import (
 )
 from zscout.scheduling.priority import AdmissionCheck, Priority, reasons_of_now
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
-from zscout.scheduling.slots import Slots, slots
+from zscout.scheduling.slots import SlotsFound, slots
 from zscout.scheduling.state import SchedulerState, Strategy
 from zscout.scheduling.votes import HolderSet
 from zscout.types import NO_TERM, ArcId, ClientId, Grant, Ns, Place, RcName, Term
@@ -213,7 +213,7 @@ class Core:
         waiting = tuple(model.Requested(arc.request, arc.place, arc.since) for arc in queued)
         return joined, model.LeadTaken(term, recovered_holds, waiting)
 
-    def slots(self, wanted: Booking, until: Ns, limit: int) -> Slots:
+    def slots(self, wanted: Booking, until: Ns, limit: int) -> SlotsFound:
         """The first `limit` stretches of time, from the start of `wanted` to `until`, in which it would be kept."""
         return slots(self._state, wanted, self._stand_in(wanted), until, limit)
 

@@ -32,7 +32,7 @@ class Slot(NamedTuple):
 
 
 @dataclass(slots=True)
-class Slots:
+class SlotsFound:
     found: list[Slot] = field(default_factory=list)
     """The earliest, first."""
     unknown: list[tuple[Rc, HolderSet]] = field(default_factory=list)
@@ -49,10 +49,10 @@ class _Taken(NamedTuple):
     arc: ArcId
 
 
-def slots(state: SchedulerState, wanted: Booking, arc: Arc, until: Ns, limit: int) -> Slots:
+def slots(state: SchedulerState, wanted: Booking, arc: Arc, until: Ns, limit: int) -> SlotsFound:
     """The first `limit` stretches of time in which `wanted` might start, from its own start to `until`; `arc` stands
     for it."""
-    search, result = _Search(state, wanted, arc), Slots()
+    search, result = _Search(state, wanted, arc), SlotsFound()
     latest: Ns = wanted.start - 1
     for tried, start in enumerate(search.starts(until)):
         if start <= latest:
