@@ -49,6 +49,11 @@ class Inadmissible(NamedTuple):
     proposal: HolderSet | None = None
 
 
+def _yields(holder: Arc, other: Arc, time: Ns) -> bool:
+    """Whether a hold is over at some time, or gives way to an ARC that comes then."""
+    return holder.known_end(other) <= time or holder.preemptible_by(other, time)
+
+
 def reservations(state: SchedulerState, patience: Ns | None, last: Reservations | None) -> Reservations:
     """What is reserved now: the `last` that was found, if nothing has changed that it depends on.
 
@@ -184,14 +189,14 @@ class Reservations:
         if not arc.mask & self.bits:
             return None
         for rc in self._state.rcs_in(arc.mask & self.bits):
-            before: list[Arc] = []
+            before: list[Reservation] = []
             blocking: Reservation | None = None
             for reservation in self.by_rc[rc.bit]:
                 if reservation.arc is arc:
                     break
                 if reservation.booked is not None and reservation.start >= arc.ends(self._state.now):
                     continue
-                before.append(reservation.arc)
+                before.append(reservation)
                 if blocking is None and self._delays(arc, reservation):
                     blocking = reservation
             if blocking is None:
@@ -200,16 +205,35 @@ class Reservations:
             reason = Reason(code, (rc.name,), (blocking.arc.party,))
             if not rc.sharable:
                 return Inadmissible(rc, reason)
-            together = frozenset((*rc.holders, arc.id, *(one.id for one in before)))
-            answer = self._votes.known(rc.name, together)
-            if answer is None or not answer.accept:
-                is_open = answer is None and rc.name not in self._votes.unresponsive
-                return Inadmissible(rc, reason, together if is_open else None)
+            for together in self._together(rc, arc, before):
+                answer = self._votes.known(rc.name, together)
+                if answer is None or not answer.accept:
+                    is_open = answer is None and rc.name not in self._votes.unresponsive
+                    return Inadmissible(rc, reason, together if is_open else None)
         return None
+
+    def _together(self, rc: Rc, arc: Arc, before: list[Reservation]) -> list[HolderSet]:
+        """Whom `rc` would have to carry beside `arc`, from now on: each time when another comes. Who gives way to that
+        one is not in its way."""
+        if all(one.booked is None for one in before):
+            return [frozenset((*rc.holders, arc.id, *(one.arc.id for one in before)))]
+        now = self._state.now
+        sets = []
+        for time in sorted({now, *(one.start for one in before if one.start > now)}):
+            there = [one for one in before if one.start <= time and (one.booked is None or one.booked > time)]
+            coming = [arc] if time == now else [one.arc for one in there if one.start == time]
+            staying = [one.id for one in rc.holders.values() if not any(_yields(one, other, time) for other in coming)]
+            sets.append(frozenset((*staying, arc.id, *(one.arc.id for one in there))))
+        return sets
 
     def reserves(self, rc: Rc, arc: Arc) -> bool:
         """Whether `rc`, exclusive, is reserved for another that goes before `arc`."""
-        return any(one.arc is not arc and self._delays(arc, one) for one in self.by_rc.get(rc.bit, ()))
+        for one in self.by_rc.get(rc.bit, ()):
+            if one.arc is arc:
+                return False
+            if self._delays(arc, one):
+                return True
+        return False
 
     def _delays(self, arc: Arc, reservation: Reservation) -> bool:
         """Whether `arc`, started now, would hold what is reserved when the time comes, and must not."""
