@@ -198,10 +198,12 @@ class Obeyed(NamedTuple):
 
 def obeyed(folder: Path) -> list[Obeyed]:
     """Every command that one of both has carried out, in the order of time."""
+    # The last line may be half written yet.
+    logs = ((folder / f"{host}.log").read_text().rpartition("\n")[0] for host in ("ws1", "ws2"))
     found = [
         Obeyed(event["at"], event["instance"], tuple(event["term"]))
-        for host in ("ws1", "ws2")
-        for event in trace.lines((folder / f"{host}.log").read_text().splitlines())
+        for log in logs
+        for event in trace.lines(log.splitlines())
         if event["do"] == "command"
     ]
     return sorted(found)

@@ -116,5 +116,5 @@ def test_one_that_fails_to_take_it_keeps_nobody_else_from_it(files: Files, caplo
 
 def test_every_setting_of_both_files_has_the_name_that_it_has_there(files: Files) -> None:
     tables = {key.partition(".")[0] for key in settings(load_node(files.file))}
-    ours = {"node", "components", "rc"}
+    ours = {"node", "components", "journal", "rc"}
     assert tables == ours | {"fleet", "mesh", "limits", "timing", "placement", "devices", "roles"}
