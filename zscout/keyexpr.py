@@ -192,6 +192,7 @@ class Keys:
     schedule_any = _Key("rcm/schedule/*/*")
     grants = _Key("rcm/grants")
     rcm_state = _Key("rcm/state")
+    rcm_bookings = _Key("rcm/bookings")
     rc_state_any = _Key("rc/*/*/state")
     frame_any = _Key("rc/*/*/frame")
     load_any = _Key("host/*/load")
@@ -212,6 +213,7 @@ class Keys:
     load = _host_key("load")
     confirm_any = _host_key("confirm/*/*")
     history_any = _host_key("history/*/*")
+    bookings_any = _host_key("bookings/*/*")
     notice = _sender_key("client", "/notice")
     requests = _sender_key("client", "/requests")
     behavior = _sender_key("client", "/behavior")
@@ -236,6 +238,10 @@ class Keys:
     def history(self, host: str, sender: Sender) -> str:
         """Where a candidate is asked for what its journal keeps."""
         return f"{self.base}/host/{check_name(host, 'host')}/history/{_sender(sender)}"
+
+    def bookings(self, sender: Sender) -> str:
+        """Where all hosts that keep bookings are asked at once."""
+        return f"{self.base}/host/*/bookings/{_sender(sender)}"
 
     def placer(self, sender: Sender) -> str:
         """Where the component placer is asked."""
@@ -327,7 +333,7 @@ def _sender_of(keys: Keys, key: str) -> Sender:
             | ["client", host, client, "notice" | "requests" | "behavior"]
             | ["building", host, client, "plan" | "poses"]
             | ["placer", "component", host, client]
-            | ["host", _, "component" | "confirm" | "history", host, client]
+            | ["host", _, "component" | "confirm" | "history" | "bookings", host, client]
         ):
             return Sender(check_name(host, "host"), check_name(client, "client"))
     raise BadName(f"{key[:200]!r} does not name its sender")
@@ -374,6 +380,7 @@ ACCESS: Final = (
     Access("rcm/schedule/{by}/*", ask=USERS, serve=_MANAGERS),
     Access("rcm/grants", publish=_MANAGERS, subscribe=_ALL),
     Access("rcm/state", ask=_ALL, serve=_MANAGERS),
+    Access("rcm/bookings", ask=_ALL, serve=_MANAGERS),
     Access("rc/{rc}/vote", ask=_MANAGERS, serve=NODES),
     Access("rc/{rc}/command/{by}/*", ask=USERS, serve=NODES),
     # Who asks may ask for a promise: a leader's right.
@@ -383,6 +390,7 @@ ACCESS: Final = (
     Access("host/{at}/component/{by}/*", ask=_ALL, serve=NODES),
     Access("host/{at}/confirm/{by}/*", ask=USERS, serve=NODES),
     Access("host/{at}/history/{by}/*", ask=_ALL, serve=_MANAGERS),
+    Access("host/{at}/bookings/{by}/*", ask=_MANAGERS, serve=NODES),
     Access("balancer/rank", ask=_ALL, serve=_MANAGERS),
     Access("placer/component/{by}/*", ask=_ALL, serve=_MANAGERS),
     Access("placer/placements", publish=_MANAGERS, subscribe=_ALL),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from zscout.messages.base import *
 from zscout.messages.behaviors import *
+from zscout.messages.bookings import *
 from zscout.messages.components import *
 from zscout.messages.controllers import *
 from zscout.messages.history import *

@@ -48,6 +48,8 @@ Seconds: TypeAlias = Finite
 """A duration that is computed with: bounded, so that it is still finite in nanoseconds."""
 Elapsed: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
 """Likewise, of the past."""
+WallTime: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e11)]
+"""Seconds since 1970, UTC."""
 ShortText: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=130)]
 """A name, or `kind/name`."""
 VersionText: TypeAlias = Annotated[str, msgspec.Meta(max_length=64)]

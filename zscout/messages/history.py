@@ -9,7 +9,7 @@ from typing import Annotated, Final, Literal, TypeAlias
 
 import msgspec
 
-from zscout.messages.base import Elapsed, Message, Seconds
+from zscout.messages.base import Elapsed, Message, Seconds, WallTime
 from zscout.messages.scheduling import ReasonParty, Who
 from zscout.types import Grant
 
@@ -23,8 +23,6 @@ MAX_ASKED_NAMES: Final = 512
 UNHEARD: Final = "unheard"
 """The outcome of a hold whose end the candidate did not hear: it ended at `ended` or later."""
 
-WallTime: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e11)]
-"""Seconds since 1970, UTC."""
 Cursor: TypeAlias = tuple[WallTime, Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]]
 """Where an answer ended: only its candidate knows what it means."""
 JournalName: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]

@@ -7,7 +7,7 @@ from typing import Annotated, TypeAlias
 
 import msgspec
 
-from zscout.messages.base import NAMES_ONCE, Amounts, Elapsed, Message, Seconds, State, VersionText
+from zscout.messages.base import Amounts, Elapsed, Message, Seconds, State, VersionText, WallTime
 from zscout.types import NO_TERM, Grant, Place, Term
 
 DOOR_CODES = frozenset({"unknown_device", "unknown_parameter", "too_much"})
@@ -20,6 +20,7 @@ MAX_OTHERS = 255
 
 Seal: TypeAlias = Annotated[str, msgspec.Meta(max_length=128)]
 RequestId: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+BookingRef: TypeAlias = Annotated[str, msgspec.Meta(max_length=96)]
 MAX_WHO = 64
 """Characters of a user's, a host's or a command's name."""
 MAX_COMMENT = 200
@@ -91,6 +92,8 @@ class Ask(_Asked, frozen=True, tag_field="op", tag="request"):
     """As its notice had it beside the place."""
     was: RequestId | None = None
     """The id under which its client had that place, where it is another one now. What is open under it ends."""
+    booking: BookingRef = ""
+    """The booking that it takes up, whose needs it has: its id, or as a notice has it."""
 
 
 class Cancel(Message, frozen=True, tag_field="op", tag="cancel"):
@@ -175,8 +178,7 @@ class Foresight(Message, frozen=True):
     """What `reason` says, as data."""
 
 
-Operation: TypeAlias = Ask | Cancel | Release | HandOver | Foresee
-NAMES_ONCE.add(Operation)
+RequestOperation: TypeAlias = Ask | Cancel | Release | HandOver | Foresee
 
 
 class Notice(_ArcParty, frozen=True):
@@ -213,6 +215,8 @@ class Notice(_ArcParty, frozen=True):
     """Proof that the place is this ARC's, for every RCM; absent where RCMs share no key."""
     hosts: dict[str, str] = {}
     """While it runs: where its RCs are, by RC, as far as that is known."""
+    booking: BookingRef = ""
+    """The date of a booking that it has taken up: `<id>@<start>`."""
 
 
 class Holder(_ArcParty, frozen=True):
@@ -233,6 +237,7 @@ class Holder(_ArcParty, frozen=True):
     direct: bool = False
     """As asked: its RCs settle when it ends."""
     who: Who | None = None
+    booking: BookingRef = ""
 
 
 class Revocation(_ArcParty, frozen=True):
@@ -265,6 +270,8 @@ class Grants(Message, frozen=True):
     begun: list[tuple[int, Elapsed]] = []
     """Of each grant of this term that begins with it: its seq, and the seconds for which its ARC was queued. Nobody
     obeys this: journals keep it."""
+    time: WallTime | None = None
+    """Fleet time, by which bookings have their dates."""
 
 
 class StateAsk(Message, frozen=True):
@@ -293,6 +300,7 @@ class HoldView(_ArcParty, frozen=True):
     bound: dict[str, str] = {}
     direct: bool = False
     who: Who | None = None
+    booking: BookingRef = ""
 
 
 class WaitView(_ArcParty, frozen=True):
@@ -309,6 +317,7 @@ class WaitView(_ArcParty, frozen=True):
     """An estimate, where one was asked for: as if nothing else were to come."""
     why: ReasonInfo | None = None
     who: Who | None = None
+    booking: BookingRef = ""
 
 
 class Parameter(Message, frozen=True):
@@ -382,6 +391,7 @@ class OpenRequest(_Wanted, frozen=True):
     who: Who | None = None
     seal: Seal | None = None
     was: RequestId | None = None
+    booking: BookingRef = ""
 
 
 class ClientRequests(Message, frozen=True):
