@@ -16,15 +16,12 @@ from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy
 from zscout.keyexpr import is_pattern, matcher
 from zscout.scheduling.adaptive import Adaptive
+from zscout.scheduling.booking import Booked, Booking, BookingChanged, BookingState
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import play_instant
 from zscout.scheduling.model import (
     ArcRequest,
-    Booked,
-    Booking,
-    BookingChanged,
-    BookingState,
     ClientLost,
     Effect,
     Event,
@@ -212,7 +209,7 @@ def test_what_is_taken_up_starts_at_its_date(part: int) -> None:
 def exhaustive(fleet: Fleet, wanted: Booking, until: Ns) -> Ns | None:
     """The first time at which it could be kept, found by trying all, with what is known of all others."""
     state = fleet.core._state
-    arc = fleet.core._stand_in(wanted)
+    arc = fleet.core._claims.stand_in(wanted)
 
     def others(rc: RcName, start: Ns, end: Ns) -> list[Fraction]:
         """What each of those asks of the RC that have it then."""

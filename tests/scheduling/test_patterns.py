@@ -33,8 +33,8 @@ from zscout.scheduling.model import (
     Tick,
     Vote,
     VoteOverdue,
-    check_patterns,
 )
+from zscout.scheduling.needs import check_patterns
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import SECOND, Grant, Ns, Params, Place, Term
 

@@ -25,13 +25,11 @@ from typing import TYPE_CHECKING, cast
 from tests.scheduling.validate import validate
 from tests.transcripts import ns, seconds, settings
 from zscout.config.scheduling_policy import DEFAULT
+from zscout.scheduling.booking import Booked, Booking, BookingChanged, Unbooked
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     Adopted,
     ArcRequest,
-    Booked,
-    Booking,
-    BookingChanged,
     Cancelled,
     ClientLost,
     Dropped,
@@ -52,7 +50,6 @@ from zscout.scheduling.model import (
     Released,
     Requested,
     Tick,
-    Unbooked,
     Unconfirmed,
     Vote,
     VoteOverdue,

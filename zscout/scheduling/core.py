@@ -19,8 +19,9 @@ from collections.abc import Collection
 from msgspec.structs import replace
 
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
-from zscout.keyexpr import is_pattern
 from zscout.scheduling import model
+from zscout.scheduling.booking import Booked, Booking, Unbooked
+from zscout.scheduling.claims import Claims
 from zscout.scheduling.model import (
     HOLD_BACK,
     MAX_HOLD_BACK,
@@ -28,9 +29,6 @@ from zscout.scheduling.model import (
     Arc,
     ArcState,
     ArcStatus,
-    Booking,
-    BookingState,
-    Claim,
     Hold,
     Outcome,
     Rc,
@@ -59,6 +57,7 @@ class Core:
         """How many batches of events were handled."""
         self._arrivals = 0
         self._effects: list[model.Effect] = []
+        self._claims = Claims(self._state, self, lambda effect: self._effects.append(effect))
         self._over: set[Grant] = set()
         """Grants of earlier terms that ended in this one."""
         self._wake: Ns | None = None
@@ -79,7 +78,7 @@ class Core:
         self._effects = []
         self._run_again = False
         self._expire()
-        self._expire_claims()
+        self._claims.expire()
         self._state.let_in()
         if len(events) == 1 and isinstance(events[0], model.Requested):
             self._ask(events[0], alone=True)
@@ -208,14 +207,14 @@ class Core:
             for arc in state.running.values()
             if arc.hold is not None
         )
-        joined += [model.Booked(claim.booking) for claim in state.claims.values()]
+        joined += [Booked(claim.booking) for claim in state.claims.values()]
         queued = (*state.queued.values(), *state.held_back.values())
         waiting = tuple(model.Requested(arc.request, arc.place, arc.since) for arc in queued)
         return joined, model.LeadTaken(term, recovered_holds, waiting)
 
     def slots(self, wanted: Booking, until: Ns, limit: int) -> SlotsFound:
         """The first `limit` stretches of time, from the start of `wanted` to `until`, in which it would be kept."""
-        return slots(self._state, wanted, self._stand_in(wanted), until, limit)
+        return slots(self._state, wanted, self._claims.stand_in(wanted), until, limit)
 
     def bookings(self) -> list[tuple[Booking, ArcId | None]]:
         """Those that are not over, with the ARC that has taken each up."""
@@ -289,11 +288,10 @@ class Core:
                 self._take_lead(event)
             case model.Adopted(held):
                 self._adopt(held)
-            case model.Booked(booking):
-                self._book(booking)
-            case model.Unbooked(booking):
-                if (claim := self._state.claims.get(booking)) is not None:
-                    self._end_claim(claim, BookingState.UNBOOKED)
+            case Booked(booking):
+                self._claims.book(booking)
+            case Unbooked(booking):
+                self._claims.unbook(booking)
             case model.Tick():
                 pass
 
@@ -308,11 +306,8 @@ class Core:
             self.start(arc)
             return
         since = self._state.now if asked.since is None else min(asked.since, self._state.now)
-        claim = self._state.claims.get(asked.request.booking)
-        if claim is None or claim.is_taken:
-            self._state.enqueue(arc, since)
-        else:
-            self._take_up_claim(claim, arc, since)
+        self._state.enqueue(arc, since)
+        self._claims.take_up(asked.request.booking, arc)
 
     def _new_arc(self, request: model.ArcRequest, place: Place | None) -> Arc:
         if place is None:
@@ -320,77 +315,7 @@ class Core:
             place = Place(self.term, self._arrivals)
         elif place.term == self.term:
             self._arrivals = max(self._arrivals, place.arrival)
-        longest = self.policy.max_runtime
-        if longest is not None and request.min_runtime > longest:
-            # Nobody gets more: what is reckoned with it (ranks, reservations) is the shorter.
-            request = replace(request, min_runtime=longest)
-        patterns = tuple(filter(is_pattern, request.needs))
-        named = self._state.mask(need for need in request.needs if need not in patterns)
-        arc = Arc(request, place, named, patterns, named)
-        if patterns:
-            self._state.bind(arc, {})
-        return arc
-
-    def _book(self, booking: Booking) -> None:
-        if booking.id in self._state.claims:
-            return
-        if booking.lapses <= self._state.now:
-            self._effects.append(model.BookingChanged(booking.id, BookingState.LAPSED))
-        else:
-            arc = self._stand_in(booking)
-            self._state.claim(Claim(booking, arc, arc.mask))
-
-    def _stand_in(self, booking: Booking) -> Arc:
-        """What stands for a booking before it is taken up."""
-        arc = self._new_arc(booking.request(), Place(NO_TERM, 0))
-        if arc.patterns:
-            self._state.bind(arc, booking.bound)
-        return arc
-
-    def _take_up_claim(self, claim: Claim, arc: Arc, since: Ns) -> None:
-        """An ARC stands for its booking from now on. It waits for the date."""
-        self._state.enqueue(arc, since)
-        self._link(claim, arc)
-        if claim.booking.start > self._state.now and arc.id in self._state.queued:
-            self._state.hold_back(arc, claim.booking.start, ())
-            self.wait(arc, Reason(ReasonCode.NOT_YET))
-
-    def _link(self, claim: Claim, arc: Arc) -> None:
-        for rc in self._state.possible_sharables(claim.arc):
-            self._votes.rename_arc(rc.name, claim.arc.id, arc.id)
-        claim.arc, arc.claim = arc, claim
-        self._state.claims_changed()
-        self._effects.append(model.BookingChanged(claim.booking.id, BookingState.TAKEN, arc.id))
-
-    def _give_up_claim(self, arc: Arc, outcome: Outcome, *, had_it: bool) -> None:
-        """An ARC is over. What it had taken up is open again if its program is gone, or gave up before it had it."""
-        claim = arc.claim
-        if claim is None:
-            return
-        again = (outcome is Outcome.CLIENT_LOST or not had_it) and self._state.now < claim.booking.lapses
-        if not again:
-            self._end_claim(claim, BookingState.USED)
-            return
-        arc.claim = None
-        claim.arc = self._stand_in(claim.booking)
-        self._state.claims_changed()
-        self._effects.append(model.BookingChanged(claim.booking.id, BookingState.OPEN, arc.id))
-
-    def _end_claim(self, claim: Claim, state: BookingState) -> None:
-        arc = claim.arc if claim.is_taken else None
-        for rc in [] if arc is not None else list(self._state.possible_sharables(claim.arc)):
-            self._votes.forget_arc(rc.name, claim.arc.id)
-        self._state.unclaim(claim)
-        self._effects.append(model.BookingChanged(claim.booking.id, state, None if arc is None else arc.id))
-        if arc is not None and arc.held_back is not None and not arc.held_back[1]:
-            self._state.consider_again(arc)
-
-    def _expire_claims(self) -> None:
-        for claim in self._state.claims_over():
-            if claim.booking.end <= self._state.now:
-                self._end_claim(claim, BookingState.USED if claim.is_taken else BookingState.LAPSED)
-            elif not claim.is_taken:
-                self._end_claim(claim, BookingState.LAPSED)
+        return self._state.new_arc(request, place)
 
     def _end_request(self, arc_id: ArcId, outcome: Outcome, reason: Reason) -> None:
         arc = self._state.arc(arc_id)
@@ -404,7 +329,7 @@ class Core:
         self._state.dequeue(arc)
         self._forget(arc)
         self._effects.append(model.Dropped(arc.id, arc.request.client, outcome, reason))
-        self._give_up_claim(arc, outcome, had_it=False)
+        self._claims.give_up(arc, outcome, had_it=False)
 
     def _lose_rc(self, name: str, reason: str) -> None:
         """An RC is gone: each gang it was part of ends as a whole and is queued with its place."""
@@ -413,17 +338,7 @@ class Core:
             self._end_hold(arc, Outcome.LOST, Reason(ReasonCode.RC_LOST, (name,), detail=reason))
         self._state.leave(name)
         self._votes.forget_rc(name)
-        self._keep_others(rc)
-
-    def _keep_others(self, lost: Rc) -> None:
-        """Bookings that any RC of a pattern would do for are kept another one, where there is one that is free then."""
-        for claim in self._state.claims.values():
-            if not claim.kept & lost.bit & ~claim.arc.named_mask or claim.arc.hold is not None:
-                continue
-            arc, start = self._stand_in(claim.booking), claim.booking.start
-            if found := slots(self._state, claim.booking, arc, start, 1).found:
-                claim.kept = arc.named_mask | self._state.mask(found[0].bound.values())
-                self._state.claims_changed()
+        self._claims.keep_others(rc)
 
     def _show_place(self, arc_id: ArcId, place: Place) -> None:
         arc = self._state.arc(arc_id)
@@ -537,9 +452,8 @@ class Core:
             self._effects.append(self._revocation(arc, hold, outcome, broken, requeued=not over))
         else:
             self._state.start(arc, hold)
-        claim = self._state.claims.get(held.request.booking)
-        if claim is not None and not claim.is_taken and self._state.arc(arc.id) is arc:
-            self._link(claim, arc)
+        if self._state.arc(arc.id) is arc:
+            self._claims.take_up(held.request.booking, arc)
         return arc
 
     def _expire(self) -> None:
@@ -598,7 +512,7 @@ class Core:
             self._state.enqueue(arc, self._state.now)
         else:
             self._forget(arc)
-            self._give_up_claim(arc, outcome, had_it=True)
+            self._claims.give_up(arc, outcome, had_it=True)
 
     def _forget(self, arc: Arc) -> None:
         self._state.forget(arc)

@@ -11,6 +11,7 @@ import itertools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
+from zscout.scheduling.claims import request_for
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     ArcRequest,
@@ -107,6 +108,6 @@ def forecast(core: Core, now: Ns, newcomer: ArcRequest | None = None) -> Forecas
         events: list[Event] = [Tick()]
         while dates and dates[0][0] <= now:
             _, name, is_open = dates.pop(0)
-            events += [Requested(booked[name].request())] if is_open else []
+            events += [Requested(request_for(booked[name]))] if is_open else []
         step(events)
     return result

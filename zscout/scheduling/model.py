@@ -17,8 +17,10 @@ from typing import Final, TypeAlias
 
 from msgspec import Struct
 
-from zscout.keyexpr import check_need, is_pattern, matcher
+from zscout.keyexpr import is_pattern, matcher
 from zscout.messages import Who
+from zscout.scheduling.booking import Booked, Booking, BookingChanged, Unbooked
+from zscout.scheduling.needs import check_request
 from zscout.scheduling.reason import SHOWN, Party, Reason
 from zscout.types import SECOND, ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName, Term
 
@@ -38,8 +40,7 @@ class ArcRequest(Struct, frozen=True):
 
     A need names an RC, or is a pattern that any one RC meets (`keyexpr.check_need`).
 
-    Raises ValueError where there are no needs, the minimum runtime is not positive, a parameter is negative,
-    and as `check_patterns` does."""
+    Raises ValueError as `needs.check_request` does."""
 
     arc: ArcId
     client: ClientId
@@ -57,14 +58,7 @@ class ArcRequest(Struct, frozen=True):
     """Who asked, as people are told; the core only prints it."""
 
     def __post_init__(self) -> None:
-        if not self.needs:
-            raise ValueError(f"ARC {self.arc} needs nothing; name at least one RC")
-        if self.min_runtime <= 0:
-            raise ValueError(f"ARC {self.arc}: the minimum runtime must be positive")
-        for params in self.needs.values():
-            if params and any(value < 0 for value in params.values()):
-                raise ValueError(f"ARC {self.arc}: bandwidth parameters must not be negative")
-        check_patterns(self.needs)
+        check_request(f"ARC {self.arc}", self.needs, self.min_runtime)
 
     @property
     def name(self) -> str:
@@ -119,20 +113,6 @@ TRANSITIONS: Final[Mapping[ArcState, tuple[ArcState, ...]]] = {
     ArcState.RUNNING: (ArcState.READY, ArcState.ENDED),
     ArcState.ENDED: (),
 }
-
-
-def check_patterns(needs: Mapping[Need, Params]) -> None:
-    """Raises ValueError (BadName) for a pattern that is none, and where the choice of RCs would decide what
-    is asked of one: its votes must not depend on that."""
-    asked: dict[str, Params] = {}
-    for need, params in needs.items():
-        if not is_pattern(need):
-            continue
-        kind = check_need(need).partition("/")[0]
-        if asked.setdefault(kind, params) != params:
-            raise ValueError(f"patterns of the kind {kind} have different parameters; give all the same")
-    if asked and any(map(is_pattern, asked)) and any(asked.values()):
-        raise ValueError("a pattern that any kind of RC meets can't stand beside parameters; name its kind")
 
 
 @dataclass(slots=True, eq=False)
@@ -239,48 +219,6 @@ class Arc:
     def protected_below(self, now: Ns) -> int | None:
         """The priority below which nobody preempts its hold now; None: any higher priority does."""
         return self.hold.protected_below if self.hold is not None and now < self.hold.end else None
-
-
-class Booking(Struct, frozen=True):
-    """All of `needs` at once, from `start` on for `runtime` ns: a claim with a date. Its owner's request takes it
-    up, or it lapses when nobody has within `patience` ns from the date.
-
-    Raises ValueError as `ArcRequest` does."""
-
-    id: str
-    """Unlike any ARC's."""
-    needs: Mapping[Need, Params]
-    priority: int
-    start: Ns
-    runtime: Ns
-    patience: Ns
-    since: Ns
-    """When it was made: of promises to equals the older stands."""
-    bound: Mapping[Need, RcName] = {}
-    """The RC that is kept for each pattern of its needs."""
-    owner: str = ""
-    """The host or person whose quotas count."""
-    label: str = ""
-    who: Who | None = None
-
-    def __post_init__(self) -> None:
-        self.request()
-
-    def request(self) -> ArcRequest:
-        """One by which its owner takes it up."""
-        client, booking = f"{self.owner}/", self.id
-        return ArcRequest(
-            self.id, client, self.needs, self.priority, self.runtime, label=self.label, booking=booking, who=self.who
-        )
-
-    @property
-    def end(self) -> Ns:
-        return self.start + self.runtime
-
-    @property
-    def lapses(self) -> Ns:
-        """When it is over if nobody takes it up."""
-        return min(self.start + self.patience, self.end)
 
 
 @dataclass(slots=True, eq=False)
@@ -473,18 +411,6 @@ class Adopted(Struct, frozen=True):
     held: RecoveredHold
 
 
-class Booked(Struct, frozen=True):
-    """A booking that was made, by this RCM or an earlier one."""
-
-    booking: Booking
-
-
-class Unbooked(Struct, frozen=True):
-    """A booking is given up. Who has taken it up goes on as if it had asked without."""
-
-    booking: str
-
-
 class Tick(Struct, frozen=True):
     """Time has passed: holds may be over, the quantum may be."""
 
@@ -583,25 +509,6 @@ class Dropped(Struct, frozen=True):
     client: ClientId
     outcome: Outcome
     reason: Reason
-
-
-class BookingState(StrEnum):
-    OPEN = "open"
-    """Nobody has taken it up, or who had is gone before its patience was over."""
-    TAKEN = "taken"
-    USED = "used"
-    """Its ARC is over, or its time."""
-    LAPSED = "lapsed"
-    """Nobody took it up in time."""
-    UNBOOKED = "unbooked"
-
-
-class BookingChanged(Struct, frozen=True):
-    """A booking is in another state; `arc` has taken it up, or had."""
-
-    booking: str
-    state: BookingState
-    arc: ArcId | None = None
 
 
 class WakeAt(Struct, frozen=True):

@@ -12,7 +12,8 @@ from dataclasses import dataclass, field
 from itertools import chain
 from typing import Final, NamedTuple
 
-from zscout.scheduling.model import Arc, Booking, Rc
+from zscout.scheduling.booking import Booking
+from zscout.scheduling.model import Arc, Rc
 from zscout.scheduling.patterns import distinct
 from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.state import SchedulerState

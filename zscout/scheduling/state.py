@@ -16,8 +16,8 @@ from typing import Protocol
 from msgspec import structs
 
 from zscout.config.scheduling_policy import DEFAULT, RcQuota, SchedulingPolicy, StrategyName
-from zscout.keyexpr import matcher
-from zscout.scheduling.model import Arc, ArcState, Claim, Hold, Rank, Rc, union
+from zscout.keyexpr import is_pattern, matcher
+from zscout.scheduling.model import Arc, ArcRequest, ArcState, Claim, Hold, Rank, Rc, union
 from zscout.scheduling.reason import Reason
 from zscout.scheduling.votes import HolderSet, Votes
 from zscout.types import ArcId, ClientId, Need, Ns, Params, Place, RcName
@@ -191,6 +191,19 @@ class SchedulerState:
         arc.needs = {bound.get(need, need): params for need, params in wanted.items() if need not in unbound}
         arc.mask = arc.named_mask | self.mask(bound.values())
         arc.rcs = tuple(self.rcs_in(arc.mask))
+
+    def new_arc(self, request: ArcRequest, place: Place) -> Arc:
+        """An ARC that neither waits nor runs yet. Nobody gets a longer minimum runtime than the policy's `max_runtime`:
+        what is reckoned with it (ranks, reservations) is the shorter."""
+        longest = self.policy.max_runtime
+        if longest is not None and request.min_runtime > longest:
+            request = structs.replace(request, min_runtime=longest)
+        patterns = tuple(filter(is_pattern, request.needs))
+        named = self.mask(need for need in request.needs if need not in patterns)
+        arc = Arc(request, place, named, patterns, named)
+        if patterns:
+            self.bind(arc, {})
+        return arc
 
     def params(self, arc: Arc, rc: Rc) -> Params:
         """What an ARC would ask of an RC, whether it is bound to it at present or not."""

@@ -23,7 +23,7 @@ from zscout.config import strict
 from zscout.config.strict import DURATIONS, BadInput, quoted
 from zscout.keyexpr import BadName, check_name, check_need, is_pattern, valid_name
 from zscout.messages import MAX_NEEDS, MAX_PARAMS, Who
-from zscout.scheduling.model import check_patterns
+from zscout.scheduling.needs import check_patterns
 
 Needs = dict[str, dict[str, Decimal]]
 

@@ -1,0 +1,35 @@
+"""What an ARC or a booking may ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from zscout.keyexpr import check_need, is_pattern
+from zscout.types import Need, Ns, Params
+
+
+def check_request(name: str, needs: Mapping[Need, Params], min_runtime: Ns) -> None:
+    """Raises ValueError where there are no needs, the minimum runtime is not positive, a parameter is negative, and as
+    `check_patterns` does; `name` says of what."""
+    if not needs:
+        raise ValueError(f"{name} needs nothing; name at least one RC")
+    if min_runtime <= 0:
+        raise ValueError(f"{name}: the minimum runtime must be positive")
+    for params in needs.values():
+        if params and any(value < 0 for value in params.values()):
+            raise ValueError(f"{name}: bandwidth parameters must not be negative")
+    check_patterns(needs)
+
+
+def check_patterns(needs: Mapping[Need, Params]) -> None:
+    """Raises ValueError (BadName) for a pattern that is none, and where the choice of RCs would decide what
+    is asked of one: its votes must not depend on that."""
+    asked: dict[str, Params] = {}
+    for need, params in needs.items():
+        if not is_pattern(need):
+            continue
+        kind = check_need(need).partition("/")[0]
+        if asked.setdefault(kind, params) != params:
+            raise ValueError(f"patterns of the kind {kind} have different parameters; give all the same")
+    if asked and any(map(is_pattern, asked)) and any(asked.values()):
+        raise ValueError("a pattern that any kind of RC meets can't stand beside parameters; name its kind")
