@@ -196,6 +196,7 @@ class Keys:
     rc_state_any = _Key("rc/*/*/state")
     frame_any = _Key("rc/*/*/frame")
     load_any = _Key("host/*/load")
+    bookings_any = _Key("host/*/bookings")
     rank = _Key("balancer/rank")
     placements = _Key("placer/placements")
     notice_any = _Key("client/*/*/notice")
@@ -213,7 +214,7 @@ class Keys:
     load = _host_key("load")
     confirm_any = _host_key("confirm/*/*")
     history_any = _host_key("history/*/*")
-    bookings_any = _host_key("bookings/*/*")
+    bookings = _host_key("bookings")
     notice = _sender_key("client", "/notice")
     requests = _sender_key("client", "/requests")
     behavior = _sender_key("client", "/behavior")
@@ -238,10 +239,6 @@ class Keys:
     def history(self, host: str, sender: Sender) -> str:
         """Where a candidate is asked for what its journal keeps."""
         return f"{self.base}/host/{check_name(host, 'host')}/history/{_sender(sender)}"
-
-    def bookings(self, sender: Sender) -> str:
-        """Where all hosts that keep bookings are asked at once."""
-        return f"{self.base}/host/*/bookings/{_sender(sender)}"
 
     def placer(self, sender: Sender) -> str:
         """Where the component placer is asked."""
@@ -333,7 +330,7 @@ def _sender_of(keys: Keys, key: str) -> Sender:
             | ["client", host, client, "notice" | "requests" | "behavior"]
             | ["building", host, client, "plan" | "poses"]
             | ["placer", "component", host, client]
-            | ["host", _, "component" | "confirm" | "history" | "bookings", host, client]
+            | ["host", _, "component" | "confirm" | "history", host, client]
         ):
             return Sender(check_name(host, "host"), check_name(client, "client"))
     raise BadName(f"{key[:200]!r} does not name its sender")
@@ -390,7 +387,7 @@ ACCESS: Final = (
     Access("host/{at}/component/{by}/*", ask=_ALL, serve=NODES),
     Access("host/{at}/confirm/{by}/*", ask=USERS, serve=NODES),
     Access("host/{at}/history/{by}/*", ask=_ALL, serve=_MANAGERS),
-    Access("host/{at}/bookings/{by}/*", ask=_MANAGERS, serve=NODES),
+    Access("host/{at}/bookings", ask=_MANAGERS, serve=NODES),
     Access("balancer/rank", ask=_ALL, serve=_MANAGERS),
     Access("placer/component/{by}/*", ask=_ALL, serve=_MANAGERS),
     Access("placer/placements", publish=_MANAGERS, subscribe=_ALL),

@@ -26,8 +26,10 @@ from zscout.types import NO_TERM, Grant, Term
 
 MAX_BOOKINGS: Final = 1_000
 """In one fleet."""
+MAX_MERGED: Final = 4 * MAX_BOOKINGS
+"""Where several halves of a fleet have booked."""
 MAX_KEPT: Final = 4_000_000
-"""Bytes of all records of a fleet."""
+"""Bytes of all bookings of a fleet."""
 MAX_AHEAD: Final = 366 * 86_400
 """Seconds: nothing is booked later than that."""
 WINDOW: Final = 60 * 86_400
@@ -95,7 +97,7 @@ class FindSlots(Message, frozen=True, tag_field="op", tag="slots"):
     who: Who | None = None
 
 
-class Slot(Message, frozen=True):
+class SlotView(Message, frozen=True):
     """From `start` to `latest` a booking may begin at any time; `bound` has the RC for each pattern."""
 
     start: Instant
@@ -108,11 +110,11 @@ class SlotsTold(Message, frozen=True):
 
     id: str
     time: WallTime
-    slots: list[Slot] = []
+    slots: list[SlotView] = []
     complete: bool = True
 
 
-BookingState: TypeAlias = Literal["open", "taken", "used", "lapsed", "unbooked", "conflict"]
+DateState: TypeAlias = Literal["open", "taken", "used", "lapsed", "unbooked", "conflict"]
 
 
 class BookedDate(Message, frozen=True):
@@ -121,7 +123,7 @@ class BookedDate(Message, frozen=True):
 
     start: Instant
     end: Instant
-    state: BookingState
+    state: DateState
     bound: dict[str, str] = {}
     """The RC that is kept for each pattern."""
     arc: str | None = None
@@ -160,11 +162,15 @@ class BookingRecord(_Booking, frozen=True):
     (given up) and `over` (used, or lapsed). `made` and `changed` are (term, seq) of its making and its last change."""
 
     owner: str = ""
+    since: Instant = 0
+    """When it was made."""
     made: Grant = Grant(NO_TERM, 0)
     changed: Grant = Grant(NO_TERM, 0)
     unbooked: bool = False
     dropped: Dates = []
     over: Dates = []
+    bound: Annotated[dict[int, dict[str, str]], msgspec.Meta(max_length=MAX_DATES)] = {}
+    """By date: the RC that is kept for each pattern of its needs."""
 
 
 class ShareBookings(Message, frozen=True):
@@ -173,7 +179,7 @@ class ShareBookings(Message, frozen=True):
 
     term: Term
     digest: str
-    records: Annotated[list[BookingRecord], msgspec.Meta(max_length=MAX_BOOKINGS)] = []
+    records: Annotated[list[BookingRecord], msgspec.Meta(max_length=MAX_MERGED)] = []
 
 
 class BookingsKept(Message, frozen=True):
@@ -186,7 +192,7 @@ class BookingsKept(Message, frozen=True):
     digest: str
     time: WallTime | None = None
     durable: bool = False
-    records: Annotated[list[BookingRecord], msgspec.Meta(max_length=MAX_BOOKINGS)] = []
+    records: Annotated[list[BookingRecord], msgspec.Meta(max_length=MAX_MERGED)] = []
     version: VersionText = ""
 
 

@@ -1,0 +1,58 @@
+"""The dates of a booking that is repeated: the same hour of the day in its owner's zone, over changes of summer time.
+
+An hour that a day has twice is its first, and one that it has not is taken by the offset before the gap: RFC 5545,
+section 3.3.5, which is what Python's `fold=0` means."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import datetime, timedelta
+from functools import lru_cache
+from itertools import dropwhile, takewhile
+from typing import Final
+from zoneinfo import ZoneInfo
+
+from zscout.messages import MAX_AHEAD, BookingRecord, Instant
+
+DAY: Final = 86_400
+
+
+@lru_cache(256)
+def zone_of(name: str) -> ZoneInfo:
+    """A time zone by its name in the IANA database. Raises ValueError where there is none."""
+    try:
+        return ZoneInfo(name)
+    except (ValueError, KeyError, OSError):
+        raise ValueError(f"{name[:80]!r} is no time zone; write one as in Europe/Berlin, or UTC") from None
+
+
+def dates(booking: BookingRecord, after: float, before: float) -> list[Instant]:
+    """The instants from `after` on and before `before` at which a booking begins, those included that were given up.
+    Raises ValueError for a zone that this host does not know."""
+    if not booking.every:
+        return [booking.start] if after <= booking.start < before else []
+    return [*takewhile(lambda at: at < before, dropwhile(lambda at: at < after, _repeated(booking, after)))]
+
+
+def last_end(booking: BookingRecord) -> float:
+    """When the last of its dates is over, or later."""
+    last = booking.start
+    if booking.every:
+        last = booking.until if booking.until is not None else booking.start + MAX_AHEAD
+    return float(last) + float(booking.runtime)
+
+
+def _repeated(booking: BookingRecord, after: float) -> Iterator[Instant]:
+    """From the last date before `after` on, to the last of all."""
+    zone = zone_of(booking.zone)
+    first = datetime.fromtimestamp(booking.start, zone).replace(tzinfo=None)
+    last = booking.until if booking.until is not None else booking.start + MAX_AHEAD
+    # Days are 23 to 25 hours long: one is begun too early rather than missed.
+    count = max(0, int((after - booking.start) // (booking.every * DAY)) - 1)
+    while True:
+        local = first + timedelta(days=count * booking.every)
+        at = booking.start if count == 0 else round(local.replace(tzinfo=zone).timestamp())
+        if at > last:
+            return
+        yield at
+        count += 1

@@ -1,0 +1,51 @@
+"""Fleet time: what the leader's publications tell, so that all mean the same by a date. Pure.
+
+In a reign it never jumps: it is slewed by at most 1 % towards the median of the hosts' clocks, as `adjtime` does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from statistics import median_low
+from typing import Final
+
+from zscout.types import SECOND, Ns
+
+SLEW: Final = 100
+"""One part in so many."""
+DIFFERS: Final = 2.0
+"""Seconds by which a host's clock may differ before people are told."""
+
+
+def wall_ns(seconds: float) -> Ns:
+    return round(seconds * SECOND)
+
+
+def agreed(times: Iterable[Ns]) -> Ns:
+    """The time of several clocks at one instant: their median, the lower one of two. Raises ValueError for none."""
+    return median_low(times)
+
+
+class FleetClock:
+    """Fleet time on one host's own clock, on which `now` always is."""
+
+    def __init__(self, time: Ns, now: Ns) -> None:
+        """`time`: ns since 1970 (UTC) that it is at `now`."""
+        self._offset = self._aim = time - now
+        self._since = now
+
+    def at(self, now: Ns) -> Ns:
+        """Fleet time, in ns since 1970 (UTC)."""
+        return now + self._slewed(now)
+
+    def local(self, time: Ns, now: Ns) -> Ns:
+        """When it will be that fleet time on the host's clock, if nothing is slewed from now on."""
+        return time - self._slewed(now)
+
+    def aim(self, time: Ns, now: Ns) -> None:
+        """It should be `time` at `now`: goes there slowly."""
+        self._offset, self._since = self._slewed(now), now
+        self._aim = time - now
+
+    def _slewed(self, now: Ns) -> Ns:
+        most = max(0, now - self._since) // SLEW
+        return self._offset + max(-most, min(most, self._aim - self._offset))

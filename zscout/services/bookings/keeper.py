@@ -1,0 +1,189 @@
+"""What one host keeps of the fleet's bookings: in memory, and on its disk if it has a state folder.
+
+Each host that may lead or has RCs is one. It learns of bookings from the leader alone, which asks all at once to keep
+what it has, and hears in the same answer what others have and it has not."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Final, Protocol
+
+import msgspec
+
+from zscout.config.state_folder import write_durably
+from zscout.config.strict import BadInput, read_bytes
+from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused
+from zscout.mesh.supervision import Supervisor
+from zscout.messages import (
+    MAX_MERGED,
+    MAX_STATE,
+    BookingRecord,
+    BookingsKept,
+    Grants,
+    Malformed,
+    ShareBookings,
+    decode,
+    decode_told,
+    encode,
+)
+from zscout.services.bookings.records import Records
+from zscout.types import SECOND, VERSION, Ns
+
+log = logging.getLogger(__name__)
+
+FILE: Final = "bookings.json"
+MAX_SAVING: Final = 16
+"""Answers that wait for the disk at one time."""
+
+
+class _BookingFile(msgspec.Struct):
+    """What is kept on disk."""
+
+    fleet: str
+    records: Annotated[list[msgspec.Raw], msgspec.Meta(max_length=MAX_MERGED)] = []
+
+
+class Disk(Protocol):
+    """Where records outlive their process."""
+
+    def read(self) -> list[BookingRecord]: ...
+    async def write(self, records: list[BookingRecord]) -> None:
+        """They are on disk on return. Raises OSError."""
+
+
+class BookingFile:
+    """A file of one fleet's bookings. A record that can't be read is left out, and told in the log."""
+
+    def __init__(self, folder: Path, fleet: str) -> None:
+        self._path, self._fleet = folder / FILE, fleet
+
+    def read(self) -> list[BookingRecord]:
+        if not self._path.exists():
+            return []
+        try:
+            kept = decode(read_bytes(self._path, max_bytes=MAX_STATE), _BookingFile, MAX_STATE)
+        except (BadInput, Malformed) as error:
+            log.warning("%s can't be read, and is not used: %s", self._path, error)
+            return []
+        if kept.fleet != self._fleet:
+            log.warning("%s is of fleet %s, and is not used", self._path, kept.fleet)
+            return []
+        found = []
+        for raw in kept.records:
+            try:
+                found.append(decode_told(bytes(raw), BookingRecord))
+            except Malformed as error:
+                log.warning("a booking in %s can't be read, and is left out: %s", self._path, error)
+        return found
+
+    async def write(self, records: list[BookingRecord]) -> None:
+        content = encode(_BookingFile(self._fleet, [msgspec.Raw(encode(record)) for record in records]))
+        await asyncio.to_thread(write_durably, self._path, content, 0o600)
+
+
+class BookingKeeper:
+    """`wall`: the host's clock, in seconds since 1970 (UTC)."""
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        disk: Disk | None = None,
+        *,
+        candidate: bool = True,
+        wall: Callable[[], float] = time.time,
+    ) -> None:
+        self.mesh, self.wall, self._disk, self._candidate = mesh, wall, disk, candidate
+        self.records = Records()
+        self.supervisor = Supervisor("what keeps bookings", self._failed)
+        self._offset: Ns | None = None
+        """What fleet time is more than the own clock, as it was heard last."""
+        self._saved = self.records.digest()
+        """What the disk has."""
+        self._saving = asyncio.Lock()
+        self._waiting = 0
+        self._served: Declaration | None = None
+        if disk is not None:
+            self.records.take(disk.read())
+            self._saved = self.records.digest()
+
+    def start(self) -> None:
+        keys, me = self.mesh.keys, self.mesh.me.host
+        guard = self.supervisor.guard
+        self._served = self.mesh.serve(keys.bookings(me), ShareBookings, guard(self._on_shared), limit=MAX_STATE)
+
+    async def stop(self) -> None:
+        if self._served is not None:
+            self._served.close()
+        await self.supervisor.close()
+
+    def _failed(self, _: Exception) -> None:
+        log.error("bookings are not kept here until this node starts anew")
+
+    # Fleet time
+
+    def hear(self, grants: Grants) -> None:
+        """A publication of the leader."""
+        if grants.time is not None:
+            self._offset = round(grants.time * SECOND) - self.mesh.now()
+
+    @property
+    def time(self) -> Ns | None:
+        """Fleet time, in ns since 1970 (UTC), as it goes on here; None: it was never heard."""
+        return None if self._offset is None else self.mesh.now() + self._offset
+
+    # Records
+
+    async def save(self) -> bool:
+        """Whether what is known now is on disk on return; False where there is none, or it fails."""
+        if self._disk is None:
+            return False
+        async with self._saving:
+            digest = self.records.digest()
+            if digest == self._saved:
+                return True
+            try:
+                await self._disk.write(list(self.records))
+            except OSError as error:
+                log.warning("bookings can't be written to disk: %s", error)
+                return False
+            self._saved = digest
+        return True
+
+    def told(self, digest: str, *, durable: bool) -> BookingsKept:
+        """What is kept here, for one who knows what `digest` tells: its records where it may know others."""
+        own, heard = self.records.digest(), self.time
+        return BookingsKept(
+            self.mesh.me.host,
+            self._candidate,
+            self.wall(),
+            own,
+            time=None if heard is None else heard / SECOND,
+            durable=durable,
+            records=[] if own == digest else list(self.records),
+            version=VERSION,
+        )
+
+    def _on_shared(self, query: IncomingQuery[ShareBookings]) -> None:
+        if self._waiting >= MAX_SAVING:
+            raise Refused("busy", "this host is still writing bookings to its disk; ask again")
+        if len(self.records) + len(query.message.records) > 2 * MAX_MERGED:
+            raise Refused("too_many", f"this host keeps {len(self.records)} bookings already")
+        if (heard := self.time) is not None:
+            self.records.forget_old(heard / SECOND)
+        changed = self.records.take(query.message.records)
+        if not changed or self._disk is None:
+            query.answer(self.told(query.message.digest, durable=not changed and self._disk is not None))
+            return
+        self._waiting += 1
+        self.supervisor.spawn(self._answer_saved(query))
+
+    async def _answer_saved(self, query: IncomingQuery[ShareBookings]) -> None:
+        try:
+            durable = await self.save()
+        finally:
+            self._waiting -= 1
+        query.answer(self.told(query.message.digest, durable=durable))
