@@ -34,9 +34,10 @@ from zscout.drivers.registry import driver_for, driver_name
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh import Mesh, MeshError, ZenohMesh
-from zscout.mesh.supervision import StallWatch
+from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.messages import LoadReport
 from zscout.services.authority import Authority
+from zscout.services.bookings.keeper import BookingFile, BookingKeeper
 from zscout.services.journal.journal import Journal
 from zscout.services.metrics.node_figures import NodeFigures
 from zscout.services.node.component_host import ComponentHost
@@ -124,6 +125,15 @@ async def run_services(
             stack.push_async_callback(rc.stop)
             rcs.append(rc)
             log.info("runs %s (%s)", spec.name, driver_name(spec))
+        keeper = BookingKeeper(
+            mesh, BookingFile(kept, node.fleet.name) if kept is not None else None, candidate=node.candidate
+        )
+        if rcs and not node.candidate:
+            # Where RCs are, copies are.
+            keeping = Supervisor("what keeps bookings", fail)
+            keeper.start(keeping)
+            stack.callback(keeper.stop)
+            stack.push_async_callback(keeping.close)
         authority = Authority(node.fleet)
         components = ComponentHost(mesh, node.fleet, node.components, fail, authority=authority)
         if node.load:
@@ -143,7 +153,9 @@ async def run_services(
                 journal = Journal(mesh, kept, node.journal, node.fleet.silence / SECOND)
                 journal.start()
                 stack.push_async_callback(journal.stop)
-            candidate = Candidate(mesh, node.fleet, kept, authority, _places_key(node.fleet), listeners, journal)
+            candidate = Candidate(
+                mesh, node.fleet, kept, authority, _places_key(node.fleet), listeners, journal, keeper
+            )
             if node.notify is not None:
                 notifier = _notifier(node.notify, node.fleet.name, candidate)
                 listeners.append(notifier.holds)

@@ -14,7 +14,7 @@ comes back with what follows from them: votes, and a `Tick` at the latest when `
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Mapping
 
 from msgspec.structs import replace
 
@@ -35,12 +35,13 @@ from zscout.scheduling.model import (
     RcStatus,
     Status,
 )
+from zscout.scheduling.overlaps import Overlaps, overlaps
 from zscout.scheduling.priority import AdmissionCheck, Priority, reasons_of_now
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.slots import SlotsFound, slots
 from zscout.scheduling.state import SchedulerState, Strategy
 from zscout.scheduling.votes import HolderSet
-from zscout.types import NO_TERM, ArcId, ClientId, Grant, Ns, Place, RcName, Term
+from zscout.types import NO_TERM, ArcId, ClientId, Grant, Need, Ns, Place, RcName, Term
 
 
 class Core:
@@ -215,6 +216,35 @@ class Core:
     def slots(self, wanted: Booking, until: Ns, limit: int) -> SlotsFound:
         """The first `limit` stretches of time, from the start of `wanted` to `until`, in which it would be kept."""
         return slots(self._state, wanted, self._claims.stand_in(wanted), until, limit)
+
+    def overlaps(self, order: Iterable[str]) -> Overlaps:
+        """Which bookings can't be beside those that go before them in this order of their ids."""
+        return overlaps(self._state, order)
+
+    def ask_votes(self, unknown: Iterable[tuple[Rc, HolderSet]], wanted: Booking | None = None) -> list[model.Propose]:
+        """Proposals for votes that are to be known of bookings; `wanted` is one that is not made yet."""
+        stranger = None if wanted is None else self._claims.stand_in(wanted)
+        proposals = []
+        for rc, holders in unknown:
+            if (number := self._votes.propose(rc.name, holders, self._state.now)) is not None:
+                arcs = [self._state.voter(one) or stranger for one in sorted(holders)]
+                params = {arc.id: self._state.params(arc, rc) for arc in arcs if arc is not None}
+                proposals.append(model.Propose(number, rc.name, params))
+        return proposals
+
+    def booked(self) -> dict[str, Booking]:
+        """Bookings that are not over, by id."""
+        return {name: claim.booking for name, claim in self._state.claims.items()}
+
+    def taken_by(self, booking: str) -> ArcId | None:
+        """The ARC that has taken up a booking."""
+        claim = self._state.claims.get(booking)
+        return claim.arc.id if claim is not None and claim.is_taken else None
+
+    def bound_of(self, booking: str) -> Mapping[Need, RcName]:
+        """The RCs that are kept, or held, for the patterns of a booking."""
+        claim = self._state.claims.get(booking)
+        return {} if claim is None else claim.booking.bound if claim.arc.hold is None else claim.arc.bound
 
     def bookings(self) -> list[tuple[Booking, ArcId | None]]:
         """Those that are not over, with the ARC that has taken each up."""

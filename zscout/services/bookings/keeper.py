@@ -65,14 +65,14 @@ class BookingFile:
         if not self._path.exists():
             return []
         try:
-            kept = decode(read_bytes(self._path, max_bytes=MAX_STATE), _BookingFile, MAX_STATE)
+            kept: _BookingFile = decode(read_bytes(self._path, max_bytes=MAX_STATE), _BookingFile, MAX_STATE)
         except (BadInput, Malformed) as error:
             log.warning("%s can't be read, and is not used: %s", self._path, error)
             return []
         if kept.fleet != self._fleet:
             log.warning("%s is of fleet %s, and is not used", self._path, kept.fleet)
             return []
-        found = []
+        found: list[BookingRecord] = []
         for raw in kept.records:
             try:
                 found.append(decode_told(bytes(raw), BookingRecord))
@@ -89,16 +89,10 @@ class BookingKeeper:
     """`wall`: the host's clock, in seconds since 1970 (UTC)."""
 
     def __init__(
-        self,
-        mesh: Mesh,
-        disk: Disk | None = None,
-        *,
-        candidate: bool = True,
-        wall: Callable[[], float] = time.time,
+        self, mesh: Mesh, disk: Disk | None = None, *, candidate: bool = True, wall: Callable[[], float] = time.time
     ) -> None:
         self.mesh, self.wall, self._disk, self._candidate = mesh, wall, disk, candidate
         self.records = Records()
-        self.supervisor = Supervisor("what keeps bookings", self._failed)
         self._offset: Ns | None = None
         """What fleet time is more than the own clock, as it was heard last."""
         self._saved = self.records.digest()
@@ -110,18 +104,14 @@ class BookingKeeper:
             self.records.take(disk.read())
             self._saved = self.records.digest()
 
-    def start(self) -> None:
-        keys, me = self.mesh.keys, self.mesh.me.host
-        guard = self.supervisor.guard
-        self._served = self.mesh.serve(keys.bookings(me), ShareBookings, guard(self._on_shared), limit=MAX_STATE)
+    def start(self, supervisor: Supervisor) -> None:
+        """From now on it answers the leader."""
+        self._supervisor, key = supervisor, self.mesh.keys.bookings(self.mesh.me.host)
+        self._served = self.mesh.serve(key, ShareBookings, supervisor.guard(self._on_shared), limit=MAX_STATE)
 
-    async def stop(self) -> None:
+    def stop(self) -> None:
         if self._served is not None:
             self._served.close()
-        await self.supervisor.close()
-
-    def _failed(self, _: Exception) -> None:
-        log.error("bookings are not kept here until this node starts anew")
 
     # Fleet time
 
@@ -174,12 +164,12 @@ class BookingKeeper:
             raise Refused("too_many", f"this host keeps {len(self.records)} bookings already")
         if (heard := self.time) is not None:
             self.records.forget_old(heard / SECOND)
-        changed = self.records.take(query.message.records)
-        if not changed or self._disk is None:
-            query.answer(self.told(query.message.digest, durable=not changed and self._disk is not None))
+        self.records.take(query.message.records)
+        if self._disk is None or self.records.digest() == self._saved:
+            query.answer(self.told(query.message.digest, durable=self._disk is not None))
             return
         self._waiting += 1
-        self.supervisor.spawn(self._answer_saved(query))
+        self._supervisor.spawn(self._answer_saved(query))
 
     async def _answer_saved(self, query: IncomingQuery[ShareBookings]) -> None:
         try:

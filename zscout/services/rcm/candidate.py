@@ -18,12 +18,24 @@ from zscout.keyexpr import RANDOM, BadName, Role, Sender, Token, client_of, new_
 from zscout.mesh import Mesh, Reply, Tally
 from zscout.mesh.supervision import StallWatch, Supervisor, done_within
 from zscout.mesh.terms import LastTerms
-from zscout.messages import MAX_COUNTER, ClientRequests, Grants, RcAsk, RcState, absurd, disbelieved
+from zscout.messages import (
+    MAX_COUNTER,
+    BookingsKept,
+    ClientRequests,
+    Grants,
+    RcAsk,
+    RcState,
+    ShareBookings,
+    absurd,
+    disbelieved,
+)
 from zscout.services.authority import Authority
+from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.journal.journal import Journal
 from zscout.services.placement.component_placer import ComponentPlacer
 from zscout.services.placement.ledger import PlacementLedger
 from zscout.services.placement.load_balancer import LoadBalancer
+from zscout.services.rcm.booking_sharing import credible
 from zscout.services.rcm.digest import HoldListener
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.inventory import Inventory
@@ -57,9 +69,12 @@ class Candidate:
         places_key: bytes | None = None,
         listeners: Sequence[HoldListener] = (),
         journal: Journal | None = None,
+        keeper: BookingKeeper | None = None,
     ) -> None:
         """`folder`: where it keeps what it must know after a restart; None: it does not. `places_key`: that by which
-        the managers of a fleet seal places. `listeners` are told of holds while it leads, `journal` of publications."""
+        the managers of a fleet seal places. `listeners` are told of holds while it leads, `journal` of publications.
+        `keeper` keeps bookings; without one it keeps them in memory, for itself."""
+        self._keeper = keeper or BookingKeeper(mesh)
         self._journal = journal
         self._places_key = places_key
         self._authority = authority or Authority(fleet)
@@ -110,6 +125,8 @@ class Candidate:
             self.ledger.start(self._supervisor)
             self._candidacy.callback(self.inventory.stop)
             self.inventory.start(self._supervisor)
+            self._candidacy.callback(self._keeper.stop)
+            self._keeper.start(self._supervisor)
             for declared in (
                 mesh.subscribe(keys.grants, Grants, guard(self._on_grants)),
                 mesh.watch(keys.alive_any(Role.RCM), guard(self._on_leader)),
@@ -153,6 +170,7 @@ class Candidate:
         known = grants.term == self.known and (self.rcm is None or self.rcm.term == self.known)
         if known or self._see(grants.term):
             self.election.published(grants.term, self.mesh.now())
+            self._keeper.hear(grants)
             if self._journal is not None:
                 self._journal.hear(grants)
 
@@ -254,9 +272,11 @@ class Candidate:
             return False
         term = Term(self.known.counter + 1, new_instance())
         promise_query = RcAsk(promise=term, above=self.mesh.me.host if self._goes_above else None, ordinary=True)
-        rcs, clients = await asyncio.gather(
+        booked = ShareBookings(term, self._keeper.records.digest())
+        rcs, clients, keepers = await asyncio.gather(
             self.mesh.ask(keys.rc_state_any, promise_query, RcState, timeout=self._timeout),
             self.mesh.ask(keys.requests_any, promise_query, ClientRequests, timeout=self._timeout),
+            self.mesh.ask(keys.bookings_any, booked, BookingsKept, timeout=self._timeout),
         )
         refusals = [_refusal(reply, term) for reply in rcs]
         for key, other in filter(None, [*refusals, *(_refusal(reply, term) for reply in clients)]):
@@ -272,7 +292,8 @@ class Candidate:
         now = self.mesh.now()
         states = [aged(state, now - arrived) for state, arrived in answers]
         open_requests = self._credible(clients, lambda one: keys.requests(client_of(one.client)))
-        self._lead(term, states, [one for one, _ in open_requests if one.term in (term, NO_TERM)])
+        asking = [one for one, _ in open_requests if one.term in (term, NO_TERM)]
+        self._lead(term, states, asking, credible(keepers, keys))
         return True
 
     async def _refused(self, key: str, term: Term) -> None:
@@ -296,7 +317,9 @@ class Candidate:
                 log.warning("ignored an answer on %.200r: %s", reply.key, error)
         return messages
 
-    def _lead(self, term: Term, states: list[RcState], open_requests: list[ClientRequests]) -> None:
+    def _lead(
+        self, term: Term, states: list[RcState], open_requests: list[ClientRequests], kept: list[BookingsKept]
+    ) -> None:
         places = Places(self.fleet.name, self._places_key, term)
         recovered = take_over(
             states,
@@ -320,6 +343,8 @@ class Candidate:
             places,
             self.listeners,
             self.tally,
+            self._keeper,
+            kept,
         )
         self.terms_led += 1
         rcm.membership.on_disbelieved = self._disbelieved

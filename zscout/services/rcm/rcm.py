@@ -53,6 +53,8 @@ from zscout.scheduling.model import (
 )
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.authority import Authority
+from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.digest import HoldDigest, HoldListener
 from zscout.services.rcm.inventory import Inventory
 from zscout.services.rcm.membership import Membership, discrepancies
@@ -95,9 +97,11 @@ class Rcm:
         places: Places | None = None,
         listeners: Sequence[HoldListener] = (),
         tally: Tally | None = None,
+        keeper: BookingKeeper | None = None,
+        kept: Sequence[messages.BookingsKept] = (),
     ) -> None:
-        """`inventory` and `authority`: those of its candidate, if it has one. `places`: those that it has recovered.
-        `listeners` are told of holds, and `tally` counts how operations end."""
+        """`inventory`, `authority`, `keeper`: those of its candidate, if it has one. `places`, `kept`: what it has
+        recovered. `listeners` are told of holds, and `tally` counts how operations end."""
         self.mesh, self.fleet, self.term = mesh, fleet, term
         self.supervisor = Supervisor(f"the RCM of term {term.counter}", on_failure)
         self._authority = authority or Authority(fleet)
@@ -127,6 +131,19 @@ class Rcm:
             self.places,
             supervisor,
             receive,
+        )
+        self.bookings = self.requests.bookings = Bookings(
+            mesh,
+            fleet,
+            term,
+            self.core,
+            keeper or BookingKeeper(mesh),
+            kept,
+            self._authority,
+            supervisor,
+            receive,
+            self._propose,
+            self.requests.check_door,
         )
         self._heartbeat = fleet.timing.heartbeat
         self._grants = mesh.publisher(mesh.keys.grants, messages.Grants)
@@ -164,8 +181,9 @@ class Rcm:
                 self._recover(request)
         self.requests.believed = recovered.believed
         lead = LeadTaken(self.term, tuple(recovered.holds), tuple(recovered.waiting))
+        booked = self.bookings.recovered({request.booking for request in requests if request.booking})
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
-        self._decide([*joined, lead], named=recovered.rcs)
+        self._decide([*joined, *booked, lead], named=recovered.rcs)
         for arc in self.core.arcs():
             self._bind(arc)
             if (expecting := recovered.expected.get(request_id(arc))) is not None:
@@ -179,6 +197,7 @@ class Rcm:
             *self.membership.watch(),
             mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, self.term.rcm)),
         ]
+        self.bookings.start()
         self.supervisor.spawn(self._send_heartbeats())
 
     def stop(self) -> None:
@@ -191,6 +210,7 @@ class Rcm:
         if self._own_inventory:
             self.inventory.stop()
         self.registry.close()
+        self.bookings.close()
         self.requests.close()
         self._grants.close()
 
@@ -260,6 +280,7 @@ class Rcm:
                     self._propose(effect)
                 case WakeAt(at):
                     self._set_wake(at)
+        self.bookings.note(events, effects)
         if line := self.core.strategy.log_line():
             log.info("%s", line)
         if self._digest is not None:
@@ -372,17 +393,22 @@ class Rcm:
             trace.write(
                 self.mesh.now(), "publish", term=self.term, seq=number, rcs=holders, instances=instances, ends=ends
             )
-        self._grants.put(messages.Grants(self.term, number, self.seq, every, rcs, revoked, instances, [*begun]))
+        self._grants.put(
+            messages.Grants(
+                self.term, number, self.seq, every, rcs, revoked, instances, [*begun], self.bookings.dates.time
+            )
+        )
         self.seq, self._published = number, self.mesh.now()
 
     # Out: proposals, and ballots in
 
     def _propose(self, effect: Propose) -> None:
-        arcs = ((self.core.arc(arc), params) for arc, params in effect.holders.items())
+        arcs = ((name, self.core.arc(name), params) for name, params in effect.holders.items())
         holders = [
             messages.ProposedHolder(request_id(arc.id), arc.name, arc.request.client, messages.decimals(params))
-            for arc, params in arcs
             if arc is not None
+            else self.bookings.proposed(name, params)
+            for name, arc, params in arcs
         ]
         proposal = messages.Proposal(proposal=effect.proposal, term=self.term, holders=holders)
         # Overdue once; an answer that comes before the query ends still counts.
@@ -462,6 +488,7 @@ def _of(arc: ArcStatus) -> dict[str, Any]:
         "place": arc.place,
         "min_runtime": messages.decimal_seconds(arc.request.min_runtime),
         "who": arc.request.who,
+        "booking": arc.request.booking,
     }
 
 

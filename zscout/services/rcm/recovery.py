@@ -199,6 +199,7 @@ def _request(arc: str, client: str, needs: dict[str, Amounts], source: OpenReque
         keep=source.keep,
         label=source.arc,
         direct=source.direct,
+        booking=source.booking,
         who=source.who,
     )
 

@@ -139,6 +139,7 @@ class RequestRegistry:
         known = {
             "priority": request.priority,
             "who": request.who,
+            "booking": request.booking,
             "place": arc.place,
             "seal": self._places.seal(arc.place, arc_id),
         }

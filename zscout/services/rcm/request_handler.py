@@ -10,6 +10,8 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from typing import TypeAlias
 
+from msgspec.structs import replace
+
 from zscout.config.fleet import Fleet, RcmLimits
 from zscout.keyexpr import BadName, Sender, check_name, check_need, client_of
 from zscout.mesh import IncomingQuery, Mesh, Refused
@@ -17,8 +19,11 @@ from zscout.mesh.sparse_log import SparseLog
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import (
     MAX_PARAMS,
+    Amounts,
     Ask,
+    Book,
     Cancel,
+    FindSlots,
     Foresee,
     Foresight,
     HandOver,
@@ -26,6 +31,7 @@ from zscout.messages import (
     Operation,
     Parameters,
     Release,
+    Unbook,
     Who,
     absurd,
     duration,
@@ -50,6 +56,7 @@ from zscout.scheduling.model import (
 )
 from zscout.scheduling.reason import Party, named
 from zscout.services.authority import Authority
+from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.devices import ExpectedDevices
 from zscout.services.rcm.door import check_door
 from zscout.services.rcm.membership import Membership
@@ -94,6 +101,8 @@ class RequestHandler:
         self._flush_guarded = supervisor.guard(self.flush)
         self._emit = emit
         """Takes the events of one instant."""
+        self.bookings: Bookings
+        """Those of this term."""
         self.waiting: dict[ArcId, list[Query]] = {}
         """Operations that are not answered yet, by ARC."""
         self.given_up: set[ArcId] = set()
@@ -138,6 +147,8 @@ class RequestHandler:
                 self._find_new_client(query, operation, client)
             case Foresee():
                 self._forecast(query, operation, sender)
+            case Book() | Unbook() | FindSlots():
+                self.bookings.handler.on_operation(query)
 
     def _ask(self, query: Query, ask: Ask, sender: Sender, client: ClientId) -> None:
         if ask.term is not None and ask.term > self.core.term:
@@ -147,7 +158,9 @@ class RequestHandler:
         arc = arc_id(client, ask.id)
         self._keep_order(arc)
         self._authority.check_ask(sender, ask, lambda names: self._open_of(names, arc))
-        if self._may_hold(arc, ask) and self._membership.awaits(arc, ask.rcs) and len(self._deferred) < MAX_BATCH:
+        undecided = self._may_hold(arc, ask) and self._membership.awaits(arc, ask.rcs)
+        undecided = undecided or bool(ask.booking and not self.bookings.settled)
+        if undecided and len(self._deferred) < MAX_BATCH:
             self._defer(query)
         elif arc in self.waiting:
             self.waiting[arc].append(query)
@@ -172,11 +185,13 @@ class RequestHandler:
         answered."""
         self._check_room(sender.host, client)
         request = admit(ask, client, arc, self.core, self.limits, self._authority.known_as(sender, ask.who))
+        if ask.booking:
+            request = replace(request, booking=self.bookings.handler.take_up(ask, sender))
         place, replaced, since = None, None, None
         if ask.place is not None and (place := self._own_place(ask, client)) is not None:
             since = self.mesh.now() - round(ask.waited * SECOND)
         elif ask.check and ask.place is None and ask.grant is None:
-            self._check_door(ask)
+            self.check_door(ask.needs, waits=ask.wait_for_device)
         self._registry.enter(arc, ask.arc, estimate=ask.estimate)
         asked = Requested(request, place, since)
         if self._may_hold(arc, ask):
@@ -204,10 +219,10 @@ class RequestHandler:
         self._strange.warning(client, "%s shows a place that is not its own: it has none for that", client)
         return None
 
-    def _check_door(self, ask: Ask | Foresee) -> None:
+    def check_door(self, needs: Mapping[str, Amounts], *, waits: bool = False) -> None:
         """Raises Refused for what can never start."""
-        waits = ask.wait_for_device or self.mesh.now() < self._knows_all
-        check_door(ask.needs, self._devices.names, self._membership.is_known, self._parameters, waits=waits)
+        waits = waits or self.mesh.now() < self._knows_all
+        check_door(needs, self._devices.names, self._membership.is_known, self._parameters, waits=waits)
 
     def _parameters(self, rc: RcName) -> Parameters | None:
         state = self._membership.reported(rc)
@@ -300,7 +315,7 @@ class RequestHandler:
         self._authority.check_ask(sender, asked, lambda names: self._open_of(names, arc))
         request = admit(asked, str(sender), arc, self.core, self.limits)
         if asked.check:
-            self._check_door(asked)
+            self.check_door(asked.needs, waits=asked.wait_for_device)
         expected = forecast(self.core, now, request)
         start = expected.starts.get(arc)
         victims = [known.request for known in map(self.core.arc, expected.preempts) if known is not None]

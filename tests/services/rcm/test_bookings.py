@@ -1,0 +1,354 @@
+"""Bookings on a mesh in memory: made, kept by others, taken up, given up; over changes of leader, partitions and
+restarts."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from decimal import Decimal
+from typing import Any, TypeVar
+
+import pytest
+from msgspec.structs import replace
+
+from tests.mesh.kit import run, until
+from tests.services.rcm.kit import FakeClient, FakeFleet, Refusal, request
+from zscout.messages import (
+    Book,
+    BookingRecord,
+    BookingsAsk,
+    BookingsTold,
+    BookingView,
+    FindSlots,
+    Operation,
+    SlotsTold,
+    Unbook,
+)
+from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.rcm.candidate import Candidate
+
+R = TypeVar("R")
+NOON = 1_800_000_000.0
+"""Seconds since 1970 at the beginning of each story."""
+
+
+class Disk:
+    """What outlives a process, in memory."""
+
+    def __init__(self) -> None:
+        self.records: list[BookingRecord] = []
+        self.broken = False
+
+    def read(self) -> list[BookingRecord]:
+        return list(self.records)
+
+    async def write(self, records: list[BookingRecord]) -> None:
+        if self.broken:
+            raise OSError("no space left")
+        self.records = list(records)
+
+
+class BookedFleet(FakeFleet):
+    """Candidates with disks and clocks of their own."""
+
+    def __init__(self, *candidates: str) -> None:
+        super().__init__(*candidates, strategy="adaptive")
+        self.disks: dict[str, Disk] = {}
+        self.ahead: dict[str, float] = {}
+        """By how many seconds a host's clock is ahead."""
+        loop = asyncio.get_running_loop()
+        begun = loop.time()
+        self.time: Callable[[], float] = lambda: NOON + loop.time() - begun
+
+    def candidate(self, host: str, *_: Any, **how: Any) -> Candidate:
+        disk = self.disks.setdefault(host, Disk())
+        mesh = self.mesh(host)
+        ahead = self.ahead.get(host, 0.0)
+        keeper = BookingKeeper(mesh, disk, wall=lambda: self.time() + ahead)
+        candidate = Candidate(mesh, self.fleet, keeper=keeper, **how)
+        candidate.start()
+        return candidate
+
+    async def bookings(self, **asked: Any) -> dict[str, BookingView]:
+        key = self.watcher.keys.rcm_bookings
+        reply = await self.watcher.ask_one(key, BookingsAsk(**asked), BookingsTold, timeout=1)
+        assert reply is not None
+        assert reply.message is not None, reply.problem
+        return {view.id: view for view in reply.message.bookings}
+
+
+async def do(client: FakeClient, operation: Operation, kind: type[R]) -> R:
+    reply = await client.mesh.ask_one(client.mesh.keys.schedule(client.mesh.me), operation, kind, timeout=10)
+    assert reply is not None, "the RCM did not answer"
+    if reply.message is None:
+        assert reply.problem is not None
+        raise Refusal(reply.problem)
+    return reply.message
+
+
+def book(name: str, *needs: str, at: float, seconds: float = 100, **more: Any) -> Book:
+    """A booking whose id is its name; `at`: seconds after the beginning of the story."""
+    wanted = request(name, *needs).needs
+    settings = {"priority": 0, "patience": Decimal(20), **more}
+    return Book(id=name, name=name, needs=wanted, start=round(NOON + at), runtime=Decimal(str(seconds)), **settings)
+
+
+async def led(fleet: BookedFleet, *hosts: str) -> list[Candidate]:
+    """Candidates, of which one leads, and two robots that count as there."""
+    candidates = [fleet.candidate(host) for host in hosts]
+    robots = [fleet.rc(f"robot/{name}") for name in "ab"]
+    await until(lambda: any(one.rcm for one in candidates))
+    await fleet.joined(*robots)
+    return candidates
+
+
+def states(view: BookingView) -> list[str]:
+    return [date.state for date in view.dates]
+
+
+def test_a_booking_is_kept_by_another_candidate_and_taken_up_at_its_date() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        await led(fleet, "x", "y")
+        client, other = fleet.client("one"), fleet.client("two")
+        made = await do(client, book("b", "robot/a", "robot/*", at=50), BookingView)
+        assert states(made) == ["open"]
+        assert made.dates[0].bound == {"robot/*": "robot/b"}
+        assert made.owner == "desk"
+        # It is on both disks before it is acknowledged.
+        assert [record.id for disk in fleet.disks.values() for record in disk.records] == ["b", "b"]
+        # Who would not be over by then waits, and who would be runs.
+        assert (await other.ask("long", "robot/a", seconds=60)).state == "queued"
+        assert (await other.ask("short", "robot/a", seconds=20)).state == "running"
+        waits = await client.ask("mine", "robot/a", "robot/*", seconds=100, booking="b")
+        assert waits.state == "queued"
+        assert waits.booking == f"b@{round(NOON + 50)}"
+        assert states((await fleet.bookings())["b"]) == ["taken"]
+        await asyncio.sleep(NOON + 50 - fleet.time() + 0.01)
+        await until(lambda: client.notices[-1].state == "running")
+        assert client.notices[-1].rcs == ["robot/a", "robot/b"]
+        assert client.notices[-1].remaining == pytest.approx(100, abs=0.1)
+
+    run(story())
+
+
+def test_slots_are_the_times_between_bookings() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x")
+        await led(fleet, "x")
+        client = fleet.client("one")
+        await do(client, book("b", "robot/a", at=50), BookingView)
+        await do(client, book("c", "robot/b", at=250), BookingView)
+        needs = request("s", "robot/a", "robot/b").needs
+        asked = FindSlots("s", needs, 0, Decimal(60), within=1_000)
+        told = await do(client, asked, SlotsTold)
+        assert told.complete
+        assert [(slot.start - NOON, slot.latest - NOON) for slot in told.slots] == [
+            (150, 190),
+            (350, pytest.approx(1_000, abs=2)),
+        ]
+        with pytest.raises(Refusal, match="not_free.*robot/a.*booked then: b of desk"):
+            await do(client, book("d", "robot/a", at=100), BookingView)
+        assert (await do(client, Unbook("b"), BookingView)).unbooked
+        await do(client, book("d", "robot/a", at=100), BookingView)
+        # The same again is the same booking.
+        assert (await do(client, book("d", "robot/a", at=100), BookingView)).id == "d"
+        assert set(await fleet.bookings()) == {"c", "d"}
+
+    run(story())
+
+
+def test_votes_decide_about_a_sharable_rc() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x")
+        await led(fleet, "x")
+        radio = fleet.rc("radio/rf0", accept=True)
+        await fleet.joined(radio)
+        client = fleet.client("one")
+        await do(client, book("b", "radio/rf0:5", at=50), BookingView)
+        await do(client, book("c", "radio/rf0:5", at=60), BookingView)
+        assert {one.id.partition("@")[0] for one in radio.proposals[-1].holders} == {"b", "c"}
+        radio.accept = False
+        with pytest.raises(Refusal, match="not_free"):
+            await do(client, book("d", "radio/rf0:5", at=70), BookingView)
+        radio.accept = None
+        with pytest.raises(Refusal, match="busy"):
+            await do(client, book("e", "radio/rf0:1", at=55, seconds=10), BookingView)
+
+    run(story())
+
+
+def test_a_booking_outlives_its_leader_and_its_taker_goes_on() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        leader, heir = await led(fleet, "x", "y")
+        client = fleet.client("one")
+        await do(client, book("b", "robot/a", at=50, every=1, until=round(NOON + 86_400 * 3 + 50)), BookingView)
+        waits = await client.ask("mine", "robot/a", seconds=100, booking="b")
+        fleet.network.kill(leader.mesh)
+        await until(lambda: heir.rcm)
+        view = (await fleet.bookings())["b"]
+        assert states(view) == ["open", "open", "open", "open"]
+        # Its client asks again, by the name that it was told.
+        again = await client.ask("mine", "robot/a", seconds=100, place=waits.place, booking=waits.booking)
+        assert again.state == "queued"
+        assert states((await fleet.bookings())["b"]) == ["taken", "open", "open", "open"]
+        await asyncio.sleep(NOON + 51 - fleet.time())
+        assert client.notices[-1].state == "running"
+        await asyncio.sleep(100)
+        assert states((await fleet.bookings())["b"]) == ["open", "open", "open"]
+        assert fleet.disks["y"].records[0].over == [round(NOON + 50)]
+
+    run(story())
+
+
+def test_a_fleet_restarted_whole_reads_its_bookings() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        both = await led(fleet, "x", "y")
+        client = fleet.client("one")
+        await do(client, book("b", "robot/a", at=500), BookingView)
+        await do(client, book("gone", "robot/b", at=500), BookingView)
+        fleet.network.kill(both[1].mesh)
+        await asyncio.sleep(3)
+        await do(client, Unbook("gone"), BookingView)
+        fleet.network.kill(both[0].mesh)
+        await asyncio.sleep(60)
+        # The one that had not heard of it leads at first.
+        second = fleet.candidate("y")
+        await until(lambda: second.rcm)
+        fleet.candidate("x")
+        await asyncio.sleep(5)
+        views = await fleet.bookings()
+        assert set(views) == {"b"}
+        assert views["b"].dates[0].start == NOON + 500
+
+    run(story())
+
+
+def test_two_halves_book_the_same_and_the_earlier_of_the_higher_priority_stands() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        x, y = await led(fleet, "x", "y")
+        assert x.rcm is not None
+        here, there = fleet.client("here", "x"), fleet.client("there", "y")
+        await do(here, book("both", "robot/b", at=900), BookingView)
+        far = fleet.rc("robot/far")
+        await fleet.joined(far)
+        fleet.network.cut_where(lambda one, other: one.startswith("y/") is not other.startswith("y/"))
+        await until(lambda: y.rcm)
+        await do(here, book("low", "robot/a", at=500), BookingView)
+        await do(here, book("high", "robot/b", at=500, priority=5), BookingView)
+        with pytest.raises(Refusal, match="not_kept"):
+            # Its only other candidate is seen no more, and so its disk has to do, which fails.
+            fleet.disks["x"].broken = True
+            await do(here, book("lost", "robot/far", at=500), BookingView)
+        fleet.disks["x"].broken = False
+        await do(there, book("higher", "robot/a", at=500, priority=2), BookingView)
+        await do(there, book("lower", "robot/b", at=550, priority=4), BookingView)
+        await do(there, Unbook("both"), BookingView)
+        fleet.network.heal()
+        await asyncio.sleep(70)
+        views = await fleet.bookings()
+        assert {name: states(view) for name, view in views.items()} == {
+            "low": ["conflict"],
+            "high": ["open"],
+            "higher": ["open"],
+            "lower": ["conflict"],
+        }
+        assert views["low"].dates[0].danger == "higher of y stands"
+        # Where that one is given up the other stands.
+        await do(there, Unbook("higher"), BookingView)
+        await asyncio.sleep(1)
+        assert states((await fleet.bookings())["low"]) == ["open"]
+
+    run(story())
+
+
+@pytest.mark.parametrize("ahead", [3_600, -3_600])
+def test_a_leader_whose_clock_is_an_hour_off_goes_on_in_the_time_of_the_fleet(ahead: float) -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y", "z")
+        fleet.ahead["y"] = ahead
+        x, y, _ = await led(fleet, "x", "y", "z")
+        client = fleet.client("one")
+        await do(client, book("b", "robot/a", at=200), BookingView)
+        fleet.network.kill(x.mesh)
+        await until(lambda: y.rcm)
+        await client.ask("mine", "robot/a", seconds=100, booking="b")
+        await asyncio.sleep(NOON + 199 - fleet.time())
+        assert client.notices[-1].state == "queued"
+        await asyncio.sleep(2)
+        assert client.notices[-1].state == "running"
+        reply = await fleet.watcher.ask_one(fleet.watcher.keys.rcm_bookings, BookingsAsk(), BookingsTold, timeout=1)
+        assert reply is not None
+        assert reply.message is not None
+        assert reply.message.clocks == {"y": pytest.approx(ahead, abs=2)}
+
+    run(story())
+
+
+def test_what_is_no_booking_is_refused_in_one_line() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x")
+        await led(fleet, "x")
+        client = fleet.client("one")
+        good = book("b", "robot/a", at=50)
+        for wrong, code in [
+            (replace(good, start=round(NOON - 100)), "bad_date"),
+            (replace(good, start=round(NOON + 400 * 86_400)), "bad_date"),
+            (replace(good, every=1), "bad_date"),
+            (replace(good, every=1, until=round(NOON + 86_400 * 9), runtime=Decimal(86_000)), "bad_date"),
+            (replace(good, zone="Europe/Nowhere"), "bad_request"),
+            (replace(good, zone="../../etc/passwd"), "bad_request"),
+            (replace(good, needs={"robot": {}}), "bad_name"),
+            (replace(good, runtime=Decimal(0)), "bad_request"),
+            (replace(good, runtime=Decimal("1e400")), "bad_request"),
+            (replace(good, priority=10**9), "bad_request"),
+            (replace(good, maintenance=True, needs={"robot/*": {}}), "bad_request"),
+        ]:
+            with pytest.raises(Refusal) as refusal:
+                await do(client, wrong, BookingView)
+            assert refusal.value.code in {code, "bad_request"}, wrong
+        with pytest.raises(Refusal, match="unknown_booking"):
+            await do(client, Unbook("nobody"), BookingView)
+        await do(client, good, BookingView)
+        with pytest.raises(Refusal, match="bad_request.*needs"):
+            await client.ask("mine", "robot/b", booking="b")
+        with pytest.raises(Refusal, match="unknown_booking"):
+            await client.ask("mine", "robot/a", booking="c")
+        assert set(await fleet.bookings()) == {"b"}
+
+    run(story())
+
+
+def test_other_strategies_keep_no_bookings() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x")
+        fleet.fleet = replace(fleet.fleet, strategy="priority")
+        await led(fleet, "x")
+        with pytest.raises(Refusal, match='wrong_strategy.*"adaptive"'):
+            await do(fleet.client("one"), book("b", "robot/a", at=50), BookingView)
+
+    run(story())
+
+
+def test_fleet_time_does_not_jump_in_a_reign() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y", "z")
+        fleet.ahead |= {"y": 10.0, "z": 10.0}
+        x = fleet.candidate("x")
+        await until(lambda: x.rcm)
+        assert x.rcm is not None
+        dates = x.rcm.bookings.dates
+        assert dates.time == pytest.approx(fleet.time(), abs=0.1)
+        fleet.candidate("y"), fleet.candidate("z")
+        last, at = dates.time, fleet.time()
+        for _ in range(1_500):
+            await asyncio.sleep(1)
+            gone = dates.time - last
+            assert 0.989 < gone / (fleet.time() - at) < 1.011
+            last, at = dates.time, fleet.time()
+        assert dates.time == pytest.approx(fleet.time() + 10, abs=0.1)
+
+    run(story())

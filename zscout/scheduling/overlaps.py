@@ -1,0 +1,57 @@
+"""Which bookings can't be beside those that go before them, where two halves of a fleet have booked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+from zscout.scheduling.model import Claim, Rc
+from zscout.scheduling.state import SchedulerState
+from zscout.scheduling.votes import HolderSet
+
+
+@dataclass(slots=True)
+class Overlaps:
+    losers: dict[str, str] = field(default_factory=dict)
+    """Bookings that can't be, each with one that goes before it."""
+    unknown: list[tuple[Rc, HolderSet]] = field(default_factory=list)
+    """Votes that have to be known before all can be told."""
+
+
+def overlaps(state: SchedulerState, order: Iterable[str]) -> Overlaps:
+    """Of claims in the order in which they stand. RCs that are absent are not judged: whether one is sharable is known
+    once it is there."""
+    result = Overlaps()
+    standing: dict[int, list[Claim]] = {}
+    for name in order:
+        if (claim := state.claims.get(name)) is None:
+            continue
+        rcs = [rc for rc in state.rcs_in(claim.kept) if rc.present]
+        for rc in rcs:
+            before = [one for one in standing.get(rc.bit, ()) if _meet(one, claim)]
+            if before and (not rc.sharable or _refused(state, rc, claim, before, result)):
+                result.losers[name] = before[0].booking.id
+                break
+        else:
+            for rc in rcs:
+                standing.setdefault(rc.bit, []).append(claim)
+    return result
+
+
+def _meet(one: Claim, other: Claim) -> bool:
+    return one.booking.start < other.booking.end and other.booking.start < one.booking.end
+
+
+def _refused(state: SchedulerState, rc: Rc, claim: Claim, before: list[Claim], result: Overlaps) -> bool:
+    """Whether the RC would refuse it beside the others, at any time of it."""
+    for time in sorted({claim.booking.start, *(one.booking.start for one in before)}):
+        if not claim.booking.start <= time < claim.booking.end:
+            continue
+        there = [one for one in (*before, claim) if one.booking.start <= time < one.booking.end]
+        holders = frozenset(one.arc.id for one in there)
+        answer = state.votes.known(rc.name, holders)
+        if answer is None:
+            result.unknown.append((rc, holders))
+        elif not answer.accept:
+            return True
+    return False

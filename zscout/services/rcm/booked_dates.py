@@ -1,0 +1,251 @@
+"""The dates of bookings in the core of a leader: as claims, as the records that are kept say it.
+
+What of two halves of a fleet can't both be is not in the core: higher priority stands, then what was made earlier."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Collection, Iterable
+from typing import NamedTuple
+
+from msgspec.structs import replace
+
+from zscout.keyexpr import check_need, is_pattern
+from zscout.mesh.sparse_log import SparseLog
+from zscout.messages import WINDOW, BookedDate, BookingRecord, BookingView, DateState, Instant, duration, exact_amounts
+from zscout.scheduling.booking import Booked, Booking, BookingChanged, BookingState, Unbooked
+from zscout.scheduling.core import Core
+from zscout.scheduling.model import Effect, Event, Propose, Rc, RcJoined, Vote, VoteOverdue
+from zscout.scheduling.votes import HolderSet
+from zscout.services.bookings.dates import dates
+from zscout.services.bookings.fleet_clock import FleetClock
+from zscout.services.bookings.records import Records
+from zscout.types import SECOND, ArcId, Grant, Need, Ns, RcName
+
+log = logging.getLogger(__name__)
+
+REDATED: Ns = SECOND // 50
+"""By how much fleet time is slewed before dates are put right."""
+OVER = (BookingState.USED, BookingState.LAPSED)
+
+
+class Date(NamedTuple):
+    """One date of a booking."""
+
+    record: BookingRecord
+    start: Instant
+
+    @property
+    def id(self) -> str:
+        """The core's name of it."""
+        return f"{self.record.id}@{self.start}"
+
+    @property
+    def bound(self) -> dict[Need, RcName]:
+        return self.record.bound.get(self.start, {})
+
+    @property
+    def rank(self) -> tuple[int, Grant, str, Instant]:
+        """Of two that can't both be the lesser stands."""
+        return -self.record.priority, self.record.made, self.record.id, self.start
+
+
+class BookedDates:
+    """`emit` takes events of one instant, `vote` sends proposals, `changed` is told of records that are not as they
+    were."""
+
+    def __init__(
+        self,
+        core: Core,
+        records: Records,
+        clock: FleetClock,
+        now: Callable[[], Ns],
+        emit: Callable[..., None],
+        vote: Callable[[Iterable[Propose]], None],
+        changed: Callable[[Iterable[BookingRecord]], None],
+    ) -> None:
+        self._core, self._records, self.clock, self._now = core, records, clock, now
+        self._emit, self._vote, self._changed = emit, vote, changed
+        self._strange = SparseLog(log, now)
+        self._conflicts: dict[str, str] = {}
+        """Dates that are not in the core, with the one that stands; nothing where no RC of a pattern is free."""
+        self._danger: dict[str, str] = {}
+        """Why dates may not be kept, in words."""
+        self._dated_by: Ns = clock.at(now()) - now()
+        """By how much fleet time is ahead of the host's clock for all dates in the core, so that what follows upon
+        another does so there as well."""
+        self._waits_for_votes = False
+
+    @property
+    def time(self) -> float:
+        """Fleet time, in seconds since 1970 (UTC)."""
+        return self.clock.at(self._now()) / SECOND
+
+    def local(self, instant: Instant) -> Ns:
+        """When that is, on the core's clock."""
+        return instant * SECOND - self._dated_by
+
+    def to_fleet(self, time: Ns) -> Ns:
+        """The same the other way: ns since 1970 (UTC)."""
+        return time + self._dated_by
+
+    def claim(self, date: Date, *, taken: bool = False) -> Booking:
+        """As the core takes it; one that is `taken` has no patience to lapse by. Raises ValueError for a record that
+        is none."""
+        record = date.record
+        for need in record.needs:
+            check_need(need)
+        runtime = duration(record.runtime, "runtime")
+        return Booking(
+            date.id,
+            {need: exact_amounts(params) for need, params in record.needs.items()},
+            record.priority,
+            self.local(date.start),
+            runtime,
+            runtime if taken else duration(record.patience, "patience"),
+            self.local(record.since),
+            date.bound,
+            record.owner,
+            record.name,
+            record.who,
+        )
+
+    def open_dates(self, record: BookingRecord) -> list[Date]:
+        """Those of a booking within the next 60 days that are not over."""
+        if record.unbooked:
+            return []
+        time = self.time
+        try:
+            starts = dates(record, time - float(record.runtime), time + WINDOW)
+        except (ValueError, OverflowError) as error:
+            self._strange.warning(record.id, "booking %s is not kept: %s", record.id, error)
+            return []
+        final = {*record.dropped, *record.over}
+        return [Date(record, start) for start in starts if start not in final]
+
+    # The core's claims
+
+    def recovered(self, taken: Collection[str]) -> list[Event]:
+        """The events by which a core that begins to lead knows of all dates; `taken`: those that ARCs have taken up."""
+        return [booked for date in self._all() if (booked := self._booked(date, taken=date.id in taken)) is not None]
+
+    def _all(self) -> list[Date]:
+        return sorted((date for record in self._records for date in self.open_dates(record)), key=lambda one: one.rank)
+
+    def _booked(self, date: Date, *, taken: bool = False) -> Booked | None:
+        try:
+            return Booked(self.claim(date, taken=taken))
+        except ValueError as error:
+            self._strange.warning(date.record.id, "booking %s is not kept: %s", date.record.id, error)
+            return None
+
+    def reconcile(self) -> None:
+        """Brings the core's claims to what the records say, and finds which can't be."""
+        wanted = {date.id: date for date in self._all()}
+        known = self._core.booked()
+        gone = [Unbooked(name) for name in known if name not in wanted]
+        coming = [self._booked(date) for name, date in wanted.items() if name not in known and not _unbound(date)]
+        if events := [*gone, *filter(None, coming)]:
+            self._emit(*events)
+        for date in wanted.values():
+            if date.id not in known and _unbound(date):
+                self._bind(date, "")
+        self._judge(wanted)
+        self._conflicts = {name: by for name, by in self._conflicts.items() if name in wanted}
+        self._danger = {name: why for name, why in self._danger.items() if name in wanted}
+
+    def _judge(self, wanted: dict[str, Date]) -> None:
+        known = self._core.booked()
+        found = self._core.overlaps(name for name in wanted if name in known)
+        self._waits_for_votes = bool(found.unknown)
+        self.ask(found.unknown)
+        for name in self._conflicts.keys() & known.keys() - found.losers.keys():
+            del self._conflicts[name]
+        for name, by in found.losers.items():
+            self._emit(Unbooked(name))
+            self._bind(wanted[name], by)
+
+    def _bind(self, date: Date, by: str) -> None:
+        """Enters a date with RCs for its patterns that are free then; if there are none, `by` is in its way."""
+        if any(map(is_pattern, date.record.needs)):
+            record = replace(date.record, bound={})
+            if (booked := self._booked(Date(record, date.start))) is None:
+                return
+            found = self._core.slots(booked.booking, booked.booking.start, 1)
+            if found.unknown:
+                self._waits_for_votes = True
+                self.ask(found.unknown, booked.booking)
+            elif found.found:
+                bound = {**date.record.bound, date.start: dict(found.found[0].bound)}
+                self._conflicts.pop(date.id, None)
+                new = self.change(date.record, bound=bound)
+                if (again := self._booked(Date(new, date.start))) is not None:
+                    self._emit(again)
+                return
+        if date.id not in self._conflicts:
+            log.warning("booking %s (%s) can't be kept: %s stands", date.id, date.record.name, by or "another")
+        self._conflicts[date.id] = by
+
+    def ask(self, unknown: Iterable[tuple[Rc, HolderSet]], wanted: Booking | None = None) -> None:
+        """Has RCs vote; `wanted` is not among the claims yet."""
+        self._vote(self._core.ask_votes(unknown, wanted))
+
+    def redate(self) -> None:
+        """Puts right the dates that fleet time, which was slewed, has moved."""
+        # Redated: with the core's next step.
+
+    def change(self, record: BookingRecord, **to: object) -> BookingRecord:
+        """The record, changed in this term."""
+        changed = Grant(self._core.term, self._core.number())
+        new = replace(record, changed=changed, **to)
+        self._records.take([new])
+        self._changed([new])
+        return self._records.get(record.id) or new
+
+    def note(self, events: Iterable[Event], effects: Iterable[Effect]) -> bool:
+        """What became of dates in an instant; whether `reconcile` is to be called, in another one."""
+        over: dict[str, list[Instant]] = {}
+        for effect in effects:
+            match effect:
+                case BookingChanged(booking=name, state=state) if state in OVER:
+                    booking, _, start = name.partition("@")
+                    over.setdefault(booking, []).append(int(start))
+        for booking, starts in over.items():
+            if (record := self._records.get(booking)) is not None:
+                self.change(record, over=sorted({*record.over, *starts}))
+        votes = self._waits_for_votes and any(isinstance(event, (Vote, VoteOverdue)) for event in events)
+        return bool(over) or votes or any(isinstance(event, RcJoined) for event in events)
+
+    # For people and programs
+
+    def standing(self, record: BookingRecord) -> list[Date]:
+        """The dates of a booking that are in the core."""
+        known = self._core.booked()
+        return [date for date in self.open_dates(record) if date.id in known]
+
+    def view(self, record: BookingRecord) -> BookingView:
+        known, runtime = self._core.booked(), float(record.runtime)
+        told = []
+        for date in self.open_dates(record):
+            taken = self._core.taken_by(date.id)
+            by = self._conflicts.get(date.id)
+            state: DateState = "open" if taken is None else "taken"
+            danger = self._danger.get(date.id, "")
+            if date.id not in known:
+                state = "conflict"
+                danger = f"{self._name(by)} stands" if by else "no RC that would do is free then"
+            bound = dict(self._core.bound_of(date.id)) or date.bound
+            told.append(BookedDate(date.start, date.start + round(runtime), state, bound, taken, danger))
+        fields = {name: getattr(record, name) for name in BookingView.__struct_fields__ if name != "dates"}
+        return BookingView(**fields, dates=told)
+
+    def _name(self, date: str) -> str:
+        record = self._records.get(date.partition("@")[0])
+        return date if record is None else f"{record.name} of {record.owner}"
+
+    def taken_by(self, date: Date) -> ArcId | None:
+        return self._core.taken_by(date.id)
+
+
+def _unbound(date: Date) -> bool:
+    return not date.bound and any(map(is_pattern, date.record.needs))

@@ -1,0 +1,383 @@
+"""Operations on bookings: what people and programs book, give up, and look for; and who takes a booking up."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import Final, TypeAlias
+
+from zscout.config.fleet import Fleet
+from zscout.keyexpr import BadName, Sender, check_name, check_need, is_pattern, matcher
+from zscout.mesh import IncomingQuery, Refused
+from zscout.mesh.supervision import Supervisor
+from zscout.messages import (
+    MAX_AHEAD,
+    MAX_BOOKINGS,
+    MAX_KEPT,
+    MAX_PARAMS,
+    WINDOW,
+    Amounts,
+    Ask,
+    Book,
+    BookingRecord,
+    BookingsAsk,
+    BookingsTold,
+    BookingView,
+    FindSlots,
+    Foresee,
+    Operation,
+    SlotsTold,
+    SlotView,
+    Unbook,
+    duration,
+    exact_amounts,
+)
+from zscout.scheduling.booking import Booking
+from zscout.scheduling.core import Core
+from zscout.scheduling.model import Tick
+from zscout.services.authority import Authority
+from zscout.services.bookings.dates import DAY, dates, zone_of
+from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.rcm.booked_dates import BookedDates, Date
+from zscout.services.rcm.booking_sharing import BookingSharing
+from zscout.types import SECOND, Grant, Ns
+
+log = logging.getLogger(__name__)
+
+Query: TypeAlias = IncomingQuery[Operation]
+
+MAX_CLAIMS: Final = 4_000
+"""Dates of all bookings within the next 60 days."""
+MAX_UNDECIDED: Final = 64
+"""Operations that wait for votes, or for a keeper, at one time."""
+DECIDE_WITHIN: Final = 1.5
+"""Seconds: an RC that does not vote is asked again meanwhile."""
+MAX_PRIORITY: Final = 1_000_000
+NAMED: Final = 3
+"""Of what is in the way, so many are named."""
+
+
+@dataclass(slots=True, eq=False)
+class _Undecided:
+    """An operation whose votes are not all known yet."""
+
+    query: Query
+    decide: Callable[[], bool]
+    """Tries; whether it is decided."""
+    until: Ns = 0
+    silent: list[str] = field(default_factory=list)
+
+
+class BookingHandler:
+    """`check_door` raises Refused for what can never start; `settled` says whether the dates of the fleet are known."""
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        core: Core,
+        keeper: BookingKeeper,
+        dates_: BookedDates,
+        sharing: BookingSharing,
+        authority: Authority,
+        supervisor: Supervisor,
+        emit: Callable[..., None],
+        check_door: Callable[[Mapping[str, Amounts]], None],
+    ) -> None:
+        self._fleet, self._core, self._keeper, self._dates, self._sharing = fleet, core, keeper, dates_, sharing
+        self._authority, self._supervisor, self._emit, self._check_door = authority, supervisor, emit, check_door
+        self._now, self._keys = keeper.mesh.now, keeper.mesh.keys
+        self._undecided: list[_Undecided] = []
+        self._keeping = 0
+
+    def close(self) -> None:
+        for one in self._undecided:
+            one.query.refuse(Refused("not_leading", "this RCM stopped leading; ask again").problem)
+
+    def on_operation(self, query: Query) -> None:
+        if self._fleet.strategy != "adaptive":
+            words = f'this fleet schedules by "{self._fleet.strategy}", which keeps no bookings; only "adaptive" does'
+            raise Refused("wrong_strategy", words)
+        sender = self._keys.sender_of(query.key)
+        match query.message:
+            case Book():
+                self._book(query, query.message, sender)
+            case Unbook():
+                self._unbook(query, query.message, sender)
+            case FindSlots():
+                self._find_slots(query, query.message, sender)
+
+    # Booking
+
+    def _book(self, query: Query, wanted: Book, sender: Sender) -> None:
+        known = self._keeper.records.get(wanted.id)
+        if known is not None:
+            self._check_owner(sender, known, "ask for it")
+            self._answer_kept(query, known)
+            return
+        record = self._record(wanted, sender)
+        self._check_allowed(wanted, sender)
+        self._check_room(record)
+        self._check_door(wanted.needs)
+        self._try(_Undecided(query, lambda: self._decide(query, record)))
+
+    def _record(self, wanted: Book, sender: Sender) -> BookingRecord:
+        """Raises Refused for what is no booking."""
+        time = self._dates.time
+        try:
+            check_name(wanted.name, "name of the booking")
+            check_needs(wanted.needs, self._fleet.limits.max_needs)
+            zone_of(wanted.zone)
+            runtime, patience = duration(wanted.runtime, "runtime"), duration(wanted.patience, "patience")
+            if wanted.maintenance and any(map(is_pattern, wanted.needs)):
+                raise ValueError("maintenance is of RCs by their names, not by pattern")
+        except (BadName, ValueError) as error:
+            raise Refused("bad_request", str(error)) from None
+        if not -MAX_PRIORITY <= wanted.priority <= MAX_PRIORITY:
+            raise Refused("bad_request", f"priority must lie between -{MAX_PRIORITY} and {MAX_PRIORITY}")
+        over = wanted.start + min(patience, runtime) / SECOND
+        if over <= time:
+            raise Refused("bad_date", f"{told(wanted.start)} is past; it is {told(time)} by fleet time")
+        last = wanted.until if wanted.every and wanted.until is not None else wanted.start
+        if max(last, wanted.start) > time + MAX_AHEAD:
+            raise Refused("bad_date", "nothing is booked more than a year ahead")
+        if wanted.every and wanted.until is None:
+            raise Refused("bad_date", "what is repeated needs an end: give until")
+        if wanted.every and last < wanted.start:
+            raise Refused("bad_date", "until is before the first date")
+        if wanted.every and runtime > (wanted.every * DAY - 3_600) * SECOND:
+            raise Refused("bad_date", "it would overlap its own next date; make it shorter, or less often")
+        made = Grant(self._core.term, self._core.number())
+        fields = {name: getattr(wanted, name) for name in Book.__struct_fields__}
+        fields["who"] = self._authority.known_as(sender, wanted.who)
+        if wanted.maintenance:
+            fields["priority"] = max(wanted.priority, self._fleet.operator_priority)
+        return BookingRecord(**fields, owner=sender.host, since=int(time), made=made, changed=made)
+
+    def _check_allowed(self, wanted: Book | FindSlots, sender: Sender) -> None:
+        if isinstance(wanted, Book) and wanted.maintenance:
+            self._authority.check_operator(sender, "have RCs in maintenance")
+            return
+        asked = Foresee(wanted.id, wanted.id, wanted.needs, wanted.priority, wanted.runtime)
+        self._authority.check_ask(sender, asked, lambda _: 0)
+
+    def _check_room(self, record: BookingRecord) -> None:
+        records, owner = self._keeper.records, record.owner
+        most = self._fleet.limits.max_bookings_per_host
+        if sum(one.owner == owner and not one.unbooked for one in records) >= most:
+            raise Refused("too_many", f"{owner} has {most} bookings; unbook one")
+        if len(records) >= MAX_BOOKINGS or records.size >= MAX_KEPT:
+            raise Refused("too_many", f"this fleet keeps {len(records)} bookings already; unbook some")
+        if len(self._core.booked()) + len(self._dates.open_dates(record)) > MAX_CLAIMS:
+            raise Refused("too_many", f"{MAX_CLAIMS} dates are booked within 60 days; repeat it less often")
+
+    def _decide(self, query: Query, record: BookingRecord) -> bool:
+        """Whether it is decided: all dates of the next 60 days are free, or one is not."""
+        unknown, bound = [], dict[int, dict[str, str]]()
+        self._emit(Tick())
+        for date in self._dates.open_dates(record):
+            claim = self._dates.claim(date)
+            found = self._core.slots(claim, claim.start, 1)
+            if found.unknown:
+                unknown.append((claim, found.unknown))
+            elif not found.found:
+                query.refuse(Refused("not_free", self._in_the_way(date, claim)).problem)
+                return True
+            elif found.found[0].bound:
+                bound[date.start] = dict(found.found[0].bound)
+        if unknown:
+            for claim, votes in unknown:
+                self._dates.ask(votes, claim)
+            return False
+        self._dates.change(record, bound=bound)
+        self._dates.reconcile()
+        log.info("%s books %s: %s at %s", record.owner, record.name, ", ".join(record.needs), told(record.start))
+        self._answer_kept(query, record, withdraw=True)
+        return True
+
+    def _in_the_way(self, date: Date, claim: Booking) -> str:
+        """Why a date can't be booked, in words."""
+        others = [
+            one
+            for one in self._core.booked().values()
+            if one.start < claim.end and claim.start < one.end and _share(one, claim)
+        ]
+        names = [f"{one.label or one.id} of {one.owner} ({', '.join(one.needs)})" for one in others[:NAMED]]
+        more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
+        why = f"booked then: {'; '.join(names)}{more}" if names else "held, in maintenance or promised to who waits"
+        return f"not all of {', '.join(date.record.needs)} are free at {told(date.start)}: {why}"
+
+    def _answer_kept(self, query: Query, record: BookingRecord, *, withdraw: bool = False) -> None:
+        """Answers once it is kept; `withdraw`: gives it up where it can't be."""
+        if self._keeping >= MAX_UNDECIDED:
+            raise Refused("busy", f"{MAX_UNDECIDED} bookings are being kept already; ask again")
+        self._keeping += 1
+        self._supervisor.spawn(self._keep(query, record.id, withdraw=withdraw))
+
+    async def _keep(self, query: Query, booking: str, *, withdraw: bool) -> None:
+        try:
+            record = self._keeper.records.get(booking)
+            why = await self._sharing.keep(record) if record is not None else "it is over"
+        finally:
+            self._keeping -= 1
+        record = self._keeper.records.get(booking)
+        if record is None or why:
+            if record is not None and withdraw:
+                self._dates.change(record, unbooked=True)
+                self._dates.reconcile()
+            query.refuse(Refused("not_kept", f"nobody keeps this booking: {why}").problem)
+            return
+        query.answer(self._dates.view(record))
+
+    # Giving up
+
+    def _unbook(self, query: Query, operation: Unbook, sender: Sender) -> None:
+        record = self._keeper.records.get(operation.id)
+        if record is None:
+            raise Refused("unknown_booking", f"there is no booking {operation.id}; see zscout bookings")
+        self._check_owner(sender, record, "unbook it")
+        if operation.start is None:
+            new = record if record.unbooked else self._dates.change(record, unbooked=True)
+        elif operation.start in record.dropped:
+            new = record
+        elif operation.start in dates(record, operation.start, operation.start + 1):
+            new = self._dates.change(record, dropped=sorted({*record.dropped, operation.start}))
+        else:
+            raise Refused("bad_date", f"{told(operation.start)} is no date of {record.name}; see zscout bookings")
+        self._dates.reconcile()
+        self._answer_kept(query, new)
+
+    def _check_owner(self, sender: Sender, record: BookingRecord, what: str) -> None:
+        if sender.host != record.owner:
+            self._authority.check_operator(sender, f"{what}: {record.name} is {record.owner}'s")
+
+    # Looking for a time
+
+    def _find_slots(self, query: Query, asked: FindSlots, sender: Sender) -> None:
+        try:
+            check_needs(asked.needs, self._fleet.limits.max_needs)
+            needs = {need: exact_amounts(params) for need, params in asked.needs.items()}
+            runtime = duration(asked.runtime, "runtime")
+        except (BadName, ValueError) as error:
+            raise Refused("bad_request", str(error)) from None
+        self._check_allowed(asked, sender)
+        self._check_door(asked.needs)
+        now = self._now()
+        start = self._dates.local(max(asked.start or 0, -(-self._dates.to_fleet(now) // SECOND)))
+        within = min(asked.within, MAX_AHEAD)
+        wanted = Booking(asked.id, needs, asked.priority, start, runtime, runtime, now, owner=sender.host)
+        self._try(_Undecided(query, lambda: self._answer_slots(query, asked, wanted, start + round(within * SECOND))))
+
+    def _answer_slots(self, query: Query, asked: FindSlots, wanted: Booking, until: Ns) -> bool:
+        self._emit(Tick())
+        found = self._core.slots(wanted, until, asked.limit)
+        if found.unknown:
+            self._dates.ask(found.unknown, wanted)
+            return False
+        slots = []
+        for one in found.found:
+            start, latest = -(-self._dates.to_fleet(one.start) // SECOND), self._dates.to_fleet(one.latest) // SECOND
+            slots.append(SlotView(start, max(start, latest), dict(one.bound)))
+        query.answer(SlotsTold(asked.id, self._dates.time, slots, found.complete))
+        return True
+
+    # Votes
+
+    def _try(self, undecided: _Undecided) -> None:
+        if len(self._undecided) >= MAX_UNDECIDED:
+            raise Refused("busy", f"{MAX_UNDECIDED} bookings wait for votes already; ask again")
+        if not undecided.decide():
+            undecided.until = self._now() + round(DECIDE_WITHIN * SECOND)
+            self._undecided.append(undecided)
+            self._supervisor.call_later(DECIDE_WITHIN + 0.01, self.try_again)
+
+    def try_again(self) -> None:
+        """Votes have come, or are overdue."""
+        undecided, self._undecided = self._undecided, []
+        for one in undecided:
+            try:
+                if one.decide():
+                    continue
+            except Refused as refused:
+                one.query.refuse(refused.problem)
+                continue
+            if self._now() >= one.until:
+                one.query.refuse(Refused("busy", "an RC that is shared does not say what it would carry").problem)
+            else:
+                self._undecided.append(one)
+
+    @property
+    def waits_for_votes(self) -> bool:
+        return bool(self._undecided)
+
+    # Taking up
+
+    def take_up(self, ask: Ask, sender: Sender) -> str:
+        """The date that an ARC takes up, as the core calls it; empty where one that goes on finds it over. Raises
+        Refused."""
+        booking, _, start = ask.booking.partition("@")
+        record = self._keeper.records.get(booking)
+        goes_on = ask.place is not None or ask.grant is not None
+        if record is None or record.unbooked:
+            if goes_on:
+                return ""
+            raise Refused("unknown_booking", f"there is no booking {booking}, or it was given up; see zscout bookings")
+        self._check_owner(sender, record, "take it up")
+        if record.maintenance:
+            raise Refused("bad_request", f"{record.name} is maintenance: nobody takes it up")
+        if ask.needs != record.needs or ask.priority != record.priority:
+            raise Refused("bad_request", f"its needs and priority are not those of booking {record.name}")
+        dates_ = [date for date in self._dates.standing(record) if not start or str(date.start) == start]
+        free = [date for date in dates_ if self._dates.taken_by(date) is None]
+        if free:
+            return free[0].id
+        if goes_on:
+            return ""
+        why = "somebody has taken it up" if dates_ else "its dates are over, or another booking stands"
+        raise Refused("unknown_booking", f"{record.name} can't be taken up: {why}; see zscout bookings")
+
+    # Telling
+
+    def answer_bookings(self, query: IncomingQuery[BookingsAsk]) -> None:
+        asked = query.message
+        query.answer(BookingsTold(self._dates.time, self.views(asked.owner, asked.rc), dict(self._sharing.clocks)))
+
+    def views(self, owner: str | None = None, rc: str | None = None) -> list[BookingView]:
+        views = []
+        for record in self._keeper.records:
+            if record.unbooked or (owner is not None and record.owner != owner):
+                continue
+            if rc is not None and not any(
+                need == rc or (is_pattern(need) and matcher(need)(rc)) for need in record.needs
+            ):
+                continue
+            view = self._dates.view(record)
+            if view.dates or (record.every and (record.until or 0) > self._dates.time + WINDOW):
+                views.append(view)
+        return sorted(views, key=lambda view: (view.dates[0].start if view.dates else 1 << 60, view.id))
+
+
+def check_needs(needs: Mapping[str, Amounts], most: int) -> None:
+    """Raises ValueError, BadName."""
+    if not needs or len(needs) > most:
+        raise ValueError(f"{len(needs)} needs; from 1 to {most} are allowed")
+    for need, params in needs.items():
+        check_need(need)
+        if len(params) > MAX_PARAMS:
+            raise ValueError(f"{need} has more than {MAX_PARAMS} parameters")
+        for parameter in params:
+            check_name(parameter, f"parameter of {need}")
+
+
+def told(time: float) -> str:
+    """An instant, for people."""
+    with suppress(ValueError, OverflowError):
+        return datetime.fromtimestamp(time, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    return f"{time:.0f} s after 1970"
+
+
+def _share(one: Booking, other: Booking) -> bool:
+    names = {*one.needs, *one.bound.values()}
+    return any(rc in names or (is_pattern(rc) and any(matcher(rc)(name) for name in names)) for rc in other.needs)

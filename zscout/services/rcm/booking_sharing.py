@@ -1,0 +1,127 @@
+"""The leader and all who keep bookings: what one has and another has not comes to both.
+
+A booking is kept once another candidate has it; where there is none, once this one's disk has."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Iterable
+from typing import Final
+
+from zscout.keyexpr import Keys, Role
+from zscout.mesh import Mesh, Reply
+from zscout.mesh.supervision import Supervisor, done_within
+from zscout.messages import BookingRecord, BookingsKept, ShareBookings
+from zscout.services.bookings.fleet_clock import DIFFERS, FleetClock, agreed, wall_ns
+from zscout.services.bookings.keeper import BookingKeeper
+from zscout.types import SECOND, HostName, Term
+
+log = logging.getLogger(__name__)
+
+SHARE_EVERY: Final = 30.0
+"""Seconds from one question to all keepers to the next, where nothing is new."""
+SOON: Final = 0.02
+"""Seconds that changes are gathered before they are shared."""
+TIMEOUT: Final = 2.0
+LOOK: Final = 0.5
+"""Seconds within which candidates that live are found."""
+
+
+def credible(replies: Iterable[Reply[BookingsKept]], keys: Keys) -> list[BookingsKept]:
+    """What keepers answered, each for its own host."""
+    told = [(reply.key, reply.message) for reply in replies if reply.message is not None]
+    return [message for key, message in told if key == keys.bookings(message.host)]
+
+
+class BookingSharing:
+    """Of one term."""
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        term: Term,
+        keeper: BookingKeeper,
+        clock: FleetClock,
+        supervisor: Supervisor,
+        on_news: Callable[[], None],
+    ) -> None:
+        """`on_news` is called when others told of what was not known here."""
+        self._mesh, self._term, self._keeper, self._clock = mesh, term, keeper, clock
+        self._supervisor, self._on_news = supervisor, on_news
+        self._unshared: dict[str, BookingRecord] = {}
+        self._behind = True
+        """Whether some host may not have all that is known here."""
+        self._why = ""
+        """Why what was told last is not kept; empty: it is."""
+        self._news = asyncio.Event()
+        self._sharing = asyncio.Lock()
+        self.clocks: dict[HostName, float] = {}
+        """By how many seconds the clocks of other hosts differ from fleet time, where it is too much."""
+
+    def start(self) -> None:
+        self._supervisor.spawn(self._keep_sharing())
+
+    def tell(self, records: Iterable[BookingRecord]) -> None:
+        """These are not as they were: shared soon."""
+        self._unshared |= {record.id: record for record in records}
+        self._news.set()
+
+    def catch_up(self) -> None:
+        """A host has come that may know less, or more."""
+        self._behind = True
+        self._news.set()
+
+    async def keep(self, record: BookingRecord) -> str:
+        """Returns once this is kept: empty, or why it is not."""
+        self._unshared[record.id] = record
+        async with self._sharing:
+            if record.id in self._unshared:
+                await self._share()
+            return self._why
+
+    async def _keep_sharing(self) -> None:
+        while True:
+            if await done_within(SHARE_EVERY, self._news.wait()):
+                await asyncio.sleep(SOON)
+            self._news.clear()
+            async with self._sharing:
+                await self._share()
+            if self._why:
+                log.warning("bookings are kept by this host alone: %s", self._why)
+
+    async def _share(self) -> None:
+        """Tells all keepers, and hears what they know. `_why` is empty then if what was told is kept."""
+        keeper, mesh = self._keeper, self._mesh
+        sent, self._unshared = self._unshared, {}
+        records = list(keeper.records) if self._behind else list(sent.values())
+        question = ShareBookings(self._term, keeper.records.digest(), records)
+        saved, replies = await asyncio.gather(
+            keeper.save(), mesh.ask(mesh.keys.bookings_any, question, BookingsKept, timeout=TIMEOUT)
+        )
+        answers = self._take(replies)
+        me = mesh.me.host
+        if not sent or any(one.candidate and one.host != me for one in answers):
+            self._why = ""
+            return
+        living = await mesh.living(mesh.keys.alive_any(Role.CANDIDATE), timeout=LOOK)
+        others = sorted({token.host for token in living} - {me})
+        if others:
+            self._why = f"{', '.join(others[:3])} may lead as well, and did not answer"
+        else:
+            self._why = "" if saved else "no other host may lead, and this one has no disk for it"
+
+    def _take(self, replies: Iterable[Reply[BookingsKept]]) -> list[BookingsKept]:
+        """What keepers answered."""
+        now, answers = self._mesh.now(), credible(replies, self._mesh.keys)
+        changed = self._keeper.records.take(record for one in answers for record in one.records)
+        digest = self._keeper.records.digest()
+        self._behind = any(one.digest != digest for one in answers)
+        if changed:
+            self._on_news()
+            self._news.set()
+        walls = {one.host: one.wall for one in answers} | {self._mesh.me.host: self._keeper.wall()}
+        self._clock.aim(agreed(map(wall_ns, walls.values())), now)
+        time = self._clock.at(now) / SECOND
+        self.clocks = {host: wall - time for host, wall in walls.items() if abs(wall - time) > DIFFERS}
+        return answers

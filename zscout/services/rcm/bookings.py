@@ -1,0 +1,125 @@
+"""Bookings in one term: fleet time, the dates in the core, who keeps them, and who asks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+
+from zscout.config.fleet import Fleet
+from zscout.keyexpr import Role, Token
+from zscout.mesh import Declaration, Mesh
+from zscout.mesh.supervision import Supervisor
+from zscout.messages import Amounts, BookingsAsk, BookingsKept, ProposedHolder, decimals
+from zscout.scheduling.core import Core
+from zscout.scheduling.model import Effect, Event, Propose, Vote, VoteOverdue
+from zscout.services.authority import Authority
+from zscout.services.bookings.fleet_clock import FleetClock, agreed, wall_ns
+from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.rcm.booked_dates import BookedDates
+from zscout.services.rcm.booking_handler import BookingHandler
+from zscout.services.rcm.booking_sharing import BookingSharing
+from zscout.types import SECOND, ArcId, Ns, Params, Term
+
+
+class Bookings:
+    """`kept`: what keepers answered as the lead was taken. `emit` takes events of one instant, `propose` sends a
+    proposal, `check_door` raises Refused for needs that can never be met."""
+
+    def __init__(
+        self,
+        mesh: Mesh,
+        fleet: Fleet,
+        term: Term,
+        core: Core,
+        keeper: BookingKeeper,
+        kept: Sequence[BookingsKept],
+        authority: Authority,
+        supervisor: Supervisor,
+        emit: Callable[..., None],
+        propose: Callable[[Propose], None],
+        check_door: Callable[[Mapping[str, Amounts]], None],
+    ) -> None:
+        self._mesh, self._supervisor, self._keeper = mesh, supervisor, keeper
+        now, self._known = mesh.now(), _is_known(keeper, kept, fleet)
+        self.settles_at: Ns = now + round(fleet.mesh.lease * SECOND)
+        """When the dates of the fleet count as known though nobody has told more of them."""
+        self.clock = FleetClock(_time(keeper, kept), now)
+        keeper.records.take(record for one in kept for record in one.records)
+
+        def vote(proposals: Iterable[Propose]) -> None:
+            for proposal in proposals:
+                propose(proposal)
+
+        self._sharing = BookingSharing(mesh, term, keeper, self.clock, supervisor, self._on_news)
+        self.dates = BookedDates(core, keeper.records, self.clock, mesh.now, emit, vote, self._sharing.tell)
+        self.handler = BookingHandler(
+            fleet, core, keeper, self.dates, self._sharing, authority, supervisor, emit, check_door
+        )
+        self._reconciling = False
+        self._declared: list[Declaration] = []
+
+    @property
+    def settled(self) -> bool:
+        """Whether the dates of the fleet are known: after a restart of all its hosts, each knows its own only."""
+        return self._known or self._mesh.now() >= self.settles_at
+
+    def recovered(self, taken: Collection[str]) -> list[Event]:
+        """The events by which the core knows of all dates; `taken`: those that ARCs have taken up."""
+        return self.dates.recovered(taken)
+
+    def start(self) -> None:
+        """From now on it answers, and shares what it knows."""
+        keys, mesh, guard = self._mesh.keys, self._mesh, self._supervisor.guard
+        self._declared = [
+            mesh.serve(keys.rcm_bookings, BookingsAsk, guard(self.handler.answer_bookings)),
+            *(mesh.watch(keys.alive_any(role), guard(self._on_token)) for role in (Role.CANDIDATE, Role.NODE)),
+        ]
+        self._sharing.start()
+        self._on_news()
+
+    def close(self) -> None:
+        for declared in self._declared:
+            declared.close()
+        self.handler.close()
+
+    def note(self, events: Collection[Event], effects: Iterable[Effect]) -> None:
+        """What has happened in an instant: what follows of it follows in another one."""
+        if self.dates.note(events, effects):
+            self._on_news()
+        if self.handler.waits_for_votes and any(isinstance(event, (Vote, VoteOverdue)) for event in events):
+            self._supervisor.call_later(0, self.handler.try_again)
+
+    def proposed(self, name: ArcId, params: Params) -> ProposedHolder:
+        """A booking as an RC is asked about it."""
+        record = self._keeper.records.get(name.partition("@")[0])
+        label, owner = (name, "") if record is None else (record.name, record.owner)
+        return ProposedHolder(name, label, f"{owner or 'nobody'}/booking", decimals(params))
+
+    def _on_news(self) -> None:
+        if not self._reconciling:
+            self._reconciling = True
+            self._supervisor.call_later(0, self._reconcile)
+
+    def _reconcile(self) -> None:
+        self._reconciling = False
+        self.dates.reconcile()
+
+    def _on_token(self, token: Token, alive: bool) -> None:
+        if alive and token.host != self._mesh.me.host:
+            self._sharing.catch_up()
+
+
+def _time(keeper: BookingKeeper, kept: Sequence[BookingsKept]) -> Ns:
+    """Fleet time as it goes on, as it was heard here or else elsewhere; where it was not, the median of the clocks."""
+    if (heard := keeper.time) is not None:
+        return heard
+    if heard_elsewhere := [wall_ns(one.time) for one in kept if one.time is not None]:
+        return agreed(heard_elsewhere)
+    walls = {one.host: one.wall for one in kept} | {keeper.mesh.me.host: keeper.wall()}
+    return agreed(map(wall_ns, walls.values()))
+
+
+def _is_known(keeper: BookingKeeper, kept: Sequence[BookingsKept], fleet: Fleet) -> bool:
+    if keeper.time is not None or any(one.time is not None for one in kept):
+        return True
+    answered = {keeper.mesh.me.host, *(one.host for one in kept)} & {*fleet.candidates}
+    return 2 * len(answered) > len(fleet.candidates) > 0
