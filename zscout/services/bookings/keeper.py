@@ -100,6 +100,8 @@ class BookingKeeper:
         self._saving = asyncio.Lock()
         self._waiting = 0
         self._served: Declaration | None = None
+        self.on_shared: Callable[[], None] = lambda: None
+        """Called when another leader told of what was not known here."""
         if disk is not None:
             self.records.take(disk.read())
             self._saved = self.records.digest()
@@ -164,7 +166,8 @@ class BookingKeeper:
             raise Refused("too_many", f"this host keeps {len(self.records)} bookings already")
         if (heard := self.time) is not None:
             self.records.forget_old(heard / SECOND)
-        self.records.take(query.message.records)
+        if self.records.take(query.message.records):
+            self.on_shared()
         if self._disk is None or self.records.digest() == self._saved:
             query.answer(self.told(query.message.digest, durable=self._disk is not None))
             return

@@ -73,10 +73,12 @@ class Bookings:
             mesh.serve(keys.rcm_bookings, BookingsAsk, guard(self.handler.answer_bookings)),
             *(mesh.watch(keys.alive_any(role), guard(self._on_token)) for role in (Role.CANDIDATE, Role.NODE)),
         ]
+        self._keeper.on_shared = self._on_shared
         self._sharing.start()
         self._on_news()
 
     def close(self) -> None:
+        self._keeper.on_shared = lambda: None
         for declared in self._declared:
             declared.close()
         self.handler.close()
@@ -98,6 +100,11 @@ class Bookings:
         if not self._reconciling:
             self._reconciling = True
             self._supervisor.call_later(0, self._reconcile)
+
+    def _on_shared(self) -> None:
+        """One that led elsewhere has told of its bookings before it stepped down."""
+        self._sharing.catch_up()
+        self._on_news()
 
     def _reconcile(self) -> None:
         self._reconciling = False
