@@ -36,7 +36,7 @@ MAX_STARVING: Final = 16
 
 
 Order: TypeAlias = tuple[bool, int, Ns, str]
-"""Sorts promises, the first first: those without maintenance after those with, band of priorities (negated), age, id."""
+"""Sorts promises, the first first: maintenance before all, then by band of priorities (negated), age, id."""
 
 
 class Reservation(NamedTuple):
@@ -105,7 +105,8 @@ class Reservations:
         self._state, self._votes, self._patience = state, state.votes, patience
         self.made_of = _versions(state)
         self._booked_of = _booked_versions(state)
-        self._booked = last._booked if last is not None and last._booked_of == self._booked_of else self._all_booked()
+        known = last is not None and last._booked_of == self._booked_of
+        self._booked: dict[int, list[Reservation]] = last._booked if last is not None and known else self._all_booked()
         self.by_rc: dict[int, list[Reservation]] = dict(self._booked)
         """By bit of the RC, in their order; of those that starve for an exclusive RC only the first."""
         self._free: dict[int, Ns] = {}

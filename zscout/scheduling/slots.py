@@ -2,8 +2,8 @@
 
 What is in the way: other bookings, maintenance too, whatever their priority; holds that would not be over, or not be
 preempted; and what starving ARCs of equal or higher priority are reserved. Whoever else is queued goes round a booking.
-Sharable RCs are asked about all who would be there at once. What is found is exact for the RCs that earlier bookings were given
-for their patterns; it does not try to give those others."""
+Sharable RCs are asked about all who would be there at once. What is found is exact for the RCs that earlier bookings
+were given for their patterns; it does not try to give those others."""
 
 from __future__ import annotations
 
