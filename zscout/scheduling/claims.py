@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from msgspec.structs import replace
 
 from zscout.scheduling.booking import Booking, BookingChanged, BookingState, BookingThreatened
-from zscout.scheduling.dangers import danger
+from zscout.scheduling.dangers import Undecided, danger
 from zscout.scheduling.model import Arc, ArcRequest, Claim, Effect, Outcome, Rc, union
 from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.reservations import Reservations, reservations
@@ -194,9 +194,13 @@ class Claims:
 
     def _tell_danger(self, claim: Claim, reserved: Reservations) -> None:
         found = danger(self._state, reserved, claim)
-        if found is not None and self._keep_another(claim):
+        if isinstance(found, Reason) and self._keep_another(claim):
             self._reserved = reserved = reservations(self._state, self._state.policy.patience, reserved)
             found = danger(self._state, reserved, claim)
+        if isinstance(found, Undecided):
+            if claim.danger is not None and found.rc is not None:
+                self._actions.propose(found.rc, found.proposal)
+            found = claim.danger
         if found != claim.danger:
             claim.danger = found
             self._emit(BookingThreatened(claim.booking.id, found))
