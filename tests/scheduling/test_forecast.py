@@ -7,6 +7,8 @@ from hypothesis import given, settings
 from tests.scheduling.workloads import workloads
 from tests.thorough import times
 from zscout.lab.workload import Workload
+from zscout.scheduling.adaptive import Adaptive
+from zscout.scheduling.booking import Booked, Booking
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
@@ -107,3 +109,27 @@ def test_what_is_foretold_comes(workload: Workload) -> None:
 
 def ends_of(core: Core) -> list[Ns]:
     return [arc.hold.end for arc in core._state.running.values() if arc.hold is not None]
+
+
+def test_bookings_and_maintenance_are_played_through() -> None:
+    core = Core(Adaptive())
+    core.handle(0, *(RcJoined(f"robot/{name}", sharable=False) for name in "abc"))
+    core.handle(0, Requested(request("kept", "robot/a", seconds=2, keep=True)))
+    core.handle(0, Booked(Booking("m", {"robot/a": {}}, 10, 5 * SECOND, 20 * SECOND, 0, 0, maintenance=True)))
+    core.handle(0, Booked(Booking("b", {"robot/b": {}}, 0, 9 * SECOND, 5 * SECOND, SECOND, 0)))
+    core.handle(0, Booked(Booking("late", {"robot/c": {}}, 0, 0, 20 * SECOND, 7 * SECOND, 0)))
+    core.handle(0, Requested(request("afterwards", "robot/a", priority=-1, seconds=3)))
+    core.handle(0, Requested(request("behind", "robot/b", seconds=10)))
+    core.handle(0, Requested(request("lapsed", "robot/c", seconds=30)))
+    foretold = forecast(core, SECOND)
+    assert foretold.starts["afterwards"] == 25 * SECOND
+    assert foretold.starts["behind"] == 14 * SECOND
+    assert foretold.starts["lapsed"] == 7 * SECOND
+    # And so it comes; of whom nobody takes up nothing is in the way once it has lapsed.
+    starts = {
+        effect.arc: at
+        for at in range(2 * SECOND, 26 * SECOND, SECOND)
+        for effect in core.handle(at, Tick())
+        if isinstance(effect, Granted)
+    }
+    assert starts == {"afterwards": 25 * SECOND, "behind": 10 * SECOND, "lapsed": 7 * SECOND}

@@ -9,10 +9,12 @@
     standing ARC ... grant=TERM.N start=S      waiting ARC ...              for the `lead` that follows
     adopt ARC ... grant=TERM.N start=S         place ARC TERM.N             unconfirmed ARC TERM.N RC,...
     lead TERM
-    book ID NEED,... start=S [runtime=S] [patience=S] [priority=N] [since=S]      unbook ID
+    book ID NEED,... start=S [runtime=S] [patience=S] [priority=N] [since=S] [bound=RC,...] [maintenance]
+    unbook ID           redate ID S            slots ID NEED,... start=S until=S [runtime=S] [priority=N] [bookings]
     strategy NAME [patience=S]                 a new core; without it, it is `priority`
 
-A NEED is `kind/name`, with parameters `kind/name{rate=5 width=0.1}`; a TERM is `COUNTER:RCM`.
+What is `bound` are the RCs kept for the patterns, in their order. A NEED is `kind/name`, with parameters
+`kind/name{rate=5 width=0.1}`; a TERM is `COUNTER:RCM`.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ from typing import TYPE_CHECKING, cast
 from tests.scheduling.validate import validate
 from tests.transcripts import ns, seconds, settings
 from zscout.config.scheduling_policy import DEFAULT
-from zscout.scheduling.booking import Booked, Booking, BookingChanged, Unbooked
+from zscout.keyexpr import is_pattern
+from zscout.scheduling.booking import Booked, Booking, BookingChanged, BookingThreatened, Redated, Unbooked
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     Adopted,
@@ -55,13 +58,14 @@ from zscout.scheduling.model import (
     VoteOverdue,
     WakeAt,
 )
+from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import Grant, Ns, Params, Place, Term
 
 if TYPE_CHECKING:
     from zscout.config.scheduling_policy import StrategyName
 
-_NEED = re.compile(r"([\w.-]+/[\w.-]+)(?:\{([^}]*)\})?")
+_NEED = re.compile(r"([\w.-]+/[\w.*#-]+)(?:\{([^}]*)\})?")
 
 
 @dataclass
@@ -80,6 +84,8 @@ class CorePlayer:
             if words[0] == "at":
                 self.now = ns(words[1])
                 words = words[2].split(maxsplit=2) if len(words) > 2 else []
+            if words and words[0] == "slots":
+                return self.slots(" ".join(words[1:]))
             if words and (event := self.event(words[0], " ".join(words[1:]))) is not None:
                 events.append(event)
         if not events:
@@ -89,6 +95,17 @@ class CorePlayer:
         effects = [*(one for one in decided if one not in wakes), *self.core.tell_reasons(), *wakes]
         validate(self.core)
         return [_print(effect) for effect in effects] or ["nothing"]
+
+    def slots(self, rest: str) -> list[str]:
+        """When a booking would be kept: until a vote is missing."""
+        booking, options = _booking(rest, self.now)
+        told = self.core.slots(booking, ns(options["until"]), 3, bookings_only="bookings" in rest.split())
+        lines = []
+        for slot in told.found:
+            bound = "".join(f", {rc} for {need}" for need, rc in slot.bound.items())
+            lines.append(f"free from {seconds(slot.start)} to {seconds(slot.latest)}{bound}")
+        lines += [f"unknown {rc.name}: {', '.join(sorted(holders))}" for rc, holders in told.unknown]
+        return lines or ["none"]
 
     def event(self, verb: str, rest: str) -> Event | None:
         first, _, second = rest.partition(" ")
@@ -139,12 +156,9 @@ class CorePlayer:
             case "ended":
                 return RcReported(first, ended=tuple(second.split(",")))
             case "book":
-                request, options = _request(rest)
-                start, patience = ns(options["start"]), ns(options.get("patience", "5"))
-                since = ns(options["since"]) if "since" in options else self.now
-                return Booked(
-                    Booking(first, request.needs, request.priority, start, request.min_runtime, patience, since)
-                )
+                return Booked(_booking(rest, self.now)[0])
+            case "redate":
+                return Redated(first, ns(second))
             case "unbook":
                 return Unbooked(first)
             case "strategy":
@@ -165,6 +179,24 @@ def _held(text: str) -> RecoveredHold:
     return RecoveredHold(request, place, grant, start, start + request.min_runtime)
 
 
+def _booking(text: str, now: Ns) -> tuple[Booking, dict[str, str]]:
+    request, options = _request(text)
+    patterns = list(filter(is_pattern, request.needs))
+    bound = options["bound"].split(",") if "bound" in options else []
+    booking = Booking(
+        request.arc,
+        request.needs,
+        request.priority,
+        ns(options["start"]),
+        request.min_runtime,
+        ns(options.get("patience", "5")),
+        ns(options["since"]) if "since" in options else now,
+        dict(zip(patterns, bound, strict=bool(bound))),
+        maintenance="maintenance" in text.split(),
+    )
+    return booking, options
+
+
 def _request(text: str) -> tuple[ArcRequest, dict[str, str]]:
     """`ARC NEED,... key=value ... [keep]`."""
     braces = re.compile(r"\{[^}]*\}")
@@ -179,8 +211,20 @@ def _request(text: str) -> tuple[ArcRequest, dict[str, str]]:
             raise ValueError(f"not a need: {need}")
         pairs = (pair.split("=") for pair in (match[2] or "").split())
         wanted[match[1]] = {key: Fraction(value) for key, value in pairs}
-    words = (word for word in rest if word != "keep")
-    known = ("priority", "runtime", "client", "place", "grant", "start", "booking", "patience", "since")
+    words = (word for word in rest if word not in {"keep", "maintenance", "bookings"})
+    known = (
+        "priority",
+        "runtime",
+        "client",
+        "place",
+        "grant",
+        "start",
+        "booking",
+        "patience",
+        "since",
+        "bound",
+        "until",
+    )
     options = settings(words, *known)
     request = ArcRequest(
         arc=arc,
@@ -226,15 +270,22 @@ def _print(effect: Effect) -> str:
         case HoldEnded(arc=arc, grant=grant, outcome=outcome, reason=reason, requeued=requeued, by=by):
             took = f" by {by}" if by is not None else ""
             tail = "; queued again" if requeued else ""
-            return f"revoke {arc} ({_grant(grant)}) {outcome.value}{took}: {reason}{tail}"
+            return f"revoke {arc} ({_grant(grant)}) {outcome.value}{took}: {_told(reason)}{tail}"
         case Queued(arc=arc, reason=reason, settled=settled):
-            return f"queued {arc}: {reason}" + ("" if settled else " (not settled)")
+            return f"queued {arc}: {_told(reason)}" + ("" if settled else " (not settled)")
         case Dropped(arc=arc, outcome=outcome, reason=reason):
             return f"dropped {arc} {outcome.value}: {reason}"
         case BookingChanged(booking=booking, state=state, arc=arc):
             return f"booking {booking} {state.value}" + (f" by {arc}" if arc is not None else "")
+        case BookingThreatened(booking=booking, reason=reason):
+            return f"booking {booking} " + ("in danger no more" if reason is None else f"in danger: {_told(reason)}")
         case WakeAt(at=at):
             return "wake " + ("never" if at is None else f"at {seconds(at)}")
+
+
+def _told(reason: Reason) -> str:
+    """With the times of maintenance, which ends when it was said to."""
+    return reason.text(seconds if reason.code is ReasonCode.MAINTENANCE else None)
 
 
 def _share(params: Params) -> str:

@@ -7,8 +7,10 @@ from enum import StrEnum
 
 from msgspec import Struct
 
+from zscout.keyexpr import is_pattern
 from zscout.messages import Who
 from zscout.scheduling.needs import check_request
+from zscout.scheduling.reason import Party, Reason
 from zscout.types import ArcId, Need, Ns, Params, RcName
 
 
@@ -16,7 +18,7 @@ class Booking(Struct, frozen=True):
     """All of `needs` at once, from `start` on for `runtime` ns: a claim with a date. Its owner's request takes it
     up, or it lapses when nobody has within `patience` ns from the date.
 
-    Raises ValueError as `needs.check_request` does."""
+    Raises ValueError as `needs.check_request` does, and for a maintenance of patterns."""
 
     id: str
     """Unlike any ARC's."""
@@ -33,9 +35,14 @@ class Booking(Struct, frozen=True):
     """The host or person whose quotas count."""
     label: str = ""
     who: Who | None = None
+    maintenance: bool = False
+    """Whether its RCs, each for itself, are granted to nobody while it lasts; nobody takes it up, and it has no
+    patience."""
 
     def __post_init__(self) -> None:
         check_request(f"booking {self.id}", self.needs, self.runtime)
+        if self.maintenance and (patterns := sorted(filter(is_pattern, self.needs))):
+            raise ValueError(f"booking {self.id}: maintenance needs RCs by name, not {patterns[0]}")
 
     @property
     def end(self) -> Ns:
@@ -44,7 +51,12 @@ class Booking(Struct, frozen=True):
     @property
     def lapses(self) -> Ns:
         """When it is over if nobody takes it up."""
-        return min(self.start + self.patience, self.end)
+        return self.end if self.maintenance else min(self.start + self.patience, self.end)
+
+    @property
+    def party(self) -> Party:
+        """It as reasons name it."""
+        return Party(self.id, self.label or self.id, self.priority, self.who)
 
 
 class BookingState(StrEnum):
@@ -73,6 +85,13 @@ class Unbooked(Struct, frozen=True):
     booking: str
 
 
+class Redated(Struct, frozen=True):
+    """The date of a booking that has not begun is `start` from now on: the fleet's clock was slewed."""
+
+    booking: str
+    start: Ns
+
+
 # Effects
 
 
@@ -82,3 +101,10 @@ class BookingChanged(Struct, frozen=True):
     booking: str
     state: BookingState
     arc: ArcId | None = None
+
+
+class BookingThreatened(Struct, frozen=True):
+    """As far as is known now, this keeps a booking from its start at its date; None: nothing does any more."""
+
+    booking: str
+    reason: Reason | None

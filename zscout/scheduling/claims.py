@@ -1,17 +1,22 @@
 """Bookings as the core keeps them: a claim with a date, until its owner's request takes it up.
 
-That nobody gets into its way is done by `reservations.py`; when there is time for one is told by `slots.py`."""
+That nobody gets into its way is done by `reservations.py`, when there is time for one is told by `slots.py`, and what
+endangers one by `dangers.py`. Maintenance is a claim that nobody takes up."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
-from zscout.scheduling.booking import Booking, BookingChanged, BookingState
-from zscout.scheduling.model import Arc, ArcRequest, Claim, Effect, Outcome, Rc
+from msgspec.structs import replace
+
+from zscout.scheduling.booking import Booking, BookingChanged, BookingState, BookingThreatened
+from zscout.scheduling.dangers import Undecided, danger
+from zscout.scheduling.model import Arc, ArcRequest, Claim, Effect, Outcome, Rc, union
 from zscout.scheduling.reason import Reason, ReasonCode
+from zscout.scheduling.reservations import Reservations, reservations
 from zscout.scheduling.slots import slots
 from zscout.scheduling.state import Actions, SchedulerState
-from zscout.types import NO_TERM, Place
+from zscout.types import NO_TERM, Ns, Place
 
 
 def request_for(booking: Booking) -> ArcRequest:
@@ -33,6 +38,8 @@ class Claims:
 
     def __init__(self, state: SchedulerState, actions: Actions, emit: Callable[[Effect], None]) -> None:
         self._state, self._actions, self._emit = state, actions, emit
+        self._reserved: Reservations | None = None
+        """What was reserved when dangers were looked for last."""
 
     def stand_in(self, booking: Booking) -> Arc:
         """What stands for a booking before it is taken up."""
@@ -45,28 +52,46 @@ class Claims:
         if booking.id in self._state.claims:
             return
         if booking.lapses <= self._state.now:
-            self._emit(BookingChanged(booking.id, BookingState.LAPSED))
-        else:
-            arc = self.stand_in(booking)
-            self._state.claim(Claim(booking, arc, arc.mask))
+            state = BookingState.USED if booking.maintenance else BookingState.LAPSED
+            self._emit(BookingChanged(booking.id, state))
+            return
+        arc = self.stand_in(booking)
+        self._state.claim(Claim(booking, arc, arc.mask))
+        if booking.maintenance:
+            self._keep_others(arc.mask)
 
     def unbook(self, booking: str) -> None:
         if (claim := self._state.claims.get(booking)) is not None:
             self._end(claim, BookingState.UNBOOKED)
 
+    def redate(self, booking: str, start: Ns) -> None:
+        claim = self._state.claims.get(booking)
+        if claim is None or claim.booking.start <= self._state.now or claim.arc.hold is not None:
+            return
+        claim.booking = replace(claim.booking, start=start)
+        self._state.redated(claim)
+        arc = claim.arc
+        if arc.held_back is not None and not arc.held_back[1]:
+            self._state.consider_again(arc)
+            self._wait_for_date(claim)
+        self.expire()
+
     def take_up(self, booking: str, arc: Arc) -> None:
         """An ARC, which waits or runs, stands for its booking from now on, if that is open. It waits for the date."""
         claim = self._state.claims.get(booking)
-        if claim is None or claim.is_taken:
+        if claim is None or claim.is_taken or claim.booking.maintenance:
             return
         for rc in self._state.possible_sharables(claim.arc):
             self._state.votes.rename_arc(rc.name, claim.arc.id, arc.id)
         claim.arc, arc.claim = arc, claim
         self._state.claims_changed()
         self._emit(BookingChanged(claim.booking.id, BookingState.TAKEN, arc.id))
-        if claim.booking.start > self._state.now and arc.id in self._state.queued:
-            self._state.hold_back(arc, claim.booking.start, ())
-            self._actions.wait(arc, Reason(ReasonCode.NOT_YET))
+        self._wait_for_date(claim)
+
+    def _wait_for_date(self, claim: Claim) -> None:
+        if claim.booking.start > self._state.now and claim.arc.id in self._state.queued:
+            self._state.hold_back(claim.arc, claim.booking.start, ())
+            self._actions.wait(claim.arc, Reason(ReasonCode.NOT_YET))
 
     def give_up(self, arc: Arc, outcome: Outcome, *, had_it: bool) -> None:
         """An ARC is over. What it had taken up is open again if its program is gone, or gave up before it had it."""
@@ -95,16 +120,87 @@ class Claims:
         """Ends the bookings whose time is over, or whose owner's to take them up."""
         for claim in self._state.claims_over():
             if claim.booking.end <= self._state.now:
-                self._end(claim, BookingState.USED if claim.is_taken else BookingState.LAPSED)
+                used = claim.is_taken or claim.booking.maintenance
+                self._end(claim, BookingState.USED if used else BookingState.LAPSED)
             elif not claim.is_taken:
                 self._end(claim, BookingState.LAPSED)
 
-    def keep_others(self, lost: Rc) -> None:
-        """Bookings that any RC of a pattern would do for are kept another one, where there is one that is free then."""
-        for claim in self._state.claims.values():
-            if not claim.kept & lost.bit & ~claim.arc.named_mask or claim.arc.hold is not None:
-                continue
-            arc, start = self.stand_in(claim.booking), claim.booking.start
-            if found := slots(self._state, claim.booking, arc, start, 1).found:
-                claim.kept = arc.named_mask | self._state.mask(found[0].bound.values())
-                self._state.claims_changed()
+    def in_maintenance(self) -> Iterator[tuple[Claim, Rc, Arc]]:
+        """Who holds an RC that is in maintenance, and has to end: those of equal or lower priority, past their minimum
+        runtimes. The caller may end them meanwhile."""
+        now = self._state.now
+        for claim in self._state.maintenance.values() if self._state.maintenance else ():
+            for rc in self._state.rcs_in(claim.kept) if claim.booking.start <= now else ():
+                for holder in list(rc.holders.values()):
+                    if holder.priority <= claim.booking.priority and holder.past_min_runtime(now):
+                        yield claim, rc, holder
+
+    def rc_lost(self, rc: Rc) -> None:
+        self._keep_others(rc.bit)
+
+    def _keep_others(self, bits: int) -> None:
+        """Bookings for which some of these RCs are kept, where others would do, are kept others that are free then."""
+        for claim in [claim for claim in self._state.claims.values() if claim.kept & bits & ~claim.arc.named_mask]:
+            self._keep_another(claim)
+
+    def _keep_another(self, claim: Claim) -> bool:
+        """Keeps other RCs for the patterns of a booking, if that helps."""
+        arc, booking, now = claim.arc, claim.booking, self._state.now
+        if not arc.patterns or arc.hold is not None:
+            return False
+        date = max(booking.start, now)
+        found = slots(self._state, replace(booking, start=date), arc, date, 1, presume=True).found
+        kept = arc.named_mask | self._state.mask(found[0].bound.values()) if found else claim.kept
+        if kept == claim.kept or kept & ~self._state.present & ~arc.named_mask:
+            return False
+        claim.booking = replace(booking, bound=found[0].bound)
+        claim.kept = kept
+        if not claim.is_taken:
+            self._state.bind(arc, found[0].bound)
+        self._state.claims_changed()
+        return True
+
+    def tell_dangers(self) -> None:
+        """Tells of each booking that is in danger, or is no more, since this was called last. Looked at are those
+        of whose RCs something has changed, and those that should have begun."""
+        state = self._state
+        if not state.claims:
+            self._reserved = None
+            return
+        before, now = self._reserved, state.now
+        self._reserved = reserved = reservations(state, state.policy.patience, before)
+        changed, state.changed = state.changed, 0
+        changed |= state.mask(state.votes.changed)
+        state.votes.changed.clear()
+        if before is None:
+            changed = -1
+        elif before is not reserved:
+            changed |= reserved.changed(before)
+        late = state.begun
+        if not changed and not late:
+            return
+        told = [
+            claim
+            for claim in state.claims.values()
+            if self._concerns(claim) & changed or (late and claim.booking.start <= now)
+        ]
+        for claim in told:
+            self._tell_danger(claim, reserved)
+
+    def _concerns(self, claim: Claim) -> int:
+        """Bits of the RCs that may change the danger that it is in."""
+        others = claim.arc.patterns if claim.danger is not None else ()
+        return claim.kept | union(rc.bit for need in others for rc in self._state.matching(need))
+
+    def _tell_danger(self, claim: Claim, reserved: Reservations) -> None:
+        found = danger(self._state, reserved, claim)
+        if isinstance(found, Reason) and self._keep_another(claim):
+            self._reserved = reserved = reservations(self._state, self._state.policy.patience, reserved)
+            found = danger(self._state, reserved, claim)
+        if isinstance(found, Undecided):
+            if claim.danger is not None and found.rc is not None:
+                self._actions.propose(found.rc, found.proposal)
+            found = claim.danger
+        if found != claim.danger:
+            claim.danger = found
+            self._emit(BookingThreatened(claim.booking.id, found))

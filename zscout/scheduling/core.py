@@ -20,7 +20,7 @@ from msgspec.structs import replace
 
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
 from zscout.scheduling import model
-from zscout.scheduling.booking import Booked, Booking, Unbooked
+from zscout.scheduling.booking import Booked, Booking, Redated, Unbooked
 from zscout.scheduling.claims import Claims
 from zscout.scheduling.model import (
     HOLD_BACK,
@@ -70,8 +70,9 @@ class Core:
 
         1. End the holds whose time is over.
         2. Apply the events, in the order given.
-        3. Run a pass of the strategy, if anybody is queued (its steps: `priority.py`, `adaptive.py`).
-        4. Say when to wake."""
+        3. End the kept holds that are in the way of maintenance.
+        4. Run a pass of the strategy, if anybody is queued (its steps: `priority.py`, `adaptive.py`).
+        5. Say which bookings are in danger, and when to wake."""
         if now < self._state.now:
             raise ValueError(f"time went backwards: {now} after {self._state.now}")
         self._state.now = now
@@ -86,11 +87,13 @@ class Core:
         else:
             for event in events:
                 self._apply(event)
+        self._begin_maintenance()
         if self._state.queued:
             self.strategy.run_pass(self._state, self)
         for arc in self._state.held_back.values():
             if arc.held_back is None and (other := self._state.at_place(arc.place)) is not None:
                 self.wait(arc, _claimed_by(other))
+        self._claims.tell_dangers()
         self._set_wake()
         return self._effects
 
@@ -213,9 +216,11 @@ class Core:
         waiting = tuple(model.Requested(arc.request, arc.place, arc.since) for arc in queued)
         return joined, model.LeadTaken(term, recovered_holds, waiting)
 
-    def slots(self, wanted: Booking, until: Ns, limit: int) -> SlotsFound:
-        """The first `limit` stretches of time, from the start of `wanted` to `until`, in which it would be kept."""
-        return slots(self._state, wanted, self._claims.stand_in(wanted), until, limit)
+    def slots(self, wanted: Booking, until: Ns, limit: int, *, bookings_only: bool = False) -> SlotsFound:
+        """The first `limit` stretches of time, from the start of `wanted` to `until`, in which it would be kept;
+        `bookings_only`: beside all other bookings, whoever holds or waits for what."""
+        arc = self._claims.stand_in(wanted)
+        return slots(self._state, wanted, arc, until, limit, bookings_only=bookings_only)
 
     def overlaps(self, order: Iterable[str]) -> Overlaps:
         """Which bookings can't be beside those that go before them in this order of their ids."""
@@ -322,6 +327,8 @@ class Core:
                 self._claims.book(booking)
             case Unbooked(booking):
                 self._claims.unbook(booking)
+            case Redated(booking, start):
+                self._claims.redate(booking, start)
             case model.Tick():
                 pass
 
@@ -368,7 +375,7 @@ class Core:
             self._end_hold(arc, Outcome.LOST, Reason(ReasonCode.RC_LOST, (name,), detail=reason))
         self._state.leave(name)
         self._votes.forget_rc(name)
-        self._claims.keep_others(rc)
+        self._claims.rc_lost(rc)
 
     def _show_place(self, arc_id: ArcId, place: Place) -> None:
         arc = self._state.arc(arc_id)
@@ -495,6 +502,12 @@ class Core:
             else:
                 self._end_hold(arc, Outcome.COMPLETED, Reason(ReasonCode.EXPIRED), requeue=False)
 
+    def _begin_maintenance(self) -> None:
+        for claim, rc, arc in self._claims.in_maintenance():
+            if arc.hold is not None:
+                party = claim.booking.party._replace(until=claim.booking.end)
+                self._end_hold(arc, Outcome.COMPLETED, Reason(ReasonCode.MAINTENANCE, (rc.name,), (party,)))
+
     # What a strategy may do (state.Actions)
 
     def start(self, arc: Arc) -> None:
@@ -564,12 +577,12 @@ class Core:
         if hold.grant.term != self.term:
             self._over.add(hold.grant)
         rcs = tuple(sorted(arc.needs))
-        by = reason.by[0].arc if reason.by else None
+        by = reason.by[0].arc if reason.by and reason.code is not ReasonCode.MAINTENANCE else None
         return model.HoldEnded(arc.id, arc.request.client, hold.grant, rcs, outcome, reason, requeued, by)
 
     def _set_wake(self) -> None:
         at = min((arc.held_back[0] for arc in self._state.held_back.values() if arc.held_back), default=None)
-        for end in (self._state.next_end(), self._state.next_claim_over()):
+        for end in (self._state.next_end(), self._state.next_claim_change()):
             if end is not None:
                 at = end if at is None else min(at, end)
         if self._state.queued:

@@ -2,7 +2,8 @@
 
 The forecast runs the very core and strategy that decide. RCs are taken to vote as they have voted; a proposal
 that was never made is taken to be a yes. Higher priority that comes later makes it wrong, of course, and so
-does who releases early: it is an estimate, and is shown as one. Bookings are taken to be taken up at their dates.
+does who releases early: it is an estimate, and is shown as one. Bookings are taken to be taken up at their dates, or
+not at all where these have come; maintenance is taken to last as long as it was said to.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import itertools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
+from zscout.scheduling.booking import Booking
 from zscout.scheduling.claims import request_for
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
@@ -65,8 +67,8 @@ def forecast(core: Core, now: Ns, newcomer: ArcRequest | None = None) -> Forecas
     joined, lead = core.as_events(Term(core.term.counter + 1, "forecast"))
     result = Forecast()
     ends = {held.request.arc: held.end for held in lead.recovered_holds}
-    dates = sorted((one.start, one.id, arc is None) for one, arc in core.bookings() if one.start > now)
-    booked = {one.id: one for one, _ in core.bookings()}
+    booked = {one.id: (one, arc is None) for one, arc in core.bookings()}
+    dates = sorted((at, name) for name, (one, is_open) in booked.items() for at in _dates(one, now, is_open=is_open))
     unserved = {one.request.arc for one in lead.waiting}
     """ARCs that are queued and have not started within what was played."""
 
@@ -104,10 +106,21 @@ def forecast(core: Core, now: Ns, newcomer: ArcRequest | None = None) -> Forecas
         checks += copy.waiting
         if checks > MAX_CHECKS:
             break
-        now = max(now, min((*ends.values(), *(date for date, _, _ in dates[:1]))))
+        now = max(now, min((*ends.values(), *(date for date, _ in dates[:1]))))
         events: list[Event] = [Tick()]
         while dates and dates[0][0] <= now:
-            _, name, is_open = dates.pop(0)
-            events += [Requested(request_for(booked[name]))] if is_open else []
+            date, name = dates.pop(0)
+            booking, is_open = booked[name]
+            if is_open and date == booking.start and not booking.maintenance:
+                events.append(Requested(request_for(booking)))
         step(events)
     return result
+
+
+def _dates(booking: Booking, now: Ns, *, is_open: bool) -> list[Ns]:
+    """When something becomes of a booking that no hold tells."""
+    if booking.maintenance:
+        return [at for at in (booking.start, booking.end) if at > now]
+    if booking.start > now:
+        return [booking.start]
+    return [booking.lapses] if is_open else []

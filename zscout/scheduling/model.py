@@ -19,7 +19,7 @@ from msgspec import Struct
 
 from zscout.keyexpr import is_pattern, matcher
 from zscout.messages import Who
-from zscout.scheduling.booking import Booked, Booking, BookingChanged, Unbooked
+from zscout.scheduling.booking import Booked, Booking, BookingChanged, BookingThreatened, Redated, Unbooked
 from zscout.scheduling.needs import check_request
 from zscout.scheduling.reason import SHOWN, Party, Reason
 from zscout.types import SECOND, ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName, Term
@@ -230,6 +230,8 @@ class Claim:
     """Who has taken it up; before, an ARC that stands for it in reservations and votes, and never waits nor runs."""
     kept: int
     """Bits of the RCs that are kept for it; who has taken it up may choose others for its patterns."""
+    danger: Reason | None = None
+    """What keeps it from its start, as last told."""
 
     @property
     def is_taken(self) -> bool:
@@ -433,6 +435,7 @@ Event: TypeAlias = (
     | Adopted
     | Booked
     | Unbooked
+    | Redated
     | Tick
 )
 
@@ -517,7 +520,7 @@ class WakeAt(Struct, frozen=True):
     at: Ns | None
 
 
-Effect: TypeAlias = Propose | Granted | HoldEnded | Queued | Dropped | BookingChanged | WakeAt
+Effect: TypeAlias = Propose | Granted | HoldEnded | Queued | Dropped | BookingChanged | BookingThreatened | WakeAt
 
 
 # The state after the last batch of events

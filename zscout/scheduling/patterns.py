@@ -57,16 +57,17 @@ def _fitness(
 ) -> tuple[Fitness, float]:
     """How well `rc` would do, and what decides between equals."""
     non_preemptible = rc.non_preemptible_holders(arc, state.now)
+    closed = reserved is not None and reserved.reserves(rc, arc)
     if rc.sharable:
         answer = state.votes.known(rc.name, frozenset((*(holder.id for holder in non_preemptible), arc.id)))
-        if answer is None and rc.name in state.votes.unresponsive:
+        if closed or (answer is None and rc.name in state.votes.unresponsive):
             return Fitness.RESERVED, rc.demand
         if answer is not None and not answer.accept:
             return Fitness.HELD, rc.demand
         return Fitness.FREE, len(rc.holders) + (answer is None)
     if non_preemptible:
         return Fitness.HELD, max(0 if one.hold is None else one.hold.end for one in non_preemptible)
-    if reserved is not None and reserved.reserves(rc, arc):
+    if closed:
         return Fitness.RESERVED, rc.demand
     if rc.holders:
         return Fitness.PREEMPTIBLE, max(one.priority for one in rc.holders.values())

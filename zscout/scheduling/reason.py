@@ -36,6 +36,9 @@ class ReasonCode(StrEnum):
     """The RC is reserved for `by`, which has waited too long."""
     BOOKED = "booked"
     """The RC is booked by `by` before this would be over."""
+    MAINTENANCE = "maintenance"
+    """The RC is in maintenance, `by` says whose and until when; or will be before this would be over. For that a kept
+    hold ends as well."""
     NOT_YET = "not_yet"
     """It has taken up a booking, whose time is still to come."""
     QUOTA = "quota"
@@ -128,6 +131,8 @@ class Reason(NamedTuple):
         if self.code is ReasonCode.VETOED:
             return _vetoed(self, until)
         text = _TEXTS[self.code](self)
+        if self.code is ReasonCode.MAINTENANCE:
+            text += _last(self.by[0], until)
         return text if self.pattern is None else f"no {self.pattern} is to be had: {text}"
 
 
@@ -215,6 +220,7 @@ _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
         f"{one.rcs[0]} is kept for {one.by[0]}, whose time to wait is over before this ends"
     ),
     ReasonCode.BOOKED: lambda one: f"{one.rcs[0]} is booked by {one.by[0]} before this would be over",
+    ReasonCode.MAINTENANCE: lambda one: f"maintenance of {one.rcs[0]} by {one.by[0]}",
     ReasonCode.NOT_YET: lambda _: "the time of its booking is still to come",
     ReasonCode.QUOTA: lambda one: f"host {one.detail} has {one.number} ARCs running, its quota",
     ReasonCode.RC_QUOTA: lambda one: f"{one.detail} may hold {one.number} RCs at one time",

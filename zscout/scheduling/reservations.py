@@ -11,7 +11,8 @@ the ARCs that were starving before it. An ARC of equal or lower priority that sh
 is over by then, or if the RC is sharable and accepts it beside everyone concerned.
 
 A booking is reserved its RCs for its own time, likewise. Promises to equals are made in the order of their age: a
-booking that is older than an ARC's wait is gone round, and one that is younger is not seen.
+booking that is older than an ARC's wait is gone round, and one that is younger is not seen. Maintenance stands before
+all promises to who has no higher priority, and while it lasts before all.
 
 `docs/scheduling.md` states the promise that follows, and what else was tried.
 """
@@ -19,10 +20,12 @@ booking that is older than an ARC's wait is gone round, and one that is younger 
 from __future__ import annotations
 
 import math
-from operator import itemgetter
-from typing import Final, NamedTuple
+from bisect import bisect_left
+from operator import attrgetter
+from typing import Final, NamedTuple, TypeAlias
 
-from zscout.scheduling.model import Arc, Claim, Rc, union
+from zscout.scheduling.booking import Booking
+from zscout.scheduling.model import Arc, Rc, union
 from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.state import SchedulerState
 from zscout.scheduling.votes import HolderSet
@@ -32,13 +35,27 @@ MAX_STARVING: Final = 16
 """ARCs that have reservations at one time; those that starve after them follow as these start."""
 
 
+Order: TypeAlias = tuple[bool, int, Ns, str]
+"""Sorts promises, the first first: maintenance before all, then by band of priorities (negated), age, id."""
+
+
 class Reservation(NamedTuple):
     """An RC is reserved for `arc` from `start` on."""
 
     arc: Arc
     start: Ns
+    order: Order
     booked: Ns | None = None
     """When that is over, if it is booked."""
+
+    @property
+    def excludes(self) -> bool:
+        """Whether it is maintenance, beside which the RC has no other holder."""
+        return not self.order[0]
+
+    def over(self) -> Ns:
+        """When it is over if it is as long as it has to be."""
+        return self.arc.ends(self.start) if self.booked is None else self.booked
 
 
 class Inadmissible(NamedTuple):
@@ -49,7 +66,12 @@ class Inadmissible(NamedTuple):
     proposal: HolderSet | None = None
 
 
-def _yields(holder: Arc, other: Arc, time: Ns) -> bool:
+def order_of(state: SchedulerState, booking: Booking) -> Order:
+    """Where a booking stands among the promises."""
+    return not booking.maintenance, -state.band(booking.priority), booking.since, booking.id
+
+
+def yields(holder: Arc, other: Arc, time: Ns) -> bool:
     """Whether a hold is over at some time, or gives way to an ARC that comes then."""
     return holder.known_end(other) <= time or holder.preemptible_by(other, time)
 
@@ -62,88 +84,96 @@ def reservations(state: SchedulerState, patience: Ns | None, last: Reservations 
         state.index.mark_starving(state.now - patience // 2, state.queued)
     if last is not None and last.made_of == _versions(state):
         return last
-    return Reservations(state, patience)
+    return Reservations(state, patience, last)
 
 
 def _versions(state: SchedulerState) -> tuple[int, ...]:
+    return state.version, state.votes.version, state.index.starving_version, *_booked_versions(state)
+
+
+def _booked_versions(state: SchedulerState) -> tuple[int, ...]:
     # A booking whose time has come is kept for as long only as all that it needs is there.
-    begun = sum(claim.booking.start <= state.now for claim in state.claims.values())
-    return state.version, state.votes.version, state.index.starving_version, state.claims_version, begun
+    begun = state.begun
+    return state.claims_version, begun, state.present if begun else 0
 
 
 class Reservations:
     """What is reserved for whom: for those starving, and for bookings."""
 
-    def __init__(self, state: SchedulerState, patience: Ns | None) -> None:
-        """Without a patience nobody starves."""
+    def __init__(self, state: SchedulerState, patience: Ns | None, last: Reservations | None = None) -> None:
+        """Without a patience nobody starves. What is booked is taken from the `last` if it has not changed."""
         self._state, self._votes, self._patience = state, state.votes, patience
-        self.by_rc: dict[int, list[Reservation]] = {}
-        """By bit of the RC, the oldest promise first; of those that starve for an exclusive RC only the first."""
-        self.bits = 0
-        """RCs with reservations."""
+        self.made_of = _versions(state)
+        self._booked_of = _booked_versions(state)
+        known = last is not None and last._booked_of == self._booked_of
+        self._booked: dict[int, list[Reservation]] = last._booked if last is not None and known else self._all_booked()
+        self.by_rc: dict[int, list[Reservation]] = dict(self._booked)
+        """By bit of the RC, in their order; of those that starve for an exclusive RC only the first."""
         self._free: dict[int, Ns] = {}
         """By bit: when the earlier reservations of the RC end."""
-        self.made_of = _versions(state)
-        starving = state.index.starving[:MAX_STARVING]
-        if not state.claims:
-            for _, _, arc in starving:
-                self._reserve(state.queued[arc])
-            return
-        promised: list[tuple[tuple[int, Ns, str], Arc | Claim]] = [(key, state.queued[key[-1]]) for key in starving]
+        for priority, since, arc in state.index.starving[:MAX_STARVING]:
+            if state.queued[arc].claim is None:
+                self._reserve(state.queued[arc], (True, priority, since, arc))
+        self.bits = union(self.by_rc)
+        """RCs with reservations."""
+
+    def _all_booked(self) -> dict[int, list[Reservation]]:
+        """What is booked is reserved while it is held as well: it may be preempted in this very pass. Once its time has
+        come, what is left of a booking is not kept while some of it is away."""
+        state, found = self._state, dict[int, list[Reservation]]()
         for claim in state.claims.values():
             booking = claim.booking
-            promised.append(((-state.band(booking.priority), booking.since, booking.id), claim))
-        for _, one in sorted(promised, key=itemgetter(0)):
-            if isinstance(one, Claim):
-                self._keep(one)
-            elif one.claim is None:
-                self._reserve(one)
+            begun = booking.start <= state.now and not booking.maintenance
+            if begun and claim.mask & ~state.present:
+                continue
+            reservation = Reservation(claim.arc, booking.start, order_of(state, booking), booking.end)
+            for rc in state.rcs_in(claim.mask):
+                found.setdefault(rc.bit, []).append(reservation)
+        for reserved in found.values():
+            reserved.sort(key=attrgetter("order"))
+        return found
 
-    def _keep(self, claim: Claim) -> None:
-        """Reserves what is booked, while it is held as well: it may be preempted in this very pass. Once its time has
-        come, what is left of it is not kept while some of it is away."""
-        booking, arc = claim.booking, claim.arc
-        rcs = list(self._state.rcs_in(claim.mask))
-        if booking.start <= self._state.now and not all(rc.present for rc in rcs):
-            return
-        for rc in rcs:
-            self.by_rc.setdefault(rc.bit, []).append(Reservation(arc, booking.start, booking.end))
-            self.bits |= rc.bit
+    def before(self, rc: Rc, order: Order) -> list[Reservation]:
+        """The reservations of `rc` that go before one in this `order`."""
+        reserved = self.by_rc.get(rc.bit, [])
+        return reserved[: bisect_left(reserved, order, key=attrgetter("order"))]
 
-    def _beside_bookings(self, arc: Arc, rcs: list[Rc], start: Ns) -> Ns:
+    def _beside_bookings(self, arc: Arc, rcs: list[Rc], start: Ns, order: Order) -> Ns:
         """From `start` on, the earliest time from which `arc` finds nothing booked for as long as it needs."""
-        booked = [(rc, one) for rc in rcs for one in self.by_rc.get(rc.bit, ()) if one.booked is not None]
+        booked = [(rc, one) for rc in rcs for one in self.before(rc, order) if one.booked is not None]
         # Each is passed once: time goes forward only.
         for rc, one in sorted(booked, key=lambda item: item[1].booked or 0):
             if one.booked is None or one.booked <= start or one.start >= arc.ends(start):
                 continue
-            if not (rc.sharable and self._votes.accepts(rc.name, frozenset((one.arc.id, arc.id)))):
-                return self._beside_bookings(arc, rcs, one.booked)
+            beside = rc.sharable and not one.excludes
+            if not (beside and self._votes.accepts(rc.name, frozenset((one.arc.id, arc.id)))):
+                return self._beside_bookings(arc, rcs, one.booked, order)
         return start
 
-    def _reserve(self, arc: Arc) -> None:
-        rcs = self._rcs(arc)
+    def _reserve(self, arc: Arc, order: Order) -> None:
+        rcs = self._rcs(arc, order)
         if not all(rc.present for rc in rcs):
             return
-        start = max(self._within_quota(arc), *(self._free_from(rc, arc) for rc in rcs))
+        start = max(self._within_quota(arc), *(self._free_from(rc, arc, order) for rc in rcs))
         if math.isinf(start):
             return
-        reservation = Reservation(arc, self._beside_bookings(arc, rcs, max(int(start), self.due(arc))))
+        start = self._beside_bookings(arc, rcs, max(int(start), self.due(arc)), order)
+        reservation = Reservation(arc, start, order)
         for rc in rcs:
-            reserved = self.by_rc.setdefault(rc.bit, [])
+            reserved = self.by_rc.get(rc.bit, [])
             if rc.sharable or all(one.booked is not None for one in reserved):
-                reserved.append(reservation)
-            self._free[rc.bit] = max(self._free.get(rc.bit, 0), arc.ends(reservation.start))
-            self.bits |= rc.bit
+                # A list of its own: that of what is booked is shared with the next reservations.
+                self.by_rc[rc.bit] = sorted((*reserved, reservation), key=attrgetter("order"))
+            self._free[rc.bit] = max(self._free.get(rc.bit, 0), arc.ends(start))
 
-    def _rcs(self, arc: Arc) -> list[Rc]:
+    def _rcs(self, arc: Arc, order: Order) -> list[Rc]:
         """The RCs to reserve. For each pattern the matching RC that is free earliest; an absent placeholder
         RC if none is left."""
         rcs = list(self._state.rcs_in(arc.named_mask)) if arc.patterns else list(arc.rcs)
         for need in arc.patterns:
             matching = self._state.matching(need)
             left = [rc for rc in matching if rc.present and rc not in rcs and not rc.bit & self._state.barred(arc)]
-            rcs.append(min(left, key=lambda rc: (self._free_from(rc, arc), rc.bit), default=Rc(need, 0)))
+            rcs.append(min(left, key=lambda rc: (self._free_from(rc, arc, order), rc.bit), default=Rc(need, 0)))
         return rcs
 
     def _within_quota(self, arc: Arc) -> float:
@@ -161,11 +191,11 @@ class Reservations:
                 held -= len(one.rcs)
         return max(ends)
 
-    def _free_from(self, rc: Rc, arc: Arc) -> float:
+    def _free_from(self, rc: Rc, arc: Arc, order: Order) -> float:
         """When `rc` has room for `arc` at the latest; infinite where that is not known."""
         non_preemptible = rc.non_preemptible_holders(arc, self._state.now)
         if rc.sharable:
-            sharing = (reservation.arc.id for reservation in self.by_rc.get(rc.bit, ()))
+            sharing = (one.arc.id for one in self.before(rc, order) if not one.excludes)
             if self._votes.accepts(rc.name, frozenset((*(holder.id for holder in non_preemptible), *sharing, arc.id))):
                 return self._state.now
             alone = self._votes.known(rc.name, frozenset((arc.id,)))
@@ -196,13 +226,16 @@ class Reservations:
                     break
                 if reservation.booked is not None and reservation.start >= arc.ends(self._state.now):
                     continue
+                if reservation.excludes:
+                    if self._delays(arc, reservation):
+                        return Inadmissible(rc, kept_for(rc, reservation))
+                    continue
                 before.append(reservation)
                 if blocking is None and self._delays(arc, reservation):
                     blocking = reservation
             if blocking is None:
                 continue
-            code = ReasonCode.RESERVED if blocking.booked is None else ReasonCode.BOOKED
-            reason = Reason(code, (rc.name,), (blocking.arc.party,))
+            reason = kept_for(rc, blocking)
             if not rc.sharable:
                 return Inadmissible(rc, reason)
             for together in self._together(rc, arc, before):
@@ -222,25 +255,39 @@ class Reservations:
         for time in sorted({now, *(one.start for one in before if one.start > now)}):
             there = [one for one in before if one.start <= time and (one.booked is None or one.booked > time)]
             coming = [arc] if time == now else [one.arc for one in there if one.start == time]
-            staying = [one.id for one in rc.holders.values() if not any(_yields(one, other, time) for other in coming)]
+            staying = [one.id for one in rc.holders.values() if not any(yields(one, other, time) for other in coming)]
             sets.append(frozenset((*staying, arc.id, *(one.arc.id for one in there))))
         return sets
 
     def reserves(self, rc: Rc, arc: Arc) -> bool:
-        """Whether `rc`, exclusive, is reserved for another that goes before `arc`."""
+        """Whether `rc` is reserved for another that goes before `arc`, and that it can't share it with."""
         for one in self.by_rc.get(rc.bit, ()):
             if one.arc is arc:
                 return False
-            if self._delays(arc, one):
+            if (one.excludes or not rc.sharable) and self._delays(arc, one):
                 return True
         return False
 
     def _delays(self, arc: Arc, reservation: Reservation) -> bool:
         """Whether `arc`, started now, would hold what is reserved when the time comes, and must not."""
-        band = self._state.band
-        return band(arc.priority) <= band(reservation.arc.priority) and arc.ends(self._state.now) > reservation.start
+        band, now = self._state.band, self._state.now
+        binds = band(arc.priority) <= band(reservation.arc.priority) or (
+            reservation.excludes and reservation.start <= now
+        )
+        return binds and arc.ends(now) > reservation.start
 
     def changed(self, earlier: Reservations) -> int:
         """Bits of the RCs at which the reservations differ from the `earlier` ones."""
         either = self.by_rc.keys() | earlier.by_rc.keys()
+        same = (bit for bit in self.by_rc if self.by_rc[bit] is earlier.by_rc.get(bit))
+        either -= set(same)
         return union(bit for bit in either if self.by_rc.get(bit) != earlier.by_rc.get(bit))
+
+
+def kept_for(rc: Rc, reservation: Reservation) -> Reason:
+    """Why an ARC waits that would delay a reservation."""
+    if reservation.excludes:
+        party = reservation.arc.party._replace(until=reservation.booked)
+        return Reason(ReasonCode.MAINTENANCE, (rc.name,), (party,))
+    code = ReasonCode.RESERVED if reservation.booked is None else ReasonCode.BOOKED
+    return Reason(code, (rc.name,), (reservation.arc.party,))

@@ -1,9 +1,9 @@
 """When all of these can be had together: times at which a booking would be kept.
 
-What is in the way: other bookings, whatever their priority; holds that would not be over, or not be preempted; and
-what starving ARCs of equal or higher priority are reserved. Whoever else is queued goes round a booking. Sharable RCs
-are asked about all who would be there at once. What is found is exact for the RCs that earlier bookings were given
-for their patterns; it does not try to give those others."""
+What is in the way: other bookings, maintenance too, whatever their priority; holds that would not be over, or not be
+preempted; and what starving ARCs of equal or higher priority are reserved. Whoever else is queued goes round a booking.
+Sharable RCs are asked about all who would be there at once. What is found is exact for the RCs that earlier bookings
+were given for their patterns; it does not try to give those others."""
 
 from __future__ import annotations
 
@@ -48,12 +48,24 @@ class _Taken(NamedTuple):
     start: Ns
     end: float
     arc: ArcId
+    excludes: bool = False
+    """Whether even a sharable RC has no other holder then."""
 
 
-def slots(state: SchedulerState, wanted: Booking, arc: Arc, until: Ns, limit: int) -> SlotsFound:
+def slots(
+    state: SchedulerState,
+    wanted: Booking,
+    arc: Arc,
+    until: Ns,
+    limit: int,
+    *,
+    bookings_only: bool = False,
+    presume: bool = False,
+) -> SlotsFound:
     """The first `limit` stretches of time in which `wanted` might start, from its own start to `until`; `arc` stands
-    for it."""
-    search, result = _Search(state, wanted, arc), SlotsFound()
+    for it. `bookings_only`: as if nobody held or waited for anything. `presume`: votes that are not known are presumed
+    to be a yes."""
+    search, result = _Search(state, wanted, arc, bookings_only, presume), SlotsFound()
     latest: Ns = wanted.start - 1
     for tried, start in enumerate(search.starts(until)):
         if start <= latest:
@@ -75,8 +87,8 @@ def slots(state: SchedulerState, wanted: Booking, arc: Arc, until: Ns, limit: in
 
 
 class _Search:
-    def __init__(self, state: SchedulerState, wanted: Booking, arc: Arc) -> None:
-        self._state, self._wanted, self._arc = state, wanted, arc
+    def __init__(self, state: SchedulerState, wanted: Booking, arc: Arc, bookings_only: bool, presume: bool) -> None:
+        self._state, self._wanted, self._arc, self._presume = state, wanted, arc, presume
         self._named = list(state.rcs_in(arc.named_mask))
         barred = state.barred(arc) | arc.named_mask
         self._choices: dict[Need, list[Rc]] = {}
@@ -86,20 +98,24 @@ class _Search:
             self._choices[need] = [rc for rc in known if rc.present] or known
         self._taken: dict[int, list[_Taken]] = {}
         for rc in {rc.bit: rc for rc in chain(self._named, *self._choices.values())}.values():
-            self._taken[rc.bit] = sorted(self._taken_of(rc))
-        self._add_reserved()
+            self._taken[rc.bit] = sorted(chain(self._booked(rc), () if bookings_only else self._held(rc)))
+        if not bookings_only:
+            self._add_reserved()
 
-    def _taken_of(self, rc: Rc) -> Iterable[_Taken]:
+    def _held(self, rc: Rc) -> Iterable[_Taken]:
         now = self._state.now
         for holder in rc.non_preemptible_holders(self._arc, now):
             yield _Taken(now, holder.known_end(self._arc), holder.id)
+
+    def _booked(self, rc: Rc) -> Iterable[_Taken]:
         for claim in self._state.claims.values():
-            if claim.mask & rc.bit and claim.booking.id != self._wanted.id:
-                yield _Taken(claim.booking.start, claim.booking.end, claim.arc.id)
+            one = claim.booking
+            if claim.mask & rc.bit and one.id != self._wanted.id:
+                yield _Taken(one.start, one.end, claim.arc.id, one.maintenance)
 
     def _add_reserved(self) -> None:
         state = self._state
-        if state.policy.patience is None:
+        if state.policy.patience is None or not state.index.starving:
             return
         for bit, reserved in Reservations(state, state.policy.patience).by_rc.items():
             for one in reserved if bit in self._taken else ():
@@ -119,12 +135,14 @@ class _Search:
             free = self._is_free(rc, start)
             if free is False:
                 return None
-            unknown += [] if free is True else [(rc, free)]
+            unknown += [] if free is True or self._presume else [(rc, free)]
         allowed: dict[Need, list[Rc]] = {}
         for need, choices in self._choices.items():
             found = {rc.bit: self._is_free(rc, start) for rc in choices}
             allowed[need] = [rc for rc in choices if found[rc.bit] is True]
-            if len(allowed[need]) < len(self._choices):
+            if self._presume:
+                allowed[need] += [rc for rc in choices if not isinstance(found[rc.bit], bool)]
+            if len(allowed[need]) < len(self._choices) and not self._presume:
                 # With enough that are free without it nobody is asked.
                 unknown += [(rc, free) for rc in choices if not isinstance(free := found[rc.bit], bool)]
         chosen = distinct(allowed)
@@ -137,9 +155,10 @@ class _Search:
     def _is_free(self, rc: Rc, start: Ns) -> bool | HolderSet:
         """Whether `rc` is to be had from then on for long enough; or the holders on which its vote is not known."""
         end = start + self._wanted.runtime
-        there = frozenset(one.arc for one in self._taken[rc.bit] if one.start < end and one.end > start)
-        if not rc.sharable:
-            return not there
+        taken = [one for one in self._taken[rc.bit] if one.start < end and one.end > start]
+        if not rc.sharable or self._wanted.maintenance or any(one.excludes for one in taken):
+            return not taken
+        there = frozenset(one.arc for one in taken)
         answer = self._state.votes.known(rc.name, there | {self._arc.id})
         return there | {self._arc.id} if answer is None else answer.accept
 

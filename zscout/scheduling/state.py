@@ -17,6 +17,7 @@ from msgspec import structs
 
 from zscout.config.scheduling_policy import DEFAULT, RcQuota, SchedulingPolicy, StrategyName
 from zscout.keyexpr import is_pattern, matcher
+from zscout.scheduling.booking import Booking
 from zscout.scheduling.model import Arc, ArcRequest, ArcState, Claim, Hold, Rank, Rc, union
 from zscout.scheduling.reason import Reason
 from zscout.scheduling.votes import HolderSet, Votes
@@ -135,12 +136,16 @@ class SchedulerState:
         """ARCs that are queued, but not considered for a while, or as long as another has their place."""
         self.claims: dict[str, Claim] = {}
         """Bookings that are not over, by id."""
+        self.maintenance: dict[str, Claim] = {}
+        """Those that are maintenance."""
         self.claimed = 0
         """Bits of the RCs that are booked, at whatever time."""
         self.claims_version = 0
         """Grows with all that changes what is booked, and by whom it is taken up."""
         self._claim_ends: list[tuple[Ns, str]] = []
-        """A heap of when bookings lapse or end. Those that are over by then are skipped."""
+        """A heap of when bookings lapse or end, and when maintenance begins. What is not so any more is skipped."""
+        self._claim_starts: list[Ns] = []
+        """The dates of all bookings, in order."""
         self._at_place: dict[Place, Arc] = {}
         """By place: who is considered, or runs. Two clients may claim one ARC, which has to run once."""
         self.present = 0
@@ -164,6 +169,8 @@ class SchedulerState:
         """Counts who was queued or started."""
         self.version = 0
         """Grows with all that changes who holds what, which RCs are there, and who is preemptible."""
+        self.changed = 0
+        """Bits of the RCs at which it grew, since who looks after bookings last emptied this."""
 
     def rc(self, name: RcName) -> Rc:
         """The RC of this name, made known (absent, exclusive) if it was not."""
@@ -251,14 +258,14 @@ class SchedulerState:
         self.present |= rc.bit
         self.sharable = self.sharable | rc.bit if sharable else self.sharable & ~rc.bit
         self.index.freed |= rc.bit
-        self.version += 1
+        self._grow(rc.bit)
 
     def leave(self, name: RcName) -> None:
         rc = self.rc(name)
         rc.present = False
         self.present &= ~rc.bit
         self.index.freed |= rc.bit
-        self.version += 1
+        self._grow(rc.bit)
 
     def is_free(self, arc: Arc) -> bool:
         """Whether a new ARC finds all that it needs there, exclusive and free, and nobody waits: the usual case where
@@ -343,34 +350,52 @@ class SchedulerState:
 
     def claim(self, claim: Claim) -> None:
         """A booking is made."""
-        booking = claim.booking
-        self.claims[booking.id] = claim
-        for at in (booking.lapses, booking.end):
-            heapq.heappush(self._claim_ends, (at, booking.id))
+        self.claims[claim.booking.id] = claim
+        if claim.booking.maintenance:
+            self.maintenance[claim.booking.id] = claim
+        self.redated(claim)
+
+    def redated(self, claim: Claim) -> None:
+        """A booking has this date from now on."""
+        for at in _instants(claim.booking):
+            heapq.heappush(self._claim_ends, (at, claim.booking.id))
         self.claims_changed()
 
     def unclaim(self, claim: Claim) -> None:
         """A booking is over."""
         del self.claims[claim.booking.id]
+        self.maintenance.pop(claim.booking.id, None)
         claim.arc.claim = None
         self.claims_changed()
 
     def claims_changed(self) -> None:
         """Bookings, or by whom they are taken up, or the RCs that are kept for them, are not what they were."""
         self.claimed = union(claim.kept for claim in self.claims.values())
+        self._claim_starts = sorted(claim.booking.start for claim in self.claims.values())
         self.claims_version += 1
+
+    @property
+    def begun(self) -> int:
+        """How many of the bookings have come to their dates."""
+        return bisect_right(self._claim_starts, self.now)
 
     def claims_over(self) -> Iterator[Claim]:
         """Bookings whose time is over by now, or whose owner's is to take them up; each may come twice."""
         while self._claim_ends and self._claim_ends[0][0] <= self.now:
-            _, booking = heapq.heappop(self._claim_ends)
-            if (claim := self.claims.get(booking)) is not None:
+            at, booking = heapq.heappop(self._claim_ends)
+            claim = self.claims.get(booking)
+            if claim is not None and at in (claim.booking.lapses, claim.booking.end):
                 yield claim
 
-    def next_claim_over(self) -> Ns | None:
-        while self._claim_ends and self._claim_ends[0][1] not in self.claims:
+    def next_claim_change(self) -> Ns | None:
+        """When the next booking lapses or ends, or maintenance begins."""
+        while self._claim_ends:
+            at, booking = self._claim_ends[0]
+            claim = self.claims.get(booking)
+            if claim is not None and at in _instants(claim.booking):
+                return at
             heapq.heappop(self._claim_ends)
-        return self._claim_ends[0][0] if self._claim_ends else None
+        return None
 
     def voter(self, arc: ArcId) -> Arc | None:
         """Who is meant by an id in a set of holders: an ARC, or what stands for a booking."""
@@ -460,7 +485,11 @@ class SchedulerState:
     def min_runtime_over(self, arc: Arc) -> None:
         """A kept hold has had its minimum runtime: from now on its equals may preempt it."""
         self.index.freed |= arc.mask
+        self._grow(arc.mask)
+
+    def _grow(self, mask: int) -> None:
         self.version += 1
+        self.changed |= mask
 
     def operator(self, priority: int) -> bool:
         """Whether it is an operator's, whom no knob of the policy keeps waiting."""
@@ -504,7 +533,8 @@ class SchedulerState:
 
     def _add_running(self, arc: Arc) -> None:
         self.running[arc.id] = arc
-        self.version += 1
+        self._grow(arc.mask)
+        self.claims_version += arc.claim is not None
         self.running_by_owner[arc.owner] = self.running_by_owner.get(arc.owner, 0) + 1
         self.held_by_owner[arc.owner] = self.held_by_owner.get(arc.owner, 0) + len(arc.rcs)
         for rc in arc.rcs:
@@ -512,7 +542,8 @@ class SchedulerState:
 
     def _remove_running(self, arc: Arc) -> None:
         del self.running[arc.id]
-        self.version += 1
+        self._grow(arc.mask)
+        self.claims_version += arc.claim is not None
         self.running_by_owner[arc.owner] -= 1
         self.held_by_owner[arc.owner] -= len(arc.rcs)
         if not self.running_by_owner[arc.owner]:
@@ -527,6 +558,11 @@ class SchedulerState:
     def _next_entry(self) -> int:
         self.entries += 1
         return self.entries
+
+
+def _instants(booking: Booking) -> tuple[Ns, ...]:
+    """When something becomes of a booking by itself."""
+    return (booking.start, booking.end) if booking.maintenance else (booking.lapses, booking.end)
 
 
 class Actions(Protocol):

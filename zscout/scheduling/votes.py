@@ -133,6 +133,8 @@ class Votes:
         """RCs that answered, or became unresponsive, since a pass last emptied this."""
         self.invalidated: set[RcName] = set()
         """RCs whose answers are no longer in force, likewise."""
+        self.changed: set[RcName] = set()
+        """RCs of which more or less is known since who looks after bookings last emptied this."""
 
     def known(self, rc: RcName, holders: HolderSet) -> Answer | None:
         """The answer in force for exactly this set, by itself or by what it implies; None if unknown."""
@@ -181,6 +183,7 @@ class Votes:
         self._close(votes, holders)
         self.unresponsive.discard(rc)
         self.answered.add(rc)
+        self.changed.add(rc)
         self.version += 1
         if accept:
             votes.accept(holders)
@@ -205,6 +208,7 @@ class Votes:
     def forget_rc(self, rc: RcName) -> None:
         """The RC left, came anew or changed its rules: its votes and open proposals are dropped."""
         self.invalidated.add(rc)
+        self.changed.add(rc)
         self.version += 1
         self.unresponsive.discard(rc)
         votes = self._by_rc.pop(rc, None)
