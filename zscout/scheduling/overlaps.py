@@ -29,7 +29,7 @@ def overlaps(state: SchedulerState, order: Iterable[str]) -> Overlaps:
         rcs = [rc for rc in state.rcs_in(claim.kept) if rc.present]
         for rc in rcs:
             before = [one for one in standing.get(rc.bit, ()) if _meet(one, claim)]
-            if before and (not rc.sharable or _refused(state, rc, claim, before, result)):
+            if before and (not rc.sharable or _excluded(claim, before) or _refused(state, rc, claim, before, result)):
                 result.losers[name] = before[0].booking.id
                 break
         else:
@@ -39,7 +39,13 @@ def overlaps(state: SchedulerState, order: Iterable[str]) -> Overlaps:
 
 
 def _meet(one: Claim, other: Claim) -> bool:
-    return one.booking.start < other.booking.end and other.booking.start < one.booking.end
+    """Whether they are at one time; that an RC is in maintenance twice keeps nobody from it more."""
+    both = one.booking.maintenance and other.booking.maintenance
+    return not both and one.booking.start < other.booking.end and other.booking.start < one.booking.end
+
+
+def _excluded(claim: Claim, before: list[Claim]) -> bool:
+    return claim.booking.maintenance or any(one.booking.maintenance for one in before)
 
 
 def _refused(state: SchedulerState, rc: Rc, claim: Claim, before: list[Claim], result: Overlaps) -> bool:

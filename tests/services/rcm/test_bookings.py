@@ -290,7 +290,7 @@ def test_a_leader_whose_clock_is_an_hour_off_goes_on_in_the_time_of_the_fleet(ah
         await until(lambda: y.rcm)
         await client.ask("mine", "robot/a", seconds=100, booking="b")
         await asyncio.sleep(NOON + 199 - fleet.time())
-        assert client.notices[-1].state == "queued"
+        assert [notice.state for notice in client.notices].count("running") == 0
         await asyncio.sleep(2)
         assert client.notices[-1].state == "running"
         reply = await fleet.watcher.ask_one(fleet.watcher.keys.rcm_bookings, BookingsAsk(), BookingsTold, timeout=1)
@@ -363,5 +363,49 @@ def test_fleet_time_does_not_jump_in_a_reign() -> None:
             assert 0.989 < gone / (fleet.time() - at) < 1.011
             last, at = dates.time, fleet.time()
         assert dates.time == pytest.approx(fleet.time() + 10, abs=0.1)
+
+    run(story())
+
+
+def test_maintenance_goes_before_what_is_booked_and_both_are_told() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x")
+        await led(fleet, "x")
+        client = fleet.client("one")
+        await do(client, book("b", "robot/a", at=300), BookingView)
+        drain = await do(client, book("m", "robot/a", "robot/b", at=200, seconds=200, maintenance=True), BookingView)
+        assert drain.priority == fleet.fleet.operator_priority
+        views = await fleet.bookings()
+        assert states(views["m"]) == ["open"]
+        assert states(views["b"]) == ["conflict"]
+        assert views["b"].dates[0].danger == "m of desk stands"
+        with pytest.raises(Refusal, match=r"bad_request.*nobody takes it up"):
+            await client.ask("mine", "robot/a", "robot/b", booking="m", priority=drain.priority)
+        kept = await client.ask("kept", "robot/b", seconds=30, keep=True)
+        late = await client.ask("late", "robot/a", seconds=250, estimate=True)
+        assert (kept.state, late.state) == ("running", "queued")
+        assert late.starts_in == pytest.approx(400 - (fleet.time() - NOON), abs=1)
+        await asyncio.sleep(NOON + 201 - fleet.time())
+        assert [(one.state, one.outcome) for one in client.notices if one.id == "kept"][-1] == ("ended", "completed")
+        await asyncio.sleep(200)
+        assert [one.state for one in client.notices if one.id == "late"][-1] == "running"
+
+    run(story())
+
+
+def test_a_booking_is_in_danger_while_what_it_needs_is_away() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x")
+        await led(fleet, "x")
+        far = fleet.rc("robot/far")
+        await fleet.joined(far)
+        client = fleet.client("one")
+        await do(client, book("b", "robot/far", at=300), BookingView)
+        fleet.network.kill(far.mesh)
+        await asyncio.sleep(3)
+        assert "robot/far" in (await fleet.bookings())["b"].dates[0].danger
+        back = fleet.rc("robot/far")
+        await fleet.joined(back)
+        assert not (await fleet.bookings())["b"].dates[0].danger
 
     run(story())

@@ -5,7 +5,7 @@ In a reign it never jumps: it is slewed by at most 1 % towards the median of the
 from __future__ import annotations
 
 from collections.abc import Iterable
-from statistics import median_low
+from statistics import median_high, median_low
 from typing import Final
 
 from zscout.types import SECOND, Ns
@@ -20,9 +20,12 @@ def wall_ns(seconds: float) -> Ns:
     return round(seconds * SECOND)
 
 
-def agreed(times: Iterable[Ns]) -> Ns:
-    """The time of several clocks at one instant: their median, the lower one of two. Raises ValueError for none."""
-    return median_low(times)
+def agreed(times: Iterable[Ns], goes_on: Ns | None = None) -> Ns:
+    """The time of several clocks at one instant: their median. Of two in the middle it is the one that is nearer to
+    the time that `goes_on`, which more may have agreed upon; else the lower. Raises ValueError for none."""
+    all_times = sorted(times)
+    low, high = median_low(all_times), median_high(all_times)
+    return high if goes_on is not None and abs(high - goes_on) < abs(low - goes_on) else low
 
 
 class FleetClock:

@@ -13,7 +13,15 @@ from msgspec.structs import replace
 from zscout.keyexpr import check_need, is_pattern
 from zscout.mesh.sparse_log import SparseLog
 from zscout.messages import WINDOW, BookedDate, BookingRecord, BookingView, DateState, Instant, duration, exact_amounts
-from zscout.scheduling.booking import Booked, Booking, BookingChanged, BookingState, Unbooked
+from zscout.scheduling.booking import (
+    Booked,
+    Booking,
+    BookingChanged,
+    BookingState,
+    BookingThreatened,
+    Redated,
+    Unbooked,
+)
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Effect, Event, Propose, Rc, RcJoined, Vote, VoteOverdue
 from zscout.scheduling.votes import HolderSet
@@ -108,6 +116,7 @@ class BookedDates:
             record.owner,
             record.name,
             record.who,
+            maintenance=record.maintenance,
         )
 
     def open_dates(self, record: BookingRecord) -> list[Date]:
@@ -171,7 +180,7 @@ class BookedDates:
             record = replace(date.record, bound={})
             if (booked := self._booked(Date(record, date.start))) is None:
                 return
-            found = self._core.slots(booked.booking, booked.booking.start, 1)
+            found = self._core.slots(booked.booking, booked.booking.start, 1, bookings_only=True)
             if found.unknown:
                 self._waits_for_votes = True
                 self.ask(found.unknown, booked.booking)
@@ -192,7 +201,15 @@ class BookedDates:
 
     def redate(self) -> None:
         """Puts right the dates that fleet time, which was slewed, has moved."""
-        # Redated: with the core's next step.
+        now = self._now()
+        ahead = self.clock.at(now) - now
+        moved = self._dated_by - ahead
+        if abs(moved) < REDATED:
+            return
+        self._dated_by = ahead
+        known = self._core.booked().items()
+        if events := [Redated(name, one.start + moved) for name, one in known if one.start > now]:
+            self._emit(*events)
 
     def change(self, record: BookingRecord, **to: object) -> BookingRecord:
         """The record, changed in this term."""
@@ -210,11 +227,21 @@ class BookedDates:
                 case BookingChanged(booking=name, state=state) if state in OVER:
                     booking, _, start = name.partition("@")
                     over.setdefault(booking, []).append(int(start))
+                case BookingThreatened(booking=name, reason=reason):
+                    self._tell_danger(name, "" if reason is None else str(reason))
         for booking, starts in over.items():
             if (record := self._records.get(booking)) is not None:
                 self.change(record, over=sorted({*record.over, *starts}))
         votes = self._waits_for_votes and any(isinstance(event, (Vote, VoteOverdue)) for event in events)
         return bool(over) or votes or any(isinstance(event, RcJoined) for event in events)
+
+    def _tell_danger(self, date: str, why: str) -> None:
+        """What keeps a date from its start; empty: nothing does any more."""
+        if why:
+            self._danger[date] = why
+        else:
+            self._danger.pop(date, None)
+        log.info("booking %s (%s) %s", date, self._name(date), f"is in danger: {why}" if why else "is safe again")
 
     # For people and programs
 

@@ -177,7 +177,8 @@ class BookingHandler:
         """Whether it is decided: all dates of the next 60 days are free, or one is not."""
         unknown, bound = [], dict[int, dict[str, str]]()
         self._emit(Tick())
-        for date in self._dates.open_dates(record):
+        # Maintenance goes before what is booked: who is in its way is told.
+        for date in [] if record.maintenance else self._dates.open_dates(record):
             claim = self._dates.claim(date)
             found = self._core.slots(claim, claim.start, 1)
             if found.unknown:

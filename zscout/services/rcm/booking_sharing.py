@@ -45,10 +45,11 @@ class BookingSharing:
         clock: FleetClock,
         supervisor: Supervisor,
         on_news: Callable[[], None],
+        on_shared: Callable[[], None],
     ) -> None:
-        """`on_news` is called when others told of what was not known here."""
+        """`on_news` is called when others told of what was not known here, `on_shared` each time all were asked."""
         self._mesh, self._term, self._keeper, self._clock = mesh, term, keeper, clock
-        self._supervisor, self._on_news = supervisor, on_news
+        self._supervisor, self._on_news, self._on_shared = supervisor, on_news, on_shared
         self._unshared: dict[str, BookingRecord] = {}
         self._behind = True
         """Whether some host may not have all that is known here."""
@@ -87,6 +88,7 @@ class BookingSharing:
             self._news.clear()
             async with self._sharing:
                 await self._share()
+            self._on_shared()
             if self._why:
                 log.warning("bookings are kept by this host alone: %s", self._why)
 
@@ -121,7 +123,7 @@ class BookingSharing:
             self._on_news()
             self._news.set()
         walls = {one.host: one.wall for one in answers} | {self._mesh.me.host: self._keeper.wall()}
-        self._clock.aim(agreed(map(wall_ns, walls.values())), now)
+        self._clock.aim(agreed(map(wall_ns, walls.values()), self._clock.at(now)), now)
         time = self._clock.at(now) / SECOND
         self.clocks = {host: wall - time for host, wall in walls.items() if abs(wall - time) > DIFFERS}
         return answers

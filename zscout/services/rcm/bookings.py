@@ -49,7 +49,10 @@ class Bookings:
             for proposal in proposals:
                 propose(proposal)
 
-        self._sharing = BookingSharing(mesh, term, keeper, self.clock, supervisor, self._on_news)
+        def redate() -> None:
+            self.dates.redate()
+
+        self._sharing = BookingSharing(mesh, term, keeper, self.clock, supervisor, self._on_news, redate)
         self.dates = BookedDates(core, keeper.records, self.clock, mesh.now, emit, vote, self._sharing.tell)
         self.handler = BookingHandler(
             fleet, core, keeper, self.dates, self._sharing, authority, supervisor, emit, check_door
