@@ -217,6 +217,7 @@ def test_every_key_of_a_fleet_file() -> None:
         max_payload = 4096
         max_running_per_host = 5
         max_runtime = "1d12h"
+        max_bookings_per_host = 7
         [timing]
         heartbeat = 0.1
         hold_lease = 5
@@ -237,7 +238,7 @@ def test_every_key_of_a_fleet_file() -> None:
             interface="eth0,wlan0",
             lease=2.0,
         ),
-        limits=RcmLimits(1, 2, 3, 4, 4096, 5, 129_600 * SECOND),
+        limits=RcmLimits(1, 2, 3, 4, 4096, 5, 129_600 * SECOND, 7),
         timing=Timing(SECOND // 10, 5 * SECOND, 3 * SECOND // 10, 5 * SECOND // 4),
         min_runtime=90 * SECOND,
     )

@@ -20,8 +20,8 @@ def project() -> dict[str, Any]:
 
 
 def pins(file: str) -> dict[str, str]:
-    """Each package of a requirements file, with its version, hashes and all."""
-    text = (ROOT / "requirements" / file).read_text()
+    """Each package of a requirements file, with its version and hashes, wherever it is needed."""
+    text = re.sub(r" ; .*(?= \\\n)", "", (ROOT / "requirements" / file).read_text())
     return {pin.partition("==")[0]: pin.strip() for pin in re.split(r"\n(?=\S)", text)}
 
 

@@ -64,6 +64,7 @@ FLEET: Final[Mapping[str, Mapping[str, Key]]] = {
         "max_queued": _number("10_000", "1", "1_000_000", "0", "1_000_001"),
         "max_needs": _number("64", "1", "1_000", "0", "1_001"),
         "max_requests_per_client": _number("256", "1", "100_000", "0", "100_001"),
+        "max_bookings_per_host": _number("100", "0", "1_000", "-1", "1_001"),
         "max_requests_per_host": _number("2_500", "1", "1_000_000", "0", "1_000_001"),
         "max_payload": _number("65_536", "1_024", "16_777_216", "1_023", "16_777_217"),
         "max_running_per_host": _number("0", "1", "100_000", "-1", "100_001"),

@@ -93,7 +93,6 @@ class RcmLimits(Struct, frozen=True, forbid_unknown_fields=True):
     max_requests_per_host: Annotated[
         int, key("ARCs of all clients of one host or person, waiting or running.", 1, 1_000_000)
     ] = 2_500
-    max_bookings_per_host: Annotated[int, key("Bookings of one host or person.", 0, 1_000)] = 100
     max_payload: Annotated[int, key("Of one request.", 1_024, 16_777_216, unit="bytes")] = 65_536
     max_running_per_host: Annotated[
         int, key("Running ARCs of all clients of one host, but for an operator's; 0: any number.", 0, 100_000)
@@ -101,6 +100,7 @@ class RcmLimits(Struct, frozen=True, forbid_unknown_fields=True):
     max_runtime: Annotated[
         Ns, seconds("0", "31622400", "After this long every hold ends as completed, whoever's it is; 0: never.")
     ] = 0
+    max_bookings_per_host: Annotated[int, key("Bookings of one host or person, that are not over.", 0, 1_000)] = 100
 
 
 class Timing(Struct, frozen=True, forbid_unknown_fields=True):

@@ -133,12 +133,14 @@ class BookedDate(Message, frozen=True):
 
 
 class BookingView(_Booking, frozen=True):
-    """A booking as the leader knows it. `owner` is the host, or the name of the certificate, that made it. `dates` are
-    those that are not over, within the next 60 days."""
+    """A booking as the leader knows it. `owner` is the host, or the name of the certificate, that made it; `since`
+    when. `dates` are those that are not over, within the next 60 days; `dropped` all that were given up."""
 
     owner: str = ""
+    since: Instant = 0
     unbooked: bool = False
     dates: list[BookedDate] = []
+    dropped: Dates = []
 
 
 class BookingsAsk(Message, frozen=True):
