@@ -396,6 +396,7 @@ FIELDS: Final = {
     "rcs": ("robot/a", "robot/b", "radio/r", "robot/*"),
     "needs": ("robot/a", "robot/b", "radio/r", "robot/*", "robot/x"),
     "bound": ("robot/*", "robot/a"),
+    "kept": ("1800000000", "0"),
     "unconfirmed": ("robot/a", "robot/b"),
     "instances": ("robot/a", "robot/b", "radio/r"),
     "params": ("rate", "x"),

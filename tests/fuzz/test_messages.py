@@ -114,7 +114,7 @@ def test_every_key_of_the_key_space_has_a_row() -> None:
         "history": ("h", sender),
         "served_placer": (),
         **dict.fromkeys(("vote", "command_any", "rc_state", "frame"), ("k/n",)),
-        **dict.fromkeys(("load", "served_component", "confirm_any", "history_any"), ("h",)),
+        **dict.fromkeys(("load", "served_component", "confirm_any", "history_any", "bookings"), ("h",)),
     }
     no_keys = {"fleet", "closed", "base", "everything"}
     built: dict[str, str] = {}

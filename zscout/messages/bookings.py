@@ -171,7 +171,7 @@ class BookingRecord(_Booking, frozen=True):
     unbooked: bool = False
     dropped: Dates = []
     over: Dates = []
-    bound: Annotated[dict[int, dict[str, str]], msgspec.Meta(max_length=MAX_DATES)] = {}
+    kept: Annotated[dict[int, dict[str, str]], msgspec.Meta(max_length=MAX_DATES)] = {}
     """By date: the RC that is kept for each pattern of its needs."""
 
 

@@ -50,7 +50,7 @@ class Date(NamedTuple):
 
     @property
     def bound(self) -> dict[Need, RcName]:
-        return self.record.bound.get(self.start, {})
+        return self.record.kept.get(self.start, {})
 
     @property
     def rank(self) -> tuple[int, Grant, str, Instant]:
@@ -177,7 +177,7 @@ class BookedDates:
     def _bind(self, date: Date, by: str) -> None:
         """Enters a date with RCs for its patterns that are free then; if there are none, `by` is in its way."""
         if any(map(is_pattern, date.record.needs)):
-            record = replace(date.record, bound={})
+            record = replace(date.record, kept={})
             if (booked := self._booked(Date(record, date.start))) is None:
                 return
             found = self._core.slots(booked.booking, booked.booking.start, 1, bookings_only=True)
@@ -185,9 +185,9 @@ class BookedDates:
                 self._waits_for_votes = True
                 self.ask(found.unknown, booked.booking)
             elif found.found:
-                bound = {**date.record.bound, date.start: dict(found.found[0].bound)}
+                kept = {**date.record.kept, date.start: dict(found.found[0].bound)}
                 self._conflicts.pop(date.id, None)
-                new = self.change(date.record, bound=bound)
+                new = self.change(date.record, kept=kept)
                 if (again := self._booked(Date(new, date.start))) is not None:
                     self._emit(again)
                 return

@@ -192,7 +192,7 @@ class BookingHandler:
             for claim, votes in unknown:
                 self._dates.ask(votes, claim)
             return False
-        self._dates.change(record, bound=bound)
+        self._dates.change(record, kept=bound)
         self._dates.reconcile()
         log.info("%s books %s: %s at %s", record.owner, record.name, ", ".join(record.needs), told(record.start))
         self._answer_kept(query, record, withdraw=True)
