@@ -162,8 +162,6 @@ class BookingKeeper:
     def _on_shared(self, query: IncomingQuery[ShareBookings]) -> None:
         if self._waiting >= MAX_SAVING:
             raise Refused("busy", "this host is still writing bookings to its disk; ask again")
-        if len(self.records) + len(query.message.records) > 2 * MAX_MERGED:
-            raise Refused("too_many", f"this host keeps {len(self.records)} bookings already")
         if (heard := self.time) is not None:
             self.records.forget_old(heard / SECOND)
         if self.records.take(query.message.records):

@@ -11,9 +11,11 @@ from typing import Final
 
 from msgspec.structs import replace
 
-from zscout.messages import BookingRecord, encode
+from zscout.messages import MAX_MERGED, BookingRecord, encode
 from zscout.services.bookings.dates import DAY, last_end
 
+MAX_BYTES: Final = 12_000_000
+"""Of all records: one answer, and a file, has room for them."""
 KEEP: Final = DAY
 """Seconds for which a record is kept beyond its last end: clocks may differ."""
 
@@ -35,7 +37,8 @@ class Records:
 
     def __init__(self) -> None:
         self._records: dict[str, BookingRecord] = {}
-        self._sizes: dict[str, int] = {}
+        self.size = 0
+        """In bytes, as they are sent."""
         self._digest: str | None = None
 
     def __iter__(self) -> Iterator[BookingRecord]:
@@ -47,20 +50,18 @@ class Records:
     def get(self, booking: str) -> BookingRecord | None:
         return self._records.get(booking)
 
-    @property
-    def size(self) -> int:
-        """In bytes, as they are sent."""
-        return sum(self._sizes.values())
-
     def take(self, records: Iterable[BookingRecord]) -> list[BookingRecord]:
-        """Merges these; returns what is not as it was."""
+        """Merges these, as far as there is room; returns what is not as it was."""
         changed = []
         for record in records:
             known = self._records.get(record.id)
             new = record if known is None else merged(known, record)
-            if new != known:
+            if new == known:
+                continue
+            grown = len(encode(new)) - (0 if known is None else len(encode(known)))
+            if self.size + grown <= MAX_BYTES and (known is not None or len(self) < MAX_MERGED):
                 self._records[record.id] = new
-                self._sizes[record.id] = len(encode(new))
+                self.size += grown
                 changed.append(new)
         if changed:
             self._digest = None
@@ -68,8 +69,8 @@ class Records:
 
     def remove(self, booking: str) -> None:
         """As if it had never been made."""
-        if self._records.pop(booking, None) is not None:
-            del self._sizes[booking]
+        if (record := self._records.pop(booking, None)) is not None:
+            self.size -= len(encode(record))
             self._digest = None
 
     def forget_old(self, time: float) -> bool:
