@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import chain, product
+from typing import Final
 
 from zscout.scheduling.model import Claim, Rc
 from zscout.scheduling.state import SchedulerState
 from zscout.scheduling.votes import HolderSet
+from zscout.types import SECOND, Ns
+
+DAY: Final[Ns] = 86_400 * SECOND
 
 
 @dataclass(slots=True)
@@ -22,20 +27,26 @@ def overlaps(state: SchedulerState, order: Iterable[str]) -> Overlaps:
     """Of claims in the order in which they stand. RCs that are absent are not judged: whether one is sharable is known
     once it is there."""
     result = Overlaps()
-    standing: dict[int, list[Claim]] = {}
+    standing: dict[tuple[int, int], list[Claim]] = {}
+    """By bit and day: thousands of dates of one RC are not compared with one another."""
     for name in order:
         if (claim := state.claims.get(name)) is None:
             continue
         rcs = [rc for rc in state.rcs_in(claim.kept) if rc.present]
         for rc in rcs:
-            before = [one for one in standing.get(rc.bit, ()) if _meet(one, claim)]
+            near = (standing.get((rc.bit, day), ()) for day in _days(claim))
+            before = list({one.booking.id: one for one in chain(*near) if _meet(one, claim)}.values())
             if before and (not rc.sharable or _excluded(claim, before) or _refused(state, rc, claim, before, result)):
                 result.losers[name] = before[0].booking.id
                 break
         else:
-            for rc in rcs:
-                standing.setdefault(rc.bit, []).append(claim)
+            for key in product((rc.bit for rc in rcs), _days(claim)):
+                standing.setdefault(key, []).append(claim)
     return result
+
+
+def _days(claim: Claim) -> range:
+    return range(claim.booking.start // DAY, claim.booking.end // DAY + 1)
 
 
 def _meet(one: Claim, other: Claim) -> bool:

@@ -12,7 +12,17 @@ from msgspec.structs import replace
 
 from zscout.keyexpr import check_need, is_pattern
 from zscout.mesh.sparse_log import SparseLog
-from zscout.messages import WINDOW, BookedDate, BookingRecord, BookingView, DateState, Instant, duration, exact_amounts
+from zscout.messages import (
+    MAX_AHEAD,
+    WINDOW,
+    BookedDate,
+    BookingRecord,
+    BookingView,
+    DateState,
+    Instant,
+    duration,
+    exact_amounts,
+)
 from zscout.scheduling.booking import (
     Booked,
     Booking,
@@ -32,6 +42,8 @@ from zscout.types import SECOND, ArcId, Grant, Need, Ns, RcName
 
 log = logging.getLogger(__name__)
 
+MAX_CLAIMS = 4_000
+"""Dates of all bookings within the next 60 days that a leader keeps free."""
 REDATED: Ns = SECOND // 50
 """By how much fleet time is slewed before dates are put right."""
 OVER = (BookingState.USED, BookingState.LAPSED)
@@ -124,6 +136,8 @@ class BookedDates:
         if record.unbooked:
             return []
         time = self.time
+        if not 0 < record.runtime <= MAX_AHEAD:
+            return []
         try:
             starts = dates(record, time - float(record.runtime), time + WINDOW)
         except (ValueError, OverflowError) as error:
@@ -139,7 +153,13 @@ class BookedDates:
         return [booked for date in self._all() if (booked := self._booked(date, taken=date.id in taken)) is not None]
 
     def _all(self) -> list[Date]:
-        return sorted((date for record in self._records for date in self.open_dates(record)), key=lambda one: one.rank)
+        found = list[Date]()
+        for record in sorted(self._records, key=lambda one: (-one.priority, one.made, one.id)):
+            found += self.open_dates(record)
+            if len(found) > MAX_CLAIMS:
+                self._strange.warning("", "more than %d dates are booked: the last are not kept", MAX_CLAIMS)
+                break
+        return sorted(found[:MAX_CLAIMS], key=lambda one: one.rank)
 
     def _booked(self, date: Date, *, taken: bool = False) -> Booked | None:
         try:

@@ -41,7 +41,7 @@ from zscout.scheduling.model import Tick
 from zscout.services.authority import Authority
 from zscout.services.bookings.dates import DAY, dates, zone_of
 from zscout.services.bookings.keeper import BookingKeeper
-from zscout.services.rcm.booked_dates import BookedDates, Date
+from zscout.services.rcm.booked_dates import MAX_CLAIMS, BookedDates, Date
 from zscout.services.rcm.booking_sharing import BookingSharing
 from zscout.types import SECOND, Grant, Ns
 
@@ -49,8 +49,6 @@ log = logging.getLogger(__name__)
 
 Query: TypeAlias = IncomingQuery[Operation]
 
-MAX_CLAIMS: Final = 4_000
-"""Dates of all bookings within the next 60 days."""
 MAX_UNDECIDED: Final = 64
 """Operations that wait for votes, or for a keeper, at one time."""
 DECIDE_WITHIN: Final = 1.5
@@ -137,6 +135,8 @@ class BookingHandler:
             raise Refused("bad_request", str(error)) from None
         if not -MAX_PRIORITY <= wanted.priority <= MAX_PRIORITY:
             raise Refused("bad_request", f"priority must lie between -{MAX_PRIORITY} and {MAX_PRIORITY}")
+        if wanted.runtime > MAX_AHEAD:
+            raise Refused("bad_date", "nothing is booked for longer than a year")
         over = wanted.start + min(patience, runtime) / SECOND
         if over <= time:
             raise Refused("bad_date", f"{told(wanted.start)} is past; it is {told(time)} by fleet time")
