@@ -71,7 +71,7 @@ async def scrapes(rcs: int, waiters: int, rounds: int) -> tuple[Samples, Samples
 def instants(listeners: Sequence[HoldListener], rounds: int) -> Samples:
     """Seconds for an ARC of five RCs that is asked for, granted and released."""
     core, samples = Core(), Samples()
-    digest = HoldDigest(core.is_running, listeners) if listeners else None
+    digest = HoldDigest(core, listeners) if listeners else None
     needs: dict[RcName, Params] = {f"robot/r{number}": {} for number in range(5)}
     core.handle(0, *(RcJoined(rc, sharable=False) for rc in needs), LeadTaken(Term(1, "bench")))
     for number in range(rounds):

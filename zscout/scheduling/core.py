@@ -337,7 +337,7 @@ class Core:
         if self._state.arc(asked.request.arc) is not None:
             return
         arc = self._new_arc(asked.request, asked.place)
-        if alone and self._state.is_free(arc):
+        if alone and asked.since is None and self._state.is_free(arc):
             # What any strategy would do, without a queue of one.
             self._state.enter(arc)
             self.start(arc)

@@ -67,7 +67,7 @@ class Term2:
 
     def __init__(self, *holds: RecoveredHold, waiting: tuple[Requested, ...] = ()) -> None:
         self.core, self.heard = Core(), Heard()
-        self.digest = HoldDigest(self.core.is_running, [self.heard])
+        self.digest = HoldDigest(self.core, [self.heard])
         joined = [RcJoined(rc, sharable=False) for rc in ("robot/a", "robot/b")]
         self.at(10, *joined, LeadTaken(Term(2, "new"), holds, waiting))
 
@@ -86,6 +86,12 @@ def test_a_wait_is_from_the_queue_to_the_grant_and_begins_anew_when_it_is_preemp
     assert fleet.heard.ends == [("one", "preempted", 5), ("two", "released", 7), ("one", "cancelled", 8)]
     assert fleet.heard.over[0].requeued
     assert str(fleet.heard.over[0].reason) == "preempted by h/c (two), priority 5"
+
+
+def test_who_waited_under_an_earlier_rcm_and_asks_again_alone_has_waited_since_then() -> None:
+    fleet = Term2()
+    fleet.at(20, Requested(asked("late", "robot/a"), Place(OLD, 9), 4 * SECOND))
+    assert fleet.heard.waits == [("late", 16)]
 
 
 def test_what_is_recovered_goes_on_and_is_no_wait() -> None:
@@ -135,11 +141,12 @@ def test_nothing_is_kept_of_what_has_ended() -> None:
     fleet = Term2(held(asked("zero", "robot/b"), 3))
     for number in range(50):
         fleet.at(20 + number, Requested(asked(f"a{number}", "robot/a")), Requested(asked(f"b{number}", "robot/a")))
+        for client in ("c", "d"):
+            fleet.digest.foretell(f"h/{client}/b{number}", 90 * SECOND)
         fleet.at(20 + number, Released(f"h/c/a{number}"), HandedOver(f"h/c/b{number}", "h/d", f"h/d/b{number}"))
         fleet.at(20 + number, Cancelled(f"h/d/b{number}"), Released(f"h/c/b{number}"))
     fleet.at(71, Released("h/c/zero"), Adopted(held(asked("zero", "robot/b"), 3)))
-    kept = [fleet.digest._waiting, fleet.digest._foretold, fleet.digest._held]
-    assert kept == [{}, {}, {}]
+    assert [fleet.digest._foretold, fleet.digest._held] == [{}, {}]
 
 
 def test_a_listener_that_fails_ends_the_telling_and_nothing_else(caplog: pytest.LogCaptureFixture) -> None:
@@ -148,8 +155,8 @@ def test_a_listener_that_fails_ends_the_telling_and_nothing_else(caplog: pytest.
             raise KeyError(began.request.name)
 
     heard = Broken()
-    digest = HoldDigest(lambda _: True, [heard])
     core = Core()
+    digest = HoldDigest(core, [heard])
     events: list[Event] = [RcJoined("robot/a", sharable=False), LeadTaken(Term(2, "new"))]
     for second, event in enumerate([*events, Requested(asked("one", "robot/a")), Released("h/c/one")]):
         digest.take(second * SECOND, [event], core.handle(second * SECOND, event))

@@ -115,7 +115,7 @@ class Rcm:
         self.membership = Membership(mesh, fleet, term, supervisor, receive, self._compare, on_newer, devices)
         self.membership.on_requests = self._on_requests
         self.registry.hosts_of = self.membership.hosts_of
-        self._digest = HoldDigest(self.core.is_running, listeners) if listeners else None
+        self._digest = HoldDigest(self.core, listeners) if listeners else None
         if self._digest is not None:
             self.registry.on_foretold = self._digest.foretell
         self._tally = tally
