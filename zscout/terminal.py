@@ -19,6 +19,7 @@ from typing import IO, TYPE_CHECKING, Any, Final, Self
 import msgspec
 
 from zscout.types import clean as clean
+from zscout.types import span as span
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -61,19 +62,6 @@ def console(*, stderr: bool = False) -> Console:
     from rich.console import Console
 
     return Console(stderr=stderr, markup=False, highlight=False, emoji=False)
-
-
-def span(seconds: float) -> str:
-    """A span of time as people read it: `0.4 s`, `12 s`, `3 min 5 s`, `2 h 4 min`, `3 d 2 h`."""
-    seconds = max(0.0, seconds)
-    if seconds < 9.95:
-        return f"{seconds:.1f} s"
-    whole = round(seconds)
-    for big, small, big_unit, small_unit in ((86_400, 3600, "d", "h"), (3600, 60, "h", "min"), (60, 1, "min", "s")):
-        if whole >= big:
-            rest = whole % big // small
-            return f"{whole // big} {big_unit}" + (f" {rest} {small_unit}" if rest else "")
-    return f"{whole} s"
 
 
 def clock(seconds: float, *, at_latest: bool = False) -> str:

@@ -47,6 +47,19 @@ def clean(text: str) -> str:
     return text if text.isprintable() else "".join(char if char.isprintable() else " " for char in text)
 
 
+def span(seconds: float) -> str:
+    """A span of time as people read it: `0.4 s`, `12 s`, `3 min 5 s`, `2 h 4 min`, `3 d 2 h`."""
+    seconds = max(0.0, seconds)
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    for big, small, big_unit, small_unit in ((86_400, 3600, "d", "h"), (3600, 60, "h", "min"), (60, 1, "min", "s")):
+        if whole >= big:
+            rest = whole % big // small
+            return f"{whole // big} {big_unit}" + (f" {rest} {small_unit}" if rest else "")
+    return f"{whole} s"
+
+
 class Term(NamedTuple):
     """The period in which one RCM leads: compared by counter, then by the RCM's instance."""
 

@@ -57,7 +57,7 @@ def test_who_leads_tells_each_thing_once_and_the_next_leader_goes_on(tmp_path: P
                 f"zscout {fleet}: two-first is yours now",
             ]
             assert re.fullmatch(
-                r"\S+ \(.*\) held robot/a for \d+ s: preempted by \S+ \(.*\), priority 5; it waits again",
+                r"\S+ \(.*\) held robot/a for [\d.]+ s: preempted by \S+ \(.*\), priority 5; it waits again",
                 receiver.heard[0]["message"],
             )
             assert Receiver.SECRET not in logs

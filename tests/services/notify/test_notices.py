@@ -32,7 +32,7 @@ def test_a_grant_is_told_to_its_user_after_a_wait_of_so_long() -> None:
             "ada@ws1 (survey.py) holds robot/a after a wait of 50 min",
         ),
         Notification(
-            "yours_now", "ws1", "zscout lab: survey is yours now", "ws1/c (survey) holds robot/a after a wait of 2.5 h"
+            "yours_now", "ws1", "zscout lab: survey is yours now", "ws1/c (survey) holds robot/a after a wait of 2 h 30 min"
         ),
     ]
 
@@ -55,7 +55,7 @@ def test_who_was_preempted_is_told_by_whom_and_why() -> None:
             "preempted",
             "ada",
             "zscout lab: survey was preempted",
-            "ada@ws1 (survey.py) held robot/a for 90 s: "
+            "ada@ws1 (survey.py) held robot/a for 1 min 30 s: "
             "preempted by bob@ws2 (drive.py), priority 10: a visitor is here; it waits again",
         )
     ]

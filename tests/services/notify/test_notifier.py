@@ -46,7 +46,7 @@ def test_it_arrives_as_text_at_the_urls_and_at_the_user_concerned() -> None:
             telling.stop()
             assert lab.titles == ["zscout lab: survey is yours now"]
             assert ada.titles == ["a title", *lab.titles]
-            assert lab.heard[0]["message"] == "ada@ws1 (survey.py) holds robot/a after a wait of 100 s"
+            assert lab.heard[0]["message"] == "ada@ws1 (survey.py) holds robot/a after a wait of 1 min 40 s"
             assert bob.heard == []
 
     asyncio.run(story())

@@ -10,7 +10,7 @@ from zscout.messages import LoadReport
 from zscout.scheduling.model import ArcRequest, Outcome
 from zscout.scheduling.reason import named
 from zscout.services.rcm.digest import Began, Over
-from zscout.types import SECOND, HostName, Ns, RcName, clean
+from zscout.types import SECOND, HostName, Ns, RcName, clean, span
 
 MAX_TITLE: Final = 120
 MAX_BODY: Final = 1_000
@@ -38,7 +38,7 @@ class HoldNotices:
             return
         request = began.request
         title = f"zscout {self._fleet}: {request.name} is yours now"
-        body = f"{_whose(request)} holds {_listed(began.rcs)} after a wait of {_span(began.waited)}"
+        body = f"{_whose(request)} holds {_listed(began.rcs)} after a wait of {span(began.waited / SECOND)}"
         self._tell(notification("yours_now", _user(request), title, body))
 
     def on_over(self, over: Over) -> None:
@@ -47,7 +47,7 @@ class HoldNotices:
         request, held = over.began.request, over.at - over.began.at
         title = f"zscout {self._fleet}: {request.name} was preempted"
         waits = "; it waits again" if over.requeued else ""
-        body = f"{_whose(request)} held {_listed(over.began.rcs)} for {_span(held)}: {over.reason}{waits}"
+        body = f"{_whose(request)} held {_listed(over.began.rcs)} for {span(held / SECOND)}: {over.reason}{waits}"
         self._tell(notification("preempted", _user(request), title, body))
 
 
@@ -87,10 +87,3 @@ def _whose(request: ArcRequest) -> str:
 
 def _listed(rcs: Iterable[RcName]) -> str:
     return ", ".join(rcs)
-
-
-def _span(time: Ns) -> str:
-    seconds = time // SECOND
-    return (
-        f"{seconds} s" if seconds < 120 else f"{seconds // 60} min" if seconds < 7_200 else f"{seconds / 3_600:.1f} h"
-    )
