@@ -3,15 +3,14 @@ shows one."""
 
 from __future__ import annotations
 
-import logging
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
-from types import ModuleType
-from typing import Annotated, Final, Literal, get_args
+from typing import Annotated, Final, Literal, NamedTuple, get_args
 
 from msgspec import Meta, Struct
 
+from zscout.config.apprise_process import NoAnswer, usable
 from zscout.config.packages import check_installed
 from zscout.config.strict import Where, key, quoted, read_text, seconds, secret
 from zscout.types import SECOND, Ns
@@ -22,8 +21,6 @@ MAX_USERS: Final = 200
 MAX_URL: Final = 2_000
 """Characters."""
 MAX_NAME: Final = 64
-SPEAKS_OF_URLS: Final = ("apprise", "urllib3", "requests", "requests_oauthlib", "oauthlib")
-"""Loggers of what sends: their lines may hold a URL, or its token."""
 
 NotifyEvent = Literal["yours_now", "preempted", "certificate_ends"]
 EVENTS: Final[tuple[NotifyEvent, ...]] = get_args(NotifyEvent)
@@ -38,6 +35,14 @@ class Address(Struct, frozen=True):
 
     def __repr__(self) -> str:
         return f"Address({self.at})"
+
+
+class _Written(NamedTuple):
+    """A URL as it stands in a file."""
+
+    url: str
+    where: Where
+    line: str = ""
 
 
 class NotifyTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -78,25 +83,23 @@ def read_notify(table: NotifyTable, folder: Path, at: Where) -> NotifyConfig:
     for user in table.users:
         if not user or len(user) > MAX_NAME or not user.isprintable():
             raise (at / "users").bad(f"{quoted(user)} is no user", f"write 1 to {MAX_NAME} printable characters")
-    urls = tuple(_addresses(table.urls, folder, at / "urls"))
-    users = {user: tuple(_addresses(urls, folder, at / "users" / user)) for user, urls in table.users.items()}
+    heard = [*_written(table.urls, folder, at / "urls")]
+    by_user = {user: [*_written(urls, folder, at / "users" / user)] for user, urls in table.users.items()}
+    every = dict.fromkeys(one.url for some in (heard, *by_user.values()) for one in some)
+    try:
+        known = {url for url, is_one in zip(every, usable([*every]), strict=True) if is_one}
+    except NoAnswer as error:
+        raise at.bad(f"can't be checked: {error}", "try apprise by hand, as in apprise --dry-run -b test URL") from None
+    users = {user: tuple(_address(one, known) for one in some) for user, some in by_user.items()}
+    urls = tuple(_address(one, known) for one in heard)
     return NotifyConfig(urls, table.events, users, table.after, table.per_minute)
 
 
-def apprise() -> ModuleType:
-    """What sends, muted: what it would log may show a URL."""
-    for name in SPEAKS_OF_URLS:
-        logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-    import apprise
-
-    return apprise
-
-
-def _addresses(urls: tuple[str, ...], folder: Path, at: Where) -> Iterator[Address]:
+def _written(urls: tuple[str, ...], folder: Path, at: Where) -> Iterator[_Written]:
     for number, url in enumerate(urls):
         here = at.item(number)
         if "://" in url:
-            yield _address(url, here)
+            yield _Written(url, here)
             continue
         lines = read_text(folder / _file_name(url, here), max_bytes=MAX_URLS * MAX_URL).splitlines()
         found = [(count, line.strip()) for count, line in enumerate(lines, 1)]
@@ -104,7 +107,7 @@ def _addresses(urls: tuple[str, ...], folder: Path, at: Where) -> Iterator[Addre
         if not 0 < len(found) <= MAX_URLS:
             raise here.bad(f"{quoted(url)} holds {len(found)} URLs", f"write 1 to {MAX_URLS}, each on a line")
         for count, line in found:
-            yield _address(line, Where(str(folder / url)), f"line {count} ")
+            yield _Written(line, Where(str(folder / url)), f"line {count} ")
 
 
 def _file_name(text: str, at: Where) -> str:
@@ -114,11 +117,12 @@ def _file_name(text: str, at: Where) -> str:
     return text
 
 
-def _address(url: str, at: Where, line: str = "") -> Address:
+def _address(written: _Written, known: Container[str]) -> Address:
+    url, at, line = written
     what = ""
     if len(url) > MAX_URL or not url.isprintable():
         what = "is too long, or not printable"
-    elif apprise().Apprise.instantiate(url) is None:
+    elif url not in known:
         what = "is no URL that Apprise can use (not shown: it may hold a secret)"
     if what:
         raise at.bad(f"{line}{what}", "see https://appriseit.com for how each service's is written")

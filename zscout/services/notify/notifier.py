@@ -9,7 +9,8 @@ import threading
 from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
-from zscout.config.notify import Address, NotifyConfig, apprise
+from zscout.config.apprise_process import NoAnswer, sent
+from zscout.config.notify import Address, NotifyConfig
 from zscout.mesh.sparse_log import SparseLog
 from zscout.mesh.supervision import Supervisor, clock
 from zscout.messages import LoadReport
@@ -22,8 +23,7 @@ log = logging.getLogger(__name__)
 QUEUE: Final = 100
 """Notifications that wait; more are left out."""
 PAUSES: Final = (1.0, 5.0)
-"""Seconds before each further attempt. One attempt takes Apprise's 4 s to connect and 4 s for each answer at most,
-where the URL does not say otherwise (`cto`, `rto`)."""
+"""Seconds before each further attempt."""
 REST: Final[Ns] = 60 * SECOND
 """After its last attempt has failed a URL is sent nothing for so long, so that it does not hold up others."""
 LOOK: Final = 60.0
@@ -118,9 +118,7 @@ class Notifier:
     def _attempt(self, address: Address, notification: Notification) -> str:
         """Why it failed; empty: it did not."""
         try:
-            sender = apprise().Apprise(asset=apprise().AppriseAsset(async_mode=False))
-            sender.add(address.url)
-            sent = sender.notify(body=notification.body, title=notification.title, body_format="text")
-        except Exception as error:  # noqa: BLE001 - its text may show the URL
-            return type(error).__name__
-        return "" if sent else "it did not take it"
+            taken = sent(address.url, notification.title, notification.body)
+        except NoAnswer as error:
+            return str(error)
+        return "" if taken else "it did not take it"
