@@ -1,15 +1,22 @@
 """`python -m benchmarks.metrics`: what figures cost a node. A scrape over a real socket, its client's part included, of
 a small node and of one with 64 RCs that leads the largest fleet whose labels all have values of their own; and what
-counting adds to a grant and its release, after all answers are sent."""
+counting adds to a grant and its release, after all answers are sent. And the memory of a real node that leads, with and
+without what it tells."""
 
 from __future__ import annotations
 
 import asyncio
+import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import AsyncIterator, Sequence
+from pathlib import Path
+
+import psutil
 
 from benchmarks.loop import run
+from benchmarks.process import MEGA, SETTLED
 from benchmarks.stats import Row, Samples, table
+from tests.live.lab import Lab
 from zscout.config.access import AccessPolicy
 from zscout.mesh.exchange import MAX_CODES
 from zscout.mesh.supervision import clock
@@ -28,6 +35,12 @@ AIM = 0.2
 """Percent of a core."""
 OWN = 64
 """RCs of one node."""
+TABLES = {
+    "neither": "",
+    "[metrics]": "[metrics]",
+    "[notify]": '[notify]\nurls = ["json://127.0.0.1:9/"]',
+}
+"""What the node file of a node has whose memory is measured."""
 ASK = b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n"
 
 
@@ -85,6 +98,17 @@ def instants(listeners: Sequence[HoldListener], rounds: int) -> Samples:
     return samples
 
 
+async def memory() -> AsyncIterator[Row]:
+    for name, tables in TABLES.items():
+        with tempfile.TemporaryDirectory() as folder:
+            async with Lab(Path(folder)) as lab:
+                lab.node("anvil", "robot/a", extra=tables)
+                await lab.ready(await lab.client(), "robot/a")
+                await asyncio.sleep(SETTLED)
+                size = psutil.Process(lab.nodes["anvil"].pid).memory_info().rss
+        yield Row(f"RSS, node that leads, {name}", size / MEGA, "MB")
+
+
 async def measure() -> list[Row]:
     server_module.FRESH = -1.0  # type: ignore[misc]  # each is made anew
     rows = []
@@ -108,7 +132,7 @@ async def measure() -> list[Row]:
     added = counted.median - without.median
     rows.append(Row("core: grant and release of 5 RCs", without.median * 1e6, "us", without.p99 * 1e6, rounds=10_000))
     rows.append(Row("counting them, after the answers", added * 1e6, "us", rounds=10_000))
-    return rows
+    return rows + [row async for row in memory()]
 
 
 if __name__ == "__main__":

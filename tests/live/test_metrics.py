@@ -20,7 +20,7 @@ import pytest
 from tests.hang import HANG
 from tests.live.lab import Lab
 from zscout.behaviors.client.client import Client
-from zscout.behaviors.client.request import CommandRefused
+from zscout.behaviors.client.request import CommandRefused, RequestRefused
 
 pytestmark = pytest.mark.live
 
@@ -108,7 +108,11 @@ async def measured(folder: Path) -> AsyncIterator[tuple[Lab, Client, int]]:
         lab.node("anvil", "robot/a", extra=f"[metrics]\nport = {port}")
         client = await lab.client("worker")
         await lab.ready(client, "robot/a")
-        first, second = [await client.request(name, {"robot/a": {}}, min_runtime=60) for name in ("first", "second")]
+        first, second = [
+            await client.request(name, {"robot/a": {}}, min_runtime=60, estimate=True) for name in ("first", "second")
+        ]
+        while second.start is None:
+            await client.changed(second)
         grant = await client.granted(first, confirmed=True)
         assert grant is not None
         await client.command("robot/a", grant, {"name": "echo", "value": 1})
@@ -116,7 +120,13 @@ async def measured(folder: Path) -> AsyncIterator[tuple[Lab, Client, int]]:
         with pytest.raises(CommandRefused):
             await client.command("robot/a", grant, {"name": "echo", "value": 2})
         assert await client.granted(second, confirmed=True) is not None
+        urgent = await client.request("urgent", {"robot/a": {}}, priority=5, min_runtime=60)
+        assert await client.granted(urgent, confirmed=True) is not None
+        await client.end(urgent)
+        assert await client.granted(second, confirmed=True) is not None
         await client.end(second)
+        with pytest.raises(RequestRefused):
+            await client.request("strange", {"robot/a": {"speed": 1}})
         yield lab, client, port
 
 
@@ -130,7 +140,12 @@ def test_a_node_shows_what_it_knows(tmp_path: Path) -> None:
             r"zscout_leading 1\.0",
             r"zscout_terms_led_total 1\.0",
             r"zscout_queue_length 0\.0",
-            r'zscout_wait_seconds_count\{group="arms",priority="0"\} 2\.0',
+            r'zscout_wait_seconds_count\{group="arms",priority="0"\} 3\.0',
+            r'zscout_wait_seconds_count\{group="arms",priority="5"\} 1\.0',
+            # It was foretold to start when the first one's minimum runtime would be over.
+            r'zscout_forecast_error_seconds_bucket\{le="-15\.0"\} [1-9]\.0',
+            r'zscout_preemptions_total\{group="arms",priority="0"\} 1\.0',
+            r'zscout_refusals_total\{code="unknown_parameter"\} 1\.0',
             r'zscout_holds\{rc="robot/a"\} 0\.0',
             r'zscout_held_seconds_total\{rc="robot/a"\} [\d.e-]+',
             r'zscout_commands_total\{rc="robot/a"\} 1\.0',
@@ -154,7 +169,7 @@ def test_prometheus_scrapes_it_and_answers_from_that(tmp_path: Path) -> None:
                 await prometheus.until("sum by (rc) (zscout_held_seconds_total)", rc, 3)
                 await prometheus.until("sum by (rc) (rate(zscout_held_seconds_total[1m]))", rc, 0.01)
                 waits = 'zscout_wait_seconds_count{group="arms"}'
-                assert await prometheus.until(waits, {"priority": "0"}, 3) == 3
+                assert await prometheus.until(waits, {"priority": "0"}, 4) == 4
                 dashboard = "(zscout_leading == 1) * on(instance) group_left(host, fleet) zscout_info"
                 assert await prometheus.until(dashboard, leads, 1) == 1
                 (up,) = await prometheus.ask('up{job="zscout"}')
