@@ -17,9 +17,11 @@ import pytest
 
 from tests.cli.tools import zscout_soon
 from tests.hang import HANG
-from tests.live.lab import Lab
+from tests.live.lab import PATIENT, Lab
 from zscout.keyexpr import Role
+from zscout.messages import Grants
 from zscout.services.journal.store import ASIDE, FILE
+from zscout.types import Term
 
 pytestmark = pytest.mark.live
 
@@ -45,9 +47,10 @@ def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> None:
     async def story() -> None:
         async with Lab(tmp_path, candidates=("anvil", "bellows")) as lab:
             lab.node("anvil", "robot/a")
-            lab.node("bellows", "robot/b")
             client = await lab.client("program")
-            await lab.ready(client, "robot/a", "robot/b")
+            await lab.ready(client, "robot/a")  # it leads before the other could
+            lab.node("bellows", "robot/b")
+            await lab.ready(client, "robot/b")
             await lab.candidates(client, "anvil", "bellows")
             survey = await client.request("survey", {"robot/b": {}}, min_runtime=600)
             await lab.held_by(client, "robot/b", "survey")
@@ -64,7 +67,6 @@ def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> None:
             assert first["holds"][0]["by"]["arc"] == "take"
 
             # The leader is killed, with what it has committed; the other goes on, with its own journal.
-            assert (await lab.state(client, lambda _: True)).host == "anvil"
             lab.signal("anvil", signal.SIGKILL)
             lab.nodes["anvil"].wait()
             await lab.living(client, Role.RCM, lambda hosts: hosts == ["bellows"])
@@ -137,6 +139,36 @@ def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> None:
             assert (arc["state"], [hold["outcome"] for hold in arc["holds"]]) == ("ended", ["preempted", "released"])
             unknown = await zscout_soon("why", "nobody", env=lab.env)
             assert unknown.returncode == 1
+
+    asyncio.run(story())
+
+
+def test_journals_answer_while_nobody_leads(tmp_path: Path) -> None:
+    async def story() -> None:
+        # Who is deposed leads again after a lease at the earliest, about.
+        async with Lab(tmp_path, lease=2 * PATIENT) as lab:
+            lab.node("anvil", "robot/a")
+            client = await lab.client("program")
+            await lab.ready(client, "robot/a")
+            await client.end(await client.request("survey", {"robot/a": {}}, min_runtime=600))
+            await told(lab, lambda found: [hold["outcome"] for hold in found["holds"]] == ["released"])
+            above = Grants(Term((await lab.state(client, lambda _: True)).term.counter + 1, "stranger"), 1, 0, 0.5)
+            client.mesh.publisher(client.mesh.keys.grants, Grants).put(above)
+            await lab.living(client, Role.RCM, lambda hosts: not hosts)
+            for command, found in (("history", "holds"), ("usage", "accounts")):
+                done = await zscout_soon(command, "--json", env=lab.env)
+                assert (done.returncode, done.stderr) == (0, "")
+                assert len(json.loads(done.stdout)[found]) == 1
+
+    asyncio.run(story())
+
+
+def test_where_nobody_is_there_nobody_answers(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            done = await zscout_soon("history", env=lab.env)
+            assert done.returncode == 3
+            assert done.stderr.startswith(f"zscout: no RCM is on the mesh of fleet {lab.fleet.name} (no other program")
 
     asyncio.run(story())
 

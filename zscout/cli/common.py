@@ -139,12 +139,13 @@ async def connected(role: str, fleet: Fleet | None = None, *, need_rcm: bool = T
         yield client
 
 
-async def see_rcm(client: Client) -> None:
-    """Returns as soon as an RCM is seen. Raises NobodyThere."""
+async def see_rcm(client: Client, seconds: float = LOOK_FOR_RCM) -> None:
+    """Returns as soon as an RCM is seen. Raises NobodyThere where none is within `seconds`, or longer where one may be
+    about to lead."""
     from zscout.behaviors.client.client import NoRcm
 
     try:
-        await client.see_rcm(LOOK_FOR_RCM, LOOK_FOR_TAKEOVER)
+        await client.see_rcm(seconds, LOOK_FOR_TAKEOVER)
     except NoRcm as nobody:
         raise NobodyThere(str(nobody)) from None
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 from msgspec import structs
 
-from zscout.cli.common import F, Failed, Parsed, until
+from zscout.cli.common import LOOK_FOR_RCM, F, Failed, Parsed, see_rcm, until
 from zscout.config.fleet import MAX_CANDIDATES, Fleet
 from zscout.config.strict import DURATIONS, BadInput, parse_duration, quoted
 from zscout.keyexpr import MAX_NAME, Role, Token, check_need
@@ -215,7 +215,7 @@ async def ask_journals(client: Client, asked: HistoryAsk, most: int) -> Told:
 
 
 async def _candidates(client: Client) -> list[HostName]:
-    """Those that are there: links are made one after another, so until no more come into sight."""
+    """Those that are there: links are made one after another, so until no more come into sight. Raises NobodyThere."""
     hosts: set[HostName] = set()
     changed = asyncio.Event()
 
@@ -226,6 +226,8 @@ async def _candidates(client: Client) -> list[HostName]:
 
     watch = client.mesh.watch(client.mesh.keys.alive_any(Role.CANDIDATE), seen)
     try:
+        if not await until(lambda: bool(hosts), changed, LOOK_FOR_RCM):
+            await see_rcm(client, 0.0)
         known = -1
         while known < len(hosts) <= MAX_CANDIDATES:
             known = len(hosts)

@@ -67,7 +67,7 @@ async def history(
     journals.check_formats(as_json=as_json, as_csv=as_csv)
     journals.check_window(since, until)
     who = journals.names_of(common.the_fleet(), users, group)
-    async with common.connected("history") as client:
+    async with common.connected("history", need_rcm=False) as client:
         asked = HistoryAsk(arc=arc, rc=rc, who=who, since=since, until=until)
         told = await journals.ask_journals(client, asked, limit)
         fleet = client.fleet

@@ -52,7 +52,7 @@ async def usage(by: str, since: float, until: float, as_json: bool, as_csv: bool
     journals.check_formats(as_json=as_json, as_csv=as_csv)
     journals.check_window(since, until)
     keys = _keys(common.the_fleet(), by)
-    async with common.connected("usage") as client:
+    async with common.connected("usage", need_rcm=False) as client:
         told = await journals.ask_journals(client, HistoryAsk(since=since, until=until), MAX_HOLDS)
     found = accounts(told.holds, keys, told.window, by_rc=by == "rc")
     names = [field.name for field in fields(Account)]
