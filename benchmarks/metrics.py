@@ -35,11 +35,7 @@ AIM = 0.2
 """Percent of a core."""
 OWN = 64
 """RCs of one node."""
-TABLES = {
-    "neither": "",
-    "[metrics]": "[metrics]",
-    "[notify]": '[notify]\nurls = ["json://127.0.0.1:9/"]',
-}
+TABLES = {"neither": "", "[metrics]": "[metrics]", "[notify]": '[notify]\nurls = ["json://127.0.0.1:9/"]'}
 """What the node file of a node has whose memory is measured."""
 ASK = b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n"
 

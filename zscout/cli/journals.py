@@ -153,23 +153,25 @@ class Told:
         if self.without:
             yield f"no journal of {', '.join(self.without)}: off, older than 0.3.0, or too slow"
 
-    def gaps_json(self) -> list[dict[str, Any]]:
-        return [{"began": utc(one.began), "ended": utc(one.ended), "why": self.causes(one)} for one in self.unknown]
-
-    def candidates_json(self) -> list[dict[str, Any]]:
-        found: list[dict[str, Any]] = [
+    def as_json(self, fleet: str, **told: object) -> dict[str, Any]:
+        """As `--json` prints it, with what it has `told` of the window."""
+        candidates: list[dict[str, Any]] = [
             {
                 "host": host,
                 "since": None if one.since is None else utc(one.since),
-                "gaps": [
-                    structs.asdict(gap)
-                    | {"began": utc(gap.began), "ended": None if gap.ended is None else utc(gap.ended)}
-                    for gap in one.gaps
-                ],
+                "gaps": [structs.asdict(gap) | _times(gap.began, gap.ended) for gap in one.gaps],
             }
             for host, one in sorted(self.journals.items())
         ]
-        return found + [{"host": host, "since": None, "gaps": None} for host in self.without]
+        return {
+            "fleet": fleet,
+            "since": utc(self.window.began),
+            "until": utc(self.window.ended),
+            **told,
+            "more": self.more,
+            "gaps": [_times(one.began, one.ended) | {"why": self.causes(one)} for one in self.unknown],
+            "candidates": candidates + [{"host": host, "since": None, "gaps": None} for host in self.without],
+        }
 
 
 async def ask_journals(client: Client, asked: HistoryAsk, most: int) -> Told:
@@ -276,11 +278,11 @@ def ending(hold: PastHold) -> str:
 
 def hold_json(hold: PastHold, now: float) -> dict[str, Any]:
     """As `--json` prints it: times in UTC, spans in seconds."""
-    return structs.asdict(hold) | {
-        "began": utc(hold.began),
-        "ended": None if hold.ended is None else utc(hold.ended),
-        "held": round(held(hold, now), 3),
-    }
+    return structs.asdict(hold) | _times(hold.began, hold.ended) | {"held": round(held(hold, now), 3)}
+
+
+def _times(began: float, ended: float | None) -> dict[str, str | None]:
+    return {"began": utc(began), "ended": None if ended is None else utc(ended)}
 
 
 def print_csv(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

@@ -1,5 +1,5 @@
-"""Apprise, in a process of its own that ends with its work: it loads all the services that it knows, which takes 28 MB, and
-what it logs may show a URL, which nobody hears there. URLs go in by its standard input."""
+"""Apprise, in a process of its own that ends with its work: it loads all the services that it knows, which takes 28 MB,
+and what it logs may show a URL, which nobody hears there. URLs go in by its standard input."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import Any, Final
 
 PROCESS: Final = (sys.executable, "-P", "-m", "zscout.config.apprise_process")
 TIMEOUT: Final = 60.0
-"""Seconds from its start to its end. One URL takes 4 s to connect and 4 s for each answer at most, where it does not say
-otherwise (`cto`, `rto`)."""
+"""Seconds from its start to its end. Apprise takes 4 s to connect and 4 s for each answer at most, where the URL does not
+say otherwise (`cto`, `rto`)."""
 
 
 class NoAnswer(Exception):

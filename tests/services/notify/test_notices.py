@@ -32,7 +32,10 @@ def test_a_grant_is_told_to_its_user_after_a_wait_of_so_long() -> None:
             "ada@ws1 (survey.py) holds robot/a after a wait of 50 min",
         ),
         Notification(
-            "yours_now", "ws1", "zscout lab: survey is yours now", "ws1/c (survey) holds robot/a after a wait of 2 h 30 min"
+            "yours_now",
+            "ws1",
+            "zscout lab: survey is yours now",
+            "ws1/c (survey) holds robot/a after a wait of 2 h 30 min",
         ),
     ]
 

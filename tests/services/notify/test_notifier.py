@@ -14,8 +14,9 @@ import pytest
 from tests.hang import HANG
 from tests.services.notify.receiver import Receiver
 from tests.services.notify.test_notices import ADA, of, report
+from zscout.config import apprise_process
 from zscout.config.notify import NotifyTable, read_notify
-from zscout.config.strict import Where
+from zscout.config.strict import BadInput, Where
 from zscout.messages import LoadReport
 from zscout.services.notify.notices import Notification
 from zscout.services.notify.notifier import QUEUE, Notifier
@@ -50,6 +51,26 @@ def test_it_arrives_as_text_at_the_urls_and_at_the_user_concerned() -> None:
             assert bob.heard == []
 
     asyncio.run(story())
+    # A node does without the 28 MB of all the services that Apprise knows.
+    assert "apprise" not in sys.modules
+
+
+def test_apprise_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    telling = notifier(NotifyTable(("json://localhost",)))
+    monkeypatch.setattr(apprise_process, "TIMEOUT", 0.001)
+    telling.tell(NEWS)
+
+    async def story() -> None:
+        telling.start()
+        await asyncio.to_thread(telling._waiting.join)
+        telling.stop()
+
+    asyncio.run(story())
+    assert [record.getMessage() for record in caplog.records] == [
+        "notify.urls[0] was not told, in 3 attempts: Apprise has not ended within 0.001 s"
+    ]
+    with pytest.raises(BadInput, match=r"notify: can't be checked: Apprise has not ended within 0\.001 s; try "):
+        notifier(NotifyTable(("json://localhost",)))
 
 
 def test_what_is_refused_is_tried_again() -> None:

@@ -11,7 +11,6 @@ from zscout.cli import common, completion, journals
 from zscout.cli.requests.options import MAX_ARC_NAME
 from zscout.config.strict import BadInput, quoted
 from zscout.messages import HistoryAsk, PastHold
-from zscout.services.journal.merging import Span
 
 MAX_LIMIT = 100_000
 COLUMNS = (
@@ -73,16 +72,8 @@ async def history(
         fleet = client.fleet
     now = time.time()
     if as_json:
-        terminal.print_json(
-            {
-                "fleet": fleet.name,
-                **_window(told.window),
-                "holds": [journals.hold_json(hold, now) for hold in told.holds],
-                "more": told.more,
-                "gaps": told.gaps_json(),
-                "candidates": told.candidates_json(),
-            }
-        )
+        holds = [journals.hold_json(hold, now) for hold in told.holds]
+        terminal.print_json(told.as_json(fleet.name, holds=holds))
     elif as_csv:
         journals.print_csv(COLUMNS, (_cells(hold, now) for hold in told.holds))
         journals.print_remarks(told, err=True)
@@ -94,10 +85,6 @@ async def history(
         else:
             journals.holds_table(title, told, told.holds, proven=fleet.security is not None).print()
         journals.print_remarks(told)
-
-
-def _window(window: Span) -> dict[str, str]:
-    return {"since": journals.utc(window.began), "until": journals.utc(window.ended)}
 
 
 def _cells(hold: PastHold, now: float) -> tuple[object, ...]:

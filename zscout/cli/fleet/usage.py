@@ -57,18 +57,7 @@ async def usage(by: str, since: float, until: float, as_json: bool, as_csv: bool
     found = accounts(told.holds, keys, told.window, by_rc=by == "rc")
     names = [field.name for field in fields(Account)]
     if as_json:
-        terminal.print_json(
-            {
-                "fleet": client.fleet.name,
-                "by": by,
-                "since": journals.utc(told.window.began),
-                "until": journals.utc(told.window.ended),
-                "accounts": [_rounded(one) for one in found],
-                "more": told.more,
-                "gaps": told.gaps_json(),
-                "candidates": told.candidates_json(),
-            }
-        )
+        terminal.print_json(told.as_json(client.fleet.name, by=by, accounts=[_rounded(one) for one in found]))
     elif as_csv:
         journals.print_csv([by, *names[1:]], ([*_rounded(one).values()] for one in found))
         _print_remarks(told, err=True)
