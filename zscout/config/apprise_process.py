@@ -13,8 +13,8 @@ from typing import Any, Final
 
 PROCESS: Final = (sys.executable, "-P", "-m", "zscout.config.apprise_process")
 TIMEOUT: Final = 60.0
-"""Seconds from its start to its end. Apprise takes 4 s to connect and 4 s for each answer at most, where the URL does not
-say otherwise (`cto`, `rto`)."""
+"""Seconds from its start to its end. Apprise takes 4 s to connect and 4 s for each answer at most, where the URL does
+not say otherwise (`cto`, `rto`)."""
 
 
 class NoAnswer(Exception):
