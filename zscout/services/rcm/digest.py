@@ -92,7 +92,7 @@ class HoldDigest:
             match event:
                 case LeadTaken(recovered_holds=holds):
                     recovered += (held.request.arc for held in holds)
-                case HandedOver(arc, _, renamed) if arc in self._foretold and self._core.is_open(renamed):
+                case HandedOver(arc, _, renamed) if arc in self._foretold and self._core.is_queued(renamed):
                     self._foretold.setdefault(renamed, self._foretold[arc])
         for effect in effects:
             match effect:
