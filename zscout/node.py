@@ -159,6 +159,7 @@ async def run_services(
             if node.notify is not None:
                 notifier = _notifier(node.notify, node.fleet.name, candidate)
                 listeners.append(notifier.holds)
+                candidate.on_danger = notifier.on_danger
                 stack.callback(notifier.stop)
             candidate.start()
             stack.push_async_callback(candidate.stop)

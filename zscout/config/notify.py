@@ -22,7 +22,7 @@ MAX_URL: Final = 2_000
 """Characters."""
 MAX_NAME: Final = 64
 
-NotifyEvent = Literal["yours_now", "preempted", "certificate_ends"]
+NotifyEvent = Literal["yours_now", "preempted", "booking_in_danger", "certificate_ends"]
 EVENTS: Final[tuple[NotifyEvent, ...]] = get_args(NotifyEvent)
 Urls = Annotated[tuple[str, ...], Meta(max_length=MAX_URLS)]
 
@@ -59,7 +59,7 @@ class NotifyTable(Struct, frozen=True, forbid_unknown_fields=True):
     users: Annotated[
         Annotated[Mapping[str, Urls], Meta(max_length=MAX_USERS)],
         secret('a table of lists, as in users = { ada = ["ntfys://ada-lab"] }'),
-        key("By user: who hears of `yours_now` and `preempted` where it is about that user's requests."),
+        key("By user: who hears of that user's requests and bookings."),
     ] = {}
     after: Annotated[Ns, seconds("0", "86400", "`yours_now`: only after a wait of so long.")] = 60 * SECOND
     per_minute: Annotated[int, key("Sent to one URL at most; the rest is left out.", 1, 600)] = 20

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from decimal import Decimal
+
 from tests.services.metrics.test_figures import began, over
-from zscout.messages import LoadReport, Who
+from zscout.messages import BookingRecord, LoadReport, Who
 from zscout.scheduling.model import ArcRequest, Outcome
 from zscout.scheduling.reason import Party, Reason, ReasonCode
-from zscout.services.notify.notices import MAX_BODY, CertificateNotices, HoldNotices, Notification
+from zscout.services.notify.notices import MAX_BODY, CertificateNotices, HoldNotices, Notification, booking_notice
 from zscout.services.notify.rate_limit import RateLimit
+from zscout.services.rcm.bookings import BookedDanger
 from zscout.services.rcm.digest import Began, Over
 from zscout.types import SECOND
 
@@ -61,6 +64,35 @@ def test_who_was_preempted_is_told_by_whom_and_why() -> None:
             "ada@ws1 (survey.py) held robot/a for 1 min 30 s: "
             "preempted by bob@ws2 (drive.py), priority 10: a visitor is here; it waits again",
         )
+    ]
+
+
+def test_whose_booking_is_in_danger_is_told_why_and_when_it_is_safe_again() -> None:
+    record = BookingRecord(
+        "b",
+        "survey",
+        {"robot/a": {}},
+        0,
+        1_800_000_000,
+        Decimal(60),
+        Decimal(60),
+        "Europe/Berlin",
+        who=ADA,
+        owner="ws1",
+    )
+    assert [booking_notice("lab", BookedDanger(record, record.start, why)) for why in ("robot/a is away", "")] == [
+        Notification(
+            "booking_in_danger",
+            "ada",
+            "zscout lab: your booking survey is in danger",
+            "robot/a from 2027-01-15 09:00 CET on: robot/a is away",
+        ),
+        Notification(
+            "booking_in_danger",
+            "ada",
+            "zscout lab: your booking survey is safe again",
+            "robot/a from 2027-01-15 09:00 CET on",
+        ),
     ]
 
 

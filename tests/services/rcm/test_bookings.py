@@ -26,6 +26,7 @@ from zscout.messages import (
     Unbook,
 )
 from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.rcm.bookings import BookedDanger
 from zscout.services.rcm.candidate import Candidate
 
 R = TypeVar("R")
@@ -396,7 +397,10 @@ def test_maintenance_goes_before_what_is_booked_and_both_are_told() -> None:
 def test_a_booking_is_in_danger_while_what_it_needs_is_away() -> None:
     async def story() -> None:
         fleet = BookedFleet("x")
-        await led(fleet, "x")
+        (leader,) = await led(fleet, "x")
+        assert leader.rcm is not None
+        dangers: list[BookedDanger] = []
+        leader.rcm.bookings.on_danger = dangers.append
         far = fleet.rc("robot/far")
         await fleet.joined(far)
         client = fleet.client("one")
@@ -407,5 +411,12 @@ def test_a_booking_is_in_danger_while_what_it_needs_is_away() -> None:
         back = fleet.rc("robot/far")
         await fleet.joined(back)
         assert not (await fleet.bookings())["b"].dates[0].danger
+        # What passes at once is not told.
+        assert dangers == []
+        fleet.network.kill(back.mesh)
+        await asyncio.sleep(10)
+        await fleet.joined(fleet.rc("robot/far"))
+        await asyncio.sleep(10)
+        assert [(one.record.id, bool(one.why)) for one in dangers] == [("b", True), ("b", False)]
 
     run(story())

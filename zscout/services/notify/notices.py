@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from datetime import datetime
 from typing import Final, NamedTuple
 
 from zscout.config.notify import NotifyEvent
 from zscout.messages import LoadReport
 from zscout.scheduling.model import ArcRequest, Outcome
 from zscout.scheduling.reason import named
+from zscout.services.bookings.dates import zone_of
+from zscout.services.rcm.bookings import BookedDanger
 from zscout.services.rcm.digest import Began, Over
 from zscout.types import SECOND, HostName, Ns, RcName, clean, span
 
@@ -49,6 +52,15 @@ class HoldNotices:
         waits = "; it waits again" if over.requeued else ""
         body = f"{_whose(request)} held {_listed(over.began.rcs)} for {span(held / SECOND)}: {over.reason}{waits}"
         self._tell(notification("preempted", _user(request), title, body))
+
+
+def booking_notice(fleet: str, danger: BookedDanger) -> Notification:
+    """That a booking may not be kept, or is safe again; its date in the zone of who made it."""
+    record, why = danger.record, danger.why
+    title = f"zscout {fleet}: your booking {record.name} is {'in danger' if why else 'safe again'}"
+    at = datetime.fromtimestamp(danger.start, zone_of(record.zone)).strftime("%Y-%m-%d %H:%M %Z")
+    body = f"{_listed(record.needs)} from {at} on{': ' if why else ''}{why}"
+    return notification("booking_in_danger", (record.who.user if record.who else "") or record.owner, title, body)
 
 
 class CertificateNotices:

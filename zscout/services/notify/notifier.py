@@ -14,8 +14,9 @@ from zscout.config.notify import Address, NotifyConfig
 from zscout.mesh.sparse_log import SparseLog
 from zscout.mesh.supervision import Supervisor, clock
 from zscout.messages import LoadReport
-from zscout.services.notify.notices import CertificateNotices, HoldNotices, Notification
+from zscout.services.notify.notices import CertificateNotices, HoldNotices, Notification, booking_notice
 from zscout.services.notify.rate_limit import RateLimit
+from zscout.services.rcm.bookings import BookedDanger
 from zscout.types import SECOND, Ns
 
 log = logging.getLogger(__name__)
@@ -43,7 +44,7 @@ class Notifier:
         pauses: Sequence[float] = PAUSES,
         look: float = LOOK,
     ) -> None:
-        self.holds = HoldNotices(fleet, config.after, self.tell)
+        self._fleet, self.holds = fleet, HoldNotices(fleet, config.after, self.tell)
         self._config, self._reports, self._pauses, self._look_every = config, reports, pauses, look
         self._certificates = CertificateNotices(fleet)
         self._waiting: queue.Queue[Notification] = queue.Queue(QUEUE)
@@ -73,6 +74,10 @@ class Notifier:
             self._waiting.put_nowait(notification)
         except queue.Full:
             self._full.warning("", "%d notifications wait to be sent: one is left out", QUEUE)
+
+    def on_danger(self, danger: BookedDanger) -> None:
+        """A booking may not be kept, or is safe again."""
+        self.tell(booking_notice(self._fleet, danger))
 
     def _addresses(self, about: Notification) -> tuple[Address, ...]:
         heard = self._config.urls if about.event in self._config.events else ()

@@ -211,8 +211,6 @@ class BookedDates:
                 if (again := self._booked(Date(new, date.start))) is not None:
                     self._emit(again)
                 return
-        if date.id not in self._conflicts:
-            log.warning("booking %s (%s) can't be kept: %s stands", date.id, date.record.name, by or "another")
         self._conflicts[date.id] = by
 
     def ask(self, unknown: Iterable[tuple[Rc, HolderSet]], wanted: Booking | None = None) -> None:
@@ -247,21 +245,28 @@ class BookedDates:
                 case BookingChanged(booking=name, state=state) if state in OVER:
                     booking, _, start = name.partition("@")
                     over.setdefault(booking, []).append(int(start))
+                case BookingThreatened(booking=name, reason=None):
+                    self._danger.pop(name, None)
                 case BookingThreatened(booking=name, reason=reason):
-                    self._tell_danger(name, "" if reason is None else str(reason))
+                    self._danger[name] = str(reason)
         for booking, starts in over.items():
             if (record := self._records.get(booking)) is not None:
                 self.change(record, over=sorted({*record.over, *starts}))
         votes = self._waits_for_votes and any(isinstance(event, (Vote, VoteOverdue)) for event in events)
         return bool(over) or votes or any(isinstance(event, RcJoined) for event in events)
 
-    def _tell_danger(self, date: str, why: str) -> None:
-        """What keeps a date from its start; empty: nothing does any more."""
-        if why:
-            self._danger[date] = why
-        else:
-            self._danger.pop(date, None)
-        log.info("booking %s (%s) %s", date, self._name(date), f"is in danger: {why}" if why else "is safe again")
+    def dangers(self) -> dict[str, str]:
+        """By date, as the core calls it: what may keep it from its start, in words."""
+        return self._danger | {name: self._conflict(by) for name, by in self._conflicts.items()}
+
+    def date(self, name: str) -> Date | None:
+        """What the core calls so; None: its booking is forgotten."""
+        booking, _, start = name.partition("@")
+        record = self._records.get(booking)
+        return None if record is None else Date(record, int(start))
+
+    def _conflict(self, by: str) -> str:
+        return f"{self._name(by)} stands" if by else "no RC that would do is free then"
 
     # For people and programs
 
@@ -280,7 +285,7 @@ class BookedDates:
             danger = self._danger.get(date.id, "")
             if date.id not in known:
                 state = "conflict"
-                danger = f"{self._name(by)} stands" if by else "no RC that would do is free then"
+                danger = self._conflict(by or "")
             bound = dict(self._core.bound_of(date.id)) or date.bound
             told.append(BookedDate(date.start, date.start + round(runtime), state, bound, taken, danger))
         fields = {name: getattr(record, name) for name in BookingView.__struct_fields__ if name != "dates"}

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from typing import Final, NamedTuple
 
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, Mesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import Amounts, BookingsAsk, BookingsKept, ProposedHolder, decimals
+from zscout.messages import Amounts, BookingRecord, BookingsAsk, BookingsKept, Instant, ProposedHolder, decimals
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Effect, Event, Propose, Vote, VoteOverdue
 from zscout.services.authority import Authority
@@ -18,6 +20,19 @@ from zscout.services.rcm.booked_dates import BookedDates
 from zscout.services.rcm.booking_handler import BookingHandler
 from zscout.services.rcm.booking_sharing import BookingSharing
 from zscout.types import SECOND, ArcId, Ns, Params, Term
+
+log = logging.getLogger(__name__)
+
+LASTS: Final = 3.0
+"""Seconds that a danger is waited for to pass: after a change of leader RCs come one after the other."""
+
+
+class BookedDanger(NamedTuple):
+    """That a date of a booking may not be kept, and why; empty: it is safe again."""
+
+    record: BookingRecord
+    start: Instant
+    why: str
 
 
 class Bookings:
@@ -58,6 +73,11 @@ class Bookings:
             fleet, core, keeper, self.dates, self._sharing, authority, supervisor, emit, check_door
         )
         self._reconciling = False
+        self._told: dict[str, str] = {}
+        """Dangers that were told, by date."""
+        self._telling = False
+        self.on_danger: Callable[[BookedDanger], object] = lambda _: None
+        """Called with what lasts."""
         self._declared: list[Declaration] = []
 
     @property
@@ -90,6 +110,7 @@ class Bookings:
         """What has happened in an instant: what follows of it follows in another one."""
         if self.dates.note(events, effects):
             self._on_news()
+        self._tell_soon()
         if self.handler.waits_for_votes and any(isinstance(event, (Vote, VoteOverdue)) for event in events):
             self._supervisor.call_later(0, self.handler.try_again)
 
@@ -112,6 +133,23 @@ class Bookings:
     def _reconcile(self) -> None:
         self._reconciling = False
         self.dates.reconcile()
+        self._tell_soon()
+
+    def _tell_soon(self) -> None:
+        if not self._telling and self.dates.dangers() != self._told:
+            self._telling = True
+            self._supervisor.call_later(LASTS, self._tell)
+
+    def _tell(self) -> None:
+        """Tells what is not as it was told last, and has been so for a while."""
+        self._telling = False
+        before, self._told = self._told, self.dates.dangers()
+        for name in sorted(before.keys() | self._told.keys()):
+            why, date = self._told.get(name, ""), self.dates.date(name)
+            if why != before.get(name, "") and date is not None:
+                words = f"is in danger: {why}" if why else "is safe again"
+                log.warning("booking %s of %s %s", date.record.name, date.record.owner, words)
+                self.on_danger(BookedDanger(date.record, date.start, why))
 
     def _on_token(self, token: Token, alive: bool) -> None:
         if alive and token.host != self._mesh.me.host:

@@ -36,6 +36,7 @@ from zscout.services.placement.component_placer import ComponentPlacer
 from zscout.services.placement.ledger import PlacementLedger
 from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.rcm.booking_sharing import credible
+from zscout.services.rcm.bookings import BookedDanger
 from zscout.services.rcm.digest import HoldListener
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.inventory import Inventory
@@ -87,6 +88,8 @@ class Candidate:
         self.balancer: LoadBalancer | None = None
         """Beside the RCM, while this node leads."""
         self.listeners = listeners
+        self.on_danger: Callable[[BookedDanger], object] = lambda _: None
+        """Called while it leads with bookings that may not be kept."""
         self.terms_led = 0
         self.tally = Tally()
         """How operations ended that its RCMs were asked for."""
@@ -348,6 +351,7 @@ class Candidate:
         )
         self.terms_led += 1
         rcm.membership.on_disbelieved = self._disbelieved
+        rcm.bookings.on_danger = self.on_danger
         self._leading.callback(rcm.stop)
         rcm.start(recovered)
         balancer = self.balancer = LoadBalancer(self.mesh, self._failed)
