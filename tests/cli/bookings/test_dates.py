@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from datetime import UTC, date, datetime, timedelta
+from datetime import UTC, date, datetime, time, timedelta
+from decimal import Decimal
 from itertools import pairwise
 from pathlib import Path
 from zoneinfo import ZoneInfo
@@ -20,10 +21,12 @@ from zscout.cli.bookings.dates import (
     parse_date,
     parse_every,
     parse_zone,
-    series,
+    remarks,
     span_words,
 )
 from zscout.config.strict import BadInput
+from zscout.messages import BookingRecord
+from zscout.services.bookings.dates import dates
 
 BERLIN, NEW_YORK = ZoneInfo("Europe/Berlin"), ZoneInfo("America/New_York")
 NOW = datetime(2026, 11, 26, 12, 0, tzinfo=BERLIN).timestamp()
@@ -143,32 +146,41 @@ def test_the_other_of_the_two_is_had_by_its_offset() -> None:
     assert when("2026-10-25T02:30+01:00") == "2026-10-25T02:30:00+01:00"
 
 
+def series(start: datetime, every: int, until: float, zone: ZoneInfo) -> list[datetime]:
+    """As the leader has them."""
+    at, day = int(start.timestamp()), Decimal(3600)
+    record = BookingRecord("id", "n", {"robot/a": {}}, 0, at, day, day, zone.key, every, int(until))
+    return [datetime.fromtimestamp(one, zone) for one in dates(record, at, until + 1)]
+
+
 def test_a_weekly_date_keeps_its_hour_over_both_changes() -> None:
     for zone, summer, winter in ((BERLIN, 2, 1), (NEW_YORK, -4, -5)):
         start = datetime(2026, 10, 20, 14, 0, tzinfo=zone)
-        found = list(series(start, 7, (start + timedelta(days=200)).timestamp()))
+        found = series(start, 7, (start + timedelta(days=200)).timestamp(), zone)
         assert len(found) == 29
-        assert {one.at.hour for one in found} == {14}
-        assert {one.at.weekday() for one in found} == {1}
-        offsets = [one.at.utcoffset() for one in found]
+        assert {one.hour for one in found} == {14}
+        assert {one.weekday() for one in found} == {1}
+        offsets = [one.utcoffset() for one in found]
         changes = [b for a, b in pairwise(offsets) if a != b]
         assert (offsets[0], changes) == (timedelta(hours=summer), [timedelta(hours=winter), timedelta(hours=summer)])
+        assert not remarks([int(one.timestamp()) for one in found], zone, time(14))
 
 
-def test_of_a_series_the_times_that_do_not_exist_are_told() -> None:
-    start = datetime(2027, 3, 26, 2, 30, tzinfo=BERLIN)
-    found = list(series(start, 1, datetime(2027, 3, 30, tzinfo=BERLIN).timestamp()))
-    assert [one.at.hour for one in found] == [2, 2, 3, 2]
-    assert [one.exists for one in found] == [True, True, False, True]
+def test_of_a_series_the_hours_that_a_day_has_not_or_twice_are_told() -> None:
+    start = datetime(2026, 10, 23, 2, 30, tzinfo=BERLIN)
+    found = series(start, 1, datetime(2027, 3, 30, tzinfo=BERLIN).timestamp(), BERLIN)
+    assert [f"{one:%m-%d %H:%M}" for one in found if one.hour != 2] == ["03-28 03:30"]
+    assert remarks([int(one.timestamp()) for one in found], BERLIN, time(2, 30)) == [
+        "2026-10-25 02:30 comes twice in Europe/Berlin: the first is taken, the other is 2026-10-25T02:30+01:00",
+        "2027-03-28 02:30 does not exist in Europe/Berlin: 03:30 is taken",
+    ]
 
 
 def test_a_series_ends_with_its_last_date_and_passes_a_leap_day() -> None:
     start = datetime(2028, 2, 28, 8, 0, tzinfo=BERLIN)
     last = datetime(2028, 3, 1, 8, 0, tzinfo=BERLIN).timestamp()
-    assert [one.at.day for one in series(start, 1, last)] == [28, 29, 1]
-    assert [one.at.day for one in series(start, 1, last - 1)] == [28, 29]
-    assert len(list(series(start, 0, None))) == 1
-    assert len(list(series(start, 1, 1e12))) == 368, "bounded"
+    assert [one.day for one in series(start, 1, last, BERLIN)] == [28, 29, 1]
+    assert [one.day for one in series(start, 1, last - 1, BERLIN)] == [28, 29]
 
 
 @given(st.integers(0, 400 * 1440), st.sampled_from(["Europe/Berlin", "America/New_York", "Australia/Lord_Howe", "UTC"]))

@@ -10,7 +10,7 @@ import math
 import os
 import re
 import time as clocks
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, time, timedelta
@@ -154,19 +154,11 @@ def local(naive: datetime, zone: ZoneInfo) -> Found:
     return Found(first, f"{naive:%Y-%m-%d %H:%M} comes twice in {zone.key}: the first is taken, the other is {other}")
 
 
-def series(start: datetime, every: int, until: float | None) -> Iterator[Found]:
-    """The dates of what begins at `start`, in its zone, and comes again every so many days at the same hour, as long
-    as that is not after `until`; 0 days: it is once."""
-    zone = start.tzinfo
-    naive, most = start.replace(tzinfo=None, fold=0), MAX_AHEAD // 86_400 + 1
-    yield Found(start)
-    if not every or until is None or not isinstance(zone, ZoneInfo):
-        return
-    for days in range(every, most + 1, every):
-        found = local(naive + timedelta(days=days), zone)
-        if found.at.timestamp() > until:
-            return
-        yield found
+def remarks(dates: Iterable[int], zone: ZoneInfo, hour: time) -> list[str]:
+    """What is to be said of the dates of something that comes again at the same hour, where a day has it twice, or not
+    at all."""
+    days = {in_zone(at, zone).date() for at in dates}
+    return [note for day in sorted(days) if (note := local(datetime.combine(day, hour), zone).note)]
 
 
 def parse_every(text: str, option: str) -> int:
