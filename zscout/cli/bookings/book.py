@@ -18,7 +18,19 @@ from zscout.behaviors.client.bookings import BookingsClient
 from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.behaviors.client.identity import bounded
 from zscout.cli import common, completion
-from zscout.cli.bookings.dates import (
+from zscout.cli.booked import (
+    ask_bookings,
+    booking_json,
+    explained,
+    free_name,
+    is_own,
+    rcs_words,
+    short,
+    state_words,
+    zone_option,
+)
+from zscout.cli.common import F, Failed, Parsed
+from zscout.cli.dates import (
     DATE_FORMS,
     EVERY_FORMS,
     Found,
@@ -33,18 +45,6 @@ from zscout.cli.bookings.dates import (
     remarks,
     span_words,
 )
-from zscout.cli.bookings.known import (
-    ask_bookings,
-    booking_json,
-    explained,
-    free_name,
-    is_own,
-    rcs_words,
-    short,
-    state_words,
-    zone_option,
-)
-from zscout.cli.common import F, Failed, Parsed
 from zscout.cli.requests.options import Needs, gather_needs, parse_comment, parse_duration, parse_need
 from zscout.cli.requests.request import MAX_PRIORITY
 from zscout.config.strict import BadInput

@@ -12,9 +12,7 @@ from zscout import terminal
 from zscout.behaviors.client.bookings import BookingsClient
 from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.cli import common, completion, journals
-from zscout.cli.bookings.book import DATE
-from zscout.cli.bookings.dates import WrittenDate, date_words, every_words, host_zone, in_zone, span_words
-from zscout.cli.bookings.known import (
+from zscout.cli.booked import (
     ask_bookings,
     booking_argument,
     booking_json,
@@ -28,7 +26,9 @@ from zscout.cli.bookings.known import (
     whose,
     zone_option,
 )
+from zscout.cli.bookings.book import DATE
 from zscout.cli.common import Failed
+from zscout.cli.dates import WrittenDate, date_words, every_words, host_zone, in_zone, span_words
 from zscout.config.strict import BadInput
 from zscout.messages import MAX_AHEAD, BookedDate, BookingRecord, BookingView
 from zscout.services.bookings.dates import dates

@@ -12,9 +12,9 @@ from zscout import terminal
 from zscout.behaviors.client.bookings import BookingsClient
 from zscout.behaviors.client.client import RequestRefused
 from zscout.cli import common
+from zscout.cli.booked import ask_bookings, explained, utc, zone_option
 from zscout.cli.bookings.book import DATE, DURATION, needs_argument
-from zscout.cli.bookings.dates import WrittenDate, date_words, host_zone
-from zscout.cli.bookings.known import ask_bookings, explained, utc, zone_option
+from zscout.cli.dates import WrittenDate, date_words, host_zone
 from zscout.cli.requests.options import gather_needs, seconds_within
 from zscout.cli.requests.request import MAX_PRIORITY
 from zscout.messages import MAX_AHEAD, MAX_SLOTS, SlotsTold

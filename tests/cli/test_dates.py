@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from zscout.cli.bookings.dates import (
+from zscout.cli.dates import (
     date_words,
     every_words,
     host_zone,

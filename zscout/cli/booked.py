@@ -15,8 +15,8 @@ from zscout.behaviors.client.bookings import BookingsClient
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common, completion
-from zscout.cli.bookings.dates import parse_zone, span_words
 from zscout.cli.common import F, Failed, Parsed
+from zscout.cli.dates import parse_zone, span_words
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import PEOPLE
 from zscout.messages import BookedDate, BookingsTold, BookingView, Who
