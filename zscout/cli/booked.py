@@ -5,8 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from typing import Any, Final
-from zoneinfo import ZoneInfo
+from typing import Any, Final, NamedTuple
 
 import click
 from msgspec import structs
@@ -68,22 +67,37 @@ def explained(refused: RequestRefused) -> Exception:
 # Which one is meant
 
 
-def is_own(booking: BookingView, client: Client) -> bool:
-    """Whether it is of the user of this program: the same user, or by certificate the same person; of one that tells no
-    user, the same host."""
-    me = client.mesh.me.host
-    user = booking.who.user if booking.who is not None else ""
-    person = client.fleet.access.ranks_of(me) & PEOPLE
-    if booking.owner == me and (person or not user):
-        return True
-    return bool(user) and client.who is not None and user == client.who.user
+class User(NamedTuple):
+    """Who runs this program: its user, and the host or the certificate that it comes from; `person` where that is one,
+    and not a machine that several may use."""
+
+    name: str
+    host: str
+    person: bool
+
+    @classmethod
+    def of(cls, client: Client) -> User:
+        host = client.mesh.me.host
+        return cls(client.who.user if client.who is not None else "", host, _is_person(client, host))
+
+    def owns(self, booking: BookingView) -> bool:
+        """Whether it is of the same user, or by certificate the same person; of one that tells no user, of the same
+        host."""
+        user = booking.who.user if booking.who is not None else ""
+        if booking.owner == self.host and (self.person or not user):
+            return True
+        return bool(user) and user == self.name
 
 
-def choose(bookings: Sequence[BookingView], name: str, client: Client) -> BookingView:
+def _is_person(client: Client, host: str) -> bool:
+    return bool(client.fleet.access.ranks_of(host) & PEOPLE)
+
+
+def choose(bookings: Sequence[BookingView], name: str, user: User) -> BookingView:
     """The one of this name or id, of the user's own first. Raises Failed where there is none, or more than one."""
     there = [one for one in bookings if not one.unbooked]
     alike = [one for one in there if one.name == name]
-    own = [one for one in alike if is_own(one, client)]
+    own = [one for one in alike if user.owns(one)]
     found = [one for one in there if one.id == name] or own or alike
     found = found or [one for one in there if one.id.startswith(name)]
     if not found:
@@ -138,17 +152,13 @@ def utc(at: float) -> str:
     return datetime.fromtimestamp(at, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
 
 
-def booking_json(booking: BookingView, client: Client) -> dict[str, Any]:
+def booking_json(booking: BookingView, user: User) -> dict[str, Any]:
     """As `--json` prints it: instants in UTC, spans in seconds."""
     dates = [structs.asdict(one) | {"start": utc(one.start), "end": utc(one.end)} for one in booking.dates]
     until = None if booking.until is None else utc(booking.until)
     return structs.asdict(booking) | {
-        "own": is_own(booking, client),
+        "own": user.owns(booking),
         "start": utc(booking.start),
         "until": until,
         "dates": dates,
     }
-
-
-def zone_name(zone: ZoneInfo | None) -> str:
-    return "this host's" if zone is None else zone.key

@@ -19,11 +19,11 @@ from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.behaviors.client.identity import bounded
 from zscout.cli import common, completion
 from zscout.cli.booked import (
+    User,
     ask_bookings,
     booking_json,
     explained,
     free_name,
-    is_own,
     rcs_words,
     short,
     state_words,
@@ -235,9 +235,9 @@ async def _make(
     async with common.connected("maintain" if maintenance else "book") as client:
         # Others are told its name, and not by which command it was made.
         client.who = replace(client.who or Who(), command="")
-        told = await ask_bookings(client)
+        told, me = await ask_bookings(client), User.of(client)
         asked = Asked.of(at, runtime, every, until, zone, told.time)
-        own = [one for one in told.bookings if is_own(one, client)]
+        own = [one for one in told.bookings if me.owns(one)]
         default = "maintenance" if maintenance else _named_after(needs)
         terms: dict[str, Any] = {"priority": priority, "comment": comment}
         try:
@@ -258,7 +258,7 @@ async def _make(
             raise Failed(await _instead(client, refused, needs, asked, priority)) from None
         twice = any(one.name == booking.name and one.id != booking.id for one in own)
         if as_json:
-            terminal.print_json(booking_json(booking, client) | {"remarks": asked.remarks()})
+            terminal.print_json(booking_json(booking, me) | {"remarks": asked.remarks()})
             return
         _print(booking, asked, told)
         if twice:

@@ -10,15 +10,15 @@ import click
 
 from zscout import terminal
 from zscout.behaviors.client.bookings import BookingsClient
-from zscout.behaviors.client.client import Client, RequestRefused
+from zscout.behaviors.client.client import RequestRefused
 from zscout.cli import common, completion, journals
 from zscout.cli.booked import (
+    User,
     ask_bookings,
     booking_argument,
     booking_json,
     choose,
     explained,
-    is_own,
     rcs_words,
     short,
     state_words,
@@ -55,18 +55,19 @@ async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: b
       zscout bookings --json | jq -r '.bookings[] | .name + " " + .dates[0].start'
     """
     async with common.connected("bookings") as client:
+        me = User.of(client)
         try:
             told = await ask_bookings(client, rc)
         except RequestRefused as refused:
             raise explained(refused) from None
-        found = [one for one in told.bookings if not mine or is_own(one, client)]
+        found = [one for one in told.bookings if not mine or me.owns(one)]
         if as_json:
             terminal.print_json(
                 {
                     "fleet": client.fleet.name,
                     "time": utc(told.time),
                     "clocks": told.clocks,
-                    "bookings": [booking_json(one, client) for one in found],
+                    "bookings": [booking_json(one, me) for one in found],
                 }
             )
             return
@@ -75,7 +76,7 @@ async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: b
         if not found:
             terminal.print_line("nothing is booked")
         else:
-            _table(found, client, zone).print()
+            _table(found, me, zone).print()
 
 
 def clock_words(host: str, differs: float) -> str:
@@ -83,13 +84,13 @@ def clock_words(host: str, differs: float) -> str:
     return f"the clock of {host} is {terminal.span(abs(differs))} {'before' if differs > 0 else 'behind'} the fleet's"
 
 
-def _table(found: Sequence[BookingView], client: Client, zone: ZoneInfo | None) -> Table:
+def _table(found: Sequence[BookingView], me: User, zone: ZoneInfo | None) -> Table:
     lines: list[tuple[float, Sequence[str], str]] = []
     for one in found:
         shown = [
             date for number, date in enumerate(one.dates) if number == 0 or date.danger or date.state == "conflict"
         ]
-        lines += [(date.start, _row(one, date, zone), _style(one, date, client)) for date in shown]
+        lines += [(date.start, _row(one, date, zone), _style(one, date, me)) for date in shown]
         if not shown:
             row = (one.name, short(one), whose(one), date_words(one.start, zone), "later", str(one.priority))
             lines.append((one.start, (*row, _repeated(one, zone), rcs_words(one)), ""))
@@ -112,10 +113,10 @@ def _repeated(booking: BookingView, zone: ZoneInfo | None) -> str:
     return every_words(booking.every) + until
 
 
-def _style(booking: BookingView, date: BookedDate, client: Client) -> str:
+def _style(booking: BookingView, date: BookedDate, me: User) -> str:
     if date.danger or date.state == "conflict":
         return "red"
-    return "bold" if is_own(booking, client) else ""
+    return "bold" if me.owns(booking) else ""
 
 
 @click.command()
@@ -139,15 +140,15 @@ async def unbook(booking: str, at: WrittenDate | None, zone: ZoneInfo | None, as
     if at is not None:
         zone = zone or host_zone()
     async with common.connected("unbook") as client:
-        told = await ask_bookings(client)
-        found = choose(told.bookings, booking, client)
+        told, me = await ask_bookings(client), User.of(client)
+        found = choose(told.bookings, booking, me)
         start = None if at is None or zone is None else _date_of(found, at, zone, told.time)
         try:
             left = await BookingsClient(client).unbook(found.id, start)
         except RequestRefused as refused:
             raise explained(refused) from None
         if as_json:
-            terminal.print_json(booking_json(left, client))
+            terminal.print_json(booking_json(left, me))
             return
     what = "" if start is None else f"its date {date_words(start, zone)} "
     whole = f" with all its dates, {every_words(found.every)}" if found.every and start is None else ""

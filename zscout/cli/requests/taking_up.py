@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from zscout.behaviors.client.client import Client
-from zscout.cli.booked import ask_bookings, choose, rcs_words
+from zscout.cli.booked import User, ask_bookings, choose, rcs_words
 from zscout.cli.common import Failed
 from zscout.cli.requests.options import HoldOptions
 from zscout.config.strict import BadInput
@@ -25,7 +25,7 @@ def check_options(**options: Any) -> None:
 async def taking_up(client: Client, wanted: HoldOptions, *, name: str | None, priority: int | None) -> HoldOptions:
     """What is asked for to take `wanted.booking` up, a name or an id; called after it, if no `name` was given. Raises
     BadInput where NEEDs or a `priority` were given that it has not; Failed, RequestRefused."""
-    booking = choose((await ask_bookings(client)).bookings, wanted.booking, client)
+    booking = choose((await ask_bookings(client)).bookings, wanted.booking, User.of(client))
     if booking.maintenance:
         raise Failed(f"{booking.name} is maintenance, which nobody takes up; to end it: zscout unbook {booking.name}")
     if wanted.needs and wanted.needs != booking.needs:
