@@ -73,6 +73,7 @@ def test_the_day_is_that_of_the_zone() -> None:
 
 def test_what_is_soon_is_never_before_it_was_asked() -> None:
     assert parse_date("in 5m", "--at").found(NOW + 0.3, BERLIN).at.timestamp() == NOW + 301
+    assert parse_date("in 2h", "--at").found(NOW + 0.3, BERLIN).at.timestamp() == NOW + 7260, "to the minute"
 
 
 @pytest.mark.parametrize(

@@ -11,18 +11,20 @@ import click
 from msgspec import structs
 
 from zscout.behaviors.client.bookings import BookingsClient
-from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.client import QUERY_TIMEOUT, Client
 from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common, completion
 from zscout.cli.common import F, Failed, Parsed
 from zscout.cli.dates import parse_zone, span_words
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import PEOPLE
-from zscout.messages import BookedDate, BookingsTold, BookingView, Who
+from zscout.messages import BookedDate, BookingsAsk, BookingsTold, BookingView, Who
 from zscout.terminal import clean, span
 
 SHOWN_ID: Final = 8
 """Characters of an id that are shown: it is named by any beginning that no other has."""
+SOON: Final = 86_400
+"""Seconds."""
 MAX_LISTED: Final = 8
 MAX_TEXT: Final = 64
 CLOCKS_DIFFER: Final = 2.0
@@ -57,6 +59,25 @@ async def ask_bookings(client: Client, rc: str | None = None) -> BookingsTold:
         words = f"{span(abs(differs))} {'before' if differs > 0 else 'behind'}"
         click.secho(f"this host's clock is {words} the fleet's; dates are by the fleet's", fg="yellow", err=True)
     return told
+
+
+async def look(client: Client) -> BookingsTold | None:
+    """The same at a glance; None: nobody told them."""
+    reply = await client.mesh.ask_one(client.mesh.keys.rcm_bookings, BookingsAsk(), BookingsTold, timeout=QUERY_TIMEOUT)
+    return reply.message if reply is not None else None
+
+
+def soon(told: BookingsTold | None) -> int:
+    """How many dates begin within a day."""
+    return (
+        0
+        if told is None
+        else sum(
+            one.state in ("open", "taken") and told.time <= one.start < told.time + SOON
+            for booking in told.bookings
+            for one in booking.dates
+        )
+    )
 
 
 def explained(refused: RequestRefused) -> Exception:
@@ -145,6 +166,11 @@ def state_words(booking: BookingView, date: BookedDate) -> str:
 def _next(booking: BookingView) -> str:
     date = next(iter(booking.dates), None)
     return span_words(date.start, date.end, None) if date is not None else "without a date within 60 days"
+
+
+def clock_words(host: str, differs: float) -> str:
+    """That a host's clock is not the fleet's."""
+    return f"the clock of {host} is {span(abs(differs))} {'before' if differs > 0 else 'behind'} the fleet's"
 
 
 def utc(at: float) -> str:

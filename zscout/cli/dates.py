@@ -24,6 +24,8 @@ from zscout.messages.bookings import DAYS, MAX_AHEAD
 DATE_FORMS: Final = '"tue 14:00", "tomorrow 9:00", "14:30", "2026-12-01 14:00", "2026-12-01T14:00+01:00" or "in 2h"'
 EVERY_FORMS: Final = 'day, week, "2 weeks" or "10 days"'
 WEEKDAYS: Final = ("monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday")
+SOON: Final = 600.0
+"""Seconds from which on `in 2h` means a whole minute."""
 YEARS: Final = range(1971, 9000)
 """Those in which every time of every zone is one that a computer knows."""
 _TIME: Final = re.compile(r"(?P<hour>\d{1,2})(:(?P<minute>\d\d)(:(?P<second>\d\d))?)? ?(?P<half>am|pm)?", re.ASCII)
@@ -62,7 +64,8 @@ class WrittenDate:
         if self.instant is not None:
             return Found(self.instant.astimezone(zone))
         if self.after is not None:
-            return Found(datetime.fromtimestamp(math.ceil(now + self.after), zone))
+            unit = 1 if self.after < SOON else 60
+            return Found(datetime.fromtimestamp(math.ceil((now + self.after) / unit) * unit, zone))
         if self.time is None:
             raise BadInput(
                 f"{self.option}: {quoted(self.text)} has no time of day; write {quoted(f'{self.text} 14:00')}"

@@ -87,8 +87,8 @@ class BookingsClient:
 
         It lapses when nobody has taken it up `patience` seconds after its date (default: 15 min, or its whole time if
         that is less). `every` so many days it comes again, at the same hour in the zone of `start`, which is a
-        `ZoneInfo` then, until `until` (default: for a year). With `maintenance`, which takes an operator, nobody is to
-        hold any of them then. It is taken up by a request with its `terms`.
+        `ZoneInfo` then, until `until`, a year from now at most. With `maintenance`, which takes an operator, nobody is
+        to hold any of them then. It is taken up by a request with its `terms`.
 
         Raises RequestRefused, whose `code` is `not_free` where something is in the way, RcmSilent, and ValueError for
         what is no date or no span of time."""

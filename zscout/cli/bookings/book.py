@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
+import time as clocks
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import date, datetime, time
 from decimal import Decimal
 from typing import Any, Final
 from zoneinfo import ZoneInfo
@@ -54,6 +54,8 @@ from zscout.services.bookings.dates import dates
 from zscout.terminal import clean, many, span
 
 DAY: Final = 86_400
+A_YEAR: Final = MAX_AHEAD - 25 * 3600
+"""Seconds after which a day begins that is over before the longest time: one has 25 hours."""
 LOOK_AHEAD: Final = 7 * DAY
 """Seconds in which other times are sought where one is not free."""
 OTHERS: Final = 3
@@ -182,14 +184,14 @@ class Asked:
             return cls(start, 0, None, runtime, zone)
         if not start.exists:
             raise BadInput(f"--at: {start.note}, and so it would go on; let it begin with another date")
+        latest = last = _end_of(in_zone(now + A_YEAR, zone).date(), zone)
         if until is not None:
             day = until.whole_day(now, zone)
-            end = datetime.max.time().replace(microsecond=0)
-            last = until.found(now, zone).at if day is None else local(datetime.combine(day, end), zone).at
+            last = until.found(now, zone).at if day is None else _end_of(day, zone)
             if last < start.at:
                 raise BadInput("--until: it is before the first date; write a later one")
-            if last.timestamp() > now + MAX_AHEAD:
-                raise BadInput(f"--until: at most a year ahead, {date_words(now + MAX_AHEAD - DAY, zone)}; write that")
+            if last > latest:
+                raise BadInput(f"--until: at most a year ahead; write {latest:%Y-%m-%d} or an earlier date")
         return cls(start, every, last, runtime, zone)
 
     def remarks(self) -> list[str]:
@@ -205,6 +207,10 @@ class Asked:
         until = None if self.last is None else int(self.last.timestamp())
         at = int(self.start.at.timestamp())
         return BookingRecord("", "", {}, 0, at, self.runtime, self.runtime, self.zone.key, self.every, until)
+
+
+def _end_of(day: date, zone: ZoneInfo) -> datetime:
+    return local(datetime.combine(day, time(23, 59, 59)), zone).at
 
 
 async def _make(
@@ -224,11 +230,9 @@ async def _make(
 ) -> None:
     zone = zone or host_zone()
     # What is wrong in any case is said before the mesh is joined.
-    at.found(time.time(), zone)
+    at.found(clocks.time(), zone)
     if until is not None and every is None:
         raise BadInput("--until is the end of what is repeated; add --every, or leave it out")
-    if every is not None and runtime > every * DAY:
-        raise BadInput(f"--for: it is not over when it begins again; write {span(every * DAY)} or less")
     if patience is not None and patience > runtime:
         raise BadInput(f"--patience: it is over after {span(float(runtime))}; write that or less")
     name = check_name(name, "--name") if name is not None else None
@@ -282,19 +286,19 @@ async def _instead(client: Client, refused: RequestRefused, needs: Needs, asked:
     free = [date_words(slot.start, asked.zone) for slot in told.slots if slot.start > start.timestamp()]
     if not free:
         return f"{refused}; within {span(LOOK_AHEAD)} after that they are not free together"
-    return f"{refused}; they are free together from {', '.join(free)}: write another --at"
+    return f"{refused}; free together from {' or '.join(free)} on ({asked.zone.key}): write another --at"
 
 
 def _print(booking: BookingView, asked: Asked, told: BookingsTold) -> None:
-    date, zone = next(iter(booking.dates), None), asked.zone
+    first, zone = next(iter(booking.dates), None), asked.zone
     begins = asked.start.at.timestamp()
     when = f"{span_words(begins, begins + float(asked.runtime), zone)} ({zone.key}), in {span(begins - told.time)}"
     done = "is kept free" if booking.maintenance else "is booked"
-    terminal.print_line(clean(f"{booking.name} ({short(booking)}) {done}: {rcs_words(booking, date)}: {when}"))
+    terminal.print_line(clean(f"{booking.name} ({short(booking)}) {done}: {rcs_words(booking, first)}: {when}"))
     if booking.every:
-        last = "for a year" if booking.until is None else f"until {in_zone(booking.until, zone):%a %Y-%m-%d}"
+        last = "" if booking.until is None else f" until {in_zone(booking.until, zone):%a %Y-%m-%d}"
         soon = many(len(booking.dates), "date")
-        terminal.print_line(f"it is repeated {every_words(booking.every)} {last}: {soon} within 60 days")
+        terminal.print_line(f"it is repeated {every_words(booking.every)}{last}: {soon} within 60 days")
     for note in asked.remarks():
         terminal.print_line(note)
     for one in booking.dates:

@@ -18,6 +18,7 @@ from zscout.cli.booked import (
     booking_argument,
     booking_json,
     choose,
+    clock_words,
     explained,
     rcs_words,
     short,
@@ -30,7 +31,7 @@ from zscout.cli.bookings.book import DATE
 from zscout.cli.common import Failed
 from zscout.cli.dates import WrittenDate, date_words, every_words, host_zone, in_zone, span_words
 from zscout.config.strict import BadInput
-from zscout.messages import MAX_AHEAD, BookedDate, BookingRecord, BookingView
+from zscout.messages import MAX_AHEAD, WINDOW, BookedDate, BookingRecord, BookingView
 from zscout.services.bookings.dates import dates
 from zscout.terminal import Table, clean
 
@@ -77,11 +78,6 @@ async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: b
             terminal.print_line("nothing is booked")
         else:
             _table(found, me, zone).print()
-
-
-def clock_words(host: str, differs: float) -> str:
-    """That a host's clock is not the fleet's."""
-    return f"the clock of {host} is {terminal.span(abs(differs))} {'before' if differs > 0 else 'behind'} the fleet's"
 
 
 def _table(found: Sequence[BookingView], me: User, zone: ZoneInfo | None) -> Table:
@@ -150,14 +146,15 @@ async def unbook(booking: str, at: WrittenDate | None, zone: ZoneInfo | None, as
         if as_json:
             terminal.print_json(booking_json(left, me))
             return
-    what = "" if start is None else f"its date {date_words(start, zone)} "
-    whole = f" with all its dates, {every_words(found.every)}" if found.every and start is None else ""
-    terminal.print_line(clean(f"{found.name} ({short(found)}) of {whose(found)}: {what}is given up{whole}"))
+    what = "is given up" if start is None else f"gives up {date_words(start, zone)}"
+    whole = ", with all its dates" if found.every and start is None else ""
+    terminal.print_line(clean(f"{found.name} ({short(found)}) of {whose(found)} {what}{whole}"))
 
 
 def _date_of(booking: BookingView, at: WrittenDate, zone: ZoneInfo, now: float) -> int:
     """The date of a booking that is meant. Raises Failed where there is none, BadInput."""
-    coming = dates(_record(booking), now - float(booking.runtime), now + MAX_AHEAD)
+    told = [one.start for one in booking.dates]
+    coming = told + [one for one in dates(_record(booking), now + WINDOW, now + MAX_AHEAD) if one not in told]
     day = at.whole_day(now, zone)
     if day is not None:
         meant = [one for one in coming if in_zone(one, zone).date() == day]
