@@ -46,10 +46,11 @@ def told(fleet: CliFleet, *args: str) -> dict[str, Any]:
 def test_booked_listed_found_taken_up_and_given_up(fleet: CliFleet) -> None:
     needs = ("robot/a", "framegrabber/*", "radio/rf0:command_rate=5")
     made = said(fleet, "book", *needs, "--for", "2h", "--at", "in 3h", "--name", "survey", "--comment", "visitors")
-    devices = r"framegrabber/f1 for framegrabber/\*, radio/rf0 \(command_rate=5\), robot/a"
+    devices = r"framegrabber/f[12] for framegrabber/\*, radio/rf0 \(command_rate=5\), robot/a"
     first, second = made.splitlines()
     assert re.fullmatch(
-        rf"survey \([0-9a-f]{{8}}\) is booked: {devices}: {DATE} to .*\d\d:\d\d \(Europe/Berlin\), in 3 h( 1 min)?", first
+        rf"survey \([0-9a-f]{{8}}\) is booked: {devices}: {DATE} to .*\d\d:\d\d \(Europe/Berlin\), in 3 h( 1 min)?",
+        first,
     )
     assert second.endswith("zscout request --booking survey -- COMMAND")
 
@@ -66,7 +67,7 @@ def test_booked_listed_found_taken_up_and_given_up(fleet: CliFleet) -> None:
     assert "booked then: survey of" in refused
     assert re.search(rf"; free together from {DATE} on \(Europe/Berlin\): write another --at\n", refused)
     slots = told(fleet, "slots", *needs, "--for", "2h", "--within", "1d")
-    assert [slot["bound"] for slot in slots["slots"]] == [{"framegrabber/*": "framegrabber/f1"}] * 2
+    assert [[*slot["bound"]] for slot in slots["slots"]] == [["framegrabber/*"]] * 2
     assert slots["slots"][0]["latest"] < listed["dates"][0]["start"]
     assert slots["slots"][1]["start"] == listed["dates"][0]["end"]
     line = said(fleet, "slots", "robot/a", "--for", "30h", "--within", "2h", code=1)
@@ -94,7 +95,7 @@ def test_at_its_date_it_is_held_and_the_command_runs(fleet: CliFleet) -> None:
     events = [json.loads(line) for line in done.stderr.splitlines()]
     [granted] = [event for event in events if event["event"] == "granted"]
     assert (granted["arc"], granted["rcs"]) == ("soon", ["robot/b"])
-    assert 50 < granted["remaining"] <= 60
+    assert 0 < granted["remaining"] <= 60
     assert told(fleet, "bookings")["bookings"] == []
     assert 'no booking "soon" is known' in said(fleet, "request", "--booking", "soon", "--", "true", code=1)
 
@@ -130,12 +131,12 @@ def test_what_is_repeated_is_given_up_date_by_date(fleet: CliFleet) -> None:
 def test_who_would_run_into_maintenance_is_told_until_when(fleet: CliFleet) -> None:
     made = said(fleet, "maintain", "robot/c", "--at", "in 10m", "--for", "1h", "--comment", "new gripper")
     assert re.search(r"^maintenance \([0-9a-f]{8}\) is kept free: robot/c: .* in 1\d min", made)
-    done = fleet.zscout("request", "robot/c", "--min-runtime", "20m", "--timeout", "1")
-    assert done.returncode == 1
-    waits = done.stdout.splitlines()[0]
-    assert re.search(
-        r"^request waits: maintenance of robot/c by .*\(maintenance\), until .* at the latest; starts at ", waits
-    )
+    waiting = fleet.start("request", "robot/c", "--min-runtime", "20m")
+    try:
+        waits = read_until(waiting, "request waits")[-1]
+        assert re.search(r"^request waits: maintenance of robot/c by .*, until .* at the latest; starts at ", waits)
+    finally:
+        end(waiting)
     assert fleet.zscout("request", "robot/c", "--min-runtime", "1m", "--", "true").returncode == 0, "it is over by then"
     nobody = said(fleet, "request", "--booking", "maintenance", "--", "true", code=1)
     assert nobody.startswith("zscout: maintenance is maintenance, which nobody takes up")
