@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 
 import zscout
 
-NEEDS = {"robot/scout33": {}}
+NEEDS: dict[str, dict[str, float]] = {"robot/scout33": {}}
 
 
 async def survey() -> None:
