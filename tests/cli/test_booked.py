@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
+import time
 from decimal import Decimal
 from zoneinfo import ZoneInfo
 
 import pytest
 
-from zscout.cli.booked import User, booking_json, choose, free_name, rcs_words, state_words, whose
+from tests.mesh.kit import run
+from zscout.behaviors.client.client import Client
+from zscout.cli.booked import (
+    User,
+    ask_bookings,
+    booking_json,
+    choose,
+    free_name,
+    in_words,
+    look,
+    rcs_words,
+    soon,
+    state_words,
+    whose,
+)
 from zscout.cli.common import Failed
-from zscout.messages import BookedDate, BookingView, Who
+from zscout.config.fleet import default_fleet
+from zscout.keyexpr import Sender
+from zscout.lab.faults.memory import MemoryNetwork
+from zscout.messages import BookedDate, BookingsAsk, BookingsTold, BookingView, Who
 
+FLEET = default_fleet()
 ALICE = User("alice", "ws1", person=False)
 ZONE = ZoneInfo("Europe/Berlin")
 START = 1_796_130_000
@@ -69,7 +88,34 @@ def test_a_name_is_numbered_where_one_has_it_already() -> None:
     assert free_name("survey", [A, booking("z", "survey-2")]) == "survey-3"
 
 
+@pytest.mark.parametrize(("differs", "words"), [(185.0, "behind"), (-185.0, "before"), (1.0, "")])
+def test_who_is_by_another_clock_than_the_fleet_is_told(
+    differs: float, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def story() -> None:
+        network = MemoryNetwork()
+        leader = network.open(FLEET.name, Sender("a", "x"))
+        client = Client(network.open(FLEET.name, Sender("b", "c")), FLEET)
+        told = BookingsTold(time.time() + differs, [A])
+        served = leader.serve(leader.keys.rcm_bookings, BookingsAsk, lambda query: query.answer(told))
+        assert (await ask_bookings(client)).bookings == [A]
+        assert await look(client) == told
+        served.close()
+
+    run(story())
+    told = capsys.readouterr().err
+    assert told == (f"this host's clock is 3 min 5 s {words} the fleet's; dates are by the fleet's\n" if words else "")
+
+
+def test_how_many_begin_within_a_day() -> None:
+    dates = [BookedDate(START + 3600 * hours, START + 3600 * hours + 1, "open") for hours in (-1, 1, 23, 25)]
+    gone = [BookedDate(START + 3600, START + 3601, "conflict")]
+    told = BookingsTold(START, [booking("x", dates=dates), booking("y", dates=gone)])
+    assert (soon(told), soon(None)) == (2, 0)
+
+
 def test_words() -> None:
+    assert [in_words(0.4), in_words(-5), in_words(7200)] == ["now", "now", "in 2 h"]
     assert whose(A) == "alice@ws1"
     assert whose(booking("x", user="", owner="ada")) == "ada"
     assert whose(booking("x", user="eve\x1b[31m")) == "eve [31m@ws1"

@@ -157,6 +157,11 @@ def rcs_words(booking: BookingView, date: BookedDate | None = None) -> str:
     return ", ".join(common.with_amounts(names[need], booking.needs[need]) for need in sorted(booking.needs))
 
 
+def in_words(seconds: float) -> str:
+    """`now`, `in 3 h`."""
+    return f"in {span(seconds)}" if seconds >= 1 else "now"
+
+
 def state_words(booking: BookingView, date: BookedDate) -> str:
     """How one date stands, and what endangers it."""
     words = "maintenance" if booking.maintenance and date.state == "open" else date.state

@@ -95,6 +95,14 @@ def test_a_refusal_is_raised_at_once_and_silence_after_the_time_given() -> None:
     run(story())
 
 
+def test_an_rcm_that_knows_no_bookings_is_told_as_such() -> None:
+    async def story() -> None:
+        with pytest.raises(RcmSilent, match="does not tell of bookings; it may be older"):
+            await BookingsClient(Leader(lambda _: None).client).list()
+
+    run(story())
+
+
 def test_what_is_no_date_is_refused_before_anybody_is_asked() -> None:
     async def story() -> None:
         leader = Leader(lambda _: None)

@@ -35,6 +35,13 @@ def test_the_last_day_is_one_on_which_it_may_begin() -> None:
     assert year.isoformat() == "2027-11-26T23:59:59+01:00"
 
 
+def test_what_began_can_be_booked_for_as_long_as_it_can_be_taken_up() -> None:
+    written = parse_date("2026-11-26 11:50", "--at")
+    assert Asked.of(written, HOUR, None, None, BERLIN, NOW, 900).start.at.minute == 50
+    with pytest.raises(BadInput, match="11:50 is over"):
+        Asked.of(written, HOUR, None, None, BERLIN, NOW, 600)
+
+
 @pytest.mark.parametrize(
     ("at", "every", "until", "why"),
     [

@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
 from tests.cli.tools import end, read_until
+from tests.hang import HANG
+from zscout.behaviors.client.blocking import connect
+from zscout.behaviors.client.bookings import BookingsClient
 
 pytestmark = pytest.mark.live
 
@@ -108,6 +112,22 @@ def test_a_booking_has_its_own_needs_and_priority(fleet: CliFleet) -> None:
     assert higher == "zscout: --priority: fixed is booked at 2; leave it out\n"
     same = said(fleet, "request", "robot/b", "--booking", "fixed", "--priority", "2", "--timeout", "0.5", code=1)
     assert "fixed was not granted within 0.5 s" in same
+
+
+def test_a_plain_script_books_and_takes_up(fleet: CliFleet) -> None:
+    with connect("script", fleet=fleet.lab.fleet, host="test") as lab:
+        bookings = BookingsClient(lab.client)
+        needs: dict[str, dict[str, Any]] = {"robot/a": {}, "radio/rf0": {"command_rate": 0.5}}
+        start = datetime.now(UTC) + timedelta(seconds=2)
+        booking = lab.run(bookings.book(needs, start, 60, name="script", priority=1))
+        with lab.hold("script", **bookings.terms(booking), timeout=HANG) as held:
+            assert held.rcs == ["radio/rf0", "robot/a"]
+            [listed] = lab.run(bookings.list(owner="test")).bookings
+            [date] = listed.dates
+            assert date.state == "taken"
+            assert date.arc is not None
+            assert date.arc.startswith("test/script/")
+        assert not lab.run(bookings.list(owner="test")).bookings
 
 
 def test_what_is_repeated_is_given_up_date_by_date(fleet: CliFleet) -> None:

@@ -67,7 +67,8 @@ class BookingsClient:
     async def list(self, *, owner: str | None = None, rc: str | None = None) -> BookingsTold:
         """All that are not over, or those of a host or person, or that may have one RC; with the fleet's time. Raises
         RcmSilent, RequestRefused."""
-        return await self._until_told(self._mesh.keys.rcm_bookings, BookingsAsk(owner=owner, rc=rc), BookingsTold)
+        question, silent = BookingsAsk(owner=owner, rc=rc), "does not tell of bookings; it may be older than these"
+        return await self._until_told(self._mesh.keys.rcm_bookings, question, BookingsTold, ANSWER, silent)
 
     async def book(
         self,
@@ -163,10 +164,11 @@ class BookingsClient:
         keys, me = self._mesh.keys, self._mesh.me
         if keys.closed and (why := self._client.fleet.access.refusal(me.host, "book", USERS)):
             raise RequestRefused(Problem("not_allowed", why))
-        return await self._until_told(keys.schedule(me), operation, kind)
+        silent = "did not answer; it may be done or not: see zscout bookings, and try again"
+        return await self._until_told(keys.schedule(me), operation, kind, self._timeout, silent)
 
-    async def _until_told(self, key: str, question: Message, kind: type[M]) -> M:
-        deadline = self._mesh.now() + round(self._timeout * SECOND)
+    async def _until_told(self, key: str, question: Message, kind: type[M], within: float, silent: str) -> M:
+        deadline = self._mesh.now() + round(min(within, self._timeout) * SECOND)
         pause, longest = BACKOFF
         problem: Problem | None = None
         while True:
@@ -180,9 +182,8 @@ class BookingsClient:
                 named = naming_versions(replies[0], who)
                 raise RequestRefused(problem if named is None or named.problem is None else named.problem)
             if self._mesh.now() > deadline:
-                why = "" if problem is None else f": {problem.message}"
-                silent = f"the RCM of fleet {self._client.fleet.name} did not answer{why}; it may be done or not"
-                raise RcmSilent(Problem("unknown", f"{silent}: see zscout bookings, and try again"))
+                why = "" if problem is None else f" ({problem.message})"
+                raise RcmSilent(Problem("unknown", f"the RCM of fleet {self._client.fleet.name} {silent}{why}"))
             await asyncio.sleep(pause)
             pause = min(longest, pause * 2)
 

@@ -14,7 +14,7 @@ import click
 from msgspec.structs import replace
 
 from zscout import terminal
-from zscout.behaviors.client.bookings import BookingsClient
+from zscout.behaviors.client.bookings import PATIENCE, BookingsClient
 from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.behaviors.client.identity import bounded
 from zscout.cli import common, completion
@@ -24,6 +24,7 @@ from zscout.cli.booked import (
     booking_json,
     explained,
     free_name,
+    in_words,
     rcs_words,
     short,
     state_words,
@@ -169,12 +170,19 @@ class Asked:
 
     @classmethod
     def of(
-        cls, at: WrittenDate, runtime: Decimal, every: int | None, until: WrittenDate | None, zone: ZoneInfo, now: float
+        cls,
+        at: WrittenDate,
+        runtime: Decimal,
+        every: int | None,
+        until: WrittenDate | None,
+        zone: ZoneInfo,
+        now: float,
+        late: float = 0.0,
     ) -> Asked:
-        """Raises BadInput."""
+        """What has begun can be taken up for `late` seconds yet. Raises BadInput."""
         start, last = at.found(now, zone), None
         begins = start.at.timestamp()
-        if begins <= now:
+        if begins + late <= now:
             raise BadInput(
                 f"--at: {date_words(begins, zone)} is over; by the fleet's clock it is {date_words(now, zone)}"
             )
@@ -240,7 +248,8 @@ async def _make(
         # Others are told its name, and not by which command it was made.
         client.who = replace(client.who or Who(), command="")
         told, me = await ask_bookings(client), User.of(client)
-        asked = Asked.of(at, runtime, every, until, zone, told.time)
+        late = min(runtime, Decimal(PATIENCE) if patience is None else patience)
+        asked = Asked.of(at, runtime, every, until, zone, told.time, float(late))
         own = [one for one in told.bookings if me.owns(one)]
         default = "maintenance" if maintenance else _named_after(needs)
         terms: dict[str, Any] = {"priority": priority, "comment": comment}
@@ -292,7 +301,7 @@ async def _instead(client: Client, refused: RequestRefused, needs: Needs, asked:
 def _print(booking: BookingView, asked: Asked, told: BookingsTold) -> None:
     first, zone = next(iter(booking.dates), None), asked.zone
     begins = asked.start.at.timestamp()
-    when = f"{span_words(begins, begins + float(asked.runtime), zone)} ({zone.key}), in {span(begins - told.time)}"
+    when = f"{span_words(begins, begins + float(asked.runtime), zone)} ({zone.key}), {in_words(begins - told.time)}"
     done = "is kept free" if booking.maintenance else "is booked"
     terminal.print_line(clean(f"{booking.name} ({short(booking)}) {done}: {rcs_words(booking, first)}: {when}"))
     if booking.every:

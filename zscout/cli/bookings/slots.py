@@ -12,7 +12,7 @@ from zscout import terminal
 from zscout.behaviors.client.bookings import BookingsClient
 from zscout.behaviors.client.client import RequestRefused
 from zscout.cli import common
-from zscout.cli.booked import ask_bookings, explained, utc, zone_option
+from zscout.cli.booked import ask_bookings, explained, in_words, utc, zone_option
 from zscout.cli.bookings.book import DATE, DURATION, needs_argument
 from zscout.cli.dates import WrittenDate, date_words, host_zone
 from zscout.cli.requests.options import gather_needs, seconds_within
@@ -79,8 +79,6 @@ def _table(told: SlotsTold, zone: ZoneInfo | None) -> Table:
     for one in told.slots:
         bound = ", ".join(f"{rc} for {need}" for need, rc in sorted(one.bound.items()))
         latest = date_words(one.latest, zone) if one.latest > one.start else "then only"
-        rows.append((date_words(one.start, zone), latest, span(one.start - told.time), bound))
-    columns = (
-        ("BEGINS", "AT THE LATEST", "IN", "WITH") if any(row[3] for row in rows) else ("BEGINS", "AT THE LATEST", "IN")
-    )
+        rows.append((date_words(one.start, zone), latest, in_words(one.start - told.time), bound))
+    columns = ("BEGINS", "AT THE LATEST", "THAT IS", "WITH")[: 4 if any(row[3] for row in rows) else 3]
     return Table("", columns, [row[: len(columns)] for row in rows])

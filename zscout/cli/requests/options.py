@@ -182,7 +182,8 @@ class HoldOptions:
     def asked_by(self, who: Who | None) -> Who:
         """Who asks, of whom only zscout's own command is known yet: for which command, or under which name."""
         who = who or Who()
-        own = f"{who.command} --name {self.name}" if self.name not in DEFAULT_NAMES else who.command
+        called = f"--booking {self.name}" if self.booking else f"--name {self.name}"
+        own = f"{who.command} {called}" if self.name not in DEFAULT_NAMES else who.command
         return replace(who, command=bounded(shlex.join(self.command) if self.command else own))
 
     def terms(self) -> dict[str, Any]:
