@@ -12,8 +12,10 @@ from zoneinfo import ZoneInfo
 import pytest
 from msgspec.structs import asdict
 
+from tests.behaviors.client.small_fleet import RC, SmallFleet, small_fleet
 from tests.behaviors.client.test_open_arc import NOW, RUNS, TAKEN, WAITS, arc
-from tests.mesh.kit import run
+from tests.mesh.kit import run, until
+from tests.services.rcm.test_bookings import Disk
 from zscout.behaviors.client.bookings import BookingsClient, RcmSilent
 from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.behaviors.client.request import OpenArc
@@ -22,6 +24,9 @@ from zscout.keyexpr import Sender
 from zscout.lab.faults.memory import MemoryNetwork
 from zscout.mesh import IncomingQuery, Refused
 from zscout.messages import Book, BookingView, OpenRequest, Operation, Who
+from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.rcm.candidate import Candidate
+from zscout.types import SECOND
 
 FLEET = default_fleet()
 AT = datetime(2026, 12, 1, 14, 0, tzinfo=ZoneInfo("Europe/Berlin"))
@@ -139,3 +144,45 @@ def test_the_date_that_an_rcm_has_linked_is_shown_to_the_next() -> None:
     assert it.ask(NOW).booking == "b1@1796130000", "preempted, it waits for the same date"
     assert isinstance(it.open_request(NOW), OpenRequest)
     assert OpenArc.expected(it.open_request(NOW), NOW).booking == "b1@1796130000", "handed over as well"
+
+
+class BookedFleet(SmallFleet):
+    """Candidates with disks, in the virtual time of the test."""
+
+    def candidate(self, host: str) -> Candidate:
+        mesh = self.mesh(host, "node")
+        keeper = BookingKeeper(mesh, Disk(), wall=lambda: AT.timestamp() + mesh.now() / SECOND)
+        candidate = self.candidates[host] = Candidate(mesh, self.fleet, keeper=keeper)
+        candidate.start()
+        return candidate
+
+
+def test_what_a_program_has_taken_up_it_has_at_its_date_though_the_leader_dies() -> None:
+    async def story() -> None:
+        async with small_fleet("one", "two", kind=BookedFleet) as (fleet, (one, two)):
+            fleet.candidate("h1")
+            bookings = BookingsClient(one)
+            start = datetime.fromtimestamp((await bookings.list()).time + 60, UTC)
+            booking = await bookings.book({RC: {}}, start, 30, name="survey", every=1, until=start + timedelta(days=3))
+            mine = await one.request("survey", **bookings.terms(booking))
+            assert (mine.state, mine.booking) == ("queued", f"{booking.id}@{booking.start}"), "the first date"
+            fleet.network.kill(fleet.leader())
+            del fleet.candidates["h0"]
+            await until(lambda: one.leader == "h1" and two.leader == "h1", within=30)
+            # What would not be over by then does not start, though it is asked for first.
+            long = await two.request("long", {RC: {}}, min_runtime=600)
+            assert await one.granted(mine) is not None
+            told = await bookings.list()
+            assert 0 <= told.time - booking.start < 1
+            [dates] = [view.dates for view in told.bookings]
+            assert [(date.state, date.arc) for date in dates][:2] == [("taken", f"h/one/{mine.id}"), ("open", None)]
+            assert mine.booking == f"{booking.id}@{booking.start}"
+            assert long.state == "queued"
+            # At its end it yields to who waits, and what asks for the booking anew has its next date.
+            assert await two.granted(long) is not None
+            assert 30 <= (await bookings.list()).time - booking.start < 32
+            assert mine.outcome == "completed"
+            again = await one.request("survey", **bookings.terms(booking))
+            assert again.booking == f"{booking.id}@{booking.start + 86_400}"
+
+    run(story())
