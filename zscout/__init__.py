@@ -19,6 +19,7 @@ __version__ = VERSION
 if TYPE_CHECKING:
     from zscout.behaviors.client.arc import Held, Revoked, hold, holds
     from zscout.behaviors.client.blocking import BlockingHeld, Lab, connect
+    from zscout.behaviors.client.bookings import BookingsClient
     from zscout.behaviors.client.client import Client, CommandRefused, NoRcm, RequestRefused
     from zscout.behaviors.components.component import Component, ComponentContext, Stage
     from zscout.config.fleet import Fleet, load_fleet
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 _HOME = {
     "BadInput": "zscout.config.strict",
     "BlockingHeld": "zscout.behaviors.client.blocking",
+    "BookingsClient": "zscout.behaviors.client.bookings",
     "Client": "zscout.behaviors.client.client",
     "CommandRefused": "zscout.behaviors.client.client",
     "Component": "zscout.behaviors.components.component",
@@ -49,6 +51,7 @@ _HOME = {
 __all__ = [
     "BadInput",
     "BlockingHeld",
+    "BookingsClient",
     "Client",
     "CommandRefused",
     "Component",

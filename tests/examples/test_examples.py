@@ -28,7 +28,11 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
 @pytest.mark.live
 @pytest.mark.parametrize(
     ("program", "words"),
-    [("hold_blocking.py", ["holding radio/rf0 robot/scout33", "hello"]), ("hold_async.py", ["0\n1\n2"])],
+    [
+        ("hold_blocking.py", ["holding radio/rf0 robot/scout33", "hello"]),
+        ("hold_async.py", ["0\n1\n2"]),
+        ("book.py", ["booked from", "hello"]),
+    ],
 )
 def test_a_program_holds_and_commands(fleet: CliFleet, program: str, words: list[str]) -> None:
     command = [sys.executable, str(EXAMPLES / program)]

@@ -1,5 +1,5 @@
-"""What the shell offers at Tab: RCs, ARCs, hosts, components and kinds of the fleet as it is then; and
-`zscout completion`, the script that makes it do so.
+"""What the shell offers at Tab: RCs, ARCs, bookings, hosts, components and kinds of the fleet as it is
+then; and `zscout completion`, the script that makes it do so.
 
 Without a fleet nothing is offered, and nothing said."""
 
@@ -112,6 +112,15 @@ async def needs(mesh: Mesh, _parameter: str) -> Iterable[str]:
 async def arcs(mesh: Mesh, _parameter: str) -> Iterable[str]:
     """Names of ARCs that are open."""
     return _arc_names(await _state(mesh))
+
+
+@_on_mesh
+async def bookings(mesh: Mesh, _parameter: str) -> Iterable[str]:
+    """Names of bookings that are not over."""
+    from zscout.messages import BookingsAsk, BookingsTold
+
+    reply = await mesh.ask_one(mesh.keys.rcm_bookings, BookingsAsk(), BookingsTold, timeout=LOOK)
+    return {one.name for one in reply.message.bookings} if reply is not None and reply.message is not None else ()
 
 
 @_on_mesh

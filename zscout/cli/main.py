@@ -27,6 +27,11 @@ from zscout import __version__
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "request": ("requests.request", "Wait for devices; hold them, or run a command that needs them."),
     "take": ("operator.take", "Take devices at an operator's priority, preempting who holds them."),
+    "book": ("bookings.book", "Book devices together, from a date on."),
+    "slots": ("bookings.slots", "List the first times at which devices are free together."),
+    "bookings": ("bookings.listing", "List who has booked what."),
+    "unbook": ("bookings.listing", "Give up a booking, or one date of it."),
+    "maintain": ("bookings.book", "Keep RCs free of everybody, from a date on."),
     "drive": ("operator.drive", "Take a robot and drive it from the keyboard, seeing what it sees."),
     "watch": ("operator.watch", "Tell when something moves in the pictures of a camera or video."),
     "release": ("requests.cancel", "End the hold of a running ARC."),
@@ -140,6 +145,7 @@ def explain(error: BaseException) -> tuple[int, str] | None:
         missing = how_to_get(error)
         return (COULD_NOT, f"zscout: this command {missing}") if missing else None
     # Only a failing command pays for these imports, and most have made them already.
+    from zscout.behaviors.client.bookings import RcmSilent
     from zscout.behaviors.client.client import CommandRefused, RequestRefused
     from zscout.behaviors.client.placer_client import PlacerSilent
     from zscout.cli.common import Failed, Interrupted
@@ -157,7 +163,7 @@ def explain(error: BaseException) -> tuple[int, str] | None:
             return error.exit_code, words
         case BadInput() | BadName():
             return BAD_INPUT, words
-        case PlacerSilent():
+        case PlacerSilent() | RcmSilent():
             return NOBODY, words
         case RequestRefused(code=code) if code in DOOR_CODES:
             return BAD_INPUT, words

@@ -63,8 +63,10 @@ class SmallFleet:
 
 
 @asynccontextmanager
-async def small_fleet(*clients: str, config: Fleet = FLEET) -> AsyncIterator[tuple[SmallFleet, list[Client]]]:
-    fleet = SmallFleet(config)
+async def small_fleet(
+    *clients: str, config: Fleet = FLEET, kind: type[SmallFleet] = SmallFleet
+) -> AsyncIterator[tuple[SmallFleet, list[Client]]]:
+    fleet = kind(config)
     for rc in fleet.rcs:
         await rc.start()
     fleet.candidate("h0")

@@ -232,7 +232,7 @@ class Attempt:
         raise revoked from None
 
 
-_ASKED = ("name", "needs", "priority", "min_runtime", "keep", "direct", "comment", "wait_for_device")
+_ASKED = ("name", "needs", "priority", "min_runtime", "keep", "direct", "comment", "wait_for_device", "booking")
 
 
 def _ask(*values: Any) -> dict[str, Any]:
@@ -253,13 +253,14 @@ def hold(
     timeout: float | None = None,
     comment: str = "",
     wait_for_device: bool | None = None,
+    booking: str = "",
 ) -> Attempt:
     """An ARC as an async context manager; see the module's text. `min_runtime` in seconds, by default the fleet's;
     `confirmed`: it is entered when all RCs have confirmed the grant; the `comment` is shown to others;
-    `wait_for_device` as `Client.request` has it.
+    `wait_for_device` and `booking` as `Client.request` has them.
 
     Entering raises TimeoutError where it was not granted within `timeout` seconds: it is cancelled then."""
-    ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device)
+    ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device, booking)
     return Attempt(client, ask, timeout=timeout, confirmed=confirmed)
 
 
@@ -275,10 +276,11 @@ async def holds(
     confirmed: bool = False,
     comment: str = "",
     wait_for_device: bool | None = None,
+    booking: str = "",
 ) -> AsyncIterator[Attempt]:
     """The same, entered again whenever it was ended for others and is granted again, until a body ends by itself, or
     without `keep` has had its time."""
-    ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device)
+    ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device, booking)
     attempt = Attempt(client, ask, again=True, confirmed=confirmed)
     yield attempt
     while attempt.goes_on:

@@ -253,6 +253,7 @@ class Lab:
         interrupt: bool = True,
         comment: str = "",
         wait_for_device: bool | None = None,
+        booking: str = "",
     ) -> AbstractContextManager[BlockingHeld, None]:
         """When entered it waits for all of `needs`, at most `timeout` seconds; when left it gives them back. Others
         are shown the `comment`.
@@ -268,12 +269,14 @@ class Lab:
         A body that touches devices past their RCs says `direct`: they settle until it has been left, in at most nine
         tenths of their `settle`; the next holder waits for that, and Revoked is raised once more in who takes longer.
 
-        What can never start is refused; with `wait_for_device`, not for a need that nobody knows.
+        What can never start is refused; with `wait_for_device`, not for a need that nobody knows. With a `booking`, by
+        its id, it takes that up, whose needs and priority it has, and waits for its next date.
 
         Entering raises TimeoutError, RequestRefused, Revoked where others ended the request, and NoRcm where none is
         seen within 3 s. Leaving raises Revoked where the hold was taken away and the body has not been told."""
         how: dict[str, Any] = {"priority": priority, "min_runtime": min_runtime, "keep": keep, "timeout": timeout}
         how |= {"comment": comment, "direct": direct, "confirmed": confirmed, "wait_for_device": wait_for_device}
+        how["booking"] = booking
         return BlockingAttempt(self, hold(self.client, name, needs, **how), interrupt=interrupt)
 
     def _stop(self) -> None:

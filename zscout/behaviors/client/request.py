@@ -71,6 +71,8 @@ class OpenArc:
     """Whether its program touches devices past their RCs (`direct.py`)."""
     who: Who | None = None
     """Who asks, as others are told."""
+    booking: str = ""
+    """The booking that it takes up: its id; once the RCM has said so, one date of it: `<id>@<start>`."""
     check: bool = False
     """Whether it is to be refused at once if it can never start."""
     wait_for_device: bool = False
@@ -128,7 +130,7 @@ class OpenArc:
             check_need(need)
         id_, name = check_name(request.id, "id"), check_name(request.arc, "arc")
         arc = cls(id_, name, request.needs, request.priority, request.min_runtime, request.keep, place=request.place)
-        arc.direct = request.direct
+        arc.direct, arc.booking = request.direct, request.booking
         arc.who = request.who and msgspec.structs.replace(request.who, host="")
         arc.state, arc.reason = "expected", "another client is to hand it over"
         arc.since, arc.waits_since = now, now - round(request.waited * SECOND)
@@ -147,6 +149,7 @@ class OpenArc:
             return False
         self.last, self.unconfirmed, self.unserved = (notice.term, notice.step), None, None
         self.told = now
+        self.booking = notice.booking or self.booking
         if self._came is not None and self._came < notice.term:
             self._came = None
         if notice.state != self.state or notice.grant != self.grant:
@@ -288,6 +291,7 @@ class OpenArc:
             "rcs": self.rcs if grant is not None else [],
             "direct": self.direct,
             "who": self.who,
+            "booking": self.booking,
         }
 
 
@@ -416,6 +420,7 @@ class RequestStore:
         """Nobody made use of its time: it is asked for under a new id, at its place."""
         del self.arcs[arc.id]
         arc.take_back(new_instance(), "it had its time before this client heard of it", self._now())
+        arc.booking = ""  # so had that
         self.arcs[arc.id] = arc
         self.ask_again(arc)
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 import click
 from msgspec import structs
 
-from zscout.cli import common, completion
+from zscout.cli import booked, common, completion
 from zscout.cli.device_words import ending, remarks
 from zscout.cli.fleet.fleet_view import Devices, FleetView, Host
 from zscout.cli.fleet.selection import Selection
@@ -19,7 +19,7 @@ from zscout.cli.fleet.watching import Overview, show
 from zscout.cli.requests.waiting import reason_text, whose
 from zscout.config.access import AccessPolicy
 from zscout.keyexpr import Role
-from zscout.messages import HoldView, Notice, RcmState, RcState, RcView, WaitView, version_words
+from zscout.messages import BookingsTold, HoldView, Notice, RcmState, RcState, RcView, WaitView, version_words
 from zscout.terminal import Table, clock, many, span
 from zscout.types import SECOND, VERSION, Ns
 
@@ -41,13 +41,13 @@ async def status(names: Sequence[str], watch: bool, every: bool, as_json: bool) 
     what has to do with them: an RC with who holds it and who waits for it, an ARC with its RCs and their holders, a
     host with its RCs and programs. Exit code 1: nothing has one of these names.
 
-    Warnings come first: of certificates that end within 14 days, roles that nobody enforces, versions that differ. The
-    queue stands in rank order, each ARC with what it waits for. Candidates that the fleet file names are shown even
-    where they are not there; other hosts that died only with --watch. A device that says that something is wrong with
-    it is shown with its words, and counts as lost until it is well; one that was seen within a day, or that the fleet
-    file expects, with why it is gone; one that several hosts offer, with those that stand by. --watch refreshes once a
-    second; in a pipe it prints a new block when something else than a load, a time or a figure has changed. Exit code
-    3: no RCM.
+    Warnings come first: of certificates that end within 14 days, roles that nobody enforces, clocks that differ by more
+    than 2 s, versions that differ. The queue stands in rank order, each ARC with what it waits for. Candidates that the
+    fleet file names are shown even where they are not there; other hosts that died only with --watch. A device that
+    says that something is wrong with it is shown with its words, and counts as lost until it is well; one that was seen
+    within a day, or that the fleet file expects, with why it is gone; one that several hosts offer, with those that
+    stand by. --watch refreshes once a second; in a pipe it prints a new block when something else than a load, a time
+    or a figure has changed. Exit code 3: no RCM.
 
     \b
     Examples:
@@ -65,7 +65,7 @@ async def status(names: Sequence[str], watch: bool, every: bool, as_json: bool) 
             standing.state = await fleet_view.settled()
         except common.NobodyThere as error:  # hosts and RCs are shown all the same
             nobody = error
-        await standing.devices.ask()
+        await asyncio.gather(standing.devices.ask(), standing.ask_bookings())
         if nobody is None and not watch and (missing := standing.selection().missing()):
             raise missing
         # Whatever becomes of an ARC is published to its client.
@@ -86,6 +86,7 @@ class Standing:
     devices: Devices
     every: bool
     names: Sequence[str] = ()
+    booked: BookingsTold | None = None
 
     def selection(self) -> Selection:
         """Of what is there now, what is to be shown."""
@@ -94,7 +95,10 @@ class Standing:
     async def refresh(self) -> None:
         self.state = await self.fleet_view.client.state(forecast=True)
         self.fleet_view.forget_gone()
-        await self.devices.ask()
+        await asyncio.gather(self.devices.ask(), self.ask_bookings())
+
+    async def ask_bookings(self) -> None:
+        self.booked = await booked.look(self.fleet_view.client) if self.state is not None else None
 
     def overview(self) -> Overview:
         fleet, links = self.fleet_view.client.fleet.name, many(self.fleet_view.mesh.links(), "link")
@@ -104,6 +108,7 @@ class Standing:
         if self.state is not None and chosen.state is not None:
             leader, term = self.state.host, self.state.term.counter
             headline = f"Fleet {fleet}: {leader} leads, term {term} ({links})"
+            headline += f"; {many(count, 'booking')} within 24 h" if (count := booked.soon(self.booked)) else ""
             ranks = {f"{wait.client}/{wait.id}": number for number, wait in enumerate(self.state.queue, 1)}
             tables = [self._rcs(chosen.state), self._running(chosen.state), _waiting(chosen.state, ranks)]
         return Overview(
@@ -123,9 +128,13 @@ class Standing:
         ]
         if self._advisory():
             rows.append(("roles", "they are advisory: nobody proves a name where [security] is not set"))
+        rows += [("clock", f"{booked.clock_words(*one)}; set it") for one in sorted(self._clocks().items())]
         if (versions := mixture(self._versions())) is not None:
             rows.append(("versions", versions))
         return Table("Warnings", ("ABOUT", "WARNING"), rows, ["yellow"] * len(rows))
+
+    def _clocks(self) -> dict[str, float]:
+        return {} if self.booked is None else self.booked.clocks
 
     def _versions(self) -> dict[str, str]:
         return versions(self.fleet_view.hosts, self.devices.known(), self.state)
@@ -205,7 +214,8 @@ class Standing:
 
     def as_object(self) -> dict[str, Any]:
         """What `--json` prints. Spans are seconds, memory bytes; `rcm` is null where there is none. `advisory`: rights
-        are written down that nobody enforces; `ending`: whose certificate ends soon."""
+        are written down that nobody enforces; `ending`: whose certificate ends soon; `clocks`: by how much those of
+        hosts differ from the fleet's; `booked_soon`: dates of bookings within 24 h."""
         chosen, versions = self.selection(), self._versions()
         state, homes, now = chosen.state, self._homes(), self.fleet_view.mesh.now()
         holds, views, queue = (state.holds, state.rcs, state.queue) if state is not None else ([], [], [])
@@ -231,6 +241,8 @@ class Standing:
             "links": self.fleet_view.mesh.links(),
             "advisory": self._advisory(),
             "ending": [{"name": name, "ends_in": left} for name, left in self.fleet_view.ending().items()],
+            "clocks": self._clocks(),
+            "booked_soon": booked.soon(self.booked),
             "rcm": None if state is None else {"host": state.host, "term": state.term, "seq": state.seq},
             "rcs": list(map(rc_object, views)),
             "holds": list(map(structs.asdict, holds)),

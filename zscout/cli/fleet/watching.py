@@ -26,8 +26,21 @@ HASTE: Final = 0.1
 MAX_ROWS: Final = 500
 """Of one table at a terminal."""
 PASSING: Final = frozenset(
-    {"held", "remaining", "waited", "starts_in", "yields_in", "ends_in", "seq", "links", "load", "age", "gone"}
-    | {"uptime", "cpu", "memory", "figures"}
+    {
+        "held",
+        "remaining",
+        "waited",
+        "starts_in",
+        "yields_in",
+        "ends_in",
+        "seq",
+        "links",
+        "load",
+        "age",
+        "gone",
+        "clocks",
+    }
+    | {"clocks", "uptime", "cpu", "memory", "figures"}
 )
 """Fields that change without anything having happened."""
 

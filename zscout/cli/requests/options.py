@@ -176,11 +176,14 @@ class HoldOptions:
     as_json: bool
     comment: str = ""
     wait_for_device: bool = False
+    booking: str = ""
+    """The id of the booking that it takes up."""
 
     def asked_by(self, who: Who | None) -> Who:
         """Who asks, of whom only zscout's own command is known yet: for which command, or under which name."""
         who = who or Who()
-        own = f"{who.command} --name {self.name}" if self.name not in DEFAULT_NAMES else who.command
+        called = f"--booking {self.name}" if self.booking else f"--name {self.name}"
+        own = f"{who.command} {called}" if self.name not in DEFAULT_NAMES else who.command
         return replace(who, command=bounded(shlex.join(self.command) if self.command else own))
 
     def terms(self) -> dict[str, Any]:
@@ -193,12 +196,7 @@ def hold_options(command: F) -> F:
     """The NEEDs and the options of all commands that hold something."""
     for option in (
         click.argument(
-            "needs",
-            nargs=-1,
-            required=True,
-            type=Parsed("need", parse_need),
-            metavar="NEED...",
-            shell_complete=completion.needs,
+            "needs", nargs=-1, type=Parsed("need", parse_need), metavar="NEED...", shell_complete=completion.needs
         ),
         json_option("Print JSON lines, one for each event."),
         click.option("--wait-for-device", is_flag=True, help="Wait for a device that nobody knows, too."),
@@ -240,7 +238,9 @@ def hold_options(command: F) -> F:
 def gather(
     needs: Any, name: str | None, default_name: str = DEFAULT_NAMES[0], *, keep: bool, release_after: Any, **rest: Any
 ) -> HoldOptions:
-    """Checks what can be checked before anybody is asked. Raises BadInput, BadName, Failed."""
+    """Checks what can be checked before anybody is asked. Raises UsageError, BadInput, BadName, Failed."""
+    if not needs and not rest.get("booking"):
+        raise click.UsageError("Missing argument 'NEED...'.", click.get_current_context())
     if release_after is not None:
         if rest["min_runtime"] is not None:
             raise BadInput("--release-after and --min-runtime are two times for one hold; give one of them")

@@ -10,16 +10,19 @@ from contextlib import asynccontextmanager, contextmanager, nullcontext, suppres
 from typing import IO, Any, Final
 
 import click
+from click.core import ParameterSource
 from msgspec.structs import replace
 
 from zscout.behaviors.client.arc import Held
 from zscout.behaviors.client.client import QUERY_TIMEOUT, Client, CommandRefused
 from zscout.behaviors.client.direct import DEFAULT_SETTLE, DirectHold
 from zscout.behaviors.client.request import HoldEnd, OpenArc
-from zscout.cli import common
+from zscout.cli import common, completion
+from zscout.cli.booked import BOOKING
 from zscout.cli.common import Failed
 from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather, hold_options
 from zscout.cli.requests.run_command import RunningCommand, environment
+from zscout.cli.requests.taking_up import check_options, taking_up
 from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text, reason_text, whose
 from zscout.config.strict import BadInput
 from zscout.mesh.supervision import done_within
@@ -45,10 +48,15 @@ REFRESH: Final = 1.0
     "--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="Higher ones preempt lower ones."
 )
 @click.option("--keep", is_flag=True, hidden=True, help="What happens without it as well.")
+@click.option(
+    "--booking", type=BOOKING, shell_complete=completion.bookings, help="Take this booking up: its name or id."
+)
 @click.option("--dry-run", is_flag=True, help="Only say when it would start, and whom it would preempt at once.")
 @hold_options
 @common.runs
-async def request(needs: Any, priority: int, keep: bool, name: str | None, dry_run: bool, **rest: Any) -> int:
+async def request(
+    needs: Any, priority: int, keep: bool, name: str | None, dry_run: bool, booking: str | None, **rest: Any
+) -> int:
     """Wait until all of the devices are granted at once, then hold them.
 
     A NEED is kind/name, and for a sharable device how it will be used: radio/rf0:command_rate=5,other=1. With a * it is
@@ -57,6 +65,9 @@ async def request(needs: Any, priority: int, keep: bool, name: str | None, dry_r
 
     They are yours for the minimum runtime, in which only a higher priority takes them, and after it until somebody of
     the same or a higher priority waits for one of them. --release-after gives them back though nobody waits.
+
+    With --booking, a booking is taken up, which has its own NEEDs, priority and time: it waits for its next date. With
+    --again, of what is repeated one date after the other.
 
     With a COMMAND, they are held while it runs, and given back as soon as nothing of it is left. When its time is over
     or the grant is taken away, the command and all that it started get SIGTERM, and SIGKILL after the grace; so they do
@@ -93,11 +104,17 @@ async def request(needs: Any, priority: int, keep: bool, name: str | None, dry_r
       zscout request 'framegrabber/*' 'framegrabber/*' robot/scout33 -- python3 -i
       zscout request robot/scout33 --json | jq .event
       zscout request robot/scout33 --priority 5 --dry-run
+      zscout request --booking survey -- sleep 7200
     """
     if keep and rest["release_after"] is not None:
         raise BadInput("--keep and --release-after contradict each other; give one of them")
-    wanted = gather(needs, name, priority=priority, keep=True, **rest)
+    if booking is not None:
+        check_options(dry_run=dry_run, **rest)
+    wanted = gather(needs, name, priority=priority, keep=True, booking=booking or "", **rest)
     async with common.connected("request") as client:
+        if booking is not None:
+            given = click.get_current_context().get_parameter_source("priority") is not ParameterSource.DEFAULT
+            wanted = await taking_up(client, wanted, name=name, priority=priority if given else None)
         return await (_foresee(client, wanted) if dry_run else carry_out(client, wanted))
 
 
@@ -136,6 +153,7 @@ async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenAr
                     comment=wanted.comment,
                     estimate=True,
                     direct=bool(wanted.command),
+                    booking=wanted.booking,
                 )
             grant = await client.granted(arc, confirmed=True)
     except (TimeoutError, asyncio.CancelledError) as error:

@@ -96,7 +96,8 @@ def whose(view: HoldView | WaitView | ReasonParty) -> str:
 
 def reason_text(reason: str, why: ReasonInfo | None, age: float = 0) -> str:
     """A reason to wait in words, with times of day by this host's clock; `age` seconds ago it was so."""
-    if why is None or why.code not in (ReasonCode.HELD, ReasonCode.VETOED) or not why.rcs:
+    told = (ReasonCode.HELD, ReasonCode.VETOED, *([ReasonCode.MAINTENANCE] if why is not None and why.by else []))
+    if why is None or why.code not in told or not why.rcs:
         return reason  # nobody holds it, or an RCM that tells no more
     parties = [
         Party(f"{one.client}/{one.id}", one.arc, one.priority, one.who, _ns(one.yields_in, age)) for one in why.by

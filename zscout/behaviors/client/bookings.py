@@ -1,0 +1,212 @@
+"""Bookings from a program: devices together, from a date on.
+
+    async with zscout.Client.connect() as client:
+        bookings = zscout.BookingsClient(client)
+        at = datetime(2026, 12, 1, 14, tzinfo=ZoneInfo("Europe/Berlin"))
+        booking = await bookings.book({"robot/arm1": {}, "framegrabber/*": {}}, at, 7200, name="survey")
+        ...
+        async with zscout.hold(client, "survey", **bookings.terms(booking)) as held:
+            ...
+
+From plain code: `lab.run(bookings.book(...))`, with `zscout.BookingsClient(lab.client)`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from datetime import datetime, timedelta
+from decimal import Decimal
+from typing import Any, Final, TypeVar
+from zoneinfo import ZoneInfo
+
+from msgspec.structs import replace
+
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.identity import checked_comment
+from zscout.behaviors.client.rcm_link import BACKOFF, TRY_AGAIN
+from zscout.behaviors.client.request import Needs, RequestRefused, amounts, check_seconds
+from zscout.keyexpr import RANDOM, USERS
+from zscout.mesh import Reply
+from zscout.mesh.exchange import naming_versions
+from zscout.messages import (
+    Book,
+    BookingsAsk,
+    BookingsTold,
+    BookingView,
+    FindSlots,
+    Message,
+    Operation,
+    Problem,
+    SlotsTold,
+    Unbook,
+    Who,
+)
+from zscout.types import SECOND
+
+ANSWER: Final = 5.0
+"""Seconds of one question: before a booking is told, another host has it on its disk."""
+TIMEOUT: Final = 15.0
+"""Seconds within which some RCM answers, though the lead changes meanwhile."""
+PATIENCE: Final = 900.0
+"""Seconds after its date in which a booking can be taken up, by default."""
+
+M = TypeVar("M", bound=Message)
+
+
+class RcmSilent(RequestRefused):
+    """No RCM answered: what was asked may be done or not."""
+
+
+class BookingsClient:
+    """The bookings of a fleet, as the program of a client knows them. `timeout`: seconds within which some RCM
+    answers."""
+
+    def __init__(self, client: Client, *, timeout: float = TIMEOUT) -> None:
+        self._client, self._mesh, self._timeout = client, client.mesh, timeout
+
+    async def list(self, *, owner: str | None = None, rc: str | None = None) -> BookingsTold:
+        """All that are not over, or those of a host or person, or that may have one RC; with the fleet's time. Raises
+        RcmSilent, RequestRefused."""
+        question, silent = BookingsAsk(owner=owner, rc=rc), "does not tell of bookings; it may be older than these"
+        return await self._until_told(self._mesh.keys.rcm_bookings, question, BookingsTold, ANSWER, silent)
+
+    async def book(
+        self,
+        needs: Needs,
+        start: datetime,
+        runtime: float | Decimal,
+        *,
+        name: str,
+        priority: int = 0,
+        patience: float | None = None,
+        every: int = 0,
+        until: datetime | None = None,
+        maintenance: bool = False,
+        comment: str = "",
+    ) -> BookingView:
+        """Books all of `needs` together, from `start` on for `runtime` seconds. Returns when a second host has it.
+
+        It lapses when nobody has taken it up `patience` seconds after its date (default: 15 min, or its whole time if
+        that is less). `every` so many days it comes again, at the same hour in the zone of `start`, which is a
+        `ZoneInfo` then, until `until`, a year from now at most. With `maintenance`, which takes an operator, nobody is
+        to hold any of them then. It is taken up by a request with its `terms`.
+
+        Raises RequestRefused, whose `code` is `not_free` where something is in the way, RcmSilent, and ValueError for
+        what is no date or no span of time."""
+        check_seconds("runtime", runtime)
+        zone = _zone(start, every)
+        if patience is None:
+            patience = float(runtime) if maintenance else min(PATIENCE, float(runtime))
+        check_seconds("patience", patience)
+        return await self.ask(
+            Book(
+                id=f"{RANDOM.get().getrandbits(128):032x}",
+                name=name,
+                needs=amounts(needs),
+                priority=priority,
+                start=_whole_second(start),
+                runtime=Decimal(str(runtime)),
+                patience=Decimal(str(patience)),
+                zone=zone,
+                every=every,
+                until=None if until is None else _whole_second(until),
+                maintenance=maintenance,
+                who=self._who(comment),
+            ),
+            BookingView,
+        )
+
+    async def unbook(self, booking: str, start: datetime | int | None = None) -> BookingView:
+        """Gives up the booking of this id, or of one that is repeated the date that begins at `start`. Who has taken it
+        up goes on. Raises RequestRefused, RcmSilent."""
+        at = _whole_second(start) if isinstance(start, datetime) else start
+        return await self.ask(Unbook(booking, at, self._client.who), BookingView)
+
+    async def slots(
+        self,
+        needs: Needs,
+        runtime: float | Decimal,
+        within: float,
+        *,
+        start: datetime | None = None,
+        priority: int = 0,
+        limit: int = 5,
+    ) -> SlotsTold:
+        """The first times at which all of `needs` could be booked together for `runtime` seconds, within so many
+        seconds from `start` (default: from now) on. Raises RequestRefused, RcmSilent."""
+        check_seconds("runtime", runtime)
+        return await self.ask(
+            FindSlots(
+                id=f"{RANDOM.get().getrandbits(128):032x}",
+                needs=amounts(needs),
+                priority=priority,
+                runtime=Decimal(str(runtime)),
+                within=float(within),
+                start=None if start is None else _whole_second(start),
+                limit=limit,
+                who=self._client.who,
+            ),
+            SlotsTold,
+        )
+
+    @staticmethod
+    def terms(booking: BookingView) -> dict[str, Any]:
+        """How a request takes it up: `zscout.hold(client, "survey", **bookings.terms(booking))`."""
+        return {
+            "needs": booking.needs,
+            "priority": booking.priority,
+            "min_runtime": booking.runtime,
+            "booking": booking.id,
+        }
+
+    async def ask(self, operation: Operation, kind: type[M]) -> M:
+        """An operation, which is idempotent by its id. Raises RequestRefused, RcmSilent."""
+        keys, me = self._mesh.keys, self._mesh.me
+        if keys.closed and (why := self._client.fleet.access.refusal(me.host, "book", USERS)):
+            raise RequestRefused(Problem("not_allowed", why))
+        silent = "did not answer; it may be done or not: see zscout bookings, and try again"
+        return await self._until_told(keys.schedule(me), operation, kind, self._timeout, silent)
+
+    async def _until_told(self, key: str, question: Message, kind: type[M], within: float, silent: str) -> M:
+        deadline = self._mesh.now() + round(min(within, self._timeout) * SECOND)
+        pause, longest = BACKOFF
+        problem: Problem | None = None
+        while True:
+            replies = await self._mesh.ask(key, question, kind, timeout=ANSWER, enough=_is_told)
+            for reply in replies:
+                if reply.message is not None:
+                    return reply.message
+            problem = next((reply.problem for reply in replies), problem)
+            if replies and problem is not None and problem.code not in TRY_AGAIN:
+                who = "the RCM" if self._client.leader is None else f"the RCM at {self._client.leader}"
+                named = naming_versions(replies[0], who)
+                raise RequestRefused(problem if named is None or named.problem is None else named.problem)
+            if self._mesh.now() > deadline:
+                why = "" if problem is None else f" ({problem.message})"
+                raise RcmSilent(Problem("unknown", f"the RCM of fleet {self._client.fleet.name} {silent}{why}"))
+            await asyncio.sleep(pause)
+            pause = min(longest, pause * 2)
+
+    def _who(self, comment: str) -> Who | None:
+        who = self._client.who
+        return replace(who or Who(), comment=checked_comment(comment)) if comment else who
+
+
+def _is_told(reply: Reply[Any]) -> bool:
+    return reply.message is not None
+
+
+def _whole_second(at: datetime) -> int:
+    """Raises ValueError for a time of no zone."""
+    if at.tzinfo is None:
+        raise ValueError(f"{at} has no zone; write one: datetime(..., tzinfo=ZoneInfo('Europe/Berlin'))")
+    return round(at.timestamp())
+
+
+def _zone(start: datetime, every: int) -> str:
+    """Raises ValueError where it has to have a name, and has none."""
+    if isinstance(start.tzinfo, ZoneInfo):
+        return start.tzinfo.key
+    if every and start.utcoffset() != timedelta(0):
+        raise ValueError("what is repeated keeps its hour in a zone; write start with a ZoneInfo('Europe/Berlin')")
+    return "UTC"

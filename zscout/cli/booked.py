@@ -1,0 +1,195 @@
+"""Bookings that the RCM told of: whose they are, which is meant by a name, and how they are shown."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from typing import Any, Final, NamedTuple
+
+import click
+from msgspec import structs
+
+from zscout.behaviors.client.bookings import BookingsClient
+from zscout.behaviors.client.client import QUERY_TIMEOUT, Client
+from zscout.behaviors.client.request import RequestRefused
+from zscout.cli import common, completion
+from zscout.cli.common import F, Failed, Parsed
+from zscout.cli.dates import parse_zone, span_words
+from zscout.config.strict import BadInput, quoted
+from zscout.keyexpr import PEOPLE
+from zscout.messages import BookedDate, BookingsAsk, BookingsTold, BookingView, Who
+from zscout.terminal import clean, span
+
+SHOWN_ID: Final = 8
+"""Characters of an id that are shown: it is named by any beginning that no other has."""
+SOON: Final = 86_400
+"""Seconds."""
+MAX_LISTED: Final = 8
+MAX_TEXT: Final = 64
+CLOCKS_DIFFER: Final = 2.0
+"""Seconds."""
+BAD: Final = frozenset({"bad_date", "bad_zone", "bad_request"})
+"""What the RCM refuses that is to be written in another way."""
+
+
+def parse_booking(text: str, option: str) -> str:
+    """What may be a booking's name or id. Raises BadInput."""
+    if not 1 <= len(text) <= MAX_TEXT or not text.isprintable():
+        raise BadInput(f"{option}: {quoted(text)} names no booking; zscout bookings lists them")
+    return text
+
+
+BOOKING: Final = Parsed("text", parse_booking)
+ZONE: Final = Parsed("zone", parse_zone)
+booking_argument = click.argument("booking", type=BOOKING, metavar="NAME|ID", shell_complete=completion.bookings)
+
+
+def zone_option(command: F) -> F:
+    """`--zone`; None: this host's."""
+    text = "Zone of the dates, as in Europe/Berlin. Default: this host's."
+    return click.option("--zone", type=ZONE, help=text)(command)
+
+
+async def ask_bookings(client: Client, rc: str | None = None) -> BookingsTold:
+    """All that are not over. Says on stderr where this host's clock is not the fleet's. Raises RequestRefused."""
+    told = await BookingsClient(client).list(rc=rc)
+    differs = time.time() - told.time
+    if abs(differs) > CLOCKS_DIFFER:
+        words = f"{span(abs(differs))} {'before' if differs > 0 else 'behind'}"
+        click.secho(f"this host's clock is {words} the fleet's; dates are by the fleet's", fg="yellow", err=True)
+    return told
+
+
+async def look(client: Client) -> BookingsTold | None:
+    """The same at a glance; None: nobody told them."""
+    reply = await client.mesh.ask_one(client.mesh.keys.rcm_bookings, BookingsAsk(), BookingsTold, timeout=QUERY_TIMEOUT)
+    return reply.message if reply is not None else None
+
+
+def soon(told: BookingsTold | None) -> int:
+    """How many dates begin within a day."""
+    return (
+        0
+        if told is None
+        else sum(
+            one.state in ("open", "taken") and told.time <= one.start < told.time + SOON
+            for booking in told.bookings
+            for one in booking.dates
+        )
+    )
+
+
+def explained(refused: RequestRefused) -> Exception:
+    """What to raise instead: bad input has its own exit code."""
+    return BadInput(str(refused)) if refused.code in BAD else refused
+
+
+# Which one is meant
+
+
+class User(NamedTuple):
+    """Who runs this program: its user, and the host or the certificate that it comes from; `person` where that is one,
+    and not a machine that several may use."""
+
+    name: str
+    host: str
+    person: bool
+
+    @classmethod
+    def of(cls, client: Client) -> User:
+        host = client.mesh.me.host
+        return cls(client.who.user if client.who is not None else "", host, _is_person(client, host))
+
+    def owns(self, booking: BookingView) -> bool:
+        """Whether it is of the same user, or by certificate the same person; of one that tells no user, of the same
+        host."""
+        user = booking.who.user if booking.who is not None else ""
+        if booking.owner == self.host and (self.person or not user):
+            return True
+        return bool(user) and user == self.name
+
+
+def _is_person(client: Client, host: str) -> bool:
+    return bool(client.fleet.access.ranks_of(host) & PEOPLE)
+
+
+def choose(bookings: Sequence[BookingView], name: str, user: User) -> BookingView:
+    """The one of this name or id, of the user's own first. Raises Failed where there is none, or more than one."""
+    there = [one for one in bookings if not one.unbooked]
+    alike = [one for one in there if one.name == name]
+    own = [one for one in alike if user.owns(one)]
+    found = [one for one in there if one.id == name] or own or alike
+    found = found or [one for one in there if one.id.startswith(name)]
+    if not found:
+        raise common.unknown("booking", name, [one.name for one in there], "and there are none", "booked")
+    if len(found) > 1:
+        listed = "; ".join(f"{short(one)} {_next(one)} of {whose(one)}" for one in found[:MAX_LISTED])
+        more = f" and {len(found) - MAX_LISTED} more" if len(found) > MAX_LISTED else ""
+        raise Failed(clean(f"{len(found)} bookings are called {quoted(name)}: {listed}{more}; name one by its id"))
+    return found[0]
+
+
+def free_name(wanted: str, own: Sequence[BookingView]) -> str:
+    """`arm1`, or if the user has a booking of that name, `arm1-2`."""
+    taken = {one.name for one in own}
+    numbered = (f"{wanted}-{number}" for number in range(2, len(taken) + 3))
+    return wanted if wanted not in taken else next(name for name in numbered if name not in taken)
+
+
+# Words
+
+
+def short(booking: BookingView) -> str:
+    return booking.id[:SHOWN_ID]
+
+
+def whose(booking: BookingView) -> str:
+    """`alice@ws1`; the host or certificate that made it, where no user is told."""
+    who = booking.who or Who()
+    return clean(f"{who.user}@{who.host or booking.owner}" if who.user else booking.owner)
+
+
+def rcs_words(booking: BookingView, date: BookedDate | None = None) -> str:
+    """`robot/arm1, framegrabber/fg1 for framegrabber/*, radio/rf0 (command_rate=5)`."""
+    bound = date.bound if date is not None else {}
+    names = {need: f"{bound[need]} for {need}" if need in bound else need for need in booking.needs}
+    return ", ".join(common.with_amounts(names[need], booking.needs[need]) for need in sorted(booking.needs))
+
+
+def in_words(seconds: float) -> str:
+    """`now`, `in 3 h`."""
+    return f"in {span(seconds)}" if seconds >= 1 else "now"
+
+
+def state_words(booking: BookingView, date: BookedDate) -> str:
+    """How one date stands, and what endangers it."""
+    words = "maintenance" if booking.maintenance and date.state == "open" else date.state
+    return f"{words}: {date.danger}" if date.danger else words
+
+
+def _next(booking: BookingView) -> str:
+    date = next(iter(booking.dates), None)
+    return span_words(date.start, date.end, None) if date is not None else "without a date within 60 days"
+
+
+def clock_words(host: str, differs: float) -> str:
+    """That a host's clock is not the fleet's."""
+    return f"the clock of {host} is {span(abs(differs))} {'before' if differs > 0 else 'behind'} the fleet's"
+
+
+def utc(at: float) -> str:
+    """For programs: `2026-12-01T13:00:00Z`."""
+    return datetime.fromtimestamp(at, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
+
+
+def booking_json(booking: BookingView, user: User) -> dict[str, Any]:
+    """As `--json` prints it: instants in UTC, spans in seconds."""
+    dates = [structs.asdict(one) | {"start": utc(one.start), "end": utc(one.end)} for one in booking.dates]
+    until = None if booking.until is None else utc(booking.until)
+    return structs.asdict(booking) | {
+        "own": user.owns(booking),
+        "start": utc(booking.start),
+        "until": until,
+        "dates": dates,
+    }

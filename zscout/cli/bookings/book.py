@@ -1,0 +1,320 @@
+"""`zscout book` and `zscout maintain`: devices together, from a date on."""
+
+from __future__ import annotations
+
+import time as clocks
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date, datetime, time
+from decimal import Decimal
+from typing import Any, Final
+from zoneinfo import ZoneInfo
+
+import click
+from msgspec.structs import replace
+
+from zscout import terminal
+from zscout.behaviors.client.bookings import PATIENCE, BookingsClient
+from zscout.behaviors.client.client import Client, RequestRefused
+from zscout.behaviors.client.identity import bounded
+from zscout.cli import common, completion
+from zscout.cli.booked import (
+    User,
+    ask_bookings,
+    booking_json,
+    explained,
+    free_name,
+    in_words,
+    rcs_words,
+    short,
+    state_words,
+    zone_option,
+)
+from zscout.cli.common import F, Failed, Parsed
+from zscout.cli.dates import (
+    DATE_FORMS,
+    EVERY_FORMS,
+    Found,
+    WrittenDate,
+    date_words,
+    every_words,
+    host_zone,
+    in_zone,
+    local,
+    parse_date,
+    parse_every,
+    remarks,
+    span_words,
+)
+from zscout.cli.requests.options import Needs, gather_needs, parse_comment, parse_duration, parse_need
+from zscout.cli.requests.request import MAX_PRIORITY
+from zscout.config.strict import BadInput
+from zscout.keyexpr import check_name, check_rc, is_pattern, valid_name
+from zscout.messages import MAX_AHEAD, BookingRecord, BookingsTold, BookingView, Who
+from zscout.services.bookings.dates import dates
+from zscout.terminal import clean, many, span
+
+DAY: Final = 86_400
+A_YEAR: Final = MAX_AHEAD - 25 * 3600
+"""Seconds after which a day begins that is over before the longest time: one has 25 hours."""
+LOOK_AHEAD: Final = 7 * DAY
+"""Seconds in which other times are sought where one is not free."""
+OTHERS: Final = 3
+MAX_REMARKS: Final = 4
+DATE: Final = Parsed("date", parse_date)
+DURATION: Final = Parsed("duration", parse_duration)
+
+
+def _rc(text: str, _option: str) -> str:
+    if is_pattern(text):
+        raise BadInput(f"{text} may be any one RC; name those that nobody is to hold")
+    return check_rc(text)
+
+
+def date_options(command: F) -> F:
+    """When, for how long and how often; and what both commands have besides."""
+    for option in (
+        common.json_option("Print one JSON object."),
+        click.option(
+            "--comment", type=Parsed("text", parse_comment), default="", help="What others are to know: shown to them."
+        ),
+        click.option("--name", help="What it is called. Default: after its first device; maintenance."),
+        zone_option,
+        click.option("--until", type=DATE, help="The last day, or date, of what is repeated. Default: after a year."),
+        click.option("--every", type=Parsed("days", parse_every), help=f"Repeat it at the same hour: {EVERY_FORMS}."),
+        click.option("--for", "runtime", type=DURATION, required=True, help="For how long: 90s, 5m, 2h, 1d12h."),
+        click.option("--at", type=DATE, required=True, help=f"When: {DATE_FORMS}."),
+    ):
+        command = option(command)
+    return command
+
+
+needs_argument = click.argument(
+    "needs",
+    nargs=-1,
+    required=True,
+    type=Parsed("need", parse_need),
+    metavar="NEED...",
+    shell_complete=completion.needs,
+)
+
+
+@click.command()
+@needs_argument
+@click.option(
+    "--priority",
+    type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY),
+    default=0,
+    help="That of the request that takes it up.",
+)
+@click.option(
+    "--patience",
+    type=DURATION,
+    help="It lapses when nobody has taken it up so long after its date. Default: 15 min, or its whole time.",
+)
+@date_options
+@common.runs
+async def book(needs: Any, priority: int, patience: Decimal | None, **rest: Any) -> None:
+    """Book devices together, from a date on.
+
+    A NEED is written as for `zscout request`. Until it is over nobody of the same or a lower priority starts on them
+    what would not be over by its date, or would not yield. `zscout request --booking NAME -- COMMAND` takes it up: at
+    its date, or before, and waits; then it holds them until the booking's end. What nobody takes up lapses.
+
+    A date is by the clock and in the zone of this host, if none is written; a zone keeps the hour of what is repeated
+    over summer time. A local time that comes twice is the first, one that does not exist an hour later; either is said.
+
+    If something is in the way, it says what, and when they are free instead (exit code 1).
+
+    \b
+    Examples:
+      zscout book robot/arm1 'framegrabber/*' radio/rf0:command_rate=5 --for 2h --at "tue 14:00"
+      zscout book robot/arm1 --for 45m --at "tomorrow 9:00" --name demo --priority 3 --comment 'visitors'
+      zscout book robot/arm1 --for 2h --at "tue 14:00" --every week --until 2027-03-31 --zone Europe/Berlin
+    """
+    await _make(gather_needs(needs), priority=priority, patience=patience, maintenance=False, **rest)
+
+
+@click.command()
+@click.argument(
+    "rcs", nargs=-1, required=True, type=Parsed("rc", _rc), metavar="RC...", shell_complete=completion.needs
+)
+@date_options
+@common.runs
+async def maintain(rcs: Sequence[str], **rest: Any) -> None:
+    """Keep RCs free of everybody from a date on: a drain with a date, by operators.
+
+    It is a booking at the fleet's operator priority that nobody takes up: what would not be over by its date does not
+    start there, and who waits is told until when. `zscout unbook` ends it early.
+
+    \b
+    Examples:
+      zscout maintain robot/arm1 --at "sat 8:00" --for 4h --comment 'new gripper'
+      zscout maintain robot/arm1 robot/arm2 --at "mon 7:00" --for 30m --every week --until 2027-03-31
+    """
+    if len(set(rcs)) < len(rcs):
+        raise BadInput("an RC is named twice; name each once")
+    priority = common.the_fleet().operator_priority
+    await _make({rc: {} for rc in rcs}, priority=priority, patience=None, maintenance=True, **rest)
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """When it is to be, by the fleet's time. `last`: of what is repeated, nothing begins after."""
+
+    start: Found
+    every: int
+    last: datetime | None
+    runtime: Decimal
+    zone: ZoneInfo
+
+    @classmethod
+    def of(
+        cls,
+        at: WrittenDate,
+        runtime: Decimal,
+        every: int | None,
+        until: WrittenDate | None,
+        zone: ZoneInfo,
+        now: float,
+        late: float = 0.0,
+    ) -> Asked:
+        """What has begun can be taken up for `late` seconds yet. Raises BadInput."""
+        start, last = at.found(now, zone), None
+        begins = start.at.timestamp()
+        if begins + late <= now:
+            raise BadInput(
+                f"--at: {date_words(begins, zone)} is over; by the fleet's clock it is {date_words(now, zone)}"
+            )
+        if begins > now + MAX_AHEAD:
+            raise BadInput(f"--at: {date_words(begins, zone)} is more than a year ahead; write an earlier date")
+        if every is None:
+            return cls(start, 0, None, runtime, zone)
+        if not start.exists:
+            raise BadInput(f"--at: {start.note}, and so it would go on; let it begin with another date")
+        latest = last = _end_of(in_zone(now + A_YEAR, zone).date(), zone)
+        if until is not None:
+            day = until.whole_day(now, zone)
+            last = until.found(now, zone).at if day is None else _end_of(day, zone)
+            if last < start.at:
+                raise BadInput("--until: it is before the first date; write a later one")
+            if last > latest:
+                raise BadInput(f"--until: at most a year ahead; write {latest:%Y-%m-%d} or an earlier date")
+        return cls(start, every, last, runtime, zone)
+
+    def remarks(self) -> list[str]:
+        """What was taken of hours that do not exist, or come twice."""
+        if not self.every:
+            return [self.start.note] if self.start.note else []
+        found = dates(self._record(), 0, self.start.at.timestamp() + MAX_AHEAD)
+        notes = remarks(found, self.zone, self.start.at.time())
+        more = len(notes) - MAX_REMARKS
+        return [*notes[:MAX_REMARKS], f"and {more} more like that"] if more > 0 else notes
+
+    def _record(self) -> BookingRecord:
+        until = None if self.last is None else int(self.last.timestamp())
+        at = int(self.start.at.timestamp())
+        return BookingRecord("", "", {}, 0, at, self.runtime, self.runtime, self.zone.key, self.every, until)
+
+
+def _end_of(day: date, zone: ZoneInfo) -> datetime:
+    return local(datetime.combine(day, time(23, 59, 59)), zone).at
+
+
+async def _make(
+    needs: Needs,
+    *,
+    at: WrittenDate,
+    runtime: Decimal,
+    every: int | None,
+    until: WrittenDate | None,
+    zone: ZoneInfo | None,
+    name: str | None,
+    comment: str,
+    priority: int,
+    patience: Decimal | None,
+    maintenance: bool,
+    as_json: bool,
+) -> None:
+    zone = zone or host_zone()
+    # What is wrong in any case is said before the mesh is joined.
+    at.found(clocks.time(), zone)
+    if until is not None and every is None:
+        raise BadInput("--until is the end of what is repeated; add --every, or leave it out")
+    if patience is not None and patience > runtime:
+        raise BadInput(f"--patience: it is over after {span(float(runtime))}; write that or less")
+    name = check_name(name, "--name") if name is not None else None
+    async with common.connected("maintain" if maintenance else "book") as client:
+        # Others are told its name, and not by which command it was made.
+        client.who = replace(client.who or Who(), command="")
+        told, me = await ask_bookings(client), User.of(client)
+        late = min(runtime, Decimal(PATIENCE) if patience is None else patience)
+        asked = Asked.of(at, runtime, every, until, zone, told.time, float(late))
+        own = [one for one in told.bookings if me.owns(one)]
+        default = "maintenance" if maintenance else _named_after(needs)
+        terms: dict[str, Any] = {"priority": priority, "comment": comment}
+        try:
+            booking = await BookingsClient(client).book(
+                needs,
+                asked.start.at,
+                runtime,
+                name=name or free_name(default, own),
+                patience=None if patience is None else float(patience),
+                every=asked.every,
+                until=asked.last,
+                maintenance=maintenance,
+                **terms,
+            )
+        except RequestRefused as refused:
+            if refused.code != "not_free":
+                raise explained(refused) from None
+            raise Failed(await _instead(client, refused, needs, asked, priority)) from None
+        twice = any(one.name == booking.name and one.id != booking.id for one in own)
+        if as_json:
+            terminal.print_json(booking_json(booking, me) | {"remarks": asked.remarks()})
+            return
+        _print(booking, asked, told)
+        if twice:
+            terminal.print_line(f"you have another booking called {booking.name}: name it by its id, {short(booking)}")
+
+
+def _named_after(needs: Needs) -> str:
+    """`arm1` for robot/arm1, `framegrabber` where any one will do."""
+    kind, _, name = next(iter(needs)).partition("/")
+    return valid_name(kind if is_pattern(name) else name)
+
+
+async def _instead(client: Client, refused: RequestRefused, needs: Needs, asked: Asked, priority: int) -> str:
+    """That they are not free then, and when they are."""
+    start = asked.start.at
+    try:
+        how: dict[str, Any] = {"start": start, "priority": priority, "limit": OTHERS}
+        told = await BookingsClient(client).slots(needs, asked.runtime, LOOK_AHEAD, **how)
+    except RequestRefused:
+        return f"{refused}; zscout slots tells when they are free"
+    free = [date_words(slot.start, asked.zone) for slot in told.slots if slot.start > start.timestamp()]
+    if not free:
+        return f"{refused}; within {span(LOOK_AHEAD)} after that they are not free together"
+    return f"{refused}; free together from {' or '.join(free)} on ({asked.zone.key}): write another --at"
+
+
+def _print(booking: BookingView, asked: Asked, told: BookingsTold) -> None:
+    first, zone = next(iter(booking.dates), None), asked.zone
+    begins = asked.start.at.timestamp()
+    when = f"{span_words(begins, begins + float(asked.runtime), zone)} ({zone.key}), {in_words(begins - told.time)}"
+    done = "is kept free" if booking.maintenance else "is booked"
+    terminal.print_line(clean(f"{booking.name} ({short(booking)}) {done}: {rcs_words(booking, first)}: {when}"))
+    if booking.every:
+        last = "" if booking.until is None else f" until {in_zone(booking.until, zone):%a %Y-%m-%d}"
+        soon = many(len(booking.dates), "date")
+        terminal.print_line(f"it is repeated {every_words(booking.every)}{last}: {soon} within 60 days")
+    for note in asked.remarks():
+        terminal.print_line(note)
+    for one in booking.dates:
+        if one.danger or one.state == "conflict":
+            text = f"{span_words(one.start, one.end, zone)}: {state_words(booking, one)}"
+            click.secho(clean(text), fg="yellow")
+    if not booking.maintenance:
+        within = span(float(booking.patience))
+        take_up = f"zscout request --booking {bounded(booking.name)} -- COMMAND"
+        terminal.print_line(f"take it up before, or within {within} of its date: {take_up}")

@@ -1,0 +1,175 @@
+"""`zscout bookings` and `zscout unbook`: what is booked, and its end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+from zoneinfo import ZoneInfo
+
+import click
+
+from zscout import terminal
+from zscout.behaviors.client.bookings import BookingsClient
+from zscout.behaviors.client.client import RequestRefused
+from zscout.cli import common, completion, journals
+from zscout.cli.booked import (
+    User,
+    ask_bookings,
+    booking_argument,
+    booking_json,
+    choose,
+    clock_words,
+    explained,
+    rcs_words,
+    short,
+    state_words,
+    utc,
+    whose,
+    zone_option,
+)
+from zscout.cli.bookings.book import DATE
+from zscout.cli.common import Failed
+from zscout.cli.dates import WrittenDate, date_words, every_words, host_zone, in_zone, span_words
+from zscout.config.strict import BadInput
+from zscout.messages import MAX_AHEAD, WINDOW, BookedDate, BookingRecord, BookingView
+from zscout.services.bookings.dates import dates
+from zscout.terminal import Table, clean
+
+
+@click.command()
+@click.option("--mine", is_flag=True, help="Only your own.")
+@click.option("--rc", type=journals.RC, shell_complete=completion.needs, help="Only those that may have this RC.")
+@zone_option
+@common.json_option("Print one JSON object.")
+@common.runs
+async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: bool) -> None:
+    """List bookings, the next date first: who has which devices from when to when, and what endangers that.
+
+    Of what is repeated the next date is listed, and those of the next 60 days that are in danger; --json has all of
+    these. A state is `open` until somebody has taken the date up, then `taken`; in `conflict` is what was booked in two
+    halves of a fleet, where the other booking stands.
+
+    \b
+    Examples:
+      zscout bookings --mine
+      zscout bookings --rc robot/arm1 --zone UTC
+      zscout bookings --json | jq -r '.bookings[] | .name + " " + .dates[0].start'
+    """
+    async with common.connected("bookings") as client:
+        me = User.of(client)
+        try:
+            told = await ask_bookings(client, rc)
+        except RequestRefused as refused:
+            raise explained(refused) from None
+        found = [one for one in told.bookings if not mine or me.owns(one)]
+        if as_json:
+            terminal.print_json(
+                {
+                    "fleet": client.fleet.name,
+                    "time": utc(told.time),
+                    "clocks": told.clocks,
+                    "bookings": [booking_json(one, me) for one in found],
+                }
+            )
+            return
+        for host, differs in sorted(told.clocks.items()):
+            click.secho(clean(clock_words(host, differs)), fg="yellow", err=True)
+        if not found:
+            terminal.print_line("nothing is booked")
+        else:
+            _table(found, me, zone).print()
+
+
+def _table(found: Sequence[BookingView], me: User, zone: ZoneInfo | None) -> Table:
+    lines: list[tuple[float, Sequence[str], str]] = []
+    for one in found:
+        shown = [
+            date for number, date in enumerate(one.dates) if number == 0 or date.danger or date.state == "conflict"
+        ]
+        lines += [(date.start, _row(one, date, zone), _style(one, date, me)) for date in shown]
+        if not shown:
+            row = (one.name, short(one), whose(one), date_words(one.start, zone), "later", str(one.priority))
+            lines.append((one.start, (*row, _repeated(one, zone), rcs_words(one)), ""))
+    lines.sort(key=lambda line: line[0])
+    columns = ("NAME", "ID", "WHO", "WHEN", "STATE", "PRIORITY", "REPEATED", "RCS")
+    rows, styles = [line[1] for line in lines], [line[2] for line in lines]
+    return Table("", columns, rows, styles, spare={"PRIORITY", "REPEATED"})
+
+
+def _row(booking: BookingView, date: BookedDate, zone: ZoneInfo | None) -> Sequence[str]:
+    when = span_words(date.start, date.end, zone)
+    names = (booking.name, short(booking), whose(booking), when, state_words(booking, date), str(booking.priority))
+    return (*names, _repeated(booking, zone), rcs_words(booking, date))
+
+
+def _repeated(booking: BookingView, zone: ZoneInfo | None) -> str:
+    if not booking.every:
+        return "-"
+    until = f" until {in_zone(booking.until, zone):%Y-%m-%d}" if booking.until is not None else ""
+    return every_words(booking.every) + until
+
+
+def _style(booking: BookingView, date: BookedDate, me: User) -> str:
+    if date.danger or date.state == "conflict":
+        return "red"
+    return "bold" if me.owns(booking) else ""
+
+
+@click.command()
+@booking_argument
+@click.option("--date", "at", type=DATE, help="Of what is repeated only this date: a day, or a day and a time.")
+@zone_option
+@common.json_option("Print one JSON object.")
+@common.runs
+async def unbook(booking: str, at: WrittenDate | None, zone: ZoneInfo | None, as_json: bool) -> None:
+    """Give up a booking, or one date of it: by its name, its id, or the beginning of its id.
+
+    A name is one of your own bookings, if you have one called so, else anybody's; who may end it the fleet says. Who
+    has taken it up goes on. A name that several have is refused with the list of them.
+
+    \b
+    Examples:
+      zscout unbook survey
+      zscout unbook survey --date 2026-12-08
+      zscout unbook 3f2a91c0
+    """
+    if at is not None:
+        zone = zone or host_zone()
+    async with common.connected("unbook") as client:
+        told, me = await ask_bookings(client), User.of(client)
+        found = choose(told.bookings, booking, me)
+        start = None if at is None or zone is None else _date_of(found, at, zone, told.time)
+        try:
+            left = await BookingsClient(client).unbook(found.id, start)
+        except RequestRefused as refused:
+            raise explained(refused) from None
+        if as_json:
+            terminal.print_json(booking_json(left, me))
+            return
+    what = "is given up" if start is None else f"gives up {date_words(start, zone)}"
+    whole = ", with all its dates" if found.every and start is None else ""
+    terminal.print_line(clean(f"{found.name} ({short(found)}) of {whose(found)} {what}{whole}"))
+
+
+def _date_of(booking: BookingView, at: WrittenDate, zone: ZoneInfo, now: float) -> int:
+    """The date of a booking that is meant. Raises Failed where there is none, BadInput."""
+    told = [one.start for one in booking.dates]
+    coming = told + [one for one in dates(_record(booking), now + WINDOW, now + MAX_AHEAD) if one not in told]
+    day = at.whole_day(now, zone)
+    if day is not None:
+        meant = [one for one in coming if in_zone(one, zone).date() == day]
+    else:
+        exactly = at.found(now, zone).at.timestamp()
+        meant = [one for one in coming if one == exactly]
+    if not meant:
+        known = ", ".join(date_words(one, zone) for one in coming[:3])
+        raise Failed(f"{booking.name} has no such date; it has {known or 'none'}{', ...' * (len(coming) > 3)}")
+    if len(meant) > 1:
+        raise BadInput(f"--date: {booking.name} begins more than once on that day; write the time as well")
+    return meant[0]
+
+
+def _record(booking: BookingView) -> BookingRecord:
+    fields: dict[str, Any] = {name: getattr(booking, name) for name in ("id", "name", "needs", "priority", "start")}
+    fields |= {name: getattr(booking, name) for name in ("runtime", "patience", "zone", "every", "until")}
+    return BookingRecord(**fields)

@@ -1,0 +1,84 @@
+"""`zscout slots`: when devices are free together."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from typing import Any
+from zoneinfo import ZoneInfo
+
+import click
+
+from zscout import terminal
+from zscout.behaviors.client.bookings import BookingsClient
+from zscout.behaviors.client.client import RequestRefused
+from zscout.cli import common
+from zscout.cli.booked import ask_bookings, explained, in_words, utc, zone_option
+from zscout.cli.bookings.book import DATE, DURATION, needs_argument
+from zscout.cli.dates import WrittenDate, date_words, host_zone
+from zscout.cli.requests.options import gather_needs, seconds_within
+from zscout.cli.requests.request import MAX_PRIORITY
+from zscout.messages import MAX_AHEAD, MAX_SLOTS, SlotsTold
+from zscout.terminal import Table, span
+
+
+@click.command()
+@needs_argument
+@click.option("--for", "runtime", type=DURATION, required=True, help="For how long: 90s, 5m, 2h, 1d12h.")
+@click.option("--within", type=seconds_within(1, MAX_AHEAD), default="7d", help="To begin within so long.")
+@click.option("--from", "since", type=DATE, help="Not before this date. Default: from now on.")
+@click.option("--limit", type=click.IntRange(1, MAX_SLOTS), default=5, help="The first so many.")
+@click.option("--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="For such a booking.")
+@zone_option
+@common.json_option("Print one JSON object.")
+@common.runs
+async def slots(
+    needs: Any,
+    runtime: Decimal,
+    within: float,
+    since: WrittenDate | None,
+    limit: int,
+    priority: int,
+    zone: ZoneInfo | None,
+    as_json: bool,
+) -> None:
+    """List the first times at which all of the devices can be booked together.
+
+    Each line is a stretch of time: a booking may begin at any time of it. What is in the way is known now: other
+    bookings, and what is held and would not yield. Exit code 1: there is none within that time.
+
+    \b
+    Examples:
+      zscout slots robot/arm1 'framegrabber/*' radio/rf0:command_rate=5 --for 2h --within 3d
+      zscout slots robot/arm1 --for 30m --from "mon 8:00" --within 8h --limit 1 --json | jq -r '.slots[0].start'
+    """
+    wanted = gather_needs(needs)
+    if since is not None:
+        zone = zone or host_zone()
+    async with common.connected("slots") as client:
+        start = None
+        if since is not None and zone is not None:
+            start = since.found((await ask_bookings(client)).time, zone).at
+        try:
+            how: dict[str, Any] = {"start": start, "priority": priority, "limit": limit}
+            told = await BookingsClient(client).slots(wanted, runtime, within, **how)
+        except RequestRefused as refused:
+            raise explained(refused) from None
+        fleet = client.fleet.name
+    if as_json:
+        found = [{"start": utc(one.start), "latest": utc(one.latest), "bound": one.bound} for one in told.slots]
+        terminal.print_json({"fleet": fleet, "time": utc(told.time), "slots": found, "complete": told.complete})
+    elif told.slots:
+        _table(told, zone).print()
+    if not told.slots:
+        more = "" if told.complete else " that was looked at"
+        raise common.Failed(f"within {span(within)} there is no time{more} at which all are free together")
+
+
+def _table(told: SlotsTold, zone: ZoneInfo | None) -> Table:
+    rows = []
+    for one in told.slots:
+        bound = ", ".join(f"{rc} for {need}" for need, rc in sorted(one.bound.items()))
+        latest = date_words(one.latest, zone) if one.latest > one.start else "then only"
+        rows.append((date_words(one.start, zone), latest, in_words(one.start - told.time), bound))
+    columns = ("BEGINS", "AT THE LATEST", "THAT IS", "WITH")[: 4 if any(row[3] for row in rows) else 3]
+    return Table("", columns, [row[: len(columns)] for row in rows])

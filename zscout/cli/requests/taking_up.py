@@ -1,0 +1,42 @@
+"""`zscout request --booking`: what a booking has instead of NEEDs and options."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Final
+
+from zscout.behaviors.client.client import Client
+from zscout.cli.booked import User, ask_bookings, choose, rcs_words
+from zscout.cli.common import Failed
+from zscout.cli.requests.options import HoldOptions
+from zscout.config.strict import BadInput
+from zscout.keyexpr import valid_name
+
+OWN: Final = ("min_runtime", "release_after", "dry_run")
+
+
+def check_options(**options: Any) -> None:
+    """That none is given that says for how long. Raises BadInput."""
+    for name in OWN:
+        if options[name] not in (None, False):
+            raise BadInput(f"--{name.replace('_', '-')} is not for --booking, which has its own time; leave it out")
+
+
+async def taking_up(client: Client, wanted: HoldOptions, *, name: str | None, priority: int | None) -> HoldOptions:
+    """What is asked for to take `wanted.booking` up, a name or an id; called after it, if no `name` was given. Raises
+    BadInput where NEEDs or a `priority` were given that it has not; Failed, RequestRefused."""
+    booking = choose((await ask_bookings(client)).bookings, wanted.booking, User.of(client))
+    if booking.maintenance:
+        raise Failed(f"{booking.name} is maintenance, which nobody takes up; to end it: zscout unbook {booking.name}")
+    if wanted.needs and wanted.needs != booking.needs:
+        raise BadInput(f"{booking.name} is booked with other devices: {rcs_words(booking)}; leave the NEEDs out")
+    if priority not in (None, booking.priority):
+        raise BadInput(f"--priority: {booking.name} is booked at {booking.priority}; leave it out")
+    return replace(
+        wanted,
+        name=wanted.name if name is not None else valid_name(booking.name),
+        needs=booking.needs,
+        priority=booking.priority,
+        min_runtime=booking.runtime,
+        booking=booking.id,
+    )
