@@ -20,7 +20,8 @@ all promises to who has no higher priority, and while it lasts before all.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
+from bisect import bisect_left, insort
+from collections.abc import Mapping
 from operator import attrgetter
 from typing import Final, NamedTuple, TypeAlias
 
@@ -133,6 +134,18 @@ class Reservations:
             reserved.sort(key=attrgetter("order"))
         return found
 
+    def booked_changed(self, earlier: Reservations) -> int:
+        """Bits of the RCs at which other things are booked than in `earlier` ones."""
+        return 0 if self._booked is earlier._booked else _changed(self._booked, earlier._booked)
+
+    def horizon(self, rc: Rc) -> float:
+        """Until when what is held, or reserved for the starving, may be in the way at an RC."""
+        if not rc.present:
+            return math.inf
+        ends = (holder.known_end() for holder in rc.holders.values())
+        starving = (one.over() for one in self.by_rc.get(rc.bit, ()) if one.booked is None)
+        return max((*ends, *starving), default=0)
+
     def before(self, rc: Rc, order: Order) -> list[Reservation]:
         """The reservations of `rc` that go before one in this `order`."""
         reserved = self.by_rc.get(rc.bit, [])
@@ -140,14 +153,15 @@ class Reservations:
 
     def _beside_bookings(self, arc: Arc, rcs: list[Rc], start: Ns, order: Order) -> Ns:
         """From `start` on, the earliest time from which `arc` finds nothing booked for as long as it needs."""
-        booked = [(rc, one) for rc in rcs for one in self.before(rc, order) if one.booked is not None]
-        # Each is passed once: time goes forward only.
-        for rc, one in sorted(booked, key=lambda item: item[1].booked or 0):
-            if one.booked is None or one.booked <= start or one.start >= arc.ends(start):
-                continue
-            beside = rc.sharable and not one.excludes
-            if not (beside and self._votes.accepts(rc.name, frozenset((one.arc.id, arc.id)))):
-                return self._beside_bookings(arc, rcs, one.booked, order)
+        end = arc.ends(start)
+        for rc in rcs:
+            for one in self.before(rc, order):
+                if one.booked is None or one.booked <= start or one.start >= end:
+                    continue
+                beside = rc.sharable and not one.excludes
+                if not (beside and self._votes.accepts(rc.name, frozenset((one.arc.id, arc.id)))):
+                    # Each is passed once: time goes forward only.
+                    return self._beside_bookings(arc, rcs, one.booked, order)
         return start
 
     def _reserve(self, arc: Arc, order: Order) -> None:
@@ -160,10 +174,10 @@ class Reservations:
         start = self._beside_bookings(arc, rcs, max(int(start), self.due(arc)), order)
         reservation = Reservation(arc, start, order)
         for rc in rcs:
-            reserved = self.by_rc.get(rc.bit, [])
-            if rc.sharable or all(one.booked is not None for one in reserved):
+            if rc.sharable or rc.bit not in self._free:
                 # A list of its own: that of what is booked is shared with the next reservations.
-                self.by_rc[rc.bit] = sorted((*reserved, reservation), key=attrgetter("order"))
+                self.by_rc[rc.bit] = list(self.by_rc.get(rc.bit, ()))
+                insort(self.by_rc[rc.bit], reservation, key=attrgetter("order"))
             self._free[rc.bit] = max(self._free.get(rc.bit, 0), arc.ends(start))
 
     def _rcs(self, arc: Arc, order: Order) -> list[Rc]:
@@ -278,10 +292,12 @@ class Reservations:
 
     def changed(self, earlier: Reservations) -> int:
         """Bits of the RCs at which the reservations differ from the `earlier` ones."""
-        either = self.by_rc.keys() | earlier.by_rc.keys()
-        same = (bit for bit in self.by_rc if self.by_rc[bit] is earlier.by_rc.get(bit))
-        either -= set(same)
-        return union(bit for bit in either if self.by_rc.get(bit) != earlier.by_rc.get(bit))
+        return _changed(self.by_rc, earlier.by_rc)
+
+
+def _changed(now: Mapping[int, list[Reservation]], earlier: Mapping[int, list[Reservation]]) -> int:
+    either = now.keys() | earlier.keys()
+    return union(bit for bit in either if now.get(bit) is not earlier.get(bit) and now.get(bit) != earlier.get(bit))
 
 
 def kept_for(rc: Rc, reservation: Reservation) -> Reason:
