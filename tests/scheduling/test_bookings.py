@@ -186,11 +186,12 @@ def excused(fleet: Fleet, one: Booking) -> bool:
             continue
         if rival.priority > one.priority:
             return True
-        # Who waited for long before the booking was made had its promise first.
-        if rival.hold is None and rival.starving and rival.since <= one.since:
+        # Who was starving before the booking was made had its promise first.
+        if rival.hold is None and rival.starving and rival.since + PATIENCE // 2 <= one.since:
             return True
         waited, granted = fleet.served.get(rival.id, (fleet.now, fleet.now))
-        if rival.hold is not None and waited <= one.since and granted >= waited + PATIENCE // 2:
+        owed = waited + PATIENCE // 2
+        if rival.hold is not None and owed <= min(one.since, granted):
             return True
         if rival.claim is not None and rival.claim.booking.since <= one.since:
             return True

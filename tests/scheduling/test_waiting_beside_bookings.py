@@ -42,10 +42,11 @@ class Run:
     """Who had taken up a booking, but had not started by its end."""
 
     def free_from(self, one: Asked, time: Ns) -> Ns:
-        """From `time` on, when its RCs are free of maintenance and of older bookings for as long as it needs."""
+        """From `time` on, when its RCs are free of maintenance, and of bookings that were made before it was owed
+        anything, for as long as it needs."""
         end = time + one.request.min_runtime
         for other in self.made:
-            before = other.maintenance or other.since <= one.at
+            before = other.maintenance or other.since <= one.at + PATIENCE // 2
             if before and other.needs.keys() & one.request.needs.keys() and other.start < end and other.end > time:
                 return self.free_from(one, other.end)
         return time

@@ -10,9 +10,9 @@ the earliest time, from when it is due, at which its RCs are free of the holders
 the ARCs that were starving before it. An ARC of equal or lower priority that shares an RC with it may start only if it
 is over by then, or if the RC is sharable and accepts it beside everyone concerned.
 
-A booking is reserved its RCs for its own time, likewise. Promises to equals are made in the order of their age: a
-booking that is older than an ARC's wait is gone round, and one that is younger is not seen. Maintenance stands before
-all promises to who has no higher priority, and while it lasts before all.
+A booking is reserved its RCs for its own time, likewise. Promises to equals are kept in the order in which they were
+made: a booking that was there when an ARC began to starve is gone round, and one that was made later is not seen.
+Maintenance stands before all promises to who has no higher priority, and while it lasts before all.
 
 `docs/scheduling.md` states the promise that follows, and what else was tried.
 """
@@ -37,7 +37,8 @@ MAX_STARVING: Final = 16
 
 
 Order: TypeAlias = tuple[bool, int, Ns, str]
-"""Sorts promises, the first first: maintenance before all, then by band of priorities (negated), age, id."""
+"""Sorts promises, the first first: maintenance before all, then by band of priorities (negated), when they were made,
+and id."""
 
 
 class Reservation(NamedTuple):
@@ -114,7 +115,7 @@ class Reservations:
         """By bit: when the earlier reservations of the RC end."""
         for priority, since, arc in state.index.starving[:MAX_STARVING]:
             if state.queued[arc].claim is None:
-                self._reserve(state.queued[arc], (True, priority, since, arc))
+                self._reserve(state.queued[arc], (True, priority, since + (patience or 0) // 2, arc))
         self.bits = union(self.by_rc)
         """RCs with reservations."""
 
