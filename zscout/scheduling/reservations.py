@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, insort
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from operator import attrgetter
 from typing import Final, NamedTuple, TypeAlias
 
@@ -110,7 +110,7 @@ class Reservations:
         known = last is not None and last._booked_of == self._booked_of
         self._booked: dict[int, list[Reservation]] = last._booked if last is not None and known else self._all_booked()
         self.by_rc: dict[int, list[Reservation]] = dict(self._booked)
-        """By bit of the RC, in their order; of those that starve for an exclusive RC only the first."""
+        """By bit of the RC, in their order."""
         self._free: dict[int, Ns] = {}
         """By bit: when the earlier reservations of the RC end."""
         for priority, since, arc in state.index.starving[:MAX_STARVING]:
@@ -175,10 +175,9 @@ class Reservations:
         start = self._beside_bookings(arc, rcs, max(int(start), self.due(arc)), order)
         reservation = Reservation(arc, start, order)
         for rc in rcs:
-            if rc.sharable or rc.bit not in self._free:
-                # A list of its own: that of what is booked is shared with the next reservations.
-                self.by_rc[rc.bit] = list(self.by_rc.get(rc.bit, ()))
-                insort(self.by_rc[rc.bit], reservation, key=attrgetter("order"))
+            # A list of its own: that of what is booked is shared with the next reservations.
+            self.by_rc[rc.bit] = list(self.by_rc.get(rc.bit, ()))
+            insort(self.by_rc[rc.bit], reservation, key=attrgetter("order"))
             self._free[rc.bit] = max(self._free.get(rc.bit, 0), arc.ends(start))
 
     def _rcs(self, arc: Arc, order: Order) -> list[Rc]:
@@ -236,9 +235,7 @@ class Reservations:
         for rc in self._state.rcs_in(arc.mask & self.bits):
             before: list[Reservation] = []
             blocking: Reservation | None = None
-            for reservation in self.by_rc[rc.bit]:
-                if reservation.arc is arc:
-                    break
+            for reservation in self._binding(rc, arc):
                 if reservation.booked is not None and reservation.start >= arc.ends(self._state.now):
                     continue
                 if reservation.excludes:
@@ -260,6 +257,18 @@ class Reservations:
                     return Inadmissible(rc, reason, together if is_open else None)
         return None
 
+    def _binding(self, rc: Rc, arc: Arc) -> Iterator[Reservation]:
+        """The reservations of `rc` that `arc` has to respect: those before its own, and all that is booked as long as
+        its own time has not come. It would be early, which nobody has promised it."""
+        early = False
+        for one in self.by_rc.get(rc.bit, ()):
+            if one.arc is arc:
+                if one.start <= self._state.now:
+                    return
+                early = True
+            elif not early or one.booked is not None:
+                yield one
+
     def _together(self, rc: Rc, arc: Arc, before: list[Reservation]) -> list[HolderSet]:
         """Whom `rc` would have to carry beside `arc`, from now on: each time when another comes. Who gives way to that
         one is not in its way."""
@@ -276,12 +285,7 @@ class Reservations:
 
     def reserves(self, rc: Rc, arc: Arc) -> bool:
         """Whether `rc` is reserved for another that goes before `arc`, and that it can't share it with."""
-        for one in self.by_rc.get(rc.bit, ()):
-            if one.arc is arc:
-                return False
-            if (one.excludes or not rc.sharable) and self._delays(arc, one):
-                return True
-        return False
+        return any((one.excludes or not rc.sharable) and self._delays(arc, one) for one in self._binding(rc, arc))
 
     def _delays(self, arc: Arc, reservation: Reservation) -> bool:
         """Whether `arc`, started now, would hold what is reserved when the time comes, and must not."""
