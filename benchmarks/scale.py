@@ -1,7 +1,9 @@
 """`python -m benchmarks.scale`: what one event costs the scheduling core against the size of the queue.
 
 Nine of ten RCs are exclusive; the tenth shares 4 units among ARCs of 1 or 2, and its votes come at once. An
-ARC needs 1 to 4 RCs, at one of four priorities. Who leaves the queue is replaced, so that its size stays.
+ARC needs 1 to 4 RCs, at one of four priorities. Who leaves the queue is replaced, so that its size stays. With
+`--bookings N` so many are made before, each of 1 to 4 RCs for one hour of the next week, at one of the priorities; no
+two have an RC and an hour in common.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from random import Random
 
 from benchmarks.stats import Samples
 from zscout.config.scheduling_policy import StrategyName
+from zscout.scheduling.booking import Booked, Booking
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
@@ -43,6 +46,8 @@ from zscout.types import SECOND, ArcId, Ns, Params
 QUEUES = (10, 100, 1_000, 10_000)
 RCS = (10, 100, 1_000)
 CAPACITY = {"rate": Fraction(4)}
+HOUR: Ns = 3_600 * SECOND
+HOURS = 7 * 24
 KINDS = ("request", "release", "end of hold", "vote", "search", "full pass", "fill")
 MEANING = {
     "request": "one ARC more",
@@ -79,7 +84,7 @@ class _FullPriority(Priority):
 class Fleet:
     """A core with a queue of constant size."""
 
-    def __init__(self, rcs: int, queue: int, seed: int, strategy: StrategyName) -> None:
+    def __init__(self, rcs: int, queue: int, seed: int, strategy: StrategyName, bookings: int) -> None:
         self.rng, self.queue = Random(seed), queue  # noqa: S311
         self.core, self.now, self.number = Core(STRATEGIES[strategy]()), 0, 0
         self.ends: dict[ArcId, Ns] = {}
@@ -88,16 +93,31 @@ class Fleet:
         self.names = list(self.sharable)
         self.samples = {kind: Samples() for kind in KINDS}
         self.core.handle(0, *[RcJoined(name, sharable) for name, sharable in self.sharable.items()])
+        self.booked: set[tuple[str, int]] = set()
+        self.core.handle(0, *[Booked(self.booking(number)) for number in range(bookings)])
         self.send("fill", *[self.ask() for _ in range(queue)])
 
-    def ask(self) -> Event:
-        rng, self.number = self.rng, self.number + 1
-        needs: dict[str, Params] = {
+    def needs(self) -> dict[str, Params]:
+        rng = self.rng
+        return {
             name: {"rate": Fraction(rng.randint(1, 2))} if self.sharable[name] else {}
             for name in rng.sample(self.names, rng.randint(1, 4))
         }
+
+    def booking(self, number: int) -> Booking:
+        while True:
+            needs, hour = self.needs(), self.rng.randrange(1, HOURS)
+            if not any((rc, hour) in self.booked for rc in needs):
+                break
+        self.booked.update((rc, hour) for rc in needs)
+        return Booking(f"b{number}", needs, self.rng.randrange(4), hour * HOUR, HOUR, HOUR // 6, 0)
+
+    def ask(self) -> Event:
+        rng, self.number = self.rng, self.number + 1
         runtime = rng.randint(10 * SECOND, 100 * SECOND)
-        return Requested(ArcRequest(f"a{self.number}", f"h/{self.number % 100}", needs, rng.randrange(4), runtime))
+        return Requested(
+            ArcRequest(f"a{self.number}", f"h/{self.number % 100}", self.needs(), rng.randrange(4), runtime)
+        )
 
     def send(self, kind: str, *events: Event) -> None:
         """One instant, timed, and then each vote and each further pass that it takes."""
@@ -147,8 +167,8 @@ class Fleet:
             self._timed("full pass", Tick())
 
 
-def measure(rcs: int, queue: int, rounds: int, seed: int, strategy: StrategyName) -> list[Point]:
-    fleet = Fleet(rcs, queue, seed, strategy)
+def measure(rcs: int, queue: int, rounds: int, seed: int, strategy: StrategyName, bookings: int) -> list[Point]:
+    fleet = Fleet(rcs, queue, seed, strategy, bookings)
     fleet.rounds(rounds)
     if strategy == "priority":
         fleet.full_passes(max(3, rounds // 20))
@@ -199,12 +219,20 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=300, help="releases per size (default: 300)")
     parser.add_argument("--seed", type=int, default=1, help="of the random requests (default: 1)")
     parser.add_argument("--strategy", choices=("priority", "adaptive"), default="adaptive")
+    parser.add_argument("--bookings", type=int, default=0, help="so many are open (default: 0)")
+    parser.add_argument("--rcs", type=int, choices=RCS, help="only fleets of so many RCs")
     args = parser.parse_args()
     if not 10 <= args.rounds <= 100_000:
         parser.error(f"--rounds is {args.rounds}; give 10 to 100000")
-    sizes = [(rcs, queue) for rcs in RCS for queue in QUEUES]
+    if not 0 <= args.bookings <= 10 * (args.rcs or RCS[0]):
+        parser.error(f"--bookings is {args.bookings}; give 0 to ten times as many as there are RCs")
+    sizes = [(rcs, queue) for rcs in RCS if args.rcs in (None, rcs) for queue in QUEUES]
     speed = _million_additions()
-    points = [point for rcs, queue in sizes for point in measure(rcs, queue, args.rounds, args.seed, args.strategy)]
+    points = [
+        point
+        for rcs, queue in sizes
+        for point in measure(rcs, queue, args.rounds, args.seed, args.strategy, args.bookings)
+    ]
     largest = {point.kind: point for point in points if (point.rcs, point.queue) == (RCS[-1], QUEUES[-1])}
     met = {kind: largest[kind].samples.median <= aim for kind, aim in AIMS.items() if kind in largest}
     if args.json:
@@ -222,7 +250,7 @@ def main() -> None:
         machine = {"cores": os.cpu_count(), "python": platform.python_version(), "million_additions_s": speed}
         print(json.dumps({"machine": machine, "rows": rows, "aims_met": met}, indent=2))
         return
-    print(table(points), *(plot(points, rcs) for rcs in RCS), sep="\n\n")
+    print(table(points), *(plot(points, rcs) for rcs in dict.fromkeys(rcs for rcs, _ in sizes)), sep="\n\n")
     print()
     for kind, meaning in MEANING.items():
         aim = f"; aim {_span(AIMS[kind])}: {'met' if met[kind] else 'missed'}" if kind in met else ""

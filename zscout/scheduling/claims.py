@@ -5,6 +5,7 @@ endangers one by `dangers.py`. Maintenance is a claim that nobody takes up."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 
 from msgspec.structs import replace
@@ -40,6 +41,8 @@ class Claims:
         self._state, self._actions, self._emit = state, actions, emit
         self._reserved: Reservations | None = None
         """What was reserved when dangers were looked for last."""
+        self._endangered: dict[Claim, None] = {}
+        """The bookings of which it was told last that they are in danger."""
 
     def stand_in(self, booking: Booking) -> Arc:
         """What stands for a booking before it is taken up."""
@@ -112,6 +115,7 @@ class Claims:
         for rc in [] if arc is not None else list(self._state.possible_sharables(claim.arc)):
             self._state.votes.forget_arc(rc.name, claim.arc.id)
         self._state.unclaim(claim)
+        self._endangered.pop(claim, None)
         self._emit(BookingChanged(claim.booking.id, state, None if arc is None else arc.id))
         if arc is not None and arc.held_back is not None and not arc.held_back[1]:
             self._state.consider_again(arc)
@@ -162,45 +166,50 @@ class Claims:
 
     def tell_dangers(self) -> None:
         """Tells of each booking that is in danger, or is no more, since this was called last. Looked at are those
-        of whose RCs something has changed, and those that should have begun."""
+        that what has changed may concern, those in danger, and those that should have begun."""
         state = self._state
         if not state.claims:
             self._reserved = None
+            self._endangered.clear()
             return
-        before, now = self._reserved, state.now
+        before = self._reserved
         self._reserved = reserved = reservations(state, state.policy.patience, before)
         changed, state.changed = state.changed, 0
-        changed |= state.mask(state.votes.changed)
+        voted = state.mask(state.votes.changed)
         state.votes.changed.clear()
-        if before is None:
-            changed = -1
-        elif before is not reserved:
+        if before is not None and before is not reserved:
             changed |= reserved.changed(before)
-        late = state.begun
-        if not changed and not late:
-            return
-        told = [
-            claim
-            for claim in state.claims.values()
-            if self._concerns(claim) & changed or (late and claim.booking.start <= now)
-        ]
-        for claim in told:
-            self._tell_danger(claim, reserved)
+            voted |= reserved.booked_changed(before)
+        concerned = dict.fromkeys(state.claims_before(math.inf if before is None else state.now))
+        for rc in state.rcs_in((changed | voted) & state.claimed):
+            until = math.inf if rc.bit & voted else reserved.horizon(rc)
+            concerned |= dict.fromkeys(state.claims_before(until, rc))
+        concerned |= {claim: None for claim in self._endangered if self._relieving(claim) & (changed | voted)}
+        for claim in concerned:
+            if state.claims.get(claim.booking.id) is claim:
+                self._tell_danger(claim)
 
-    def _concerns(self, claim: Claim) -> int:
-        """Bits of the RCs that may change the danger that it is in."""
-        others = claim.arc.patterns if claim.danger is not None else ()
-        return claim.kept | union(rc.bit for need in others for rc in self._state.matching(need))
+    def _relieving(self, claim: Claim) -> int:
+        """Bits of the RCs that may end the danger that it is in."""
+        patterns = claim.arc.patterns
+        return claim.kept | union(rc.bit for need in patterns for rc in self._state.matching(need))
 
-    def _tell_danger(self, claim: Claim, reserved: Reservations) -> None:
-        found = danger(self._state, reserved, claim)
+    def _tell_danger(self, claim: Claim) -> None:
+        state, reserved = self._state, reservations(self._state, self._state.policy.patience, self._reserved)
+        found = danger(state, reserved, claim)
         if isinstance(found, Reason) and self._keep_another(claim):
-            self._reserved = reserved = reservations(self._state, self._state.policy.patience, reserved)
-            found = danger(self._state, reserved, claim)
+            reserved = reservations(state, state.policy.patience, reserved)
+            found = danger(state, reserved, claim)
+        self._reserved = reserved
         if isinstance(found, Undecided):
             if claim.danger is not None and found.rc is not None:
                 self._actions.propose(found.rc, found.proposal)
             found = claim.danger
-        if found != claim.danger:
-            claim.danger = found
-            self._emit(BookingThreatened(claim.booking.id, found))
+        if found == claim.danger:
+            return
+        claim.danger = found
+        if found is None:
+            del self._endangered[claim]
+        else:
+            self._endangered[claim] = None
+        self._emit(BookingThreatened(claim.booking.id, found))

@@ -10,9 +10,9 @@ the earliest time, from when it is due, at which its RCs are free of the holders
 the ARCs that were starving before it. An ARC of equal or lower priority that shares an RC with it may start only if it
 is over by then, or if the RC is sharable and accepts it beside everyone concerned.
 
-A booking is reserved its RCs for its own time, likewise. Promises to equals are made in the order of their age: a
-booking that is older than an ARC's wait is gone round, and one that is younger is not seen. Maintenance stands before
-all promises to who has no higher priority, and while it lasts before all.
+A booking is reserved its RCs for its own time, likewise. Promises to equals are kept in the order in which they were
+made: a booking that was there when an ARC began to starve is gone round, and one that was made later is not seen.
+Maintenance stands before all promises to who has no higher priority, and while it lasts before all.
 
 `docs/scheduling.md` states the promise that follows, and what else was tried.
 """
@@ -20,7 +20,8 @@ all promises to who has no higher priority, and while it lasts before all.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
+from bisect import bisect_left, insort
+from collections.abc import Iterator, Mapping
 from operator import attrgetter
 from typing import Final, NamedTuple, TypeAlias
 
@@ -36,7 +37,8 @@ MAX_STARVING: Final = 16
 
 
 Order: TypeAlias = tuple[bool, int, Ns, str]
-"""Sorts promises, the first first: maintenance before all, then by band of priorities (negated), age, id."""
+"""Sorts promises, the first first: maintenance before all, then by band of priorities (negated), when they were made,
+and id."""
 
 
 class Reservation(NamedTuple):
@@ -108,12 +110,12 @@ class Reservations:
         known = last is not None and last._booked_of == self._booked_of
         self._booked: dict[int, list[Reservation]] = last._booked if last is not None and known else self._all_booked()
         self.by_rc: dict[int, list[Reservation]] = dict(self._booked)
-        """By bit of the RC, in their order; of those that starve for an exclusive RC only the first."""
+        """By bit of the RC, in their order."""
         self._free: dict[int, Ns] = {}
         """By bit: when the earlier reservations of the RC end."""
         for priority, since, arc in state.index.starving[:MAX_STARVING]:
             if state.queued[arc].claim is None:
-                self._reserve(state.queued[arc], (True, priority, since, arc))
+                self._reserve(state.queued[arc], (True, priority, since + (patience or 0) // 2, arc))
         self.bits = union(self.by_rc)
         """RCs with reservations."""
 
@@ -133,6 +135,18 @@ class Reservations:
             reserved.sort(key=attrgetter("order"))
         return found
 
+    def booked_changed(self, earlier: Reservations) -> int:
+        """Bits of the RCs at which other things are booked than in `earlier` ones."""
+        return 0 if self._booked is earlier._booked else _changed(self._booked, earlier._booked)
+
+    def horizon(self, rc: Rc) -> float:
+        """Until when what is held, or reserved for the starving, may be in the way at an RC."""
+        if not rc.present:
+            return math.inf
+        ends = (holder.known_end() for holder in rc.holders.values())
+        starving = (one.over() for one in self.by_rc.get(rc.bit, ()) if one.booked is None)
+        return max((*ends, *starving), default=0)
+
     def before(self, rc: Rc, order: Order) -> list[Reservation]:
         """The reservations of `rc` that go before one in this `order`."""
         reserved = self.by_rc.get(rc.bit, [])
@@ -140,14 +154,15 @@ class Reservations:
 
     def _beside_bookings(self, arc: Arc, rcs: list[Rc], start: Ns, order: Order) -> Ns:
         """From `start` on, the earliest time from which `arc` finds nothing booked for as long as it needs."""
-        booked = [(rc, one) for rc in rcs for one in self.before(rc, order) if one.booked is not None]
-        # Each is passed once: time goes forward only.
-        for rc, one in sorted(booked, key=lambda item: item[1].booked or 0):
-            if one.booked is None or one.booked <= start or one.start >= arc.ends(start):
-                continue
-            beside = rc.sharable and not one.excludes
-            if not (beside and self._votes.accepts(rc.name, frozenset((one.arc.id, arc.id)))):
-                return self._beside_bookings(arc, rcs, one.booked, order)
+        end = arc.ends(start)
+        for rc in rcs:
+            for one in self.before(rc, order):
+                if one.booked is None or one.booked <= start or one.start >= end:
+                    continue
+                beside = rc.sharable and not one.excludes
+                if not (beside and self._votes.accepts(rc.name, frozenset((one.arc.id, arc.id)))):
+                    # Each is passed once: time goes forward only.
+                    return self._beside_bookings(arc, rcs, one.booked, order)
         return start
 
     def _reserve(self, arc: Arc, order: Order) -> None:
@@ -160,10 +175,9 @@ class Reservations:
         start = self._beside_bookings(arc, rcs, max(int(start), self.due(arc)), order)
         reservation = Reservation(arc, start, order)
         for rc in rcs:
-            reserved = self.by_rc.get(rc.bit, [])
-            if rc.sharable or all(one.booked is not None for one in reserved):
-                # A list of its own: that of what is booked is shared with the next reservations.
-                self.by_rc[rc.bit] = sorted((*reserved, reservation), key=attrgetter("order"))
+            # A list of its own: that of what is booked is shared with the next reservations.
+            self.by_rc[rc.bit] = list(self.by_rc.get(rc.bit, ()))
+            insort(self.by_rc[rc.bit], reservation, key=attrgetter("order"))
             self._free[rc.bit] = max(self._free.get(rc.bit, 0), arc.ends(start))
 
     def _rcs(self, arc: Arc, order: Order) -> list[Rc]:
@@ -221,9 +235,7 @@ class Reservations:
         for rc in self._state.rcs_in(arc.mask & self.bits):
             before: list[Reservation] = []
             blocking: Reservation | None = None
-            for reservation in self.by_rc[rc.bit]:
-                if reservation.arc is arc:
-                    break
+            for reservation in self._binding(rc, arc):
                 if reservation.booked is not None and reservation.start >= arc.ends(self._state.now):
                     continue
                 if reservation.excludes:
@@ -245,6 +257,18 @@ class Reservations:
                     return Inadmissible(rc, reason, together if is_open else None)
         return None
 
+    def _binding(self, rc: Rc, arc: Arc) -> Iterator[Reservation]:
+        """The reservations of `rc` that `arc` has to respect: those before its own, and all that is booked as long as
+        its own time has not come. It would be early, which nobody has promised it."""
+        early = False
+        for one in self.by_rc.get(rc.bit, ()):
+            if one.arc is arc:
+                if one.start <= self._state.now:
+                    return
+                early = True
+            elif not early or one.booked is not None:
+                yield one
+
     def _together(self, rc: Rc, arc: Arc, before: list[Reservation]) -> list[HolderSet]:
         """Whom `rc` would have to carry beside `arc`, from now on: each time when another comes. Who gives way to that
         one is not in its way."""
@@ -261,12 +285,7 @@ class Reservations:
 
     def reserves(self, rc: Rc, arc: Arc) -> bool:
         """Whether `rc` is reserved for another that goes before `arc`, and that it can't share it with."""
-        for one in self.by_rc.get(rc.bit, ()):
-            if one.arc is arc:
-                return False
-            if (one.excludes or not rc.sharable) and self._delays(arc, one):
-                return True
-        return False
+        return any((one.excludes or not rc.sharable) and self._delays(arc, one) for one in self._binding(rc, arc))
 
     def _delays(self, arc: Arc, reservation: Reservation) -> bool:
         """Whether `arc`, started now, would hold what is reserved when the time comes, and must not."""
@@ -278,10 +297,12 @@ class Reservations:
 
     def changed(self, earlier: Reservations) -> int:
         """Bits of the RCs at which the reservations differ from the `earlier` ones."""
-        either = self.by_rc.keys() | earlier.by_rc.keys()
-        same = (bit for bit in self.by_rc if self.by_rc[bit] is earlier.by_rc.get(bit))
-        either -= set(same)
-        return union(bit for bit in either if self.by_rc.get(bit) != earlier.by_rc.get(bit))
+        return _changed(self.by_rc, earlier.by_rc)
+
+
+def _changed(now: Mapping[int, list[Reservation]], earlier: Mapping[int, list[Reservation]]) -> int:
+    either = now.keys() | earlier.keys()
+    return union(bit for bit in either if now.get(bit) is not earlier.get(bit) and now.get(bit) != earlier.get(bit))
 
 
 def kept_for(rc: Rc, reservation: Reservation) -> Reason:

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 from zscout.scheduling.booking import Booking
 from zscout.scheduling.model import Arc, Rc
 from zscout.scheduling.patterns import distinct
-from zscout.scheduling.reservations import Reservations
+from zscout.scheduling.reservations import reservations
 from zscout.scheduling.state import SchedulerState
 from zscout.scheduling.votes import HolderSet
 from zscout.types import ArcId, Need, Ns, RcName
@@ -115,9 +115,9 @@ class _Search:
 
     def _add_reserved(self) -> None:
         state = self._state
-        if state.policy.patience is None or not state.index.starving:
+        if state.policy.patience is None or not state.queued:
             return
-        for bit, reserved in Reservations(state, state.policy.patience).by_rc.items():
+        for bit, reserved in reservations(state, state.policy.patience, None).by_rc.items():
             for one in reserved if bit in self._taken else ():
                 if one.booked is None and state.band(one.arc.priority) >= state.band(self._wanted.priority):
                     self._taken[bit].append(_Taken(one.start, one.arc.ends(one.start), one.arc.id))

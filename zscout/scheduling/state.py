@@ -144,8 +144,10 @@ class SchedulerState:
         """Grows with all that changes what is booked, and by whom it is taken up."""
         self._claim_ends: list[tuple[Ns, str]] = []
         """A heap of when bookings lapse or end, and when maintenance begins. What is not so any more is skipped."""
-        self._claim_starts: list[Ns] = []
-        """The dates of all bookings, in order."""
+        self._by_date: list[Claim] = []
+        """All bookings in the order of their dates."""
+        self._claims_at: dict[int, list[Claim]] = {}
+        """By bit of the RC: those for which it is kept, likewise."""
         self._at_place: dict[Place, Arc] = {}
         """By place: who is considered, or runs. Two clients may claim one ARC, which has to run once."""
         self.present = 0
@@ -370,14 +372,23 @@ class SchedulerState:
 
     def claims_changed(self) -> None:
         """Bookings, or by whom they are taken up, or the RCs that are kept for them, are not what they were."""
-        self.claimed = union(claim.kept for claim in self.claims.values())
-        self._claim_starts = sorted(claim.booking.start for claim in self.claims.values())
+        self._by_date = sorted(self.claims.values(), key=_date)
+        self._claims_at = {}
+        for claim in self._by_date:
+            for rc in self.rcs_in(claim.kept):
+                self._claims_at.setdefault(rc.bit, []).append(claim)
+        self.claimed = union(self._claims_at)
         self.claims_version += 1
 
     @property
     def begun(self) -> int:
         """How many of the bookings have come to their dates."""
-        return bisect_right(self._claim_starts, self.now)
+        return bisect_right(self._by_date, self.now, key=_date)
+
+    def claims_before(self, time: float, rc: Rc | None = None) -> list[Claim]:
+        """The bookings with dates up to then, all of them or those that an RC is kept for."""
+        claims = self._by_date if rc is None else self._claims_at.get(rc.bit, [])
+        return claims[: bisect_right(claims, time, key=_date)]
 
     def claims_over(self) -> Iterator[Claim]:
         """Bookings whose time is over by now, or whose owner's is to take them up; each may come twice."""
@@ -558,6 +569,10 @@ class SchedulerState:
     def _next_entry(self) -> int:
         self.entries += 1
         return self.entries
+
+
+def _date(claim: Claim) -> Ns:
+    return claim.booking.start
 
 
 def _instants(booking: Booking) -> tuple[Ns, ...]:

@@ -24,6 +24,7 @@ from zscout.cli.lab.options import (
 )
 from zscout.cli.requests.options import seconds_within
 from zscout.config.strict import BadInput, quoted
+from zscout.lab.study.scheduling.bookings import BOOKABLE, DEFAULT_FAMILIES, SHARES
 from zscout.lab.study.scheduling.families import FAMILIES
 from zscout.lab.study.scheduling.trial import STRATEGIES, SchedulingJob, run_timed
 
@@ -48,6 +49,7 @@ def study() -> None:
     Examples:
       zscout study
       zscout study schedule --family paper --seeds 100
+      zscout study bookings --seeds 20
       zscout study placement --seeds 20
       zscout study robots --starts 40
       zscout study faults --runs 1000
@@ -120,6 +122,45 @@ def schedule(
 
         record(rrd, report, result.curves)
     _show(dataclasses.asdict(report), rrd, partial(print_report, report), as_json=as_json)
+
+
+@study.command()
+@click.option(
+    "--family",
+    "families",
+    multiple=True,
+    type=click.Choice(BOOKABLE),
+    help=f"A family of workloads; repeat it for several. Default: {', '.join(DEFAULT_FAMILIES)}.",
+)
+@seeds_option("5", "Workloads of each family: so many, or those of seeds A to B.", MAX_SEEDS)
+@jobs_option
+@common.json_option("Print one JSON object instead of tables.")
+def bookings(families: tuple[str, ...], seeds: range, processes: int | None, as_json: bool) -> None:
+    """Measures what bookings cost, and what they give to those who book.
+
+    The same random requests with none, a tenth, a fifth and two fifths of them booked half a minute to two
+    minutes ahead, under strategy adaptive: RCs in use, lost to bookings (idle though somebody waited whom a
+    booking kept out), work thrown away by preemption; how many of the booked began at their dates, how much
+    later these were than wanted, and how many of the same began at once without bookings; and the wait of those
+    who never book. docs/study.md says what was found.
+
+    \b
+    Examples:
+      zscout study bookings
+      zscout study bookings --family load65 --seeds 50 --json
+    """
+    chosen = list(dict.fromkeys(families)) or list(DEFAULT_FAMILIES)
+    trials = len(chosen) * len(SHARES) * len(seeds)
+    if trials > MAX_SCHEDULES:
+        raise BadInput(f"--seeds: {trials} trials are more than {MAX_SCHEDULES}; ask for fewer seeds or families")
+    from zscout.lab.study.process_pool import run_trials
+    from zscout.lab.study.scheduling import bookings as study_of
+    from zscout.lab.study.scheduling.tables import print_bookings
+
+    found: list[study_of.BookingTrial] = []
+    common.run(run_trials(study_of.run, study_of.jobs(chosen, seeds), processes, found.append))
+    report = study_of.report(found)
+    _show(dataclasses.asdict(report), None, partial(print_bookings, report), as_json=as_json)
 
 
 @study.command()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from zscout.lab.study.scheduling.bookings import BookingsReport
 from zscout.lab.study.scheduling.families import FAMILIES
 from zscout.lab.study.scheduling.summary import Degeneracy, FamilyReport, SchedulingReport, StrategyReport
 from zscout.terminal import print_line, print_table
@@ -34,6 +35,30 @@ def print_report(report: SchedulingReport) -> None:
             f'(always saying "never", or "always": {rule.base_rate:.1%}). It names {rule.named:.1%} of them, '
             f"{rule.precision:.1%} of these rightly, and finds {rule.found:.1%} of those behind."
         )
+
+
+def print_bookings(report: BookingsReport) -> None:
+    columns = ["booked", "of a run", "in use", "lost", "thrown away", "at their dates", "later by", "without"]
+    for family, rows in report.families.items():
+        shown = [
+            [
+                f"{one.share:.0%}",
+                f"{one.booked:.1f}",
+                f"{one.in_use:.1%}",
+                f"{one.lost:.1%}",
+                f"{one.thrown_away:.1%}",
+                *(
+                    (f"{one.at_date:.1%}", f"{one.moved:.1f} s", f"{one.at_once:.1%}")
+                    if one.booked
+                    else ("-", "-", "-")
+                ),
+                f"{one.wait:.1f} s",
+                f"{one.longest:.0f} s",
+            ]
+            for one in rows
+        ]
+        print_table([*columns, "mean wait", "longest"], shown, title=f"{family}: {FAMILIES[family].summary}")
+        print_line("")
 
 
 def _family(family: FamilyReport) -> None:
