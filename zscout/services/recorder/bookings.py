@@ -1,0 +1,151 @@
+"""Bookings as the leader tells of them, put together for the timeline: pure; times are passed in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime
+from typing import Final
+
+from zscout.messages import BookedDate, BookingsTold, BookingView
+from zscout.services.recorder.ahead import Bar, chart, rows_of
+from zscout.services.recorder.blueprint import AHEAD
+from zscout.services.recorder.colours import ALERT, FAILED, MAINTENANCE
+from zscout.services.recorder.drawing import Drawing, clean_text
+
+AGAIN: Final = 60.0
+"""Seconds until the charts are drawn anew though no booking has changed: now goes on."""
+STALE: Final = 60.0
+"""Seconds without word of bookings after which the charts show that."""
+MAX_NAME: Final = 30
+"""Characters of an RC's name."""
+MAX_TOLD: Final = 50
+"""Events that one answer may make."""
+AHEAD_OF_NOW: Final = ("open", "taken", "conflict")
+"""States of dates that are drawn."""
+
+Key = tuple[str, int]
+"""A booking's id, and when a date of it starts."""
+
+
+class BookingTracker:
+    """Draws what is booked, and tells what changes; `colour` gives a name its RGBA."""
+
+    def __init__(self, drawing: Drawing, colour: Callable[[str], int]) -> None:
+        self._drawing, self._colour = drawing, colour
+        self.rows = 0
+        """That the charts take; 0: nothing is booked."""
+        self._bookings: list[BookingView] | None = None
+        """None: nobody has told yet."""
+        self._zero = 0.0
+        """Fleet time of second 0."""
+        self._told = self._drawn = 0.0
+        """When bookings were told last, and drawn."""
+        self._stale = False
+
+    def told(self, at: float, told: BookingsTold) -> None:
+        """All bookings there are."""
+        self._told, self._zero = at, told.time - at
+        bookings = [one for one in told.bookings if not one.unbooked]
+        if bookings != self._bookings:
+            self._tell(at, bookings)
+            self._bookings = bookings
+            self._draw(at)
+
+    def tick(self, at: float) -> None:
+        """What time alone brings: call it now and then."""
+        if self._bookings is not None and (at - self._drawn >= AGAIN or (at - self._told > STALE) != self._stale):
+            self._draw(at)
+
+    def _draw(self, at: float) -> None:
+        self._drawn, self._stale = at, at - self._told > STALE
+        now = self._zero + (self._told if self._stale else at)
+        bars = [bar for one in self._bookings or () for bar in self._bars(one)]
+        self.rows = rows_of(bars, now)
+        for ahead in AHEAD:
+            for name, layer in chart(bars, now, ahead, stale=self._stale).items():
+                self._drawing.show(at, f"{ahead.entity}/{name}", layer.shape, **layer.fields)
+        self._drawing.arrange()
+
+    def _bars(self, booking: BookingView) -> Iterator[Bar]:
+        """One for each date and RC of it."""
+        for date in booking.dates:
+            if date.state not in AHEAD_OF_NOW:
+                continue
+            colour = MAINTENANCE if booking.maintenance else self._colour(booking.name)
+            text = f"maintenance: {booking.name}" if booking.maintenance else booking.name
+            taken = date.state == "taken"
+            if date.state == "conflict":
+                colour, text = FAILED, f"{text}, in conflict"
+            elif date.danger:
+                colour, text = ALERT, f"{text}, in danger"
+            elif taken:
+                text = f"{text}, taken up"
+            for rc in _rcs(booking, date):
+                row, text = clean_text(rc, MAX_NAME), clean_text(text)
+                yield Bar(row, date.start, date.end, text, colour, thick=taken, hatched=booking.maintenance)
+
+    # In words
+
+    def _tell(self, at: float, bookings: list[BookingView]) -> None:
+        """What is another than it was. At first only what people should look at: the rest did not happen now."""
+        first = self._bookings is None
+        before = {one.id: one for one in self._bookings or ()}
+        dates = {(one.id, date.start): date for one in before.values() for date in one.dates}
+        words = [
+            (text, level)
+            for one in bookings
+            for text, level in self._news(one, before.get(one.id), dates)
+            if level == "WARN" or not first
+        ]
+        known, now = {one.id for one in bookings}, self._zero + at
+        gone = (one for key, one in before.items() if key not in known)
+        ahead = (one for one in gone if any(date.end > now and date.state in AHEAD_OF_NOW for date in one.dates))
+        words += [(f"{_subject(one)} is given up", "INFO") for one in ahead]
+        for text, level in words[:MAX_TOLD]:
+            self._drawing.event(at, text, level)
+        if len(words) > MAX_TOLD:
+            self._drawing.event(at, f"and {len(words) - MAX_TOLD} more changes of bookings")
+
+    def _news(
+        self, one: BookingView, before: BookingView | None, dates: dict[Key, BookedDate]
+    ) -> Iterator[tuple[str, str]]:
+        subject = _subject(one)
+        if before is None and one.dates:
+            more = "" if not one.every else f", and every {one.every} days" if one.every > 1 else ", and every day"
+            yield f"{subject} is made: {', '.join(_rcs(one, one.dates[0]))}, {_span(one.dates[0])}{more}", "INFO"
+        for date in one.dates:
+            was = dates.get((one.id, date.start))
+            state, danger = (was.state, was.danger) if was is not None else ("open", "")
+            if date.state == "conflict" and (state, danger) != ("conflict", date.danger):
+                yield f"{subject}, {_span(date)}, can't be: {date.danger or 'another stands'}", "WARN"
+            elif date.danger and date.danger != danger:
+                yield f"{subject} may not start {_span(date)}: {date.danger}", "WARN"
+            if date.state == state:
+                continue
+            match date.state:
+                case "taken":
+                    yield f"{subject} is taken up", "INFO"
+                case "lapsed":
+                    yield f"{subject} has lapsed: nobody took it up", "WARN"
+                case "used":
+                    yield f"{subject} was used", "INFO"
+                case "unbooked":
+                    yield f"{subject}, {_span(date)}, is given up", "INFO"
+                case _:
+                    pass
+
+
+def _rcs(booking: BookingView, date: BookedDate) -> list[str]:
+    return list(dict.fromkeys(date.bound.get(need, need) for need in booking.needs))
+
+
+def _subject(booking: BookingView) -> str:
+    owner = f" of {booking.owner}" if booking.owner else ""
+    return f"{'maintenance' if booking.maintenance else 'booking'} {booking.name}{owner}"
+
+
+def _span(date: BookedDate) -> str:
+    """`Fri 27 Nov, 10:00 to 11:30 UTC`."""
+    start, end = (datetime.fromtimestamp(at, UTC) for at in (date.start, date.end))
+    until = f"{end:%H:%M}" if start.date() == end.date() else f"{end:%a %d %b, %H:%M}"
+    return f"{start:%a %d %b, %H:%M} to {until} UTC"
