@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -74,9 +74,18 @@ class Told:
         return "; ".join(words)
 
 
-async def ask_journals(mesh: Mesh, fleet: Fleet, asked: HistoryAsk, most: int, *, look: float = QUIET) -> Told:
+async def ask_journals(
+    mesh: Mesh,
+    fleet: Fleet,
+    asked: HistoryAsk,
+    most: int,
+    *,
+    look: float = QUIET,
+    wall: Callable[[], float] = time.time,
+) -> Told:
     """The latest holds, `most` at most, from as few journals as know all that any knows. `look`: seconds in which some
-    candidate comes into sight. Raises NoJournal where none answers, or one does not go on."""
+    candidate comes into sight; `wall`: seconds since 1970, UTC. Raises NoJournal where none answers, or one does not
+    go on."""
     hosts = await _candidates(mesh, fleet, look)
     why = f"fleet {fleet.name} has no journal that could be asked"
     if not hosts:
@@ -106,7 +115,7 @@ async def ask_journals(mesh: Mesh, fleet: Fleet, asked: HistoryAsk, most: int, *
     if not journals:
         count = "1 candidate" if len(hosts) == 1 else f"{len(hosts)} candidates"
         raise NoJournal(f"{why}: none of its {count} answers; see [journal] of a node file")
-    now = time.time()
+    now = wall()
     begins = [one.since for one in journals.values() if one.since is not None]
     began = now - asked.since if asked.since is not None else min(begins, default=now)
     window = Span(began, now - asked.until)

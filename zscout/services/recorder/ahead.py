@@ -21,7 +21,7 @@ LEFT: Final = 170.0
 """Where now is: names stand before it."""
 MARGIN: Final = 4.0
 """Between an outline and the lines of its row."""
-LETTER: Final = 6.4
+LETTER: Final = 6.8
 """Width of a letter, about: the viewer does not tell."""
 PADDING: Final = 14.0
 """Beside a label, in all."""

@@ -154,8 +154,7 @@ def _charts(rows: int) -> dict[str, tuple[int, rrb.View | rrb.Container]]:
         for one in AHEAD
         if rows
     ]
-    # Its rows are less high than those of lanes.
-    return {"/ahead": (_share(round(0.8 * rows), 2), rrb.Tabs(*views))} if views else {}
+    return {"/ahead": (_share(rows, 2), rrb.Tabs(*views))} if views else {}
 
 
 def _rc_panes(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[int, rrb.View | rrb.Container]]:

@@ -86,12 +86,13 @@ class Recorder:
         frames: float = 2.0,
         where: Callable[[], messages.Recorded] | None = None,
         past: float = 0.0,
+        wall: Callable[[], float] = time.time,
     ) -> None:
         """`where` answers who asks for the recording; without it nobody is answered. `past`: seconds before this object
-        was made of which journals are asked."""
+        was made of which journals are asked. `wall`: seconds since 1970, UTC."""
         self.mesh, self.timeline, self.frames, self._where = mesh, timeline, frames, where
-        self.fleet, self.past = fleet, past
-        self._zero, self._epoch = mesh.now(), time.time()
+        self.fleet, self.past, self._wall = fleet, past, wall
+        self._zero, self._epoch = mesh.now(), wall()
         timeline.start_clock(self._epoch)
         self._hosts, self._robots, self._bookings = timeline.hosts, timeline.robots, timeline.bookings
         self._requests = RequestTracker(timeline, fleet.operator_priority)
@@ -275,10 +276,10 @@ class Recorder:
         await self._caught_up.wait()
         await asyncio.sleep(COMMITTED)
         for _ in range(TRIES):
-            ago = time.time() - self._epoch
+            ago = self._wall() - self._epoch
             asked = messages.HistoryAsk(since=ago + self.past, until=ago)
             try:
-                told = await ask_journals(self.mesh, self.fleet, asked, MAX_PAST)
+                told = await ask_journals(self.mesh, self.fleet, asked, MAX_PAST, self._wall)
             except NoJournal as error:
                 log.info("nothing is shown of the past: %s", error)
                 await asyncio.sleep(AGAIN)
