@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from datetime import UTC, datetime
-from typing import Final
+from typing import Final, TypeAlias
 
 from zscout.messages import BookedDate, BookingsTold, BookingView
 from zscout.services.recorder.ahead import Bar, chart, rows_of
@@ -21,10 +21,13 @@ MAX_NAME: Final = 30
 MAX_TOLD: Final = 50
 """Events that one answer may make."""
 AHEAD_OF_NOW: Final = ("open", "taken", "conflict")
-"""States of dates that are drawn."""
+"""States of dates that are not over."""
 
-Key = tuple[str, int]
+Key: TypeAlias = tuple[str, int]
 """A booking's id, and when a date of it starts."""
+Dated: TypeAlias = tuple[BookingView, BookedDate]
+Event: TypeAlias = tuple[str, str]
+"""Words and level."""
 
 
 class BookingTracker:
@@ -88,51 +91,53 @@ class BookingTracker:
 
     def _tell(self, at: float, bookings: list[BookingView]) -> None:
         """What is another than it was. At first only what people should look at: the rest did not happen now."""
-        first = self._bookings is None
-        before = {one.id: one for one in self._bookings or ()}
-        dates = {(one.id, date.start): date for one in before.values() for date in one.dates}
-        words = [
-            (text, level)
-            for one in bookings
-            for text, level in self._news(one, before.get(one.id), dates)
-            if level == "WARN" or not first
-        ]
-        known, now = {one.id for one in bookings}, self._zero + at
-        gone = (one for key, one in before.items() if key not in known)
-        ahead = (one for one in gone if any(date.end > now and date.state in AHEAD_OF_NOW for date in one.dates))
-        words += [(f"{_subject(one)} is given up", "INFO") for one in ahead]
+        first, before, after = self._bookings is None, _dates(self._bookings or ()), _dates(bookings)
+        known = {one.id for one in self._bookings or ()}
+        words = [] if first else [_made(one) for one in bookings if one.id not in known and one.dates]
+        words += [news for key, (one, date) in after.items() for news in _news(one, date, before.get(key))]
+        words += _gone(
+            [one for key, one in before.items() if key not in after], {one.id for one in bookings}, self._zero + at
+        )
         for text, level in words[:MAX_TOLD]:
             self._drawing.event(at, text, level)
         if len(words) > MAX_TOLD:
             self._drawing.event(at, f"and {len(words) - MAX_TOLD} more changes of bookings")
 
-    def _news(
-        self, one: BookingView, before: BookingView | None, dates: dict[Key, BookedDate]
-    ) -> Iterator[tuple[str, str]]:
-        subject = _subject(one)
-        if before is None and one.dates:
-            more = "" if not one.every else f", and every {one.every} days" if one.every > 1 else ", and every day"
-            yield f"{subject} is made: {', '.join(_rcs(one, one.dates[0]))}, {_span(one.dates[0])}{more}", "INFO"
-        for date in one.dates:
-            was = dates.get((one.id, date.start))
-            state, danger = (was.state, was.danger) if was is not None else ("open", "")
-            if date.state == "conflict" and (state, danger) != ("conflict", date.danger):
-                yield f"{subject}, {_span(date)}, can't be: {date.danger or 'another stands'}", "WARN"
-            elif date.danger and date.danger != danger:
-                yield f"{subject} may not start {_span(date)}: {date.danger}", "WARN"
-            if date.state == state:
-                continue
-            match date.state:
-                case "taken":
-                    yield f"{subject} is taken up", "INFO"
-                case "lapsed":
-                    yield f"{subject} has lapsed: nobody took it up", "WARN"
-                case "used":
-                    yield f"{subject} was used", "INFO"
-                case "unbooked":
-                    yield f"{subject}, {_span(date)}, is given up", "INFO"
-                case _:
-                    pass
+
+def _dates(bookings: Iterable[BookingView]) -> dict[Key, Dated]:
+    return {(one.id, date.start): (one, date) for one in bookings for date in one.dates if date.state in AHEAD_OF_NOW}
+
+
+def _made(one: BookingView) -> Event:
+    again = "" if not one.every else ", and every day" if one.every == 1 else f", and every {one.every} days"
+    return f"{_subject(one)} is made: {', '.join(_rcs(one, one.dates[0]))}, {_span(one.dates[0])}{again}", "INFO"
+
+
+def _news(one: BookingView, date: BookedDate, before: Dated | None) -> Iterator[Event]:
+    state, danger = ("open", "") if before is None else (before[1].state, before[1].danger)
+    if date.state == "conflict" and (state, danger) != ("conflict", date.danger):
+        yield f"{_subject(one)}, {_span(date)}, can't be: {date.danger or 'another stands'}", "WARN"
+    elif date.danger and date.danger != danger:
+        yield f"{_subject(one)} may not start {_span(date)}: {date.danger}", "WARN"
+    elif state == "conflict" and date.state != state:
+        yield f"{_subject(one)}, {_span(date)}, stands again", "INFO"
+    elif date.state == "taken" and before is not None and state != "taken":
+        yield f"{_subject(one)} is taken up", "INFO"
+
+
+def _gone(gone: Iterable[Dated], known: Container[str], now: float) -> Iterator[Event]:
+    """Of dates that are told no more: who had taken one up is spoken of elsewhere. `known`: bookings that are there."""
+    given_up = set[str]()
+    for one, date in gone:
+        if date.state == "taken" or now >= date.end:
+            continue
+        if not one.maintenance and now >= date.start + float(one.patience):
+            yield f"{_subject(one)} has lapsed: nobody took it up", "WARN"
+        elif one.id in known:
+            yield f"{_subject(one)}, {_span(date)}, is given up", "INFO"
+        elif one.id not in given_up:
+            given_up.add(one.id)
+            yield f"{_subject(one)} is given up", "INFO"
 
 
 def _rcs(booking: BookingView, date: BookedDate) -> list[str]:

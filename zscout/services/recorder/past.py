@@ -51,7 +51,8 @@ def past_of(told: Told, zero: float, seconds: float, operator_priority: int) -> 
     hours, journals = f"{seconds / 3600:.3g} h", f"of {', '.join(sorted(told.journals)[:MAX_NAMED])}"
     words = []
     if told.holds:
-        count = f"the latest {len(told.holds)} holds" if told.more else f"{len(told.holds)} holds"
+        count = "1 hold" if len(told.holds) == 1 else f"{len(told.holds)} holds"
+        count = f"the latest {count}" if told.more else count
         words = [f"the journals {journals} tell of {count} in the {hours} before this recording"]
     if told.without:
         words.append(f"no journal of {', '.join(told.without[:MAX_NAMED])}: off, older than 0.3.0, or too slow")
