@@ -16,6 +16,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 import pytest
 from PIL import Image, ImageChops
 from rerun.experimental import ViewerClient
@@ -244,14 +245,9 @@ def test_what_is_booked_is_outlined_ahead_of_now(tmp_path: Path) -> None:
 
     def spread(colour: int) -> tuple[int, int, int, int, int]:
         """Edges of what has this colour, left of the events, and how many pixels it has."""
-        wanted = rgb(colour)
-        pixels = picture.load()
-        assert pixels is not None
-        found = [
-            (x, y) for y in range(picture.height) for x in range(round(WIDTH * PANES)) if near(pixels[x, y][:3], wanted)
-        ]
-        across, down = [x for x, _ in found], [y for _, y in found]
-        return min(across), max(across), min(down), max(down), len(found)
+        pixels = np.asarray(picture)[:, : round(WIDTH * PANES)].astype(int)
+        down, across = np.nonzero((abs(pixels - rgb(colour)) <= 3).all(axis=2))
+        return int(across.min()), int(across.max()), int(down.min()), int(down.max()), len(down)
 
     survey, mend, film = (spread(colour) for colour in (PALETTE[0], MAINTENANCE, ALERT))
     # The first two are as long and begin at one time; the third is as long, and twelve hours later.
@@ -262,8 +258,8 @@ def test_what_is_booked_is_outlined_ahead_of_now(tmp_path: Path) -> None:
     # An outline, nothing more: within it the rest is dark, but for the text.
     around = 2 * (survey[1] - survey[0] + survey[3] - survey[2])
     assert survey[4] < 3 * around
-    middle = (survey[0] + (survey[1] - survey[0]) // 8, (survey[2] + survey[3]) // 2)
-    assert max(picture.crop((*middle, middle[0] + 1, middle[1] + 1)).getdata()[0]) < 40
+    x, y = survey[0] + (survey[1] - survey[0]) // 8, (survey[2] + survey[3]) // 2
+    assert max(picture.crop((x, y, x + 1, y + 1)).tobytes()) < 40
 
 
 def height_of(picture: Image.Image, colour: int) -> float:

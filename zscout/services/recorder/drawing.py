@@ -91,8 +91,6 @@ class Drawing:
 
     def columns(self, entity: str, times: Sequence[float], columns: rr.ComponentColumnList) -> None:
         """Logs at many times as one piece: neither begin nor end are moved."""
-        if self.closed:
-            return
         at = [time if self.epoch is None else self.epoch + time for time in times]
         index = rr.TimeColumn(TIME, duration=at) if self.epoch is None else rr.TimeColumn(WALL_TIME, timestamp=at)
         for stream in self.streams:

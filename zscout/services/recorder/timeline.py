@@ -179,7 +179,7 @@ class Timeline(Drawing):
 
     def past(self, seconds: float, lanes: Mapping[str, PastLane]) -> None:
         """What RCs showed before second 0, as journals tell, for up to so many seconds."""
-        if not lanes:
+        if not lanes or self.closed:
             return
         for rc, changes in lanes.items():
             self._rc_lanes.past(rc, [(at, [self._past_bar(bar) for bar in bars]) for at, bars in changes])
