@@ -119,10 +119,10 @@ def test_the_past_is_drawn_paler_and_makes_the_run_no_longer(tmp_path: Path) -> 
         )
         timeline.event(9, "the end")
         layout = timeline.layout(live=False)
+    # Too late:
     timeline.past(600, {"robot/late": [(-1, [SURVEY])]})
-    assert layout.span == (0.5, 9)
-    assert layout.past == 600
     assert layout.only_past == ("/rc/robot/gone",)
+    assert (layout.past, layout.span) == (600.0, (0.5, 9.0))
     assert lanes(path, "/rc/robot/a")["/rc/robot/a"] == [
         (-500, ["survey (journal)"]),
         (-400, ["not known"]),
