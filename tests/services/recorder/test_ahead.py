@@ -189,6 +189,17 @@ def test_conflicts_and_danger_are_said_though_they_stood_before(tmp_path: Path) 
     assert events(path) == ["booking stuck of ws1, Fri 15 Jan, 09:00 to 10:00 UTC, can't be: crew of ws2 stands"]
 
 
+def test_a_danger_that_is_over_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    with Timeline("lab", path=path) as timeline:
+        for at, danger in enumerate(("robot/a is gone", "robot/a is gone", "", "")):
+            timeline.bookings.told(at, tells(booked("fine", "robot/a", dates=[{"state": "open", "danger": danger}])))
+    assert events(path) == [
+        "booking fine of ws1 may not start Fri 15 Jan, 09:00 to 10:00 UTC: robot/a is gone",
+        "booking fine of ws1, Fri 15 Jan, 09:00 to 10:00 UTC, stands again",
+    ]
+
+
 def test_a_flood_of_bookings_is_summed_up(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:

@@ -119,7 +119,7 @@ def _news(one: BookingView, date: BookedDate, before: Dated | None) -> Iterator[
         yield f"{_subject(one)}, {_span(date)}, can't be: {date.danger or 'another stands'}", "WARN"
     elif date.danger and date.danger != danger:
         yield f"{_subject(one)} may not start {_span(date)}: {date.danger}", "WARN"
-    elif state == "conflict" and date.state != state:
+    elif (state == "conflict" and date.state != state) or (danger and not date.danger):
         yield f"{_subject(one)}, {_span(date)}, stands again", "INFO"
     elif date.state == "taken" and before is not None and state != "taken":
         yield f"{_subject(one)} is taken up", "INFO"
