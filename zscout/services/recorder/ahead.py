@@ -14,6 +14,7 @@ import rerun as rr
 
 from zscout.services.recorder.blueprint import AHEAD, CHART_HEAD, CHART_ROW, CHART_WIDTH, MAX_CHART_ROWS, Ahead
 from zscout.services.recorder.colours import GRID, NOW, PALE, bright, faded
+from zscout.services.recorder.drawing import clean_text
 
 MAX_BARS: Final = 300
 """Outlines in one chart: the first."""
@@ -31,13 +32,15 @@ LABEL: Final = CHART_ROW / 2 - 10
 """From the top of a row to the point of a label, which stands below that."""
 CLEAR: Final = 62.0, 40.0
 """From the label of now to the first label of a time, and from the last one to the edge."""
+MAX_NAME: Final = 30
+"""Characters of an RC's name."""
 DAY: Final = 86_400
 
 Point = tuple[float, float]
 
 
 class Bar(NamedTuple):
-    """A date on the row of one RC. Times in seconds since 1970."""
+    """A date on the row of one RC. Times in seconds since 1970; texts as others wrote them."""
 
     row: str
     start: float
@@ -94,7 +97,9 @@ def chart(bars: Iterable[Bar], now: float, ahead: Ahead, *, stale: bool = False)
         "grid": _lines([(line, GRID) for line in grid], 0.5, 0.0),
         "now": _lines([([(LEFT, CHART_HEAD - 4), (LEFT, bottom)], NOW)] if names else [], 1.5, 40.0),
         "times": _texts([(x, 2.0, text, PALE) for x, text in heads]),
-        "names": _texts([(LEFT / 2, edges[row] + LABEL, name, PALE) for row, name in enumerate(names) if name]),
+        "names": _texts(
+            [(LEFT / 2, edges[row] + LABEL, clean_text(name, MAX_NAME), PALE) for row, name in enumerate(names) if name]
+        ),
         "hatch": _lines([(line, faded(colour, 0.45 * shade)) for line, colour in hatches], 0.5, 10.0),
         "dates": Layer(
             rr.Boxes2D,
@@ -153,7 +158,8 @@ def _placed(bars: Sequence[Bar], seats: Sequence[int | None], now: float, scale:
         left = max(LEFT, LEFT + (bar.start - now) * scale)
         right = min(CHART_WIDTH, LEFT + (bar.end - now) * scale)
         top = CHART_HEAD + CHART_ROW * seat + MARGIN
-        found.append(_Placed(bar, left, right, top, nexts.get(seat, CHART_WIDTH)))
+        shown = bar._replace(text=clean_text(bar.text))
+        found.append(_Placed(shown, left, right, top, nexts.get(seat, CHART_WIDTH)))
         nexts[seat] = left
     return reversed(found)
 

@@ -10,14 +10,12 @@ from zscout.messages import BookedDate, BookingsTold, BookingView
 from zscout.services.recorder.ahead import Bar, chart, rows_of
 from zscout.services.recorder.blueprint import AHEAD
 from zscout.services.recorder.colours import ALERT, FAILED, MAINTENANCE
-from zscout.services.recorder.drawing import Drawing, clean_text
+from zscout.services.recorder.drawing import Drawing
 
 AGAIN: Final = 60.0
 """Seconds until the charts are drawn anew though no booking has changed: now goes on."""
 STALE: Final = 60.0
 """Seconds without word of bookings after which the charts show that."""
-MAX_NAME: Final = 30
-"""Characters of an RC's name."""
 MAX_TOLD: Final = 50
 """Events that one answer may make."""
 AHEAD_OF_NOW: Final = ("open", "taken", "conflict")
@@ -62,17 +60,18 @@ class BookingTracker:
     def _draw(self, at: float) -> None:
         self._drawn, self._stale = at, at - self._told > STALE
         now = self._zero + (self._told if self._stale else at)
-        bars = [bar for one in self._bookings or () for bar in self._bars(one)]
+        bars = [bar for one in self._bookings or () for bar in self._bars(one, now)]
         self.rows = rows_of(bars, now)
         for ahead in AHEAD:
             for name, layer in chart(bars, now, ahead, stale=self._stale).items():
                 self._drawing.show(at, f"{ahead.entity}/{name}", layer.shape, **layer.fields)
         self._drawing.arrange()
 
-    def _bars(self, booking: BookingView) -> Iterator[Bar]:
-        """One for each date and RC of it."""
+    def _bars(self, booking: BookingView, now: float) -> Iterator[Bar]:
+        """One for each RC of each date that a chart may show."""
+        latest = now + max(ahead.seconds for ahead in AHEAD)
         for date in booking.dates:
-            if date.state not in AHEAD_OF_NOW:
+            if date.state not in AHEAD_OF_NOW or not (date.start < latest and now < date.end):
                 continue
             colour = MAINTENANCE if booking.maintenance else self._colour(booking.name)
             text = f"maintenance: {booking.name}" if booking.maintenance else booking.name
@@ -84,8 +83,7 @@ class BookingTracker:
             elif taken:
                 text = f"{text}, taken up"
             for rc in _rcs(booking, date):
-                row, text = clean_text(rc, MAX_NAME), clean_text(text)
-                yield Bar(row, date.start, date.end, text, colour, thick=taken, hatched=booking.maintenance)
+                yield Bar(rc, date.start, date.end, text, colour, thick=taken, hatched=booking.maintenance)
 
     # In words
 

@@ -3,14 +3,15 @@ go out."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from operator import itemgetter
 from typing import Final, NamedTuple, TypeAlias
 
 from zscout.messages import PastHold
 from zscout.services.journal.asking import Told
-from zscout.services.journal.merging import Span
+from zscout.services.journal.merging import Span, apart, both
 from zscout.services.recorder.drawing import MAX_SLOTS
 
 MAX_LANES: Final = 500
@@ -99,7 +100,7 @@ def _lane(bars: Sequence[tuple[Span, PastBar]], unknown: Sequence[Span], zero: f
             ends.append(0.0)
         ends[row] = span.ended
         add(span, row, bar)
-    for span in _free(unknown, [span for span, _ in bars]):
+    for span in _free(unknown, (span for span, _ in bars)):
         add(span, 0, PastBar())
     shown: list[PastBar | None] = [None] * len(ends)
     lane: list[tuple[float, Sequence[PastBar | None]]] = []
@@ -111,15 +112,8 @@ def _lane(bars: Sequence[tuple[Span, PastBar]], unknown: Sequence[Span], zero: f
     return lane
 
 
-def _free(unknown: Sequence[Span], held: Sequence[Span]) -> Iterator[Span]:
-    """What is left of times where nothing is held; `held` in the order in which they begin."""
-    for one in unknown:
-        at = one.began
-        for span in held:
-            if span.began >= one.ended:
-                break
-            if span.began > at:
-                yield Span(at, span.began)
-            at = max(at, span.ended)
-        if at < one.ended:
-            yield Span(at, one.ended)
+def _free(unknown: Sequence[Span], held: Iterable[Span]) -> list[Span]:
+    """What is left of times, in order and apart, where nothing is held."""
+    busy = apart(held)
+    begins, ends = [-math.inf, *(span.ended for span in busy)], [*(span.began for span in busy), math.inf]
+    return both(unknown, [Span(*between) for between in zip(begins, ends, strict=True)])
