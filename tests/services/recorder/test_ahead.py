@@ -17,8 +17,9 @@ from tests.services.rcm.test_bookings import NOON, BookedFleet, book, do, led
 from tests.services.recorder.paper_run import events, rows
 from zscout.keyexpr import Role, Token
 from zscout.messages import BookedDate, BookingsTold, BookingView, Unbook
-from zscout.services.recorder.ahead import LEFT, MARGIN, MAX_BARS, Bar, Layer, chart, rows_of
-from zscout.services.recorder.blueprint import AHEAD, CHART_HEAD, CHART_ROW, CHART_WIDTH, MAX_CHART_ROWS
+from zscout.services.recorder.ahead import LEFT, MARGIN, MAX_BARS, Bar, Layer, rows_of
+from zscout.services.recorder.ahead import chart as chart_of_rows
+from zscout.services.recorder.blueprint import AHEAD, CHART_HEAD, CHART_WIDTH, MAX_CHART_ROWS, Ahead, chart_row
 from zscout.services.recorder.bookings import AGAIN, MAX_TOLD, STALE
 from zscout.services.recorder.colours import ALERT, FAILED, MAINTENANCE, PALETTE
 from zscout.services.recorder.recorder import Recorder
@@ -35,12 +36,21 @@ def bar(row: str, start: float, end: float, text: str = "survey", **more: Any) -
     return Bar(row, NOW + start * HOUR, NOW + end * HOUR, text, PALETTE[0], **more)
 
 
+def chart(bars: list[Bar], now: float, ahead: Ahead) -> dict[str, Layer]:
+    return chart_of_rows(bars, now, ahead, rows_of(bars, now))
+
+
 def boxes(layers: dict[str, Layer]) -> list[tuple[str, float, float, int]]:
     """Text, begin and end in hours from now, and row of each outline, as they are drawn."""
     fields = layers["dates"].fields
     scale = TODAY.seconds / HOUR / (CHART_WIDTH - LEFT)
     return [
-        (text, round((x - LEFT) * scale, 6), round((x - LEFT + wide) * scale, 6), round((y - CHART_HEAD) // CHART_ROW))
+        (
+            text,
+            round((x - LEFT) * scale, 6),
+            round((x - LEFT + wide) * scale, 6),
+            round((y - CHART_HEAD) // chart_row(1)),
+        )
         for text, (x, y), (wide, _) in zip(fields["labels"], fields["mins"], fields["sizes"], strict=True)
     ]
 
@@ -116,14 +126,16 @@ def test_more_than_there_is_room_for_is_told() -> None:
     st.lists(st.tuples(st.sampled_from(["a/a", "a/b"]), st.integers(-30, 60), st.integers(1, 40)), max_size=40),
     st.sampled_from(AHEAD),
 )
-def test_no_outline_covers_another_or_leaves_the_chart(found: list[tuple[str, int, int]], ahead: Any) -> None:
-    layers = chart([bar(row, at / 2, (at + long) / 2) for row, at, long in found], NOW, ahead)
+def test_no_outline_covers_another_or_leaves_the_chart(found: list[tuple[str, int, int]], ahead: Ahead) -> None:
+    bars = [bar(row, at / 2, (at + long) / 2) for row, at, long in found]
+    layers = chart(bars, NOW, ahead)
     fields = layers["dates"].fields
     drawn = sorted((y, x, x + wide) for (x, y), (wide, _) in zip(fields["mins"], fields["sizes"], strict=True))
     assert all(LEFT <= begin < end <= CHART_WIDTH for _, begin, end in drawn)
     for (y, _, end), (below, begin, _) in pairwise(drawn):
         assert y != below or begin >= end - 1e-6
-    assert all((y - CHART_HEAD - MARGIN) % CHART_ROW == 0 for y, _, _ in drawn)
+    high = chart_row(rows_of(bars, NOW))
+    assert all((y - CHART_HEAD - MARGIN) % high == 0 for y, _, _ in drawn)
 
 
 def test_hostile_names_are_tamed() -> None:

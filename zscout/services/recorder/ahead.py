@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 
 import rerun as rr
 
-from zscout.services.recorder.blueprint import AHEAD, CHART_HEAD, CHART_ROW, CHART_WIDTH, MAX_CHART_ROWS, Ahead
+from zscout.services.recorder.blueprint import AHEAD, CHART_HEAD, CHART_WIDTH, MAX_CHART_ROWS, Ahead, chart_row
 from zscout.services.recorder.colours import GRID, NOW, PALE, bright, faded
 from zscout.services.recorder.drawing import clean_text
 
@@ -28,8 +28,8 @@ PADDING: Final = 14.0
 """Beside a label, in all."""
 HATCH: Final = 9.0
 """From one line of a hatching to the next."""
-LABEL: Final = CHART_ROW / 2 - 10
-"""From the top of a row to the point of a label, which stands below that."""
+LABEL: Final = -10.0
+"""From the middle of a row to the point of a label, which stands below that."""
 CLEAR: Final = 62.0, 40.0
 """From the label of now to the first label of a time, and from the last one to the edge."""
 MAX_NAME: Final = 30
@@ -64,12 +64,9 @@ class _Placed(NamedTuple):
     left: float
     right: float
     top: float
+    bottom: float
     room: float
     """Up to here nothing else stands in its row."""
-
-    @property
-    def bottom(self) -> float:
-        return self.top + CHART_ROW - 2 * MARGIN
 
 
 def rows_of(bars: Iterable[Bar], now: float) -> int:
@@ -78,15 +75,16 @@ def rows_of(bars: Iterable[Bar], now: float) -> int:
     return max(len(_seated(_within(known, now, ahead.seconds))[0]) for ahead in AHEAD)
 
 
-def chart(bars: Iterable[Bar], now: float, ahead: Ahead, *, stale: bool = False) -> dict[str, Layer]:
-    """Layers by name. `stale`: nobody tells of bookings any more; `now` is when somebody did."""
+def chart(bars: Iterable[Bar], now: float, ahead: Ahead, rows: int, *, stale: bool = False) -> dict[str, Layer]:
+    """Layers by name; `rows`: those of the tallest chart. `stale`: nobody tells of bookings any more; `now` is when
+    somebody did."""
     within = _within(bars, now, ahead.seconds)
     names, seats = _seated(within)
-    scale = (CHART_WIDTH - LEFT) / ahead.seconds
-    placed = [*_placed(within, seats, now, scale)]
-    bottom = CHART_HEAD + CHART_ROW * len(names)
+    scale, high = (CHART_WIDTH - LEFT) / ahead.seconds, chart_row(rows)
+    placed = [*_placed(within, seats, now, scale, high)]
+    bottom = CHART_HEAD + high * len(names)
     times = [(LEFT + (at - now) * scale, text) for at, text in _ticks(now, ahead) if names]
-    edges = [CHART_HEAD + CHART_ROW * row for row in range(len(names) + 1)]
+    edges = [CHART_HEAD + high * row for row in range(len(names) + 1)]
     grid = [[(0.0, y), (CHART_WIDTH, y)] for y in edges if names] + [[(x, CHART_HEAD), (x, bottom)] for x, _ in times]
     heads = [(LEFT, f"{'as of' if stale else 'now'} {_at(now):%H:%M}")] if names else []
     heads += [(x, text) for x, text in times if LEFT + CLEAR[0] < x < CHART_WIDTH - CLEAR[1]]
@@ -98,7 +96,11 @@ def chart(bars: Iterable[Bar], now: float, ahead: Ahead, *, stale: bool = False)
         "now": _lines([([(LEFT, CHART_HEAD - 4), (LEFT, bottom)], NOW)] if names else [], 1.5, 40.0),
         "times": _texts([(x, 2.0, text, PALE) for x, text in heads]),
         "names": _texts(
-            [(LEFT / 2, edges[row] + LABEL, clean_text(name, MAX_NAME), PALE) for row, name in enumerate(names) if name]
+            [
+                (LEFT / 2, edges[row] + high / 2 + LABEL, clean_text(name, MAX_NAME), PALE)
+                for row, name in enumerate(names)
+                if name
+            ]
         ),
         "hatch": _lines([(line, faded(colour, 0.45 * shade)) for line, colour in hatches], 0.5, 10.0),
         "dates": Layer(
@@ -149,7 +151,9 @@ def _seated(bars: Sequence[Bar]) -> tuple[list[str], list[int | None]]:
     return names, [None if seat is None else first[seat[0]] + seat[1] for seat in seats]
 
 
-def _placed(bars: Sequence[Bar], seats: Sequence[int | None], now: float, scale: float) -> Iterator[_Placed]:
+def _placed(
+    bars: Sequence[Bar], seats: Sequence[int | None], now: float, scale: float, high: float
+) -> Iterator[_Placed]:
     nexts: dict[int, float] = {}
     found: list[_Placed] = []
     for bar, seat in reversed([*zip(bars, seats, strict=True)]):
@@ -157,16 +161,16 @@ def _placed(bars: Sequence[Bar], seats: Sequence[int | None], now: float, scale:
             continue
         left = max(LEFT, LEFT + (bar.start - now) * scale)
         right = min(CHART_WIDTH, LEFT + (bar.end - now) * scale)
-        top = CHART_HEAD + CHART_ROW * seat + MARGIN
+        top = CHART_HEAD + high * seat
         shown = bar._replace(text=clean_text(bar.text))
-        found.append(_Placed(shown, left, right, top, nexts.get(seat, CHART_WIDTH)))
+        found.append(_Placed(shown, left, right, top + MARGIN, top + high - MARGIN, nexts.get(seat, CHART_WIDTH)))
         nexts[seat] = left
     return reversed(found)
 
 
 def _label(one: _Placed) -> tuple[float, float, str] | None:
     """Where its text stands, and how much of it: in the box; else behind it, where nothing else is; else a part."""
-    y, wide = one.top - MARGIN + LABEL, len(one.bar.text) * LETTER + PADDING
+    y, wide = (one.top + one.bottom) / 2 + LABEL, len(one.bar.text) * LETTER + PADDING
     if wide <= one.right - one.left:
         return (one.left + one.right) / 2, y, one.bar.text
     if wide <= one.room - one.right:

@@ -57,9 +57,9 @@ AHEAD: Final = (
 )
 CHART_WIDTH: Final = 1_000.0
 CHART_HEAD: Final = 26.0
-CHART_ROW: Final = 34.0
-"""Sizes of such a chart, of its line of times and of a row, in units of which one is about a pixel."""
-MAX_CHART_ROWS: Final = 16
+"""Sizes of such a chart and of its line of times, in units of which one is about a pixel."""
+MAX_CHART_ROWS: Final = 12
+"""And one that says what is left out: the viewer makes all smaller that has no room, but for the texts."""
 
 
 class RobotLayout(NamedTuple):
@@ -146,9 +146,14 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
     return page(root, timeline=time)
 
 
+def chart_row(rows: int) -> float:
+    """How high a row of charts is of which the taller one has so many."""
+    return 34.0 if rows <= 8 else 24.0
+
+
 def _charts(rows: int) -> dict[str, tuple[int, rrb.View | rrb.Container]]:
     """What is booked, as pages of one pane; none without rows."""
-    bounds = rrb.VisualBounds2D(x_range=[0, CHART_WIDTH], y_range=[0, CHART_HEAD + CHART_ROW * rows])
+    bounds = rrb.VisualBounds2D(x_range=[0, CHART_WIDTH], y_range=[0, CHART_HEAD + chart_row(rows) * rows])
     views = [rrb.Spatial2DView(origin=one.entity, name=one.name, visual_bounds=bounds) for one in AHEAD if rows]
     return {"/ahead": (_share(rows, 2), rrb.Tabs(*views))} if views else {}
 

@@ -63,7 +63,7 @@ class BookingTracker:
         bars = [bar for one in self._bookings or () for bar in self._bars(one, now)]
         self.rows = rows_of(bars, now)
         for ahead in AHEAD:
-            for name, layer in chart(bars, now, ahead, stale=self._stale).items():
+            for name, layer in chart(bars, now, ahead, self.rows, stale=self._stale).items():
                 self._drawing.show(at, f"{ahead.entity}/{name}", layer.shape, **layer.fields)
         self._drawing.arrange()
 

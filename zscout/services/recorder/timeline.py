@@ -13,7 +13,15 @@ from typing import Final, Self
 import rerun as rr
 
 from zscout.config.strict import BadInput
-from zscout.services.recorder.blueprint import APPLICATION, LIVE_HOST_ROWS, LIVE_ROWS, NO_ROBOTS, Layout, blueprint
+from zscout.services.recorder.blueprint import (
+    APPLICATION,
+    LIVE_HOST_ROWS,
+    LIVE_ROWS,
+    MAX_CHART_ROWS,
+    NO_ROBOTS,
+    Layout,
+    blueprint,
+)
 from zscout.services.recorder.bookings import BookingTracker
 from zscout.services.recorder.colours import ABSENT, OPERATOR, OTHER, PALETTE, STATES, faded
 from zscout.services.recorder.drawing import Drawing, HolderRow, Lanes, clean_text, disconnect, with_detail
@@ -304,7 +312,7 @@ class Timeline(Drawing):
 
     def _ahead_rows(self) -> int:
         """A few more than there are: a layout that is sent anew undoes what people have changed of it."""
-        return -(-self.bookings.rows // ROWS_MORE) * ROWS_MORE
+        return min(-(-self.bookings.rows // ROWS_MORE) * ROWS_MORE, MAX_CHART_ROWS + 1)
 
     def _colour(self, at: float, arc: str) -> int:
         others = "ARC names: the others have no lane and no colour of their own"
