@@ -148,7 +148,7 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
 
 def chart_row(rows: int) -> float:
     """How high a row of charts is of which the taller one has so many."""
-    return 34.0 if rows <= 8 else 24.0
+    return 32.0 if rows <= 4 else 24.0
 
 
 def _charts(rows: int) -> dict[str, tuple[int, rrb.View | rrb.Container]]:
