@@ -279,7 +279,7 @@ class Recorder:
             ago = self._wall() - self._epoch
             asked = messages.HistoryAsk(since=ago + self.past, until=ago)
             try:
-                told = await ask_journals(self.mesh, self.fleet, asked, MAX_PAST, self._wall)
+                told = await ask_journals(self.mesh, self.fleet, asked, MAX_PAST, wall=self._wall)
             except NoJournal as error:
                 log.info("nothing is shown of the past: %s", error)
                 await asyncio.sleep(AGAIN)
