@@ -33,6 +33,7 @@ from zscout.keyexpr import Role, Token
 from zscout.messages import Notice, RcState
 from zscout.services.recorder.colours import OPERATOR
 from zscout.services.recorder.process import RecorderJob, Recording, encode_job, new_recording, prune
+from zscout.types import SECOND
 
 pytestmark = pytest.mark.live
 
@@ -367,6 +368,36 @@ def test_bad_settings_are_one_line_and_code_2(tmp_path: Path) -> None:
         assert list((tmp_path / "runs").iterdir()) == []
 
     asyncio.run(story())
+
+
+@pytest.mark.parametrize("past", [3_600 * SECOND, 0])
+def test_a_recorder_that_comes_late_has_what_a_journal_kept(tmp_path: Path, past: int) -> None:
+    runs = tmp_path / "runs"
+
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("a", "robot/a")
+            client = await lab.client("crew")
+            await lab.ready(client, "robot/a")
+            async with hold(client, "survey", {"robot/a": {}}, min_runtime=60):
+                pass
+            film = await client.request("film", {"robot/a": {}}, min_runtime=60)
+            await lab.state(client, lambda state: {held.arc for held in state.holds} == {"film"})
+            job = RecorderJob(RecorderConfig(runs, "127.0.0.1", 0, past=past), lab.fleet, "b")
+            process = run_recorder(lab, encode_job(job))
+            await recording(lab)
+            if past:
+                await recorded(runs, lambda path: any("before this recording" in text for text in events(path)))
+            await client.end(film)
+            await lab.state(client, lambda state: not state.holds)
+            assert process.stdin is not None
+            process.stdin.close()
+            assert await asyncio.to_thread(process.wait, HANG) == 0
+
+    asyncio.run(story())
+    shown = [state for (state,) in lane(the_file(runs), "/rc/robot/a") if state]
+    assert shown == (["survey (journal)", "film (journal)"] if past else []) + ["film"]
+    RrdReader(the_file(runs)).store()
 
 
 IN_A_HURRY = (

@@ -1,44 +1,30 @@
-"""What the journals of all candidates tell: asked side by side, and merged."""
+"""What the journals of all candidates tell, as people ask for it and read it."""
 
 from __future__ import annotations
 
-import asyncio
 import csv
 import sys
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final
 
 import click
 from msgspec import structs
 
-from zscout.cli.common import LOOK_FOR_RCM, F, Failed, Parsed, see_rcm, until
-from zscout.config.fleet import MAX_CANDIDATES, Fleet
+from zscout.cli.common import LOOK_FOR_RCM, F, Failed, Parsed, see_rcm
+from zscout.config.fleet import Fleet
 from zscout.config.strict import DURATIONS, BadInput, parse_duration, quoted
-from zscout.keyexpr import MAX_NAME, Role, Token, check_need
-from zscout.messages import MAX_ASKED_NAMES, MAX_PAGE, History, HistoryAsk, PastHold
-from zscout.services.journal.merging import Span, enough, merged, unknown_to, unknown_to_all
-from zscout.terminal import Table, clean, many, span
-from zscout.types import HostName
+from zscout.keyexpr import MAX_NAME, check_need
+from zscout.messages import MAX_ASKED_NAMES, HistoryAsk, PastHold
+from zscout.services.journal import asking
+from zscout.services.journal.asking import Told
+from zscout.terminal import Table, clean, span
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
 
-ASK: Final = 5.0
-"""Seconds that a candidate has for a page."""
-QUIET: Final = 0.3
-"""Seconds without another candidate after which all are seen."""
-AT_ONCE: Final = 16
-"""Candidates that are asked at one time."""
 MAX_AGO: Final = 1e9
-CAUSES: Final[Mapping[str, str]] = {
-    "off": "did not run",
-    "silent": "heard no RCM",
-    "missed": "missed publications",
-    "dropped": "could not keep all",
-}
 PAST_FORMS: Final = f"{DURATIONS}, or a date as in 2026-11-20 or 2026-11-20T14:30"
 FORMULA: Final = ("=", "+", "-", "@")
 """How a cell begins that a spreadsheet would compute."""
@@ -113,133 +99,48 @@ def names_of(fleet: Fleet, users: Sequence[str], group: str | None) -> list[str]
     return names
 
 
-@dataclass(frozen=True, slots=True)
-class Told:
-    """What the journals tell of a window."""
-
-    window: Span
-    holds: Sequence[PastHold]
-    """In the order in which they began: of more than were wanted the latest."""
-    more: bool
-    """Whether there are earlier ones."""
-    journals: Mapping[HostName, History]
-    """The first page of each candidate that answered."""
-    without: Sequence[HostName]
-    """Candidates that did not: they keep no journal, are older than journals, or too slow."""
-
-    @property
-    def unknown(self) -> list[Span]:
-        """Times of which no journal knows all."""
-        return unknown_to_all([*self.journals.values()], self.window)
-
-    def causes(self, unknown: Span) -> str:
-        """Why none knows of it, by candidate."""
-        words = []
-        for host, journal in sorted(self.journals.items()):
-            found = [
-                CAUSES[gap.cause]
-                for gap in journal.gaps
-                if gap.began < unknown.ended and (gap.ended is None or gap.ended > unknown.began)
-            ]
-            if not found and any(one.ended > unknown.began for one in unknown_to(journal, unknown)):
-                found = ["has nothing of then"]
-            words += [f"{host} {', '.join(dict.fromkeys(found))}"] if found else []
-        return "; ".join(words)
-
-    def remarks(self) -> Iterable[str]:
-        """What is not known, in lines."""
-        for one in self.unknown:
-            yield f"from {local(one.began)} to {local(one.ended)} not all is known: {self.causes(one)}"
-        if self.without:
-            yield f"no journal of {', '.join(self.without)}: off, older than 0.3.0, or too slow"
-
-    def as_json(self, fleet: str, **told: object) -> dict[str, Any]:
-        """As `--json` prints it, with what it has `told` of the window."""
-        candidates: list[dict[str, Any]] = [
-            {
-                "host": host,
-                "since": None if one.since is None else utc(one.since),
-                "gaps": [structs.asdict(gap) | _times(gap.began, gap.ended) for gap in one.gaps],
-            }
-            for host, one in sorted(self.journals.items())
-        ]
-        return {
-            "fleet": fleet,
-            "since": utc(self.window.began),
-            "until": utc(self.window.ended),
-            **told,
-            "more": self.more,
-            "gaps": [_times(one.began, one.ended) | {"why": self.causes(one)} for one in self.unknown],
-            "candidates": candidates + [{"host": host, "since": None, "gaps": None} for host in self.without],
-        }
-
-
 async def ask_journals(client: Client, asked: HistoryAsk, most: int) -> Told:
     """The latest holds, `most` at most, from as few journals as know all that any knows. Raises Failed where none
-    answers."""
-    mesh = client.mesh
-    hosts = await _candidates(client)
-    slots = asyncio.Semaphore(AT_ONCE)
-
-    async def page(host: HostName, question: HistoryAsk) -> History | None:
-        async with slots:
-            reply = await mesh.ask_one(mesh.keys.history(host, mesh.me), question, History, timeout=ASK)
-        return reply.message if reply is not None and reply.message is not None and reply.message.host == host else None
-
-    async def pages(host: HostName) -> tuple[list[PastHold], bool]:
-        found: list[PastHold] = []
-        question: HistoryAsk | None = structs.replace(asked, limit=min(most, MAX_PAGE))
-        while question is not None and len(found) < most:
-            answer = await page(host, question)
-            if answer is None:
-                raise Failed(f"{host} did not go on to tell its journal; try again")
-            found += answer.holds
-            # What does not go on would never end.
-            ahead = answer.next is not None and answer.next != question.before
-            question = structs.replace(question, before=answer.next) if ahead else None
-        return found, question is not None
-
-    firsts = await asyncio.gather(*(page(host, structs.replace(asked, limit=1)) for host in hosts))
-    journals = {host: first for host, first in zip(hosts, firsts, strict=True) if first is not None}
-    if not journals:
-        seen = f"none of its {many(len(hosts), 'candidate')} answers" if hosts else "no candidate is seen"
-        raise Failed(
-            f"fleet {client.fleet.name} has no journal that could be asked: {seen}; see [journal] of a node file"
-        )
-    now = time.time()
-    begins = [one.since for one in journals.values() if one.since is not None]
-    began = now - asked.since if asked.since is not None else min(begins, default=now)
-    window = Span(began, now - asked.until)
-    found = await asyncio.gather(*map(pages, enough(journals, window)))
-    holds = merged(some for some, _ in found)
-    more = len(holds) > most or any(left for _, left in found)
-    return Told(window, holds[-most:], more, journals, [host for host in hosts if host not in journals])
-
-
-async def _candidates(client: Client) -> list[HostName]:
-    """Those that are there: links are made one after another, so until no more come into sight. Raises NobodyThere."""
-    hosts: set[HostName] = set()
-    changed = asyncio.Event()
-
-    def seen(token: Token, alive: bool) -> None:
-        if alive and client.fleet.may_lead(token.host):
-            hosts.add(token.host)
-            changed.set()
-
-    watch = client.mesh.watch(client.mesh.keys.alive_any(Role.CANDIDATE), seen)
+    answers, and NobodyThere where no candidate is seen."""
     try:
-        if not await until(lambda: bool(hosts), changed, LOOK_FOR_RCM):
-            await see_rcm(client, 0.0)
-        known = -1
-        while known < len(hosts) <= MAX_CANDIDATES:
-            known = len(hosts)
-            await until(lambda: len(hosts) > known, changed, QUIET)  # noqa: B023 - awaited
-    finally:
-        watch.close()
-    return sorted(hosts)[:MAX_CANDIDATES]
+        return await asking.ask_journals(client.mesh, client.fleet, asked, most, look=LOOK_FOR_RCM)
+    except asking.NoCandidate as error:
+        await see_rcm(client, 0.0)
+        raise Failed(str(error)) from None
+    except asking.NoJournal as error:
+        raise Failed(str(error)) from None
 
 
 # Words
+
+
+def remarks(told: Told) -> Iterable[str]:
+    """What is not known, in lines."""
+    for one in told.unknown:
+        yield f"from {local(one.began)} to {local(one.ended)} not all is known: {told.causes(one)}"
+    if told.without:
+        yield f"no journal of {', '.join(told.without)}: off, older than 0.3.0, or too slow"
+
+
+def as_json(told: Told, fleet: str, **of: object) -> dict[str, Any]:
+    """As `--json` prints it, with what is told `of` the window."""
+    candidates: list[dict[str, Any]] = [
+        {
+            "host": host,
+            "since": None if one.since is None else utc(one.since),
+            "gaps": [structs.asdict(gap) | _times(gap.began, gap.ended) for gap in one.gaps],
+        }
+        for host, one in sorted(told.journals.items())
+    ]
+    return {
+        "fleet": fleet,
+        "since": utc(told.window.began),
+        "until": utc(told.window.ended),
+        **of,
+        "more": told.more,
+        "gaps": [_times(one.began, one.ended) | {"why": told.causes(one)} for one in told.unknown],
+        "candidates": candidates + [{"host": host, "since": None, "gaps": None} for host in told.without],
+    }
 
 
 def utc(at: float) -> str:
@@ -300,7 +201,7 @@ def _cell(cell: object) -> object:
 
 
 def print_remarks(told: Told, *, err: bool = False) -> None:
-    for line in told.remarks():
+    for line in remarks(told):
         click.secho(clean(line), fg="yellow", err=err)
 
 

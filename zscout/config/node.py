@@ -41,6 +41,10 @@ FRAMES: Final = 2.0
 """Pictures a second that a recorder shows of each camera, by default."""
 
 STATE: Final = 'state = "/var/lib/zscout"'
+PAST: Final = 24 * 3_600 * SECOND
+"""Of the time before a recording, asked of the journals, by default."""
+MAX_PAST: Final = 31 * 86_400
+"""Seconds."""
 RECORDED: Final = 5_000
 """Megabytes of recordings that are kept, by default."""
 
@@ -59,6 +63,8 @@ class RecorderConfig(Struct, frozen=True):
     """Frames a second shown of each camera; 0: none."""
     limit: int = RECORDED
     """Megabytes (10^6 bytes) of this fleet's recordings that are kept."""
+    past: Ns = PAST
+    """Of the time before a recording, asked of the journals; 0: none."""
 
 
 class MetricsConfig(Struct, frozen=True):
@@ -141,6 +147,7 @@ class RecorderTable(Struct, frozen=True, forbid_unknown_fields=True):
     limit: Annotated[
         int, key("Kept of this fleet's recordings in `path`; the oldest go first.", 300, 1_000_000, unit="MB")
     ] = RECORDED
+    past: Annotated[Ns, seconds("0", str(MAX_PAST), "Of before a recording, shown from journals; 0: none.")] = PAST
 
 
 class MetricsTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -255,7 +262,7 @@ def _folder(text: str, folder: Path, at: Where, example: str) -> Path:
 def _recorder(table: RecorderTable, folder: Path, at: Where) -> RecorderConfig:
     path = _folder(table.path, folder, at / "path", 'path = "runs"')
     address = _served_at(table.bind, "the recording", at, allow_remote=table.allow_remote)
-    return RecorderConfig(path, address, table.port, table.frames, table.limit)
+    return RecorderConfig(path, address, table.port, table.frames, table.limit, table.past)
 
 
 def _metrics(table: MetricsTable, at: Where) -> MetricsConfig:

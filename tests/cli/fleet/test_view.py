@@ -148,14 +148,22 @@ def test_the_viewer_does_not_outlive_a_command_that_is_killed(recording: Path, t
 
 @pytest.mark.live
 def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: Path) -> None:
+    def has_past() -> bool:
+        with suppress(ValueError, RuntimeError, OSError, KeyError), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            (file,) = (tmp_path / "out").glob("*.rrd")
+            return ["before (journal)"] in [states for lane in lanes(file, "/rc/**").values() for _, states in lane]
+        return False
+
     async def story() -> None:
         async with Lab(tmp_path) as lab:
             lab.node("anvil", "robot/a")
             client = await lab.client("program")
             await lab.ready(client, "robot/a")
+            await client.end(await client.request("before", {"robot/a": {}}, min_runtime=600))
             recorded = asyncio.Event()
             client.mesh.watch(client.mesh.keys.alive_any("recorder"), lambda _token, _alive: recorded.set())
-            with viewing(tmp_path, "--web", "--out", tmp_path / "out", env=lab.env) as process:
+            with viewing(tmp_path, "--web", "--out", tmp_path / "out", "--past", "1h", env=lab.env) as process:
                 _, stream = await asyncio.to_thread(page, tmp_path, process)
                 assert listens(stream)
                 async with asyncio.timeout(HANG):
@@ -163,6 +171,7 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
                 arc = await client.request("survey", {"robot/a": {}}, min_runtime=600)
                 await lab.state(client, lambda state: len(state.holds) == 1)
                 await client.end(arc)
+                await asyncio.to_thread(until, has_past, "nothing is shown of the past")
                 children = descendants(process)
                 assert len(children) == 2
                 process.send_signal(signal.SIGINT)
@@ -187,10 +196,12 @@ def test_where_a_node_of_this_host_records_its_recording_is_shown(tmp_path: Path
             client = await lab.client("program")
             await lab.ready(client, "robot/a")
             await lab.living(client, Role.RECORDER, lambda hosts: hosts == ["anvil"])
-            with viewing(tmp_path, "--web", "--json", "--out", tmp_path / "out", env=lab.env) as process:
+            options = ("--web", "--json", "--out", tmp_path / "out", "--past", "1h")
+            with viewing(tmp_path, *options, env=lab.env) as process:
                 said = await asyncio.to_thread(said_as_json, tmp_path, process)
                 assert said["live"] == f"rerun+http://127.0.0.1:{port}/proxy"
                 assert [Path(said["file"])] == list((tmp_path / "runs").glob("*.rrd"))
+                assert "--past: a node records" in (tmp_path / "view.log").read_text()
                 # No second recorder was started.
                 assert [child.name() for child in descendants(process)] == ["rerun"]
                 assert not (tmp_path / "out").exists()
@@ -268,6 +279,8 @@ def test_what_can_t_be_opened_or_served_is_one_line_and_code_2(
             ([tmp_path / "none.rrd"], "there is no such file"),
             ([tmp_path], "there is no such file"),
             ([text], "is not a Rerun recording"),
+            (["--past", "99d"], "at most 31d"),
+            (["--past", "soon"], "is no such duration"),
             ([recording, "--bind", "here"], "is not an IP address"),
             ([recording, "--bind", "192.0.2.1"], "can't serve on 192.0.2.1"),
             ([recording, "--port", port], f"port {port} (Address already in use); choose another"),

@@ -11,10 +11,12 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from decimal import Decimal
 from itertools import groupby
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import numpy as np
 import pytest
 from PIL import Image, ImageChops
 from rerun.experimental import ViewerClient
@@ -31,8 +33,9 @@ from tests.services.recorder.paper_run import (
     play_table1,
     second_by_second,
 )
-from zscout.services.recorder.blueprint import LIVE_WINDOW, MARGIN, TIME
-from zscout.services.recorder.colours import ABSENT, LINES, OPERATOR, PALETTE, STATES
+from zscout.messages import BookedDate, BookingsTold, BookingView
+from zscout.services.recorder.blueprint import AHEAD, LIVE_WINDOW, MARGIN, TIME
+from zscout.services.recorder.colours import ABSENT, ALERT, LINES, MAINTENANCE, OPERATOR, PALETTE, STATES
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import Timeline
 
@@ -213,6 +216,50 @@ def test_what_several_want_stands_above_and_what_is_not_there_below(tmp_path: Pa
         assert [report for view in client.get_state().views for report in view.reports] == []
     bars = [round(height_of(picture, colour)) for colour in (OPERATOR, PALETTE[0], ABSENT)]
     assert bars == sorted(bars)
+
+
+def test_what_is_booked_is_outlined_ahead_of_now(tmp_path: Path) -> None:
+    now, hour = 1_800_000_000, 3_600
+
+    def booked(name: str, rc: str, start: int, hours: int, maintenance: bool = False, **date: Any) -> BookingView:
+        dates = [BookedDate(now + start * hour, now + (start + hours) * hour, "open", **date)]
+        runtime, patience = Decimal(hours * hour), Decimal(60)
+        return BookingView(
+            name, name, {rc: {}}, 1, dates[0].start, runtime, patience, maintenance=maintenance, dates=dates
+        )
+
+    with Timeline("lab", path=tmp_path / "run.rrd") as timeline:
+        timeline.holders(0, "robot/a", [])
+        bookings = [
+            booked("survey", "robot/a", 2, 6),
+            booked("mend", "robot/b", 2, 6, maintenance=True),
+            booked("film", "robot/c", 14, 6, danger="robot/c is gone"),
+        ]
+        timeline.bookings.told(0, BookingsTold(now, bookings))
+        timeline.event(SECONDS, "the end")
+    with viewer(tmp_path / "run.rrd", tmp_path, panes=7) as client:
+        picture = settled_picture(client, tmp_path / "picture.png")
+        state = client.get_state()
+    assert [report for view in state.views for report in view.reports] == []
+    assert {one.name for one in AHEAD} <= {view.name for view in state.views}
+
+    def spread(colour: int) -> tuple[int, int, int, int, int]:
+        """Edges of what has this colour, left of the events, and how many pixels it has."""
+        pixels = np.asarray(picture)[:, : round(WIDTH * PANES)].astype(int)
+        down, across = np.nonzero((abs(pixels - rgb(colour)) <= 3).all(axis=2))
+        return int(across.min()), int(across.max()), int(down.min()), int(down.max()), len(down)
+
+    survey, mend, film = (spread(colour) for colour in (PALETTE[0], MAINTENANCE, ALERT))
+    # The first two are as long and begin at one time; the third is as long, and twelve hours later.
+    assert survey[:2] == pytest.approx(mend[:2], abs=2)
+    assert film[1] - film[0] == pytest.approx(survey[1] - survey[0], abs=2)
+    assert film[0] - survey[0] == pytest.approx(2 * (survey[1] - survey[0]), abs=6)
+    assert survey[3] < mend[2] < mend[3] < film[2]
+    # An outline, nothing more: within it the rest is dark, but for the text.
+    around = 2 * (survey[1] - survey[0] + survey[3] - survey[2])
+    assert survey[4] < 3 * around
+    x, y = survey[0] + (survey[1] - survey[0]) // 8, (survey[2] + survey[3]) // 2
+    assert max(picture.crop((x, y, x + 1, y + 1)).tobytes()) < 40
 
 
 def height_of(picture: Image.Image, colour: int) -> float:

@@ -73,7 +73,7 @@ async def history(
     now = time.time()
     if as_json:
         holds = [journals.hold_json(hold, now) for hold in told.holds]
-        terminal.print_json(told.as_json(fleet.name, holds=holds))
+        terminal.print_json(journals.as_json(told, fleet.name, holds=holds))
     elif as_csv:
         journals.print_csv(COLUMNS, (_cells(hold, now) for hold in told.holds))
         journals.print_remarks(told, err=True)

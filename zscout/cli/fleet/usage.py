@@ -13,6 +13,7 @@ from zscout.config.fleet import Fleet
 from zscout.config.strict import BadInput
 from zscout.messages import HistoryAsk, PastHold
 from zscout.services.journal.accounts import Account, accounts
+from zscout.services.journal.asking import Told
 from zscout.terminal import Table, span
 
 MAX_HOLDS = 200_000
@@ -57,7 +58,7 @@ async def usage(by: str, since: float, until: float, as_json: bool, as_csv: bool
     found = accounts(told.holds, keys, told.window, by_rc=by == "rc")
     names = [field.name for field in fields(Account)]
     if as_json:
-        terminal.print_json(told.as_json(client.fleet.name, by=by, accounts=[_rounded(one) for one in found]))
+        terminal.print_json(journals.as_json(told, client.fleet.name, by=by, accounts=[_rounded(one) for one in found]))
     elif as_csv:
         journals.print_csv([by, *names[1:]], ([*_rounded(one).values()] for one in found))
         _print_remarks(told, err=True)
@@ -82,7 +83,7 @@ def _rounded(account: Account) -> dict[str, object]:
     return {name: round(value, 3) if isinstance(value, float) else value for name, value in asdict(account).items()}
 
 
-def _table(found: list[Account], by: str, told: journals.Told) -> Table:
+def _table(found: list[Account], by: str, told: Told) -> Table:
     rows = [
         (
             *(one.key, str(one.holds), span(one.held), span(one.rc_seconds), span(one.waited)),
@@ -96,7 +97,7 @@ def _table(found: list[Account], by: str, told: journals.Told) -> Table:
     return Table(title, columns, rows)
 
 
-def _print_remarks(told: journals.Told, *, err: bool = False) -> None:
+def _print_remarks(told: Told, *, err: bool = False) -> None:
     if told.more:
         click.secho(f"only the latest {MAX_HOLDS} holds are counted; ask for less time", fg="yellow", err=err)
     journals.print_remarks(told, err=err)

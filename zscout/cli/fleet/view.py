@@ -25,10 +25,11 @@ import msgspec
 from zscout import terminal
 from zscout.behaviors.launch import LAUNCH
 from zscout.cli import common
-from zscout.config.node import RecorderConfig
-from zscout.config.strict import BadInput, quoted
+from zscout.config.node import MAX_PAST, PAST, RecorderConfig
+from zscout.config.strict import DURATIONS, BadInput, parse_duration, quoted
 from zscout.keyexpr import valid_name
 from zscout.services.recorder.process import BAD_SETTINGS, QUIET, RecorderJob, Recording, encode_job
+from zscout.types import SECOND, Ns
 
 if TYPE_CHECKING:
     from zscout.config.fleet import Fleet
@@ -58,6 +59,16 @@ WINDOW: Final = ("--bind", "127.0.0.1", "--port", "auto", "--hide-welcome-screen
 _COLOURS: Final = re.compile(r"\x1b\[[0-9;]*m")
 
 
+def parse_recorded_past(text: str, option: str) -> Ns:
+    """Raises BadInput."""
+    found = parse_duration(text)
+    if found is None or found > MAX_PAST:
+        raise BadInput(
+            f"{option}: {quoted(text)} is no such duration; write {DURATIONS}, at most {MAX_PAST // 86_400}d"
+        )
+    return int(found * SECOND)
+
+
 @click.command()
 @click.argument("file", required=False, type=click.Path(path_type=Path))
 @click.option("--web", is_flag=True, help="Serve the viewer to a browser, and print the address to open.")
@@ -78,20 +89,27 @@ _COLOURS: Final = re.compile(r"\x1b\[[0-9;]*m")
     default=Path("runs"),
     help="Where no node of this host records: the folder of the live recording.",
 )
+@click.option(
+    "--past",
+    type=common.Parsed("duration", parse_recorded_past),
+    help="Likewise: for how long before now it shows what the journals tell; 0: nothing. [default: 24h]",
+)
 @common.json_option("Print one JSON object as soon as it is served or recorded: url, live, file.")
 @common.runs
-async def view(file: Path | None, web: bool, bind: str, port: int | None, out: Path, as_json: bool) -> None:
+async def view(
+    file: Path | None, web: bool, bind: str, port: int | None, out: Path, past: int | None, as_json: bool
+) -> None:
     """Open the recording FILE (.rrd), or show the fleet live.
 
     Where a node of this host records (the table [recorder] in its file), its recording is shown with its past;
-    elsewhere the fleet is recorded from now on. The viewer is a window of its own, which ends the command when it
-    is closed. On a host without a display use --web. Ctrl-C ends everything that was started; a recording that was
-    started here is complete then.
+    elsewhere the fleet is recorded from now on. What was held before a recording is shown as the journals tell it. The
+    viewer is a window of its own, which ends the command when it is closed. On a host without a display use --web.
+    Ctrl-C ends everything that was started; a recording that was started here is complete then.
 
     \b
     Examples:
       zscout view
-      zscout view --web
+      zscout view --web --past 7d
       zscout view demo.rrd
       zscout view --web --json | jq -r --unbuffered .url
     """
@@ -104,7 +122,7 @@ async def view(file: Path | None, web: bool, bind: str, port: int | None, out: P
     if not web and not has_display():
         raise common.Failed("no display is here (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web, and a browser")
     # The page comes last, so what it shows needs its own port first.
-    async with _source(file, bind, None if web else port, out) as (recording, recorder):
+    async with _source(file, bind, None if web else port, out, past) as (recording, recorder):
         if not as_json and file is None:
             terminal.print_line(f"{'Recording to' if recorder is not None else 'A node records to'} {recording.file}")
             terminal.print_line(f"Live at {recording.url}")
@@ -146,7 +164,7 @@ async def open_viewer(
 
 @asynccontextmanager
 async def _source(
-    file: Path | None, bind: str, port: int | None, out: Path
+    file: Path | None, bind: str, port: int | None, out: Path, past: int | None
 ) -> AsyncIterator[tuple[Recording, Child | None]]:
     """What the viewer opens, and the recorder behind it where one was started."""
     if file is not None:
@@ -155,10 +173,16 @@ async def _source(
     fleet = common.the_fleet()
     joined, alone = await _recorded_here(fleet, bind)
     if joined is not None:
+        if past is not None:
+            terminal.print_line(
+                "zscout: --past: a node records; what it shows of before stands in its file", sys.stderr
+            )
         yield joined, None
         return
     host = os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
-    job = RecorderJob(RecorderConfig(out, bind, port or 0), fleet, host, joined=False)
+    job = RecorderJob(
+        RecorderConfig(out, bind, port or 0, past=PAST if past is None else past), fleet, host, joined=False
+    )
     command = [sys.executable, "-m", "zscout.services.recorder"]
     async with child("the recorder", command, QUIET, job=encode_job(job)) as recorder:
         recording = await recorder.recording()

@@ -41,12 +41,12 @@ def unknown_to(journal: History, window: Span) -> list[Span]:
     since = window.ended if journal.since is None else journal.since
     spans = [Span(window.began, since)]
     spans += [Span(gap.began, window.ended if gap.ended is None else gap.ended) for gap in journal.gaps]
-    return _apart(Span(max(one.began, window.began), min(one.ended, window.ended)) for one in spans)
+    return apart(Span(max(one.began, window.began), min(one.ended, window.ended)) for one in spans)
 
 
 def unknown_to_all(journals: Sequence[History], window: Span) -> list[Span]:
     """The times of a window of which no journal knows all."""
-    return reduce(_both, (unknown_to(one, window) for one in journals), [window])
+    return reduce(both, (unknown_to(one, window) for one in journals), [window])
 
 
 def enough(journals: Mapping[HostName, History], window: Span) -> list[HostName]:
@@ -56,14 +56,15 @@ def enough(journals: Mapping[HostName, History], window: Span) -> list[HostName]
     chosen: list[HostName] = []
     left = [window]
     for host in sorted(unknown, key=lambda host: (_length(unknown[host]), host)):
-        rest = _both(left, unknown[host])
+        rest = both(left, unknown[host])
         if not chosen or _length(rest) < _length(left):
             chosen.append(host)
             left = rest
     return chosen
 
 
-def _apart(spans: Iterable[Span]) -> list[Span]:
+def apart(spans: Iterable[Span]) -> list[Span]:
+    """All of them, in order; what touches is one."""
     found: list[Span] = []
     for span in sorted(span for span in spans if span.ended > span.began):
         if found and span.began <= found[-1].ended:
@@ -73,7 +74,7 @@ def _apart(spans: Iterable[Span]) -> list[Span]:
     return found
 
 
-def _both(some: Sequence[Span], others: Sequence[Span]) -> list[Span]:
+def both(some: Sequence[Span], others: Sequence[Span]) -> list[Span]:
     """What is in both; each in order and apart."""
     found, at = [], 0
     for one in some:

@@ -32,6 +32,7 @@ from zscout.services.recorder.process import (
     prune,
     writing,
 )
+from zscout.types import SECOND
 
 try:
     import rerun  # noqa: F401 - the first that is named where it is missing: it brings NumPy along
@@ -95,7 +96,8 @@ async def _record(job: RecorderJob, out: BinaryIO) -> None:
         async with await ZenohMesh.open(fleet, Sender(job.host, "recorder")) as mesh:
             out.write(msgspec.json.encode(Recording(str(files.path.absolute()), timeline.url)) + b"\n")
             out.flush()
-            recorder = Recorder(mesh, fleet, timeline, settings.frames, files.where if job.joined else None)
+            where, past = files.where if job.joined else None, settings.past / SECOND
+            recorder = Recorder(mesh, fleet, timeline, settings.frames, where, past)
             rolling = asyncio.create_task(files.keep(recorder))
             try:
                 await recorder.run(stop)

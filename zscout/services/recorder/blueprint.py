@@ -40,6 +40,28 @@ BESIDE: Final = 4
 """Cameras side by side; more of them have pages of as many."""
 
 
+class Ahead(NamedTuple):
+    """A chart of what is booked."""
+
+    entity: str
+    name: str
+    seconds: int
+    """Up to when."""
+    tick: int
+    """Seconds between two times that it names."""
+
+
+AHEAD: Final = (
+    Ahead("/ahead/day", "Booked in the next 24 hours (UTC)", 86_400, 7_200),
+    Ahead("/ahead/week", "In the next 7 days", 7 * 86_400, 86_400),
+)
+CHART_WIDTH: Final = 1_000.0
+CHART_HEAD: Final = 26.0
+"""Sizes of such a chart and of its line of times, in units of which one is about a pixel."""
+MAX_CHART_ROWS: Final = 12
+"""And one that says what is left out: the viewer makes all smaller that has no room, but for the texts."""
+
+
 class RobotLayout(NamedTuple):
     """What there is of robots and other devices: panes are made for these."""
 
@@ -67,7 +89,9 @@ class Layout(msgspec.Struct, frozen=True):
     slides with the newest data and shows the last minute. `wall`: whether the timeline has wall-clock times. `rc_rows`,
     `arc_rows` and `host_rows` are the rows expected in the upper panes, which share the height accordingly. Without
     components `host_rows` is 0. `contended` and `absent` are rows by entity of RCs that several want, and of those that
-    are not there: panes of their own, above the other RCs and below them."""
+    are not there: panes of their own, above the other RCs and below them. `ahead`: rows of the charts of what is
+    booked; 0: none. `past`: seconds before the begin of which journals told, 0: none; `only_past` are entities of RCs
+    of which nothing else is known."""
 
     span: tuple[float, float] | None = None
     wall: bool = False
@@ -77,6 +101,9 @@ class Layout(msgspec.Struct, frozen=True):
     arc_rows: int = 6
     host_rows: int = 0
     robots: RobotLayout = NO_ROBOTS
+    ahead: int = 0
+    past: float = 0.0
+    only_past: tuple[str, ...] = ()
 
 
 def blueprint(layout: Layout) -> rrb.Blueprint:
@@ -88,15 +115,19 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
     span, robots, host_rows = layout.span, layout.robots, layout.host_rows
     axis = rrb.archetypes.TimeAxis(view_range=_window(span))
     behavior_rows = LIVE_BEHAVIOR_ROWS if span is None and robots.behavior_rows else robots.behavior_rows
-    lanes = _rc_panes(layout, axis) | {
-        origin: (_share(rows), rrb.StateTimelineView(origin=origin, name=name, time_view=axis))
-        for origin, name, rows, alone in (
-            ("/arc", "What each ARC is doing", layout.arc_rows, not host_rows),
-            ("/host", "What runs on each host", host_rows, False),
-            ("/behavior", "What each behavior is doing", behavior_rows if robots.any else 0, False),
-        )
-        if rows or alone
-    }
+    lanes = (
+        _rc_panes(layout, axis)
+        | _charts(layout.ahead)
+        | {
+            origin: (_share(rows), rrb.StateTimelineView(origin=origin, name=name, time_view=axis))
+            for origin, name, rows, alone in (
+                ("/arc", "What each ARC is doing", layout.arc_rows, not host_rows),
+                ("/host", "What runs on each host", host_rows, False),
+                ("/behavior", "What each behavior is doing", behavior_rows if robots.any else 0, False),
+            )
+            if rows or alone
+        }
+    )
     load: rrb.View | rrb.Container = rrb.TimeSeriesView(
         origin="/",
         contents=["/load/**", "/mark/**"],
@@ -115,26 +146,57 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
     return page(root, timeline=time)
 
 
-def _rc_panes(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[int, rrb.View]]:
+def chart_row(rows: int) -> float:
+    """How high a row of charts is of which the taller one has so many."""
+    return 32.0 if rows <= 4 else 24.0
+
+
+def _charts(rows: int) -> dict[str, tuple[int, rrb.View | rrb.Container]]:
+    """What is booked, as pages of one pane; none without rows."""
+    bounds = rrb.VisualBounds2D(x_range=[0, CHART_WIDTH], y_range=[0, CHART_HEAD + chart_row(rows) * rows])
+    views = [rrb.Spatial2DView(origin=one.entity, name=one.name, visual_bounds=bounds) for one in AHEAD if rows]
+    return {"/ahead": (_share(rows, 2), rrb.Tabs(*views))} if views else {}
+
+
+def _rc_panes(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[int, rrb.View | rrb.Container]]:
     """Share of the height and view, by any name. Within a view lanes are sorted by their names: what is to stand above
     them has a view of its own, and room to be seen whole."""
     apart = {**layout.contended, **layout.absent}
     rest = layout.rc_rows - sum(apart.values())
-    panes: dict[str, tuple[int, rrb.View]] = {}
+    panes: dict[str, tuple[int, rrb.View | rrb.Container]] = {}
+    without = [f"- {entity}" for entity in (*apart, *layout.only_past)]
 
     def add(name: str, rows: int, least: int, *contents: str) -> None:
-        view = rrb.StateTimelineView(origin="/rc", contents=contents or "$origin/**", name=name, time_view=axis)
+        view: rrb.View | rrb.Container = rrb.StateTimelineView(
+            origin="/rc", contents=contents or ["$origin/**", *without], name=name, time_view=axis
+        )
+        if layout.past and not panes:
+            view = rrb.Tabs(view, _past(layout))
         panes[name] = _share(rows, least), view
 
     if layout.contended:
         add("Resources that several want, and who holds them", 2 * sum(layout.contended.values()), 2, *layout.contended)
     if apart and rest > 0:
-        add("Who holds each other resource", rest, 2, "$origin/**", *(f"- {entity}" for entity in apart))
+        add("Who holds each other resource", rest, 2)
     elif not apart and (layout.rc_rows or not layout.host_rows):
         add("Who holds each resource", rest, 3)
     if layout.absent:
         add("Resources that are not there", sum(layout.absent.values()), 2, *layout.absent)
     return panes
+
+
+def _past(layout: Layout) -> rrb.View:
+    """The same lanes, with the time before."""
+    relative, absolute = rr.TimeRangeBoundary.cursor_relative, rr.TimeRangeBoundary.absolute
+    if layout.span is None:
+        window = rr.TimeRange(start=relative(seconds=-layout.past), end=relative(seconds=layout.past * MARGIN))
+    else:
+        begin, end = layout.span
+        window = rr.TimeRange(
+            start=absolute(seconds=begin - layout.past), end=absolute(seconds=end + layout.past * MARGIN)
+        )
+    name = f"With the {layout.past / 3600:.3g} h before   dark: from journals"
+    return rrb.StateTimelineView(origin="/rc", name=name, time_view=rrb.archetypes.TimeAxis(view_range=window))
 
 
 def page(

@@ -31,6 +31,11 @@ OTHER: Final = 0x8A8A94FF
 """RGBA of what has no colour of its own: a summary, or an ARC past the limit of names."""
 ABSENT: Final = 0x55555CFF
 """RGBA of an RC that is not there."""
+MAINTENANCE: Final = 0xC0C6D4FF
+"""RGBA of a booking for which nobody is to hold anything."""
+GRID: Final = 0x3A3F4AFF
+"""RGBA of the lines between rows of a chart, and at its times."""
+NOW: Final = 0xF4F6FAFF
 STATES: Final[dict[str, int]] = {
     "waiting": 0x6E5A20FF,
     "running": 0x2A7A46FF,

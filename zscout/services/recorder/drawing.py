@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sized
+from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
@@ -85,15 +85,16 @@ class Drawing:
         if at - self._gathered < CURVE_TICK:
             return
         for entity, points in self._points.items():
-            times = [at if self.epoch is None else self.epoch + at for at, _ in points]
-            index = (
-                rr.TimeColumn(TIME, duration=times) if self.epoch is None else rr.TimeColumn(WALL_TIME, timestamp=times)
-            )
-            columns = rr.Scalars.columns(scalars=[value for _, value in points])
-            for stream in self.streams:
-                stream.send_columns(entity, indexes=[index], columns=columns)
+            self.columns(entity, [at for at, _ in points], rr.Scalars.columns(scalars=[value for _, value in points]))
         self._points.clear()
         self._gathered = math.inf
+
+    def columns(self, entity: str, times: Sequence[float], columns: rr.ComponentColumnList) -> None:
+        """Logs at many times as one piece: neither begin nor end are moved."""
+        at = [time if self.epoch is None else self.epoch + time for time in times]
+        index = rr.TimeColumn(TIME, duration=at) if self.epoch is None else rr.TimeColumn(WALL_TIME, timestamp=at)
+        for stream in self.streams:
+            stream.send_columns(entity, indexes=[index], columns=columns)
 
     def restate(self, stream: rr.RecordingStream, at: float) -> None:
         """Writes to a stream that begins at `at` what was logged for all times, and what is shown now."""
@@ -195,7 +196,8 @@ class _Lane:
     """By text, the one longest unused first."""
     slots: list[str] = field(default_factory=list)
     """What each row shows, "" where it is free."""
-    rows: int = 1
+    rows: int = 0
+    """0: only its past is known."""
 
 
 class Lanes:
@@ -218,8 +220,13 @@ class Lanes:
 
     @property
     def entities(self) -> dict[str, int]:
-        """Rows by entity."""
-        return {entity: lane.rows for entity, lane in self._lanes.items()}
+        """Rows by entity; not of those of which only the past is known."""
+        return {entity: lane.rows for entity, lane in self._lanes.items() if lane.rows}
+
+    @property
+    def only_past(self) -> tuple[str, ...]:
+        """Those."""
+        return tuple(sorted(entity for entity, lane in self._lanes.items() if not lane.rows))
 
     def entity(self, name: str) -> str:
         return clean_path(self._folder, name, self._depth)
@@ -233,18 +240,39 @@ class Lanes:
         """From `at` on, the lane of this name shows exactly these: text and RGBA by what they are about. Each
         gets a row."""
         entity = clean_path(self._folder, name, self._depth)
-        lane = self._lanes.get(entity)
+        lane = self._lane(at, entity)
         if lane is None:
-            if not self._drawing.room(at, self._lanes, self._limit, self._others):
-                return
-            lane = self._lanes[entity] = _Lane()
+            return
         rows = [shown.get(row, (row, OTHER)) for row in _seat(lane, (name for name in shown if name))]
+        self._configure(entity, lane, rows)
+        lane.rows = len(rows)
+        self._drawing.show(at, entity, rr.StateChange, state=[text for text, _ in rows])
+
+    def past(self, name: str, changes: Sequence[tuple[float, Sequence[tuple[str, int]]]]) -> None:
+        """What the lane of this name showed before all else, by time: text and RGBA of each row, "" where it is
+        free."""
+        entity = clean_path(self._folder, name, self._depth)
+        lane = self._lane(0.0, entity)
+        if lane is None or not changes:
+            return
+        self._configure(entity, lane, [row for _, rows in changes for row in rows])
+        texts = [[text for text, _ in rows] for _, rows in changes]
+        column = rr.StateChange.columns(state=[text for row in texts for text in row])
+        self._drawing.columns(entity, [at for at, _ in changes], column.partition([len(row) for row in texts]))
+
+    def _lane(self, at: float, entity: str) -> _Lane | None:
+        """None where there are too many."""
+        if entity not in self._lanes:
+            if not self._drawing.room(at, self._lanes, self._limit, self._others):
+                return None
+            self._lanes[entity] = _Lane()
+        return self._lanes[entity]
+
+    def _configure(self, entity: str, lane: _Lane, rows: Iterable[tuple[str, int]]) -> None:
         news = [self._learn(lane, text, colour) for text, colour in rows if text]
         if any(news):
             colours = np.array(list(lane.colours.values()), np.uint32)
             self._drawing.log(None, entity, rr.StateConfiguration(values=list(lane.colours), colors=colours))
-        lane.rows = len(rows)
-        self._drawing.show(at, entity, rr.StateChange, state=[text for text, _ in rows])
 
     def _learn(self, lane: _Lane, text: str, colour: int) -> bool:
         """Whether the colour is new to the viewer."""

@@ -3,7 +3,8 @@
 It only subscribes. The holders of each RC come from what the RCM publishes; why an ARC waits, from the notices to its
 client; hosts and RCs that come and go, from liveliness; what runs on which host, from the component placer; what robots
 do and see, from behaviors, framegrabbers and buildings. `rcm/state` is read at the start and where something was
-missed, so that a recorder may begin in the middle of things."""
+missed, so that a recorder may begin in the middle of things. What was held before that, journals tell; what is booked,
+the leader, when it is asked."""
 
 from __future__ import annotations
 
@@ -19,7 +20,9 @@ from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Supervisor
 from zscout.mesh.supervision import done_within
+from zscout.services.journal.asking import NoJournal, ask_journals
 from zscout.services.recorder.hosts import MAX_FOLLOWED
+from zscout.services.recorder.past import past_of
 from zscout.services.recorder.request_tracker import RequestTracker
 from zscout.services.recorder.robots import MAX_CAMERAS
 from zscout.services.recorder.timeline import Timeline
@@ -31,7 +34,15 @@ READ_TIMEOUT: Final = 2.0
 PAUSE: Final = 0.1
 """Seconds before a leader that did not answer is asked again."""
 AGAIN: Final = 2.0
-"""Seconds until a placer that did not answer is asked again."""
+"""Seconds until a placer, or journals, that did not answer are asked again."""
+BOOKINGS_EVERY: Final = 5.0
+"""Seconds from one question for bookings to the next."""
+MANY_BOOKINGS: Final = 100
+"""Bookings past which it is asked less often: so many more, so much longer."""
+MAX_PAST: Final = 5_000
+"""Holds of the time before the recording: the latest."""
+COMMITTED: Final = 2.0
+"""Seconds until journals have what was heard before."""
 TRIES: Final = 5
 """Past it, it is asked when an RCM comes or something was missed."""
 CHECK_EVERY: Final = 1.0
@@ -74,19 +85,23 @@ class Recorder:
         timeline: Timeline,
         frames: float = 2.0,
         where: Callable[[], messages.Recorded] | None = None,
+        past: float = 0.0,
+        wall: Callable[[], float] = time.time,
     ) -> None:
-        """`where` answers who asks for the recording; without it nobody is answered."""
+        """`where` answers who asks for the recording; without it nobody is answered. `past`: seconds before this object
+        was made of which journals are asked. `wall`: seconds since 1970, UTC."""
         self.mesh, self.timeline, self.frames, self._where = mesh, timeline, frames, where
-        self._zero = mesh.now()
-        timeline.start_clock(time.time())
-        self._hosts, self._robots = timeline.hosts, timeline.robots
+        self.fleet, self.past, self._wall = fleet, past, wall
+        self._zero, self._epoch = mesh.now(), wall()
+        timeline.start_clock(self._epoch)
+        self._hosts, self._robots, self._bookings = timeline.hosts, timeline.robots, timeline.bookings
         self._requests = RequestTracker(timeline, fleet.operator_priority)
         self._tokens: dict[tuple[str, str, str], set[str]] = {}
         self._declared: list[Declaration] = []
-        self._wanted, self._placer_wanted = asyncio.Event(), asyncio.Event()
+        self._wanted, self._placer_wanted, self._bookings_wanted = asyncio.Event(), asyncio.Event(), asyncio.Event()
         self._fresher: set[str] | None = None
         """Components published since the placer was asked for all, until it has answered."""
-        self._caught_up = False
+        self._caught_up = asyncio.Event()
         self._cameras: dict[str, asyncio.Task[None]] = {}
         self._asking: asyncio.Task[None] | None = None
 
@@ -114,8 +129,11 @@ class Recorder:
         ]
         self._wanted.set()
         self._placer_wanted.set()
-        for work in (self._keep_reading(), self._keep_asking_placer(), self._tick()):
-            self._supervisor.spawn(work)
+        work = [self._keep_reading(), self._keep_asking_placer(), self._keep_asking_for_bookings(), self._tick()]
+        if self.past > 0:
+            work.append(self._show_past())
+        for one in work:
+            self._supervisor.spawn(one)
         try:
             await stop.wait()
             if self._supervisor.error is not None:
@@ -169,6 +187,7 @@ class Recorder:
             if alive:
                 self._wanted.set()
                 self._placer_wanted.set()
+                self._bookings_wanted.set()
         elif bool(instances) == before:
             return
         at = self.now()
@@ -182,7 +201,7 @@ class Recorder:
         elif token.role in PRESENCE:
             self.timeline.presence(at, PRESENCE[token.role][alive].format(host=token.host, name=token.name), level)
         # Before the state was read, nobody knows that a new RC is free.
-        if token.role == Role.RC and self._caught_up:
+        if token.role == Role.RC and self._caught_up.is_set():
             self._requests.rc(at, token.name, alive)
 
     # The whole state, where something was missed
@@ -210,8 +229,8 @@ class Recorder:
         newest = max(states, key=lambda state: (state.term, state.seq), default=None)
         if newest is None or not self._requests.state(self.now(), newest):
             return False
-        if not self._caught_up:
-            self._caught_up = True
+        if not self._caught_up.is_set():
+            self._caught_up.set()
             me = self.mesh.me
             self._declared.append(self.mesh.alive(Token(me.host, Role.RECORDER, me.client, new_instance())))
         return True
@@ -238,6 +257,41 @@ class Recorder:
             self._fresher.update(news.forgotten)
         self._hosts.placements(self.now(), news)
 
+    # What is ahead, and what was before
+
+    async def _keep_asking_for_bookings(self) -> None:
+        """Does not return."""
+        key, ask = self.mesh.keys.rcm_bookings, messages.BookingsAsk()
+        while True:
+            self._bookings_wanted.clear()
+            reply = await self.mesh.ask_one(key, ask, messages.BookingsTold, timeout=READ_TIMEOUT)
+            told = reply.message if reply is not None else None
+            if told is not None:
+                self._bookings.told(self.now(), told)
+            many = len(told.bookings) / MANY_BOOKINGS if told is not None else 1.0
+            await done_within(BOOKINGS_EVERY * max(1.0, many), self._bookings_wanted.wait())
+
+    async def _show_past(self) -> None:
+        """What was held before second 0, once journals tell."""
+        await self._caught_up.wait()
+        await asyncio.sleep(COMMITTED)
+        for _ in range(TRIES):
+            ago = self._wall() - self._epoch
+            asked = messages.HistoryAsk(since=ago + self.past, until=ago)
+            try:
+                told = await ask_journals(self.mesh, self.fleet, asked, MAX_PAST, wall=self._wall)
+            except NoJournal as error:
+                log.info("nothing is shown of the past: %s", error)
+                await asyncio.sleep(AGAIN)
+                continue
+            past = await asyncio.to_thread(past_of, told, self._epoch, self.past, self.fleet.operator_priority)
+            self.timeline.past(self.past, past.lanes)
+            for text in past.words:
+                self.timeline.event(self.now(), text)
+            for text in past.gaps:
+                self.timeline.warn(self.now(), text)
+            return
+
     # Robots
 
     async def _tick(self) -> None:
@@ -245,6 +299,7 @@ class Recorder:
             await asyncio.sleep(TICK)
             at = self.now()
             self._robots.tick(at)
+            self._bookings.tick(at)
             self.timeline.regroup(at)
 
     def _follow_camera(self, at: float, camera: str, alive: bool) -> None:

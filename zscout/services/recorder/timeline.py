@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import socket
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final, Self
@@ -13,11 +13,21 @@ from typing import Final, Self
 import rerun as rr
 
 from zscout.config.strict import BadInput
-from zscout.services.recorder.blueprint import APPLICATION, LIVE_HOST_ROWS, LIVE_ROWS, NO_ROBOTS, Layout, blueprint
-from zscout.services.recorder.colours import ABSENT, OPERATOR, OTHER, PALETTE, STATES
+from zscout.services.recorder.blueprint import (
+    APPLICATION,
+    LIVE_HOST_ROWS,
+    LIVE_ROWS,
+    MAX_CHART_ROWS,
+    NO_ROBOTS,
+    Layout,
+    blueprint,
+)
+from zscout.services.recorder.bookings import BookingTracker
+from zscout.services.recorder.colours import ABSENT, OPERATOR, OTHER, PALETTE, STATES, faded
 from zscout.services.recorder.drawing import Drawing, HolderRow, Lanes, clean_text, disconnect, with_detail
 from zscout.services.recorder.finish import Job, finish
 from zscout.services.recorder.hosts import HostTracker
+from zscout.services.recorder.past import PastBar, PastLane
 from zscout.services.recorder.robots import RobotTracker
 
 log = logging.getLogger(__name__)
@@ -36,6 +46,12 @@ CONTENDED: Final = 300.0
 """Seconds for which an RC for which nobody waits any more stands among the contended ones of a live view."""
 REGROUP: Final = 5.0
 """Seconds between two times at which a live view's RCs may change their panes."""
+ROWS_MORE: Final = 4
+"""The chart of bookings grows by so many rows."""
+PAST_MARK: Final = " (journal)"
+"""Follows the ARC's name in an RC's lane where a journal told of it."""
+PAST_PART: Final = 0.4
+"""Of a colour that is left then."""
 FILE_TICK: Final = 1.0
 """Seconds for which a file gathers what it writes: a file that is written to its end is made of few, large chunks
 only then, and one whose recorder was killed stays as it is."""
@@ -74,13 +90,16 @@ class Timeline(Drawing):
         self._arc_lanes = Lanes(self, "arc", MAX_ARCS, "ARCs: the others have no lane", colours=ARC_STATES)
         self.hosts = HostTracker(self, self._colour_of)
         self.robots = RobotTracker(self)
-        self._arranged: object = (False, NO_ROBOTS, (), ())
+        self.bookings = BookingTracker(self, self._colour_of)
+        self._arranged: object = (False, NO_ROBOTS, 0, 0.0, (), (), ())
         self._contended: dict[str, float] = {}
         """When somebody waited last for an RC, by entity."""
         self._absent: set[str] = set()
         self._grouped = -REGROUP
         """When RCs were grouped last for the live view."""
         self._groups: tuple[tuple[str, ...], tuple[str, ...]] = (), ()
+        self._past, self._past_here = 0.0, False
+        """Seconds of the past that journals told of; and whether the present file has them."""
         if port is not None:
             port = _free_port(bind, port)
             host = f"[{bind}]" if ":" in bind else bind
@@ -149,6 +168,7 @@ class Timeline(Drawing):
         self._file.send_blueprint(blueprint(self.layout(live=True)))
         self.streams.remove(before)
         self.begin = self.end = at
+        self._past_here = False
         self._contended = {entity: since for entity, since in self._contended.items() if at - since <= CONTENDED}
         return Job(old, layout) if disconnect(before, DISCONNECT_SECONDS) else None
 
@@ -164,6 +184,23 @@ class Timeline(Drawing):
             name = clean_text(holder.arc) + (OPERATOR_MARK if holder.operator else "")
             shown[name] = name, OPERATOR if holder.operator else self._colour(at, holder.arc)
         self._rc_lanes.show(at, rc, shown)
+
+    def past(self, seconds: float, lanes: Mapping[str, PastLane]) -> None:
+        """What RCs showed before second 0, as journals tell, for up to so many seconds."""
+        if not lanes or self.closed:
+            return
+        for rc, changes in lanes.items():
+            self._rc_lanes.past(rc, [(at, [self._past_bar(bar) for bar in bars]) for at, bars in changes])
+        self._past, self._past_here = seconds, True
+        self.arrange()
+
+    def _past_bar(self, bar: PastBar | None) -> tuple[str, int]:
+        if bar is None:
+            return "", OTHER
+        if not bar.arc:
+            return "not known", ABSENT
+        name = clean_text(bar.arc) + (OPERATOR_MARK if bar.operator else "") + PAST_MARK
+        return name, faded(OPERATOR if bar.operator else self._colour_of(bar.arc), PAST_PART)
 
     def contended(self, at: float, rcs: Iterable[str]) -> None:
         """Somebody waits for these RCs: they are shown first."""
@@ -243,7 +280,7 @@ class Timeline(Drawing):
         has no use for empty panes."""
         robots = self.robots.shown
         robots = robots._replace(behavior_rows=min(robots.behavior_rows, 1))
-        now = self.hosts.placing, robots, *self._groups
+        now = self.hosts.placing, robots, self._ahead_rows(), self._past, self._rc_lanes.only_past, *self._groups
         if now != self._arranged and not self.closed:
             self._arranged = now
             layout = blueprint(self.layout(live=True))
@@ -268,7 +305,14 @@ class Timeline(Drawing):
             arc_rows=arc_rows,
             host_rows=host_rows if self.hosts.placing else 0,
             robots=robots,
+            ahead=self._ahead_rows(),
+            past=self._past if live or self._past_here else 0.0,
+            only_past=self._rc_lanes.only_past,
         )
+
+    def _ahead_rows(self) -> int:
+        """A few more than there are: a layout that is sent anew undoes what people have changed of it."""
+        return min(-(-self.bookings.rows // ROWS_MORE) * ROWS_MORE, MAX_CHART_ROWS + 1)
 
     def _colour(self, at: float, arc: str) -> int:
         others = "ARC names: the others have no lane and no colour of their own"

@@ -1,0 +1,147 @@
+"""The journals of all candidates, asked side by side, and what they tell as one."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from msgspec import structs
+
+from zscout.config.fleet import MAX_CANDIDATES, Fleet
+from zscout.keyexpr import Role, Token
+from zscout.mesh import Mesh
+from zscout.mesh.supervision import done_within
+from zscout.messages import MAX_PAGE, History, HistoryAsk, PastHold
+from zscout.services.journal.merging import Span, enough, merged, unknown_to, unknown_to_all
+from zscout.types import HostName
+
+ASK: Final = 5.0
+"""Seconds that a candidate has for a page."""
+QUIET: Final = 0.3
+"""Seconds without another candidate after which all are seen."""
+AT_ONCE: Final = 16
+"""Candidates that are asked at one time."""
+CAUSES: Final[Mapping[str, str]] = {
+    "off": "did not run",
+    "silent": "heard no RCM",
+    "missed": "missed publications",
+    "dropped": "could not keep all",
+}
+
+
+class NoJournal(Exception):
+    """Nobody tells, or not all of it: one line that says why."""
+
+
+class NoCandidate(NoJournal):
+    """Nobody is there to be asked."""
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What the journals tell of a window."""
+
+    window: Span
+    holds: Sequence[PastHold]
+    """In the order in which they began: of more than were wanted the latest."""
+    more: bool
+    """Whether there are earlier ones."""
+    journals: Mapping[HostName, History]
+    """The first page of each candidate that answered."""
+    without: Sequence[HostName]
+    """Candidates that did not: they keep no journal, are older than journals, or too slow."""
+
+    @property
+    def unknown(self) -> list[Span]:
+        """Times of which no journal knows all."""
+        return unknown_to_all([*self.journals.values()], self.window)
+
+    def causes(self, unknown: Span) -> str:
+        """Why none knows of it, by candidate."""
+        words = []
+        for host, journal in sorted(self.journals.items()):
+            found = [
+                CAUSES[gap.cause]
+                for gap in journal.gaps
+                if gap.began < unknown.ended and (gap.ended is None or gap.ended > unknown.began)
+            ]
+            if not found and any(one.ended > unknown.began for one in unknown_to(journal, unknown)):
+                found = ["has nothing of then"]
+            words += [f"{host} {', '.join(dict.fromkeys(found))}"] if found else []
+        return "; ".join(words)
+
+
+async def ask_journals(
+    mesh: Mesh,
+    fleet: Fleet,
+    asked: HistoryAsk,
+    most: int,
+    *,
+    look: float = QUIET,
+    wall: Callable[[], float] = time.time,
+) -> Told:
+    """The latest holds, `most` at most, from as few journals as know all that any knows. `look`: seconds in which some
+    candidate comes into sight; `wall`: seconds since 1970, UTC. Raises NoJournal where none answers, or one does not
+    go on."""
+    hosts = await _candidates(mesh, fleet, look)
+    why = f"fleet {fleet.name} has no journal that could be asked"
+    if not hosts:
+        raise NoCandidate(f"{why}: no candidate is seen; see [journal] of a node file")
+    slots = asyncio.Semaphore(AT_ONCE)
+
+    async def page(host: HostName, question: HistoryAsk) -> History | None:
+        async with slots:
+            reply = await mesh.ask_one(mesh.keys.history(host, mesh.me), question, History, timeout=ASK)
+        return reply.message if reply is not None and reply.message is not None and reply.message.host == host else None
+
+    async def pages(host: HostName) -> tuple[list[PastHold], bool]:
+        found: list[PastHold] = []
+        question: HistoryAsk | None = structs.replace(asked, limit=min(most, MAX_PAGE))
+        while question is not None and len(found) < most:
+            answer = await page(host, question)
+            if answer is None:
+                raise NoJournal(f"{host} did not go on to tell its journal; try again")
+            found += answer.holds
+            # What does not go on would never end.
+            ahead = answer.next is not None and answer.next != question.before
+            question = structs.replace(question, before=answer.next) if ahead else None
+        return found, question is not None
+
+    firsts = await asyncio.gather(*(page(host, structs.replace(asked, limit=1)) for host in hosts))
+    journals = {host: first for host, first in zip(hosts, firsts, strict=True) if first is not None}
+    if not journals:
+        count = "1 candidate" if len(hosts) == 1 else f"{len(hosts)} candidates"
+        raise NoJournal(f"{why}: none of its {count} answers; see [journal] of a node file")
+    now = wall()
+    begins = [one.since for one in journals.values() if one.since is not None]
+    began = now - asked.since if asked.since is not None else min(begins, default=now)
+    window = Span(began, now - asked.until)
+    found = await asyncio.gather(*map(pages, enough(journals, window)))
+    holds = merged(some for some, _ in found)
+    more = len(holds) > most or any(left for _, left in found)
+    return Told(window, holds[-most:], more, journals, [host for host in hosts if host not in journals])
+
+
+async def _candidates(mesh: Mesh, fleet: Fleet, look: float) -> list[HostName]:
+    """Those that are there: links are made one after another, so until no more come into sight."""
+    hosts: set[HostName] = set()
+    changed = asyncio.Event()
+
+    def seen(token: Token, alive: bool) -> None:
+        if alive and fleet.may_lead(token.host) and token.host not in hosts:
+            hosts.add(token.host)
+            changed.set()
+
+    watch = mesh.watch(mesh.keys.alive_any(Role.CANDIDATE), seen)
+    try:
+        known = -1
+        while known < len(hosts) <= MAX_CANDIDATES:
+            known = len(hosts)
+            changed.clear()
+            await done_within(QUIET if hosts else look, changed.wait())
+    finally:
+        watch.close()
+    return sorted(hosts)[:MAX_CANDIDATES]
