@@ -17,7 +17,6 @@ from zscout.scheduling.forecast import play_instant
 from zscout.scheduling.state import Strategy
 from zscout.types import ArcId, Ns, RcName
 
-
 SERVED: Final = (model.Outcome.COMPLETED, model.Outcome.RELEASED)
 """How holds end that had all that their programs wanted of them."""
 

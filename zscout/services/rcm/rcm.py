@@ -51,6 +51,7 @@ from zscout.scheduling.model import (
     VoteOverdue,
     WakeAt,
 )
+from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.authority import Authority
 from zscout.services.bookings.keeper import BookingKeeper
@@ -99,9 +100,11 @@ class Rcm:
         tally: Tally | None = None,
         keeper: BookingKeeper | None = None,
         kept: Sequence[messages.BookingsKept] = (),
+        runtimes: RuntimeEstimator | None = None,
     ) -> None:
         """`inventory`, `authority`, `keeper`: those of its candidate, if it has one. `places`, `kept`: what it has
-        recovered. `listeners` are told of holds, and `tally` counts how operations end."""
+        recovered. `listeners` are told of holds, and `tally` counts how operations end. Forecasts go by
+        `runtimes`."""
         self.mesh, self.fleet, self.term = mesh, fleet, term
         self.supervisor = Supervisor(f"the RCM of term {term.counter}", on_failure)
         self._authority = authority or Authority(fleet)
@@ -109,6 +112,7 @@ class Rcm:
         supervisor, receive = self.supervisor, self._receive
         self.places = places or Places(fleet.name, None, term)
         self.registry = RequestRegistry(mesh, self.core, term, supervisor, self.places)
+        self.registry.runtimes = runtimes
         self._own_inventory = inventory is None
         self.inventory = inventory or Inventory(mesh, fleet)
         devices = self.inventory.devices
