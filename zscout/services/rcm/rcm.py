@@ -112,7 +112,7 @@ class Rcm:
         supervisor, receive = self.supervisor, self._receive
         self.places = places or Places(fleet.name, None, term)
         self.registry = RequestRegistry(mesh, self.core, term, supervisor, self.places)
-        self.registry.runtimes = runtimes
+        self._runtimes = self.registry.runtimes = runtimes
         self._own_inventory = inventory is None
         self.inventory = inventory or Inventory(mesh, fleet)
         devices = self.inventory.devices
@@ -444,7 +444,7 @@ class Rcm:
             query.answer(messages.RcmState(self.term, self.seq, self.mesh.me.host, rcs=rcs, version=VERSION))
             return
         status = self.core.status(0 if asked.holds_only else MAX_LISTED)
-        holds = [_hold_view(arc, arc.hold, now) for arc in status.running if arc.hold is not None]
+        holds = [_hold_view(arc, arc.hold, now, self._runtimes) for arc in status.running if arc.hold is not None]
         instances = self.membership.named(sorted({rc for hold in holds for rc in hold.needs}))
         me = self.mesh.me.host
         state = messages.RcmState(self.term, self.seq, me, holds, instances=instances, version=VERSION)
@@ -528,7 +528,8 @@ def _revocation(effect: HoldEnded, name: str, now: Ns, *, own: bool) -> messages
     )
 
 
-def _hold_view(arc: ArcStatus, hold: Hold, now: Ns) -> messages.HoldView:
+def _hold_view(arc: ArcStatus, hold: Hold, now: Ns, runtimes: RuntimeEstimator | None) -> messages.HoldView:
+    end = None if runtimes is None else runtimes.end(arc.request, hold, now)
     return messages.HoldView(
         **_of(arc),
         grant=hold.grant,
@@ -538,6 +539,7 @@ def _hold_view(arc: ArcStatus, hold: Hold, now: Ns) -> messages.HoldView:
         keep=arc.request.keep,
         bound=dict(arc.bound),
         direct=arc.request.direct,
+        ends_in=None if end is None else (end - now) / SECOND,
     )
 
 

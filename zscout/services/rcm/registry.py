@@ -289,7 +289,7 @@ class RequestRegistry:
         """When each queued ARC will start, forecast from the present state; absent: never, or too late."""
         if self._foreseen is None or self._foreseen[0] != self._core.batches:
             now = self._mesh.now()
-            self._starts = forecast(self._core, now, runtimes=self.runtimes).starts
+            self._starts = forecast(self._core, now, None, self.runtimes).starts
             self._foreseen = self._core.batches, now
         return self._starts
 
