@@ -79,10 +79,9 @@ def test_what_is_known_of_a_name_serves_for_other_rcs_until_more_is_known() -> N
     assert estimator.runtime(wish()) == 10 * MINUTE
 
 
-def test_another_program_of_the_same_owner_is_expected_to_be_like_its_others() -> None:
-    assert taught(*[10 * MINUTE] * 3).runtime(wish(HOUR, "another")) == 10 * MINUTE
-    other = ArcRequest("one", "h2/c", {"robot/a": {}}, 0, HOUR)
-    assert taught(*[10 * MINUTE] * 3).runtime(Wish.of(other)) is None
+def test_nothing_is_known_of_another_program() -> None:
+    assert taught(*[10 * MINUTE] * 3).runtime(wish(HOUR, "another")) is None
+    assert taught(*[10 * MINUTE] * 3).runtime(wish()._replace(command="another")) is None
 
 
 def test_a_hold_that_was_taken_away_would_have_lasted_longer() -> None:

@@ -3,8 +3,8 @@ to take ten minutes.
 
 After Tsafrir, Etsion and Feitelson, "Backfilling using system-generated predictions rather than user runtime estimates"
 (IEEE TPDS 18(6), 2007): what is asked for is kept for whatever ends a hold or promises something, and predictions
-serve estimates alone. Histories are by name, command and RCs as asked, and by less where that is not known well
-enough. A hold that was taken away would have lasted longer: its time is a lower bound, and medians are those of Kaplan
+serve estimates alone. Histories are by name, command and RCs as asked, and by name and command alone where that
+is not known well enough. A hold that was taken away would have lasted longer: its time is a lower bound, and medians are those of Kaplan
 and Meier ("Nonparametric estimation from incomplete observations", JASA 53, 1958), among the holds that lasted longer
 than the one in question has already.
 
@@ -40,16 +40,14 @@ class Wish(NamedTuple):
 
     name: str
     command: str
-    owner: str
     needs: frozenset[Need]
     runtime: Ns
     """> 0."""
 
     @classmethod
     def of(cls, request: ArcRequest) -> Wish:
-        who, host = request.who, request.client.partition("/")[0]
-        command, user = ("", "") if who is None else (who.command, who.user)
-        return cls(request.name, command, user or host, frozenset(request.needs), request.min_runtime)
+        command = "" if request.who is None else request.who.command
+        return cls(request.name, command, frozenset(request.needs), request.min_runtime)
 
     def histories(self) -> Iterator[Hashable]:
         """The keys of those that it belongs to, the closest first."""
@@ -57,7 +55,6 @@ class Wish(NamedTuple):
         if len(self.needs) <= MAX_NEEDS:
             yield name, command, self.needs
         yield name, command
-        yield (self.owner[:MAX_TEXT],)
 
 
 class RuntimeEstimator:

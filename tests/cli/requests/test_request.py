@@ -264,11 +264,12 @@ def test_a_command_does_not_outlive_zscout(fleet: CliFleet) -> None:
 
 
 def test_a_timeout_ends_the_wait(fleet: CliFleet) -> None:
-    blocker = fleet.holder("blocker", "robot/a")
+    # A name of its own: nothing is known of how long it takes.
+    blocker = fleet.holder("patient", "robot/a")
     done = fleet.zscout("request", "robot/a", "--name", "late", "--timeout", "400ms", "--json")
     assert done.returncode == 1
     waits, ended = events(done.stdout)
-    assert waits["needs"][0]["holders"][0]["arc"] == "blocker"
+    assert waits["needs"][0]["holders"][0]["arc"] == "patient"
     assert 50 < waits["starts_in"] < 60
     assert waits["starts_in"] == pytest.approx(waits["needs"][0]["holders"][0]["remaining"], abs=0.5)
     assert (ended["event"], ended["outcome"]) == ("ended", "timeout")

@@ -109,7 +109,7 @@ def test_one_who_starts_anew_knows_what_its_journal_knows(tmp_path: Path) -> Non
 
 
 def wish(need: str, asked: int = 60) -> Wish:
-    return Wish("survey", "./survey.py", "alice", frozenset({need}), asked * SECOND)
+    return Wish("survey", "./survey.py", frozenset({need}), asked * SECOND)
 
 
 def tell(observer: RuntimeObserver, number: int, lasted: float, outcome: str, reason: str, **more: Any) -> None:

@@ -46,7 +46,7 @@ class RuntimeObserver:
             if hold.ended is not None and hold.min_runtime is not None and not hold.late and hold.rcs:
                 asked = round(hold.min_runtime * SECOND)
                 if asked > 0:
-                    wish = _wish(hold.arc, hold.client, hold.who, hold.rcs, asked)
+                    wish = _wish(hold.arc, hold.who, hold.rcs, asked)
                     self._end(wish, round((hold.ended - hold.began) * SECOND), hold)
 
     def _begin(self, now: Ns, holder: Holder) -> None:
@@ -56,7 +56,7 @@ class RuntimeObserver:
             return
         patterns = {rc: need for need, rc in holder.bound.items()}
         needs = [patterns.get(rc, rc) for rc in holder.rcs]
-        wish = _wish(holder.arc, holder.client, holder.who, needs, asked)
+        wish = _wish(holder.arc, holder.who, needs, asked)
         # One that is heard of late, or goes on under another grant, began as long ago as it has used up of its time.
         self._open[holder.grant] = _Begun(wish, now - max(0, asked - round(holder.remaining * SECOND)))
         if len(self._open) > MAX_OPEN:
@@ -71,6 +71,5 @@ class RuntimeObserver:
         self.estimator.observe(wish, lasted, whole=whole)
 
 
-def _wish(arc: str, client: str, who: Who | None, needs: Iterable[str], asked: Ns) -> Wish:
-    command, user = ("", "") if who is None else (who.command, who.user)
-    return Wish(arc, command, user or client.partition("/")[0], frozenset(needs), asked)
+def _wish(arc: str, who: Who | None, needs: Iterable[str], asked: Ns) -> Wish:
+    return Wish(arc, "" if who is None else who.command, frozenset(needs), asked)
