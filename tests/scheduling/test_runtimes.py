@@ -113,7 +113,7 @@ def test_a_forecast_goes_by_what_was_learned_and_a_kept_hold_by_when_it_is_given
         lower = ArcRequest("low", "z/c", {"robot/a": {}}, -1, HOUR)
         core.handle(0, Requested(lower))
         told = forecast(core, 0, runtimes=taught(*[10 * MINUTE] * 3)).starts
-        assert told == {"next": 10 * MINUTE, "low": 20 * MINUTE}
+        assert told == {"next": 10 * MINUTE, "low": 70 * MINUTE}
         # In its eleventh minute nothing but a little more is expected.
         told = forecast(core, 11 * MINUTE, runtimes=taught(*[10 * MINUTE] * 3)).starts
         assert 11 * MINUTE < told["next"] < 13 * MINUTE

@@ -3,10 +3,10 @@ to take ten minutes.
 
 After Tsafrir, Etsion and Feitelson, "Backfilling using system-generated predictions rather than user runtime estimates"
 (IEEE TPDS 18(6), 2007): what is asked for is kept for whatever ends a hold or promises something, and predictions
-serve estimates alone. Histories are by name, command and RCs as asked, and by name and command alone where that
-is not known well enough. A hold that was taken away would have lasted longer: its time is a lower bound, and medians are those of Kaplan
-and Meier ("Nonparametric estimation from incomplete observations", JASA 53, 1958), among the holds that lasted longer
-than the one in question has already.
+serve estimates alone. Histories are by name, command and RCs as asked, and by name and command alone where too little
+is known of that. A hold that was taken away would have lasted longer: its time is a lower bound, and medians are those
+of Kaplan and Meier ("Nonparametric estimation from incomplete observations", JASA 53, 1958), among the holds that
+lasted longer than the one in question has already.
 
 Each history judges itself. It foretells every hold in two ways, by the time that earlier ones lasted and by the share
 of what they had asked for, and goes by the better one only where that was nearer than what was asked for.
