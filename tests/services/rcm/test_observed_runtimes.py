@@ -17,7 +17,7 @@ from zscout.config.node import JournalConfig
 from zscout.messages import Cancel, Release, Who
 from zscout.scheduling.reason import ITS_CLIENT, Reason, ReasonCode
 from zscout.scheduling.runtimes import Wish
-from zscout.services.journal.follower import HoldOver, HoldSeen
+from zscout.services.journal.follower import Change, HoldOver, HoldSeen
 from zscout.services.journal.journal import Journal
 from zscout.services.journal.store import JournalStore
 from zscout.services.rcm import observed_runtimes
@@ -164,7 +164,13 @@ def test_a_journal_tells_of_what_it_heard_from_beginning_to_end(tmp_path: Path) 
     store.open()
     whole = past(1, 10.0, 12.0, "released")
     later = past(2, 11.0, 20.0, "preempted")
-    changes = [HoldSeen(whole), HoldSeen(later), HoldSeen(past(3, 12.0)), HoldOver(later), HoldOver(whole)]
+    changes: list[Change] = [
+        HoldSeen(whole),
+        HoldSeen(later),
+        HoldSeen(past(3, 12.0)),
+        HoldOver(later),
+        HoldOver(whole),
+    ]
     store.commit([*changes, HoldOver(past(4, 13.0, 14.0, "released", late=True))], 5.0, 30.0, 30.0)
     assert [hold.grant.seq for hold in store.latest(5)] == [1, 2]
     assert [hold.grant.seq for hold in store.latest(1)] == [2]

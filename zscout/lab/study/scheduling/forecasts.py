@@ -40,6 +40,8 @@ class ForecastJob:
     family: str
     seed: int
     strategy: str
+    exact: bool = False
+    """Whether all ask for exactly what they take."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,13 +83,13 @@ class _TrueRuntimes(RuntimeEstimator):
         return max(now + 1, hold.start + self._lasting[request.arc])
 
 
-def overestimated(workload: Workload, random: Random) -> tuple[Workload, Mapping[ArcId, Ns]]:
-    """The same with requests for too much time; and what each ARC takes, in ns."""
+def overestimated(workload: Workload, random: Random, *, exact: bool = False) -> tuple[Workload, Mapping[ArcId, Ns]]:
+    """The same as runs of programs that ask for too much time, unless `exact`; and what each ARC takes, in ns."""
     factors = [random.uniform(*FACTORS) for _ in range(PROGRAMS)]
     arrivals = []
     for arrival in workload.arrivals:
         program = random.randrange(PROGRAMS)
-        factor = factors[program] * random.uniform(1 - NOISE, 1 + NOISE)
+        factor = 1.0 if exact else factors[program] * random.uniform(1 - NOISE, 1 + NOISE)
         asked = round(arrival.request.min_runtime * factor / MILLISECOND) * MILLISECOND
         arrivals.append(Arrival(arrival.at, replace(arrival.request, label=f"program{program}", min_runtime=asked)))
     lasting = {arrival.request.arc: arrival.request.min_runtime for arrival in workload.arrivals}
@@ -97,7 +99,7 @@ def overestimated(workload: Workload, random: Random) -> tuple[Workload, Mapping
 def run(job: ForecastJob) -> ForecastTrial:
     """Raises KeyError for a family or strategy that does not exist."""
     random = Random(f"{job.family}/{job.seed}/asked")  # noqa: S311 - workloads, not secrets
-    workload, lasting = overestimated(FAMILIES[job.family].workload(job.seed), random)
+    workload, lasting = overestimated(FAMILIES[job.family].workload(job.seed), random, exact=job.exact)
     requests = {arrival.request.arc: arrival.request for arrival in workload.arrivals}
     learned, true = RuntimeEstimator(), _TrueRuntimes(lasting)
     queued: dict[ArcId, Ns] = {}
