@@ -14,6 +14,8 @@ from zscout.lab.replay import SERVED, replay
 from zscout.lab.study.scheduling.forecasts import overestimated
 from zscout.lab.workload import Workload
 from zscout.messages import Who
+from zscout.scheduling.adaptive import Adaptive
+from zscout.scheduling.booking import Booking
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcRequest, Effect, Granted, HoldEnded, RcJoined, Released, Requested, Tick
@@ -212,3 +214,14 @@ def test_what_is_given_back_at_its_end_is_given_back_once() -> None:
     assert forecast(core, 0, runtimes=estimator).starts == {f"a{number}": number * MINUTE for number in (1, 2, 3)}
     core.handle(MINUTE, Released("a0"))
     assert core.waiting == 2
+
+
+def test_a_slot_is_where_what_was_asked_for_is_over_and_likely_earlier() -> None:
+    core, estimator = Core(Adaptive()), taught(*[10 * MINUTE] * 5)
+    core.handle(0, RcJoined("robot/a", sharable=False))
+    core.handle(0, Requested(request("one")))
+    wanted = Booking("b", {"robot/a": {}}, 0, 0, MINUTE, MINUTE, 0)
+    assert core.slots(wanted, 2 * HOUR, 1).found[0].start == HOUR
+    assert core.likely_slot(wanted, 2 * HOUR, estimator) == 10 * MINUTE
+    assert core.likely_slot(wanted, 2 * HOUR, RuntimeEstimator()) == HOUR
+    assert core.likely_slot(wanted, MINUTE, estimator) is None

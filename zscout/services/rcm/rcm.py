@@ -149,6 +149,7 @@ class Rcm:
             self._propose,
             self.requests.check_door,
         )
+        self.bookings.handler.runtimes = runtimes
         self._heartbeat = fleet.timing.heartbeat
         self._grants = mesh.publisher(mesh.keys.grants, messages.Grants)
         self.seq = 0
