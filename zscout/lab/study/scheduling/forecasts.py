@@ -45,7 +45,7 @@ class ForecastJob:
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class ForetoldStart:
     """What an ARC was told when it was first queued, and what came: waits in ns. None: that it never starts."""
 
     waits: tuple[Ns | None, ...]
@@ -56,7 +56,7 @@ class Told:
 @dataclass(frozen=True, slots=True)
 class ForecastTrial:
     job: ForecastJob
-    told: tuple[Told, ...]
+    told: tuple[ForetoldStart, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +127,7 @@ def run(job: ForecastJob) -> ForecastTrial:
             told[arc] = tuple(starts[arc] - now if arc in starts else None for starts in found)
 
     replay(workload, watch, strategy=STRATEGIES[job.strategy](), lasting=lasting)
-    found = (Told(waits, started[arc] - queued[arc]) for arc, waits in told.items() if arc in started)
+    found = (ForetoldStart(waits, started[arc] - queued[arc]) for arc, waits in told.items() if arc in started)
     return ForecastTrial(job, tuple(found))
 
 
@@ -140,7 +140,7 @@ def accuracy(told: Sequence[tuple[Ns | None, Ns]]) -> Accuracy:
 
 def report(trials: Iterable[ForecastTrial]) -> list[FamilyForecasts]:
     """By family, in the order of the trials."""
-    families: dict[str, list[Told]] = {}
+    families: dict[str, list[ForetoldStart]] = {}
     for trial in trials:
         families.setdefault(trial.job.family, []).extend(trial.told)
     return [
