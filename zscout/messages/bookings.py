@@ -106,12 +106,14 @@ class SlotView(Message, frozen=True):
 
 
 class SlotsTold(Message, frozen=True):
-    """`complete` is False where there was more to look at than one question may. `time`: the fleet's."""
+    """`complete` is False where there was more to look at than one question may. `time`: the fleet's. `likely`: all is
+    likely to be there then, before it can be booked."""
 
     id: str
     time: WallTime
     slots: list[SlotView] = []
     complete: bool = True
+    likely: Instant | None = None
 
 
 DateState: TypeAlias = Literal["open", "taken", "used", "lapsed", "unbooked", "conflict"]

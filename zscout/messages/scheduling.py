@@ -287,7 +287,8 @@ class StateAsk(Message, frozen=True):
 
 class HoldView(_ArcParty, frozen=True):
     """A hold in force. `held` is how long it has stood, in seconds; `needs` are by RC, `bound` the RC that
-    meets each of its patterns."""
+    meets each of its patterns. In `ends_in` seconds it is likely to be given back, as such holds usually were, before
+    it is over."""
 
     priority: int
     grant: Grant
@@ -301,6 +302,7 @@ class HoldView(_ArcParty, frozen=True):
     direct: bool = False
     who: Who | None = None
     booking: BookingRef = ""
+    ends_in: Seconds | None = None
 
 
 class WaitView(_ArcParty, frozen=True):

@@ -38,6 +38,7 @@ from zscout.scheduling.model import (
 from zscout.scheduling.overlaps import Overlaps, overlaps
 from zscout.scheduling.priority import AdmissionCheck, Priority, reasons_of_now
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
+from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.scheduling.slots import SlotsFound, slots
 from zscout.scheduling.state import SchedulerState, Strategy
 from zscout.scheduling.votes import HolderSet
@@ -221,6 +222,14 @@ class Core:
         `bookings_only`: beside all other bookings, whoever holds or waits for what."""
         arc = self._claims.stand_in(wanted)
         return slots(self._state, wanted, arc, until, limit, bookings_only=bookings_only)
+
+    def likely_slot(self, wanted: Booking, until: Ns, runtimes: RuntimeEstimator) -> Ns | None:
+        """When it could start if holds were given back when they usually are: a guess, for which nothing is kept."""
+        now, running = self._state.now, self._state.running.values()
+        ends = {one.id: runtimes.end(one.request, one.hold, now) for one in running if one.hold is not None}
+        likely = {arc: end for arc, end in ends.items() if end is not None}
+        found = slots(self._state, wanted, self._claims.stand_in(wanted), until, 1, likely=likely).found
+        return found[0].start if found else None
 
     def overlaps(self, order: Iterable[str]) -> Overlaps:
         """Which bookings can't be beside those that go before them in this order of their ids."""

@@ -20,15 +20,18 @@ from zscout.scheduling.model import (
     Effect,
     Event,
     Granted,
+    Hold,
     HoldEnded,
     Outcome,
     Propose,
+    Released,
     Requested,
     Tick,
     Vote,
     WakeAt,
 )
 from zscout.scheduling.reason import Reason
+from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import ArcId, Ns, Term
 
@@ -60,17 +63,27 @@ class Forecast:
     """What the newcomer waits for at first; None if it starts at once."""
 
 
-def forecast(core: Core, now: Ns, newcomer: ArcRequest | None = None) -> Forecast:
-    """Plays `core` forward from `now`, with `newcomer` asking at once. `core` is not touched."""
+def forecast(
+    core: Core, now: Ns, newcomer: ArcRequest | None = None, runtimes: RuntimeEstimator | None = None
+) -> Forecast:
+    """Plays `core` forward from `now`, with `newcomer` asking at once. `core` is not touched. With `runtimes` holds are
+    taken to be given back when they usually are."""
     # A strategy may keep unfinished searches: the forecast must not meddle with them.
     copy = Core(STRATEGIES[core.strategy.name](), core.policy)
     joined, lead = core.as_events(Term(core.term.counter + 1, "forecast"))
     result = Forecast()
     ends = {held.request.arc: held.end for held in lead.recovered_holds}
+    releases: dict[ArcId, Ns] = {}
+    """When holds are likely to be given back."""
     booked = {one.id: (one, arc is None) for one, arc in core.bookings()}
     dates = sorted((at, name) for name, (one, is_open) in booked.items() for at in _dates(one, now, is_open=is_open))
     unserved = {one.request.arc for one in lead.waiting}
     """ARCs that are queued and have not started within what was played."""
+
+    def expect(request: ArcRequest, hold: Hold) -> None:
+        end = None if runtimes is None else runtimes.end(request, hold, now)
+        if end is not None:
+            releases[request.arc] = end
 
     def vote(asked: Propose) -> Vote:
         return Vote(asked.proposal, core.expects_yes(asked.rc, frozenset(asked.holders)))
@@ -85,8 +98,10 @@ def forecast(core: Core, now: Ns, newcomer: ArcRequest | None = None) -> Forecas
                     running = copy.arc(arc)
                     if running is not None and running.hold is not None:
                         ends[arc] = running.hold.end
+                        expect(running.request, running.hold)
                 case HoldEnded(arc=arc, outcome=outcome, by=by, requeued=requeued):
                     ends.pop(arc, None)
+                    releases.pop(arc, None)
                     if requeued and arc not in result.starts:
                         unserved.add(arc)
                     if preempting is not None and by == preempting and outcome is Outcome.PREEMPTED:
@@ -95,6 +110,8 @@ def forecast(core: Core, now: Ns, newcomer: ArcRequest | None = None) -> Forecas
         for arc in [arc for arc, end in ends.items() if end <= now]:
             del ends[arc]
 
+    for held in lead.recovered_holds:
+        expect(held.request, Hold(held.grant, held.start, held.end))
     step([*joined, lead])
     if newcomer is not None:
         unserved.add(newcomer.arc)
@@ -102,12 +119,12 @@ def forecast(core: Core, now: Ns, newcomer: ArcRequest | None = None) -> Forecas
         asking = copy.arc(newcomer.arc)
         result.reason = asking.reported if asking is not None else None
     checks = 0
-    while (ends or dates) and unserved:
+    while (ends or releases or dates) and unserved:
         checks += copy.waiting
         if checks > MAX_CHECKS:
             break
-        now = max(now, min((*ends.values(), *(date for date, _ in dates[:1]))))
-        events: list[Event] = [Tick()]
+        now = max(now, min((*ends.values(), *releases.values(), *(date for date, _ in dates[:1]))))
+        events: list[Event] = [Tick(), *(Released(arc) for arc, at in releases.items() if at <= now)]
         while dates and dates[0][0] <= now:
             date, name = dates.pop(0)
             booking, is_open = booked[name]

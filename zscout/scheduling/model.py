@@ -21,7 +21,7 @@ from zscout.keyexpr import is_pattern, matcher
 from zscout.messages import Who
 from zscout.scheduling.booking import Booked, Booking, BookingChanged, BookingThreatened, Redated, Unbooked
 from zscout.scheduling.needs import check_request
-from zscout.scheduling.reason import SHOWN, Party, Reason
+from zscout.scheduling.reason import ITS_CLIENT, SHOWN, Party, Reason
 from zscout.types import SECOND, ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName, Term
 
 QUANTUM: Ns = SECOND
@@ -292,14 +292,14 @@ class Cancelled(Struct, frozen=True):
     """The ARC is not wanted any more, whether it waits or runs."""
 
     arc: ArcId
-    by: str = "its client"
+    by: str = ITS_CLIENT
 
 
 class Released(Struct, frozen=True):
     """A running ARC gives back what it holds; a waiting one leaves the queue."""
 
     arc: ArcId
-    by: str = "its client"
+    by: str = ITS_CLIENT
 
 
 class Vote(Struct, frozen=True):

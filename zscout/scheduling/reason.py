@@ -10,6 +10,8 @@ from typing import Final, NamedTuple
 from zscout.messages import Who
 from zscout.types import ArcId, ClientId, Need, Ns, RcName, clean
 
+ITS_CLIENT: Final = "its client"
+"""In the `detail` of an end: it was its own client's will."""
 SHOWN = 3
 """How many RCs a reason names; it counts the rest."""
 SHOWN_CHOICES = 8

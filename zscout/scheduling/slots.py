@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from zscout.scheduling.booking import Booking
@@ -61,11 +62,12 @@ def slots(
     *,
     bookings_only: bool = False,
     presume: bool = False,
+    likely: Mapping[ArcId, Ns] = MappingProxyType({}),
 ) -> SlotsFound:
     """The first `limit` stretches of time in which `wanted` might start, from its own start to `until`; `arc` stands
     for it. `bookings_only`: as if nobody held or waited for anything. `presume`: votes that are not known are presumed
-    to be a yes."""
-    search, result = _Search(state, wanted, arc, bookings_only, presume), SlotsFound()
+    to be a yes. `likely`: when holds are taken to be over, if that is earlier: what is found then is a guess."""
+    search, result = _Search(state, wanted, arc, bookings_only, presume, likely), SlotsFound()
     latest: Ns = wanted.start - 1
     for tried, start in enumerate(search.starts(until)):
         if start <= latest:
@@ -87,8 +89,16 @@ def slots(
 
 
 class _Search:
-    def __init__(self, state: SchedulerState, wanted: Booking, arc: Arc, bookings_only: bool, presume: bool) -> None:
-        self._state, self._wanted, self._arc, self._presume = state, wanted, arc, presume
+    def __init__(
+        self,
+        state: SchedulerState,
+        wanted: Booking,
+        arc: Arc,
+        bookings_only: bool,
+        presume: bool,
+        likely: Mapping[ArcId, Ns],
+    ) -> None:
+        self._state, self._wanted, self._arc, self._presume, self._likely = state, wanted, arc, presume, likely
         self._named = list(state.rcs_in(arc.named_mask))
         barred = state.barred(arc) | arc.named_mask
         self._choices: dict[Need, list[Rc]] = {}
@@ -105,7 +115,8 @@ class _Search:
     def _held(self, rc: Rc) -> Iterable[_Taken]:
         now = self._state.now
         for holder in rc.non_preemptible_holders(self._arc, now):
-            yield _Taken(now, holder.known_end(self._arc), holder.id)
+            end = holder.known_end(self._arc)
+            yield _Taken(now, min(end, self._likely.get(holder.id, end)), holder.id)
 
     def _booked(self, rc: Rc) -> Iterable[_Taken]:
         for claim in self._state.claims.values():

@@ -64,6 +64,17 @@ def test_in_a_pipe_it_prints_plain_tables(capsys: pytest.CaptureFixture[str]) ->
     assert re.search(r"^unreached +\+0\.\d\d$", shown.out, re.MULTILINE)
 
 
+def test_forecasts_are_held_against_what_came(capsys: pytest.CaptureFixture[str]) -> None:
+    some = ("study", "forecasts", "--family", "calm", "--seeds", "1", "--jobs", "1")
+    assert zscout_here(*some, "--json") == 0
+    ((calm,),) = json.loads(capsys.readouterr().out).values()
+    assert calm["ways"].keys() == {"asked", "learned", "true"}
+    assert zscout_here(*some) == 0
+    assert re.search(
+        rf"^calm +{calm['queued']} +{calm['ways']['asked']['near']:.1%} ", capsys.readouterr().out, re.MULTILINE
+    )
+
+
 def test_the_group_s_help_leads_to_the_options(capsys: pytest.CaptureFixture[str]) -> None:
     assert zscout_here("study", "--help") == 0
     assert "Compares scheduling strategies" in capsys.readouterr().out

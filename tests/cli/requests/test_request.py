@@ -64,10 +64,10 @@ def test_without_a_command_it_holds_for_its_time(fleet: CliFleet) -> None:
 
 
 def test_in_a_pipe_it_says_who_is_in_the_way_and_since_when(fleet: CliFleet) -> None:
-    blocker = fleet.holder("blocker", "robot/a")
+    blocker = fleet.holder("slow", "robot/a")
     waiting = fleet.start("request", "robot/a", "--name", "next", "--", "true")
     (line,) = read_until(waiting, "next waits")
-    who = re.escape(named("blocker"))
+    who = re.escape(named("slow"))
     assert re.fullmatch(
         rf"next waits for {who}: robot/a, until {CLOCK} at the latest; starts at {CLOCK} \(in (\d\d s|1 min)\); "
         rf"robot/a: {who}, priority 0, since {CLOCK} \(.* s\), until {CLOCK} \((\d\d s|1 min)\) at the latest",
@@ -264,11 +264,12 @@ def test_a_command_does_not_outlive_zscout(fleet: CliFleet) -> None:
 
 
 def test_a_timeout_ends_the_wait(fleet: CliFleet) -> None:
-    blocker = fleet.holder("blocker", "robot/a")
+    # A name of its own: nothing is known of how long it takes.
+    blocker = fleet.holder("patient", "robot/a")
     done = fleet.zscout("request", "robot/a", "--name", "late", "--timeout", "400ms", "--json")
     assert done.returncode == 1
     waits, ended = events(done.stdout)
-    assert waits["needs"][0]["holders"][0]["arc"] == "blocker"
+    assert waits["needs"][0]["holders"][0]["arc"] == "patient"
     assert 50 < waits["starts_in"] < 60
     assert waits["starts_in"] == pytest.approx(waits["needs"][0]["holders"][0]["remaining"], abs=0.5)
     assert (ended["event"], ended["outcome"]) == ("ended", "timeout")

@@ -22,6 +22,7 @@ from zscout.messages import (
     BookingView,
     FindSlots,
     Operation,
+    Release,
     SlotsTold,
     Unbook,
 )
@@ -168,6 +169,24 @@ def test_slots_are_the_times_between_bookings() -> None:
         # The same again is the same booking.
         assert (await do(client, book("d", "robot/a", at=100), BookingView)).id == "d"
         assert set(await fleet.bookings()) == {"c", "d"}
+
+    run(story())
+
+
+def test_slots_go_by_what_was_asked_for_and_tell_what_is_likely() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x")
+        await led(fleet, "x")
+        client, other = fleet.client("one"), fleet.client("two")
+        asked = FindSlots("s", request("s", "robot/a").needs, 0, Decimal(60), within=1_000)
+        for number in range(4):
+            await other.do(replace(request("survey", "robot/a", seconds=600), id=f"survey{number}"))
+            begun = fleet.time()
+            told = await do(client, asked, SlotsTold)
+            assert told.slots[0].start == pytest.approx(begun + 600, abs=2)
+            assert told.likely == (None if number < 3 else pytest.approx(begun + 30, abs=2))
+            await asyncio.sleep(30)
+            await other.do(Release(f"survey{number}"))
 
     run(story())
 

@@ -166,6 +166,8 @@ class Standing:
             until = f"{clock(hold.remaining, at_latest=True)} ({span(hold.remaining)})"
             if hold.keep:
                 until = f"{until}, keeps" if hold.remaining > 0 else "kept"
+            if hold.ends_in is not None:
+                until = f"{until}, likely {clock(hold.ends_in)}"
             rcs = " ".join(sorted(hold.needs))
             rows.append((hold.arc, _who(hold), str(hold.priority), since, until, rcs, hold.client))
             operator = hold.priority >= self.fleet_view.client.fleet.operator_priority

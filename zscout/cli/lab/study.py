@@ -50,6 +50,7 @@ def study() -> None:
       zscout study
       zscout study schedule --family paper --seeds 100
       zscout study bookings --seeds 20
+      zscout study forecasts --family load65
       zscout study placement --seeds 20
       zscout study robots --starts 40
       zscout study faults --runs 1000
@@ -161,6 +162,59 @@ def bookings(families: tuple[str, ...], seeds: range, processes: int | None, as_
     common.run(run_trials(study_of.run, study_of.jobs(chosen, seeds), processes, found.append))
     report = study_of.report(found)
     _show(dataclasses.asdict(report), None, partial(print_bookings, report), as_json=as_json)
+
+
+@study.command()
+@click.option(
+    "--family",
+    "families",
+    multiple=True,
+    type=click.Choice(list(FAMILIES)),
+    help="A family of workloads; repeat it for several. Default: all whose requests come one after the other.",
+)
+@click.option(
+    "--strategy", type=click.Choice(list(STRATEGIES)), default="adaptive", show_default=True, help="Who schedules."
+)
+@click.option("--exact", is_flag=True, help="All ask for exactly what they take.")
+@seeds_option("5", "Workloads of each family: so many, or those of seeds A to B.", MAX_SEEDS)
+@jobs_option
+@common.json_option("Print one JSON object instead of a table.")
+def forecasts(
+    families: tuple[str, ...], strategy: str, exact: bool, seeds: range, processes: int | None, as_json: bool
+) -> None:
+    """Measures how right it is what requests are told of their start, where they ask for 2 to 10 times too much.
+
+    Each ARC is a run of one of 12 programs, and asks for so many times what it takes: always about as many for
+    one program. As it is queued its start is foretold from what holds have asked for, from what was learned of
+    how long they last, and from what they will take: the best there can be, as nobody knows who comes later.
+    docs/study.md says what was found.
+
+    \b
+    Examples:
+      zscout study forecasts
+      zscout study forecasts --family load65 --family bursts --seeds 20
+      zscout study forecasts --exact --strategy priority --json
+    """
+    chosen = list(dict.fromkeys(families)) or [name for name, family in FAMILIES.items() if not family.at_once]
+    from zscout.lab.study.process_pool import run_trials
+    from zscout.lab.study.scheduling import forecasts as study
+
+    trials: list[study.ForecastTrial] = []
+    planned = [study.ForecastJob(family, seed, strategy, exact) for family in chosen for seed in seeds]
+    common.run(run_trials(study.run, planned, processes, trials.append))
+    found = study.report(trials)
+    if as_json:
+        terminal.print_json({"families": [dataclasses.asdict(one) for one in found]})
+        return
+    columns = ["family", "queued", *(f"near, {way}" for way in study.WAYS), *(f"error, {way}" for way in study.WAYS)]
+    rows = [
+        [one.family, str(one.queued)]
+        + [f"{one.ways[way].near:.1%}" for way in study.WAYS]
+        + [f"{one.ways[way].error:.1f} s" for way in study.WAYS]
+        for one in found
+    ]
+    title = f"Starts as they were foretold by what was asked for, learned and true ({strategy})"
+    terminal.print_table(columns, rows, title=title)
 
 
 @study.command()

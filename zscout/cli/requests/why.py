@@ -154,6 +154,10 @@ def _print_standing(arc: dict[str, Any]) -> None:
             left = f"until {_end(arc['remaining'])}, its minimum runtime of {runtime}"
         after = "; it keeps what it has after that" if arc["keep"] else ""
         _say(f"  {left}{after}")
+        if (ends := arc.get("ends_in")) is not None:
+            _say(
+                f"  it is likely to be given back at {terminal.clock(ends)} (in {terminal.span(ends)}), as others were"
+            )
         return
     _say(f"{who} has waited since {_past(arc['waited'])}", bold=True, fg="yellow")
     _say(names)

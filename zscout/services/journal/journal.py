@@ -17,7 +17,7 @@ from zscout.config.node import JournalConfig
 from zscout.keyexpr import check_need
 from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError, Refused
 from zscout.mesh.supervision import Supervisor, done_within
-from zscout.messages import Grants, HistoryAsk, JournalGap, Problem, RcmState, StateAsk
+from zscout.messages import Grants, HistoryAsk, JournalGap, PastHold, Problem, RcmState, StateAsk
 from zscout.services.journal.follower import Change, Follower, PublicationHeard, StateRead
 from zscout.services.journal.store import Damaged, JournalStore, Unwritable
 from zscout.types import NO_TERM, SECOND, Ns, Term
@@ -34,6 +34,8 @@ AGAIN_AFTER: Final = 30.0
 """Seconds until a disk that failed is tried again."""
 MAX_GATHERED: Final = 100_000
 """Holders and ends that wait to be committed: more are dropped, and the journal has a gap."""
+MAX_TOLD: Final = 5_000
+"""Holds that a journal tells of when it is opened."""
 MAX_ASKING: Final = 16
 """Questions that are answered at one time."""
 ENDS_WITHIN: Final = 5.0
@@ -65,6 +67,9 @@ class Journal:
         """None: the file is not open."""
         self._pending: list[Change] = []
         """Worked out, and not written yet."""
+        self.on_opened: Callable[[list[PastHold]], object] = lambda _: None
+        """Called once, in the event loop, with the latest holds of the journal as it was left, the oldest first."""
+        self._told = False
         self._troubled: str | None = None
         self._not_before: Ns = 0
         self._read_at: Ns = 0
@@ -134,7 +139,11 @@ class Journal:
         try:
             if self._follower is None:
                 stood, left = await asyncio.to_thread(self._store.open)
+                latest = [] if self._told else await asyncio.to_thread(self._store.latest, MAX_TOLD)
                 self._follower = Follower(self._silent, stood, left)
+                if not self._told:
+                    self._told = True
+                    self.on_opened(latest)
             await self._write(self._follower)
         except Unwritable as error:
             self._trouble(error)

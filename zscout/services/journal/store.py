@@ -139,6 +139,16 @@ class JournalStore:
             except sqlite3.Error as error:
                 raise self._failed(error) from None
 
+    def latest(self, limit: int) -> list[PastHold]:
+        """The last holds whose beginning and end were heard, the oldest first. Raises Unwritable."""
+        heard = f"ended IS NOT NULL AND late = 0 AND outcome <> '{UNHEARD}'"
+        sql = f"SELECT {_COLUMNS} FROM holds WHERE {heard} ORDER BY ended DESC LIMIT ?"  # noqa: S608 - constants
+        with self._one:
+            try:
+                return [_hold(row) for row in reversed(self._opened().execute(sql, (limit,)).fetchall())]
+            except sqlite3.Error as error:
+                raise self._failed(error) from None
+
     def size(self) -> int:
         """Bytes of the file that are in use."""
         with self._one:

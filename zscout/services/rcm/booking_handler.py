@@ -38,6 +38,7 @@ from zscout.messages import (
 from zscout.scheduling.booking import Booking
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Tick
+from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.services.authority import Authority
 from zscout.services.bookings.dates import DAY, dates, zone_of
 from zscout.services.bookings.keeper import BookingKeeper
@@ -87,6 +88,8 @@ class BookingHandler:
         self._fleet, self._core, self._keeper, self._dates, self._sharing = fleet, core, keeper, dates_, sharing
         self._authority, self._supervisor, self._emit, self._check_door = authority, supervisor, emit, check_door
         self._now, self._keys = keeper.mesh.now, keeper.mesh.keys
+        self.runtimes: RuntimeEstimator | None = None
+        """What is known of how long holds last, for hints."""
         self._undecided: list[_Undecided] = []
         self._keeping = 0
 
@@ -281,7 +284,11 @@ class BookingHandler:
         for one in found.found:
             start, latest = -(-self._dates.to_fleet(one.start) // SECOND), self._dates.to_fleet(one.latest) // SECOND
             slots.append(SlotView(start, max(start, latest), dict(one.bound)))
-        query.answer(SlotsTold(asked.id, self._dates.time, slots, found.complete))
+        guess = None if self.runtimes is None else self._core.likely_slot(wanted, until, self.runtimes)
+        likely = None if guess is None else -(-self._dates.to_fleet(guess) // SECOND)
+        if likely is not None and slots and likely >= slots[0].start:
+            likely = None
+        query.answer(SlotsTold(asked.id, self._dates.time, slots, found.complete, likely))
         return True
 
     # Votes

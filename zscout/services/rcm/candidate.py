@@ -40,6 +40,7 @@ from zscout.services.rcm.bookings import BookedDanger
 from zscout.services.rcm.digest import HoldListener
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.inventory import Inventory
+from zscout.services.rcm.observed_runtimes import RuntimeObserver
 from zscout.services.rcm.places import Places
 from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.recovery import aged, take_over
@@ -76,7 +77,9 @@ class Candidate:
         the managers of a fleet seal places. `listeners` are told of holds while it leads, `journal` of publications.
         `keeper` keeps bookings; without one it keeps them in memory, for itself."""
         self._keeper = keeper or BookingKeeper(mesh)
-        self._journal = journal
+        self._journal, self._runtimes = journal, RuntimeObserver()
+        if journal is not None:
+            journal.on_opened = self._runtimes.recall
         self._places_key = places_key
         self._authority = authority or Authority(fleet)
         self.mesh, self.fleet = mesh, fleet
@@ -174,6 +177,7 @@ class Candidate:
         if known or self._see(grants.term):
             self.election.published(grants.term, self.mesh.now())
             self._keeper.hear(grants)
+            self._runtimes.hear(self.mesh.now(), grants)
             if self._journal is not None:
                 self._journal.hear(grants)
 
@@ -348,6 +352,7 @@ class Candidate:
             self.tally,
             self._keeper,
             kept,
+            self._runtimes.estimator,
         )
         self.terms_led += 1
         rcm.membership.on_disbelieved = self._disbelieved

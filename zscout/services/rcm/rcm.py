@@ -51,6 +51,7 @@ from zscout.scheduling.model import (
     VoteOverdue,
     WakeAt,
 )
+from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.authority import Authority
 from zscout.services.bookings.keeper import BookingKeeper
@@ -99,9 +100,11 @@ class Rcm:
         tally: Tally | None = None,
         keeper: BookingKeeper | None = None,
         kept: Sequence[messages.BookingsKept] = (),
+        runtimes: RuntimeEstimator | None = None,
     ) -> None:
         """`inventory`, `authority`, `keeper`: those of its candidate, if it has one. `places`, `kept`: what it has
-        recovered. `listeners` are told of holds, and `tally` counts how operations end."""
+        recovered. `listeners` are told of holds, and `tally` counts how operations end. Forecasts go by
+        `runtimes`."""
         self.mesh, self.fleet, self.term = mesh, fleet, term
         self.supervisor = Supervisor(f"the RCM of term {term.counter}", on_failure)
         self._authority = authority or Authority(fleet)
@@ -109,6 +112,7 @@ class Rcm:
         supervisor, receive = self.supervisor, self._receive
         self.places = places or Places(fleet.name, None, term)
         self.registry = RequestRegistry(mesh, self.core, term, supervisor, self.places)
+        self._runtimes = self.registry.runtimes = runtimes
         self._own_inventory = inventory is None
         self.inventory = inventory or Inventory(mesh, fleet)
         devices = self.inventory.devices
@@ -145,6 +149,7 @@ class Rcm:
             self._propose,
             self.requests.check_door,
         )
+        self.bookings.handler.runtimes = runtimes
         self._heartbeat = fleet.timing.heartbeat
         self._grants = mesh.publisher(mesh.keys.grants, messages.Grants)
         self.seq = 0
@@ -440,7 +445,7 @@ class Rcm:
             query.answer(messages.RcmState(self.term, self.seq, self.mesh.me.host, rcs=rcs, version=VERSION))
             return
         status = self.core.status(0 if asked.holds_only else MAX_LISTED)
-        holds = [_hold_view(arc, arc.hold, now) for arc in status.running if arc.hold is not None]
+        holds = [_hold_view(arc, arc.hold, now, self._runtimes) for arc in status.running if arc.hold is not None]
         instances = self.membership.named(sorted({rc for hold in holds for rc in hold.needs}))
         me = self.mesh.me.host
         state = messages.RcmState(self.term, self.seq, me, holds, instances=instances, version=VERSION)
@@ -524,7 +529,8 @@ def _revocation(effect: HoldEnded, name: str, now: Ns, *, own: bool) -> messages
     )
 
 
-def _hold_view(arc: ArcStatus, hold: Hold, now: Ns) -> messages.HoldView:
+def _hold_view(arc: ArcStatus, hold: Hold, now: Ns, runtimes: RuntimeEstimator | None) -> messages.HoldView:
+    end = None if runtimes is None else runtimes.end(arc.request, hold, now)
     return messages.HoldView(
         **_of(arc),
         grant=hold.grant,
@@ -534,6 +540,7 @@ def _hold_view(arc: ArcStatus, hold: Hold, now: Ns) -> messages.HoldView:
         keep=arc.request.keep,
         bound=dict(arc.bound),
         direct=arc.request.direct,
+        ends_in=None if end is None else (end - now) / SECOND,
     )
 
 

@@ -21,6 +21,7 @@ from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcStatus, Dropped, Effect, Granted, HoldEnded, Outcome, Queued
 from zscout.scheduling.reason import Party, Reason, ended, waits
+from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.services.rcm.places import Places, client_id, request_id
 from zscout.types import SECOND, ArcId, Grant, HostName, Ns, RcName, Term
 
@@ -82,6 +83,8 @@ class RequestRegistry:
         """Whether reasons are told before long."""
         self._changed: dict[ArcId, None] = {}
         """Queued ARCs whose reason to wait has changed and has not been published yet."""
+        self.runtimes: RuntimeEstimator | None = None
+        """What is known of how long holds last, for forecasts."""
         self._starts: Mapping[ArcId, Ns] = {}
         """The last forecast."""
         self._foreseen: tuple[int, Ns] | None = None
@@ -286,7 +289,7 @@ class RequestRegistry:
         """When each queued ARC will start, forecast from the present state; absent: never, or too late."""
         if self._foreseen is None or self._foreseen[0] != self._core.batches:
             now = self._mesh.now()
-            self._starts = forecast(self._core, now).starts
+            self._starts = forecast(self._core, now, None, self.runtimes).starts
             self._foreseen = self._core.batches, now
         return self._starts
 

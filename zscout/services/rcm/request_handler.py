@@ -54,7 +54,7 @@ from zscout.scheduling.model import (
     Requested,
     Unconfirmed,
 )
-from zscout.scheduling.reason import Party, named
+from zscout.scheduling.reason import ITS_CLIENT, Party, named
 from zscout.services.authority import Authority
 from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.devices import ExpectedDevices
@@ -273,7 +273,7 @@ class RequestHandler:
         event = Cancelled if isinstance(operation, Cancel) else Released
         who = self._authority.known_as(sender, operation.who)
         by = str(sender) if who is None else named(who, str(sender), operation.id)
-        self._gather(query, arc, event(arc, "its client" if owner == sender else by))
+        self._gather(query, arc, event(arc, ITS_CLIENT if owner == sender else by))
 
     def _goes_on_elsewhere(self, ask: Ask) -> bool:
         """Whether another client has this ARC: what one RCM handed over, the next knows by its place only."""
@@ -316,7 +316,7 @@ class RequestHandler:
         request = admit(asked, str(sender), arc, self.core, self.limits)
         if asked.check:
             self.check_door(asked.needs, waits=asked.wait_for_device)
-        expected = forecast(self.core, now, request)
+        expected = forecast(self.core, now, request, self._registry.runtimes)
         start = expected.starts.get(arc)
         victims = [known.request for known in map(self.core.arc, expected.preempts) if known is not None]
         query.answer(

@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from zscout.lab.replay import HoldRecord, Replay
+from zscout.lab.replay import SERVED, HoldRecord, Replay
 from zscout.lab.workload import Workload
 from zscout.scheduling.model import Outcome
 from zscout.types import ArcId, Ns, RcName
@@ -42,7 +42,7 @@ def measure(workload: Workload, played: Replay) -> Measures:
     for hold in played.holds:
         work = (hold.end - hold.start) * len(hold.rcs)
         held += work
-        if hold.outcome is Outcome.COMPLETED:
+        if hold.outcome in SERVED:
             served[hold.arc] = hold.start
         elif hold.outcome is Outcome.PREEMPTED:
             wasted += work
@@ -99,7 +99,7 @@ def curve(workload: Workload, played: Replay) -> Curve:
         changes[arrival.at][1] += 1
     for hold in played.holds:
         changes[hold.start][1] -= 1
-        if hold.outcome is not Outcome.COMPLETED:
+        if hold.outcome not in SERVED:
             changes[hold.end][1] += 1
     times = sorted(changes)
     return Curve(

@@ -1,0 +1,176 @@
+"""What candidates learn of how long holds last, and what their RCMs tell by it."""
+
+from __future__ import annotations
+
+import asyncio
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from tests.mesh.kit import run, until
+from tests.services.journal.kit import holder, over, past, published
+from tests.services.rcm.kit import FakeClient, FakeFleet, request
+from zscout.config.node import JournalConfig
+from zscout.messages import Cancel, Release, Who
+from zscout.scheduling.reason import ITS_CLIENT, Reason, ReasonCode
+from zscout.scheduling.runtimes import Wish
+from zscout.services.journal.follower import Change, HoldOver, HoldSeen
+from zscout.services.journal.journal import Journal
+from zscout.services.journal.store import JournalStore
+from zscout.services.rcm import observed_runtimes
+from zscout.services.rcm.candidate import Candidate
+from zscout.services.rcm.observed_runtimes import RuntimeObserver
+from zscout.types import SECOND, Ns
+
+RELEASED = str(Reason(ReasonCode.RELEASED, detail=ITS_CLIENT))
+WHO = Who("alice", "ws1", "./survey.py")
+EXPIRED = str(Reason(ReasonCode.EXPIRED))
+
+
+async def begin(client: FakeClient, number: int, rc: str = "robot/a") -> None:
+    """A run of a program that asks for ten minutes."""
+    await client.do(replace(request("survey", rc, seconds=600, who=WHO), id=f"survey{number}"))
+
+
+async def end(client: FakeClient, number: int) -> None:
+    await client.do(Release(f"survey{number}"))
+
+
+def test_a_new_leader_knows_how_long_programs_take() -> None:
+    async def story() -> None:
+        fleet = FakeFleet("x", "y")
+        candidates: dict[str, Candidate] = {host: fleet.candidate(host) for host in ("x", "y")}
+        rc = fleet.rc("robot/a")
+        await until(lambda: candidates["x"].rcm)
+        await fleet.joined(rc)
+        survey, other = fleet.client("survey"), fleet.client("other", "ws2")
+        for number in range(4):
+            await begin(survey, number)
+            told = await other.ask(f"early{number}", "robot/a", seconds=60, estimate=True)
+            assert told.starts_in == pytest.approx(600 if number < 3 else 30, abs=0.5)
+            assert ((await fleet.state()).holds[0].ends_in is None) == (number < 3)
+            await other.do(Cancel(f"early{number}"))
+            await asyncio.sleep(30)
+            await end(survey, number)
+        await begin(survey, 4)
+        told = await other.ask("next", "robot/a", seconds=60, estimate=True)
+        assert told.starts_in == pytest.approx(30, abs=0.5)
+        await asyncio.sleep(10)
+        assert (await fleet.state()).holds[0].ends_in == pytest.approx(20, abs=0.5)
+        assert rc.arcs == ["survey"]
+        # It is given back later than was foretold, and nobody took it.
+        await asyncio.sleep(50)
+        assert rc.arcs == ["survey"]
+        await end(survey, 4)
+        await until(lambda: rc.arcs == ["next"])
+        await candidates.pop("x").stop()
+        await until(lambda: candidates["y"].rcm)
+        await other.do(Release("next"))
+        await begin(survey, 5)
+        state = await fleet.state()
+        assert state.host == "y"
+        assert state.holds[0].ends_in == pytest.approx(30, abs=0.5)
+        await candidates.pop("y").stop()
+
+    run(story())
+
+
+def test_one_who_starts_anew_knows_what_its_journal_knows(tmp_path: Path) -> None:
+    async def story() -> None:
+        fleet = FakeFleet("x")
+        for life in range(2):
+            mesh = fleet.mesh("x")
+            silent = fleet.fleet.silence / SECOND
+            journal = Journal(mesh, tmp_path, JournalConfig(), silent, wall=lambda: 1e9 + fleet.watcher.now() / SECOND)
+            journal.start()
+            candidate = Candidate(mesh, fleet.fleet, journal=journal)
+            candidate.start()
+            await until(partial(getattr, candidate, "rcm"))
+            await until(partial(getattr, journal, "_follower"))
+            rc, client = fleet.rc(f"robot/{'ab'[life]}"), fleet.client(f"c{life}")
+            await fleet.joined(rc)
+            if life == 0:
+                for number in range(4):
+                    await begin(client, number)
+                    await asyncio.sleep(30)
+                    await end(client, number)
+            else:
+                # Of another RC, so that nothing but the name and the command tell what it is.
+                await begin(client, 4, "robot/b")
+                assert (await fleet.state()).holds[0].ends_in == pytest.approx(30, abs=0.5)
+            await candidate.stop()
+            await journal.stop()
+            await mesh.close()
+
+    run(story())
+
+
+def wish(need: str, asked: int = 60) -> Wish:
+    return Wish("survey", "./survey.py", frozenset({need}), asked * SECOND)
+
+
+def tell(observer: RuntimeObserver, number: int, lasted: float, outcome: str, reason: str, **more: Any) -> None:
+    """A hold of a minute, from its first publication to that of its end."""
+    begun = replace(holder(number, "robot/a"), **more)
+    end = replace(over(number, outcome, "robot/a"), reason=reason)
+    observer.hear(number * 100 * SECOND, published(2 * number - 1, [begun]))
+    observer.hear(number * 100 * SECOND + round(lasted * SECOND), published(2 * number, [], [end]))
+
+
+@pytest.mark.parametrize(
+    ("outcome", "reason", "learned"),
+    [
+        ("released", RELEASED, 6 * SECOND),
+        ("completed", RELEASED, 6 * SECOND),
+        ("released", "released by an operator", None),
+        ("cancelled", "cancelled by its client", None),
+        ("preempted", "preempted by bob", None),
+        ("lost", "robot/a was lost", None),
+        ("completed", "its minimum runtime is over and bob, priority 0, needs its RCs", None),
+        ("completed", EXPIRED, None),  # all that was asked for
+        ("handed_over", "handed over to ws2/c", None),
+    ],
+)
+def test_only_what_ended_by_itself_says_how_long_it_takes(outcome: str, reason: str, learned: Ns | None) -> None:
+    heard, recalled = RuntimeObserver(), RuntimeObserver()
+    for number in range(1, 9):
+        tell(heard, number, 6, outcome, reason, bound={"robot/*": "robot/a"})
+    assert heard.estimator.runtime(wish("robot/*")) == learned
+    assert not heard._open
+    recalled.recall(past(number, 0.0, 6.0, outcome, reason=reason, who=WHO) for number in range(8))
+    assert recalled.estimator.runtime(wish("robot/a")) == learned
+
+
+def test_a_hold_that_is_heard_of_late_began_before() -> None:
+    observer = RuntimeObserver()
+    for number in range(1, 4):
+        tell(observer, number, 50, "completed", RELEASED, remaining=-100.0, keep=True)
+    assert observer.estimator.runtime(wish("robot/a")) == 210 * SECOND
+
+
+def test_what_is_followed_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(observed_runtimes, "MAX_OPEN", 10)
+    observer = RuntimeObserver()
+    for number in range(1, 100):
+        observer.hear(number, published(number, [holder(number, "robot/a")]))
+    assert len(observer._open) == 10
+
+
+def test_a_journal_tells_of_what_it_heard_from_beginning_to_end(tmp_path: Path) -> None:
+    store = JournalStore(tmp_path, 1e6, 64_000_000)
+    store.open()
+    whole = past(1, 10.0, 12.0, "released")
+    later = past(2, 11.0, 20.0, "preempted")
+    changes: list[Change] = [
+        HoldSeen(whole),
+        HoldSeen(later),
+        HoldSeen(past(3, 12.0)),
+        HoldOver(later),
+        HoldOver(whole),
+    ]
+    store.commit([*changes, HoldOver(past(4, 13.0, 14.0, "released", late=True))], 5.0, 30.0, 30.0)
+    assert [hold.grant.seq for hold in store.latest(5)] == [1, 2]
+    assert [hold.grant.seq for hold in store.latest(1)] == [2]

@@ -1,0 +1,75 @@
+"""Learns how long holds last from what the leader publishes, as every candidate hears it, and from the own journal: so
+who begins to lead knows what the others know."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterable
+from typing import Final, NamedTuple
+
+from zscout.messages import Grants, Holder, PastHold, Revocation, Who, duration
+from zscout.scheduling.model import Outcome
+from zscout.scheduling.reason import ITS_CLIENT, Reason, ReasonCode
+from zscout.scheduling.runtimes import RuntimeEstimator, Wish
+from zscout.types import SECOND, Grant, Ns
+
+MAX_OPEN: Final = 20_000
+"""Holds that are followed at one time: of more, those that began last."""
+_BY_ITSELF: Final = {str(Reason(ReasonCode.RELEASED, detail=ITS_CLIENT)), str(Reason(ReasonCode.EXPIRED))}
+"""Reasons of holds that had all that their programs wanted, or asked for."""
+
+
+class _Begun(NamedTuple):
+    wish: Wish
+    at: Ns
+
+
+class RuntimeObserver:
+    def __init__(self) -> None:
+        self.estimator = RuntimeEstimator()
+        self._open: OrderedDict[Grant, _Begun] = OrderedDict()
+
+    def hear(self, now: Ns, grants: Grants) -> None:
+        """A publication, of a term that is believed; `now` by any clock that goes on."""
+        for holders in grants.rcs.values():
+            for holder in holders:
+                if holder.grant not in self._open:
+                    self._begin(now, holder)
+        for revoked in grants.revoked:
+            begun = self._open.pop(revoked.grant, None)
+            if begun is not None:
+                self._end(begun.wish, now - begun.at, revoked)
+
+    def recall(self, holds: Iterable[PastHold]) -> None:
+        """What a journal knows, the oldest first."""
+        for hold in holds:
+            if hold.ended is not None and hold.min_runtime is not None and not hold.late and hold.rcs:
+                asked = round(hold.min_runtime * SECOND)
+                if asked > 0:
+                    wish = _wish(hold.arc, hold.who, hold.rcs, asked)
+                    self._end(wish, round((hold.ended - hold.began) * SECOND), hold)
+
+    def _begin(self, now: Ns, holder: Holder) -> None:
+        try:
+            asked = duration(holder.min_runtime, "min_runtime")
+        except ValueError:
+            return
+        patterns = {rc: need for need, rc in holder.bound.items()}
+        needs = [patterns.get(rc, rc) for rc in holder.rcs]
+        wish = _wish(holder.arc, holder.who, needs, asked)
+        # One that is heard of late, or goes on under another grant, began as long ago as it has used up of its time.
+        self._open[holder.grant] = _Begun(wish, now - max(0, asked - round(holder.remaining * SECOND)))
+        if len(self._open) > MAX_OPEN:
+            self._open.popitem(last=False)
+
+    def _end(self, wish: Wish, lasted: Ns, how: Revocation | PastHold) -> None:
+        if how.outcome == Outcome.HANDED_OVER or lasted < 0:
+            return
+        whole = how.outcome in (Outcome.COMPLETED, Outcome.RELEASED) and how.reason in _BY_ITSELF
+        if how.reason == str(Reason(ReasonCode.EXPIRED)):
+            lasted = wish.runtime  # all that was asked for: what is more is the way of the news
+        self.estimator.observe(wish, lasted, whole=whole)
+
+
+def _wish(arc: str, who: Who | None, needs: Iterable[str], asked: Ns) -> Wish:
+    return Wish(arc, "" if who is None else who.command, frozenset(needs), asked)
