@@ -12,7 +12,7 @@ from functools import lru_cache
 from typing import Final, NamedTuple
 from zoneinfo import ZoneInfo
 
-from icalendar import Calendar, Event, Timezone, vRecur, vText
+from icalendar import Calendar, Event, Timezone, TimezoneDaylight, TimezoneStandard, vRecur, vText
 
 from zscout.keyexpr import is_pattern, matcher
 from zscout.messages import MAX_AHEAD, BookedDate, BookingView, Instant
@@ -89,7 +89,8 @@ def _until(view: BookingView) -> Instant:
 def _timezone(name: str, first: int, last: int) -> Timezone:
     """As it is in these years."""
     timezone = Timezone.from_tzid(name, first_date=date(first - 1, 1, 1), last_date=date(last + 2, 1, 1))
-    for part in (*timezone.standard, *timezone.daylight):
+    for part in timezone.subcomponents:
+        assert isinstance(part, TimezoneStandard | TimezoneDaylight)  # noqa: S101 - from_tzid makes no others
         # icalendar 7 tells where a gap ends, and not the local time at which it begins.
         gap = max(timedelta(), part.TZOFFSETTO - part.TZOFFSETFROM)
         later = [at - gap for at, _ in part.rdates]
