@@ -28,13 +28,6 @@ NOT_NOW: Final = Page(
 )
 
 
-def calendar_path(selection: Selection) -> str:
-    """Where a calendar stands."""
-    if selection.rc is not None:
-        return f"/rc/{selection.rc}.ics"
-    return f"/owner/{selection.owner}.ics" if selection.owner is not None else "/fleet.ics"
-
-
 class CalendarServer(PlainHttpServer):
     where = "calendars are at /fleet.ics, /rc/KIND/NAME.ics and /owner/NAME.ics"
 

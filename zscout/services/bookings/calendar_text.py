@@ -34,6 +34,13 @@ class Selection(NamedTuple):
     def name(self, fleet: str) -> str:
         return " ".join(filter(None, (fleet, self.rc, self.owner)))
 
+    @property
+    def path(self) -> str:
+        """Where its calendar stands: `fleet.ics`, `rc/robot/arm1.ics`, `owner/anvil.ics`."""
+        if self.rc is not None:
+            return f"rc/{self.rc}.ics"
+        return f"owner/{self.owner}.ics" if self.owner is not None else "fleet.ics"
+
     def of(self, bookings: Iterable[BookingView]) -> list[BookingView]:
         return [
             one
