@@ -99,7 +99,7 @@ def _write_all(folder: Path, fleet: str, bookings: list[BookingView], rcs: Itera
     """How many files are new, and how many there are. Raises Failed."""
     bound = {rc for one in bookings for date in one.dates for rc in date.bound.values()}
     named = {need for one in bookings for need in one.needs if not is_pattern(need)}
-    selections = {Selection(), *(Selection(one.owner) for one in bookings)}
+    selections = {Selection(), *(Selection(one.owner) for one in bookings if one.owner)}
     selections |= {Selection(rc=rc) for rc in {*rcs, *bound, *named}}
     selections |= {Selection(path.stem) for path in folder.glob("owner/*.ics")}
     selections |= {Selection(rc=f"{path.parent.name}/{path.stem}") for path in folder.glob("rc/*/*.ics")}
@@ -111,7 +111,10 @@ def _write_all(folder: Path, fleet: str, bookings: list[BookingView], rcs: Itera
 def _write(path: Path, text: bytes) -> bool:
     """Whether it had to be. Raises Failed."""
     try:
-        if path.is_file() and path.read_bytes() == text:
+        if path.exists() and not path.is_file():  # a device, a pipe
+            path.write_bytes(text)
+            return True
+        if path.exists() and path.read_bytes() == text:
             return False
         path.parent.mkdir(parents=True, exist_ok=True)
         write_durably(path, text)
@@ -253,9 +256,9 @@ async def import_(
     """Book the events of an iCalendar FILE (- is stdin): of Google, Outlook, Nextcloud and others.
 
     What an event needs is what --needs and --map say; where they say nothing, the RCs that its resources name. Others
-    are left out, as are events that are over, cancelled, or whose people are free then. To import it again books nothing
-    twice; what was changed in it is another booking, so that --sync is wanted then. Times without a zone, and whole days,
-    are of --zone.
+    are left out, as are events that are over, cancelled, or whose people are free then. To import it again books
+    nothing twice; what was changed in it is another booking, so that --sync is wanted then. Times without a zone, and
+    whole days, are of --zone.
 
     The exit code is 1 where something was not booked that should have been.
 
