@@ -13,16 +13,17 @@ from typing import Any, Final
 from zoneinfo import ZoneInfo
 
 import click
+from msgspec.structs import replace
 
 from zscout import terminal
 from zscout.behaviors.client.bookings import BookingsClient, RcmSilent
 from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.cli import common, completion
+from zscout.cli.booked import ask_bookings, utc, zone_option
 from zscout.cli.bookings.calendar_file import MAX_BYTES, read_calendar
 from zscout.cli.bookings.calendar_plan import ImportOptions, Pairs, Plan, Wanted, plan_import
-from zscout.cli.bookings.dates import date_words, every_words, host_zone
-from zscout.cli.bookings.known import ask_bookings, is_own, utc, zone_option
 from zscout.cli.common import Failed, NobodyThere, Parsed
+from zscout.cli.dates import date_words, every_words, host_zone
 from zscout.cli.requests.options import parse_duration, parse_need
 from zscout.cli.requests.request import MAX_PRIORITY
 from zscout.config.state_folder import write_durably
@@ -36,7 +37,6 @@ MAX_WORDS: Final = 200
 LOOK: Final = 1.0
 """Seconds in which RCs are seen."""
 _NEXT_NEED: Final = re.compile(r",(?=[^,=]*/)")
-DONE: Final = ("booked", "already there")
 
 
 @click.group()
@@ -159,36 +159,33 @@ class _Import:
     options: ImportOptions
     known: list[BookingView]
     dry_run: bool
+    again: bool
     rows: list[Row] = field(default_factory=list)
 
     async def run(self, plan: Plan, *, sync: bool) -> None:
         """Raises NobodyThere."""
-        prefix, by_id = self.options.prefix, {one.id: one for one in self.known}
-        gone = [one for one in self.known if one.id.startswith(prefix) and one.id not in plan.ids]
+        gone = [one for one in self.known if one.id.endswith(self.options.suffix) and one.id not in plan.ids]
         for view in gone:
-            if not view.unbooked and is_own(view, self.client):
+            if not view.unbooked and view.owner == self.client.mesh.me.host:
                 words = view.who.comment if view.who is not None and view.who.comment else view.name
                 if sync:
                     await self._unbook(view, words)
                 else:
                     self.rows.append(Row(words, "kept", "it is not in the calendar any more; --sync gives it up", view))
+        by_id = {one.id: one for one in self.known if not one.unbooked}
         for wanted in plan.wanted:
-            await self._want(wanted, by_id.get(wanted.id))
+            await self._want(wanted, next((by_id[one] for one in wanted.ids if one in by_id), None))
 
     async def _want(self, wanted: Wanted, known: BookingView | None) -> None:
         if known is None and wanted.book is None:
             return
-        row = Row(wanted.title, DONE[1], book=known or wanted.book)
+        row = Row(wanted.title, "already there", book=known or wanted.book)
         self.rows.append(row)
         if known is None and wanted.book is not None:
-            row.result = "would be booked" if self.dry_run else DONE[0]
-            if self.dry_run or (known := await self._ask(wanted.book, row)) is None:
+            row.result = "would be booked" if self.dry_run else "booked"
+            if self.dry_run or (known := await self._book(wanted.ids, wanted.book, row)) is None:
                 return
-            row.book = known
         if known is None:
-            return
-        if known.unbooked:
-            row.result, row.why = "given up before", "it was unbooked since, and stays so"
             return
         last = known.start if known.until is None else known.until
         given_up = {*known.dropped, *(one.start for one in known.dates if one.state == "unbooked")}
@@ -197,6 +194,15 @@ class _Import:
             if not self.dry_run:
                 await self._ask(Unbook(known.id, at, self.client.who), row)
         row.why = row.why or (f"without {many(len(dropped), 'date')} given up in the calendar" if dropped else "")
+
+    async def _book(self, ids: tuple[str, ...], book: Book, row: Row) -> BookingView | None:
+        """None: it is not booked, and the row tells. Raises NobodyThere."""
+        for booking in ids if self.again else ids[:1]:
+            made = await self._ask(replace(book, id=booking), row)
+            if made is None or not made.unbooked:
+                return made
+        row.result, row.why = "given up before", "it was unbooked since then; --again books it again"
+        return None
 
     async def _unbook(self, view: BookingView, words: str) -> None:
         row = Row(
@@ -237,6 +243,7 @@ class _Import:
 @click.option("--maintenance", is_flag=True, help="Keep the RCs free of everybody then, as an operator.")
 @click.option("--calendar", "name", metavar="NAME", help="What this calendar is called. Default: the file's name.")
 @click.option("--sync", is_flag=True, help="Give up what was imported from it and is not in it any more.")
+@click.option("--again", is_flag=True, help="Book again what was imported, and unbooked since.")
 @click.option("--dry-run", is_flag=True, help="Only say what would be done.")
 @common.json_option("Print one JSON object.")
 @common.runs
@@ -250,6 +257,7 @@ async def import_(
     maintenance: bool,
     name: str | None,
     sync: bool,
+    again: bool,
     dry_run: bool,
     as_json: bool,
 ) -> int:
@@ -287,7 +295,7 @@ async def import_(
             client.who,
         )
         plan = plan_import(events, options, told.time)
-        work = _Import(client, options, told.bookings, dry_run)
+        work = _Import(client, options, told.bookings, dry_run, again)
         await work.run(plan, sync=sync)
     rows = [*work.rows, *(Row(one.title, "not booked", one.why, failed=True) for one in plan.skipped if one.failed)]
     left_out = Counter(one.why for one in plan.skipped if not one.failed)

@@ -17,8 +17,8 @@ from icalendar.parser import Contentline, Contentlines
 from icalendar.timezone.windows_to_olson import WINDOWS_TO_OLSON
 
 from zscout.behaviors.client.identity import bounded
-from zscout.cli.bookings.dates import YEARS
 from zscout.cli.bookings.recurrence import Rule, parse_rule
+from zscout.cli.dates import YEARS
 from zscout.config.strict import BadInput, Where, quoted
 from zscout.services.bookings.calendar_text import NEEDS
 from zscout.services.bookings.dates import zone_of

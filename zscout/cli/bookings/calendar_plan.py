@@ -30,6 +30,8 @@ from zscout.keyexpr import BadName, check_need, is_pattern, valid_name
 from zscout.messages import MAX_AHEAD, MAX_BOOKINGS, MAX_COMMENT, Book, Instant, Who
 from zscout.services.bookings.dates import DAY
 
+TIMES: Final = 8
+"""That one event is booked again after it was given up, at most."""
 LOOK_BACK: Final = 31 * DAY
 """Seconds: what began so long ago may not be over yet."""
 OVER, FREE, CANCELLED = "over, or begun", "of people who are free then", "cancelled"
@@ -56,17 +58,17 @@ class ImportOptions:
     who: Who | None = None
 
     @property
-    def prefix(self) -> str:
-        """How all ids begin."""
+    def suffix(self) -> str:
+        """How all ids end: people name bookings by how they begin."""
         return _hashed([self.fleet, self.calendar], 12)
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """A booking of the calendar; `book` is None where nothing of it is left. `dropped`: dates of it to come on which it
-    is not."""
+    """A booking of the calendar, by the first of its `ids`: one that was given up is never booked again, and the next
+    is taken. `book` is None where nothing of it is left. `dropped`: dates of it to come on which it is not."""
 
-    id: str
+    ids: tuple[str, ...]
     title: str
     book: Book | None
     dropped: tuple[Instant, ...] = ()
@@ -233,14 +235,14 @@ class _Planned:
 
     def _add_once(self, at: Instant) -> None:
         runtime = self._runtime(self._local(at))
-        booking = self._id(at, at, 0, runtime)
-        if booking in self._plan.ids:
+        ids = self._ids(at, at, 0, runtime)
+        if ids[0] in self._plan.ids:
             return
-        self._plan.ids.add(booking)
+        self._plan.ids.update(ids)
         if at <= self._now or at > self._now + MAX_AHEAD:
             self._plan.skipped.append(Skipped(self._title, OVER if at <= self._now else LATER))
         else:
-            self._plan.wanted.append(Wanted(booking, self._title, self._book(booking, at, runtime)))
+            self._plan.wanted.append(Wanted(ids, self._title, self._book(ids[0], at, runtime)))
 
     def _add_repeated(self, dates: list[datetime], step: int, given_up: set[Instant]) -> None:
         instants = [*map(self._at, dates)]
@@ -248,10 +250,10 @@ class _Planned:
         if self._start.whole_day:
             # As the RCM wants it: days may be an hour shorter.
             runtime = min(runtime, step * DAY - 3_600)
-        booking = self._id(instants[0], instants[-1], step, runtime)
-        if booking in self._plan.ids:
+        ids = self._ids(instants[0], instants[-1], step, runtime)
+        if ids[0] in self._plan.ids:
             return
-        self._plan.ids.add(booking)
+        self._plan.ids.update(ids)
         if instants[-1] > self._now + MAX_AHEAD:
             self._plan.skipped.append(Skipped(self._title, LATER))
             return
@@ -268,8 +270,8 @@ class _Planned:
         book = None
         if left:
             every, until = (step, left[-1]) if len(left) > 1 else (0, None)
-            book = self._book(booking, left[0], runtime, every, until)
-        self._plan.wanted.append(Wanted(booking, self._title, book, dropped))
+            book = self._book(ids[0], left[0], runtime, every, until)
+        self._plan.wanted.append(Wanted(ids, self._title, book, dropped))
 
     def _book(self, booking: str, start: Instant, runtime: int, every: int = 0, until: Instant | None = None) -> Book:
         options = self._options
@@ -289,8 +291,8 @@ class _Planned:
             who=replace(options.who or Who(), comment=bounded(self._title, MAX_COMMENT)),
         )
 
-    def _id(self, first: Instant, last: Instant, step: int, runtime: int) -> str:
-        """Of an event that is changed it is another one, but for its title."""
+    def _ids(self, first: Instant, last: Instant, step: int, runtime: int) -> tuple[str, ...]:
+        """Of an event that is changed they are others, but for its title."""
         options, event = self._options, self._event
         needs = sorted(
             (name, sorted((key, str(value)) for key, value in of.items())) for name, of in self._needs.items()
@@ -298,7 +300,8 @@ class _Planned:
         of: Callable[[Moment], Instant] = self._instant
         which = None if event.instead_of is None else of(event.instead_of)
         terms = [options.priority, options.maintenance, self._zone.key if step else ""]
-        return options.prefix + _hashed([event.uid or self._title, which, first, last, step, runtime, needs, terms], 20)
+        known = [event.uid or self._title, which, first, last, step, runtime, needs, terms]
+        return tuple(_hashed([*known, number], 20) + options.suffix for number in range(TIMES))
 
 
 def _half_year(at: datetime) -> tuple[datetime, datetime]:
