@@ -200,6 +200,7 @@ class _Import:
         for booking in ids if self.again else ids[:1]:
             made = await self._ask(replace(book, id=booking), row)
             if made is None or not made.unbooked:
+                row.book = made or row.book
                 return made
         row.result, row.why = "given up before", "it was unbooked since then; --again books it again"
         return None

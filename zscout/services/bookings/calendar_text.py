@@ -110,7 +110,7 @@ def _timezone(name: str, first: int, last: int) -> Timezone:
 
 def _repeated(fleet: str, view: BookingView, zone: ZoneInfo) -> list[Event]:
     first = datetime.fromtimestamp(view.start, zone)
-    hour = first.time()
+    hour = first.time().replace(fold=0)
 
     def nominal(at: Instant) -> datetime:
         """A date as its rule has it: on a day without that hour it is not what clocks show."""
@@ -152,7 +152,7 @@ def _event(fleet: str, view: BookingView, start: Instant | datetime, told: Booke
     event.add("RESOURCES", rcs)
     event.add("CATEGORIES", rcs)
     comment = view.who.comment if view.who is not None else ""
-    if lines := [clean(text) for text in (comment, told.danger if told is not None else "") if text]:
+    if lines := [clean(text).strip() for text in (comment, told.danger if told is not None else "") if text]:
         event.add("DESCRIPTION", "\n".join(lines))
     tentative = told is not None and told.state == "conflict"
     event.add("STATUS", "CANCELLED" if view.unbooked else "TENTATIVE" if tentative else "CONFIRMED")
