@@ -43,7 +43,9 @@ def rules(draw: st.DrawFn) -> str:
         some("BYDAY", weekdays)
         some("WKST", st.sampled_from([["MO"], ["SU"], ["WE"]]))
     elif freq == "YEARLY":
-        some("BYMONTH", months) and (some("BYDAY", numbered) or some("BYMONTHDAY", days)) and some("BYSETPOS", positions)
+        some("BYMONTH", months) and (some("BYDAY", numbered) or some("BYMONTHDAY", days)) and some(
+            "BYSETPOS", positions
+        )
     elif freq == "MONTHLY" and (some("BYDAY", numbered) or some("BYMONTHDAY", days)):
         some("BYSETPOS", positions)
     return ";".join(parts)
