@@ -1,3 +1,4 @@
+# ruff: noqa: DTZ001 - times in UTC
 """What is booked of a calendar: of the programs' samples, of what zscout writes itself, and over and over again."""
 
 from __future__ import annotations
@@ -62,7 +63,8 @@ def words(found: Plan) -> list[str]:
     for one in found.wanted:
         assert one.book is not None
         first = datetime.fromtimestamp(one.book.start, BERLIN)
-        line = f"{one.book.name} {first:%a %m-%d %H:%M} for {one.book.runtime / 60} min: {', '.join(sorted(one.book.needs))}"
+        rcs = ", ".join(sorted(one.book.needs))
+        line = f"{one.book.name} {first:%a %m-%d %H:%M} for {one.book.runtime / 60} min: {rcs}"
         if one.book.until is not None:
             line += f"; every {one.book.every} days until {datetime.fromtimestamp(one.book.until, BERLIN):%y-%m-%d}"
         without = [f"{datetime.fromtimestamp(at, BERLIN):%m-%d}" for at in one.dropped]
@@ -93,8 +95,9 @@ def test_a_calendar_of_google() -> None:
         "Arm 1 demo: over, or begun",
     ]
     book = found.wanted[0].book
-    assert book is not None and book.who is not None
-    assert (book.who.comment, book.patience, book.zone) == ("Grasping practical", 900, "Europe/Berlin")
+    assert book is not None
+    assert book.who is not None
+    assert (book.who.comment, book.patience, book.zone) == ("Grasping practical", Decimal(900), "Europe/Berlin")
 
 
 def test_a_calendar_of_outlook() -> None:
@@ -117,7 +120,10 @@ def test_a_calendar_of_nextcloud() -> None:
     """Its resources are named as RCs are. What has no end is booked by half years, each once it ends within a year."""
     found = plan("nextcloud")
     assert words(found) == [
-        "Morgenrunde Fri 11-27 09:00 for 45 min: framegrabber/*, robot/arm1; every 2 days until 26-12-31; without 12-01, 12-03",
+        (
+            "Morgenrunde Fri 11-27 09:00 for 45 min: framegrabber/*, robot/arm1; every 2 days until 26-12-31; "
+            "without 12-01, 12-03"
+        ),
         "Morgenrunde Sat 01-02 09:00 for 45 min: framegrabber/*, robot/arm1; every 2 days until 27-06-29",
         "Ohne-Zone Wed 12-02 15:00 for 60 min: robot/arm1",
         "Drei-Termine Thu 12-10 15:00 for 60 min: robot/arm1",
@@ -134,9 +140,11 @@ def test_what_options_say_goes_before_what_an_event_names() -> None:
     assert every.book is not None
     assert every.book.needs == {"radio/rf0": {"command_rate": Decimal(5)}, "robot/arm1": {}}
     (mapped,) = plan_of(event).wanted
-    assert mapped.book is not None and mapped.book.needs == {"robot/arm1": {}}
+    assert mapped.book is not None
+    assert mapped.book.needs == {"robot/arm1": {}}
     (named,) = plan_of(event, mapped={}).wanted
-    assert named.book is not None and named.book.needs == {"robot/arm2": {}}
+    assert named.book is not None
+    assert named.book.needs == {"robot/arm2": {}}
     # Whole words: arm 12 is another arm.
     assert plan_of(f"{event}2\nLOCATION:arm 12", mapped={"arm 2": ARM, "rm 1": ARM}).wanted[0].book != mapped.book
     assert plan_of(event.replace("robot/arm2", "the arm 12"), mapped={"rm 12": ARM}).wanted == []
@@ -145,7 +153,9 @@ def test_what_options_say_goes_before_what_an_event_names() -> None:
 def test_maintenance_is_of_rcs_by_name() -> None:
     event = "DTSTART:20261201T080000Z\nDURATION:PT1H"
     (one,) = plan_of(event, maintenance=True).wanted
-    assert one.book is not None and one.book.maintenance and one.book.patience == 3600
+    assert one.book is not None
+    assert one.book.maintenance
+    assert one.book.patience == 3600
     refused = plan_of(event, maintenance=True, needs=(("robot/*", {}),))
     assert skipped(refused) == ["arm 1: maintenance is of RCs by their names, not by pattern (failed)"]
 
@@ -172,7 +182,8 @@ def test_a_day_is_as_long_as_it_is() -> None:
     assert minutes("20261201", "20270328", "20271031") == [24 * 60, 23 * 60, 25 * 60]
     # Days in a row are booked an hour short: none may overlap the next.
     (row,) = plan_of("DTSTART;VALUE=DATE:20261201\nRRULE:FREQ=DAILY;COUNT=9").wanted
-    assert row.book is not None and (row.book.runtime, row.book.every) == (23 * 3600, 1)
+    assert row.book is not None
+    assert (row.book.runtime, row.book.every) == (Decimal(23 * 3600), 1)
 
 
 def test_a_series_keeps_its_hour_over_summer_time() -> None:

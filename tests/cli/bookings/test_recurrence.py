@@ -1,3 +1,4 @@
+# ruff: noqa: DTZ001 - local times
 """Rules of repeated events, held against dateutil's reading of them."""
 
 from __future__ import annotations
