@@ -49,7 +49,7 @@ def plan_of(*events: str, now: float = NOW, **more: Any) -> Plan:
 def begins(book: Book) -> list[int]:
     fields = {name: getattr(book, name) for name in ("id", "name", "needs", "priority", "start", "runtime", "patience")}
     record = BookingRecord(**fields, zone=book.zone, every=book.every, until=book.until)
-    return dates(record, 0, NOW + 3 * MAX_AHEAD)
+    return dates(record, 0, NOW + 6 * MAX_AHEAD)
 
 
 def left(wanted: Wanted) -> list[int]:
