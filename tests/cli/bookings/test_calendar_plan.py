@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from msgspec import structs
 
 from zscout.cli.bookings.calendar_file import read_calendar
-from zscout.cli.bookings.calendar_plan import ImportOptions, Pairs, Plan, Wanted, plan_import
+from zscout.cli.bookings.calendar_plan import ImportOptions, ImportPlan, Pairs, Wanted, plan_import
 from zscout.config.strict import BadInput
 from zscout.messages import MAX_AHEAD, MAX_BOOKINGS, Book, BookingRecord, BookingView
 from zscout.services.bookings.calendar_text import calendar_text
@@ -34,11 +34,11 @@ def options(**more: Any) -> ImportOptions:
     return ImportOptions("lab", "sample", BERLIN, **({"mapped": {"arm 1": ARM}} | more))
 
 
-def plan(name: str, **more: Any) -> Plan:
+def plan(name: str, **more: Any) -> ImportPlan:
     return plan_import(read_calendar((SAMPLES / f"{name}.ics").read_bytes(), name), options(**more), NOW)
 
 
-def plan_of(*events: str, now: float = NOW, **more: Any) -> Plan:
+def plan_of(*events: str, now: float = NOW, **more: Any) -> ImportPlan:
     inner = "".join(
         f"BEGIN:VEVENT\nUID:a{number}\nSUMMARY:arm 1\n{event}\nEND:VEVENT\n" for number, event in enumerate(events)
     )
@@ -57,7 +57,7 @@ def left(wanted: Wanted) -> list[int]:
     return [] if wanted.book is None else [at for at in begins(wanted.book) if at not in wanted.dropped]
 
 
-def words(found: Plan) -> list[str]:
+def words(found: ImportPlan) -> list[str]:
     """Each booking in a line, by the clocks of Berlin."""
     lines = []
     for one in found.wanted:
@@ -72,7 +72,7 @@ def words(found: Plan) -> list[str]:
     return lines
 
 
-def skipped(found: Plan) -> list[str]:
+def skipped(found: ImportPlan) -> list[str]:
     return [f"{one.title}: {one.why}{' (failed)' if one.failed else ''}" for one in found.skipped]
 
 

@@ -13,7 +13,7 @@ import pytest
 from icalendar import Calendar
 
 from zscout.messages import BookedDate, BookingView, Who
-from zscout.services.bookings.calendar_text import Selection, calendar_text
+from zscout.services.bookings.calendar_text import CalendarSelection, calendar_text
 
 GOLDEN = Path(__file__).with_name("fleet.ics")
 BERLIN = ZoneInfo("Europe/Berlin")
@@ -153,17 +153,17 @@ def test_a_zone_is_told_as_it_is(zone: str) -> None:
 
 
 def test_what_a_selection_has() -> None:
-    def ids(selection: Selection) -> list[str]:
+    def ids(selection: CalendarSelection) -> list[str]:
         return [one.id for one in selection.of(fleet())]
 
-    assert ids(Selection()) == ["weekly", "once", "service", "gone", "tenth"]
-    assert ids(Selection(owner="bellows")) == ["once"]
-    assert ids(Selection(rc="radio/rf0")) == ["weekly"]
+    assert ids(CalendarSelection()) == ["weekly", "once", "service", "gone", "tenth"]
+    assert ids(CalendarSelection(owner="bellows")) == ["once"]
+    assert ids(CalendarSelection(rc="radio/rf0")) == ["weekly"]
     # Of a pattern: what is kept for it; where nothing is kept yet, any that it may be.
-    assert ids(Selection(rc="framegrabber/f1")) == ["weekly", "once"]
-    assert ids(Selection(rc="framegrabber/f3")) == []
+    assert ids(CalendarSelection(rc="framegrabber/f1")) == ["weekly", "once"]
+    assert ids(CalendarSelection(rc="framegrabber/f3")) == []
     unbound = [booking("a", at(2027, 6, 1), needs={"framegrabber/*": {}})]
-    assert Selection(rc="framegrabber/f3").of(unbound) == unbound
-    assert Selection(rc="robot/arm1").of(unbound) == []
-    paths = [one.path for one in (Selection(), Selection("anvil"), Selection(rc="robot/arm1"))]
+    assert CalendarSelection(rc="framegrabber/f3").of(unbound) == unbound
+    assert CalendarSelection(rc="robot/arm1").of(unbound) == []
+    paths = [one.path for one in (CalendarSelection(), CalendarSelection("anvil"), CalendarSelection(rc="robot/arm1"))]
     assert paths == ["fleet.ics", "owner/anvil.ics", "rc/robot/arm1.ics"]

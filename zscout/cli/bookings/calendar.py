@@ -21,7 +21,7 @@ from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.cli import common, completion
 from zscout.cli.booked import ask_bookings, utc, zone_option
 from zscout.cli.bookings.calendar_file import MAX_BYTES, read_calendar
-from zscout.cli.bookings.calendar_plan import ImportOptions, Pairs, Plan, Wanted, plan_import
+from zscout.cli.bookings.calendar_plan import ImportOptions, ImportPlan, Pairs, Wanted, plan_import
 from zscout.cli.common import Failed, NobodyThere, Parsed
 from zscout.cli.dates import date_words, every_words, host_zone
 from zscout.cli.requests.options import parse_duration, parse_need
@@ -30,7 +30,7 @@ from zscout.config.state_folder import write_durably
 from zscout.config.strict import BadInput, quoted, read_bytes
 from zscout.keyexpr import Role, check_rc, is_pattern
 from zscout.messages import Book, BookingView, Unbook
-from zscout.services.bookings.calendar_text import Selection, calendar_text
+from zscout.services.bookings.calendar_text import CalendarSelection, calendar_text
 from zscout.terminal import Table, clean, many
 
 MAX_WORDS: Final = 200
@@ -88,7 +88,7 @@ async def export(rc: str | None, owner: str | None, out: str | None, folder: Pat
         written, total = _write_all(folder, fleet, bookings, rcs)
         terminal.print_line(f"{many(total, 'calendar')} in {folder}, {written} of them changed")
         return
-    text = calendar_text(fleet, bookings, Selection(owner, rc))
+    text = calendar_text(fleet, bookings, CalendarSelection(owner, rc))
     if out in (None, "-"):
         sys.stdout.buffer.write(text)
         return
@@ -99,10 +99,10 @@ def _write_all(folder: Path, fleet: str, bookings: list[BookingView], rcs: Itera
     """How many files are new, and how many there are. Raises Failed."""
     bound = {rc for one in bookings for date in one.dates for rc in date.bound.values()}
     named = {need for one in bookings for need in one.needs if not is_pattern(need)}
-    selections = {Selection(), *(Selection(one.owner) for one in bookings if one.owner)}
-    selections |= {Selection(rc=rc) for rc in {*rcs, *bound, *named}}
-    selections |= {Selection(path.stem) for path in folder.glob("owner/*.ics")}
-    selections |= {Selection(rc=f"{path.parent.name}/{path.stem}") for path in folder.glob("rc/*/*.ics")}
+    selections = {CalendarSelection(), *(CalendarSelection(one.owner) for one in bookings if one.owner)}
+    selections |= {CalendarSelection(rc=rc) for rc in {*rcs, *bound, *named}}
+    selections |= {CalendarSelection(path.stem) for path in folder.glob("owner/*.ics")}
+    selections |= {CalendarSelection(rc=f"{path.parent.name}/{path.stem}") for path in folder.glob("rc/*/*.ics")}
     # A kind may consist of dots.
     safe = [one for one in selections if ".." not in one.path.split("/")]
     return sum(_write(folder / one.path, calendar_text(fleet, bookings, one)) for one in safe), len(safe)
@@ -162,7 +162,7 @@ class _Import:
     again: bool
     rows: list[Row] = field(default_factory=list)
 
-    async def run(self, plan: Plan, *, sync: bool) -> None:
+    async def run(self, plan: ImportPlan, *, sync: bool) -> None:
         """Raises NobodyThere."""
         gone = [one for one in self.known if one.id.endswith(self.options.suffix) and one.id not in plan.ids]
         for view in gone:

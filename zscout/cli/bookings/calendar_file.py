@@ -17,7 +17,7 @@ from icalendar.parser import Contentline, Contentlines
 from icalendar.timezone.windows_to_olson import WINDOWS_TO_OLSON
 
 from zscout.behaviors.client.identity import bounded
-from zscout.cli.bookings.recurrence import Rule, parse_rule
+from zscout.cli.bookings.recurrence import RepeatRule, parse_rule
 from zscout.cli.dates import YEARS
 from zscout.config.strict import BadInput, Where, quoted
 from zscout.services.bookings.calendar_text import NEEDS
@@ -68,7 +68,7 @@ class CalendarEvent:
     start: Moment | None = None
     end: Moment | None = None
     duration: timedelta | None = None
-    rule: Rule | None = None
+    rule: RepeatRule | None = None
     more: list[Moment] = field(default_factory=list)
     without: list[Moment] = field(default_factory=list)
     instead_of: Moment | None = None

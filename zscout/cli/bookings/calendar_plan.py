@@ -84,7 +84,7 @@ class Skipped:
 
 
 @dataclass(slots=True)
-class Plan:
+class ImportPlan:
     wanted: list[Wanted] = field(default_factory=list)
     """What is repeated comes first: what is in the place of a date of it is free once that is given up."""
     skipped: list[Skipped] = field(default_factory=list)
@@ -92,14 +92,14 @@ class Plan:
     """Of all that is in the calendar, if it is over or begun as well."""
 
 
-def plan_import(events: Iterable[CalendarEvent], options: ImportOptions, now: float) -> Plan:
+def plan_import(events: Iterable[CalendarEvent], options: ImportOptions, now: float) -> ImportPlan:
     """What to book at `now`, in seconds since 1970. Raises BadInput for too much."""
     events = list(events)
     moved: dict[str, set[Instant]] = defaultdict(set)
     for event in events:
         if event.uid and event.instead_of is not None:
             moved[event.uid].add(event.instead_of.instant(options.zone))
-    plan = Plan()
+    plan = ImportPlan()
     for event in events:
         title = event.title or event.uid or "event"
         try:
@@ -151,7 +151,7 @@ class _Planned:
     """The bookings of one event."""
 
     def __init__(
-        self, plan: Plan, event: CalendarEvent, title: str, needs: Needs, options: ImportOptions, now: float
+        self, plan: ImportPlan, event: CalendarEvent, title: str, needs: Needs, options: ImportOptions, now: float
     ) -> None:
         """Raises ValueError."""
         if event.start is None:

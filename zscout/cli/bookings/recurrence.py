@@ -29,7 +29,7 @@ DAYS_OF_WEEK: Final = ("MO", "TU", "WE", "TH", "FR", "SA", "SU")
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class RepeatRule:
     """`by_day` has (which of the month, or 0 for all; weekday from 0, Monday). Empty: as its first date has it."""
 
     freq: str
@@ -50,7 +50,7 @@ class Rule:
         return days if days <= DAYS else 0
 
 
-def parse_rule(parts: Mapping[str, Sequence[Any]]) -> Rule:
+def parse_rule(parts: Mapping[str, Sequence[Any]]) -> RepeatRule:
     """A rule as icalendar reads it. Raises ValueError for one that is not followed here."""
     found = {str(name).upper(): list(values) for name, values in parts.items()}
     freq = str(_one(found, "FREQ", "")).upper()
@@ -67,7 +67,7 @@ def parse_rule(parts: Mapping[str, Sequence[Any]]) -> Rule:
     if not 1 <= interval <= MAX_INTERVAL or (most is not None and not 1 <= most <= MAX_COUNT):
         raise ValueError(f"its INTERVAL or COUNT is not from 1 to {MAX_COUNT}")
     days = tuple((one.relative or 0, DAYS_OF_WEEK.index(str(one.weekday))) for one in found.get("BYDAY", []))
-    rule = Rule(
+    rule = RepeatRule(
         freq,
         interval,
         most,
@@ -95,7 +95,7 @@ def _one(parts: Mapping[str, Sequence[Any]], name: str, default: Any) -> Any:
     return values[0]
 
 
-def occurrences(rule: Rule, start: datetime, since: datetime, before: datetime) -> Iterator[datetime]:
+def occurrences(rule: RepeatRule, start: datetime, since: datetime, before: datetime) -> Iterator[datetime]:
     """The local times from `since` on and before `before` at which an event begins that began first at `start`, all
     without a zone. UNTIL is left to who knows the zone."""
     number = 0
@@ -114,14 +114,14 @@ def occurrences(rule: Rule, start: datetime, since: datetime, before: datetime) 
                 yield at
 
 
-def _periods(rule: Rule, start: datetime, since: datetime) -> int:
+def _periods(rule: RepeatRule, start: datetime, since: datetime) -> int:
     """How many are over by then, or fewer."""
     months = (since.year - start.year) * 12 + since.month - start.month
     over = {"DAILY": (since - start).days, "WEEKLY": (since - start).days // 7, "MONTHLY": months}
     return max(0, over.get(rule.freq, since.year - start.year) // rule.interval - 1)
 
 
-def _period(rule: Rule, first: date, number: int) -> tuple[date, Iterable[date]]:
+def _period(rule: RepeatRule, first: date, number: int) -> tuple[date, Iterable[date]]:
     """When a day, week, month or year begins, and the days of it that count, in order."""
     over = rule.interval * number
     if rule.freq == "DAILY":
@@ -144,7 +144,7 @@ def _period(rule: Rule, first: date, number: int) -> tuple[date, Iterable[date]]
     return begin, days
 
 
-def _days(rule: Rule, default: int, year: int, month: int) -> list[date]:
+def _days(rule: RepeatRule, default: int, year: int, month: int) -> list[date]:
     length = monthrange(year, month)[1]
     days = range(1, length + 1)
     found = set(days)

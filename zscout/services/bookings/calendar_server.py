@@ -13,7 +13,7 @@ from typing import Final
 from zscout.keyexpr import NAME
 from zscout.mesh import Mesh
 from zscout.messages import BookingsAsk, BookingsTold
-from zscout.services.bookings.calendar_text import CONTENT_TYPE, Selection, calendar_text
+from zscout.services.bookings.calendar_text import CONTENT_TYPE, CalendarSelection, calendar_text
 from zscout.services.plain_http import Page, PlainHttpServer
 
 FRESH: Final = 5.0
@@ -37,13 +37,13 @@ class CalendarServer(PlainHttpServer):
         self._one_by_one = asyncio.Lock()
         self._told: BookingsTold | None = None
         self._asked = float("-inf")
-        self._texts: dict[Selection, bytes] = {}
+        self._texts: dict[CalendarSelection, bytes] = {}
 
     async def page(self, path: str) -> Page | None:
         found = _PATH.fullmatch(path)
         if found is None:
             return None
-        selection = Selection(found["owner"], found["rc"])
+        selection = CalendarSelection(found["owner"], found["rc"])
         async with self._one_by_one:
             if time.monotonic() - self._asked > FRESH:
                 await self._ask()

@@ -25,7 +25,7 @@ REFRESH: Final = "PT15M"
 NEEDS, PRIORITY, PATIENCE = "X-ZSCOUT-NEEDS", "X-ZSCOUT-PRIORITY", "X-ZSCOUT-PATIENCE"
 
 
-class Selection(NamedTuple):
+class CalendarSelection(NamedTuple):
     """Which bookings a calendar has: of one `owner`, of those that have one `rc`, or all."""
 
     owner: str | None = None
@@ -49,7 +49,9 @@ class Selection(NamedTuple):
         ]
 
 
-def calendar_text(fleet: str, bookings: Iterable[BookingView], selection: Selection = Selection()) -> bytes:  # noqa: B008
+def calendar_text(
+    fleet: str, bookings: Iterable[BookingView], selection: CalendarSelection = CalendarSelection()
+) -> bytes:  # noqa: B008
     """The calendar of those that are selected. Lines end as the format wants it, in CR LF."""
     calendar = Calendar()
     calendar.add("VERSION", "2.0")
