@@ -72,8 +72,8 @@ async def export(rc: str | None, owner: str | None, out: str | None, folder: Pat
     \b
     Examples:
       zscout calendar export > fleet.ics
-      zscout calendar export --rc robot/arm1 --out /srv/calendars/arm1.ics
-      zscout calendar export --folder /srv/calendars
+      zscout calendar export --rc robot/arm1 --out arm1.ics
+      zscout calendar export --folder calendars
     """
     if folder is not None and (rc or owner or out):
         raise BadInput("--folder: it has all calendars; leave --rc, --owner and --out out")

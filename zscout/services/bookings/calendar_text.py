@@ -49,9 +49,10 @@ class CalendarSelection(NamedTuple):
         ]
 
 
-def calendar_text(
-    fleet: str, bookings: Iterable[BookingView], selection: CalendarSelection = CalendarSelection()
-) -> bytes:  # noqa: B008
+EVERYTHING: Final = CalendarSelection()
+
+
+def calendar_text(fleet: str, bookings: Iterable[BookingView], selection: CalendarSelection = EVERYTHING) -> bytes:
     """The calendar of those that are selected. Lines end as the format wants it, in CR LF."""
     calendar = Calendar()
     calendar.add("VERSION", "2.0")
