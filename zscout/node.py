@@ -23,7 +23,7 @@ from zscout import __version__
 from zscout.config.certificates import PLACES_KEY, read_places_key
 from zscout.config.devices import RobotRc
 from zscout.config.fleet import Fleet
-from zscout.config.node import MetricsConfig, Node, default_node, load_node
+from zscout.config.node import CalendarConfig, MetricsConfig, Node, default_node, load_node
 from zscout.config.notify import NotifyConfig
 from zscout.config.state_folder import state_folder
 from zscout.config.strict import BadInput
@@ -45,6 +45,7 @@ from zscout.services.node.load_reporter import LoadReporter
 from zscout.services.node.reload import Reload
 from zscout.services.node.service_manager import ServiceManager
 from zscout.services.notify.notifier import Notifier
+from zscout.services.plain_http import PlainHttpServer
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.digest import HoldListener
 from zscout.services.recorder.process import RecorderProcess
@@ -166,6 +167,8 @@ async def run_services(
         if node.metrics is not None:
             figures.candidate = candidate
             stack.push_async_callback(await _serve_figures(node.metrics, figures))
+        if node.calendar is not None:
+            stack.push_async_callback(await _serve_calendars(node.calendar, mesh, node.fleet.name))
         await components.start()
         # Before all else: they give back their ARCs while there is an RCM and while there are RCs.
         stack.push_async_callback(components.stop)
@@ -200,12 +203,27 @@ async def _serve_figures(metrics: MetricsConfig, figures: NodeFigures) -> Callab
     from zscout.services.metrics.server import MetricsServer
 
     server = MetricsServer(figures.samples, metrics.bind, metrics.port)
+    await _serve("metrics", server)
+    log.info("serves its figures at http://%s:%d/metrics", metrics.bind, server.port)
+    return server.stop
+
+
+async def _serve_calendars(calendar: CalendarConfig, mesh: Mesh, fleet: str) -> Callable[[], Awaitable[None]]:
+    """Returns what ends it. Raises NodeFailed."""
+    from zscout.services.bookings.calendar_server import CalendarServer
+
+    server = CalendarServer(mesh, fleet, calendar.bind, calendar.port)
+    await _serve("calendar", server)
+    log.info("serves calendars at http://%s:%d/fleet.ics", calendar.bind, server.port)
+    return server.stop
+
+
+async def _serve(table: str, server: PlainHttpServer) -> None:
+    """Raises NodeFailed."""
     try:
         await server.start()
     except OSError as error:
-        raise NodeFailed(f"[metrics] can't be served at {metrics.bind}:{metrics.port}: {error.strerror}") from error
-    log.info("serves its figures at http://%s:%d/metrics", metrics.bind, server.port)
-    return server.stop
+        raise NodeFailed(f"[{table}] can't be served at {server.bind}:{server.port}: {error.strerror}") from error
 
 
 def _notifier(config: NotifyConfig, fleet: str, candidate: Candidate) -> Notifier:

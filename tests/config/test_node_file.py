@@ -28,6 +28,9 @@ BAD_NODES = {
     "[node]\nload = 1": 'node.load: is 1; write true, false or "tree"',
     '[metrics]\nbind = "0.0.0.0"': 'metrics.bind: "0.0.0.0" shows the figures to other hosts; '
     'write "127.0.0.1", or add allow_remote = true if that is meant',
+    '[calendar]\nbind = "0.0.0.0"': 'calendar.bind: "0.0.0.0" shows the bookings to other hosts; '
+    'write "127.0.0.1", or add allow_remote = true if that is meant',
+    "[calendar]\nport = 0": "calendar.port: is 0; write a whole number from 1 to 65535",
     "[notify]": "notify: tells nobody; name urls or users, or remove the table",
     '[node]\ncandidate = false\n[notify]\nurls = ["json://a"]': "notify: this host never leads, "
     "and only who leads tells anybody; move it to one that does",

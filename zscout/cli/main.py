@@ -42,6 +42,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "usage": ("fleet.usage", "Sum up who held what for how long, by user, group or RC."),
     "start": ("components.start", "Have a component run on the best host, and keep it running."),
     "stop": ("components.start", "End components for good."),
+    "calendar": ("bookings.calendar", "Write bookings as iCalendar files, and book what such files have."),
     "components": ("components.components", "List components: where each runs, and what it uses."),
     "logs": ("components.logs", "Print or follow the output of a component."),
     "migrate": ("components.moves", "Move a running component to another host."),

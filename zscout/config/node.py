@@ -75,6 +75,14 @@ class MetricsConfig(Struct, frozen=True):
     port: int
 
 
+class CalendarConfig(Struct, frozen=True):
+    """Where the fleet's bookings are served as calendars."""
+
+    bind: str
+    """IP address; loopback unless the file allowed others."""
+    port: int
+
+
 class ComponentsConfig(Struct, frozen=True, forbid_unknown_fields=True):
     """The table [components]: what a node starts for others."""
 
@@ -111,6 +119,8 @@ class Node(Struct, frozen=True):
     components: ComponentsConfig = ComponentsConfig()
     metrics: MetricsConfig | None = None
     """None: it serves no figures."""
+    calendar: CalendarConfig | None = None
+    """None: it serves no calendars."""
     notify: NotifyConfig | None = None
     """None: it tells nobody."""
     journal: JournalConfig = JournalConfig()
@@ -158,6 +168,14 @@ class MetricsTable(Struct, frozen=True, forbid_unknown_fields=True):
     allow_remote: Annotated[bool, key("Whether `bind` may let other hosts in.")] = False
 
 
+class CalendarTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [calendar]. With it the node serves the fleet's bookings as iCalendar, over plain HTTP."""
+
+    bind: Annotated[str, key("IP address.")] = "127.0.0.1"
+    port: Annotated[int, key("TCP port.", 1, 65_535)] = 9465
+    allow_remote: Annotated[bool, key("Whether `bind` may let other hosts in.")] = False
+
+
 class NodeMeshTable(Struct, frozen=True, forbid_unknown_fields=True):
     """The table [mesh] of a node file: what this host has instead of the fleet file's."""
 
@@ -181,6 +199,7 @@ class NodeFile(Struct, frozen=True, forbid_unknown_fields=True):
     security: SecurityTable | None = None
     components: ComponentsConfig = ComponentsConfig()
     metrics: MetricsTable | None = None
+    calendar: CalendarTable | None = None
     notify: NotifyTable | None = None
     journal: JournalConfig = JournalConfig()
 
@@ -235,6 +254,7 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
         labels=file.node.labels,
         components=file.components,
         metrics=None if file.metrics is None else _metrics(file.metrics, top / "metrics"),
+        calendar=None if file.calendar is None else _calendar(file.calendar, top / "calendar"),
         notify=None if file.notify is None else read_notify(file.notify, folder, top / "notify"),
         journal=file.journal,
         state=None if file.node.state is None else _folder(file.node.state, folder, top / "node" / "state", STATE),
@@ -268,6 +288,11 @@ def _recorder(table: RecorderTable, folder: Path, at: Where) -> RecorderConfig:
 def _metrics(table: MetricsTable, at: Where) -> MetricsConfig:
     check_installed("prometheus_client", at)
     return MetricsConfig(_served_at(table.bind, "the figures", at, allow_remote=table.allow_remote), table.port)
+
+
+def _calendar(table: CalendarTable, at: Where) -> CalendarConfig:
+    address = _served_at(table.bind, "the bookings", at, allow_remote=table.allow_remote)
+    return CalendarConfig(address, table.port)
 
 
 def _served_at(bind: str, what: str, at: Where, *, allow_remote: bool) -> str:

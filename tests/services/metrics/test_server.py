@@ -9,9 +9,10 @@ from contextlib import asynccontextmanager
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from zscout.services.metrics import server as server_module
+from zscout.services import plain_http
 from zscout.services.metrics.figures import FAMILIES, Histogram, Samples
-from zscout.services.metrics.server import MAX_CONNECTIONS, MAX_HEAD, MetricsServer
+from zscout.services.metrics.server import MetricsServer
+from zscout.services.plain_http import MAX_CONNECTIONS, MAX_HEAD
 
 
 def everything() -> Samples:
@@ -85,7 +86,7 @@ def test_other_requests_are_answered_in_a_line(request_: bytes, answer: bytes) -
 
 
 def test_who_sends_too_much_or_nothing_is_shut_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server_module, "TIMEOUT", 0.2)
+    monkeypatch.setattr(plain_http, "TIMEOUT", 0.2)
 
     async def story() -> None:
         async with served() as server:
@@ -140,4 +141,4 @@ def test_a_fault_of_the_figures_is_logged_and_ends_nothing(caplog: pytest.LogCap
                 assert await say(server, b"GET /metrics HTTP/1.1\r\n\r\n") in (b"", b"reset")
 
     asyncio.run(story())
-    assert [record.message for record in caplog.records] == ["a scrape of the figures failed: KeyError('a fault')"]
+    assert [record.message for record in caplog.records] == ["figures can't be served: KeyError('a fault')"]

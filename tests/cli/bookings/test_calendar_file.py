@@ -1,0 +1,159 @@
+# ruff: noqa: DTZ001 - local times
+"""iCalendar files as they come: of other programs, and of who wants to harm."""
+
+from __future__ import annotations
+
+import time
+from contextlib import suppress
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from zscout.cli.bookings.calendar_file import MAX_BYTES, MAX_EVENTS, CalendarEvent, read_calendar
+from zscout.config.strict import BadInput
+
+SAMPLES = Path(__file__).with_name("calendars")
+START = "DTSTART:20261201T080000Z\n"
+
+
+def read(*events: str) -> list[CalendarEvent]:
+    inner = "".join(f"BEGIN:VEVENT\nUID:a\n{event}\nEND:VEVENT\n" for event in events)
+    return read_calendar(f"BEGIN:VCALENDAR\n{inner}END:VCALENDAR\n".encode(), "a.ics")
+
+
+def problem(event: str) -> str:
+    return read(event)[0].problem
+
+
+def test_what_google_exports() -> None:
+    events = read_calendar((SAMPLES / "google.ics").read_bytes(), "google.ics")
+    assert len(events) == 8
+    assert not any(event.problem for event in events)
+    weekly, moved, once, whole, holiday, _, off, _ = events
+    assert weekly.start is not None
+    assert str(weekly.start.zone) == "Europe/Berlin"
+    assert weekly.rule is not None
+    assert weekly.rule.by_day == ((0, 0), (0, 2))
+    # A resource that is invited counts; a person does not.
+    assert weekly.words == ["Building 3-Arm 1", "Building 3", "Grasping practical"]
+    assert moved.uid == weekly.uid
+    assert moved.instead_of is not None
+    assert moved.instead_of.local == datetime(2026, 12, 2, 10)
+    assert once.words == ["Camera room, arm 1", "Calibration"]
+    assert whole.start is not None
+    assert whole.start.whole_day
+    assert (holiday.free, off.cancelled) == (True, True)
+
+
+def test_what_outlook_exports() -> None:
+    daily, monthly, own = read_calendar((SAMPLES / "outlook.ics").read_bytes(), "outlook.ics")
+    assert daily.start is not None
+    assert str(daily.start.zone) == "Europe/Berlin"
+    assert daily.rule is not None
+    assert (daily.rule.freq, daily.rule.count) == ("WEEKLY", 5)
+    assert daily.words == ["Labor 2; Arm 1", "Einmessen"]
+    assert monthly.rule is not None
+    assert monthly.rule.by_day == ((1, 1),)
+    assert own.problem == 'its zone "Customized Time Zone 1" is none of the IANA database'
+
+
+def test_what_nextcloud_exports() -> None:
+    daily, floating, several = read_calendar((SAMPLES / "nextcloud.ics").read_bytes(), "nextcloud.ics")
+    assert daily.start is not None
+    assert str(daily.start.zone) == "Europe/Berlin"
+    assert daily.resources == ["robot/arm1", "Tripod", "framegrabber/*"]
+    assert (daily.duration, len(daily.without)) == (timedelta(minutes=45), 2)
+    assert floating.start is not None
+    assert floating.start.zone is None
+    assert [one.local.day for one in several.more] == [12, 14]
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (b"", "ends before its END:VCALENDAR; download or export it again"),
+        (b"<html>Sign in</html>", "is no iCalendar file; export it as .ics; it begins with BEGIN:VCALENDAR"),
+        (b"\x00\xff\xfe" * 99, "is not UTF-8, so it is no iCalendar file; export it as .ics again"),
+        (b"\x00" * 99, "is no iCalendar file; export it as .ics; it begins with BEGIN:VCALENDAR"),
+        (b"BEGIN:VEVENT\nEND:VEVENT\n", "is no iCalendar file, or nested too deep; export it as .ics again"),
+        (b"BEGIN:VCALENDAR\nBEGIN:VEVENT\nEND:VEVENT\n", "ends before its END:VCALENDAR; download or export it again"),
+        (b"BEGIN:VCALENDAR\nEND:VEVENT\n", "has an END of what did not begin; export it again"),
+        (b"BEGIN:VCALENDAR\n" * 100_000, "is no iCalendar file, or nested too deep; export it as .ics again"),
+        (b"BEGIN:VCALENDAR\n" + b"BEGIN:VEVENT\nEND:VEVENT\n" * (MAX_EVENTS + 1) + b"END:VCALENDAR\n",
+         "has more than 5000 events; export less, as the coming year only"),
+        (b"x" * (MAX_BYTES + 1), "has more than 5,000,000 bytes; export less, as the coming year only"),
+    ],
+)  # fmt: skip
+def test_what_is_no_calendar(data: bytes, why: str) -> None:
+    began = time.process_time()
+    with pytest.raises(BadInput) as error:
+        read_calendar(data, "a.ics")
+    assert str(error.value) == f"a.ics: {why}"
+    assert time.process_time() - began < 5
+
+
+@pytest.mark.parametrize(
+    ("event", "why"),
+    [
+        ("SUMMARY:x", "it has no DTSTART"),
+        (START + START, "it has DTSTART more than once"),
+        ("DTSTART:2026", 'Expected datetime, date, or time. Got: \'2026\''),
+        ("DTSTART:00010101T000000Z", '"00010101T000000Z" is no date'),
+        ("DTSTART:20261301T000000Z", "Wrong datetime format: 20261301T000000Z"),
+        ("DTSTART;TZID=../../etc/passwd:20261201T080000", 'its zone "../../etc/passwd" is none of the IANA database'),
+        ("DTSTART;TZID=:20261201T080000", 'its zone "" is none of the IANA database'),
+        (START + "RRULE:FREQ=SECONDLY", "it is repeated SECONDLY, which can't be booked"),
+        (START + "RRULE:FREQ=DAILY\nRRULE:FREQ=WEEKLY", "it has RRULE more than once"),
+        (START + "EXDATE:" + ",".join(["20261201T080000Z"] * 1_001), "it has more than 1000 dates"),
+        (START + "SUMMARY:x\n" * 1_001, "it is too long"),
+        (START + "SUMMARY:" + "x" * 200_000, "it is too long"),
+        (START + "RDATE;VALUE=PERIOD:20261201T080000Z/PT1H", '"20261201T080000Z/PT1H" is no date'),
+        (START + "RECURRENCE-ID;RANGE=THISANDFUTURE:20261201T080000Z",
+         "it is in the place of many dates (RANGE), which can't be booked"),
+    ],
+)  # fmt: skip
+def test_an_event_that_can_not_be_read_tells_why(event: str, why: str) -> None:
+    assert problem(event) == why
+    # All others can.
+    assert [one.problem for one in read(event, START)] == [why, ""]
+
+
+def test_a_zone_of_the_file_is_never_worked_out() -> None:
+    """Its rules may go on for ever: icalendar follows them when it reads a file."""
+    zone = "BEGIN:VTIMEZONE\nTZID:x\nBEGIN:STANDARD\nDTSTART:16010101T000000\nRRULE:FREQ=SECONDLY\n"
+    zone += "TZOFFSETFROM:+0000\nTZOFFSETTO:+0100\nEND:STANDARD\nEND:VTIMEZONE\n"
+    event = "BEGIN:VEVENT\nUID:a\nDTSTART;TZID=x:20261201T080000\nEND:VEVENT\n"
+    began = time.process_time()
+    (found,) = read_calendar(f"BEGIN:VCALENDAR\n{zone}{event}END:VCALENDAR\n".encode(), "a.ics")
+    assert found.problem == 'its zone "x" is none of the IANA database'
+    assert time.process_time() - began < 1
+
+
+def test_what_an_event_holds_inside_is_not_its_own() -> None:
+    (event,) = read(START + "BEGIN:VALARM\nDTSTART:20300101T000000Z\nSUMMARY:alarm\nEND:VALARM\nSUMMARY:own")
+    assert (event.problem, event.title) == ("", "own")
+
+
+def test_words_are_bounded_and_draw_nothing() -> None:
+    (event,) = read(START + "SUMMARY:\x1b[2Ja\\nb" + "c" * 300 + "\nLOCATION:" + "d," * 99)
+    assert event.title.startswith("[2Ja bccc")
+    assert len(event.title) == 200
+    assert all(text.isprintable() for text in event.words)
+
+
+values = st.text(max_size=20)
+names = st.sampled_from(["DTSTART", "DURATION", "RRULE", "EXDATE", "ATTENDEE", "SUMMARY", " "])
+params = st.sampled_from(["", ";TZID=Europe/Berlin", ';CN="a', ";", ";=", ";X=\\"])
+parts = st.sampled_from(["BEGIN:VCALENDAR", "END:VCALENDAR", "BEGIN:VEVENT", "END:VEVENT", "BEGIN:X", "END:X"])
+lines = st.lists(parts | st.builds("{}{}:{}".format, names, params, values) | values, max_size=20)
+
+
+@given(lines)
+def test_whatever_a_file_has_it_is_read_or_refused_in_a_line(some: list[str]) -> None:
+    text = "\r\n".join(["BEGIN:VCALENDAR", "BEGIN:VEVENT", *some, "END:VEVENT", "END:VCALENDAR", ""])
+    with suppress(BadInput):
+        for event in read_calendar(text.encode(errors="replace"), "a.ics"):
+            assert "\n" not in event.problem

@@ -1,0 +1,354 @@
+"""`zscout calendar`: bookings as iCalendar files, and those of others as bookings."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from decimal import Decimal
+from pathlib import Path
+from typing import Any, Final
+from zoneinfo import ZoneInfo
+
+import click
+from msgspec.structs import replace
+
+from zscout import terminal
+from zscout.behaviors.client.bookings import BookingsClient, RcmSilent
+from zscout.behaviors.client.client import Client, RequestRefused
+from zscout.cli import common, completion
+from zscout.cli.booked import ask_bookings, utc, zone_option
+from zscout.cli.bookings.calendar_file import MAX_BYTES, read_calendar
+from zscout.cli.bookings.calendar_plan import ImportOptions, ImportPlan, Pairs, Wanted, plan_import
+from zscout.cli.common import Failed, NobodyThere, Parsed
+from zscout.cli.dates import date_words, every_words, host_zone
+from zscout.cli.requests.options import parse_duration, parse_need
+from zscout.cli.requests.request import MAX_PRIORITY
+from zscout.config.state_folder import write_durably
+from zscout.config.strict import BadInput, quoted, read_bytes
+from zscout.keyexpr import Role, check_rc, is_pattern
+from zscout.messages import Book, BookingView, Unbook
+from zscout.services.bookings.calendar_text import CalendarSelection, calendar_text
+from zscout.terminal import Table, clean, many
+
+MAX_WORDS: Final = 200
+LOOK: Final = 1.0
+"""Seconds in which RCs are seen."""
+_NEXT_NEED: Final = re.compile(r",(?=[^,=]*/)")
+
+
+@click.group()
+def calendar() -> None:
+    """Write bookings as iCalendar files, and book what such files have.
+
+    A calendar program can subscribe to what a node serves, too: see [calendar] of its node file.
+
+    \b
+    Examples:
+      zscout calendar export --out fleet.ics
+      zscout calendar import lab.ics --map 'Arm 1=robot/arm1' --dry-run
+    """
+
+
+# Out
+
+
+@calendar.command()
+@click.option(
+    "--rc", type=Parsed("rc", lambda text, _: check_rc(text)), shell_complete=completion.needs, help="Of one RC."
+)
+@click.option("--owner", metavar="NAME", help="Of one host, or person by certificate.")
+@click.option("--out", metavar="FILE", help="The file, written as a whole; without it, or with -, stdout.")
+@click.option("--folder", type=click.Path(path_type=Path), help="Write all calendars below this folder.")
+@common.runs
+async def export(rc: str | None, owner: str | None, out: str | None, folder: Path | None) -> None:
+    """Write the bookings that are not over as an iCalendar file.
+
+    With --folder it writes fleet.ics, rc/KIND/NAME.ics for each RC and owner/NAME.ics for each owner, for a web server;
+    one that has no bookings any more stays, empty. Files are replaced as a whole, and only where bookings changed.
+
+    \b
+    Examples:
+      zscout calendar export > fleet.ics
+      zscout calendar export --rc robot/arm1 --out arm1.ics
+      zscout calendar export --folder calendars
+    """
+    if folder is not None and (rc or owner or out):
+        raise BadInput("--folder: it has all calendars; leave --rc, --owner and --out out")
+    async with common.connected("calendar") as client:
+        bookings = (await ask_bookings(client)).bookings
+        rcs = set[str]()
+        if folder is not None:
+            tokens = await client.mesh.living(client.mesh.keys.alive_any(Role.RC), timeout=LOOK)
+            rcs = {token.name for token in tokens}
+        fleet = client.fleet.name
+    if folder is not None:
+        written, total = _write_all(folder, fleet, bookings, rcs)
+        terminal.print_line(f"{many(total, 'calendar')} in {folder}, {written} of them changed")
+        return
+    text = calendar_text(fleet, bookings, CalendarSelection(owner, rc))
+    if out in (None, "-"):
+        sys.stdout.buffer.write(text)
+        return
+    _write(Path(str(out)), text)
+
+
+def _write_all(folder: Path, fleet: str, bookings: list[BookingView], rcs: Iterable[str]) -> tuple[int, int]:
+    """How many files are new, and how many there are. Raises Failed."""
+    bound = {rc for one in bookings for date in one.dates for rc in date.bound.values()}
+    named = {need for one in bookings for need in one.needs if not is_pattern(need)}
+    selections = {CalendarSelection(), *(CalendarSelection(one.owner) for one in bookings if one.owner)}
+    selections |= {CalendarSelection(rc=rc) for rc in {*rcs, *bound, *named}}
+    selections |= {CalendarSelection(path.stem) for path in folder.glob("owner/*.ics")}
+    selections |= {CalendarSelection(rc=f"{path.parent.name}/{path.stem}") for path in folder.glob("rc/*/*.ics")}
+    # A kind may consist of dots.
+    safe = [one for one in selections if ".." not in one.path.split("/")]
+    return sum(_write(folder / one.path, calendar_text(fleet, bookings, one)) for one in safe), len(safe)
+
+
+def _write(path: Path, text: bytes) -> bool:
+    """Whether it had to be. Raises Failed."""
+    try:
+        if path.exists() and not path.is_file():  # a device, a pipe
+            path.write_bytes(text)
+            return True
+        if path.exists() and path.read_bytes() == text:
+            return False
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_durably(path, text)
+    except OSError as error:
+        raise Failed(f"{path} can't be written: {error.strerror}") from None
+    return True
+
+
+# In
+
+
+def _needs(text: str, option: str) -> Pairs:
+    """`robot/arm1,framegrabber/*,radio/rf0:command_rate=5`. Raises BadInput."""
+    found = tuple(parse_need(one, option) for one in _NEXT_NEED.split(text))
+    if not text:
+        raise BadInput(f"{option}: names no RC")
+    return found
+
+
+def _mapping(text: str, option: str) -> tuple[str, Pairs]:
+    """`Arm 1=robot/arm1`. Raises BadInput."""
+    words, equals, needs = text.partition("=")
+    if not equals or not 1 <= len(words.strip()) <= MAX_WORDS:
+        raise BadInput(f"{option}: {quoted(text)} maps nothing; write words of the calendar, as in 'Arm 1=robot/arm1'")
+    return " ".join(words.split()), _needs(needs, option)
+
+
+@dataclass(slots=True)
+class Row:
+    """What became of one booking of the calendar."""
+
+    title: str
+    result: str
+    why: str = ""
+    book: Book | BookingView | None = None
+    failed: bool = False
+
+
+@dataclass(slots=True)
+class _Import:
+    client: Client
+    options: ImportOptions
+    known: list[BookingView]
+    dry_run: bool
+    again: bool
+    rows: list[Row] = field(default_factory=list)
+
+    async def run(self, plan: ImportPlan, *, sync: bool) -> None:
+        """Raises NobodyThere."""
+        gone = [one for one in self.known if one.id.endswith(self.options.suffix) and one.id not in plan.ids]
+        for view in gone:
+            if not view.unbooked and view.owner == self.client.mesh.me.host:
+                words = view.who.comment if view.who is not None and view.who.comment else view.name
+                if sync:
+                    await self._unbook(view, words)
+                else:
+                    self.rows.append(Row(words, "kept", "it is not in the calendar any more; --sync gives it up", view))
+        by_id = {one.id: one for one in self.known if not one.unbooked}
+        for wanted in plan.wanted:
+            await self._want(wanted, next((by_id[one] for one in wanted.ids if one in by_id), None))
+
+    async def _want(self, wanted: Wanted, known: BookingView | None) -> None:
+        if known is None and wanted.book is None:
+            return
+        row = Row(wanted.title, "already there", book=known or wanted.book)
+        self.rows.append(row)
+        if known is None and wanted.book is not None:
+            row.result = "would be booked" if self.dry_run else "booked"
+            if self.dry_run or (known := await self._book(wanted.ids, wanted.book, row)) is None:
+                return
+        if known is None:
+            return
+        last = known.start if known.until is None else known.until
+        given_up = {*known.dropped, *(one.start for one in known.dates if one.state == "unbooked")}
+        dropped = [at for at in wanted.dropped if known.start <= at <= last and at not in given_up]
+        for at in dropped:
+            if not self.dry_run:
+                await self._ask(Unbook(known.id, at, self.client.who), row)
+        row.why = row.why or (f"without {many(len(dropped), 'date')} given up in the calendar" if dropped else "")
+
+    async def _book(self, ids: tuple[str, ...], book: Book, row: Row) -> BookingView | None:
+        """None: it is not booked, and the row tells. Raises NobodyThere."""
+        for booking in ids if self.again else ids[:1]:
+            made = await self._ask(replace(book, id=booking), row)
+            if made is None or not made.unbooked:
+                row.book = made or row.book
+                return made
+        row.result, row.why = "given up before", "it was unbooked since then; --again books it again"
+        return None
+
+    async def _unbook(self, view: BookingView, words: str) -> None:
+        row = Row(
+            words, "would be given up" if self.dry_run else "given up", "it is not in the calendar any more", view
+        )
+        self.rows.append(row)
+        if not self.dry_run:
+            await self._ask(Unbook(view.id, who=self.client.who), row)
+
+    async def _ask(self, operation: Book | Unbook, row: Row) -> BookingView | None:
+        """None: it was refused, and the row tells. Raises NobodyThere."""
+        try:
+            return await BookingsClient(self.client).ask(operation, BookingView)
+        except RcmSilent as silent:
+            raise NobodyThere(f"{silent}; what was imported is known again") from None
+        except RequestRefused as refused:
+            row.result = "not free" if refused.code == "not_free" else "refused"
+            row.why, row.failed = str(refused), True
+            return None
+
+
+@calendar.command("import")
+@click.argument("file", type=click.Path(path_type=Path, allow_dash=True))
+@click.option(
+    "--needs", "needs", multiple=True, type=Parsed("needs", _needs), help="What every event needs: robot/a,'camera/*'."
+)
+@click.option(
+    "--map",
+    "mapped",
+    multiple=True,
+    metavar="WORDS=NEEDS",
+    type=Parsed("mapping", _mapping),
+    help="What an event needs whose title, place or resources have these words.",
+)
+@zone_option
+@click.option("--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="Of all.")
+@click.option("--patience", type=Parsed("duration", parse_duration), help="As of zscout book. Default: 15 min.")
+@click.option("--maintenance", is_flag=True, help="Keep the RCs free of everybody then, as an operator.")
+@click.option("--calendar", "name", metavar="NAME", help="What this calendar is called. Default: the file's name.")
+@click.option("--sync", is_flag=True, help="Give up what was imported from it and is not in it any more.")
+@click.option("--again", is_flag=True, help="Book again what was imported, and unbooked since.")
+@click.option("--dry-run", is_flag=True, help="Only say what would be done.")
+@common.json_option("Print one JSON object.")
+@common.runs
+async def import_(
+    file: Path,
+    needs: tuple[Pairs, ...],
+    mapped: tuple[tuple[str, Pairs], ...],
+    zone: ZoneInfo | None,
+    priority: int,
+    patience: Decimal | None,
+    maintenance: bool,
+    name: str | None,
+    sync: bool,
+    again: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> int:
+    """Book the events of an iCalendar FILE (- is stdin): of Google, Outlook, Nextcloud and others.
+
+    What an event needs is what --needs and --map say; where they say nothing, the RCs that its resources name. Others
+    are left out, as are events that are over, cancelled, or whose people are free then. To import it again books
+    nothing twice; what was changed in it is another booking, so that --sync is wanted then. Times without a zone, and
+    whole days, are of --zone.
+
+    The exit code is 1 where something was not booked that should have been.
+
+    \b
+    Examples:
+      zscout calendar import lab.ics --map 'Arm 1=robot/arm1' --map 'Camera=framegrabber/*' --dry-run
+      curl -s URL | zscout calendar import - --calendar lab --needs robot/arm1 --sync
+      zscout calendar import service.ics --needs robot/arm1 --maintenance
+    """
+    if str(file) == "-" and name is None:
+        raise BadInput("--calendar: what is read from stdin has no name; write one, and the same each time")
+    data = sys.stdin.buffer.read(MAX_BYTES + 1) if str(file) == "-" else read_bytes(file, max_bytes=MAX_BYTES)
+    events = read_calendar(data, "stdin" if str(file) == "-" else str(file))
+    zone = zone or host_zone()
+    async with common.connected("calendar") as client:
+        told = await ask_bookings(client)
+        options = ImportOptions(
+            client.fleet.name,
+            name or file.stem,
+            zone,
+            tuple(one for some in needs for one in some),
+            _merged(mapped),
+            client.fleet.operator_priority if maintenance else priority,
+            patience,
+            maintenance,
+            client.who,
+        )
+        plan = plan_import(events, options, told.time)
+        work = _Import(client, options, told.bookings, dry_run, again)
+        await work.run(plan, sync=sync)
+    rows = [*work.rows, *(Row(one.title, "not booked", one.why, failed=True) for one in plan.skipped if one.failed)]
+    left_out = Counter(one.why for one in plan.skipped if not one.failed)
+    if as_json:
+        terminal.print_json(
+            {"fleet": options.fleet, "calendar": options.calendar, "dry_run": dry_run}
+            | {"events": [_row_json(row) for row in rows], "left_out": dict(left_out)}
+        )
+    else:
+        _print(rows, left_out, zone, options.calendar)
+    return int(any(row.failed for row in rows))
+
+
+def _merged(mapped: Iterable[tuple[str, Pairs]]) -> dict[str, Pairs]:
+    """Words may be given more than once."""
+    found: dict[str, Pairs] = {}
+    for words, needs in mapped:
+        found[words] = (*found.get(words, ()), *needs)
+    return found
+
+
+def _row_json(row: Row) -> dict[str, Any]:
+    found: dict[str, Any] = {"title": row.title, "result": row.result, "why": row.why, "failed": row.failed}
+    if (book := row.book) is not None:
+        until = None if book.until is None else utc(book.until)
+        found |= {"id": book.id, "name": book.name, "needs": book.needs, "start": utc(book.start), "every": book.every}
+        found |= {"until": until, "runtime": book.runtime, "zone": book.zone, "priority": book.priority}
+    return found
+
+
+def _print(rows: list[Row], left_out: Counter[str], zone: ZoneInfo, name: str) -> None:
+    if rows:
+        cells = [
+            (
+                clean(row.title),
+                "-" if row.book is None else _when(row.book, zone),
+                "-" if row.book is None else clean(", ".join(sorted(row.book.needs))),
+                clean(f"{row.result}: {row.why}" if row.why else row.result),
+            )
+            for row in rows
+        ]
+        Table(f"Calendar {clean(name)}", ("EVENT", "DATE", "RCS", "RESULT"), cells).print()
+    else:
+        terminal.print_line(f"calendar {clean(name)} has nothing to book")
+    for why, number in sorted(left_out.items()):
+        terminal.print_line(f"left out, {why}: {number}")
+
+
+def _when(book: Book | BookingView, zone: ZoneInfo) -> str:
+    begin = date_words(book.start, zone)
+    return (
+        f"{begin}, {every_words(book.every)} until {date_words(book.until or book.start, zone)[4:14]}"
+        if book.every
+        else begin
+    )

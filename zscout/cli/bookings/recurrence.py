@@ -1,0 +1,162 @@
+"""How an event of a calendar is repeated (RFC 5545, section 3.3.10), as far as it can be booked. Pure.
+
+dateutil would go on to the year 9999 where nothing matches, and for ever at an interval of 0; a calendar is a file of
+others."""
+
+from __future__ import annotations
+
+from calendar import monthrange
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import date, datetime, timedelta
+from itertools import count
+from typing import Any, Final
+
+from zscout.messages.bookings import DAYS
+
+PARTS: Final = {
+    "DAILY": frozenset[str](),
+    "WEEKLY": frozenset({"BYDAY", "WKST"}),
+    "MONTHLY": frozenset({"BYDAY", "BYMONTHDAY", "BYMONTH", "BYSETPOS", "WKST"}),
+    "YEARLY": frozenset({"BYDAY", "BYMONTHDAY", "BYMONTH", "BYSETPOS", "WKST"}),
+}
+"""What may stand beside FREQ, INTERVAL, COUNT and UNTIL."""
+MAX_INTERVAL: Final = 1_000
+MAX_COUNT: Final = 1_000
+MAX_LISTED: Final = 100
+"""Of each kind: weekdays, days of the month."""
+DAYS_OF_WEEK: Final = ("MO", "TU", "WE", "TH", "FR", "SA", "SU")
+
+
+@dataclass(frozen=True, slots=True)
+class RepeatRule:
+    """`by_day` has (which of the month, or 0 for all; weekday from 0, Monday). Empty: as its first date has it."""
+
+    freq: str
+    interval: int = 1
+    count: int | None = None
+    until: date | None = None
+    """A date, or a datetime: in UTC, or where it has no zone by the event's own clock."""
+    by_day: tuple[tuple[int, int], ...] = ()
+    by_monthday: tuple[int, ...] = ()
+    by_month: tuple[int, ...] = ()
+    positions: tuple[int, ...] = ()
+    week_start: int = 0
+
+    @property
+    def step(self) -> int:
+        """Days between two dates of a weekday, or of all; 0: it is not the same number each time."""
+        days = {"DAILY": 1, "WEEKLY": 7}.get(self.freq, 0) * self.interval
+        return days if days <= DAYS else 0
+
+
+def parse_rule(parts: Mapping[str, Sequence[Any]]) -> RepeatRule:
+    """A rule as icalendar reads it. Raises ValueError for one that is not followed here."""
+    found = {str(name).upper(): list(values) for name, values in parts.items()}
+    freq = str(_one(found, "FREQ", "")).upper()
+    if freq == "DAILY" and "BYDAY" in found and _one(found, "INTERVAL", 1) == 1:
+        freq = "WEEKLY"  # as some write it
+    allowed = PARTS.get(freq)
+    if allowed is None:
+        raise ValueError(f"it is repeated {freq or 'in no known way'}, which can't be booked")
+    if odd := sorted(found.keys() - allowed - {"FREQ", "INTERVAL", "COUNT", "UNTIL"}):
+        raise ValueError(f"it is repeated {freq} by {', '.join(odd)}, which can't be booked")
+    if any(len(values) > MAX_LISTED for values in found.values()):
+        raise ValueError("its rule is too long")
+    interval, most = _one(found, "INTERVAL", 1), _one(found, "COUNT", None)
+    if not 1 <= interval <= MAX_INTERVAL or (most is not None and not 1 <= most <= MAX_COUNT):
+        raise ValueError(f"its INTERVAL or COUNT is not from 1 to {MAX_COUNT}")
+    days = tuple((one.relative or 0, DAYS_OF_WEEK.index(str(one.weekday))) for one in found.get("BYDAY", []))
+    rule = RepeatRule(
+        freq,
+        interval,
+        most,
+        _one(found, "UNTIL", None),
+        days,
+        tuple(map(int, found.get("BYMONTHDAY", []))),
+        tuple(map(int, found.get("BYMONTH", []))),
+        tuple(map(int, found.get("BYSETPOS", []))),
+        DAYS_OF_WEEK.index(str(_one(found, "WKST", "MO"))),
+    )
+    if rule.until is not None and not isinstance(rule.until, date):
+        raise ValueError("its UNTIL is no date")
+    if freq == "WEEKLY" and any(which for which, _ in days):
+        raise ValueError("it is repeated WEEKLY by numbered days, which no rule may be")
+    if freq == "YEARLY" and (days or rule.by_monthday) and not rule.by_month:
+        raise ValueError("it is repeated YEARLY by days of no month, which can't be booked")
+    return rule
+
+
+def _one(parts: Mapping[str, Sequence[Any]], name: str, default: Any) -> Any:
+    """Raises ValueError where there are several."""
+    values = parts.get(name, [default])
+    if len(values) != 1:
+        raise ValueError(f"its rule has several {name}")
+    return values[0]
+
+
+def occurrences(rule: RepeatRule, start: datetime, since: datetime, before: datetime) -> Iterator[datetime]:
+    """The local times from `since` on and before `before` at which an event begins that began first at `start`, all
+    without a zone. UNTIL is left to who knows the zone."""
+    number = 0
+    for period in count(0 if rule.count is not None else _periods(rule, start, since)):
+        begin, days = _period(rule, start.date(), period)
+        if begin > before.date():
+            return
+        for day in days:
+            at = datetime.combine(day, start.time())
+            if at < start:
+                continue
+            number += 1
+            if at >= before or (rule.count is not None and number > rule.count):
+                return
+            if at >= since:
+                yield at
+
+
+def _periods(rule: RepeatRule, start: datetime, since: datetime) -> int:
+    """How many are over by then, or fewer."""
+    months = (since.year - start.year) * 12 + since.month - start.month
+    over = {"DAILY": (since - start).days, "WEEKLY": (since - start).days // 7, "MONTHLY": months}
+    return max(0, over.get(rule.freq, since.year - start.year) // rule.interval - 1)
+
+
+def _period(rule: RepeatRule, first: date, number: int) -> tuple[date, Iterable[date]]:
+    """When a day, week, month or year begins, and the days of it that count, in order."""
+    over = rule.interval * number
+    if rule.freq == "DAILY":
+        day = first + timedelta(days=over)
+        return day, [day]
+    if rule.freq == "WEEKLY":
+        week = first + timedelta(days=7 * over - (first.weekday() - rule.week_start) % 7)
+        weekdays = {day for _, day in rule.by_day} or {first.weekday()}
+        return week, sorted(week + timedelta(days=(day - rule.week_start) % 7) for day in weekdays)
+    if rule.freq == "MONTHLY":
+        year, month = divmod(first.year * 12 + first.month - 1 + over, 12)
+        months = [month + 1] if not rule.by_month or month + 1 in rule.by_month else []
+        begin = date(year, month + 1, 1)
+    else:
+        months, begin = sorted({*rule.by_month} or {first.month}), date(first.year + over, 1, 1)
+    days = [day for month in months if 1 <= month <= 12 for day in _days(rule, first.day, begin.year, month)]
+    if rule.positions:
+        chosen = {at - 1 if at > 0 else len(days) + at for at in rule.positions if at}
+        days = [day for at, day in enumerate(days) if at in chosen]
+    return begin, days
+
+
+def _days(rule: RepeatRule, default: int, year: int, month: int) -> list[date]:
+    length = monthrange(year, month)[1]
+    days = range(1, length + 1)
+    found = set(days)
+    if rule.by_monthday:
+        found &= {day if day > 0 else length + 1 + day for day in rule.by_monthday}
+    if rule.by_day:
+        meant = set[int]()
+        for which, weekday in rule.by_day:
+            alike = [day for day in days if date(year, month, day).weekday() == weekday]
+            at = which - 1 if which > 0 else len(alike) + which
+            meant |= {day for number, day in enumerate(alike) if not which or number == at}
+        found &= meant
+    if not (rule.by_monthday or rule.by_day):
+        found &= {default}
+    return [date(year, month, day) for day in sorted(found)]

@@ -1,0 +1,64 @@
+"""Serves bookings as calendars over HTTP, for programs that subscribe to one: of the fleet, an RC, an owner.
+
+Nothing is kept here: the leader is asked when somebody asks, at most once in `FRESH` seconds. Where none answers
+programs are told so (503), and go on to show what they have."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import time
+from typing import Final
+
+from zscout.keyexpr import NAME
+from zscout.mesh import Mesh
+from zscout.messages import BookingsAsk, BookingsTold
+from zscout.services.bookings.calendar_text import CONTENT_TYPE, CalendarSelection, calendar_text
+from zscout.services.plain_http import Page, PlainHttpServer
+
+FRESH: Final = 5.0
+"""Seconds for which what the leader told is told again."""
+ASK: Final = 2.0
+"""Seconds that it has to answer."""
+MAX_TEXTS: Final = 64
+"""Calendars that are kept as text."""
+_PATH: Final = re.compile(rf"/(?:fleet|rc/(?P<rc>{NAME.pattern}/{NAME.pattern})|owner/(?P<owner>{NAME.pattern}))\.ics")
+NOT_NOW: Final = Page(
+    b"no leader tells the bookings now\n", status="503 Service Unavailable", headers="Retry-After: 60\r\n"
+)
+
+
+class CalendarServer(PlainHttpServer):
+    where = "calendars are at /fleet.ics, /rc/KIND/NAME.ics and /owner/NAME.ics"
+
+    def __init__(self, mesh: Mesh, fleet: str, bind: str, port: int) -> None:
+        super().__init__("calendars", bind, port)
+        self._mesh, self._fleet = mesh, fleet
+        self._one_by_one = asyncio.Lock()
+        self._told: BookingsTold | None = None
+        self._asked = float("-inf")
+        self._texts: dict[CalendarSelection, bytes] = {}
+
+    async def page(self, path: str) -> Page | None:
+        found = _PATH.fullmatch(path)
+        if found is None:
+            return None
+        selection = CalendarSelection(found["owner"], found["rc"])
+        async with self._one_by_one:
+            if time.monotonic() - self._asked > FRESH:
+                await self._ask()
+            if self._told is None:
+                return NOT_NOW
+            if selection not in self._texts:
+                if len(self._texts) >= MAX_TEXTS:
+                    self._texts.clear()
+                text = await asyncio.to_thread(calendar_text, self._fleet, self._told.bookings, selection)
+                self._texts[selection] = text
+            return Page(self._texts[selection], CONTENT_TYPE)
+
+    async def _ask(self) -> None:
+        reply = await self._mesh.ask_one(self._mesh.keys.rcm_bookings, BookingsAsk(), BookingsTold, timeout=ASK)
+        told = reply.message if reply is not None else None
+        if told is None or self._told is None or told.bookings != self._told.bookings:
+            self._texts.clear()
+        self._told, self._asked = told, time.monotonic()

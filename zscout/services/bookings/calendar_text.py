@@ -1,0 +1,181 @@
+"""Bookings as iCalendar (RFC 5545), for calendar programs. Pure; the same bookings give the same text.
+
+One that is repeated is one event in its zone; all others are in UTC, and have no hour that comes twice. A duration is
+written in hours: days would be longer or shorter where clocks change."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from datetime import UTC, date, datetime, timedelta
+from functools import lru_cache
+from typing import Final, NamedTuple
+from zoneinfo import ZoneInfo
+
+from icalendar import Calendar, Event, Timezone, TimezoneDaylight, TimezoneStandard, vRecur, vText
+
+from zscout.keyexpr import is_pattern, matcher
+from zscout.messages import MAX_AHEAD, BookedDate, BookingView, Instant
+from zscout.services.bookings.dates import zone_of
+from zscout.types import clean
+
+CONTENT_TYPE: Final = "text/calendar; charset=utf-8"
+REFRESH: Final = "PT15M"
+"""How often programs are asked to read it again; they do as they like."""
+NEEDS, PRIORITY, PATIENCE = "X-ZSCOUT-NEEDS", "X-ZSCOUT-PRIORITY", "X-ZSCOUT-PATIENCE"
+
+
+class CalendarSelection(NamedTuple):
+    """Which bookings a calendar has: of one `owner`, of those that have one `rc`, or all."""
+
+    owner: str | None = None
+    rc: str | None = None
+
+    def name(self, fleet: str) -> str:
+        return " ".join(filter(None, (fleet, self.rc, self.owner)))
+
+    @property
+    def path(self) -> str:
+        """Where its calendar stands: `fleet.ics`, `rc/robot/arm1.ics`, `owner/anvil.ics`."""
+        if self.rc is not None:
+            return f"rc/{self.rc}.ics"
+        return f"owner/{self.owner}.ics" if self.owner is not None else "fleet.ics"
+
+    def of(self, bookings: Iterable[BookingView]) -> list[BookingView]:
+        return [
+            one
+            for one in bookings
+            if self.owner in (None, one.owner) and (self.rc is None or self.rc in one.needs or _may_have(one, self.rc))
+        ]
+
+
+EVERYTHING: Final = CalendarSelection()
+
+
+def calendar_text(fleet: str, bookings: Iterable[BookingView], selection: CalendarSelection = EVERYTHING) -> bytes:
+    """The calendar of those that are selected. Lines end as the format wants it, in CR LF."""
+    calendar = Calendar()
+    calendar.add("VERSION", "2.0")
+    calendar.add("PRODID", "-//zscout//zscout//EN")
+    calendar.add("X-WR-CALNAME", selection.name(fleet))
+    calendar.add("REFRESH-INTERVAL", vText(REFRESH, params={"VALUE": "DURATION"}), encode=False)
+    calendar.add("X-PUBLISHED-TTL", REFRESH)
+    zones: dict[str, list[int]] = {}
+    events: list[Event] = []
+    for view in sorted(selection.of(bookings), key=lambda one: (one.start, one.id)):
+        zone = _zone(view)
+        if zone is None:
+            events += [_event(fleet, view, one.start, one) for one in view.dates] or [_event(fleet, view, view.start)]
+            continue
+        zones.setdefault(view.zone, []).extend((view.start, _until(view)))
+        events += _repeated(fleet, view, zone)
+    for name, instants in sorted(zones.items()):
+        first, last = (datetime.fromtimestamp(at, UTC).year for at in (min(instants), max(instants)))
+        calendar.add_component(_timezone(name, first, last))
+    for event in events:
+        calendar.add_component(event)
+    return bytes(calendar.to_ical())
+
+
+def _may_have(view: BookingView, rc: str) -> bool:
+    """Whether it is kept `rc` for a pattern, or may be where none is kept yet."""
+    bound = {name for one in view.dates for name in one.bound.values()}
+    return rc in bound if bound else any(is_pattern(need) and matcher(need)(rc) for need in view.needs)
+
+
+def _zone(view: BookingView) -> ZoneInfo | None:
+    """None: it is not repeated, or in a zone that this host does not know; it is written as the dates that are told."""
+    try:
+        return zone_of(view.zone) if view.every else None
+    except ValueError:
+        return None
+
+
+def _until(view: BookingView) -> Instant:
+    return view.start + MAX_AHEAD if view.until is None else view.until
+
+
+@lru_cache(64)
+def _timezone(name: str, first: int, last: int) -> Timezone:
+    """As it is in these years."""
+    timezone = Timezone.from_tzid(name, first_date=date(first - 1, 1, 1), last_date=date(last + 2, 1, 1))
+    for part in timezone.subcomponents:
+        assert isinstance(part, TimezoneStandard | TimezoneDaylight)  # noqa: S101 - from_tzid makes no others
+        # icalendar 7 tells where a gap ends, and not the local time at which it begins.
+        gap = max(timedelta(), part.TZOFFSETTO - part.TZOFFSETFROM)
+        later = [at - gap for at, _ in part.rdates]
+        part.DTSTART -= gap
+        if later:
+            del part["RDATE"]
+            part.add("RDATE", later)
+    return timezone
+
+
+def _repeated(fleet: str, view: BookingView, zone: ZoneInfo) -> list[Event]:
+    first = datetime.fromtimestamp(view.start, zone)
+    hour = first.time().replace(fold=0)
+
+    def nominal(at: Instant) -> datetime:
+        """A date as its rule has it: on a day without that hour it is not what clocks show."""
+        return datetime.combine(datetime.fromtimestamp(at, zone).date(), hour, zone)
+
+    event = _event(fleet, view, first)
+    weeks, days = divmod(view.every, 7)
+    rule: dict[str, object] = {"FREQ": "DAILY" if days else "WEEKLY", "INTERVAL": view.every if days else weeks}
+    event.add("RRULE", vRecur({**rule, "UNTIL": datetime.fromtimestamp(_until(view), UTC)}))
+    given_up = {*view.dropped, *(one.start for one in view.dates if one.state == "unbooked")}
+    for at in sorted(given_up):
+        event.add("EXDATE", nominal(at))
+    found = [event]
+    told = {one.start: one for one in view.dates if one.state == "conflict"}
+    if nominal(view.start).timestamp() != view.start:
+        told.setdefault(view.start, BookedDate(view.start, view.start, "open"))
+    for at, one in sorted(told.items()):
+        if at not in given_up:
+            other = _event(fleet, view, at if at == view.start else nominal(at), one)
+            other.add("RECURRENCE-ID", nominal(at))
+            found.append(other)
+    return found
+
+
+def _event(fleet: str, view: BookingView, start: Instant | datetime, told: BookedDate | None = None) -> Event:
+    """One date, or the first of many. `told` is what is told of it."""
+    event = Event()
+    whole = view.every and not isinstance(start, datetime) and _zone(view) is None
+    event.add("UID", f"{view.id}{f'-{start}' if whole else ''}@{fleet}")
+    event.add("DTSTAMP", datetime.fromtimestamp(view.since or view.start, UTC))
+    event.add("SEQUENCE", len(view.dropped) + view.unbooked)
+    event.add("DTSTART", start if isinstance(start, datetime) else datetime.fromtimestamp(start, UTC))
+    event.add("DURATION", vText(_duration(math.ceil(view.runtime))), encode=False)
+    words = f"{view.name} ({view.owner})" if view.owner else view.name
+    event.add("SUMMARY", clean(f"maintenance: {words}" if view.maintenance else words))
+    bound = told.bound if told is not None else {}
+    rcs = [bound.get(need, need.partition("#")[0]) for need in sorted(view.needs)]
+    event.add("LOCATION", ", ".join(rcs))
+    event.add("RESOURCES", rcs)
+    event.add("CATEGORIES", rcs)
+    comment = view.who.comment if view.who is not None else ""
+    if lines := [clean(text).strip() for text in (comment, told.danger if told is not None else "") if text]:
+        event.add("DESCRIPTION", "\n".join(lines))
+    tentative = told is not None and told.state == "conflict"
+    event.add("STATUS", "CANCELLED" if view.unbooked else "TENTATIVE" if tentative else "CONFIRMED")
+    event.add(NEEDS, " ".join(_need(need, view) for need in sorted(view.needs)))
+    event.add(PRIORITY, str(view.priority))
+    event.add(PATIENCE, f"{view.patience.normalize():f}")
+    return event
+
+
+def _need(need: str, view: BookingView) -> str:
+    """As on the command line: `radio/rf0:command_rate=5`."""
+    amounts = ",".join(f"{name}={value.normalize():f}" for name, value in sorted(view.needs[need].items()))
+    return f"{need}:{amounts}" if amounts else need
+
+
+def _duration(seconds: int) -> str:
+    minutes, seconds = divmod(seconds, 60)
+    hours, minutes = divmod(minutes, 60)
+    parts = ((hours, "H"), (minutes, "M"), (seconds, "S"))
+    # RFC 5545 has no hours and seconds without minutes between.
+    if hours and seconds:
+        return f"PT{hours}H{minutes}M{seconds}S"
+    return "PT" + "".join(f"{number}{unit}" for number, unit in parts if number)

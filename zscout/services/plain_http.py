@@ -1,0 +1,97 @@
+"""A small read-only server of texts over plain HTTP: `GET` and `HEAD`, one request to a connection."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from abc import ABC, abstractmethod
+from typing import Final, NamedTuple
+
+from zscout.mesh.sparse_log import SparseLog
+from zscout.mesh.supervision import clock
+
+log = logging.getLogger(__name__)
+
+MAX_CONNECTIONS: Final = 8
+"""That are served at one time; others are closed at once."""
+MAX_HEAD: Final = 8_192
+"""Bytes of a request."""
+TIMEOUT: Final = 5.0
+"""Seconds from a connection to its end."""
+
+
+class Page(NamedTuple):
+    """What is answered."""
+
+    text: bytes
+    kind: str = "text/plain"
+    status: str = "200 OK"
+    headers: str = ""
+    """More of them, each ended by CR LF."""
+
+
+class PlainHttpServer(ABC):
+    """`what` it serves, for the log."""
+
+    def __init__(self, what: str, bind: str, port: int) -> None:
+        self._what, self.bind, self.port = what, bind, port
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._server: asyncio.Server | None = None
+        self._strange = SparseLog(log, clock.now)
+
+    @abstractmethod
+    async def page(self, path: str) -> Page | None:
+        """What stands at a path, without what follows a `?`; None: nothing. It may be called many times at once."""
+
+    @property
+    @abstractmethod
+    def where(self) -> str:
+        """Where something stands, for who asked for what does not."""
+
+    async def start(self) -> None:
+        """Raises OSError where the port can't be had. Port 0 becomes a free one."""
+        self._server = await asyncio.start_server(self._accept, self.bind, self.port, limit=MAX_HEAD, backlog=16)
+        self.port = self._server.sockets[0].getsockname()[1]
+
+    async def stop(self) -> None:
+        if self._server is not None:
+            self._server.close()
+        for task in self._tasks:
+            task.cancel()
+        if self._tasks:
+            await asyncio.wait(self._tasks)
+
+    def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if len(self._tasks) >= MAX_CONNECTIONS:
+            writer.transport.abort()
+            return
+        task = asyncio.create_task(self._serve(reader, writer))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            async with asyncio.timeout(TIMEOUT):
+                writer.write(await self._response(await reader.readuntil(b"\r\n\r\n")))
+                await writer.drain()
+                writer.close()
+                await writer.wait_closed()
+        except (TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, OSError):
+            pass  # whoever asked is slow, gone, or no HTTP client
+        except Exception as error:  # noqa: BLE001 - what is served disturbs nothing else
+            self._strange.warning("", "%s can't be served: %r", self._what, error)
+        finally:
+            writer.transport.abort()
+
+    async def _response(self, head: bytes) -> bytes:
+        method, _, rest = head.partition(b" ")
+        path = rest.partition(b" ")[0].partition(b"?")[0].decode("ascii", "replace")
+        found = None
+        if path.startswith("/"):
+            found = Page(b"GET or HEAD\n", status="405 Method Not Allowed", headers="Allow: GET, HEAD\r\n")
+            if method in (b"GET", b"HEAD"):
+                found = await self.page(path)
+        page = found or Page(f"{self.where}\n".encode(), status="404 Not Found")
+        first = f"HTTP/1.1 {page.status}\r\nContent-Type: {page.kind}\r\n{page.headers}"
+        text = f"{first}Content-Length: {len(page.text)}\r\nConnection: close\r\n\r\n".encode("ascii")
+        return text if method == b"HEAD" else text + page.text
