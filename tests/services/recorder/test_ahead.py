@@ -17,7 +17,7 @@ from tests.services.rcm.test_bookings import NOON, BookedFleet, book, do, led
 from tests.services.recorder.paper_run import events, rows
 from zscout.keyexpr import Role, Token
 from zscout.messages import BookedDate, BookingsTold, BookingView, Unbook
-from zscout.services.recorder.ahead import LEFT, MARGIN, MAX_BARS, Bar, Layer, rows_of
+from zscout.services.recorder.ahead import LEFT, MARGIN, MAX_BARS, Bar, ChartLayer, rows_of
 from zscout.services.recorder.ahead import chart as chart_of_rows
 from zscout.services.recorder.blueprint import AHEAD, CHART_HEAD, CHART_WIDTH, MAX_CHART_ROWS, Ahead, chart_row
 from zscout.services.recorder.bookings import AGAIN, MAX_TOLD, STALE
@@ -36,11 +36,11 @@ def bar(row: str, start: float, end: float, text: str = "survey", **more: Any) -
     return Bar(row, NOW + start * HOUR, NOW + end * HOUR, text, PALETTE[0], **more)
 
 
-def chart(bars: list[Bar], now: float, ahead: Ahead) -> dict[str, Layer]:
+def chart(bars: list[Bar], now: float, ahead: Ahead) -> dict[str, ChartLayer]:
     return chart_of_rows(bars, now, ahead, rows_of(bars, now))
 
 
-def boxes(layers: dict[str, Layer]) -> list[tuple[str, float, float, int]]:
+def boxes(layers: dict[str, ChartLayer]) -> list[tuple[str, float, float, int]]:
     """Text, begin and end in hours from now, and row of each outline, as they are drawn."""
     fields = layers["dates"].fields
     scale = TODAY.seconds / HOUR / (CHART_WIDTH - LEFT)
@@ -55,7 +55,7 @@ def boxes(layers: dict[str, Layer]) -> list[tuple[str, float, float, int]]:
     ]
 
 
-def texts(layers: dict[str, Layer], layer: str) -> list[str]:
+def texts(layers: dict[str, ChartLayer], layer: str) -> list[str]:
     return list(layers[layer].fields["labels"])
 
 

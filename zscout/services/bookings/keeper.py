@@ -89,12 +89,7 @@ class BookingKeeper:
     """`wall`: the host's clock, in seconds since 1970 (UTC)."""
 
     def __init__(
-        self,
-        mesh: Mesh,
-        disk: Disk | None = None,
-        *,
-        candidate: bool = True,
-        wall: Callable[[], float] = time.time,
+        self, mesh: Mesh, disk: Disk | None = None, *, candidate: bool = True, wall: Callable[[], float] = time.time
     ) -> None:
         self.mesh, self.wall, self._disk, self._candidate = mesh, wall, disk, candidate
         self.records = Records()

@@ -52,7 +52,7 @@ class Bar(NamedTuple):
     hatched: bool = False
 
 
-class Layer(NamedTuple):
+class ChartLayer(NamedTuple):
     """What an entity below the chart's shows; nothing where the first field is empty."""
 
     shape: type[rr.AsComponents]
@@ -75,7 +75,7 @@ def rows_of(bars: Iterable[Bar], now: float) -> int:
     return max(len(_seated(_within(known, now, ahead.seconds))[0]) for ahead in AHEAD)
 
 
-def chart(bars: Iterable[Bar], now: float, ahead: Ahead, rows: int, *, stale: bool = False) -> dict[str, Layer]:
+def chart(bars: Iterable[Bar], now: float, ahead: Ahead, rows: int, *, stale: bool = False) -> dict[str, ChartLayer]:
     """Layers by name; `rows`: those of the tallest chart. `stale`: nobody tells of bookings any more; `now` is when
     somebody did."""
     within = _within(bars, now, ahead.seconds)
@@ -103,7 +103,7 @@ def chart(bars: Iterable[Bar], now: float, ahead: Ahead, rows: int, *, stale: bo
             ]
         ),
         "hatch": _lines([(line, faded(colour, 0.45 * shade)) for line, colour in hatches], 0.5, 10.0),
-        "dates": Layer(
+        "dates": ChartLayer(
             rr.Boxes2D,
             {
                 "mins": [(one.left, one.top) for one in placed],
@@ -202,12 +202,12 @@ def _at(seconds: float) -> datetime:
     return datetime.fromtimestamp(seconds, UTC)
 
 
-def _lines(lines: Sequence[tuple[list[Point], int]], radius: float, order: float) -> Layer:
+def _lines(lines: Sequence[tuple[list[Point], int]], radius: float, order: float) -> ChartLayer:
     strips, colours = [line for line, _ in lines], [colour for _, colour in lines]
-    return Layer(rr.LineStrips2D, {"strips": strips, "colors": colours, "radii": [-radius], "draw_order": order})
+    return ChartLayer(rr.LineStrips2D, {"strips": strips, "colors": colours, "radii": [-radius], "draw_order": order})
 
 
-def _texts(texts: Sequence[tuple[float, float, str, int]]) -> Layer:
+def _texts(texts: Sequence[tuple[float, float, str, int]]) -> ChartLayer:
     fields = {
         "positions": [(x, y) for x, y, _, _ in texts],
         "colors": [colour for *_, colour in texts],
@@ -216,4 +216,4 @@ def _texts(texts: Sequence[tuple[float, float, str, int]]) -> Layer:
         "radii": [0.0],
         "draw_order": 50.0,
     }
-    return Layer(rr.Points2D, fields)
+    return ChartLayer(rr.Points2D, fields)
