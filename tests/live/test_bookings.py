@@ -54,8 +54,8 @@ async def taken_up(client: Client, booking: BookingView) -> float:
     """Takes it up; returns by how many seconds its hold began after its date."""
     async with asyncio.timeout(HANG + SOON), hold(client, "taken", **BookingsClient.terms(booking), keep=False) as held:
         assert held.rcs == sorted(booking.needs)
-        late = datetime.now(UTC).timestamp() - booking.start
-    return late
+        began = datetime.now(UTC)
+    return began.timestamp() - booking.start
 
 
 def test_a_booking_outlives_its_leader(tmp_path: Path) -> None:
