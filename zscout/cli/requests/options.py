@@ -192,7 +192,7 @@ class HoldOptions:
         return terms | {"wait_for_device": self.wait_for_device}
 
 
-def hold_options(command: F) -> F:
+def hold_options(command: F, *, needs_required: bool = True) -> F:
     """The NEEDs and the options of all commands that hold something."""
     for option in (
         click.argument(

@@ -7,6 +7,7 @@ import signal
 import sys
 from collections.abc import AsyncIterator, Coroutine, Iterator
 from contextlib import asynccontextmanager, contextmanager, nullcontext, suppress
+from functools import partial
 from typing import IO, Any, Final
 
 import click
@@ -52,7 +53,7 @@ REFRESH: Final = 1.0
     "--booking", type=BOOKING, shell_complete=completion.bookings, help="Take this booking up: its name or id."
 )
 @click.option("--dry-run", is_flag=True, help="Only say when it would start, and whom it would preempt at once.")
-@hold_options
+@partial(hold_options, needs_required=False)
 @common.runs
 async def request(
     needs: Any, priority: int, keep: bool, name: str | None, dry_run: bool, booking: str | None, **rest: Any
