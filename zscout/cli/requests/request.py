@@ -67,8 +67,7 @@ async def request(
     They are yours for the minimum runtime, in which only a higher priority takes them, and after it until somebody of
     the same or a higher priority waits for one of them. --release-after gives them back though nobody waits.
 
-    With --booking, a booking is taken up, which has its own NEEDs, priority and time: it waits for its next date. With
-    --again, of what is repeated one date after the other.
+    With --booking, a booking is taken up, which has its own NEEDs, priority and time: it waits for its next date.
 
     With a COMMAND, they are held while it runs, and given back as soon as nothing of it is left. When its time is over
     or the grant is taken away, the command and all that it started get SIGTERM, and SIGKILL after the grace; so they do
