@@ -192,11 +192,16 @@ class HoldOptions:
         return terms | {"wait_for_device": self.wait_for_device}
 
 
-def hold_options(command: F) -> F:
+def hold_options(command: F, *, needs_required: bool = True) -> F:
     """The NEEDs and the options of all commands that hold something."""
     for option in (
         click.argument(
-            "needs", nargs=-1, type=Parsed("need", parse_need), metavar="NEED...", shell_complete=completion.needs
+            "needs",
+            nargs=-1,
+            required=needs_required,
+            type=Parsed("need", parse_need),
+            metavar="NEED...",
+            shell_complete=completion.needs,
         ),
         json_option("Print JSON lines, one for each event."),
         click.option("--wait-for-device", is_flag=True, help="Wait for a device that nobody knows, too."),

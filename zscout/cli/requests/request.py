@@ -7,6 +7,7 @@ import signal
 import sys
 from collections.abc import AsyncIterator, Coroutine, Iterator
 from contextlib import asynccontextmanager, contextmanager, nullcontext, suppress
+from functools import partial
 from typing import IO, Any, Final
 
 import click
@@ -52,7 +53,7 @@ REFRESH: Final = 1.0
     "--booking", type=BOOKING, shell_complete=completion.bookings, help="Take this booking up: its name or id."
 )
 @click.option("--dry-run", is_flag=True, help="Only say when it would start, and whom it would preempt at once.")
-@hold_options
+@partial(hold_options, needs_required=False)
 @common.runs
 async def request(
     needs: Any, priority: int, keep: bool, name: str | None, dry_run: bool, booking: str | None, **rest: Any
@@ -66,8 +67,7 @@ async def request(
     They are yours for the minimum runtime, in which only a higher priority takes them, and after it until somebody of
     the same or a higher priority waits for one of them. --release-after gives them back though nobody waits.
 
-    With --booking, a booking is taken up, which has its own NEEDs, priority and time: it waits for its next date. With
-    --again, of what is repeated one date after the other.
+    With --booking, a booking is taken up, which has its own NEEDs, priority and time: it waits for its next date.
 
     With a COMMAND, they are held while it runs, and given back as soon as nothing of it is left. When its time is over
     or the grant is taken away, the command and all that it started get SIGTERM, and SIGKILL after the grace; so they do
