@@ -28,7 +28,7 @@ PADDING: Final = 14.0
 """Beside a label, in all."""
 HATCH: Final = 9.0
 """From one line of a hatching to the next."""
-LABEL: Final = -10.0
+LABEL: Final = -12.0
 """From the middle of a row to the point of a label, which stands below that."""
 CLEAR: Final = 62.0, 40.0
 """From the label of now to the first label of a time, and from the last one to the edge."""

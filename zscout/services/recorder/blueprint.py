@@ -155,7 +155,7 @@ def _charts(rows: int) -> dict[str, tuple[int, rrb.View | rrb.Container]]:
     """What is booked, as pages of one pane; none without rows."""
     bounds = rrb.VisualBounds2D(x_range=[0, CHART_WIDTH], y_range=[0, CHART_HEAD + chart_row(rows) * rows])
     views = [rrb.Spatial2DView(origin=one.entity, name=one.name, visual_bounds=bounds) for one in AHEAD if rows]
-    return {"/ahead": (_share(rows, 2), rrb.Tabs(*views))} if views else {}
+    return {"/ahead": (_share(round(rows * chart_row(rows) / 32), 2), rrb.Tabs(*views))} if views else {}
 
 
 def _rc_panes(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[int, rrb.View | rrb.Container]]:
