@@ -88,3 +88,24 @@ def test_what_names_no_arc_is_bad_input(capsys: pytest.CaptureFixture[str]) -> N
     for name in ("", "a\nb", "x" * 300):
         assert zscout_here("why", name) == 2
         assert capsys.readouterr().err.endswith("names no ARC; zscout status lists them\n")
+
+
+def test_how_long_such_holds_usually_last_is_told(tmp_path: Path) -> None:
+    async def story() -> None:
+        async with Lab(tmp_path) as lab:
+            lab.node("anvil", "robot/a")
+            client = await lab.client("program")
+            await lab.ready(client, "robot/a")
+            for _ in range(4):
+                arc = await client.request("survey", {"robot/a": {}}, min_runtime=600)
+                await lab.state(client, lambda state: len(state.holds) == 1)
+                await client.end(arc)
+                await lab.state(client, lambda state: not state.holds)
+            await client.request("survey", {"robot/a": {}}, min_runtime=600)
+            await lab.state(client, lambda state: len(state.holds) == 1)
+            why = await zscout_soon("why", "survey", env=lab.env)
+            assert re.search(rf"^  it is likely to be given back at {CLOCK} \(in ", why.stdout, re.MULTILINE)
+            status = await zscout_soon("status", env=lab.env)
+            assert re.search(rf", keeps, likely {CLOCK}", status.stdout)
+
+    asyncio.run(story())
