@@ -235,6 +235,9 @@ class _Planned:
 
     def _add_once(self, at: Instant) -> None:
         runtime = self._runtime(self._local(at))
+        if at + runtime < self._now - LOOK_BACK:
+            self._plan.skipped.append(Skipped(self._title, OVER))
+            return
         ids = self._ids(at, at, 0, runtime)
         if ids[0] in self._plan.ids:
             return

@@ -95,7 +95,7 @@ def _until(view: BookingView) -> Instant:
     return view.start + MAX_AHEAD if view.until is None else view.until
 
 
-@lru_cache(64)
+@lru_cache(1_024)  # it takes milliseconds, and there are 600 zones
 def _timezone(name: str, first: int, last: int) -> Timezone:
     """As it is in these years."""
     timezone = Timezone.from_tzid(name, first_date=date(first - 1, 1, 1), last_date=date(last + 2, 1, 1))
