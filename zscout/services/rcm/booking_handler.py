@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import datetime
 from typing import Final, TypeAlias
 
 from zscout.config.fleet import Fleet
@@ -142,7 +142,7 @@ class BookingHandler:
             raise Refused("bad_date", "nothing is booked for longer than a year")
         over = wanted.start + min(patience, runtime) / SECOND
         if over <= time:
-            raise Refused("bad_date", f"{told(wanted.start)} is past; it is {told(time)} by fleet time")
+            raise Refused("bad_date", f"{told(wanted.start, wanted.zone)} is past; it is {told(time, wanted.zone)} by fleet time")
         last = wanted.until if wanted.every and wanted.until is not None else wanted.start
         if max(last, wanted.start) > time + MAX_AHEAD:
             raise Refused("bad_date", "nothing is booked more than a year ahead")
@@ -197,7 +197,7 @@ class BookingHandler:
             return False
         self._dates.change(record, kept=bound)
         self._dates.reconcile()
-        log.info("%s books %s: %s at %s", record.owner, record.name, ", ".join(record.needs), told(record.start))
+        log.info("%s books %s: %s at %s", record.owner, record.name, ", ".join(record.needs), told(record.start, record.zone))
         self._answer_kept(query, record, withdraw=True)
         return True
 
@@ -211,7 +211,7 @@ class BookingHandler:
         names = [f"{one.label or one.id} of {one.owner} ({', '.join(one.needs)})" for one in others[:NAMED]]
         more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
         why = f"booked then: {'; '.join(names)}{more}" if names else "held, in maintenance or promised to who waits"
-        return f"not all of {', '.join(date.record.needs)} are free at {told(date.start)}: {why}"
+        return f"not all of {', '.join(date.record.needs)} are free at {told(date.start, date.record.zone)}: {why}"
 
     def _answer_kept(self, query: Query, record: BookingRecord, *, withdraw: bool = False) -> None:
         """Answers once it is kept; `withdraw`: gives it up where it can't be."""
@@ -249,7 +249,7 @@ class BookingHandler:
         elif operation.start in dates(record, operation.start, operation.start + 1):
             new = self._dates.change(record, dropped=sorted({*record.dropped, operation.start}))
         else:
-            raise Refused("bad_date", f"{told(operation.start)} is no date of {record.name}; see zscout bookings")
+            raise Refused("bad_date", f"{told(operation.start, record.zone)} is no date of {record.name}; see zscout bookings")
         self._dates.reconcile()
         self._answer_kept(query, new)
 
@@ -379,10 +379,10 @@ def check_needs(needs: Mapping[str, Amounts], most: int) -> None:
             check_name(parameter, f"parameter of {need}")
 
 
-def told(time: float) -> str:
-    """An instant, for people."""
+def told(time: float, zone: str) -> str:
+    """An instant, for people who live in that zone."""
     with suppress(ValueError, OverflowError):
-        return datetime.fromtimestamp(time, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        return datetime.fromtimestamp(time, zone_of(zone)).strftime("%Y-%m-%d %H:%M:%S %Z")
     return f"{time:.0f} s after 1970"
 
 
