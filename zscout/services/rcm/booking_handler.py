@@ -142,7 +142,8 @@ class BookingHandler:
             raise Refused("bad_date", "nothing is booked for longer than a year")
         over = wanted.start + min(patience, runtime) / SECOND
         if over <= time:
-            raise Refused("bad_date", f"{told(wanted.start, wanted.zone)} is past; it is {told(time, wanted.zone)} by fleet time")
+            date, now = told(wanted.start, wanted.zone), told(time, wanted.zone)
+            raise Refused("bad_date", f"{date} is past; it is {now} by fleet time")
         last = wanted.until if wanted.every and wanted.until is not None else wanted.start
         if max(last, wanted.start) > time + MAX_AHEAD:
             raise Refused("bad_date", "nothing is booked more than a year ahead")
@@ -197,7 +198,8 @@ class BookingHandler:
             return False
         self._dates.change(record, kept=bound)
         self._dates.reconcile()
-        log.info("%s books %s: %s at %s", record.owner, record.name, ", ".join(record.needs), told(record.start, record.zone))
+        when = told(record.start, record.zone)
+        log.info("%s books %s: %s at %s", record.owner, record.name, ", ".join(record.needs), when)
         self._answer_kept(query, record, withdraw=True)
         return True
 
@@ -249,7 +251,8 @@ class BookingHandler:
         elif operation.start in dates(record, operation.start, operation.start + 1):
             new = self._dates.change(record, dropped=sorted({*record.dropped, operation.start}))
         else:
-            raise Refused("bad_date", f"{told(operation.start, record.zone)} is no date of {record.name}; see zscout bookings")
+            date = told(operation.start, record.zone)
+            raise Refused("bad_date", f"{date} is no date of {record.name}; see zscout bookings")
         self._dates.reconcile()
         self._answer_kept(query, new)
 
