@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from zscout.lab.replay import HoldRecord, Replay, replay
+from zscout.lab.study.scheduling.bookings import SHARES, BookingJob, drawn, jobs, report
+from zscout.lab.study.scheduling.bookings import play as play_booked
 from zscout.lab.study.scheduling.families import FAMILIES, Mix, at_once, stream
 from zscout.lab.study.scheduling.foretell import FEWEST, Condition, correlations, fit
 from zscout.lab.study.scheduling.measures import Curve, curve, measure, percentile
@@ -312,3 +314,37 @@ def test_a_condition_says_what_it_means() -> None:
     assert Condition("clashes", True, 3.0).holds(features).tolist() == [False, True]
     assert Condition("clashes", False, 3.0).holds(features).tolist() == [True, False]
     assert str(Condition("clashes", False, 3.0)) == "clashes < 3"
+
+
+# Bookings
+
+
+def test_a_booking_keeps_its_date_and_what_is_lost_to_it_is_counted() -> None:
+    long, booked = request("long", "a", 9), request("booked", "a", 4)
+    arrivals = (Arrival(7 * SECOND, long), Arrival(10 * SECOND, booked), Arrival(20 * SECOND, request("last", "b", 1)))
+    work = Workload((WorkloadRc("a"), WorkloadRc("b")), arrivals)
+    without = play_booked(BookingJob("one", 0, 0.0), work, {})
+    assert dict(without.wait) == {"long": 0, "booked": 6 * SECOND, "last": 0}
+    assert (without.lost, without.moved) == (0.0, {})
+    ahead = play_booked(BookingJob("one", 0, SHARES[-1]), work, {"booked": 5 * SECOND})
+    # From 7 to 10 a is idle, for the long one would not be over by then: 3 of 2 times 20 s.
+    assert dict(ahead.wait) == {"long": 7 * SECOND, "booked": 0, "last": 0}
+    assert (ahead.lost, ahead.moved) == (3 / 40, {"booked": 0})
+
+
+def test_the_same_requests_are_booked_at_a_larger_share() -> None:
+    work = FAMILIES["load65"].workload(1)
+    smaller, larger = (drawn(BookingJob("load65", 1, share), work) for share in (0.1, 0.4))
+    assert 20 < len(smaller) < 60
+    assert smaller.items() < larger.items()
+
+
+def test_shares_are_compared_on_the_same_arcs() -> None:
+    work = workload("ab", request("one", "a", 2), request("two", "a", 3), request("other", "b", 5))
+    trials = [play_booked(job, work, {"two": SECOND} if job.share else {}) for job in jobs(["load65"], [0])]
+    rows = report(trials).families["load65"]
+    assert [row.share for row in rows] == list(SHARES)
+    assert [row.booked for row in rows] == [0, 1, 1, 1]
+    # Without a booking it goes behind the shorter one; the others are those that are booked at no share.
+    assert [(row.at_date, row.at_once) for row in rows[1:]] == [(1.0, 0.0)] * 3
+    assert [row.wait for row in rows] == [0.0, 1.5, 1.5, 1.5]
