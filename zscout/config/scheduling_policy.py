@@ -27,6 +27,18 @@ class RcQuota:
 
 
 @dataclass(frozen=True, slots=True)
+class FairShares:
+    """Groups of equal priority in the order of what they lately had and others waited for (`fair_shares.py`)."""
+
+    half_life: Ns
+    """Time in ns after which a group is charged half of what it had."""
+    weights: Mapping[str, float] = field(default_factory=dict)
+    """By group: how much of what is contended is to be its, against the others' weights; 1 where nothing is said."""
+    groups: Mapping[str, str] = field(default_factory=dict)
+    """By owner (host or person): its group. Any other is a group of its own."""
+
+
+@dataclass(frozen=True, slots=True)
 class SchedulingPolicy:
     """The knobs. The defaults are the paper's rules, and bounded waiting among equals under `adaptive`."""
 
@@ -47,6 +59,8 @@ class SchedulingPolicy:
     """By owner: the quotas that bind it."""
     barred: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """By owner: patterns of the RCs that no need of its ARCs is bound to."""
+    fair_shares: FairShares | None = None
+    """None: whose an ARC is does not count."""
 
 
 DEFAULT: Final = SchedulingPolicy()
