@@ -29,6 +29,7 @@ SURFACE = {
     "tell_reasons",
     "slots",
     "bookings",
+    "charged",
 }
 SURFACE |= {"as_events", "expects_yes", "number", "batches", "term", "seq", "strategy", "policy"}
 ACTIONS = {"start", "preempt", "wait", "propose", "run_again"}
