@@ -215,8 +215,8 @@ class FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class FairSharesTable(Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [fair_shares]: of one priority the group goes first that lately had least of what others waited for. Off
-    where it is not there."""
+    """The table [fair_shares]: of one priority that group goes first which lately had least of what others waited for.
+    Off where it is not there."""
 
     half_life: Annotated[Ns, seconds("60", "31622400", "After this long half of what a group had counts.")] = DAY
     weights: Annotated[

@@ -36,7 +36,7 @@ SWEEP: Final[Ns] = 60 * SECOND
 
 
 @dataclass(slots=True)
-class Account:
+class GroupAccount:
     """What one group had."""
 
     charged: float = 0.0
@@ -53,7 +53,7 @@ class Account:
     shares are near have the same."""
 
 
-class Fleet(Protocol):
+class FleetState(Protocol):
     """What is asked of the state."""
 
     now: Ns
@@ -67,10 +67,10 @@ class Fleet(Protocol):
 class Shares:
     """The accounts of all groups, and who waits for what."""
 
-    def __init__(self, state: Fleet, policy: FairShares) -> None:
+    def __init__(self, state: FleetState, policy: FairShares) -> None:
         self._state, self._policy = state, policy
-        self._accounts: dict[str, Account] = {}
-        self._queued: dict[str, Account] = {}
+        self._accounts: dict[str, GroupAccount] = {}
+        self._queued: dict[str, GroupAccount] = {}
         """Those of the groups that wait."""
         self._waiting: dict[int, Counter[tuple[str, int]]] = {}
         """By bit of an RC: how many queued ARCs of each group and priority name it."""
@@ -102,10 +102,11 @@ class Shares:
         return ""
 
     def charged(self) -> dict[str, float]:
-        """By group: RC-seconds, decayed as of now; without those that had next to nothing."""
+        """By group: RC-seconds, decayed as of now, the greatest first; without those that had next to nothing."""
         now = self._state.now
         found = {group: self._settle(account, now).charged for group, account in self._accounts.items()}
-        return {group: had for group, had in sorted(found.items()) if had >= FORGOTTEN}
+        most = sorted(found.items(), key=lambda item: (-item[1], item[0]))[:MAX_GROUPS]
+        return {group: had for group, had in most if had >= FORGOTTEN}
 
     def totals(self) -> dict[str, float]:
         """By group: RC-seconds that were charged in all, since this was begun or the group was forgotten."""
@@ -193,13 +194,13 @@ class Shares:
 
     # Accounts
 
-    def _account(self, group: str) -> Account:
+    def _account(self, group: str) -> GroupAccount:
         account = self._accounts.get(group)
         if account is None:
-            account = self._accounts[group] = Account(at=self._state.now)
+            account = self._accounts[group] = GroupAccount(at=self._state.now)
         return account
 
-    def _settle(self, account: Account, now: Ns) -> Account:
+    def _settle(self, account: GroupAccount, now: Ns) -> GroupAccount:
         """The account as of now: what it had decays, and so does what it was charged meanwhile."""
         passed = now - account.at
         if passed:

@@ -38,7 +38,7 @@ class Authority:
         Who is in several groups counts in the first."""
         if policy.fair_shares is not None:
             # Backwards, so that the first group of a name stands last.
-            listed = reversed(self._policy.groups.items())
+            listed = reversed([*self._policy.groups.items()])
             groups = {name: group for group, members in listed for name in members}
             policy = replace(policy, fair_shares=replace(policy.fair_shares, groups=groups))
         if not self._enforced:
