@@ -71,6 +71,9 @@ BAD_FLEETS = {
         'fair_shares: is there, but only "adaptive" has an order of groups, not "priority"; '
         'write strategy = "adaptive" under [fleet], or remove the table'
     ),
+    "[fair_shares]\npatience = 100": (
+        "fair_shares.patience: is 100 s, less than fleet.patience (142 s); write as much, or more"
+    ),
     "[fair_shares]\nhalf_life = 1": "fair_shares.half_life: is 1 s; write 60 to 31622400 seconds",
     "[fair_shares.weights]\nbob = 0": "fair_shares.weights.bob: is 0; write a number from 0.001 to 1000",
     '[roles]\nclient = ["bob"]\n[groups]\narms = ["bob"]\n[fair_shares.weights]\nbob = 2': (

@@ -30,6 +30,7 @@ SURFACE = {
     "slots",
     "bookings",
     "charged",
+    "charged_in_all",
 }
 SURFACE |= {"as_events", "expects_yes", "number", "batches", "term", "seq", "strategy", "policy"}
 ACTIONS = {"start", "preempt", "wait", "propose", "run_again"}

@@ -14,6 +14,7 @@ from msgspec import Meta, Struct, structs
 from zscout.config.access import MAX_NAMES, AccessPolicy, Ceiling, Names, Quota, Roles, check_access
 from zscout.config.scheduling_policy import (
     DEFAULT,
+    FAIR_PATIENCE,
     PATIENCE,
     FairShares,
     Preempt,
@@ -227,6 +228,9 @@ class FairSharesTable(Struct, frozen=True, forbid_unknown_fields=True):
             example={"arms": 2},
         ),
     ] = {}
+    patience: Annotated[
+        Ns, seconds("0", "31622400", "That of groups that had more than another that waits; `fleet.patience` or more.")
+    ] = FAIR_PATIENCE
 
 
 class FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
@@ -338,7 +342,10 @@ def _fair_shares(file: FleetFile, access: AccessPolicy, at: Where) -> FairShares
             raise here.bad(f"{quoted(name)} is of the group {groups[0]}, and counts there", "give the group a weight")
         if access.ranks and name not in access.groups and name not in access.ranks:
             raise here.bad(f"{quoted(name)} is no group and has no role", "name it under [groups], or mend the name")
-    return FairShares(table.half_life, table.weights)
+    if table.patience < file.fleet.patience:
+        what = f"is {table.patience / SECOND:g} s, less than fleet.patience ({file.fleet.patience / SECOND:g} s)"
+        raise (at / "patience").bad(what, "write as much, or more")
+    return FairShares(table.half_life, table.weights, patience=table.patience)
 
 
 def keys_folder(table: SecurityTable, beside: Path, top: Where) -> Path:

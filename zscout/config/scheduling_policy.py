@@ -10,6 +10,8 @@ from zscout.types import SECOND, Ns
 
 PATIENCE: Final[Ns] = 142 * SECOND
 """Default, in ns. Measured: docs/study.md."""
+FAIR_PATIENCE: Final[Ns] = 3_600 * SECOND
+"""Default, in ns."""
 OPERATOR_PRIORITY: Final = 10
 
 StrategyName: TypeAlias = Literal["priority", "optimal", "adaptive"]
@@ -34,6 +36,9 @@ class FairShares:
     """Time in ns after which a group is charged half of what it had."""
     weights: Mapping[str, float] = field(default_factory=dict)
     """By group: how much of what is contended is to be its, against the others' weights; 1 where nothing is said."""
+    patience: Ns = FAIR_PATIENCE
+    """In ns: that of the ARCs of groups that had more than another that waits. `SchedulingPolicy.patience` is that of
+    the others."""
     groups: Mapping[str, str] = field(default_factory=dict)
     """By owner (host or person): its group. Any other is a group of its own."""
 

@@ -265,6 +265,10 @@ class Core:
         """By group: RC-seconds that it lately had and others waited for; empty where fair shares are off."""
         return self._state.charged()
 
+    def charged_in_all(self) -> dict[str, float]:
+        """The same since the core was made, not decayed: for studies."""
+        return {} if self._state.shares is None else self._state.shares.totals()
+
     def bookings(self) -> list[tuple[Booking, ArcId | None]]:
         """Those that are not over, with the ARC that has taken each up."""
         return [(one.booking, one.arc.id if one.is_taken else None) for one in self._state.claims.values()]

@@ -159,6 +159,8 @@ class Arc:
     """The booking that it has taken up, until that is over."""
     position: int = 0
     """That of its group (`fair_shares.py`); while it runs, that which it started with."""
+    late: Ns = 0
+    """While it waits: so much later it counts as queued when it comes to who is due (`reservations.py`)."""
     owner: str = field(init=False)
     """Whose quota it counts against: its client's host."""
     id: ArcId = field(init=False)

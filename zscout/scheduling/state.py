@@ -62,7 +62,7 @@ class QueueIndex:
     def add(self, arc: Arc) -> None:
         """A newcomer."""
         insort(self.ranks, arc.rank)
-        insort(self._not_starving, (arc.since, arc.id))
+        insort(self._not_starving, (arc.since + arc.late, arc.id))
         self.ready[arc.id] = arc
         arc.move_to(ArcState.READY)
 
@@ -74,7 +74,7 @@ class QueueIndex:
             self.starving_version += 1
             del self.starving[bisect_left(self.starving, self._starving_key(arc))]
         else:
-            del self._not_starving[bisect_left(self._not_starving, (arc.since, arc.id))]
+            del self._not_starving[bisect_left(self._not_starving, (arc.since + arc.late, arc.id))]
         self._leave(arc)
 
     def mark_starving(self, since: Ns, queued: Mapping[ArcId, Arc]) -> None:
@@ -87,10 +87,16 @@ class QueueIndex:
         del self._not_starving[:count]
 
     def _starving_key(self, arc: Arc) -> tuple[int, Ns, ArcId]:
-        return -self._band(arc.priority), arc.since, arc.id
+        return -self._band(arc.priority), arc.since + arc.late, arc.id
 
     def sort(self, queued: Mapping[ArcId, Arc], rcs: Iterable[Rc]) -> None:
-        """The ranks of the queued have changed; `rcs` are those that are watched."""
+        """The ranks of the queued have changed, and since when they count as such; `rcs` are those that are watched.
+        Who is starving is to be marked anew."""
+        self._not_starving = sorted((arc.since + arc.late, arc.id) for arc in queued.values())
+        for _, _, arc_id in self.starving:
+            queued[arc_id].starving = False
+        self.starving.clear()
+        self.starving_version += 1
         self.ranks = sorted(arc.rank for arc in queued.values())
         for rc in rcs:
             rc.watchers = sorted(queued[rank[-1]].rank for rank in rc.watchers)
@@ -308,7 +314,7 @@ class SchedulerState:
         if arc.patterns:
             self.by_pattern[arc.id] = arc
         if self.shares is not None:
-            arc.put_at(self.shares.position(arc))
+            self._put(arc, self.shares)
         self._count_demand(arc, 1)
         self.index.add(arc)
 
@@ -530,9 +536,7 @@ class SchedulerState:
         """Puts the groups in the order of their shares, and the queued ARCs with them."""
         if self.shares is None or not self.shares.order():
             return
-        for arc in self.queued.values():
-            arc.put_at(self.shares.position(arc))
-        self.index.sort(self.queued, self.rcs_in(self.index.watched))
+        self._put_all(self.shares)
 
     def take_policy(self, policy: SchedulingPolicy) -> None:
         """What runs goes on; the next pass goes by the new one. Groups keep what they had, by name."""
@@ -548,9 +552,18 @@ class SchedulerState:
             for arc in self.running.values():
                 self.shares.hold(arc)
             self.shares.order()
+        self._put_all(self.shares)
+
+    def _put_all(self, shares: Shares | None) -> None:
         for arc in self.queued.values():
-            arc.put_at(0 if self.shares is None else self.shares.position(arc))
+            self._put(arc, shares)
         self.index.sort(self.queued, self.rcs_in(self.index.watched))
+
+    def _put(self, arc: Arc, shares: Shares | None) -> None:
+        """Puts an ARC where its group is."""
+        arc.put_at(0 if shares is None else shares.position(arc))
+        fair, patience = self.policy.fair_shares, self.policy.patience
+        arc.late = max(0, fair.patience - patience) if arc.position and fair is not None and patience is not None else 0
 
     def charged(self) -> dict[str, float]:
         """By group: RC-seconds that it lately had and others waited for; empty where fair shares are off."""
