@@ -39,6 +39,10 @@ class Use:
     waited: float = 0.0
     longest: float = 0.0
 
+    @property
+    def mean_wait(self) -> float:
+        return self.waited / max(1, self.done)
+
 
 @dataclass(slots=True)
 class _Program:

@@ -182,10 +182,6 @@ class CaseTrial:
         """By which part of itself its part grows with fair shares."""
         return self.gamed / self.honest - 1 if self.honest else 0.0
 
-    @property
-    def rise_off(self) -> float:
-        return self.gamed_off / self.honest_off - 1 if self.honest_off else 0.0
-
 
 def play_case(seed: int) -> CaseTrial:
     case = draw_case(seed)
@@ -208,59 +204,72 @@ def _part(case: Case, way: Way, policy: SchedulingPolicy) -> float:
 
 
 @dataclass(frozen=True, slots=True)
+class WeekReport:
+    seed: int
+    fair: bool
+    apart: float
+    uses: Mapping[str, Use]
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """In which part of the cases the gamer's part rose and fell by more than `RISE` of itself, and where it rose came to
+    more than that beyond an equal part; by how much it changed in all; and the greatest rise, with its case."""
+
+    rose: float
+    beyond: float
+    fell: float
+    mean: float
+    greatest: float
+    seed: int
+
+    @classmethod
+    def of(cls, found: Sequence[tuple[Case, float, float]]) -> Changes:
+        """From the parts honest and gamed."""
+        rises = [(gamed / honest - 1 if honest else 0.0, case.seed) for case, honest, gamed in found]
+        greatest, seed = max(rises)
+        honest = sum(one for _, one, _ in found)
+        beyond = [gamed * len(case.groups) > 1 + RISE for case, _, gamed in found]
+        return cls(
+            sum(rise > RISE for rise, _ in rises) / len(found),
+            sum(rise > RISE and far for (rise, _), far in zip(rises, beyond, strict=True)) / len(found),
+            sum(rise < -RISE for rise, _ in rises) / len(found),
+            sum(one for _, _, one in found) / honest - 1 if honest else 0.0,
+            greatest,
+            seed,
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class WayReport:
-    """Of all cases of one way: how often the gamer's part rose and fell by more than `RISE`, and the mean and the
-    greatest rise; `off`: the same without fair shares."""
+    """All cases of one way, with fair shares and without."""
 
     way: str
     cases: int
-    rose: int
-    fell: int
-    mean: float
-    greatest: float
-    greatest_seed: int
-    rose_off: int
-    fell_off: int
-    mean_off: float
+    on: Changes
+    off: Changes
 
 
 @dataclass(frozen=True, slots=True)
 class SharesReport:
-    weeks: list[dict[str, object]]
+    weeks: list[WeekReport]
     ways: list[WayReport]
-    risen: list[int]
-    """Seeds of the cases in which a part rose with fair shares, but for those of luck alone."""
+    risen: dict[str, list[int]]
+    """By way: the seeds of the cases in which a part rose with fair shares."""
 
 
 def report(weeks: Sequence[WeekTrial], cases: Sequence[CaseTrial]) -> SharesReport:
-    shown: list[dict[str, object]] = [
-        {"seed": one.job.seed, "fair": one.job.fair, "apart": one.apart}
-        | {
-            name: {field: getattr(use, field) for field in ("charged", "useful", "done")} | _waits(use)
-            for name, use in one.uses.items()
-        }
-        for one in weeks
-    ]
-    ways = [_way_report(way, found) for way in WAYS if (found := [one for one in cases if one.case.way == way])]
-    luck = next(iter(WAYS))
-    return SharesReport(shown, ways, [one.case.seed for one in cases if one.rise > RISE and one.case.way != luck])
-
-
-def _waits(use: Use) -> dict[str, float]:
-    return {"wait_mean": use.waited / max(1, use.done), "wait_longest": use.longest}
-
-
-def _way_report(way: str, found: Sequence[CaseTrial]) -> WayReport:
-    greatest = max(found, key=lambda one: one.rise)
-    return WayReport(
-        way,
-        len(found),
-        sum(one.rise > RISE for one in found),
-        sum(one.rise < -RISE for one in found),
-        sum(one.gamed - one.honest for one in found) / sum(one.honest for one in found),
-        greatest.rise,
-        greatest.case.seed,
-        sum(one.rise_off > RISE for one in found),
-        sum(one.rise_off < -RISE for one in found),
-        sum(one.gamed_off - one.honest_off for one in found) / sum(one.honest_off for one in found),
+    by_way = {way: found for way in WAYS if (found := [one for one in cases if one.case.way == way])}
+    return SharesReport(
+        [WeekReport(one.job.seed, one.job.fair, one.apart, one.uses) for one in weeks],
+        [
+            WayReport(
+                way,
+                len(found),
+                Changes.of([(one.case, one.honest, one.gamed) for one in found]),
+                Changes.of([(one.case, one.honest_off, one.gamed_off) for one in found]),
+            )
+            for way, found in by_way.items()
+        ],
+        {way: [one.case.seed for one in found if one.rise > RISE] for way, found in by_way.items()},
     )
