@@ -213,7 +213,7 @@ class WeekReport:
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """In which part of the cases the gamer's part rose and fell by more than `RISE` of itself, and where it rose came to
+    """In which part of the cases the gamer's part rose and fell by more than `RISE` of itself, and in which it rose to
     more than that beyond an equal part; by how much it changed in all; and the greatest rise, with its case."""
 
     rose: float
