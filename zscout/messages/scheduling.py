@@ -7,17 +7,7 @@ from typing import Annotated, TypeAlias
 
 import msgspec
 
-from zscout.messages.base import (
-    Amounts,
-    Elapsed,
-    Message,
-    RcSeconds,
-    Seconds,
-    ShortText,
-    State,
-    VersionText,
-    WallTime,
-)
+from zscout.messages.base import Amounts, Elapsed, Message, RcSeconds, Seconds, ShortText, State, VersionText, WallTime
 from zscout.types import NO_TERM, Grant, Place, Term
 
 DOOR_CODES = frozenset({"unknown_device", "unknown_parameter", "too_much"})
