@@ -75,6 +75,9 @@ def check_bound(workload: Workload, played: Replay, patience: Ns, late: Ns = 0) 
             linked |= {one.arc: one for one in found}
         ahead = sum(one.min_runtime for one in linked.values() if one is not arc)
         ahead += longest * ((len(linked) - 1) // MAX_STARVING)
+        if late:
+            # Who asked after it may come before it only once its group has come to be first, and waits for its RCs.
+            ahead += longest * sum(other.at > since for other in workload.arrivals if other.request.arc in linked)
         bound = late + max(patience, patience // 2 + longest) + ahead
         assert waited <= bound, f"{arc.arc} waited {waited / SECOND} s, promised are {bound / SECOND}"
     return tried
