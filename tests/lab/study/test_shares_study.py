@@ -7,14 +7,14 @@ from itertools import islice
 import pytest
 
 from zscout.config.scheduling_policy import FairShares, SchedulingPolicy
-from zscout.lab.study.scheduling.programs import Job, play
+from zscout.lab.study.scheduling.programs import ProgramJob, play
 from zscout.lab.study.scheduling.shares import (
     BURSTY,
     RISE,
     STEADY,
     WAYS,
-    Case,
     CaseTrial,
+    SharesCase,
     Week,
     draw_case,
     play_case,
@@ -26,8 +26,8 @@ from zscout.types import SECOND, Ns
 POLICY = SchedulingPolicy(fair_shares=FairShares(3_600 * SECOND))
 
 
-def job(asked: int, used: int, *rcs: str, pause: int = 0) -> Job:
-    return Job(pause * SECOND, rcs, asked * SECOND, used * SECOND)
+def job(asked: int, used: int, *rcs: str, pause: int = 0) -> ProgramJob:
+    return ProgramJob(pause * SECOND, rcs, asked * SECOND, used * SECOND)
 
 
 def test_programs_ask_for_one_arc_after_the_other() -> None:
@@ -75,7 +75,7 @@ def test_each_way_asks_for_the_same_work() -> None:
     assert {total(way) for way in WAYS} == {160 * SECOND}
 
 
-def trial(case: Case, honest: float, gamed: float) -> CaseTrial:
+def trial(case: SharesCase, honest: float, gamed: float) -> CaseTrial:
     return CaseTrial(case, honest, gamed, honest, honest)
 
 

@@ -19,7 +19,7 @@ TICK: Final[Ns] = 30 * SECOND
 """From one pass to the next while somebody waits; the RCM's is a second, and nothing here takes so little time."""
 
 
-class Job(NamedTuple):
+class ProgramJob(NamedTuple):
     """One ARC of a program: asked for `pause` ns after the one before was over, for `asked` ns, of which `used` are of
     use; what is used less is given back early."""
 
@@ -47,8 +47,8 @@ class Use:
 @dataclass(slots=True)
 class _Program:
     group: str
-    jobs: Iterator[Job]
-    job: Job
+    jobs: Iterator[ProgramJob]
+    job: ProgramJob
     number: int = 0
     asked_at: Ns = 0
 
@@ -107,13 +107,13 @@ class _Run:
 
 
 def play(
-    rcs: Sequence[RcName], groups: Mapping[str, Sequence[Iterator[Job]]], policy: SchedulingPolicy, until: Ns
+    rcs: Sequence[RcName], groups: Mapping[str, Sequence[Iterator[ProgramJob]]], policy: SchedulingPolicy, until: Ns
 ) -> dict[str, Use]:
     """What each group had by then. Strategy `adaptive`, exclusive RCs, one priority; a group's name is its host's."""
     run = _Run(Core(Adaptive(), policy), uses={group: Use() for group in groups})
     for group, programs in groups.items():
         for jobs in programs:
-            program = _Program(group, jobs, Job(0, (), 0, 0))
+            program = _Program(group, jobs, ProgramJob(0, (), 0, 0))
             run.go_on(program, 0)
     now: Ns = 0
     events: list[model.Event] = [model.RcJoined(rc, sharable=False) for rc in rcs]

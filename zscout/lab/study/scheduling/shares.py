@@ -15,7 +15,7 @@ from random import Random
 from typing import Final, NamedTuple
 
 from zscout.config.scheduling_policy import FairShares, SchedulingPolicy
-from zscout.lab.study.scheduling.programs import Job, Use, play
+from zscout.lab.study.scheduling.programs import ProgramJob, Use, play
 from zscout.types import SECOND, Ns, RcName
 
 DAY: Final[Ns] = 86_400 * SECOND
@@ -68,24 +68,24 @@ def play_week(job: Week) -> WeekTrial:
     return WeekTrial(job, play(WEEK_RCS, {STEADY: steady, BURSTY: bursty}, policy, DAYS * DAY))
 
 
-def _job(random: Random, rcs: Sequence[RcName], mean: float, pause: Ns, most: int = 3) -> Job:
+def _job(random: Random, rcs: Sequence[RcName], mean: float, pause: Ns, most: int = 3) -> ProgramJob:
     runtime = max(10, min(3_600, round(random.expovariate(1 / mean)))) * SECOND
-    return Job(pause, tuple(random.sample(rcs, random.randint(1, min(most, len(rcs))))), runtime, runtime)
+    return ProgramJob(pause, tuple(random.sample(rcs, random.randint(1, min(most, len(rcs))))), runtime, runtime)
 
 
-def _endless(random: Random, rcs: Sequence[RcName], mean: float, pause: float) -> Iterator[Job]:
+def _endless(random: Random, rcs: Sequence[RcName], mean: float, pause: float) -> Iterator[ProgramJob]:
     while True:
         yield _job(random, rcs, mean, round(random.expovariate(1 / pause)) * SECOND)
 
 
 # Whether it is of use to ask otherwise than one needs
 
-Programs = list[Iterator[Job]]
-Way = Callable[[Sequence[int], Callable[[int], Iterator[Job]], "Case"], Programs]
+Programs = list[Iterator[ProgramJob]]
+Way = Callable[[Sequence[int], Callable[[int], Iterator[ProgramJob]], "SharesCase"], Programs]
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class SharesCase:
     """A fleet and its groups: by group the seeds of its programs. `factor`: by how much is asked for more, or in how
     many pieces."""
 
@@ -99,13 +99,13 @@ class Case:
     way: str
 
 
-def draw_case(seed: int) -> Case:
+def draw_case(seed: int) -> SharesCase:
     random = Random(f"case/{seed}")  # noqa: S311
     groups = {
         name: tuple(random.getrandbits(32) for _ in range(random.randint(1, 5)))
         for name in (GAMER, "other", "third")[: random.randint(2, 3)]
     }
-    return Case(
+    return SharesCase(
         seed,
         tuple(f"robot/r{number}" for number in range(random.randint(2, 6))),
         groups,
@@ -117,34 +117,34 @@ def draw_case(seed: int) -> Case:
     )
 
 
-def _truthful(seeds: Sequence[int], jobs: Callable[[int], Iterator[Job]], _case: Case) -> Programs:
+def _truthful(seeds: Sequence[int], jobs: Callable[[int], Iterator[ProgramJob]], _case: SharesCase) -> Programs:
     return [jobs(seed) for seed in seeds]
 
 
-def _later(seeds: Sequence[int], jobs: Callable[[int], Iterator[Job]], _case: Case) -> Programs:
-    def begin(of: Iterator[Job]) -> Iterator[Job]:
+def _later(seeds: Sequence[int], jobs: Callable[[int], Iterator[ProgramJob]], _case: SharesCase) -> Programs:
+    def begin(of: Iterator[ProgramJob]) -> Iterator[ProgramJob]:
         yield next(of)._replace(pause=SECOND)
         yield from of
 
     return [begin(jobs(seed)) for seed in seeds]
 
 
-def _inflate(seeds: Sequence[int], jobs: Callable[[int], Iterator[Job]], case: Case) -> Programs:
+def _inflate(seeds: Sequence[int], jobs: Callable[[int], Iterator[ProgramJob]], case: SharesCase) -> Programs:
     return [(job._replace(asked=job.asked * case.factor) for job in jobs(seed)) for seed in seeds]
 
 
-def _split_time(seeds: Sequence[int], jobs: Callable[[int], Iterator[Job]], case: Case) -> Programs:
-    def pieces(of: Iterable[Job]) -> Iterator[Job]:
+def _split_time(seeds: Sequence[int], jobs: Callable[[int], Iterator[ProgramJob]], case: SharesCase) -> Programs:
+    def pieces(of: Iterable[ProgramJob]) -> Iterator[ProgramJob]:
         for job in of:
             piece = job.used // case.factor
             for number in range(case.factor):
-                yield Job(0 if number else job.pause, job.rcs, piece, piece)
+                yield ProgramJob(0 if number else job.pause, job.rcs, piece, piece)
 
     return [pieces(jobs(seed)) for seed in seeds]
 
 
-def _split_gang(seeds: Sequence[int], jobs: Callable[[int], Iterator[Job]], case: Case) -> Programs:
-    def part(of: Iterator[Job], number: int) -> Iterator[Job]:
+def _split_gang(seeds: Sequence[int], jobs: Callable[[int], Iterator[ProgramJob]], case: SharesCase) -> Programs:
+    def part(of: Iterator[ProgramJob], number: int) -> Iterator[ProgramJob]:
         for job in of:
             if number < len(job.rcs):
                 yield job._replace(rcs=job.rcs[number : number + 1])
@@ -152,8 +152,8 @@ def _split_gang(seeds: Sequence[int], jobs: Callable[[int], Iterator[Job]], case
     return [part(jobs(seed), number) for seed in seeds for number in range(min(3, len(case.rcs)))]
 
 
-def _spoil(seeds: Sequence[int], jobs: Callable[[int], Iterator[Job]], case: Case) -> Programs:
-    everything = (Job(5 * SECOND, case.rcs, SHORT, SHORT) for _ in count())
+def _spoil(seeds: Sequence[int], jobs: Callable[[int], Iterator[ProgramJob]], case: SharesCase) -> Programs:
+    everything = (ProgramJob(5 * SECOND, case.rcs, SHORT, SHORT) for _ in count())
     return [*_truthful(seeds, jobs, case), everything]
 
 
@@ -171,7 +171,7 @@ class CaseTrial:
     """The gamer's part of all RC-seconds of use, if it asks for what it needs, and if not; with fair shares and
     without."""
 
-    case: Case
+    case: SharesCase
     honest: float
     gamed: float
     honest_off: float
@@ -190,8 +190,8 @@ def play_case(seed: int) -> CaseTrial:
     return CaseTrial(case, *parts)
 
 
-def _part(case: Case, way: Way, policy: SchedulingPolicy) -> float:
-    def jobs(seed: int) -> Iterator[Job]:
+def _part(case: SharesCase, way: Way, policy: SchedulingPolicy) -> float:
+    def jobs(seed: int) -> Iterator[ProgramJob]:
         return _endless(Random(seed), case.rcs, case.mean, case.pause)  # noqa: S311
 
     groups = {name: (way if name == GAMER else _truthful)(seeds, jobs, case) for name, seeds in case.groups.items()}
@@ -224,7 +224,7 @@ class Changes:
     seed: int
 
     @classmethod
-    def of(cls, found: Sequence[tuple[Case, float, float]]) -> Changes:
+    def of(cls, found: Sequence[tuple[SharesCase, float, float]]) -> Changes:
         """From the parts honest and gamed."""
         rises = [(gamed / honest - 1 if honest else 0.0, case.seed) for case, honest, gamed in found]
         greatest, seed = max(rises)
