@@ -20,7 +20,7 @@ from fractions import Fraction
 from random import Random
 
 from benchmarks.stats import Samples
-from zscout.config.scheduling_policy import StrategyName
+from zscout.config.scheduling_policy import DEFAULT, FairShares, SchedulingPolicy, StrategyName
 from zscout.scheduling.booking import Booked, Booking
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
@@ -84,9 +84,11 @@ class _FullPriority(Priority):
 class Fleet:
     """A core with a queue of constant size."""
 
-    def __init__(self, rcs: int, queue: int, seed: int, strategy: StrategyName, bookings: int) -> None:
+    def __init__(
+        self, rcs: int, queue: int, seed: int, strategy: StrategyName, bookings: int, policy: SchedulingPolicy
+    ) -> None:
         self.rng, self.queue = Random(seed), queue  # noqa: S311
-        self.core, self.now, self.number = Core(STRATEGIES[strategy]()), 0, 0
+        self.core, self.now, self.number = Core(STRATEGIES[strategy](), policy), 0, 0
         self.ends: dict[ArcId, Ns] = {}
         """Of those that run. `Core.status` would leave the processor's caches cold for what is timed."""
         self.sharable = {f"device/{number}": number % 10 == 0 for number in range(rcs)}
@@ -115,9 +117,8 @@ class Fleet:
     def ask(self) -> Event:
         rng, self.number = self.rng, self.number + 1
         runtime = rng.randint(10 * SECOND, 100 * SECOND)
-        return Requested(
-            ArcRequest(f"a{self.number}", f"h/{self.number % 100}", self.needs(), rng.randrange(4), runtime)
-        )
+        arc, client = f"a{self.number}", f"h{self.number % 20}/c"
+        return Requested(ArcRequest(arc, client, self.needs(), rng.randrange(4), runtime))
 
     def send(self, kind: str, *events: Event) -> None:
         """One instant, timed, and then each vote and each further pass that it takes."""
@@ -167,8 +168,16 @@ class Fleet:
             self._timed("full pass", Tick())
 
 
-def measure(rcs: int, queue: int, rounds: int, seed: int, strategy: StrategyName, bookings: int) -> list[Point]:
-    fleet = Fleet(rcs, queue, seed, strategy, bookings)
+def measure(
+    rcs: int,
+    queue: int,
+    rounds: int,
+    seed: int,
+    strategy: StrategyName,
+    bookings: int = 0,
+    policy: SchedulingPolicy = DEFAULT,
+) -> list[Point]:
+    fleet = Fleet(rcs, queue, seed, strategy, bookings, policy)
     fleet.rounds(rounds)
     if strategy == "priority":
         fleet.full_passes(max(3, rounds // 20))
@@ -221,7 +230,9 @@ def main() -> None:
     parser.add_argument("--strategy", choices=("priority", "adaptive"), default="adaptive")
     parser.add_argument("--bookings", type=int, default=0, help="so many are open (default: 0)")
     parser.add_argument("--rcs", type=int, choices=RCS, help="only fleets of so many RCs")
+    parser.add_argument("--fair-shares", action="store_true", help="20 hosts, each with its share")
     args = parser.parse_args()
+    policy = SchedulingPolicy(fair_shares=FairShares(86_400 * SECOND)) if args.fair_shares else DEFAULT
     if not 10 <= args.rounds <= 100_000:
         parser.error(f"--rounds is {args.rounds}; give 10 to 100000")
     if not 0 <= args.bookings <= 10 * (args.rcs or RCS[0]):
@@ -231,7 +242,7 @@ def main() -> None:
     points = [
         point
         for rcs, queue in sizes
-        for point in measure(rcs, queue, args.rounds, args.seed, args.strategy, args.bookings)
+        for point in measure(rcs, queue, args.rounds, args.seed, args.strategy, args.bookings, policy)
     ]
     largest = {point.kind: point for point in points if (point.rcs, point.queue) == (RCS[-1], QUEUES[-1])}
     met = {kind: largest[kind].samples.median <= aim for kind, aim in AIMS.items() if kind in largest}

@@ -17,7 +17,7 @@ from zscout.config.fleet import (
     fleet_from_env,
     load_fleet,
 )
-from zscout.config.scheduling_policy import SchedulingPolicy
+from zscout.config.scheduling_policy import FairShares, SchedulingPolicy
 from zscout.config.strict import DURATIONS, BadInput
 from zscout.types import SECOND
 
@@ -39,8 +39,8 @@ BAD_FLEETS = {
     "[limits]\nmax_needed = 1": "limits.max_needed: unknown key; did you mean max_needs or max_queued?",
     "[fleet]\nzzz = 1": "fleet.zzz: unknown key; known here: candidates, min_runtime, name, operator_priority, "
     "patience, preempt, promise, strategy",
-    '"a\\u001b\\nb" = 1': r'"a\x1b\nb": unknown key; known here: access, ceilings, devices, fleet, '
-    "groups, limits, mesh, placement, quotas, roles, security, timing",
+    '"a\\u001b\\nb" = 1': r'"a\x1b\nb": unknown key; known here: access, ceilings, devices, fair_shares, '
+    "fleet, groups, limits, mesh, placement, quotas, roles, security, timing",
     'fleet = "lab"': 'fleet: is the text "lab"; write a table, under [fleet]',
     "[[fleet]]": "fleet: is a list; write a table, under [fleet]",
     # [fleet]
@@ -66,6 +66,21 @@ BAD_FLEETS = {
     '[fleet]\npromise = "all"\nstrategy = "optimal"': (
         'fleet.promise: is "all", but only "adaptive" with some patience promises anything; '
         'write strategy = "adaptive" and a patience above 0, or promise = "equals"'
+    ),
+    '[fair_shares]\n[fleet]\nstrategy = "priority"': (
+        'fair_shares: is there, but only "adaptive" has an order of groups, not "priority"; '
+        'write strategy = "adaptive" under [fleet], or remove the table'
+    ),
+    "[fair_shares]\npatience = 100": (
+        "fair_shares.patience: is 100 s, less than fleet.patience (142 s); write as much, or more"
+    ),
+    "[fair_shares]\nhalf_life = 1": "fair_shares.half_life: is 1 s; write 60 to 31622400 seconds",
+    "[fair_shares.weights]\nbob = 0": "fair_shares.weights.bob: is 0; write a number from 0.001 to 1000",
+    '[roles]\nclient = ["bob"]\n[groups]\narms = ["bob"]\n[fair_shares.weights]\nbob = 2': (
+        'fair_shares.weights.bob: "bob" is of the group arms, and counts there; give the group a weight'
+    ),
+    '[roles]\nclient = ["bob"]\n[fair_shares.weights]\nlegs = 2': (
+        'fair_shares.weights.legs: "legs" is no group and has no role; name it under [groups], or mend the name'
     ),
     "[limits]\nmax_running_per_host = -1": (
         "limits.max_running_per_host: is -1; write a whole number from 0 to 100000"
@@ -248,6 +263,13 @@ def test_every_key_of_a_fleet_file() -> None:
 def test_durations_are_numbers_or_texts() -> None:
     made = fleet('[mesh]\nlease = "2s"\n[timing]\nhold_lease = "1m"\nheartbeat = "300ms"\nrebuild = 0.5')
     assert (made.mesh.lease, made.timing) == (2.0, Timing(3 * SECOND // 10, 60 * SECOND, SECOND // 4, SECOND // 2))
+
+
+def test_fair_shares_are_off_unless_the_file_says_so() -> None:
+    assert default_fleet().scheduling.fair_shares is None
+    made = fleet('[fair_shares]\nhalf_life = "12h"\n[fair_shares.weights]\nws1 = 2')
+    assert made.scheduling.fair_shares == FairShares(43_200 * SECOND, {"ws1": 2.0})
+    assert fleet("[fair_shares]").scheduling.fair_shares == FairShares(86_400 * SECOND)
 
 
 def test_nobody_is_protected_for_longer_than_a_hold_lasts() -> None:

@@ -9,11 +9,67 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from zscout.config.scheduling_policy import FairShares
+from zscout.keyexpr import is_pattern, matcher
 from zscout.lab.replay import HoldRecord, Replay
 from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.capacity import excess
-from zscout.scheduling.model import ArcRequest, Outcome
-from zscout.types import Ns, RcName
+from zscout.scheduling.fair_shares import LITTLE, NEAR
+from zscout.scheduling.model import QUANTUM, ArcRequest, Outcome
+from zscout.types import SECOND, Ns, RcName
+
+
+@dataclass
+class SlowShares:
+    """Fair shares a second time: who holds and who waits is gone through whole, and so is time."""
+
+    policy: FairShares
+    operator_priority: int = 10
+    now: Ns = 0
+
+    def __post_init__(self) -> None:
+        self.charged: dict[str, float] = {}
+
+    def group(self, request: ArcRequest) -> str:
+        owner = request.client.partition("/")[0]
+        return self.policy.groups.get(owner, owner)
+
+    def pass_time(
+        self,
+        now: Ns,
+        holds: Iterable[tuple[ArcRequest, Iterable[RcName]]],
+        waiting: Iterable[ArcRequest],
+        present: set[RcName],
+    ) -> None:
+        """From the last time on until now these were held, and these waited."""
+        half_life, passed, waiting = self.policy.half_life / SECOND, (now - self.now) / SECOND, list(waiting)
+        left = 0.5 ** (passed / half_life)
+        self.charged = {group: had * left for group, had in self.charged.items()}
+        for request, rcs in holds:
+            group = self.group(request)
+            count = 0
+            for rc in rcs if request.priority < self.operator_priority else ():
+                count += any(
+                    self.group(other) != group
+                    and other.priority >= request.priority
+                    and all(need in present for need in other.needs if not is_pattern(need))
+                    and any(matcher(need)(rc) if is_pattern(need) else need == rc for need in other.needs)
+                    for other in waiting
+                )
+            # Of a constant stream into what halves in each half-life.
+            self.charged[group] = self.charged.get(group, 0.0) + count * (1 - left) * half_life / 0.6931471805599453
+        self.now = now
+
+    def positions(self, groups: Iterable[str]) -> dict[str, int]:
+        """The order of these groups."""
+        shares = sorted((self.charged.get(one, 0.0) / self.policy.weights.get(one, 1.0), one) for one in groups)
+        found: dict[str, int] = {}
+        position, first = 0, shares[0][0] if shares else 0.0
+        for share, group in shares:
+            if share - first > LITTLE and share - first > NEAR * share:
+                position, first = position + 1, share
+            found[group] = position
+        return found
 
 
 @dataclass(eq=False)
@@ -23,10 +79,12 @@ class Contender:
     request: ArcRequest
     place: int
     start: Ns | None = None
+    position: int = 0
+    """Of its group, when it last waited."""
 
     @property
-    def rank(self) -> tuple[int, Ns, int]:
-        return (-self.request.priority, self.request.min_runtime, self.place)
+    def rank(self) -> tuple[int, int, Ns, int]:
+        return (-self.request.priority, self.position, self.request.min_runtime, self.place)
 
     def end(self) -> Ns:
         """When its minimum runtime is over; only of a running one."""
@@ -40,7 +98,11 @@ class Contender:
 class Oracle:
     """All contenders, and the holds that are over."""
 
-    def __init__(self, rcs: Iterable[WorkloadRc]) -> None:
+    def __init__(self, rcs: Iterable[WorkloadRc], fair: FairShares | None = None) -> None:
+        self.shares = None if fair is None else SlowShares(fair)
+        self.groups: dict[str, int] = {}
+        """Those that wait, and their positions."""
+        self.next_look: Ns = 0
         self.rcs: dict[RcName, WorkloadRc] = {rc.name: rc for rc in rcs}
         self.contenders: list[Contender] = []
         self.holds: list[HoldRecord] = []
@@ -48,13 +110,49 @@ class Oracle:
 
     def instant(self, now: Ns, asked: list[ArcRequest]) -> None:
         """First what ends, then what was asked, then one pass."""
+        if self.shares is not None:
+            holds = [(one.request, one.request.needs) for one in self.running()]
+            waiting = [one.request for one in self.contenders if one.start is None]
+            self.shares.pass_time(now, holds, waiting, {*self.rcs})
         for one in self.running():
             if not one.request.keep and one.end() <= now:
                 self.finish(one, now)
         for request in asked:
             self.arrivals += 1
             self.contenders.append(Contender(request, self.arrivals))
+            if self.shares is not None and len(asked) == 1 and self.is_free(request):
+                self.contenders[-1].start = now  # it never waits
+                return
+            self.note_waiting(now)
+        self.look(now)
         self.run_pass(now)
+
+    def is_free(self, request: ArcRequest) -> bool:
+        """Whether nobody else waits, and all that it needs, which is exclusive, is free."""
+        free = self.rcs.keys() - {rc for one in self.running() for rc in one.request.needs}
+        return len(self.contenders) == len(self.running()) + 1 and request.needs.keys() <= free
+
+    def note_waiting(self, now: Ns) -> None:
+        """A group that begins to wait is the first until the next look, which is due."""
+        if self.shares is not None:
+            waiting = {self.shares.group(one.request) for one in self.contenders if one.start is None}
+            if waiting - self.groups.keys():
+                self.next_look = now
+            self.groups = {group: self.groups.get(group, 0) for group in waiting}
+            self.put()
+
+    def look(self, now: Ns) -> None:
+        """Puts the groups in order, once a quantum."""
+        if self.shares is not None and self.groups and now >= self.next_look:
+            self.next_look = now + QUANTUM
+            self.groups = self.shares.positions(self.groups)
+            self.put()
+
+    def put(self) -> None:
+        for one in self.contenders:
+            if self.shares is not None and one.start is None:
+                operator = one.request.priority >= self.shares.operator_priority
+                one.position = 0 if operator else self.groups[self.shares.group(one.request)]
 
     def running(self) -> list[Contender]:
         return [one for one in self.contenders if one.start is not None]
@@ -88,7 +186,9 @@ class Oracle:
                 self.finish(victim, now)
             else:
                 self.close(victim, now, Outcome.PREEMPTED)
+                self.note_waiting(now)
         a.start = now
+        self.note_waiting(now)
 
     def victims(self, a: Contender, now: Ns) -> list[Contender] | None:
         """Whom `a` would preempt; None when it has to wait (steps 1 to 3)."""
@@ -129,12 +229,12 @@ class Oracle:
         )
 
 
-def play(workload: Workload, *, one_by_one: bool = False) -> Replay:
+def play(workload: Workload, *, one_by_one: bool = False, fair: FairShares | None = None) -> Replay:
     """Plays a workload to its end.
 
     `one_by_one` runs a pass after each single arrival, where otherwise all of one instant share one. A kept
     hold ends when nothing else is left to come, but not before its minimum runtime is over."""
-    oracle = Oracle(workload.rcs)
+    oracle = Oracle(workload.rcs, fair)
     # `sorted` is stable: what asks at one instant asks in the order of the workload.
     arrivals: list[Arrival] = sorted(workload.arrivals, key=lambda arrival: arrival.at)
     now: Ns = 0

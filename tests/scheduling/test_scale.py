@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from random import Random
@@ -12,7 +12,8 @@ import pytest
 from tests.scheduling.plain_pass import PlainPriority
 from tests.scheduling.validate import validate
 from tests.thorough import times
-from zscout.scheduling import priority
+from zscout.config.scheduling_policy import DEFAULT, FairShares, SchedulingPolicy
+from zscout.scheduling import fair_shares, priority
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
@@ -29,6 +30,7 @@ from zscout.scheduling.model import (
     HoldEnded,
     Propose,
     Queued,
+    Rc,
     RcJoined,
     RcLost,
     RcReported,
@@ -39,7 +41,7 @@ from zscout.scheduling.model import (
     VoteOverdue,
 )
 from zscout.scheduling.priority import AdmissionCheck
-from zscout.scheduling.state import SchedulerState
+from zscout.scheduling.state import QueueIndex, SchedulerState
 from zscout.types import SECOND, Params
 
 
@@ -67,9 +69,9 @@ SIZES = {
 class Twins:
     """The indexed core and the plain one, fed with the same random events; they must say the same."""
 
-    def __init__(self, size: Size, seed: int) -> None:
+    def __init__(self, size: Size, seed: int, policy: SchedulingPolicy = DEFAULT) -> None:
         self.size, self.rng = size, Random(seed)  # noqa: S311
-        self.indexed, self.plain = Core(), Core(PlainPriority())
+        self.indexed, self.plain = Core(policy=policy), Core(PlainPriority(), policy)
         self.now = 0
         self.number = 0
         self.sharable = {f"rc/{number}": number < size.sharable for number in range(size.rcs)}
@@ -86,7 +88,7 @@ class Twins:
         needs: dict[str, Params] = {
             rc: {"rate": Fraction(rng.randint(0, 6))} if self.sharable[rc] else {} for rc in names
         }
-        client = f"host/{rng.randrange(self.size.clients)}"
+        client = client_of(rng.randrange(self.size.clients))
         runtime = rng.randint(1, 6) * SECOND // 2
         return Requested(ArcRequest(f"a{self.number}", client, needs, rng.randrange(4), runtime, rng.random() < 0.2))
 
@@ -135,7 +137,7 @@ class Twins:
             (1.0 if queued else 0.0, lambda: Cancelled(rng.choice(queued))),
             (0.3 if running else 0.0, lambda: self.hand_over(rng.choice([*running, *queued]))),
             (2.0, Tick),
-            (0.2, lambda: ClientLost(f"host/{rng.randrange(self.size.clients)}")),
+            (0.2, lambda: ClientLost(client_of(rng.randrange(self.size.clients)))),
             (0.5, lambda: self.come_or_go(some_rc)),
             (0.4, lambda: self.new_rules(some_rc)),
         ]
@@ -144,7 +146,7 @@ class Twins:
 
     def hand_over(self, arc: str) -> Event:
         self.number += 1
-        return HandedOver(arc, f"host/{self.rng.randrange(9)}", f"{arc.partition('.')[0]}.{self.number}")
+        return HandedOver(arc, client_of(self.rng.randrange(9)), f"{arc.partition('.')[0]}.{self.number}")
 
     def come_or_go(self, rc: str) -> Event:
         self.void(rc)
@@ -182,6 +184,10 @@ class Twins:
             assert self.indexed.arcs_of(client) == [arc.id for arc in theirs if arc.request.client == client]
 
 
+def client_of(number: int) -> str:
+    return f"host{number % 3}/{number}"
+
+
 def decisions(effects: list[Effect]) -> list[Effect]:
     """All but the words for those who wait: they are told later than they change."""
     return [effect for effect in effects if not isinstance(effect, Queued)]
@@ -202,6 +208,25 @@ def test_an_indexed_pass_is_a_full_pass(size: Size, seed: int) -> None:
     assert twins.grants > size.events / 5
     assert twins.preemptions > 10
     assert bool(twins.vetoes) == bool(size.sharable)
+
+
+@pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
+def test_so_it_is_where_the_order_of_groups_changes(size: Size, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(fair_shares, "LITTLE", 0.1)
+    sort, sorted_anew = QueueIndex.sort, [0]
+
+    def counted(index: QueueIndex, queued: Mapping[str, Arc], rcs: Iterable[Rc]) -> None:
+        sorted_anew[0] += 1
+        sort(index, queued, rcs)
+
+    monkeypatch.setattr(QueueIndex, "sort", counted)
+    twins = Twins(size, 3, SchedulingPolicy(fair_shares=FairShares(20 * SECOND)))
+    for number in range(size.events):
+        twins.step()
+        if number % size.validate_every == 0:
+            twins.compare()
+    assert twins.grants > size.events / 5
+    assert sorted_anew[0] > min(10, size.events // 20)
 
 
 def test_what_a_release_looks_at_does_not_grow_with_the_queue(monkeypatch: pytest.MonkeyPatch) -> None:

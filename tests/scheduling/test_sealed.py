@@ -29,6 +29,8 @@ SURFACE = {
     "tell_reasons",
     "slots",
     "bookings",
+    "charged",
+    "charged_in_all",
 }
 SURFACE |= {"as_events", "expects_yes", "number", "batches", "term", "seq", "strategy", "policy"}
 ACTIONS = {"start", "preempt", "wait", "propose", "run_again"}

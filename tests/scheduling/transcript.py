@@ -11,7 +11,7 @@
     lead TERM
     book ID NEED,... start=S [runtime=S] [patience=S] [priority=N] [since=S] [bound=RC,...] [maintenance]
     unbook ID           redate ID S            slots ID NEED,... start=S until=S [runtime=S] [priority=N] [bookings]
-    strategy NAME [patience=S]                 a new core; without it, it is `priority`
+    strategy NAME [patience=S] [half_life=S]   a new core; without it, it is `priority`; a half-life: with fair shares
 
 What is `bound` are the RCs kept for the patterns, in their order. A NEED is `kind/name`, with parameters
 `kind/name{rate=5 width=0.1}`; a TERM is `COUNTER:RCM`.
@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, cast
 
 from tests.scheduling.validate import validate
 from tests.transcripts import ns, seconds, settings
-from zscout.config.scheduling_policy import DEFAULT
+from zscout.config.scheduling_policy import DEFAULT, FairShares
 from zscout.keyexpr import is_pattern
 from zscout.scheduling.booking import Booked, Booking, BookingChanged, BookingThreatened, Redated, Unbooked
 from zscout.scheduling.core import Core
@@ -162,8 +162,10 @@ class CorePlayer:
             case "unbook":
                 return Unbooked(first)
             case "strategy":
-                options = settings(second.split(), "patience")
-                policy = replace(DEFAULT, patience=ns(options["patience"]) if options else DEFAULT.patience)
+                options = settings(second.split(), "patience", "half_life")
+                patience = ns(options["patience"]) if "patience" in options else DEFAULT.patience
+                fair = FairShares(ns(options["half_life"])) if "half_life" in options else None
+                policy = replace(DEFAULT, patience=patience, fair_shares=fair)
                 self.core = Core(STRATEGIES[cast("StrategyName", first)](), policy)
                 return None
             case "tick":

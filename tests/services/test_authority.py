@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from zscout.config.fleet import load_fleet
-from zscout.config.scheduling_policy import DEFAULT
+from zscout.config.scheduling_policy import DEFAULT, FairShares, SchedulingPolicy
 from zscout.keyexpr import Sender
 from zscout.mesh import Refused
 from zscout.messages import Ask
@@ -45,6 +45,16 @@ def authority(folder: Path, text: str = FILE) -> Authority:
 
 def ask(*needs: str, priority: int = 1, keep: bool = False, min_runtime: int = 5) -> Ask:
     return Ask("q1", "survey", {need: {} for need in needs}, priority, Decimal(min_runtime), keep)
+
+
+def test_who_is_in_several_groups_counts_in_the_first(tmp_path: Path) -> None:
+    legs = FILE.replace("[access]", 'legs = ["bob", "eve"]\n[access]')
+    policy = SchedulingPolicy(fair_shares=FairShares(SECOND))
+    for text in (legs, legs.replace('[security]\nfolder = "keys"', "")):
+        fair = authority(tmp_path, text).bound(policy).fair_shares
+        assert fair is not None
+        assert fair.groups == {"ada": "arms", "eve": "arms", "bob": "legs"}
+    assert authority(tmp_path, legs).bound(DEFAULT).fair_shares is None
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,16 @@ from typing import Annotated, Final
 from msgspec import Meta, Struct, structs
 
 from zscout.config.access import MAX_NAMES, AccessPolicy, Ceiling, Names, Quota, Roles, check_access
-from zscout.config.scheduling_policy import DEFAULT, PATIENCE, Preempt, Promise, SchedulingPolicy, StrategyName
+from zscout.config.scheduling_policy import (
+    DEFAULT,
+    FAIR_PATIENCE,
+    PATIENCE,
+    FairShares,
+    Preempt,
+    Promise,
+    SchedulingPolicy,
+    StrategyName,
+)
 from zscout.config.strict import (
     BadInput,
     Where,
@@ -38,6 +47,7 @@ MAX_ENDPOINTS: Final = 256
 MAX_SITES: Final = 64
 MIN_RUNTIME: Final[Ns] = 60 * SECOND
 """Default, in ns."""
+DAY: Final[Ns] = 86_400 * SECOND
 MAX_HOSTS: Final = 1_000
 MAX_DEVICES: Final = 1_000
 """That a fleet file expects of one host."""
@@ -205,6 +215,24 @@ class FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
     ] = MIN_RUNTIME
 
 
+class FairSharesTable(Struct, frozen=True, forbid_unknown_fields=True):
+    """The table [fair_shares]: of one priority that group goes first which lately had least of what others waited for.
+    Off where it is not there."""
+
+    half_life: Annotated[Ns, seconds("60", "31622400", "After this long half of what a group had counts.")] = DAY
+    weights: Annotated[
+        Mapping[str, Annotated[float, Meta(ge=0.001, le=1_000)]],
+        key(
+            "By group, or name that is in none: the parts that they are to have, 1 where nothing is said.",
+            most=MAX_NAMES,
+            example={"arms": 2},
+        ),
+    ] = {}
+    patience: Annotated[
+        Ns, seconds("0", "31622400", "That of groups that had more than another that waits; `fleet.patience` or more.")
+    ] = FAIR_PATIENCE
+
+
 class FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
     """A fleet file."""
 
@@ -213,6 +241,7 @@ class FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
     limits: RcmLimits = RcmLimits()
     timing: Timing = Timing()
     placement: PlacementPolicy = DEFAULT_PLACEMENT
+    fair_shares: FairSharesTable | None = None
     security: SecurityTable | None = None
     roles: Roles = Roles()
     groups: Annotated[
@@ -278,6 +307,7 @@ def _fleet(file: FleetFile, top: Where, folder: Path = Path()) -> Fleet:
         promise=table.promise,
         max_running_per_host=file.limits.max_running_per_host or None,
         max_runtime=file.limits.max_runtime or None,
+        fair_shares=_fair_shares(file, access, top / "fair_shares"),
     )
     fleet = Fleet(
         name=table.name,
@@ -295,6 +325,27 @@ def _fleet(file: FleetFile, top: Where, folder: Path = Path()) -> Fleet:
     )
     check_security(fleet, top)
     return fleet
+
+
+def _fair_shares(file: FleetFile, access: AccessPolicy, at: Where) -> FairShares | None:
+    """What the table says, without groups: `Authority` has these. Raises BadInput."""
+    table = file.fair_shares
+    if table is None:
+        return None
+    if file.fleet.strategy != "adaptive":
+        what = f'is there, but only "adaptive" has an order of groups, not "{file.fleet.strategy}"'
+        raise at.bad(what, 'write strategy = "adaptive" under [fleet], or remove the table')
+    for name in table.weights:
+        here = at / "weights" / name
+        check_name(name, here)
+        if groups := access.groups_of(name):
+            raise here.bad(f"{quoted(name)} is of the group {groups[0]}, and counts there", "give the group a weight")
+        if access.ranks and name not in access.groups and name not in access.ranks:
+            raise here.bad(f"{quoted(name)} is no group and has no role", "name it under [groups], or mend the name")
+    if table.patience < file.fleet.patience:
+        what = f"is {table.patience / SECOND:g} s, less than fleet.patience ({file.fleet.patience / SECOND:g} s)"
+        raise (at / "patience").bad(what, "write as much, or more")
+    return FairShares(table.half_life, table.weights, patience=table.patience)
 
 
 def keys_folder(table: SecurityTable, beside: Path, top: Where) -> Path:

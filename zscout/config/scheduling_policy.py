@@ -10,6 +10,8 @@ from zscout.types import SECOND, Ns
 
 PATIENCE: Final[Ns] = 142 * SECOND
 """Default, in ns. Measured: docs/study.md."""
+FAIR_PATIENCE: Final[Ns] = 3_600 * SECOND
+"""Default, in ns."""
 OPERATOR_PRIORITY: Final = 10
 
 StrategyName: TypeAlias = Literal["priority", "optimal", "adaptive"]
@@ -24,6 +26,21 @@ class RcQuota:
     name: str
     owners: frozenset[str]
     rcs: int
+
+
+@dataclass(frozen=True, slots=True)
+class FairShares:
+    """Groups of equal priority in the order of what they lately had and others waited for (`fair_shares.py`)."""
+
+    half_life: Ns
+    """Time in ns after which a group is charged half of what it had."""
+    weights: Mapping[str, float] = field(default_factory=dict)
+    """By group: how much of what is contended is to be its, against the others' weights; 1 where nothing is said."""
+    patience: Ns = FAIR_PATIENCE
+    """In ns: that of the ARCs of groups that had more than another that waits. `SchedulingPolicy.patience` is that of
+    the others."""
+    groups: Mapping[str, str] = field(default_factory=dict)
+    """By owner (host or person): its group. Any other is a group of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +64,8 @@ class SchedulingPolicy:
     """By owner: the quotas that bind it."""
     barred: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """By owner: patterns of the RCs that no need of its ARCs is bound to."""
+    fair_shares: FairShares | None = None
+    """None: whose an ARC is does not count."""
 
 
 DEFAULT: Final = SchedulingPolicy()

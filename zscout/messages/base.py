@@ -56,6 +56,7 @@ VersionText: TypeAlias = Annotated[str, msgspec.Meta(max_length=64)]
 """What `zscout --version` prints where it is from; empty: it is older than versions that tell theirs."""
 FIRST_TOLD = "0.2.0"
 """The first version that tells itself."""
+RcSeconds: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e15)]
 Figure: TypeAlias = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
 Bytes: TypeAlias = Annotated[int, msgspec.Meta(ge=0, le=1 << 60)]
 

@@ -7,13 +7,15 @@ from typing import Annotated, TypeAlias
 
 import msgspec
 
-from zscout.messages.base import Amounts, Elapsed, Message, Seconds, State, VersionText, WallTime
+from zscout.messages.base import Amounts, Elapsed, Message, RcSeconds, Seconds, ShortText, State, VersionText, WallTime
 from zscout.types import NO_TERM, Grant, Place, Term
 
 DOOR_CODES = frozenset({"unknown_device", "unknown_parameter", "too_much"})
 """What a request is refused with that asked for a `check` and can never start."""
 MAX_KNOWN = 64
 """Bandwidth parameters that one RC knows."""
+MAX_GROUPS = 1_000
+"""Groups of which is told what they had."""
 MAX_OTHERS = 255
 """ARCs that one hand-over takes along, beside the one that it names first."""
 
@@ -253,6 +255,9 @@ class Revocation(_ArcParty, frozen=True):
     """Whether its own client gave it back: its program is gone."""
 
 
+Charged: TypeAlias = Annotated[dict[ShortText, RcSeconds], msgspec.Meta(max_length=MAX_GROUPS)]
+
+
 class Grants(Message, frozen=True):
     """A publication of the leading RCM. For each RC touched, all its holders from now on, and the `instance` of it that
     is meant: another one that hears this holds nothing.
@@ -272,6 +277,9 @@ class Grants(Message, frozen=True):
     obeys this: journals keep it."""
     time: WallTime | None = None
     """Fleet time, by which bookings have their dates."""
+    charged: Charged = {}
+    """With fair shares, now and then: by group the RC-seconds that it lately had and others waited for. Nobody obeys
+    this: candidates go on from it when they lead."""
 
 
 class StateAsk(Message, frozen=True):
@@ -379,6 +387,8 @@ class RcmState(Message, frozen=True):
     more: int = 0
     instances: dict[str, tuple[str, str]] = {}
     version: VersionText = ""
+    charged: Charged = {}
+    """As in Grants."""
 
 
 class OpenRequest(_Wanted, frozen=True):

@@ -178,14 +178,16 @@ def split(arcs: Iterable[Arc]) -> list[list[Arc]]:
     return list(groups.values())
 
 
-def _level_key(arc: Arc, first: set[ArcId], now: Ns) -> tuple[int, int]:
+def _level_key(arc: Arc, first: set[ArcId], last: int, now: Ns) -> tuple[int, int]:
     """Sorts ARCs into levels, the best smallest, by priority. A protected hold counts at least as the highest priority
     that may not end it. Among equals, those to go `first` and holds within their minimum runtime come before the
-    rest."""
+    rest, and these by the position of their groups, of which `last` is the last; holds that yield are at the end."""
     if (below := arc.protected_below(now)) is not None:
         return min(-arc.priority, 1 - below), 0
-    later = arc.past_min_runtime(now) if arc.hold is not None else arc.id not in first
-    return -arc.priority, 2 if first and later else 1
+    if arc.past_min_runtime(now) if arc.hold is not None else arc.id not in first:
+        position = arc.position if arc.hold is None else last
+        return -arc.priority, 2 + position if first or last else 1
+    return -arc.priority, 1
 
 
 def _one_group(arcs: Sequence[Arc]) -> bool:
@@ -211,7 +213,8 @@ class ConflictGroup:
         self.state, self.votes = state, state.votes
         now = state.now
         first = {arc.id for arc in arcs if reserved is not None and reserved.goes_first(arc)}
-        keyed = sorted((_level_key(arc, first, now), arc.rank, arc) for arc in arcs)
+        last = max((arc.position for arc in arcs if arc.hold is None), default=0)
+        keyed = sorted((_level_key(arc, first, last, now), arc.rank, arc) for arc in arcs)
         self.arcs = [arc for _, _, arc in keyed]
         """Best first."""
         self.mask = union(arc.mask for arc in arcs)

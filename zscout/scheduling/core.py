@@ -90,6 +90,7 @@ class Core:
                 self._apply(event)
         self._begin_maintenance()
         if self._state.queued:
+            self._state.order_groups()
             self.strategy.run_pass(self._state, self)
         for arc in self._state.held_back.values():
             if arc.held_back is None and (other := self._state.at_place(arc.place)) is not None:
@@ -117,7 +118,7 @@ class Core:
     @policy.setter
     def policy(self, policy: SchedulingPolicy) -> None:
         """What runs goes on; the next pass goes by the new one."""
-        self._state.policy = policy
+        self._state.take_policy(policy)
 
     # The present state
 
@@ -215,7 +216,7 @@ class Core:
         joined += [Booked(claim.booking) for claim in state.claims.values()]
         queued = (*state.queued.values(), *state.held_back.values())
         waiting = tuple(model.Requested(arc.request, arc.place, arc.since) for arc in queued)
-        return joined, model.LeadTaken(term, recovered_holds, waiting)
+        return joined, model.LeadTaken(term, recovered_holds, waiting, self.charged())
 
     def slots(self, wanted: Booking, until: Ns, limit: int, *, bookings_only: bool = False) -> SlotsFound:
         """The first `limit` stretches of time, from the start of `wanted` to `until`, in which it would be kept;
@@ -259,6 +260,14 @@ class Core:
         """The RCs that are kept, or held, for the patterns of a booking."""
         claim = self._state.claims.get(booking)
         return {} if claim is None else claim.booking.bound if claim.arc.hold is None else claim.arc.bound
+
+    def charged(self) -> dict[str, float]:
+        """By group: RC-seconds that it lately had and others waited for; empty where fair shares are off."""
+        return self._state.charged()
+
+    def charged_in_all(self) -> dict[str, float]:
+        """The same since the core was made, not decayed: for studies."""
+        return {} if self._state.shares is None else self._state.shares.totals()
 
     def bookings(self) -> list[tuple[Booking, ArcId | None]]:
         """Those that are not over, with the ARC that has taken each up."""
@@ -444,6 +453,8 @@ class Core:
         if lead.term <= self.term:
             raise ValueError(f"the new term {lead.term} is not above {self.term}")
         self.term, self.seq, self._arrivals = lead.term, 0, 0
+        if self._state.shares is not None:
+            self._state.shares.restore(lead.charged)
         # The newest grant is the truth where two claim one exclusive RC.
         for held in sorted(lead.recovered_holds, key=lambda held: held.grant, reverse=True):
             if self._state.arc(held.request.arc) is None:

@@ -31,8 +31,9 @@ HOLD_BACK: Final[Ns] = SECOND
 MAX_HOLD_BACK: Final[Ns] = 30 * SECOND
 """and at most."""
 
-Rank: TypeAlias = tuple[int, Ns, Place, ArcId]
-"""Sorts contenders, best first: priority (negated), minimum runtime, place, id."""
+Rank: TypeAlias = tuple[int, int, Ns, Place, ArcId]
+"""Sorts contenders, best first: priority (negated), position of the group (`fair_shares.py`), minimum runtime, place,
+id."""
 
 
 class ArcRequest(Struct, frozen=True):
@@ -156,12 +157,16 @@ class Arc:
     if there is none for some pattern."""
     claim: Claim | None = None
     """The booking that it has taken up, until that is over."""
+    position: int = 0
+    """That of its group (`fair_shares.py`); while it runs, that which it started with."""
+    late: Ns = 0
+    """While it waits: so much later it counts as queued when it comes to who is due (`reservations.py`)."""
     owner: str = field(init=False)
     """Whose quota it counts against: its client's host."""
     id: ArcId = field(init=False)
     priority: int = field(init=False)
     rank: Rank = field(init=False)
-    """Higher priority, then shorter minimum runtime, then earlier place goes first.
+    """Higher priority, then the group that had less, then shorter minimum runtime, then earlier place goes first.
 
     Clients give their places after a takeover, so two may claim one: the id keeps the order total."""
     party: Party = field(init=False)
@@ -177,8 +182,13 @@ class Arc:
         """Takes this for its request: its own one, or that of another client with the same needs."""
         self.request, self.id, self.priority = request, request.arc, request.priority
         self.owner = request.client.partition("/")[0]
-        self.rank = (-self.priority, request.min_runtime, self.place, self.id)
         self.party = Party(self.id, request.label or self.id, self.priority, request.who)
+        self.put_at(self.position)
+
+    def put_at(self, position: int) -> None:
+        """Its group has this position."""
+        self.position = position
+        self.rank = (-self.priority, position, self.request.min_runtime, self.place, self.id)
 
     def ends(self, start: Ns) -> Ns:
         """When its minimum runtime is over if it starts then: with a booking, when that is over."""
@@ -404,6 +414,8 @@ class LeadTaken(Struct, frozen=True):
     term: Term
     recovered_holds: tuple[RecoveredHold, ...] = ()
     waiting: tuple[Requested, ...] = ()
+    charged: Mapping[str, float] = {}
+    """By group: RC-seconds that it had and others waited for, decayed as of now (`fair_shares.py`)."""
 
 
 class Adopted(Struct, frozen=True):

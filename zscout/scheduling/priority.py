@@ -121,7 +121,7 @@ class AdmissionCheck:
         if not arc.patterns:
             shown = self.non_preemptible[:SHOWN]
             rcs, parties = tuple(rc.name for rc, _ in shown), tuple(holder.blocks(arc) for _, holder in shown)
-            return Reason(ReasonCode.HELD, rcs, parties, number=number)
+            return Reason(ReasonCode.HELD, rcs, parties, self._preferred(), number)
         bound = {rc: need for need, rc in arc.bound.items()}
         told = [(rc, holder, "") for rc, holder in self.non_preemptible if rc.name not in bound]
         known = {rc.bit for rc, _, _ in told}
@@ -138,9 +138,15 @@ class AdmissionCheck:
             ReasonCode.HELD,
             tuple(rc.name for rc, _, _ in first),
             tuple(holder.blocks(arc) for _, holder, _ in first),
-            number=len(told),
+            self._preferred(),
+            len(told),
             patterns=tuple(need for _, _, need in first),
         )
+
+    def _preferred(self) -> str:
+        """The group that goes before its own by fair shares, if one of them is in its way for that."""
+        shares = self.state.shares
+        return "" if shares is None else shares.preferred(self.arc, (holder for _, holder in self.non_preemptible))
 
     def masked_obstacles(self) -> int:
         """Bits of the RCs that keep the ARC out at present, whether off limits or not."""

@@ -25,7 +25,8 @@ class ReasonCode(StrEnum):
     NO_MATCH = "no_match"
     """No RC is left for the patterns in `rcs`; `detail` says why RCs that would do are lost."""
     HELD = "held"
-    """`rcs` are held by `by`, one each, who are not preempted for it; of a pattern all its choices are told."""
+    """`rcs` are held by `by`, one each, who are not preempted for it; of a pattern all its choices are told. `detail`
+    is the group of one that was preferred by fair shares."""
     VETOED = "vetoed"
     """The RC refuses it beside `by`, who hold it and are not preempted for it; `detail` in the RC's own words."""
     UNCONFIRMED = "unconfirmed"
@@ -196,7 +197,8 @@ def _held(reason: Reason, until: Until | None) -> str:
         shown = [f"{rc} (held by {one[1]}{_last(one[1], until)})" for rc, one in zip(names, choices, strict=True)]
         parts.append(f"one of {', '.join(shown)}")
     more = f" and {reason.number - len(held)} more" if reason.number > len(held) else ""
-    return f"waits for {'; for '.join(parts)}{more}"
+    preferred = f"; by fair shares {reason.detail} goes first" if reason.detail else ""
+    return f"waits for {'; for '.join(parts)}{more}{preferred}"
 
 
 def _listed(reason: Reason) -> str:

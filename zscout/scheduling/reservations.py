@@ -14,6 +14,8 @@ A booking is reserved its RCs for its own time, likewise. Promises to equals are
 made: a booking that was there when an ARC began to starve is gone round, and one that was made later is not seen.
 Maintenance stands before all promises to who has no higher priority, and while it lasts before all.
 
+With fair shares an ARC whose group had more than another that waits counts as queued later (`Arc.late`).
+
 `docs/scheduling.md` states the promise that follows, and what else was tried.
 """
 
@@ -219,7 +221,7 @@ class Reservations:
 
     def due(self, arc: Arc) -> Ns:
         """When its patience is over."""
-        return arc.since + (self._patience or 0)
+        return arc.since + arc.late + (self._patience or 0)
 
     def goes_first(self, arc: Arc) -> bool:
         """Whether `arc` goes before its equals that could start as well. A sharable RC may accept each

@@ -18,6 +18,7 @@ from msgspec import structs
 from zscout.config.scheduling_policy import DEFAULT, RcQuota, SchedulingPolicy, StrategyName
 from zscout.keyexpr import is_pattern, matcher
 from zscout.scheduling.booking import Booking
+from zscout.scheduling.fair_shares import Shares
 from zscout.scheduling.model import Arc, ArcRequest, ArcState, Claim, Hold, Rank, Rc, union
 from zscout.scheduling.reason import Reason
 from zscout.scheduling.votes import HolderSet, Votes
@@ -61,7 +62,7 @@ class QueueIndex:
     def add(self, arc: Arc) -> None:
         """A newcomer."""
         insort(self.ranks, arc.rank)
-        insort(self._not_starving, (arc.since, arc.id))
+        insort(self._not_starving, (arc.since + arc.late, arc.id))
         self.ready[arc.id] = arc
         arc.move_to(ArcState.READY)
 
@@ -73,7 +74,7 @@ class QueueIndex:
             self.starving_version += 1
             del self.starving[bisect_left(self.starving, self._starving_key(arc))]
         else:
-            del self._not_starving[bisect_left(self._not_starving, (arc.since, arc.id))]
+            del self._not_starving[bisect_left(self._not_starving, (arc.since + arc.late, arc.id))]
         self._leave(arc)
 
     def mark_starving(self, since: Ns, queued: Mapping[ArcId, Arc]) -> None:
@@ -86,7 +87,19 @@ class QueueIndex:
         del self._not_starving[:count]
 
     def _starving_key(self, arc: Arc) -> tuple[int, Ns, ArcId]:
-        return -self._band(arc.priority), arc.since, arc.id
+        return -self._band(arc.priority), arc.since + arc.late, arc.id
+
+    def sort(self, queued: Mapping[ArcId, Arc], rcs: Iterable[Rc]) -> None:
+        """The ranks of the queued have changed, and since when they count as such; `rcs` are those that are watched.
+        Who is starving is to be marked anew."""
+        self._not_starving = sorted((arc.since + arc.late, arc.id) for arc in queued.values())
+        for _, _, arc_id in self.starving:
+            queued[arc_id].starving = False
+        self.starving.clear()
+        self.starving_version += 1
+        self.ranks = sorted(arc.rank for arc in queued.values())
+        for rc in rcs:
+            rc.watchers = sorted(queued[rank[-1]].rank for rank in rc.watchers)
 
     def ahead(self, arc: Arc) -> int:
         """How many of the queued rank above `arc`."""
@@ -173,6 +186,8 @@ class SchedulerState:
         """Grows with all that changes who holds what, which RCs are there, and who is preemptible."""
         self.changed = 0
         """Bits of the RCs at which it grew, since who looks after bookings last emptied this."""
+        self.shares = Shares(self, policy.fair_shares) if policy.fair_shares is not None else None
+        """What each group had, where fair shares are on."""
 
     def rc(self, name: RcName) -> Rc:
         """The RC of this name, made known (absent, exclusive) if it was not."""
@@ -244,7 +259,7 @@ class SchedulerState:
         at = 0 if rank is None else bisect_right(rc.watchers, rank)
         if at == len(rc.watchers):
             return None
-        return rc.watchers[at], rc.bit, self.queued[rc.watchers[at][3]], rc
+        return rc.watchers[at], rc.bit, self.queued[rc.watchers[at][-1]], rc
 
     def arc(self, arc: ArcId) -> Arc | None:
         return self.running.get(arc) or self.queued.get(arc) or self.held_back.get(arc)
@@ -256,6 +271,8 @@ class SchedulerState:
 
     def join(self, name: RcName, *, sharable: bool) -> None:
         rc = self.rc(name)
+        if self.shares is not None and not rc.present:
+            self.shares.count_absent(rc, self.queued.values(), 1)
         rc.present, rc.sharable, rc.absence = True, sharable, ""
         self.present |= rc.bit
         self.sharable = self.sharable | rc.bit if sharable else self.sharable & ~rc.bit
@@ -264,6 +281,8 @@ class SchedulerState:
 
     def leave(self, name: RcName) -> None:
         rc = self.rc(name)
+        if self.shares is not None and rc.present:
+            self.shares.count_absent(rc, self.queued.values(), -1)
         rc.present = False
         self.present &= ~rc.bit
         self.index.freed |= rc.bit
@@ -294,6 +313,8 @@ class SchedulerState:
         self.queued[arc.id] = arc
         if arc.patterns:
             self.by_pattern[arc.id] = arc
+        if self.shares is not None:
+            self._put(arc, self.shares)
         self._count_demand(arc, 1)
         self.index.add(arc)
 
@@ -511,6 +532,43 @@ class SchedulerState:
         alone = self.policy.promise == "equals" or self.operator(priority)
         return priority if alone else self.policy.operator_priority - 1
 
+    def order_groups(self) -> None:
+        """Puts the groups in the order of their shares, and the queued ARCs with them."""
+        if self.shares is None or not self.shares.order():
+            return
+        self._put_all(self.shares)
+
+    def take_policy(self, policy: SchedulingPolicy) -> None:
+        """What runs goes on; the next pass goes by the new one. Groups keep what they had, by name."""
+        charged, same = self.charged(), policy.fair_shares == self.policy.fair_shares
+        self.policy = policy
+        if same:
+            return
+        self.shares = None if policy.fair_shares is None else Shares(self, policy.fair_shares)
+        if self.shares is not None:
+            self.shares.restore(charged)
+            for arc in self.queued.values():
+                self.shares.count_waiting(arc, 1)
+            for arc in self.running.values():
+                self.shares.hold(arc)
+            self.shares.order()
+        self._put_all(self.shares)
+
+    def _put_all(self, shares: Shares | None) -> None:
+        for arc in self.queued.values():
+            self._put(arc, shares)
+        self.index.sort(self.queued, self.rcs_in(self.index.watched))
+
+    def _put(self, arc: Arc, shares: Shares | None) -> None:
+        """Puts an ARC where its group is."""
+        arc.put_at(0 if shares is None else shares.position(arc))
+        fair, patience = self.policy.fair_shares, self.policy.patience
+        arc.late = max(0, fair.patience - patience) if arc.position and fair is not None and patience is not None else 0
+
+    def charged(self) -> dict[str, float]:
+        """By group: RC-seconds that it lately had and others waited for; empty where fair shares are off."""
+        return {} if self.shares is None else self.shares.charged()
+
     def longest(self, start: Ns) -> Ns | None:
         """When a hold from `start` on ends at the latest."""
         limit = self.policy.max_runtime
@@ -550,8 +608,12 @@ class SchedulerState:
         self.held_by_owner[arc.owner] = self.held_by_owner.get(arc.owner, 0) + len(arc.rcs)
         for rc in arc.rcs:
             rc.holders[arc.id] = arc
+        if self.shares is not None:
+            self.shares.hold(arc)
 
     def _remove_running(self, arc: Arc) -> None:
+        if self.shares is not None:
+            self.shares.end(arc)
         del self.running[arc.id]
         self._grow(arc.mask)
         self.claims_version += arc.claim is not None
@@ -565,6 +627,8 @@ class SchedulerState:
     def _count_demand(self, arc: Arc, by: int) -> None:
         for rc in self.rcs_in(arc.named_mask) if arc.patterns else arc.rcs:
             rc.demand += by
+        if self.shares is not None:
+            self.shares.count_waiting(arc, by)
 
     def _next_entry(self) -> int:
         self.entries += 1

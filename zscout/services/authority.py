@@ -34,7 +34,13 @@ class Authority:
         self._policy = fleet.access
 
     def bound(self, policy: SchedulingPolicy) -> SchedulingPolicy:
-        """The policy, with what the scheduler has to see to: quotas of RCs, and what no pattern is bound to."""
+        """The policy, with what the scheduler has to see to: groups, quotas of RCs, and what no pattern is bound to.
+        Who is in several groups counts in the first."""
+        if policy.fair_shares is not None:
+            # Backwards, so that the first group of a name stands last.
+            listed = reversed([*self._policy.groups.items()])
+            groups = {name: group for group, members in listed for name in members}
+            policy = replace(policy, fair_shares=replace(policy.fair_shares, groups=groups))
         if not self._enforced:
             return policy
         names = list(self._policy.ranks)

@@ -6,14 +6,17 @@ import asyncio
 import itertools
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from decimal import Decimal
 from itertools import pairwise
 from typing import Any
 
 import pytest
+from msgspec import structs
 
 from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeFleet, Refusal
+from zscout.config.scheduling_policy import FairShares
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role
@@ -59,6 +62,33 @@ def test_a_takeover_carries_on_what_stands_and_nobody_is_disturbed() -> None:
         await client.do(Release("held"))
         await until(lambda: robots[0].arcs == ["waits"])
         assert late.notices == []
+        await heir.stop()
+        await leader.stop()
+
+    run(story())
+
+
+def test_a_takeover_goes_on_with_what_groups_had() -> None:
+    async def story() -> None:
+        fleet = FakeFleet("x", "y", strategy="adaptive")
+        policy = replace(fleet.fleet.scheduling, fair_shares=FairShares(3_600 * SECOND))
+        fleet.fleet = structs.replace(fleet.fleet, scheduling=policy)
+        leader, heir = fleet.candidate("x"), fleet.candidate("y")
+        robot = fleet.rc("robot/a")
+        await until(lambda: leader.rcm)
+        await fleet.joined(robot)
+        client, other = fleet.client("one", "ws1"), fleet.client("two", "ws2")
+        held, waits = await client.ask("held", "robot/a", seconds=600), await other.ask("waits", "robot/a", seconds=600)
+        client.open, other.open = [open_request(held)], [open_request(waits)]
+        await asyncio.sleep(100)
+        had = (await fleet.state()).charged
+        assert had == {"ws1": pytest.approx(99, abs=1.5)}
+        fleet.network.kill(leader.mesh)
+        await until(lambda: heir.rcm)
+        taken = (await fleet.state()).charged
+        assert had["ws1"] - 11 < taken["ws1"] < had["ws1"] + 2, "it was told at most 10 s before"
+        await asyncio.sleep(50)
+        assert (await fleet.state()).charged["ws1"] == pytest.approx(taken["ws1"] + 50, rel=0.05)
         await heir.stop()
         await leader.stop()
 

@@ -41,6 +41,8 @@ async def status(names: Sequence[str], watch: bool, every: bool, as_json: bool) 
     what has to do with them: an RC with who holds it and who waits for it, an ARC with its RCs and their holders, a
     host with its RCs and programs. Exit code 1: nothing has one of these names.
 
+    With fair shares the groups stand in the order in which they go, with what they lately had and others waited for.
+
     Warnings come first: of certificates that end within 14 days, roles that nobody enforces, clocks that differ by more
     than 2 s, versions that differ. The queue stands in rank order, each ARC with what it waits for. Candidates that the
     fleet file names are shown even where they are not there; other hosts that died only with --watch. A device that
@@ -111,6 +113,7 @@ class Standing:
             headline += f"; {many(count, 'booking')} within 24 h" if (count := booked.soon(self.booked)) else ""
             ranks = {f"{wait.client}/{wait.id}": number for number, wait in enumerate(self.state.queue, 1)}
             tables = [self._rcs(chosen.state), self._running(chosen.state), _waiting(chosen.state, ranks)]
+            tables += [] if self.names else [shares_table(self._shares())]
         return Overview(
             headline, [self._warnings(), *tables, self._hosts(chosen), self._devices(chosen)], alarm=self.state is None
         )
@@ -174,6 +177,11 @@ class Standing:
             styles.append("bold red" if operator else "")
         columns = ("ARC", "WHO", "PRIORITY", "SINCE", "UNTIL", "RCS", "CLIENT")
         return Table("Running", columns, rows, styles, {"CLIENT"}, cut={"WHO"})
+
+    def _shares(self) -> list[dict[str, Any]]:
+        """Of all groups, whatever is to be shown."""
+        fair = self.fleet_view.client.fleet.scheduling.fair_shares
+        return [] if self.state is None else shares(self.state.charged, {} if fair is None else fair.weights)
 
     def _hosts(self, chosen: Selection) -> Table:
         rows, styles = [], []
@@ -250,6 +258,7 @@ class Standing:
             "holds": list(map(structs.asdict, holds)),
             "queue": list(map(structs.asdict, queue)),
             "more": state.more if state is not None else 0,
+            "shares": self._shares(),
             "hosts": [self._host_object(name, host, now) for name, host in chosen.hosts.items()],
         }
 
@@ -269,6 +278,23 @@ class Standing:
             "load": None if host.load is None else structs.asdict(host.load),
             "age": None if host.load is None else (now - host.reported) / SECOND,
         }
+
+
+def shares(charged: Mapping[str, float], weights: Mapping[str, float]) -> list[dict[str, Any]]:
+    """What groups lately had and others waited for, by group in RC-seconds: the group that goes first first."""
+    total = sum(charged.values())
+    found = [
+        {"group": group, "charged": had, "part": had / total if total else 0.0, "weight": weights.get(group, 1.0)}
+        for group, had in charged.items()
+    ]
+    return sorted(found, key=lambda one: (one["charged"] / one["weight"], one["group"]))
+
+
+def shares_table(found: Sequence[Mapping[str, Any]]) -> Table:
+    rows = [
+        (one["group"], f"{one['charged']:,.0f}", f"{100 * one['part']:.1f} %", f"{one['weight']:g}") for one in found
+    ]
+    return Table("Shares", ("GROUP", "RC-SECONDS", "PART", "WEIGHT"), rows)
 
 
 def versions(hosts: Mapping[str, Host], devices: Mapping[str, RcState], state: RcmState | None) -> dict[str, str]:

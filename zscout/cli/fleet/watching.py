@@ -40,7 +40,7 @@ PASSING: Final = frozenset(
         "gone",
         "clocks",
     }
-    | {"clocks", "uptime", "cpu", "memory", "figures"}
+    | {"clocks", "uptime", "cpu", "memory", "figures", "charged", "part"}
 )
 """Fields that change without anything having happened."""
 

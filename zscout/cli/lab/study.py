@@ -34,6 +34,7 @@ MAX_SEEDS: Final = 1_000
 """More take hours."""
 MAX_NETS: Final = 5_000
 """At ten seconds each they take half a day."""
+MAX_CASES: Final = 100_000
 MAX_FAULT_RUNS: Final = 100_000
 MAX_CREW: Final = 16
 MAX_BAUD: Final = 1_000_000
@@ -54,6 +55,7 @@ def study() -> None:
       zscout study placement --seeds 20
       zscout study robots --starts 40
       zscout study faults --runs 1000
+      zscout study shares
       zscout study schedule --help
     """
 
@@ -339,6 +341,43 @@ def robots(
         write(svg, found.grid, found.radio)
     shown = {**dataclasses.asdict(found), "runs": [dataclasses.asdict(trial) for trial in trials]}
     _show(shown, rrd, partial(print_report, found, names, len(numbers), seconds), as_json=as_json)
+
+
+@study.command()
+@seeds_option("3", "Weeks: so many, or those of seeds A to B.", MAX_SEEDS)
+@click.option(
+    "--cases",
+    type=click.IntRange(0, MAX_CASES),
+    default=500,
+    show_default=True,
+    help="Random fleets in which one group asks otherwise than it needs.",
+)
+@jobs_option
+@common.json_option("Print one JSON object instead of tables; it has the seeds of all cases in which it was of use.")
+def shares(seeds: range, cases: int, processes: int | None, as_json: bool) -> None:
+    """Measures fair shares: how equal two groups come out, and whether it is of use to inflate or split requests.
+
+    A week of 10 RCs, with fair shares and without: one group is always at work, the other comes in bursts of 20.
+    Then random fleets for an hour each, in which one group asks for more time than it needs, splits what it asks
+    for, or asks for everything besides: does it get more of use? docs/study.md says what was found.
+
+    \b
+    Examples:
+      zscout study shares
+      zscout study shares --seeds 1 --cases 10000 --json
+    """
+    from zscout.lab.study.process_pool import run_trials
+    from zscout.lab.study.scheduling import shares as fair
+    from zscout.lab.study.scheduling.tables import print_shares
+
+    weeks: list[fair.WeekTrial] = []
+    found: list[fair.CaseTrial] = []
+    planned = [fair.Week(seed, on) for seed in seeds for on in (False, True)]
+    common.run(run_trials(fair.play_week, planned, processes, weeks.append))
+    if cases:
+        common.run(run_trials(fair.play_case, range(cases), processes, found.append))
+    report = fair.report(weeks, found)
+    _show(dataclasses.asdict(report), None, partial(print_shares, report), as_json=as_json)
 
 
 @study.command()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TypeVar
@@ -29,6 +29,7 @@ from zscout.messages import (
     absurd,
     disbelieved,
 )
+from zscout.scheduling.fair_shares import decayed
 from zscout.services.authority import Authority
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.journal.journal import Journal
@@ -98,6 +99,10 @@ class Candidate:
         """How operations ended that its RCMs were asked for."""
         self._leader: str | None = None
         """The host of the leader that was seen last."""
+        self._charged: Mapping[str, float] = {}
+        """By group: what it had, as a leader told last (`fair_shares.py`),"""
+        self._charged_at: Ns = 0
+        """and when."""
         self.ledger = PlacementLedger(mesh)
         self.inventory = Inventory(mesh, fleet, folder)
         self._timeout = fleet.timing.rebuild / SECOND
@@ -178,6 +183,8 @@ class Candidate:
             self.election.published(grants.term, self.mesh.now())
             self._keeper.hear(grants)
             self._runtimes.hear(self.mesh.now(), grants)
+            if grants.charged:
+                self._charged, self._charged_at = grants.charged, self.mesh.now()
             if self._journal is not None:
                 self._journal.hear(grants)
 
@@ -335,6 +342,9 @@ class Candidate:
             self.inventory.devices.home_of,
             lambda client, one, place: places.may_recover(place, client, one.was or one.id, one.seal),
         )
+        if (fair := self.fleet.scheduling.fair_shares) is not None:
+            passed = self.mesh.now() - self._charged_at
+            recovered.charged = {group: decayed(had, passed, fair.half_life) for group, had in self._charged.items()}
         recovered.patient = self.election.links_return(self.mesh.now(), self._leader)
         self.known, self._goes_above = term, False
         counts = len(recovered.rcs), len(recovered.holds), len(recovered.waiting)

@@ -69,6 +69,8 @@ log = logging.getLogger(__name__)
 
 MAX_LISTED = 1_000
 """Queued ARCs in one answer."""
+TELL_CHARGED: Final[Ns] = 10 * SECOND
+"""From one time that candidates are told what groups had to the next: what is lost with a leader."""
 LATE_VOTE = 2.0
 """Seconds within which a late vote still counts."""
 REMOVED = "the fleet file, which names its owner under no role"
@@ -156,6 +158,8 @@ class Rcm:
         """The last number that was published."""
         self._published: Ns = 0
         """When that was."""
+        self._told_charged: Ns = 0
+        """When candidates were told last what groups had."""
         self._named: dict[RcName, int] = {}
         """The number of the last publication that named an RC."""
         self._recovered: dict[ClientId, set[ArcId]] = {}
@@ -185,7 +189,7 @@ class Rcm:
             if request.client not in recovered.answered:
                 self._recover(request)
         self.requests.believed = recovered.believed
-        lead = LeadTaken(self.term, tuple(recovered.holds), tuple(recovered.waiting))
+        lead = LeadTaken(self.term, tuple(recovered.holds), tuple(recovered.waiting), recovered.charged)
         booked = self.bookings.recovered({request.booking for request in requests if request.booking})
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
         self._decide([*joined, *booked, lead], named=recovered.rcs)
@@ -398,12 +402,14 @@ class Rcm:
             trace.write(
                 self.mesh.now(), "publish", term=self.term, seq=number, rcs=holders, instances=instances, ends=ends
             )
+        now, charged = self.mesh.now(), dict[str, float]()
+        if now >= self._told_charged + TELL_CHARGED:
+            self._told_charged, charged = now, self.core.charged()
+        time = self.bookings.dates.time
         self._grants.put(
-            messages.Grants(
-                self.term, number, self.seq, every, rcs, revoked, instances, [*begun], self.bookings.dates.time
-            )
+            messages.Grants(self.term, number, self.seq, every, rcs, revoked, instances, [*begun], time, charged)
         )
-        self.seq, self._published = number, self.mesh.now()
+        self.seq, self._published = number, now
 
     # Out: proposals, and ballots in
 
@@ -457,6 +463,7 @@ class Rcm:
                 rcs=self._devices(status, now),
                 story=self.registry.story(asked.arc) if asked.arc is not None else [],
                 more=status.waiting - len(status.queued),
+                charged=self.core.charged(),
             )
         query.answer(state)
 

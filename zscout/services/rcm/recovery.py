@@ -43,6 +43,8 @@ class RecoveredState:
     """Of what waits: the RCs that its client believes to hold. They may not have answered yet."""
     answered: set[ClientId] = field(default_factory=set)
     """The clients that have said what they ask for."""
+    charged: Mapping[str, float] = field(default_factory=dict)
+    """By group: what it lately had, as the leader before told (`fair_shares.py`)."""
 
 
 def aged(state: RcState, by: Ns) -> RcState:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from zscout.lab.study.scheduling.bookings import BookingsReport
 from zscout.lab.study.scheduling.families import FAMILIES
+from zscout.lab.study.scheduling.shares import BURSTY, RISE, STEADY, Changes, SharesReport
 from zscout.lab.study.scheduling.summary import Degeneracy, FamilyReport, SchedulingReport, StrategyReport
 from zscout.terminal import print_line, print_table
 
@@ -59,6 +60,30 @@ def print_bookings(report: BookingsReport) -> None:
         ]
         print_table([*columns, "mean wait", "longest"], shown, title=f"{family}: {FAMILIES[family].summary}")
         print_line("")
+
+
+def print_shares(report: SharesReport) -> None:
+    """Both tables of `zscout study shares`."""
+    rows = []
+    for week in report.weeks:
+        cells = [f"{week.uses[name].charged:,.0f}" for name in (STEADY, BURSTY)]
+        waits = [f"{week.uses[name].mean_wait:.0f}, {week.uses[name].longest:.0f} s" for name in (STEADY, BURSTY)]
+        rows.append([str(week.seed), "yes" if week.fair else "no", *cells, f"{week.apart:.1%}", *waits])
+    columns = ["seed", "fair shares", STEADY, BURSTY, "apart", f"wait of {STEADY} (longest)", f"wait of {BURSTY}"]
+    print_table(columns, rows, title="RC-seconds in a week that others waited for")
+    if not report.ways:
+        return
+    print_line("")
+    columns = ["a group", "cases", "rose", "beyond", "fell", "mean", "most", "without: rose", "beyond", "fell", "mean"]
+    ways = [
+        [one.way, str(one.cases), *_changed(one.on), f"{one.on.greatest:+.0%} (seed {one.on.seed})", *_changed(one.off)]
+        for one in report.ways
+    ]
+    print_table(columns, ways, title=f"Its part of all that is of use: cases in which that changed by over {RISE:.0%}")
+
+
+def _changed(one: Changes) -> list[str]:
+    return [f"{one.rose:.1%}", f"{one.beyond:.1%}", f"{one.fell:.1%}", f"{one.mean:+.1%}"]
 
 
 def _family(family: FamilyReport) -> None:

@@ -1,0 +1,142 @@
+"""Programs that ask for one ARC after the other, played through the core under virtual time: the next is asked for when
+the one before is over, as programs do, so that what a group gets decides what it asks for next."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+from zscout.config.scheduling_policy import SchedulingPolicy
+from zscout.scheduling import model
+from zscout.scheduling.adaptive import Adaptive
+from zscout.scheduling.core import Core
+from zscout.scheduling.forecast import play_instant
+from zscout.types import SECOND, ArcId, Ns, Params, RcName
+
+TICK: Final[Ns] = 30 * SECOND
+"""From one pass to the next while somebody waits; the RCM's is a second, and nothing here takes so little time."""
+
+
+class ProgramJob(NamedTuple):
+    """One ARC of a program: asked for `pause` ns after the one before was over, for `asked` ns, of which `used` are of
+    use; what is used less is given back early."""
+
+    pause: Ns
+    rcs: tuple[RcName, ...]
+    asked: Ns
+    used: Ns
+
+
+@dataclass(slots=True)
+class Use:
+    """What a group had: RC-seconds of use, and those that were charged; waits in seconds."""
+
+    useful: float = 0.0
+    charged: float = 0.0
+    done: int = 0
+    waited: float = 0.0
+    longest: float = 0.0
+
+    @property
+    def mean_wait(self) -> float:
+        return self.waited / max(1, self.done)
+
+
+@dataclass(slots=True)
+class _Program:
+    group: str
+    jobs: Iterator[ProgramJob]
+    job: ProgramJob
+    number: int = 0
+    asked_at: Ns = 0
+
+
+@dataclass(slots=True)
+class _Run:
+    core: Core
+    programs: dict[ArcId, _Program] = field(default_factory=dict)
+    """By the ARC that each has asked for."""
+    coming: list[tuple[Ns, int, _Program | ArcId | None]] = field(default_factory=list)
+    """A heap: a program asks, an ARC gives back, or (None) a minimum runtime is over."""
+    pushed: int = 0
+    uses: dict[str, Use] = field(default_factory=dict)
+    begun: dict[ArcId, Ns] = field(default_factory=dict)
+
+    def push(self, at: Ns, what: _Program | ArcId | None) -> None:
+        self.pushed += 1
+        heapq.heappush(self.coming, (at, self.pushed, what))
+
+    def go_on(self, program: _Program, now: Ns) -> None:
+        job = next(program.jobs, None)
+        if job is not None:
+            program.job, program.number = job, program.number + 1
+            self.push(now + job.pause, program)
+
+    def event(self, what: _Program | ArcId | None, now: Ns) -> model.Event:
+        if what is None:
+            return model.Tick()
+        if not isinstance(what, _Program):
+            return model.Released(what)
+        arc, job = f"{what.group}/{id(what)}.{what.number}", what.job
+        self.programs[arc], what.asked_at = what, now
+        needs: dict[RcName, Params] = {rc: {} for rc in job.rcs}
+        return model.Requested(model.ArcRequest(arc, f"{what.group}/study", needs, 1, job.asked))
+
+    def note(self, effect: model.Effect, now: Ns) -> None:
+        match effect:
+            case model.Granted(arc=arc):
+                program = self.programs[arc]
+                job, use = program.job, self.uses[program.group]
+                self.begun[arc] = now
+                waited = (now - program.asked_at) / SECOND
+                use.waited, use.longest = use.waited + waited, max(use.longest, waited)
+                self.push(now + min(job.used, job.asked), arc if job.used < job.asked else None)
+            case model.HoldEnded(arc=arc):
+                program = self.programs.pop(arc)
+                self.used(program, arc, now)
+                self.uses[program.group].done += 1
+                self.go_on(program, now)
+            case _:
+                pass
+
+    def used(self, program: _Program, arc: ArcId, now: Ns) -> None:
+        held = min(now - self.begun.pop(arc), program.job.used)
+        self.uses[program.group].useful += held * len(program.job.rcs) / SECOND
+
+
+def play(
+    rcs: Sequence[RcName], groups: Mapping[str, Sequence[Iterator[ProgramJob]]], policy: SchedulingPolicy, until: Ns
+) -> dict[str, Use]:
+    """What each group had by then. Strategy `adaptive`, exclusive RCs, one priority; a group's name is its host's."""
+    run = _Run(Core(Adaptive(), policy), uses={group: Use() for group in groups})
+    for group, programs in groups.items():
+        for jobs in programs:
+            program = _Program(group, jobs, ProgramJob(0, (), 0, 0))
+            run.go_on(program, 0)
+    now: Ns = 0
+    events: list[model.Event] = [model.RcJoined(rc, sharable=False) for rc in rcs]
+    while True:
+        for effects in play_instant(run.core, now, events, _no_vote):
+            for effect in effects:
+                run.note(effect, now)
+        at = run.coming[0][0] if run.coming else until
+        now = min(at, until, now + TICK if run.core.waiting else until)
+        if now >= until:
+            break
+        events = []
+        while run.coming and run.coming[0][0] <= now:
+            events.append(run.event(heapq.heappop(run.coming)[2], now))
+        events = events or [model.Tick()]
+    run.core.handle(until, model.Tick())
+    for arc in list(run.begun):
+        run.used(run.programs[arc], arc, until)
+    shares = run.core.charged_in_all()
+    for group, use in run.uses.items():
+        use.charged = shares.get(group, 0.0)
+    return run.uses
+
+
+def _no_vote(asked: model.Propose) -> model.Vote:
+    raise AssertionError(f"{asked.rc} is exclusive")
