@@ -108,3 +108,14 @@ class BookingThreatened(Struct, frozen=True):
 
     booking: str
     reason: Reason | None
+
+
+# The state after the last batch of events
+
+
+class BookingStatus(Struct, frozen=True):
+    """A booking that is not over, the ARC that has taken it up, and the RCs that it has for its patterns."""
+
+    booking: Booking
+    arc: ArcId | None
+    bound: Mapping[Need, RcName]

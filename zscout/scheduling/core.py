@@ -14,13 +14,13 @@ comes back with what follows from them: votes, and a `Tick` at the latest when `
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 
 from msgspec.structs import replace
 
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
 from zscout.scheduling import model
-from zscout.scheduling.booking import Booked, Booking, Redated, Unbooked
+from zscout.scheduling.booking import Booked, Booking, BookingStatus, Redated, Unbooked
 from zscout.scheduling.claims import Claims
 from zscout.scheduling.model import (
     HOLD_BACK,
@@ -42,7 +42,7 @@ from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.scheduling.slots import SlotsFound, slots
 from zscout.scheduling.state import SchedulerState, Strategy
 from zscout.scheduling.votes import HolderSet
-from zscout.types import NO_TERM, ArcId, ClientId, Grant, Need, Ns, Place, RcName, Term
+from zscout.types import NO_TERM, ArcId, ClientId, Grant, Ns, Place, RcName, Term
 
 
 class Core:
@@ -247,19 +247,13 @@ class Core:
                 proposals.append(model.Propose(number, rc.name, params))
         return proposals
 
-    def booked(self) -> dict[str, Booking]:
-        """Bookings that are not over, by id."""
-        return {name: claim.booking for name, claim in self._state.claims.items()}
-
-    def taken_by(self, booking: str) -> ArcId | None:
-        """The ARC that has taken up a booking."""
-        claim = self._state.claims.get(booking)
-        return claim.arc.id if claim is not None and claim.is_taken else None
-
-    def bound_of(self, booking: str) -> Mapping[Need, RcName]:
-        """The RCs that are kept, or held, for the patterns of a booking."""
-        claim = self._state.claims.get(booking)
-        return {} if claim is None else claim.booking.bound if claim.arc.hold is None else claim.arc.bound
+    def booking(self, name: str) -> BookingStatus | None:
+        """A booking that is not over."""
+        claim = self._state.claims.get(name)
+        if claim is None:
+            return None
+        bound = claim.booking.bound if claim.arc.hold is None else claim.arc.bound
+        return BookingStatus(claim.booking, claim.arc.id if claim.is_taken else None, bound)
 
     def charged(self) -> dict[str, float]:
         """By group: RC-seconds that it lately had and others waited for; empty where fair shares are off."""

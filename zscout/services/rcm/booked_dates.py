@@ -171,7 +171,7 @@ class BookedDates:
     def reconcile(self) -> None:
         """Brings the core's claims to what the records say, and finds which can't be."""
         wanted = {date.id: date for date in self._all()}
-        known = self._core.booked()
+        known = {booking.id for booking, _ in self._core.bookings()}
         gone = [Unbooked(name) for name in known if name not in wanted]
         coming = [self._booked(date) for name, date in wanted.items() if name not in known and not _unbound(date)]
         if events := [*gone, *filter(None, coming)]:
@@ -184,12 +184,10 @@ class BookedDates:
         self._danger = {name: why for name, why in self._danger.items() if name in wanted}
 
     def _judge(self, wanted: dict[str, Date]) -> None:
-        known = self._core.booked()
-        found = self._core.overlaps(name for name in wanted if name in known)
+        found = self._core.overlaps(wanted)
         self._waits_for_votes = bool(found.unknown)
         self.ask(found.unknown)
-        for name in self._conflicts.keys() & known.keys() - found.losers.keys():
-            del self._conflicts[name]
+        self._conflicts = {name: by for name, by in self._conflicts.items() if self._core.booking(name) is None}
         for name, by in found.losers.items():
             self._emit(Unbooked(name))
             self._bind(wanted[name], by)
@@ -225,8 +223,8 @@ class BookedDates:
         if abs(moved) < REDATED:
             return
         self._dated_by = ahead
-        known = self._core.booked().items()
-        if events := [Redated(name, one.start + moved) for name, one in known if one.start > now]:
+        known = [booking for booking, _ in self._core.bookings()]
+        if events := [Redated(one.id, one.start + moved) for one in known if one.start > now]:
             self._emit(*events)
 
     def change(self, record: BookingRecord, **to: object) -> BookingRecord:
@@ -272,22 +270,19 @@ class BookedDates:
 
     def standing(self, record: BookingRecord) -> list[Date]:
         """The dates of a booking that are in the core."""
-        known = self._core.booked()
-        return [date for date in self.open_dates(record) if date.id in known]
+        return [date for date in self.open_dates(record) if self._core.booking(date.id) is not None]
 
     def view(self, record: BookingRecord) -> BookingView:
-        known, runtime = self._core.booked(), float(record.runtime)
-        told = []
+        told, runtime = [], round(record.runtime)
         for date in self.open_dates(record):
-            taken = self._core.taken_by(date.id)
-            by = self._conflicts.get(date.id)
-            state: DateState = "open" if taken is None else "taken"
-            danger = self._danger.get(date.id, "")
-            if date.id not in known:
-                state = "conflict"
-                danger = self._conflict(by or "")
-            bound = dict(self._core.bound_of(date.id)) or date.bound
-            told.append(BookedDate(date.start, date.start + round(runtime), state, bound, taken, danger))
+            kept, by = self._core.booking(date.id), self._conflicts.get(date.id)
+            taken = kept.arc if kept is not None else None
+            state: DateState = "conflict" if by is not None else "open" if taken is None else "taken"
+            danger = self._danger.get(date.id, "") if by is None else self._conflict(by)
+            if kept is None and by is None:
+                danger = "an RC that is shared has yet to say whether it would carry it"
+            bound = dict(kept.bound) if kept is not None else date.bound
+            told.append(BookedDate(date.start, date.start + runtime, state, bound, taken, danger))
         fields = {name: getattr(record, name) for name in BookingView.__struct_fields__ if name != "dates"}
         return BookingView(**fields, dates=told)
 
@@ -296,7 +291,8 @@ class BookedDates:
         return date if record is None else f"{record.name} of {record.owner}"
 
     def taken_by(self, date: Date) -> ArcId | None:
-        return self._core.taken_by(date.id)
+        kept = self._core.booking(date.id)
+        return kept.arc if kept is not None else None
 
 
 def _unbound(date: Date) -> bool:

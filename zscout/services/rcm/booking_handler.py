@@ -174,7 +174,7 @@ class BookingHandler:
             raise Refused("too_many", f"{owner} has {most} bookings; unbook one")
         if len(records) >= MAX_BOOKINGS or records.size >= MAX_KEPT:
             raise Refused("too_many", f"this fleet keeps {len(records)} bookings already; unbook some")
-        if len(self._core.booked()) + len(self._dates.open_dates(record)) > MAX_CLAIMS:
+        if len(self._core.bookings()) + len(self._dates.open_dates(record)) > MAX_CLAIMS:
             raise Refused("too_many", f"{MAX_CLAIMS} dates are booked within 60 days; repeat it less often")
 
     def _decide(self, query: Query, record: BookingRecord) -> bool:
@@ -207,7 +207,7 @@ class BookingHandler:
         """Why a date can't be booked, in words."""
         others = [
             one
-            for one in self._core.booked().values()
+            for one, _ in self._core.bookings()
             if one.start < claim.end and claim.start < one.end and _share(one, claim)
         ]
         names = [f"{one.label or one.id} of {one.owner} ({', '.join(one.needs)})" for one in others[:NAMED]]
