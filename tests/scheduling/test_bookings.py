@@ -73,9 +73,11 @@ class Fleet:
     dangers: dict[str, Reason | None] = field(default_factory=dict)
     """By booking: what was told of it last."""
     redated: set[str] = field(default_factory=set)
+    made: dict[str, Booking] = field(default_factory=dict)
 
     def send(self, *events: Event) -> list[Effect]:
         """All that comes of one instant."""
+        self.made |= {event.booking.id: event.booking for event in events if isinstance(event, Booked)}
         since = {arc.id: arc.since for arc in self.core._state.all_arcs() if arc.hold is None}
         came = list(itertools.chain.from_iterable(play_instant(self.core, self.now, events, vote)))
         for effect in came:
@@ -193,7 +195,9 @@ def excused(fleet: Fleet, one: Booking) -> bool:
         owed = waited + PATIENCE // 2
         if rival.hold is not None and owed <= min(one.since, granted):
             return True
-        if rival.claim is not None and rival.claim.booking.since <= one.since:
+        # Who had taken up an older one goes on, though it is unbooked meanwhile.
+        taken = fleet.made.get(rival.request.booking)
+        if taken is not None and taken.since <= one.since:
             return True
     return False
 

@@ -189,6 +189,12 @@ class Claims:
             if state.claims.get(claim.booking.id) is claim:
                 self._tell_danger(claim)
 
+    @property
+    def next_start(self) -> Ns | None:
+        """When the next of those starving may start, whatever is booked after it began to starve."""
+        starts = self._reserved.starts if self._reserved is not None else ()
+        return min((start for start in starts if start > self._state.now), default=None)
+
     def _relieving(self, claim: Claim) -> int:
         """Bits of the RCs that may end the danger that it is in."""
         patterns = claim.arc.patterns

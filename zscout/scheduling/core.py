@@ -596,7 +596,7 @@ class Core:
 
     def _set_wake(self) -> None:
         at = min((arc.held_back[0] for arc in self._state.held_back.values() if arc.held_back), default=None)
-        for end in (self._state.next_end(), self._state.next_claim_change()):
+        for end in (self._state.next_end(), self._state.next_claim_change(), self._claims.next_start):
             if end is not None:
                 at = end if at is None else min(at, end)
         if self._state.queued:

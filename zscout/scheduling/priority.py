@@ -377,10 +377,13 @@ class Pass:
                 self.index.put(arc, ArcState.READY)
                 self.actions.wait(arc, VOTING, settled=False)
                 self.actions.propose(rc, proposal)
-            case Inadmissible(rc, reason):
+            case Inadmissible(rc, reason, _, early):
                 pattern = next((need for need, name in arc.bound.items() if name == rc.name), None)
                 if pattern is None:
-                    self.index.watch(arc, rc)
+                    if early:
+                        self.index.put(arc, ArcState.READY)
+                    else:
+                        self.index.watch(arc, rc)
                     self.actions.wait(arc, reason)
                 else:
                     # The ARC could do with another RC.

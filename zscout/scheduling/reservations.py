@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, insort
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from operator import attrgetter
 from typing import Final, NamedTuple, TypeAlias
 
@@ -68,6 +68,8 @@ class Inadmissible(NamedTuple):
     rc: Rc
     reason: Reason
     proposal: HolderSet | None = None
+    early: bool = False
+    """Its own time, which is reserved, may let it start without any change at the RC."""
 
 
 def order_of(state: SchedulerState, booking: Booking) -> Order:
@@ -115,6 +117,8 @@ class Reservations:
         """By bit of the RC, in their order."""
         self._free: dict[int, Ns] = {}
         """By bit: when the earlier reservations of the RC end."""
+        self.starts: list[Ns] = []
+        """The times that are reserved for those starving."""
         for priority, since, arc in state.index.starving[:MAX_STARVING]:
             if state.queued[arc].claim is None:
                 self._reserve(state.queued[arc], (True, priority, since + (patience or 0) // 2, arc))
@@ -176,6 +180,7 @@ class Reservations:
             return
         start = self._beside_bookings(arc, rcs, max(int(start), self.due(arc)), order)
         reservation = Reservation(arc, start, order)
+        self.starts.append(start)
         for rc in rcs:
             # A list of its own: that of what is booked is shared with the next reservations.
             self.by_rc[rc.bit] = list(self.by_rc.get(rc.bit, ()))
@@ -237,12 +242,13 @@ class Reservations:
         for rc in self._state.rcs_in(arc.mask & self.bits):
             before: list[Reservation] = []
             blocking: Reservation | None = None
-            for reservation in self._binding(rc, arc):
+            binding, early = self._binding(rc, arc)
+            for reservation in binding:
                 if reservation.booked is not None and reservation.start >= arc.ends(self._state.now):
                     continue
                 if reservation.excludes:
                     if self._delays(arc, reservation):
-                        return Inadmissible(rc, kept_for(rc, reservation))
+                        return Inadmissible(rc, kept_for(rc, reservation), early=early)
                     continue
                 before.append(reservation)
                 if blocking is None and self._delays(arc, reservation):
@@ -251,25 +257,22 @@ class Reservations:
                 continue
             reason = kept_for(rc, blocking)
             if not rc.sharable:
-                return Inadmissible(rc, reason)
+                return Inadmissible(rc, reason, early=early)
             for together in self._together(rc, arc, before):
                 answer = self._votes.known(rc.name, together)
                 if answer is None or not answer.accept:
                     is_open = answer is None and rc.name not in self._votes.unresponsive
-                    return Inadmissible(rc, reason, together if is_open else None)
+                    return Inadmissible(rc, reason, together if is_open else None, early)
         return None
 
-    def _binding(self, rc: Rc, arc: Arc) -> Iterator[Reservation]:
+    def _binding(self, rc: Rc, arc: Arc) -> tuple[list[Reservation], bool]:
         """The reservations of `rc` that `arc` has to respect: those before its own, and all that is booked as long as
-        its own time has not come. It would be early, which nobody has promised it."""
-        early = False
-        for one in self.by_rc.get(rc.bit, ()):
-            if one.arc is arc:
-                if one.start <= self._state.now:
-                    return
-                early = True
-            elif not early or one.booked is not None:
-                yield one
+        its own time has not come. It would be early, which nobody has promised it: whether that is so."""
+        reserved = self.by_rc.get(rc.bit, [])
+        own = next((number for number, one in enumerate(reserved) if one.arc is arc), len(reserved))
+        if own == len(reserved) or reserved[own].start <= self._state.now:
+            return reserved[:own], False
+        return [*reserved[:own], *(one for one in reserved[own + 1 :] if one.booked is not None)], True
 
     def _together(self, rc: Rc, arc: Arc, before: list[Reservation]) -> list[HolderSet]:
         """Whom `rc` would have to carry beside `arc`, from now on: each time when another comes. Who gives way to that
@@ -287,7 +290,7 @@ class Reservations:
 
     def reserves(self, rc: Rc, arc: Arc) -> bool:
         """Whether `rc` is reserved for another that goes before `arc`, and that it can't share it with."""
-        return any((one.excludes or not rc.sharable) and self._delays(arc, one) for one in self._binding(rc, arc))
+        return any((one.excludes or not rc.sharable) and self._delays(arc, one) for one in self._binding(rc, arc)[0])
 
     def _delays(self, arc: Arc, reservation: Reservation) -> bool:
         """Whether `arc`, started now, would hold what is reserved when the time comes, and must not."""
