@@ -1,0 +1,314 @@
+"""What zscout promises of bookings under every fault: the second part of the list of docs/promises.md.
+
+What an RCM has acknowledged is a fact: that a booking was made, that it or one of its dates was given up. Facts outlive
+all faults but those that destroy every copy: in the memory of a process that keeps bookings, or on a host's disk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import TYPE_CHECKING, Any, Final
+
+from zscout.behaviors.client.request import OpenArc
+from zscout.keyexpr import is_pattern
+from zscout.messages import WINDOW, Book, BookingRecord, BookingView, Instant
+from zscout.scheduling.booking import Booking
+from zscout.services.bookings.dates import dates, last_end
+from zscout.services.bookings.keeper import BookingKeeper, Disk
+from zscout.services.bookings.records import KEEP, Records
+from zscout.types import SECOND, ArcId, Term
+
+if TYPE_CHECKING:
+    from zscout.services.rcm.rcm import Rcm
+
+RUNS_APART: Final = 0.012
+"""Of the time: by which fleet time may be faster or slower than virtual time, slewed on a clock that is not true."""
+AGREE: Final = 0.1
+"""Seconds by which the fleet time of a leader may differ from that of the one before, as it begins."""
+AT_ITS_DATE: Final = 1.5
+"""Seconds after its date, or after it was taken up if that was later, within which a booking is held."""
+GIVEN_UP: Final = 0.1
+"""Seconds within which a leader that has heard that a booking is given up keeps nothing for it."""
+
+
+@dataclass(slots=True)
+class Life:
+    """A booking as the program knows it that made it."""
+
+    book: Book
+    made: bool = False
+    """Whether an RCM has acknowledged it."""
+    given_up: bool = False
+    """Whether the program has asked to unbook it, whatever became of that."""
+    dropped: set[Instant] = field(default_factory=set)
+    """The dates that it has asked to give up."""
+    withdrawn: bool = False
+    """Whether the RCM that took it has said that nobody keeps it."""
+
+    def dates(self) -> list[Instant]:
+        return dates(_as_record(self.book), 0, last_end(_as_record(self.book)))
+
+    def give_up(self, start: Instant | None) -> None:
+        if start is None:
+            self.given_up = True
+        else:
+            self.dropped.add(start)
+
+
+@dataclass(slots=True, eq=False)
+class Fact:
+    booking: str
+    what: Instant | str
+    """`made`, `unbooked`, or the date that was given up."""
+    destroyed: bool = False
+    """Whether faults have destroyed every copy of it."""
+
+    def __str__(self) -> str:
+        return f"{self.booking} {self.what}"
+
+    def known_by(self, record: BookingRecord | None) -> bool:
+        if record is None:
+            return False
+        if self.what == "made":
+            return True
+        return record.unbooked or self.what in record.dropped
+
+
+class BookingPromises:
+    """`broken(text)` is told of a promise that was not kept. `keepers`: of processes that live, by host; `disks`: of
+    all hosts; `calm`: there is no fault now; `inside`
+    calls something as code of the process of a host's node."""
+
+    def __init__(
+        self,
+        broken: Callable[[str], None],
+        now: Callable[[], float],
+        keepers: Mapping[str, BookingKeeper],
+        disks: Mapping[str, Disk],
+        candidates: list[str],
+        calm: Callable[[], bool],
+        inside: Callable[[str, Callable[[], Any]], Any],
+    ) -> None:
+        self._broken, self._now, self._calm, self._inside = broken, now, calm, inside
+        self._keepers, self._disks, self._candidates = keepers, disks, candidates
+        self.lives: dict[str, Life] = {}
+        self.facts: dict[tuple[str, Instant | str], Fact] = {}
+        self._final: dict[BookingKeeper, dict[str, BookingRecord]] = {}
+        """What each process has heard last of each booking."""
+        self._led: dict[Term, tuple[float, float]] = {}
+        """By term: when its leader was looked at last, and by how much fleet time was ahead of virtual time then."""
+        self._heard: set[str] = set()
+        """Hosts whose processes knew fleet time as they were looked at last."""
+        self._latest = 0.0
+        """The latest fleet time that any leader has told."""
+        self._known: dict[Term, dict[str, float]] = {}
+        """By term and date: since when its leader knows of it."""
+        self._records: dict[str, set[str]] = {}
+        """By host: the bookings that it knew as it was looked at last."""
+
+    # What programs are told
+
+    def asked(self, book: Book) -> Life:
+        return self.lives.setdefault(book.id, Life(book))
+
+    def booked(self, life: Life, view: BookingView) -> None:
+        """An RCM has acknowledged it."""
+        if view.unbooked:
+            if life.made and not life.given_up and not self.facts[life.book.id, "made"].destroyed:
+                self._broken(f"booking {life.book.name} was acknowledged, and is unbooked though nobody gave it up")
+            life.withdrawn = True
+            return
+        if life.withdrawn:
+            self._broken(f"booking {life.book.name} was withdrawn, and is told as made again")
+        life.made = True
+        self._establish(life, "made")
+
+    def unbooked(self, life: Life, start: Instant | None, view: BookingView) -> None:
+        """An RCM has acknowledged that it, or its date `start`, is given up."""
+        if start is None and not view.unbooked:
+            self._broken(f"{life.book.name} is told as booked in the answer to its unbooking")
+        self._establish(life, "unbooked" if start is None else start)
+
+    def _establish(self, life: Life, what: Instant | str) -> None:
+        fact = self.facts.setdefault((life.book.id, what), Fact(life.book.id, what))
+        memory, disk = self._copies(fact)
+        enough = len({*memory, *disk} & {*self._candidates}) > 1
+        # Of a leader that sees no other candidate its own disk has to do.
+        if not enough and not fact.destroyed and (self._calm() or not disk):
+            where = f"the memory of {sorted(memory)}, and on the disk of {sorted(disk)}"
+            self._broken(f"{life.book.name} {what} is acknowledged, and is in {where} alone")
+
+    def preempted(self, arc: OpenArc) -> None:
+        """A program has news of a request."""
+        life = self.lives.get((arc.by or "").partition("@")[0])
+        if life is not None and arc.outcome == "preempted" and not life.book.maintenance:
+            self._broken(f"{arc.name} is preempted for {life.book.name}, which nobody has taken up")
+
+    # What is destroyed
+
+    def _copies(self, fact: Fact) -> tuple[set[str], set[str]]:
+        """The hosts that have it in memory, and on disk."""
+        memory = {host for host, one in self._keepers.items() if fact.known_by(one.records.get(fact.booking))}
+        return memory, {
+            host
+            for host, disk in self._disks.items()
+            if any(fact.known_by(record) for record in disk.read() if record.id == fact.booking)
+        }
+
+    @contextmanager
+    def destroying(self) -> Iterator[None]:
+        """Processes die within, or disks are exchanged."""
+        facts = [fact for fact in self.facts.values() if not fact.destroyed and not self._is_over(fact)]
+        for fact in facts:
+            if not any(self._copies(fact)):
+                self._broken(f"{fact} was acknowledged, and nobody knows of it any more")
+        yield
+        for fact in facts:
+            fact.destroyed = not any(self._copies(fact))
+
+    def _is_over(self, fact: Fact) -> bool:
+        """Whether it may be forgotten."""
+        book = self.lives[fact.booking].book
+        return last_end(_as_record(book)) + KEEP < self._latest + 1
+
+    # What is so at any time
+
+    def look(self, leaders: Mapping[str, Rcm], *, calm: bool) -> Iterator[tuple[tuple[object, ...], float]]:
+        """What may not last, each with for how long it may. `leaders`: by host, of processes that do not stand
+        still."""
+        for keeper in self._keepers.values():
+            self._look_at_records(keeper)
+        for host, rcm in leaders.items():
+            self._look_at_time(host, rcm)
+            known = self._known.setdefault(rcm.term, {})
+            first = not known
+            claims = {booking.id: (booking, arc) for booking, arc in rcm.core.bookings()}
+            for name in claims:
+                before = first and name.partition("@")[0] in self._records.get(host, ())
+                known.setdefault(name, 0.0 if before else self._now())
+            for name, (booking, arc) in claims.items():
+                id_, _, start = name.partition("@")
+                record = self._keepers[host].records.get(id_)
+                if record is None or record.unbooked or int(start) in record.dropped:
+                    yield (host, "keeps", name, "for nobody: it was given up"), GIVEN_UP
+                elif calm and arc is not None and self._has_no_excuse(host, rcm, name, booking, arc):
+                    yield (name, "is taken up, and its date has come, but", arc, "does not run"), AT_ITS_DATE
+        self._heard = {host for host, keeper in self._keepers.items() if keeper.time is not None}
+        self._records = {host: {one.id for one in keeper.records} for host, keeper in self._keepers.items()}
+
+    def _look_at_records(self, keeper: BookingKeeper) -> None:
+        """What is final of a booking stays, wherever it has been heard."""
+        final = self._final.setdefault(keeper, {})
+        for record in keeper.records:
+            before = final.get(record.id)
+            if before is record:
+                continue
+            if before is not None and (
+                before.unbooked > record.unbooked
+                or not {*before.dropped} <= {*record.dropped}
+                or not {*before.over} <= {*record.over}
+            ):
+                self._broken(f"{record.name} was given up or over on {keeper.mesh.me}, and is not any more")
+            final[record.id] = record
+
+    def _look_at_time(self, host: str, rcm: Rcm) -> None:
+        now, time = self._now(), self._inside(host, lambda: rcm.bookings.dates.time)
+        self._latest = max(self._latest, time)
+        ahead = time - now
+        if (before := self._led.get(rcm.term)) is not None:
+            at, then = before
+            if abs(ahead - then) > RUNS_APART * (now - at) + 1e-6:
+                self._broken(f"fleet time jumps by {ahead - then:g} s in term {rcm.term.counter}")
+        elif self._led and host in self._heard:
+            at, then = max(self._led.values())
+            if abs(ahead - then) > AGREE + 2 * RUNS_APART * (now - at):
+                text = f"fleet time is {ahead - then:g} s off that of {now - at:g} s ago, of another leader"
+                self._broken(f"{text}, as term {rcm.term.counter} begins")
+        self._led[rcm.term] = now, ahead
+
+    def _has_no_excuse(self, host: str, rcm: Rcm, name: str, booking: Booking, arc: ArcId) -> bool:
+        """Whether it should be held now, and is not: its date has come, and nobody is in its way of higher priority, or
+        who held before its leader knew of it."""
+        status, now = rcm.core.arc(arc), self._inside(host, rcm.mesh.now)
+        if status is None or status.hold is not None or booking.start > now:
+            return False
+        known = self._now() - self._known[rcm.term][name]
+        rcs = {rc.name: rc for rc in rcm.core.status().rcs}
+        for rc in status.needs:
+            if rc not in rcs or not rcs[rc].present:
+                return False
+            for holder in rcm.core.holders(rc):
+                hold = holder.hold
+                if hold is None or holder.request.priority > booking.priority or hold.grant.term != rcm.term:
+                    return False
+                if known < (now - hold.start) / SECOND + GIVEN_UP:
+                    return False
+        # A pattern may be bound to any.
+        return not any(map(is_pattern, booking.needs)) and len(status.needs) == len(booking.needs)
+
+    # What is so at the end
+
+    def unsettled(self, leaders: Mapping[str, Rcm]) -> str:
+        """Why not all keepers know the same, in words; empty: they do."""
+        if len(leaders) != 1:
+            return f"{len(leaders)} lead"
+        own = self._keepers[next(iter(leaders))].records.digest()
+        others = [host for host, keeper in self._keepers.items() if keeper.records.digest() != own]
+        return f"{', '.join(others)} know other bookings than the leader" if others else ""
+
+    def at_end(self, leaders: Mapping[str, Rcm], *, jumped: bool) -> None:
+        """All is healed, and `unsettled` is empty. `jumped`: all processes were gone at once, and fleet time with
+        them."""
+        ((host, rcm),) = leaders.items()
+        time = self._inside(host, lambda: rcm.bookings.dates.time)
+        views = {view.id: view for view in self._inside(host, rcm.bookings.handler.views)}
+        records = self._keepers[host].records
+        for fact in self.facts.values():
+            life = self.lives[fact.booking]
+            if fact.destroyed or self._is_over(fact):
+                continue
+            record = records.get(fact.booking)
+            if not fact.known_by(record):
+                self._broken(f"{life.book.name} {fact.what} was acknowledged, and is lost")
+            elif fact.what == "made" and not (life.given_up or life.withdrawn):
+                self._is_listed(life, views.get(fact.booking), max(time, self._latest) if jumped else time)
+            view = views.get(fact.booking)
+            if view is not None and (fact.what == "unbooked" or fact.what in {date.start for date in view.dates}):
+                self._broken(f"{life.book.name} {fact.what} is listed, though it was given up")
+        self._look_at_conflicts(rcm, records, views)
+
+    def _is_listed(self, life: Life, view: BookingView | None, time: float) -> None:
+        told = {} if view is None else {date.start: date.state for date in view.dates}
+        for start in dates(_as_record(life.book), time + 1, time + WINDOW - 1):
+            if start not in life.dropped and told.get(start) not in ("open", "taken", "conflict"):
+                self._broken(f"{life.book.name} at {start} is lost: it is {told.get(start, 'not listed')}")
+
+    def _look_at_conflicts(self, rcm: Rcm, records: Records, views: Mapping[str, BookingView]) -> None:
+        """Of two that can't both be the one of better rank stands; that is told here of RCs that are not sharable."""
+        sharable = {rc.name for rc in rcm.core.status().rcs if rc.sharable or not rc.present}
+        stands, not_held = [], []
+        for view in views.values():
+            record = records.get(view.id)
+            assert record is not None  # noqa: S101 - it is listed
+            for date in view.dates:
+                rcs = {date.bound.get(need, need) for need in view.needs} - sharable
+                rank = (-view.priority, record.made, view.id)
+                (not_held if date.state == "conflict" else stands).append((rank, date, rcs, view))
+        for one, other in combinations(stands, 2):
+            both = one[3].maintenance and other[3].maintenance
+            if not both and one[3].id != other[3].id and _meet(one, other):
+                self._broken(f"{one[3].name} and {other[3].name} both stand: {one[1]} {other[1]}")
+        for one in not_held:
+            exact = not any(map(is_pattern, one[3].needs)) and sharable.isdisjoint(one[3].needs)
+            if exact and not any(other[0] < one[0] and _meet(one, other) for other in stands):
+                self._broken(f"{one[3].name} at {one[1].start} is in conflict with none: {one[1].danger}")
+
+
+def _meet(one: tuple, other: tuple) -> bool:  # type: ignore[type-arg]
+    return bool(one[2] & other[2]) and one[1].start < other[1].end and other[1].start < one[1].end
+
+
+def _as_record(book: Book) -> BookingRecord:
+    return BookingRecord(**{name: getattr(book, name) for name in Book.__struct_fields__})
