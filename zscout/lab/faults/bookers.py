@@ -160,6 +160,8 @@ class Booker:
         asked = FindSlots(new_instance(), needs, 0, Decimal(runtime), within=100.0, start=start, limit=2)
         try:
             told = await bookings.ask(asked, SlotsTold)
+        except RcmSilent:
+            raise
         except RequestRefused as refused:
             self._refused(refused)
             return None

@@ -96,7 +96,7 @@ class BookingPromises:
         self.lives: dict[str, Life] = {}
         self.facts: dict[tuple[str, Instant | str], Fact] = {}
         self._final: dict[BookingKeeper, dict[str, BookingRecord]] = {}
-        """What each process has heard last of each booking."""
+        """What each process knew of bookings as it was looked at last."""
         self._led: dict[Term, tuple[float, float]] = {}
         """By term: when its leader was looked at last, and by how much fleet time was ahead of virtual time then."""
         self._heard: set[str] = set()
@@ -200,9 +200,11 @@ class BookingPromises:
 
     def _look_at_records(self, keeper: BookingKeeper) -> None:
         """What is final of a booking stays, wherever it has been heard."""
-        final = self._final.setdefault(keeper, {})
+        before_it = self._final.get(keeper, {})
+        # What was over long ago may be forgotten, and may be heard once more of a host that was away.
+        self._final[keeper] = {record.id: record for record in keeper.records}
         for record in keeper.records:
-            before = final.get(record.id)
+            before = before_it.get(record.id)
             if before is record:
                 continue
             if before is not None and (
@@ -211,7 +213,6 @@ class BookingPromises:
                 or not {*before.over} <= {*record.over}
             ):
                 self._broken(f"{record.name} was given up or over on {keeper.mesh.me}, and is not any more")
-            final[record.id] = record
 
     def _look_at_time(self, host: str, rcm: Rcm) -> None:
         now, time = self._now(), self._inside(host, lambda: rcm.bookings.dates.time)

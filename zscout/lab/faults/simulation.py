@@ -640,6 +640,7 @@ class Simulation:
                 with self.booked.destroying():
                     for name in names:
                         self._take_down(name)
+                DEEDS.get().done.clear()  # numbers of incarnations begin anew
                 self.equipment.pass_by(fault.jump)
                 end = lambda: [self.start(name) for name in names]  # noqa: E731
             case "disk":
