@@ -13,7 +13,9 @@ from msgspec.structs import replace
 
 from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeClient, FakeFleet, Refusal, request
+from zscout.keyexpr import Role, Token
 from zscout.lab.faults.memory import MemoryMesh
+from zscout.mesh.supervision import Supervisor
 from zscout.messages import (
     Book,
     BookingRecord,
@@ -26,11 +28,12 @@ from zscout.messages import (
     SlotsTold,
     Unbook,
 )
-from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.bookings.keeper import MAX_SAVING, BookingKeeper
 from zscout.services.rcm.bookings import BookedDanger
 from zscout.services.rcm.candidate import Candidate
 
 R = TypeVar("R")
+FIELDS = Book.__struct_fields__
 NOON = 1_800_000_000.0
 """Seconds since 1970 at the beginning of each story."""
 
@@ -437,5 +440,51 @@ def test_a_booking_is_in_danger_while_what_it_needs_is_away() -> None:
         await fleet.joined(fleet.rc("robot/far"))
         await asyncio.sleep(10)
         assert [(one.record.id, bool(one.why)) for one in dangers] == [("b", True), ("b", False)]
+
+    run(story())
+
+
+def test_what_is_long_over_is_forgotten_by_all_who_keep_bookings() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        await led(fleet, "x", "y")
+        await do(fleet.client("one"), book("b", "robot/a", at=500), BookingView)
+        # A host with RCs, which can't lead, comes back after a month.
+        old = BookingRecord(**{name: getattr(book("old", "robot/a", at=-86_400 * 30), name) for name in FIELDS})
+        fleet.disks["far"] = Disk()
+        fleet.disks["far"].records = [old]
+        far = BookingKeeper(fleet.mesh("far"), fleet.disks["far"], candidate=False, wall=fleet.time)
+        asked = 0
+
+        def count() -> None:
+            nonlocal asked
+            asked += 1
+
+        far.on_shared = count
+        far.start(Supervisor("far", lambda error: pytest.fail(str(error))))
+        far.mesh.alive(Token("far", Role.NODE, "node", "1"))
+        await asyncio.sleep(40)
+        assert {disk: [one.id for one in fleet.disks[disk].records] for disk in ("x", "y", "far")} == {
+            "x": ["b"],
+            "y": ["b"],
+            "far": ["b"],
+        }
+        assert asked == 1
+
+    run(story())
+
+
+def test_a_keeper_that_was_busy_is_told_before_long() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y", "z")
+        *_, last = await led(fleet, "x", "y", "z")
+        client = fleet.client("one")
+        last._keeper._waiting = MAX_SAVING
+        await do(client, book("b", "robot/a", at=500), BookingView)
+        await asyncio.sleep(1)
+        assert not fleet.disks["z"].records
+        last._keeper._waiting = 0
+        await asyncio.sleep(6)
+        assert [one.id for one in fleet.disks["z"].records] == ["b"]
 
     run(story())

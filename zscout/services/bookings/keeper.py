@@ -171,8 +171,8 @@ class BookingKeeper:
     def _on_shared(self, query: IncomingQuery[ShareBookings]) -> None:
         if self._waiting >= MAX_SAVING:
             raise Refused("busy", "this host is still writing bookings to its disk; ask again")
-        if (heard := self.time) is not None:
-            self.records.forget_old(heard / SECOND)
+        if query.message.time is not None:
+            self.records.forget_old(query.message.time)
         if self.records.take(query.message.records):
             self.on_shared()
         if self._disk is None or self.records.digest() == self._saved:
