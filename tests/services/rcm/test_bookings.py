@@ -31,6 +31,7 @@ from zscout.messages import (
 from zscout.services.bookings.keeper import MAX_SAVING, BookingKeeper
 from zscout.services.rcm.bookings import BookedDanger
 from zscout.services.rcm.candidate import Candidate
+from zscout.types import Grant, Term
 
 R = TypeVar("R")
 FIELDS = Book.__struct_fields__
@@ -486,5 +487,28 @@ def test_a_keeper_that_was_busy_is_told_before_long() -> None:
         last._keeper._waiting = 0
         await asyncio.sleep(6)
         assert [one.id for one in fleet.disks["z"].records] == ["b"]
+
+    run(story())
+
+
+def test_what_changes_after_a_restart_of_all_counts_though_terms_begin_anew() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        before = Grant(Term(9, "old"), 50)
+        asked = book("b", "robot/*", at=500, every=1, until=round(NOON) + 200_000)
+        old = BookingRecord(**{name: getattr(asked, name) for name in FIELDS}, owner="desk", made=before, changed=before)
+        fleet.disks["y"] = Disk()
+        fleet.disks["y"].records = [old]
+        await led(fleet, "x")
+        fleet.candidate("y")
+        await asyncio.sleep(1)
+        client = fleet.client("one", "desk")
+        assert [date.bound for date in (await fleet.bookings())["b"].dates] == [{"robot/*": "robot/a"}] * 3
+        for disk in fleet.disks.values():
+            assert [len(one.kept) for one in disk.records] == [3]
+            assert disk.records[0].changed > before
+        # What is made later goes behind, in whatever half.
+        await do(client, book("c", "robot/b", at=500), BookingView)
+        assert {one.id: one.made > before for one in fleet.disks["y"].records} == {"b": False, "c": True}
 
     run(story())
