@@ -18,17 +18,19 @@ from zscout.scheduling.booking import Booking
 from zscout.services.bookings.dates import dates, last_end
 from zscout.services.bookings.keeper import BookingKeeper, Disk
 from zscout.services.bookings.records import KEEP, Records
-from zscout.types import SECOND, ArcId, Term
+from zscout.types import SECOND, ArcId, Grant, Ns, Term
 
 if TYPE_CHECKING:
     from zscout.services.rcm.rcm import Rcm
 
 RUNS_APART: Final = 0.012
 """Of the time: by which fleet time may be faster or slower than virtual time, slewed on a clock that is not true."""
-AGREE: Final = 0.1
+AGREE: Final = 0.5
 """Seconds by which the fleet time of a leader may differ from that of the one before, as it begins."""
 AT_ITS_DATE: Final = 1.5
 """Seconds after its date, or after it was taken up if that was later, within which a booking is held."""
+NOT_EXACT: Final[Ns] = SECOND // 4
+"""By how much a date may be put off, as fleet time is slewed."""
 GIVEN_UP: Final = 0.1
 """Seconds within which a leader that has heard that a booking is given up keeps nothing for it."""
 
@@ -105,6 +107,8 @@ class BookingPromises:
         """The latest fleet time that any leader has told."""
         self._known: dict[Term, dict[str, float]] = {}
         """By term and date: since when its leader knows of it."""
+        self._looked: dict[Term, int] = {}
+        self._running: dict[Term, set[Grant]] = {}
         self._records: dict[str, set[str]] = {}
         """By host: the bookings that it knew as it was looked at last."""
 
@@ -195,6 +199,9 @@ class BookingPromises:
                     yield (host, "keeps", name, "for nobody: it was given up"), GIVEN_UP
                 elif calm and arc is not None and self._has_no_excuse(host, rcm, name, booking, arc):
                     yield (name, "is taken up, and its date has come, but", arc, "does not run"), AT_ITS_DATE
+            if self._looked.get(rcm.term) != rcm.core.batches:
+                self._looked[rcm.term] = rcm.core.batches
+                self._look_at_grants(host, rcm, claims)
         self._heard = {host for host, keeper in self._keepers.items() if keeper.time is not None}
         self._records = {host: {one.id for one in keeper.records} for host, keeper in self._keepers.items()}
 
@@ -228,6 +235,31 @@ class BookingPromises:
                 text = f"fleet time is {ahead - then:g} s off that of {now - at:g} s ago, of another leader"
                 self._broken(f"{text}, as term {rcm.term.counter} begins")
         self._led[rcm.term] = now, ahead
+
+    def _look_at_grants(self, host: str, rcm: Rcm, claims: Mapping[str, tuple[Booking, ArcId | None]]) -> None:
+        """Nobody starts what would not be over by the date of a booking of its rank that its leader knew of."""
+        status, local = rcm.core.status(), self._inside(host, rcm.mesh.now)
+        running = {one.hold.grant: one for one in status.running if one.hold and one.hold.grant.term == rcm.term}
+        before, self._running[rcm.term] = self._running.get(rcm.term, set()), set(running)
+        exclusive = {rc.name for rc in status.rcs if rc.present and not rc.sharable}
+        has_it = {one.id for one in status.running}
+        waiting = {name: claim for name, claim in claims.items() if claim[1] not in has_it}
+        for arc in (running[grant] for grant in running.keys() - before):
+            assert arc.hold is not None  # noqa: S101 - it runs
+            began = self._now() - (local - arc.hold.start) / SECOND
+            for name, (booking, by) in waiting.items():
+                over = booking.lapses if by is None else booking.end
+                meet = booking.start + NOT_EXACT < arc.hold.end and arc.hold.start + NOT_EXACT < over
+                rcs = {booking.bound.get(need, need) for need in booking.needs}
+                if (
+                    meet
+                    and arc.request.priority <= booking.priority
+                    and rcs <= {rc.name for rc in status.rcs if rc.present}
+                    and rcs & arc.needs.keys() & exclusive
+                    and self._known[rcm.term][name] < began
+                ):
+                    booked = self.lives[name.partition("@")[0]].book.name
+                    self._broken(f"{arc.name} begins what is not over by the date of {booked}")
 
     def _has_no_excuse(self, host: str, rcm: Rcm, name: str, booking: Booking, arc: ArcId) -> bool:
         """Whether it should be held now, and is not: its date has come, and nobody is in its way of higher priority, or

@@ -176,13 +176,12 @@ def _believed(one: BookingRecord, _other: BookingRecord) -> BookingRecord:
     return one
 
 
-_take_replies = BookingSharing._take
+def _hear_any(self: BookingKeeper, grants: Any) -> None:
+    if grants.time is not None:
+        self._offset = wall_ns(grants.time) - self.mesh.now()
 
 
-def _nothing_taken(self: BookingSharing, replies: Any) -> list[Any]:
-    answers = _take_replies(self, [replace(reply, message=replace(reply.message, records=[])) for reply in replies])
-    self._behind = False
-    return answers
+NEVER: Final = property(lambda _: False, _nothing)
 
 
 async def _keep_later(self: BookingSharing, record: BookingRecord) -> str:
@@ -269,9 +268,8 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "dates": Guard("a date that was given up, or is over, stays so", {(records, "merged"): _dates_of_newer}),
         "merged": Guard("what a host has is one source among all", {(records, "merged"): _believed}),
         "copied": Guard("a booking is acknowledged when another host has it", {(BookingSharing, "keep"): _keep_later}),
-        "caught up": Guard(
-            "who has heard of less is told, and who of more tells", {(BookingSharing, "_take"): _nothing_taken}
-        ),
+        "caught up": Guard("who comes later is told all", {(Bookings, "_on_token"): _nothing, (BookingSharing, "_behind"): NEVER}),
+        "late": Guard("a late publication turns no clock back", {(BookingKeeper, "hear"): _hear_any}),
         "fleet time": Guard("a leader goes on in the time of the fleet", {(bookings, "_time"): _own_wall}),
         "slewed": Guard("fleet time does not jump in a reign", {(FleetClock, "_slewed"): _jumps}),
         "dates first": Guard("a leader knows of all dates before it grants", {(Bookings, "recovered"): _none_recovered}),
