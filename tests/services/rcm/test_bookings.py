@@ -512,3 +512,24 @@ def test_what_changes_after_a_restart_of_all_counts_though_terms_begin_anew() ->
         assert {one.id: one.made > before for one in fleet.disks["y"].records} == {"b": False, "c": True}
 
     run(story())
+
+
+def test_a_booking_right_after_another_stands_though_fleet_time_is_slewed() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y", "z")
+        fleet.ahead |= {"y": 10.0, "z": 10.0}
+        await led(fleet, "x")
+        client = fleet.client("one")
+        await do(client, book("first", "robot/a", at=20, seconds=100), BookingView)
+        await do(client, book("next", "robot/a", at=120, seconds=100), BookingView)
+        await asyncio.sleep(2)
+        await client.ask("mine", "robot/a", seconds=100, booking="first")
+        fleet.candidate("y"), fleet.candidate("z")
+        for number in range(18):
+            await asyncio.sleep(5)
+            await do(client, book(f"other{number}", "robot/b", at=1_000 + 200 * number), BookingView)
+            views = await fleet.bookings()
+            assert states(views["next"]) == ["open"], f"at {fleet.time() - NOON:g}: {views['next'].dates}"
+        assert states(views["first"]) == ["taken"]
+
+    run(story())

@@ -259,7 +259,7 @@ class BookingPromises:
                     and self._known[rcm.term][name] < began
                 ):
                     booked = self.lives[name.partition("@")[0]].book.name
-                    self._broken(f"{arc.name} begins what is not over by the date of {booked}")
+                    self._broken(f"{arc.name} begins what is not over by the date of {booked}: {name}")
 
     def _has_no_excuse(self, host: str, rcm: Rcm, name: str, booking: Booking, arc: ArcId) -> bool:
         """Whether it should be held now, and is not: its date has come, and nobody is in its way of higher priority, or

@@ -185,7 +185,9 @@ class BookedDates:
 
     def _judge(self, wanted: dict[str, Date]) -> None:
         known = self._core.booked()
-        found = self._core.overlaps(name for name in wanted if name in known)
+        # What has begun was not moved as fleet time was slewed: what comes right after it would seem to meet it.
+        starts = {name: self.local(date.start) for name, date in wanted.items()}
+        found = self._core.overlaps((name for name in wanted if name in known), starts)
         self._waits_for_votes = bool(found.unknown)
         self.ask(found.unknown)
         for name in self._conflicts.keys() & known.keys() - found.losers.keys():
