@@ -6,6 +6,7 @@ import asyncio
 import json
 from decimal import Decimal
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,7 +20,7 @@ from zscout.types import SECOND, Term
 NOON = 1_800_000_000.0
 
 
-def record(name: str, **more: object) -> BookingRecord:
+def record(name: str, **more: Any) -> BookingRecord:
     return BookingRecord(name, name, {"robot/a": {}}, 0, round(NOON), Decimal(60), Decimal(60), **more)
 
 
@@ -53,7 +54,10 @@ def test_a_publication_that_comes_late_turns_no_clock_back() -> None:
 
 def test_a_file_is_read_as_it_was_written(tmp_path: Path) -> None:
     async def story() -> None:
-        records = [record("one", unbooked=True), record("two", every=1, until=round(NOON) + 86_400, dropped=[round(NOON)])]
+        records = [
+            record("one", unbooked=True),
+            record("two", every=1, until=round(NOON) + 86_400, dropped=[round(NOON)]),
+        ]
         await BookingFile(tmp_path, "zscout").write(records)
         assert BookingFile(tmp_path, "zscout").read() == records
         assert (tmp_path / FILE).stat().st_mode & 0o777 == 0o600
@@ -76,9 +80,7 @@ def test_half_a_file_is_not_used(tmp_path: Path, share: float, caplog: pytest.Lo
     assert "can't be read, and is not used" in caplog.text
 
 
-def test_a_damaged_record_is_left_out_and_all_others_are_kept(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_damaged_record_is_left_out_and_all_others_are_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     asyncio.run(BookingFile(tmp_path, "zscout").write([record("one"), record("two"), record("three")]))
     kept = json.loads((tmp_path / FILE).read_bytes())
     kept["records"][1]["start"] = "noon"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from decimal import Decimal
 from itertools import permutations
+from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,7 +19,7 @@ DATES = st.lists(st.sampled_from([START + day * DAY for day in range(4)]), uniqu
 GRANTS = st.builds(lambda counter, seq: Grant(Term(counter, "x"), seq), st.integers(0, 2), st.integers(0, 3))
 
 
-def record(**changes: object) -> BookingRecord:
+def record(**changes: Any) -> BookingRecord:
     return BookingRecord("b", "b", {"robot/a": {}}, 0, START, Decimal(60), Decimal(60), **changes)
 
 

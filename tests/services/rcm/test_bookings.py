@@ -496,7 +496,9 @@ def test_what_changes_after_a_restart_of_all_counts_though_terms_begin_anew() ->
         fleet = BookedFleet("x", "y")
         before = Grant(Term(9, "old"), 50)
         asked = book("b", "robot/*", at=500, every=1, until=round(NOON) + 200_000)
-        old = BookingRecord(**{name: getattr(asked, name) for name in FIELDS}, owner="desk", made=before, changed=before)
+        old = BookingRecord(
+            **{name: getattr(asked, name) for name in FIELDS}, owner="desk", made=before, changed=before
+        )
         fleet.disks["y"] = Disk()
         fleet.disks["y"].records = [old]
         await led(fleet, "x")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import random
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from decimal import Decimal
 from typing import Any, Final
@@ -18,7 +18,7 @@ from zscout.keyexpr import RANDOM, new_instance
 from zscout.lab.faults.booking_promises import BookingPromises, Life
 from zscout.lab.faults.programs import Work
 from zscout.lab.faults.virtual_time import START
-from zscout.messages import Book, BookingRecord, BookingView, FindSlots, SlotsTold, Unbook, decode_told, encode
+from zscout.messages import Amounts, Book, BookingRecord, BookingView, FindSlots, SlotsTold, Unbook, decode_told, encode
 from zscout.services.bookings.dates import DAY
 
 EPOCH: Final = 1_804_000_000.0
@@ -27,6 +27,8 @@ SECONDS_OFF, HOURS_OFF, DRIFT = 3.0, (3_600.0, 20_000.0), 0.0005
 """By how much a host's clock is off: usually, and in some runs; and by which part of the time it drifts, at most."""
 SOON, FAR = (1, 12), (8_000, 12_000)
 """Seconds until the date of a booking: components hold for an hour, and would not begin before one that is nearer."""
+TIMES: Final = (1, 2, 2, 3, 40)
+"""How often bookings are repeated: some go on after a month."""
 QUICK, SLOW = (0.001, 0.02), (0.1, 1.0)
 """Seconds that a disk takes."""
 TIMEOUT: Final = 3.0
@@ -82,6 +84,11 @@ class Hosts:
     def copy_disks(self) -> None:
         self._copies = {host: disk.content for host, disk in self.disks.items()}
 
+    def fail(self, hosts: Iterable[str], *, fails: bool = True) -> None:
+        """Their disks take nothing more, or do again."""
+        for host in hosts:
+            self.disks[host].failing = fails
+
     def restore_disk(self, host: str) -> None:
         """What the disk had when it was copied; before, it is a new one."""
         self.disks[host].content = self._copies.get(host, [])
@@ -134,7 +141,7 @@ class Booker:
         more: dict[str, Any] = {}
         if rng.random() < 0.25:
             every = rng.choice((1, 1, 7))
-            until = start + every * DAY * rng.randrange(1, 40)
+            until = start + every * DAY * rng.choice(TIMES)
             more = {"every": every, "until": until, "zone": rng.choice(("UTC", "Europe/Berlin"))}
         if rng.random() < 0.06 and all("*" not in need for need in needs):
             more["maintenance"] = True
@@ -149,7 +156,7 @@ class Booker:
             **more,
         )
 
-    def _needs(self) -> Mapping[str, Any]:
+    def _needs(self) -> dict[str, Amounts]:
         rng = RANDOM.get()
         if rng.random() < 0.2:
             return amounts({need: {} for need in rng.choice((("robot/*",), ("robot/*", "robot/*#2")))})

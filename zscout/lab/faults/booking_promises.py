@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from zscout.behaviors.client.request import OpenArc
 from zscout.keyexpr import is_pattern
-from zscout.messages import WINDOW, Book, BookingRecord, BookingView, Instant
+from zscout.messages import WINDOW, Book, BookedDate, BookingRecord, BookingView, Instant
 from zscout.scheduling.booking import Booking
 from zscout.services.bookings.dates import dates, last_end
 from zscout.services.bookings.keeper import BookingKeeper, Disk
@@ -243,14 +243,19 @@ class BookingPromises:
         before, self._running[rcm.term] = self._running.get(rcm.term, set()), set(running)
         exclusive = {rc.name for rc in status.rcs if rc.present and not rc.sharable}
         has_it = {one.id for one in status.running}
-        waiting = {name: claim for name, claim in claims.items() if claim[1] not in has_it}
+        # For patterns others may be kept at any time.
+        waiting = {
+            name: (booking, by)
+            for name, (booking, by) in claims.items()
+            if by not in has_it and not any(map(is_pattern, booking.needs))
+        }
         for arc in (running[grant] for grant in running.keys() - before):
             assert arc.hold is not None  # noqa: S101 - it runs
             began = self._now() - (local - arc.hold.start) / SECOND
             for name, (booking, by) in waiting.items():
                 over = booking.lapses if by is None else booking.end
                 meet = booking.start + NOT_EXACT < arc.hold.end and arc.hold.start + NOT_EXACT < over
-                rcs = {booking.bound.get(need, need) for need in booking.needs}
+                rcs = booking.needs.keys()
                 if (
                     meet
                     and arc.request.priority <= booking.priority
@@ -321,26 +326,35 @@ class BookingPromises:
     def _look_at_conflicts(self, rcm: Rcm, records: Records, views: Mapping[str, BookingView]) -> None:
         """Of two that can't both be the one of better rank stands; that is told here of RCs that are not sharable."""
         sharable = {rc.name for rc in rcm.core.status().rcs if rc.sharable or not rc.present}
-        stands, not_held = [], []
+        stands, not_held = list[_Listed](), list[_Listed]()
         for view in views.values():
             record = records.get(view.id)
             assert record is not None  # noqa: S101 - it is listed
             for date in view.dates:
                 rcs = {date.bound.get(need, need) for need in view.needs} - sharable
-                rank = (-view.priority, record.made, view.id)
-                (not_held if date.state == "conflict" else stands).append((rank, date, rcs, view))
+                listed = _Listed((-view.priority, record.made, view.id), date, rcs, view)
+                (not_held if date.state == "conflict" else stands).append(listed)
         for one, other in combinations(stands, 2):
-            both = one[3].maintenance and other[3].maintenance
-            if not both and one[3].id != other[3].id and _meet(one, other):
-                self._broken(f"{one[3].name} and {other[3].name} both stand: {one[1]} {other[1]}")
+            both = one.view.maintenance and other.view.maintenance
+            if not both and one.view.id != other.view.id and one.meets(other):
+                self._broken(f"{one.view.name} and {other.view.name} both stand: {one.date} {other.date}")
         for one in not_held:
-            exact = not any(map(is_pattern, one[3].needs)) and sharable.isdisjoint(one[3].needs)
-            if exact and not any(other[0] < one[0] and _meet(one, other) for other in stands):
-                self._broken(f"{one[3].name} at {one[1].start} is in conflict with none: {one[1].danger}")
+            exact = not any(map(is_pattern, one.view.needs)) and sharable.isdisjoint(one.view.needs)
+            if exact and not any(other.rank < one.rank and one.meets(other) for other in stands):
+                self._broken(f"{one.view.name} at {one.date.start} is in conflict with none: {one.date.danger}")
 
 
-def _meet(one: tuple, other: tuple) -> bool:  # type: ignore[type-arg]
-    return bool(one[2] & other[2]) and one[1].start < other[1].end and other[1].start < one[1].end
+class _Listed(NamedTuple):
+    """A date, as the leader lists it."""
+
+    rank: tuple[int, Grant, str]
+    date: BookedDate
+    rcs: set[str]
+    view: BookingView
+
+    def meets(self, other: _Listed) -> bool:
+        one, two = self.date, other.date
+        return bool(self.rcs & other.rcs) and one.start < two.end and two.start < one.end
 
 
 def _as_record(book: Book) -> BookingRecord:

@@ -268,11 +268,15 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "dates": Guard("a date that was given up, or is over, stays so", {(records, "merged"): _dates_of_newer}),
         "merged": Guard("what a host has is one source among all", {(records, "merged"): _believed}),
         "copied": Guard("a booking is acknowledged when another host has it", {(BookingSharing, "keep"): _keep_later}),
-        "caught up": Guard("who comes later is told all", {(Bookings, "_on_token"): _nothing, (BookingSharing, "_behind"): NEVER}),
+        "caught up": Guard(
+            "who comes later is told all", {(Bookings, "_on_token"): _nothing, (BookingSharing, "_behind"): NEVER}
+        ),
         "late": Guard("a late publication turns no clock back", {(BookingKeeper, "hear"): _hear_any}),
         "fleet time": Guard("a leader goes on in the time of the fleet", {(bookings, "_time"): _own_wall}),
         "slewed": Guard("fleet time does not jump in a reign", {(FleetClock, "_slewed"): _jumps}),
-        "dates first": Guard("a leader knows of all dates before it grants", {(Bookings, "recovered"): _none_recovered}),
+        "dates first": Guard(
+            "a leader knows of all dates before it grants", {(Bookings, "recovered"): _none_recovered}
+        ),
         "one stands": Guard("of two bookings that can't both be one stands", {(BookedDates, "_judge"): _nothing}),
         "withdrawn": Guard(
             "what nobody asks for is given back",

@@ -297,7 +297,7 @@ class Simulation:
         """All who keep bookings know the same, and that is what was acknowledged."""
         try:
             async with asyncio.timeout(SETTLED_WITHIN):
-                while self.booked.unsettled(self._leading_hosts()):
+                while self.booked.unsettled(self._leading_hosts()):  # noqa: ASYNC110 - nobody tells it
                     await asyncio.sleep(LOOK_EVERY)
         except TimeoutError:
             why = self.booked.unsettled(self._leading_hosts())
@@ -367,6 +367,11 @@ class Simulation:
     def start(self, name: str) -> None:
         process, mesh = self.open_process(name)
         process.run(self._start, process, name, mesh)
+
+    def _start_all(self, names: Iterable[str]) -> None:
+        for name in names:
+            if self.running[name][0].dead:
+                self.start(name)
 
     def open_process(self, name: str) -> tuple[Process, MemoryMesh]:
         rng = self.random
@@ -634,7 +639,7 @@ class Simulation:
                 self._kill(f"{host}/node", fault)
                 with self.booked.destroying():
                     self.equipment.restore_disk(host)
-                end = lambda: self.start(f"{host}/node")  # noqa: E731
+                end = partial(self._start_all, [f"{host}/node"])
             case "restart":
                 names = [name for name in self.everybody if not self.running[name][0].dead]
                 with self.booked.destroying():
@@ -642,12 +647,10 @@ class Simulation:
                         self._take_down(name)
                 DEEDS.get().done.clear()  # numbers of incarnations begin anew
                 self.equipment.pass_by(fault.jump)
-                end = lambda: [self.start(name) for name in names]  # noqa: E731
+                end = partial(self._start_all, names)
             case "disk":
-                disks = [self.equipment.disks[host] for host in fault.whom]
-                for disk in disks:
-                    disk.failing = True
-                end = lambda: [setattr(disk, "failing", False) for disk in disks]  # noqa: E731
+                self.equipment.fail(fault.whom)
+                end = partial(self.equipment.fail, fault.whom, fails=False)
             case "clock":
                 self.equipment.ahead[fault.whom[0]] += fault.jump
                 end = lambda: None  # noqa: E731
