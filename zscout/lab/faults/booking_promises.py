@@ -5,6 +5,7 @@ all faults but those that destroy every copy: in the memory of a process that ke
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -296,9 +297,9 @@ class BookingPromises:
         others = [host for host, keeper in self._keepers.items() if keeper.records.digest() != own]
         return f"{', '.join(others)} know other bookings than the leader" if others else ""
 
-    def at_end(self, leaders: Mapping[str, Rcm], *, jumped: bool) -> None:
+    def at_end(self, leaders: Mapping[str, Rcm], *, jumped: bool) -> Counter[str]:
         """All is healed, and `unsettled` is empty. `jumped`: all processes were gone at once, and fleet time with
-        them."""
+        them. Returns what there was of what."""
         ((host, rcm),) = leaders.items()
         time = self._inside(host, lambda: rcm.bookings.dates.time)
         views = {view.id: view for view in self._inside(host, rcm.bookings.handler.views)}
@@ -316,6 +317,9 @@ class BookingPromises:
             if view is not None and (fact.what == "unbooked" or fact.what in {date.start for date in view.dates}):
                 self._broken(f"{life.book.name} {fact.what} is listed, though it was given up")
         self._look_at_conflicts(rcm, records, views)
+        states = Counter(f"dates {date.state} at the end" for view in views.values() for date in view.dates)
+        destroyed = sum(fact.destroyed for fact in self.facts.values())
+        return states + Counter({"acknowledged, and destroyed": destroyed})
 
     def _is_listed(self, life: Life, view: BookingView | None, time: float) -> None:
         told = {} if view is None else {date.start: date.state for date in view.dates}

@@ -304,7 +304,7 @@ class Simulation:
             self.broken(f"bookings are not the same everywhere within {SETTLED_WITHIN:g} s: {why}")
             return
         restarted = any(fault.kind == "restart" for fault in self.faults)
-        self.booked.at_end(self._leading_hosts(), jumped=restarted)
+        self.result.counts += self.booked.at_end(self._leading_hosts(), jumped=restarted)
 
     # What is seen
 
