@@ -34,8 +34,8 @@ QUICK, SLOW = (0.001, 0.02), (0.1, 1.0)
 TIMEOUT: Final = 3.0
 """Seconds after which a program does not know what became of an operation."""
 WAITS: Final = 25.0
-REFUSED: Final = frozenset({"not_free", "bad_date", "not_kept", "busy", "unknown_booking", "too_many"})
-"""How operations may be refused that are no nonsense."""
+REFUSED: Final = frozenset({"not_free", "bad_date", "not_kept", "unknown_booking", "unknown_device"})
+"""How operations may be refused that are no nonsense. (A leader that has just begun knows of no RC that is down.)"""
 NOT_TAKEN: Final = frozenset({"unknown_booking"})
 
 

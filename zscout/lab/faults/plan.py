@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Final, Literal, TypeAlias
 
@@ -173,10 +173,11 @@ def draw_moves(seed: int, processes: Sequence[str], *, count: int, span: float) 
     return sorted((_at_a_step(rng, nodes, *_when(rng, span)) for _ in range(count)), key=lambda fault: fault.at)
 
 
-def draw_for_bookings(seed: int, hosts: Sequence[str], span: float) -> list[Fault]:
-    """What endangers bookings most: halves that both go on for some time, and what becomes of disks and clocks."""
+def draw_for_bookings(seed: int, hosts: Sequence[str], span: float, drawn: Sequence[Fault]) -> list[Fault]:
+    """What endangers bookings most, beside the faults that are `drawn`: halves that both go on for some time, and what becomes of disks and clocks."""
     rng = random.Random(f"bookings {seed}")  # noqa: S311
-    faults = []
+    # An answer on this key may be of any booking, and says nothing of what was asked.
+    faults = [replace(one, how=replace(one.how, old=0.0)) if one.message == "schedule" else one for one in drawn]
 
     def add(kind: FaultKind, whom: Sequence[str], lasts: float, jump: int = 0, after: float = 3.0) -> None:
         faults.append(Fault(rng.uniform(after, span), lasts, kind, tuple(sorted(whom)), jump=jump))
@@ -191,7 +192,7 @@ def draw_for_bookings(seed: int, hosts: Sequence[str], span: float) -> list[Faul
         add("disk", rng.sample(hosts, rng.choice((1, len(hosts)))), rng.uniform(2, span / 2))
     if rng.random() < 0.3:
         add("clock", [rng.choice(hosts)], 0.0, rng.randrange(-STEP, STEP))
-    return faults
+    return sorted(faults, key=lambda fault: fault.at)
 
 
 def _nodes(processes: Sequence[str]) -> tuple[str, ...]:

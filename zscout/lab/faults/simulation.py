@@ -201,7 +201,7 @@ class Simulation:
         else:
             drawn = plan.draw(seed, self.everybody, self.hosts, sorted(DEVICES), count=size.faults, span=size.span)
         if size.bookers:
-            drawn = sorted((*drawn, *plan.draw_for_bookings(seed, self.hosts, size.span)), key=lambda one: one.at)
+            drawn = plan.draw_for_bookings(seed, self.hosts, size.span, drawn)
         if size.direct:
             # A second instance has a device of its own, which no program of the first touches.
             drawn = [fault for fault in drawn if fault.kind != "double"]
