@@ -184,6 +184,8 @@ class ShareBookings(Message, frozen=True):
     term: Term
     digest: str
     records: Annotated[list[BookingRecord], msgspec.Meta(max_length=MAX_MERGED)] = []
+    time: WallTime | None = None
+    """Fleet time: what was over a day before is forgotten. Absent: nothing is."""
 
 
 class BookingsKept(Message, frozen=True):

@@ -14,7 +14,8 @@ comes back with what follows from them: votes, and a `Tick` at the latest when `
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
+from types import MappingProxyType
 
 from msgspec.structs import replace
 
@@ -232,9 +233,10 @@ class Core:
         found = slots(self._state, wanted, self._claims.stand_in(wanted), until, 1, likely=likely).found
         return found[0].start if found else None
 
-    def overlaps(self, order: Iterable[str]) -> Overlaps:
-        """Which bookings can't be beside those that go before them in this order of their ids."""
-        return overlaps(self._state, order)
+    def overlaps(self, order: Iterable[str], starts: Mapping[str, Ns] = MappingProxyType({})) -> Overlaps:
+        """Which bookings can't be beside those that go before them in this order of their ids. `starts`: when they
+        begin, as far as that is not known here."""
+        return overlaps(self._state, order, starts)
 
     def ask_votes(self, unknown: Iterable[tuple[Rc, HolderSet]], wanted: Booking | None = None) -> list[model.Propose]:
         """Proposals for votes that are to be known of bookings; `wanted` is one that is not made yet."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import chain, product
 from typing import Final
@@ -23,8 +23,9 @@ class Overlaps:
     """Votes that have to be known before all can be told."""
 
 
-def overlaps(state: SchedulerState, order: Iterable[str]) -> Overlaps:
-    """Of claims in the order in which they stand. RCs that are absent are not judged: whether one is sharable is known
+def overlaps(state: SchedulerState, order: Iterable[str], starts: Mapping[str, Ns]) -> Overlaps:
+    """Of claims in the order in which they stand. `starts`: when they begin by the fleet's clock of now, which was not
+    moved for what has begun. RCs that are absent are not judged: whether one is sharable is known
     once it is there."""
     result = Overlaps()
     standing: dict[tuple[int, int], list[Claim]] = {}
@@ -34,25 +35,31 @@ def overlaps(state: SchedulerState, order: Iterable[str]) -> Overlaps:
             continue
         rcs = [rc for rc in state.rcs_in(claim.kept) if rc.present]
         for rc in rcs:
-            near = (standing.get((rc.bit, day), ()) for day in _days(claim))
-            before = list({one.booking.id: one for one in chain(*near) if _meet(one, claim)}.values())
+            near = (standing.get((rc.bit, day), ()) for day in _days(claim, starts))
+            before = list({one.booking.id: one for one in chain(*near) if _meet(one, claim, starts)}.values())
             if before and (not rc.sharable or _excluded(claim, before) or _refused(state, rc, claim, before, result)):
                 result.losers[name] = before[0].booking.id
                 break
         else:
-            for key in product((rc.bit for rc in rcs), _days(claim)):
+            for key in product((rc.bit for rc in rcs), _days(claim, starts)):
                 standing.setdefault(key, []).append(claim)
     return result
 
 
-def _days(claim: Claim) -> range:
-    return range(claim.booking.start // DAY, claim.booking.end // DAY + 1)
+def _start(claim: Claim, starts: Mapping[str, Ns]) -> Ns:
+    return starts.get(claim.booking.id, claim.booking.start)
 
 
-def _meet(one: Claim, other: Claim) -> bool:
+def _days(claim: Claim, starts: Mapping[str, Ns]) -> range:
+    start = _start(claim, starts)
+    return range(start // DAY, (start + claim.booking.runtime) // DAY + 1)
+
+
+def _meet(one: Claim, other: Claim, starts: Mapping[str, Ns]) -> bool:
     """Whether they are at one time; that an RC is in maintenance twice keeps nobody from it more."""
     both = one.booking.maintenance and other.booking.maintenance
-    return not both and one.booking.start < other.booking.end and other.booking.start < one.booking.end
+    apart = _start(other, starts) - _start(one, starts)
+    return not both and -other.booking.runtime < apart < one.booking.runtime
 
 
 def _excluded(claim: Claim, before: list[Claim]) -> bool:

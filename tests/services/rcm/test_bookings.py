@@ -13,7 +13,9 @@ from msgspec.structs import replace
 
 from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeClient, FakeFleet, Refusal, request
+from zscout.keyexpr import Role, Token
 from zscout.lab.faults.memory import MemoryMesh
+from zscout.mesh.supervision import Supervisor
 from zscout.messages import (
     Book,
     BookingRecord,
@@ -26,11 +28,13 @@ from zscout.messages import (
     SlotsTold,
     Unbook,
 )
-from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.bookings.keeper import MAX_SAVING, BookingKeeper
 from zscout.services.rcm.bookings import BookedDanger
 from zscout.services.rcm.candidate import Candidate
+from zscout.types import Grant, Term
 
 R = TypeVar("R")
+FIELDS = Book.__struct_fields__
 NOON = 1_800_000_000.0
 """Seconds since 1970 at the beginning of each story."""
 
@@ -437,5 +441,97 @@ def test_a_booking_is_in_danger_while_what_it_needs_is_away() -> None:
         await fleet.joined(fleet.rc("robot/far"))
         await asyncio.sleep(10)
         assert [(one.record.id, bool(one.why)) for one in dangers] == [("b", True), ("b", False)]
+
+    run(story())
+
+
+def test_what_is_long_over_is_forgotten_by_all_who_keep_bookings() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        await led(fleet, "x", "y")
+        await do(fleet.client("one"), book("b", "robot/a", at=500), BookingView)
+        # A host with RCs, which can't lead, comes back after a month.
+        old = BookingRecord(**{name: getattr(book("old", "robot/a", at=-86_400 * 30), name) for name in FIELDS})
+        fleet.disks["far"] = Disk()
+        fleet.disks["far"].records = [old]
+        far = BookingKeeper(fleet.mesh("far"), fleet.disks["far"], candidate=False, wall=fleet.time)
+        asked = 0
+
+        def count() -> None:
+            nonlocal asked
+            asked += 1
+
+        far.on_shared = count
+        far.start(Supervisor("far", lambda error: pytest.fail(str(error))))
+        far.mesh.alive(Token("far", Role.NODE, "node", "1"))
+        await asyncio.sleep(40)
+        assert {disk: [one.id for one in fleet.disks[disk].records] for disk in ("x", "y", "far")} == {
+            "x": ["b"],
+            "y": ["b"],
+            "far": ["b"],
+        }
+        assert asked == 1
+
+    run(story())
+
+
+def test_a_keeper_that_was_busy_is_told_before_long() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y", "z")
+        *_, last = await led(fleet, "x", "y", "z")
+        client = fleet.client("one")
+        last._keeper._waiting = MAX_SAVING
+        await do(client, book("b", "robot/a", at=500), BookingView)
+        await asyncio.sleep(1)
+        assert not fleet.disks["z"].records
+        last._keeper._waiting = 0
+        await asyncio.sleep(6)
+        assert [one.id for one in fleet.disks["z"].records] == ["b"]
+
+    run(story())
+
+
+def test_what_changes_after_a_restart_of_all_counts_though_terms_begin_anew() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        before = Grant(Term(9, "old"), 50)
+        asked = book("b", "robot/*", at=500, every=1, until=round(NOON) + 200_000)
+        old = BookingRecord(
+            **{name: getattr(asked, name) for name in FIELDS}, owner="desk", made=before, changed=before
+        )
+        fleet.disks["y"] = Disk()
+        fleet.disks["y"].records = [old]
+        await led(fleet, "x")
+        fleet.candidate("y")
+        await asyncio.sleep(1)
+        client = fleet.client("one", "desk")
+        assert [date.bound for date in (await fleet.bookings())["b"].dates] == [{"robot/*": "robot/a"}] * 3
+        for disk in fleet.disks.values():
+            assert [len(one.kept) for one in disk.records] == [3]
+            assert disk.records[0].changed > before
+        # What is made later goes behind, in whatever half.
+        await do(client, book("c", "robot/b", at=500), BookingView)
+        assert {one.id: one.made > before for one in fleet.disks["y"].records} == {"b": False, "c": True}
+
+    run(story())
+
+
+def test_a_booking_right_after_another_stands_though_fleet_time_is_slewed() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y", "z")
+        fleet.ahead |= {"y": 10.0, "z": 10.0}
+        await led(fleet, "x")
+        client = fleet.client("one")
+        await do(client, book("first", "robot/a", at=20, seconds=100), BookingView)
+        await do(client, book("next", "robot/a", at=120, seconds=100), BookingView)
+        await asyncio.sleep(2)
+        await client.ask("mine", "robot/a", seconds=100, booking="first")
+        fleet.candidate("y"), fleet.candidate("z")
+        for number in range(18):
+            await asyncio.sleep(5)
+            await do(client, book(f"other{number}", "robot/b", at=1_000 + 200 * number), BookingView)
+            views = await fleet.bookings()
+            assert states(views["next"]) == ["open"], f"at {fleet.time() - NOON:g}: {views['next'].dates}"
+        assert states(views["first"]) == ["taken"]
 
     run(story())

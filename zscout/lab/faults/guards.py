@@ -24,9 +24,15 @@ from zscout.drivers.instances import Instances
 from zscout.drivers.repeated import CommandMemory
 from zscout.drivers.resource_controller import ResourceController
 from zscout.mesh.renewal import Suspicions
-from zscout.messages import Problem
+from zscout.messages import BookingRecord, Problem
 from zscout.scheduling.state import SchedulerState
-from zscout.services.rcm import candidate, membership, recovery
+from zscout.services.bookings import records
+from zscout.services.bookings.fleet_clock import FleetClock, wall_ns
+from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.rcm import bookings, candidate, membership, recovery
+from zscout.services.rcm.booked_dates import BookedDates
+from zscout.services.rcm.booking_sharing import BookingSharing
+from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.membership import Membership
 from zscout.services.rcm.places import Places
@@ -150,6 +156,51 @@ def _confirmed_once(self: HoldTable, grant: Grant, now: Ns) -> None:
         _confirmed(self, grant, now)
 
 
+_merged = records.merged
+
+
+def _newer(one: BookingRecord, other: BookingRecord) -> BookingRecord:
+    return max(one, other, key=lambda record: record.changed)
+
+
+def _unbooked_by_newer(one: BookingRecord, other: BookingRecord) -> BookingRecord:
+    return replace(_merged(one, other), unbooked=_newer(one, other).unbooked)
+
+
+def _dates_of_newer(one: BookingRecord, other: BookingRecord) -> BookingRecord:
+    newer = _newer(one, other)
+    return replace(_merged(one, other), dropped=newer.dropped, over=newer.over)
+
+
+def _believed(one: BookingRecord, _other: BookingRecord) -> BookingRecord:
+    return one
+
+
+def _hear_any(self: BookingKeeper, grants: Any) -> None:
+    if grants.time is not None:
+        self._offset = wall_ns(grants.time) - self.mesh.now()
+
+
+NEVER: Final = property(lambda _: False, _nothing)
+
+
+async def _keep_later(self: BookingSharing, record: BookingRecord) -> str:
+    self.tell([record])
+    return ""
+
+
+def _own_wall(keeper: BookingKeeper, _kept: Any) -> Ns:
+    return wall_ns(keeper.wall())
+
+
+def _jumps(self: FleetClock, _now: Ns) -> Ns:
+    return self._aim
+
+
+def _none_recovered(*_: object) -> list[Any]:
+    return []
+
+
 GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
     {
         "promise": Guard("an RC that answered a new leader obeys no older one", {(HoldTable, "promise"): _promise}),
@@ -213,6 +264,20 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
             "an RC that starts anew settles where it may have been held directly",
             {(HoldTable, "settle_at_start"): _nothing},
         ),
+        "unbooked": Guard("a booking that was given up stays so", {(records, "merged"): _unbooked_by_newer}),
+        "dates": Guard("a date that was given up, or is over, stays so", {(records, "merged"): _dates_of_newer}),
+        "merged": Guard("what a host has is one source among all", {(records, "merged"): _believed}),
+        "copied": Guard("a booking is acknowledged when another host has it", {(BookingSharing, "keep"): _keep_later}),
+        "caught up": Guard(
+            "who comes later is told all", {(Bookings, "_on_token"): _nothing, (BookingSharing, "_behind"): NEVER}
+        ),
+        "late": Guard("a late publication turns no clock back", {(BookingKeeper, "hear"): _hear_any}),
+        "fleet time": Guard("a leader goes on in the time of the fleet", {(bookings, "_time"): _own_wall}),
+        "slewed": Guard("fleet time does not jump in a reign", {(FleetClock, "_slewed"): _jumps}),
+        "dates first": Guard(
+            "a leader knows of all dates before it grants", {(Bookings, "recovered"): _none_recovered}
+        ),
+        "one stands": Guard("of two bookings that can't both be one stands", {(BookedDates, "_judge"): _nothing}),
         "withdrawn": Guard(
             "what nobody asks for is given back",
             {(RcmLink, "give_back"): _do_nothing, (Membership, "ask_requests"): _nothing},

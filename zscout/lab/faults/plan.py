@@ -4,15 +4,29 @@ from __future__ import annotations
 
 import random
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Literal, TypeAlias
+from typing import Final, Literal, TypeAlias
 
 from zscout.lab.faults.link import Disturbance
 from zscout.messages import MAX_COUNTER
 
 FaultKind: TypeAlias = Literal[
-    "freeze", "stall", "kill", "cut", "isolate", "part", "disturb", "forget", "double", "fail", "forge"
+    "freeze",
+    "stall",
+    "kill",
+    "cut",
+    "isolate",
+    "part",
+    "disturb",
+    "forget",
+    "double",
+    "fail",
+    "forge",
+    "old disk",
+    "restart",
+    "disk",
+    "clock",
 ]
 
 KINDS: Mapping[FaultKind, int] = MappingProxyType(
@@ -37,6 +51,13 @@ JUMPS = (3, 10_000_000, MAX_COUNTER)
 """How far a forged term is above the fleet's: it is believed; it is absurd; it is the last there is, at most."""
 LONGER = 1.0
 """Seconds for which hosts are apart besides, at most: so that both sides have a leader."""
+HALVES = (4.0, 12.0)
+"""The same where programs book: both book for some time."""
+OUT = (1.0, 8.0)
+"""Seconds for which a host is out that comes back with an old disk, or all are that are started anew."""
+MONTH: Final = 30 * 86_400
+STEP: Final = 7_200
+"""Seconds by which a host's clock is set at once, at most."""
 HEALED = 45.0
 RELINK = 1.0
 """Seconds after which links that were lost stand again, at most."""
@@ -65,6 +86,7 @@ class Fault:
     """A kind of messages, or of a kill an operation."""
     how: Disturbance = field(default_factory=Disturbance)
     jump: int = 0
+    """Of a forged term; in seconds, of a clock that is set, or for how long nothing ran by the clocks of hosts."""
 
     @property
     def felt(self) -> float:
@@ -86,6 +108,10 @@ class Fault:
             "fail": "fails, and works again",
             "forge": f"has a stranger that says to lead in a term {self.jump} higher",
             "forget": "is cut off, and its links come back without all that was declared",
+            "old disk": "is out, and comes back with what its disk had early in the run",
+            "restart": f"everything is out, and started anew {self.jump / 86_400:g} days later",
+            "disk": "can't write to its disk",
+            "clock": f"has its clock set by {self.jump} s",
         }[self.kind]
         return f"{self.at:7.3f} for {self.lasts:.3f} s: {' '.join(self.whom)} {what}"
 
@@ -145,6 +171,28 @@ def draw_moves(seed: int, processes: Sequence[str], *, count: int, span: float) 
     rng = random.Random(f"moves {seed}")  # noqa: S311
     nodes = _nodes(processes)
     return sorted((_at_a_step(rng, nodes, *_when(rng, span)) for _ in range(count)), key=lambda fault: fault.at)
+
+
+def draw_for_bookings(seed: int, hosts: Sequence[str], span: float, drawn: Sequence[Fault]) -> list[Fault]:
+    """What endangers bookings most, beside the faults that are `drawn`: halves that both go on for some time, and what becomes of disks and clocks."""
+    rng = random.Random(f"bookings {seed}")  # noqa: S311
+    # An answer on this key may be of any booking, and says nothing of what was asked.
+    faults = [replace(one, how=replace(one.how, old=0.0)) if one.message == "schedule" else one for one in drawn]
+
+    def add(kind: FaultKind, whom: Sequence[str], lasts: float, jump: int = 0, after: float = 3.0) -> None:
+        faults.append(Fault(rng.uniform(after, span), lasts, kind, tuple(sorted(whom)), jump=jump))
+
+    if rng.random() < 0.6:
+        add("part", rng.sample(hosts, rng.randrange(1, len(hosts))), rng.uniform(*HALVES))
+    if rng.random() < 0.4:
+        add("old disk", [rng.choice(hosts)], rng.uniform(*OUT), after=span / 2)
+    if rng.random() < 0.25:
+        add("restart", [], rng.uniform(*OUT), rng.choice((0, MONTH)), after=span / 3)
+    if rng.random() < 0.5:
+        add("disk", rng.sample(hosts, rng.choice((1, len(hosts)))), rng.uniform(2, span / 2))
+    if rng.random() < 0.3:
+        add("clock", [rng.choice(hosts)], 0.0, rng.randrange(-STEP, STEP))
+    return sorted(faults, key=lambda fault: fault.at)
 
 
 def _nodes(processes: Sequence[str]) -> tuple[str, ...]:

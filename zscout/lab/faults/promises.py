@@ -220,9 +220,11 @@ class Promises:
         silence: Mapping[str, Ns],
         *,
         calm: bool,
+        lasting: Mapping[tuple[object, ...], float],
     ) -> None:
         """What must be so at any time, of processes that do not stand still. `silence`: for how long each RC that goes
-        on has heard no RCM, by its own clock. `calm`: there is no fault now."""
+        on has heard no RCM, by its own clock. `calm`: there is no fault now. `lasting`: what else may not last, and how
+        long it may."""
         for rcm in leaders.values():
             if self.terms.setdefault(rcm.term, self._now()) == self._now() and not self.unheard:
                 self._begun.append(self._now())
@@ -232,7 +234,7 @@ class Promises:
             for arc in rcm.core.arcs_of(self._thief):
                 if (place := rcm.core.place_of(arc)) in given:
                     self._broken(f"{arc} has a place that was given to another: {place}")
-        lasting = dict.fromkeys(_half_gangs(clients, rcs), self._half_a_gang)
+        lasting = {**lasting, **dict.fromkeys(_half_gangs(clients, rcs), self._half_a_gang)}
         lasting |= dict.fromkeys(_unled(rcs, silence), UNLED)
         if calm:
             come_right = (*_left(leaders, rcs), *_worse_places(clients, leaders), *self._given_up(rcs))

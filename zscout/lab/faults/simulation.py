@@ -31,6 +31,8 @@ from zscout.drivers.last_holder import LastHolder
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.lab.faults import plan
+from zscout.lab.faults.bookers import Booker, Hosts
+from zscout.lab.faults.booking_promises import BookingPromises
 from zscout.lab.faults.components import DEEDS, KINDS, Deeds, SimulatedComponent, operate, report_load
 from zscout.lab.faults.device import Device, WatchedCapacity, WatchedExclusive
 from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork, MemoryTransport
@@ -38,8 +40,9 @@ from zscout.lab.faults.plan import OPERATIONS, Fault
 from zscout.lab.faults.programs import Work, steal_places
 from zscout.lab.faults.promises import LEFT_OVER, Promises
 from zscout.lab.faults.virtual_time import PROCESS, START, Process, VirtualTimeLoop
-from zscout.mesh.supervision import StallWatch
+from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.messages import MAX_COUNTER, Grants
+from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.node.component_host import ComponentHost
 from zscout.services.rcm.absence import AT_ONCE
 from zscout.services.rcm.candidate import Candidate
@@ -67,6 +70,10 @@ FORGOTTEN: Final = 0.3
 """Of what was declared, where links come back without all of it."""
 SETTLE: Final = 2.0
 """Seconds that RCs settle."""
+SETTLED_WITHIN: Final = 40.0
+"""Seconds after all was served in which all keepers know the same bookings: they are all asked every 30 s."""
+COPIED_AT: Final = 10.0
+"""Seconds after the beginning at which disks are copied."""
 LOOK_EVERY: Final = 0.05
 FORGED_EVERY: Final = 0.25
 OPERATOR: Final = "h0/operator"
@@ -93,12 +100,16 @@ class Size:
     """Managers share a key, and a program asks at the places of others. Commands arrive twice."""
     moves_only: bool = False
     """Nothing fails but nodes, in the steps of a component's move: no other fault excuses what breaks."""
+    bookers: int = 0
+    """Programs that book, give up and take up."""
 
     @classmethod
     def of(cls, seed: int) -> Size:
         """Every tenth run is a long one of many, every tenth one of moves that fail, every tenth one of programs that
-        touch devices past their RCs, and every tenth one with a thief."""
+        touch devices past their RCs, every tenth one with a thief, and every fifth one of bookings."""
         match seed % 10:
+            case 3 | 4:
+                return cls(bookers=2, clients=3, faults=4, span=40.0)
             case 8:
                 return cls(direct=True, span=40.0)
             case 9:
@@ -160,10 +171,16 @@ class Simulation:
         self.clients = {f"{self.random.choice(self.hosts)}/c{number}": None for number in range(size.clients)}
         fleet = default_fleet()
         self.fleet = replace(fleet, strategy=self.random.choice(("priority", "adaptive")))
+        if size.bookers:
+            self.fleet = replace(self.fleet, strategy="adaptive")
         self.where = {rc: f"{self.random.choice(self.hosts)}/{self._program(rc)}" for rc in DEVICES}
         """In which process each RC is: in its host's node, or in one of its own, without a candidate beside it."""
+        bookers = [f"{self.random.choice(self.hosts)}/b{number}" for number in range(size.bookers)]
+        self.clients |= dict.fromkeys(bookers)
         self.running: dict[str, tuple[Process, MemoryMesh]] = {}
         self.candidates: dict[str, Candidate] = {}
+        self.keepers: dict[str, BookingKeeper] = {}
+        """By host: those of processes that live."""
         self.rcs: dict[str, ResourceController] = {}
         self.programs: dict[str, Client] = {}
         self.busy: dict[str, set[str]] = {}
@@ -183,6 +200,8 @@ class Simulation:
             drawn = plan.draw_moves(seed, self.everybody, count=size.faults, span=size.span)
         else:
             drawn = plan.draw(seed, self.everybody, self.hosts, sorted(DEVICES), count=size.faults, span=size.span)
+        if size.bookers:
+            drawn = plan.draw_for_bookings(seed, self.hosts, size.span, drawn)
         if size.direct:
             # A second instance has a device of its own, which no program of the first touches.
             drawn = [fault for fault in drawn if fault.kind != "double"]
@@ -218,8 +237,21 @@ class Simulation:
             strict=self.fleet.strategy == "priority",
             thief=THIEF,
         )
+        self.equipment = Hosts(self.seed, self.hosts, lambda: loop.now, booked=self.size.bookers > 0)
+        self.booked = BookingPromises(
+            self.broken,
+            lambda: loop.now,
+            self.keepers,
+            self.equipment.disks,
+            self.candidates_at,
+            lambda: not self.present,
+            lambda host, call: self.running[f"{host}/node"][0].run(call),
+        )
+        bookers = [name for name in self.clients if name.split("/")[1].startswith("b")]
+        self.bookers = {name: Booker(name, self.work, self.booked) for name in bookers}
         for name in (*self.everybody, OPERATOR):
             self.start(name)
+        loop.call_later(COPIED_AT, self.equipment.copy_disks)
         if self.size.thief:
             self.network.twice = ("command",)
             process, mesh = self.open_process(THIEF)
@@ -255,9 +287,24 @@ class Simulation:
             self.broken(f"not served within {SERVED_WITHIN:g} s: {waiting}")
         self.result.served_after = self.loop.now - mended
         await asyncio.sleep(LEFT_OVER)
+        if self.bookers:
+            await self._bookings_settled()
         faults = [(START + fault.at, START + fault.at + fault.lasts + plan.RELINK) for fault in self.faults]
         self.promises.at_end(self._alive(self.programs), self._leaders(), faults)
         self.result.counts["terms"] += len(self.promises.terms)
+
+    async def _bookings_settled(self) -> None:
+        """All who keep bookings know the same, and that is what was acknowledged."""
+        try:
+            async with asyncio.timeout(SETTLED_WITHIN):
+                while self.booked.unsettled(self._leading_hosts()):  # noqa: ASYNC110 - nobody tells it
+                    await asyncio.sleep(LOOK_EVERY)
+        except TimeoutError:
+            why = self.booked.unsettled(self._leading_hosts())
+            self.broken(f"bookings are not the same everywhere within {SETTLED_WITHIN:g} s: {why}")
+            return
+        restarted = any(fault.kind == "restart" for fault in self.faults)
+        self.result.counts += self.booked.at_end(self._leading_hosts(), jumped=restarted)
 
     # What is seen
 
@@ -299,7 +346,8 @@ class Simulation:
             clients = self._alive(self.programs)
             # Two instances of an RC on one mesh are settled while there are two.
             calm = all(fault.kind == "double" for fault in self.present)
-            self.promises.look(clients, self.rcs, self._leaders(), silence, calm=calm)
+            lasting = dict(self.booked.look(self._leading_hosts(), calm=not self.present)) if self.bookers else {}
+            self.promises.look(clients, self.rcs, self._leaders(), silence, calm=calm, lasting=lasting)
             if self.work.over and not any(self.busy.values()):
                 self.idle.set()
 
@@ -311,11 +359,19 @@ class Simulation:
         candidates = {f"{host}/node": one for host, one in self.candidates.items()}
         return {name: one.rcm for name, one in self._alive(candidates).items() if one.rcm is not None}
 
+    def _leading_hosts(self) -> dict[str, Rcm]:
+        return {name.split("/")[0]: rcm for name, rcm in self._leaders().items()}
+
     # Processes
 
     def start(self, name: str) -> None:
         process, mesh = self.open_process(name)
         process.run(self._start, process, name, mesh)
+
+    def _start_all(self, names: Iterable[str]) -> None:
+        for name in names:
+            if self.running[name][0].dead:
+                self.start(name)
 
     def open_process(self, name: str) -> tuple[Process, MemoryMesh]:
         rng = self.random
@@ -366,10 +422,18 @@ class Simulation:
         stall = StallWatch(mesh.now).start()
         mesh_token = mesh.alive(Token(host, Role.NODE, "node", new_instance()))
         await self._offer_all(mesh, stall)
-        if host in self.candidates_at:
+        leads = host in self.candidates_at
+        keeper = BookingKeeper(
+            mesh, self.equipment.disks[host], candidate=leads, wall=partial(self.equipment.wall, host)
+        )
+        if leads:
+            self.keepers[host] = keeper
             key = PLACES_KEY if self.size.thief else None
-            candidate = self.candidates[host] = Candidate(mesh, self.fleet, places_key=key)
+            candidate = self.candidates[host] = Candidate(mesh, self.fleet, places_key=key, keeper=keeper)
             candidate.start()
+        elif self.size.bookers and str(mesh.me) in self.where.values():
+            self.keepers[host] = keeper
+            keeper.start(Supervisor("what keeps bookings", self._on_failure))
         component_host = ComponentHost(
             mesh, self.fleet, ComponentsConfig(), self._on_failure, kinds=lambda: KINDS, process=self.component
         )
@@ -423,6 +487,10 @@ class Simulation:
         client.waits_for_devices = True
         busy = self.busy[name] = set()
         self.watch(name, client)
+        if name in self.bookers:
+            await self.bookers[name].run(client, busy)
+            await client.close()
+            return
         await asyncio.gather(*(self.work.run(client, f"{mesh.me.client}-{number}", busy) for number in range(2)))
 
     # Faults
@@ -434,6 +502,7 @@ class Simulation:
 
         def told(arc: OpenArc) -> None:
             self.log(f"{arc.name} {arc.state} {arc.outcome or ''} {arc.reason}")
+            self.booked.preempted(arc)
             grant, since = began.get(arc.id, (None, 0.0))
             self.promises.told(name, arc, client.term, touched=self._touched(since, name, *arc.rcs, *arc.needs))
             if arc.grant is not None and arc.grant != grant:
@@ -482,12 +551,14 @@ class Simulation:
         lasts, timing = self.loop.now - START - fault.at, self.fleet.timing
         just_over = 0 <= lasts - fault.lasts < 2 * AT_ONCE
         match fault.kind:
-            case "kill":
+            case "kill" | "old disk":
                 name, at = self.killed.get(fault, ("", math.inf))
                 # What it said last may have reached some only.
                 return name in names or 0 < since - at < self.fleet.mesh.lease
             case "stall" | "fail" | "double":
                 return bool(names & {*fault.whom})
+            case "disk" | "clock":
+                return False
             case "freeze":
                 return just_over or bool(names & {*fault.whom})
             case "isolate" | "part":
@@ -561,6 +632,28 @@ class Simulation:
                 self.cuts.update(pairs)
                 self._cut()
                 end = lambda: self._come_back(pairs)  # noqa: E731
+            case "old disk":
+                (host,) = fault.whom
+                if self.running[f"{host}/node"][0].dead:
+                    return
+                self._kill(f"{host}/node", fault)
+                with self.booked.destroying():
+                    self.equipment.restore_disk(host)
+                end = partial(self._start_all, [f"{host}/node"])
+            case "restart":
+                names = [name for name in self.everybody if not self.running[name][0].dead]
+                with self.booked.destroying():
+                    for name in names:
+                        self._take_down(name)
+                DEEDS.get().done.clear()  # numbers of incarnations begin anew
+                self.equipment.pass_by(fault.jump)
+                end = partial(self._start_all, names)
+            case "disk":
+                self.equipment.fail(fault.whom)
+                end = partial(self.equipment.fail, fault.whom, fails=False)
+            case "clock":
+                self.equipment.ahead[fault.whom[0]] += fault.jump
+                end = lambda: None  # noqa: E731
         self.present.append(fault)
         self._look_who_is_heard()
         self.loop.call_later(fault.lasts, self._end, fault, end)
@@ -591,9 +684,14 @@ class Simulation:
         if fault in self.killed or self.running[name][0].dead:
             return
         self.killed[fault] = name, self.loop.now - START
-        self.end_process(name, reached if fault.message in OPERATIONS else None)
+        with self.booked.destroying():
+            self._take_down(name, reached if fault.message in OPERATIONS else None)
+
+    def _take_down(self, name: str, reached: MemoryTransport | None = None) -> None:
+        self.end_process(name, reached)
         host, program = name.split("/")
         if program == "node":
+            self.keepers.pop(host, None)
             for other in [other for other in self.running if other.startswith(f"{host}/") and "." in other]:
                 self.end_process(other)
             self.candidates.pop(host, None)

@@ -30,8 +30,9 @@ from zscout.messages import (
     decode_told,
     encode,
 )
+from zscout.services.bookings.fleet_clock import SLEW
 from zscout.services.bookings.records import Records
-from zscout.types import SECOND, VERSION, Ns
+from zscout.types import NO_TERM, SECOND, VERSION, Ns, Term
 
 log = logging.getLogger(__name__)
 
@@ -95,6 +96,8 @@ class BookingKeeper:
         self.records = Records()
         self._offset: Ns | None = None
         """What fleet time is more than the own clock, as it was heard last."""
+        self._heard: tuple[Term, Ns] = NO_TERM, 0
+        """In which term, and when, that was."""
         self._saved = self.records.digest()
         """What the disk has."""
         self._saving = asyncio.Lock()
@@ -118,9 +121,15 @@ class BookingKeeper:
     # Fleet time
 
     def hear(self, grants: Grants) -> None:
-        """A publication of the leader."""
-        if grants.time is not None:
-            self._offset = round(grants.time * SECOND) - self.mesh.now()
+        """A publication of the leader. One that tells an earlier time than can be was late."""
+        if grants.time is None:
+            return
+        now, (term, at) = self.mesh.now(), self._heard
+        offset = round(grants.time * SECOND) - now
+        if self._offset is not None and grants.term == term:
+            # Slewed as far as it may be, on a clock that is as far off again.
+            offset = max(offset, self._offset - 2 * (now - at) // SLEW)
+        self._offset, self._heard = offset, (grants.term, now)
 
     @property
     def time(self) -> Ns | None:
@@ -162,8 +171,8 @@ class BookingKeeper:
     def _on_shared(self, query: IncomingQuery[ShareBookings]) -> None:
         if self._waiting >= MAX_SAVING:
             raise Refused("busy", "this host is still writing bookings to its disk; ask again")
-        if (heard := self.time) is not None:
-            self.records.forget_old(heard / SECOND)
+        if query.message.time is not None:
+            self.records.forget_old(query.message.time)
         if self.records.take(query.message.records):
             self.on_shared()
         if self._disk is None or self.records.digest() == self._saved:

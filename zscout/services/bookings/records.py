@@ -22,7 +22,7 @@ KEEP: Final = DAY
 
 def merged(one: BookingRecord, other: BookingRecord) -> BookingRecord:
     """What both tell of one booking. The newer tells all but what is final."""
-    newer = max(one, other, key=lambda record: (record.changed, encode(record)))
+    newer = max(one, other, key=lambda record: (record.changed, _changing(record)))
     return replace(
         newer,
         made=min(one.made, other.made),
@@ -30,6 +30,11 @@ def merged(one: BookingRecord, other: BookingRecord) -> BookingRecord:
         dropped=sorted({*one.dropped, *other.dropped}),
         over=sorted({*one.over, *other.over}),
     )
+
+
+def _changing(record: BookingRecord) -> bytes:
+    """What the newer tells."""
+    return encode(replace(record, made=record.changed, unbooked=False, dropped=[], over=[]))
 
 
 class Records:

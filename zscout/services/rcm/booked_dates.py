@@ -184,7 +184,9 @@ class BookedDates:
         self._danger = {name: why for name, why in self._danger.items() if name in wanted}
 
     def _judge(self, wanted: dict[str, Date]) -> None:
-        found = self._core.overlaps(wanted)
+        # What has begun was not moved as fleet time was slewed: what comes right after it would seem to meet it.
+        starts = {name: self.local(date.start) for name, date in wanted.items()}
+        found = self._core.overlaps(wanted, starts)
         self._waits_for_votes = bool(found.unknown)
         self.ask(found.unknown)
         self._conflicts = {name: by for name, by in self._conflicts.items() if self._core.booking(name) is None}
@@ -203,9 +205,10 @@ class BookedDates:
                 self._waits_for_votes = True
                 self.ask(found.unknown, booked.booking)
             elif found.found:
-                kept = {**date.record.kept, date.start: dict(found.found[0].bound)}
+                # Another of its dates may have been bound just now.
+                latest = self._records.get(date.record.id) or date.record
                 self._conflicts.pop(date.id, None)
-                new = self.change(date.record, kept=kept)
+                new = self.change(latest, kept={**latest.kept, date.start: dict(found.found[0].bound)})
                 if (again := self._booked(Date(new, date.start))) is not None:
                     self._emit(again)
                 return
@@ -227,9 +230,16 @@ class BookedDates:
         if events := [Redated(one.id, one.start + moved) for one in known if one.start > now]:
             self._emit(*events)
 
+    def number(self) -> Grant:
+        """(term, seq) of what is made or changed now: above all that is known. Where all hosts were started anew terms
+        began anew."""
+        own = Grant(self._core.term, self._core.number())
+        latest = max((record.changed for record in self._records), default=own)
+        return own if own > latest else Grant(latest.term, latest.seq + 1)
+
     def change(self, record: BookingRecord, **to: object) -> BookingRecord:
         """The record, changed in this term."""
-        changed = Grant(self._core.term, self._core.number())
+        changed = self.number()
         new = replace(record, changed=changed, **to)
         self._records.take([new])
         self._changed([new])

@@ -44,7 +44,7 @@ from zscout.services.bookings.dates import DAY, dates, zone_of
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.rcm.booked_dates import MAX_CLAIMS, BookedDates, Date
 from zscout.services.rcm.booking_sharing import BookingSharing
-from zscout.types import SECOND, Grant, Ns
+from zscout.types import SECOND, Ns
 
 log = logging.getLogger(__name__)
 
@@ -153,7 +153,7 @@ class BookingHandler:
             raise Refused("bad_date", "until is before the first date")
         if wanted.every and runtime > (wanted.every * DAY - 3_600) * SECOND:
             raise Refused("bad_date", "it would overlap its own next date; make it shorter, or less often")
-        made = Grant(self._core.term, self._core.number())
+        made = self._dates.number()
         fields = {name: getattr(wanted, name) for name in Book.__struct_fields__}
         fields["who"] = self._authority.known_as(sender, wanted.who)
         if wanted.maintenance:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Final
 
 from zscout.keyexpr import Keys, Role
@@ -21,6 +21,8 @@ log = logging.getLogger(__name__)
 
 SHARE_EVERY: Final = 30.0
 """Seconds from one question to all keepers to the next, where nothing is new."""
+AGAIN: Final = 5.0
+"""The same where some host does not know the same yet."""
 SOON: Final = 0.02
 """Seconds that changes are gathered before they are shared."""
 TIMEOUT: Final = 2.0
@@ -83,7 +85,7 @@ class BookingSharing:
 
     async def _keep_sharing(self) -> None:
         while True:
-            if await done_within(SHARE_EVERY, self._news.wait()):
+            if await done_within(AGAIN if self._behind else SHARE_EVERY, self._news.wait()):
                 await asyncio.sleep(SOON)
             self._news.clear()
             async with self._sharing:
@@ -96,8 +98,11 @@ class BookingSharing:
         """Tells all keepers, and hears what they know. `_why` is empty then if what was told is kept."""
         keeper, mesh = self._keeper, self._mesh
         sent, self._unshared = self._unshared, {}
+        time = self._clock.at(mesh.now()) / SECOND
+        # All forget by the time of one question: else what one has forgotten came back from another.
+        keeper.records.forget_old(time)
         records = list(keeper.records) if self._behind else list(sent.values())
-        question = ShareBookings(self._term, keeper.records.digest(), records)
+        question = ShareBookings(self._term, keeper.records.digest(), records, time)
         saved, replies = await asyncio.gather(
             keeper.save(), mesh.ask(mesh.keys.bookings_any, question, BookingsKept, timeout=TIMEOUT)
         )
@@ -113,12 +118,12 @@ class BookingSharing:
         else:
             self._why = "" if saved else "no other host may lead, and this one has no disk for it"
 
-    def _take(self, replies: Iterable[Reply[BookingsKept]]) -> list[BookingsKept]:
+    def _take(self, replies: Collection[Reply[BookingsKept]]) -> list[BookingsKept]:
         """What keepers answered."""
         now, answers = self._mesh.now(), credible(replies, self._mesh.keys)
         changed = self._keeper.records.take(record for one in answers for record in one.records)
         digest = self._keeper.records.digest()
-        self._behind = any(one.digest != digest for one in answers)
+        self._behind = any(reply.message is None or reply.message.digest != digest for reply in replies)
         if changed:
             self._on_news()
             self._news.set()

@@ -1,0 +1,365 @@
+"""What zscout promises of bookings under every fault: the second part of the list of docs/promises.md.
+
+What an RCM has acknowledged is a fact: that a booking was made, that it or one of its dates was given up. Facts outlive
+all faults but those that destroy every copy: in the memory of a process that keeps bookings, or on a host's disk."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from itertools import combinations
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from zscout.behaviors.client.request import OpenArc
+from zscout.keyexpr import is_pattern
+from zscout.messages import WINDOW, Book, BookedDate, BookingRecord, BookingView, Instant
+from zscout.scheduling.booking import Booking
+from zscout.services.bookings.dates import dates, last_end
+from zscout.services.bookings.keeper import BookingKeeper, Disk
+from zscout.services.bookings.records import KEEP, Records
+from zscout.types import SECOND, ArcId, Grant, Ns, Term
+
+if TYPE_CHECKING:
+    from zscout.services.rcm.rcm import Rcm
+
+RUNS_APART: Final = 0.012
+"""Of the time: by which fleet time may be faster or slower than virtual time, slewed on a clock that is not true."""
+AGREE: Final = 0.5
+"""Seconds by which the fleet time of a leader may differ from that of the one before, as it begins."""
+AT_ITS_DATE: Final = 1.5
+"""Seconds after its date, or after it was taken up if that was later, within which a booking is held."""
+NOT_EXACT: Final[Ns] = SECOND // 4
+"""By how much a date may be put off, as fleet time is slewed."""
+GIVEN_UP: Final = 0.1
+"""Seconds within which a leader that has heard that a booking is given up keeps nothing for it."""
+
+
+@dataclass(slots=True)
+class Life:
+    """A booking as the program knows it that made it."""
+
+    book: Book
+    made: bool = False
+    """Whether an RCM has acknowledged it."""
+    given_up: bool = False
+    """Whether the program has asked to unbook it, whatever became of that."""
+    dropped: set[Instant] = field(default_factory=set)
+    """The dates that it has asked to give up."""
+    withdrawn: bool = False
+    """Whether the RCM that took it has said that nobody keeps it."""
+
+    def dates(self) -> list[Instant]:
+        return dates(_as_record(self.book), 0, last_end(_as_record(self.book)))
+
+    def give_up(self, start: Instant | None) -> None:
+        if start is None:
+            self.given_up = True
+        else:
+            self.dropped.add(start)
+
+
+@dataclass(slots=True, eq=False)
+class Fact:
+    booking: str
+    what: Instant | str
+    """`made`, `unbooked`, or the date that was given up."""
+    destroyed: bool = False
+    """Whether faults have destroyed every copy of it."""
+
+    def __str__(self) -> str:
+        return f"{self.booking} {self.what}"
+
+    def known_by(self, record: BookingRecord | None) -> bool:
+        if record is None:
+            return False
+        if self.what == "made":
+            return True
+        return record.unbooked or self.what in record.dropped
+
+
+class BookingPromises:
+    """`broken(text)` is told of a promise that was not kept. `keepers`: of processes that live, by host; `disks`: of
+    all hosts; `calm`: there is no fault now; `inside`
+    calls something as code of the process of a host's node."""
+
+    def __init__(
+        self,
+        broken: Callable[[str], None],
+        now: Callable[[], float],
+        keepers: Mapping[str, BookingKeeper],
+        disks: Mapping[str, Disk],
+        candidates: list[str],
+        calm: Callable[[], bool],
+        inside: Callable[[str, Callable[[], Any]], Any],
+    ) -> None:
+        self._broken, self._now, self._calm, self._inside = broken, now, calm, inside
+        self._keepers, self._disks, self._candidates = keepers, disks, candidates
+        self.lives: dict[str, Life] = {}
+        self.facts: dict[tuple[str, Instant | str], Fact] = {}
+        self._final: dict[BookingKeeper, dict[str, BookingRecord]] = {}
+        """What each process knew of bookings as it was looked at last."""
+        self._led: dict[Term, tuple[float, float]] = {}
+        """By term: when its leader was looked at last, and by how much fleet time was ahead of virtual time then."""
+        self._heard: set[str] = set()
+        """Hosts whose processes knew fleet time as they were looked at last."""
+        self._latest = 0.0
+        """The latest fleet time that any leader has told."""
+        self._known: dict[Term, dict[str, float]] = {}
+        """By term and date: since when its leader knows of it."""
+        self._looked: dict[Term, int] = {}
+        self._running: dict[Term, set[Grant]] = {}
+        self._records: dict[str, set[str]] = {}
+        """By host: the bookings that it knew as it was looked at last."""
+
+    # What programs are told
+
+    def asked(self, book: Book) -> Life:
+        return self.lives.setdefault(book.id, Life(book))
+
+    def booked(self, life: Life, view: BookingView) -> None:
+        """An RCM has acknowledged it."""
+        if view.unbooked:
+            if life.made and not life.given_up and not self.facts[life.book.id, "made"].destroyed:
+                self._broken(f"booking {life.book.name} was acknowledged, and is unbooked though nobody gave it up")
+            life.withdrawn = True
+            return
+        if life.withdrawn:
+            self._broken(f"booking {life.book.name} was withdrawn, and is told as made again")
+        life.made = True
+        self._establish(life, "made")
+
+    def unbooked(self, life: Life, start: Instant | None, view: BookingView) -> None:
+        """An RCM has acknowledged that it, or its date `start`, is given up."""
+        if start is None and not view.unbooked:
+            self._broken(f"{life.book.name} is told as booked in the answer to its unbooking")
+        self._establish(life, "unbooked" if start is None else start)
+
+    def _establish(self, life: Life, what: Instant | str) -> None:
+        fact = self.facts.setdefault((life.book.id, what), Fact(life.book.id, what))
+        memory, disk = self._copies(fact)
+        enough = len({*memory, *disk} & {*self._candidates}) > 1
+        # Of a leader that sees no other candidate its own disk has to do.
+        if not enough and not fact.destroyed and (self._calm() or not disk):
+            where = f"the memory of {sorted(memory)}, and on the disk of {sorted(disk)}"
+            self._broken(f"{life.book.name} {what} is acknowledged, and is in {where} alone")
+
+    def preempted(self, arc: OpenArc) -> None:
+        """A program has news of a request."""
+        life = self.lives.get((arc.by or "").partition("@")[0])
+        if life is not None and arc.outcome == "preempted" and not life.book.maintenance:
+            self._broken(f"{arc.name} is preempted for {life.book.name}, which nobody has taken up")
+
+    # What is destroyed
+
+    def _copies(self, fact: Fact) -> tuple[set[str], set[str]]:
+        """The hosts that have it in memory, and on disk."""
+        memory = {host for host, one in self._keepers.items() if fact.known_by(one.records.get(fact.booking))}
+        return memory, {
+            host
+            for host, disk in self._disks.items()
+            if any(fact.known_by(record) for record in disk.read() if record.id == fact.booking)
+        }
+
+    @contextmanager
+    def destroying(self) -> Iterator[None]:
+        """Processes die within, or disks are exchanged."""
+        facts = [fact for fact in self.facts.values() if not fact.destroyed and not self._is_over(fact)]
+        for fact in facts:
+            if not any(self._copies(fact)):
+                self._broken(f"{fact} was acknowledged, and nobody knows of it any more")
+        yield
+        for fact in facts:
+            fact.destroyed = not any(self._copies(fact))
+
+    def _is_over(self, fact: Fact) -> bool:
+        """Whether it may be forgotten."""
+        book = self.lives[fact.booking].book
+        return last_end(_as_record(book)) + KEEP < self._latest + 1
+
+    # What is so at any time
+
+    def look(self, leaders: Mapping[str, Rcm], *, calm: bool) -> Iterator[tuple[tuple[object, ...], float]]:
+        """What may not last, each with for how long it may. `leaders`: by host, of processes that do not stand
+        still."""
+        for keeper in self._keepers.values():
+            self._look_at_records(keeper)
+        for host, rcm in leaders.items():
+            self._look_at_time(host, rcm)
+            known = self._known.setdefault(rcm.term, {})
+            first = not known
+            claims = {booking.id: (booking, arc) for booking, arc in rcm.core.bookings()}
+            for name in claims:
+                before = first and name.partition("@")[0] in self._records.get(host, ())
+                known.setdefault(name, 0.0 if before else self._now())
+            for name, (booking, arc) in claims.items():
+                id_, _, start = name.partition("@")
+                record = self._keepers[host].records.get(id_)
+                if record is None or record.unbooked or int(start) in record.dropped:
+                    yield (host, "keeps", name, "for nobody: it was given up"), GIVEN_UP
+                elif calm and arc is not None and self._has_no_excuse(host, rcm, name, booking, arc):
+                    yield (name, "is taken up, and its date has come, but", arc, "does not run"), AT_ITS_DATE
+            if self._looked.get(rcm.term) != rcm.core.batches:
+                self._looked[rcm.term] = rcm.core.batches
+                self._look_at_grants(host, rcm, claims)
+        self._heard = {host for host, keeper in self._keepers.items() if keeper.time is not None}
+        self._records = {host: {one.id for one in keeper.records} for host, keeper in self._keepers.items()}
+
+    def _look_at_records(self, keeper: BookingKeeper) -> None:
+        """What is final of a booking stays, wherever it has been heard."""
+        before_it = self._final.get(keeper, {})
+        # What was over long ago may be forgotten, and may be heard once more of a host that was away.
+        self._final[keeper] = {record.id: record for record in keeper.records}
+        for record in keeper.records:
+            before = before_it.get(record.id)
+            if before is record:
+                continue
+            if before is not None and (
+                before.unbooked > record.unbooked
+                or not {*before.dropped} <= {*record.dropped}
+                or not {*before.over} <= {*record.over}
+            ):
+                self._broken(f"{record.name} was given up or over on {keeper.mesh.me}, and is not any more")
+
+    def _look_at_time(self, host: str, rcm: Rcm) -> None:
+        now, time = self._now(), self._inside(host, lambda: rcm.bookings.dates.time)
+        self._latest = max(self._latest, time)
+        ahead = time - now
+        if (before := self._led.get(rcm.term)) is not None:
+            at, then = before
+            if abs(ahead - then) > RUNS_APART * (now - at) + 1e-6:
+                self._broken(f"fleet time jumps by {ahead - then:g} s in term {rcm.term.counter}")
+        elif self._led and host in self._heard:
+            at, then = max(self._led.values())
+            if abs(ahead - then) > AGREE + 2 * RUNS_APART * (now - at):
+                text = f"fleet time is {ahead - then:g} s off that of {now - at:g} s ago, of another leader"
+                self._broken(f"{text}, as term {rcm.term.counter} begins")
+        self._led[rcm.term] = now, ahead
+
+    def _look_at_grants(self, host: str, rcm: Rcm, claims: Mapping[str, tuple[Booking, ArcId | None]]) -> None:
+        """Nobody starts what would not be over by the date of a booking of its rank that its leader knew of."""
+        status, local = rcm.core.status(), self._inside(host, rcm.mesh.now)
+        running = {one.hold.grant: one for one in status.running if one.hold and one.hold.grant.term == rcm.term}
+        before, self._running[rcm.term] = self._running.get(rcm.term, set()), set(running)
+        exclusive = {rc.name for rc in status.rcs if rc.present and not rc.sharable}
+        has_it = {one.id for one in status.running}
+        # For patterns others may be kept at any time.
+        waiting = {
+            name: (booking, by)
+            for name, (booking, by) in claims.items()
+            if by not in has_it and not any(map(is_pattern, booking.needs))
+        }
+        for arc in (running[grant] for grant in running.keys() - before):
+            assert arc.hold is not None  # noqa: S101 - it runs
+            began = self._now() - (local - arc.hold.start) / SECOND
+            for name, (booking, by) in waiting.items():
+                over = booking.lapses if by is None else booking.end
+                meet = booking.start + NOT_EXACT < arc.hold.end and arc.hold.start + NOT_EXACT < over
+                rcs = booking.needs.keys()
+                if (
+                    meet
+                    and arc.request.priority <= booking.priority
+                    and rcs <= {rc.name for rc in status.rcs if rc.present}
+                    and rcs & arc.needs.keys() & exclusive
+                    and self._known[rcm.term][name] < began
+                ):
+                    booked = self.lives[name.partition("@")[0]].book.name
+                    self._broken(f"{arc.name} begins what is not over by the date of {booked}: {name}")
+
+    def _has_no_excuse(self, host: str, rcm: Rcm, name: str, booking: Booking, arc: ArcId) -> bool:
+        """Whether it should be held now, and is not: its date has come, and nobody is in its way of higher priority, or
+        who held before its leader knew of it."""
+        status, now = rcm.core.arc(arc), self._inside(host, rcm.mesh.now)
+        if status is None or status.hold is not None or booking.start > now:
+            return False
+        known = self._now() - self._known[rcm.term][name]
+        rcs = {rc.name: rc for rc in rcm.core.status().rcs}
+        for rc in status.needs:
+            if rc not in rcs or not rcs[rc].present:
+                return False
+            for holder in rcm.core.holders(rc):
+                hold = holder.hold
+                if hold is None or holder.request.priority > booking.priority or hold.grant.term != rcm.term:
+                    return False
+                if known < (now - hold.start) / SECOND + GIVEN_UP:
+                    return False
+        # A pattern may be bound to any.
+        return not any(map(is_pattern, booking.needs)) and len(status.needs) == len(booking.needs)
+
+    # What is so at the end
+
+    def unsettled(self, leaders: Mapping[str, Rcm]) -> str:
+        """Why not all keepers know the same, in words; empty: they do."""
+        if len(leaders) != 1:
+            return f"{len(leaders)} lead"
+        own = self._keepers[next(iter(leaders))].records.digest()
+        others = [host for host, keeper in self._keepers.items() if keeper.records.digest() != own]
+        return f"{', '.join(others)} know other bookings than the leader" if others else ""
+
+    def at_end(self, leaders: Mapping[str, Rcm], *, jumped: bool) -> Counter[str]:
+        """All is healed, and `unsettled` is empty. `jumped`: all processes were gone at once, and fleet time with
+        them. Returns what there was of what."""
+        ((host, rcm),) = leaders.items()
+        time = self._inside(host, lambda: rcm.bookings.dates.time)
+        views = {view.id: view for view in self._inside(host, rcm.bookings.handler.views)}
+        records = self._keepers[host].records
+        for fact in self.facts.values():
+            life = self.lives[fact.booking]
+            if fact.destroyed or self._is_over(fact):
+                continue
+            record = records.get(fact.booking)
+            if not fact.known_by(record):
+                self._broken(f"{life.book.name} {fact.what} was acknowledged, and is lost")
+            elif fact.what == "made" and not (life.given_up or life.withdrawn):
+                self._is_listed(life, views.get(fact.booking), max(time, self._latest) if jumped else time)
+            view = views.get(fact.booking)
+            if view is not None and (fact.what == "unbooked" or fact.what in {date.start for date in view.dates}):
+                self._broken(f"{life.book.name} {fact.what} is listed, though it was given up")
+        self._look_at_conflicts(rcm, records, views)
+        states = Counter(f"dates {date.state} at the end" for view in views.values() for date in view.dates)
+        destroyed = sum(fact.destroyed for fact in self.facts.values())
+        return states + Counter({"acknowledged, and destroyed": destroyed})
+
+    def _is_listed(self, life: Life, view: BookingView | None, time: float) -> None:
+        told = {} if view is None else {date.start: date.state for date in view.dates}
+        for start in dates(_as_record(life.book), time + 1, time + WINDOW - 1):
+            if start not in life.dropped and told.get(start) not in ("open", "taken", "conflict"):
+                self._broken(f"{life.book.name} at {start} is lost: it is {told.get(start, 'not listed')}")
+
+    def _look_at_conflicts(self, rcm: Rcm, records: Records, views: Mapping[str, BookingView]) -> None:
+        """Of two that can't both be the one of better rank stands; that is told here of RCs that are not sharable."""
+        sharable = {rc.name for rc in rcm.core.status().rcs if rc.sharable or not rc.present}
+        stands, not_held = list[_Listed](), list[_Listed]()
+        for view in views.values():
+            record = records.get(view.id)
+            assert record is not None  # noqa: S101 - it is listed
+            for date in view.dates:
+                rcs = {date.bound.get(need, need) for need in view.needs} - sharable
+                listed = _Listed((-view.priority, record.made, view.id), date, rcs, view)
+                (not_held if date.state == "conflict" else stands).append(listed)
+        for one, other in combinations(stands, 2):
+            both = one.view.maintenance and other.view.maintenance
+            if not both and one.view.id != other.view.id and one.meets(other):
+                self._broken(f"{one.view.name} and {other.view.name} both stand: {one.date} {other.date}")
+        for one in not_held:
+            exact = not any(map(is_pattern, one.view.needs)) and sharable.isdisjoint(one.view.needs)
+            if exact and not any(other.rank < one.rank and one.meets(other) for other in stands):
+                self._broken(f"{one.view.name} at {one.date.start} is in conflict with none: {one.date.danger}")
+
+
+class _Listed(NamedTuple):
+    """A date, as the leader lists it."""
+
+    rank: tuple[int, Grant, str]
+    date: BookedDate
+    rcs: set[str]
+    view: BookingView
+
+    def meets(self, other: _Listed) -> bool:
+        one, two = self.date, other.date
+        return bool(self.rcs & other.rcs) and one.start < two.end and two.start < one.end
+
+
+def _as_record(book: Book) -> BookingRecord:
+    return BookingRecord(**{name: getattr(book, name) for name in Book.__struct_fields__})
