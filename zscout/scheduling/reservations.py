@@ -267,12 +267,13 @@ class Reservations:
 
     def _binding(self, rc: Rc, arc: Arc) -> tuple[list[Reservation], bool]:
         """The reservations of `rc` that `arc` has to respect: those before its own, and all that is booked as long as
-        its own time has not come. It would be early, which nobody has promised it: whether that is so."""
+        its own time has not come. It would be early, which nobody has promised it: whether any of these is there."""
         reserved = self.by_rc.get(rc.bit, [])
         own = next((number for number, one in enumerate(reserved) if one.arc is arc), len(reserved))
         if own == len(reserved) or reserved[own].start <= self._state.now:
             return reserved[:own], False
-        return [*reserved[:own], *(one for one in reserved[own + 1 :] if one.booked is not None)], True
+        later = [one for one in reserved[own + 1 :] if one.booked is not None]
+        return [*reserved[:own], *later], bool(later)
 
     def _together(self, rc: Rc, arc: Arc, before: list[Reservation]) -> list[HolderSet]:
         """Whom `rc` would have to carry beside `arc`, from now on: each time when another comes. Who gives way to that
