@@ -6,7 +6,6 @@ for 1,000 dates that are booked: a request that is granted at once, and one that
 from __future__ import annotations
 
 import argparse
-import asyncio
 import tempfile
 import time
 from collections.abc import Awaitable, Callable
