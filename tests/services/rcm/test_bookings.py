@@ -30,6 +30,7 @@ from zscout.messages import (
 )
 from zscout.services.bookings.keeper import MAX_SAVING, BookingKeeper
 from zscout.services.rcm.bookings import BookedDanger
+from zscout.services.bookings.records import MAX_BYTES
 from zscout.services.rcm.candidate import Candidate
 from zscout.types import Grant, Term
 
@@ -533,5 +534,22 @@ def test_a_booking_right_after_another_stands_though_fleet_time_is_slewed() -> N
             views = await fleet.bookings()
             assert states(views["next"]) == ["open"], f"at {fleet.time() - NOON:g}: {views['next'].dates}"
         assert states(views["first"]) == ["taken"]
+
+    run(story())
+
+
+def test_a_host_that_has_no_room_for_a_booking_does_not_keep_it() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        _, other = await led(fleet, "x", "y")
+        client = fleet.client("one")
+        await do(client, book("b", "robot/a", at=500), BookingView)
+        other._keeper.records.size = MAX_BYTES
+        with pytest.raises(Refusal, match="not_kept"):
+            await do(client, book("c", "robot/b", at=500), BookingView)
+        with pytest.raises(Refusal, match="not_kept"):
+            await do(client, Unbook("b"), BookingView)
+        other._keeper.records.size = 1_000
+        assert (await do(client, Unbook("b"), BookingView)).unbooked
 
     run(story())
