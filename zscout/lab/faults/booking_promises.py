@@ -110,6 +110,7 @@ class BookingPromises:
         """By term and date: since when its leader knows of it."""
         self._looked: dict[Term, int] = {}
         self._running: dict[Term, set[Grant]] = {}
+        self._present: dict[Term, set[str]] = {}
         self._records: dict[str, set[str]] = {}
         """By host: the bookings that it knew as it was looked at last."""
 
@@ -244,6 +245,10 @@ class BookingPromises:
         before, self._running[rcm.term] = self._running.get(rcm.term, set()), set(running)
         exclusive = {rc.name for rc in status.rcs if rc.present and not rc.sharable}
         has_it = {one.id for one in status.running}
+        # What has begun is kept as long only as all of it is there.
+        present = {rc.name for rc in status.rcs if rc.present}
+        there = present & self._present.get(rcm.term, set())
+        self._present[rcm.term] = present
         # For patterns others may be kept at any time.
         waiting = {
             name: (booking, by)
@@ -260,7 +265,7 @@ class BookingPromises:
                 if (
                     meet
                     and arc.request.priority <= booking.priority
-                    and rcs <= {rc.name for rc in status.rcs if rc.present}
+                    and (booking.start > arc.hold.start or rcs <= there)
                     and rcs & arc.needs.keys() & exclusive
                     and self._known[rcm.term][name] < began
                 ):
