@@ -553,3 +553,24 @@ def test_a_host_that_has_no_room_for_a_booking_does_not_keep_it() -> None:
         assert (await do(client, Unbook("b"), BookingView)).unbooked
 
     run(story())
+
+
+def test_a_booking_that_one_leader_could_not_keep_stands_where_another_one_has_it() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        _, y = await led(fleet, "x", "y")
+        here, there = fleet.client("here", "x"), fleet.client("there", "y")
+        fleet.part("y")
+        await until(lambda: y.rcm)
+        fleet.disks["x"].broken = True
+        with pytest.raises(Refusal, match="not_kept"):
+            await do(here, book("b", "robot/a", at=500), BookingView)
+        assert await fleet.bookings() == {}
+        fleet.disks["x"].broken = False
+        # Whoever asked asks again, and finds the leader of the other half.
+        await do(there, book("b", "robot/a", at=500), BookingView)
+        fleet.network.heal()
+        await asyncio.sleep(10)
+        assert states((await fleet.bookings())["b"]) == ["open"]
+
+    run(story())

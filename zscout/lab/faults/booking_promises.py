@@ -47,8 +47,6 @@ class Life:
     """Whether the program has asked to unbook it, whatever became of that."""
     dropped: set[Instant] = field(default_factory=set)
     """The dates that it has asked to give up."""
-    withdrawn: bool = False
-    """Whether the RCM that took it has said that nobody keeps it."""
 
     def dates(self) -> list[Instant]:
         return dates(_as_record(self.book), 0, last_end(_as_record(self.book)))
@@ -122,12 +120,9 @@ class BookingPromises:
     def booked(self, life: Life, view: BookingView) -> None:
         """An RCM has acknowledged it."""
         if view.unbooked:
-            if life.made and not life.given_up and not self.facts[life.book.id, "made"].destroyed:
-                self._broken(f"booking {life.book.name} was acknowledged, and is unbooked though nobody gave it up")
-            life.withdrawn = True
+            if not life.given_up:
+                self._broken(f"booking {life.book.name} is unbooked though nobody gave it up")
             return
-        if life.withdrawn:
-            self._broken(f"booking {life.book.name} was withdrawn, and is told as made again")
         life.made = True
         self._establish(life, "made")
 
@@ -316,7 +311,7 @@ class BookingPromises:
             record = records.get(fact.booking)
             if not fact.known_by(record):
                 self._broken(f"{life.book.name} {fact.what} was acknowledged, and is lost")
-            elif fact.what == "made" and not (life.given_up or life.withdrawn):
+            elif fact.what == "made" and not life.given_up:
                 self._is_listed(life, views.get(fact.booking), max(time, self._latest) if jumped else time)
             view = views.get(fact.booking)
             if view is not None and (fact.what == "unbooked" or fact.what in {date.start for date in view.dates}):
