@@ -106,6 +106,8 @@ class BookingPromises:
         """The latest fleet time that any leader has told."""
         self._known: dict[Term, dict[str, float]] = {}
         """By term and date: since when its leader knows of it."""
+        self._begun: dict[Term, float] = {}
+        """When each was seen first, or a little before: what is held for longer may be handed over in it."""
         self._looked: dict[Term, int] = {}
         self._running: dict[Term, set[Grant]] = {}
         self._present: dict[Term, set[str]] = {}
@@ -183,6 +185,7 @@ class BookingPromises:
             self._look_at_records(keeper)
         for host, rcm in leaders.items():
             self._look_at_time(host, rcm)
+            self._begun.setdefault(rcm.term, self._now() - GIVEN_UP)
             known = self._known.setdefault(rcm.term, {})
             first = not known
             claims = {booking.id: (booking, arc) for booking, arc in rcm.core.bookings()}
@@ -262,7 +265,7 @@ class BookingPromises:
                     and arc.request.priority <= booking.priority
                     and (booking.start > arc.hold.start or rcs <= there)
                     and rcs & arc.needs.keys() & exclusive
-                    and self._known[rcm.term][name] < began
+                    and max(self._known[rcm.term][name], self._begun[rcm.term]) < began
                 ):
                     booked = self.lives[name.partition("@")[0]].book.name
                     self._broken(f"{arc.name} begins what is not over by the date of {booked}: {name}")
@@ -273,7 +276,7 @@ class BookingPromises:
         status, now = rcm.core.arc(arc), self._inside(host, rcm.mesh.now)
         if status is None or status.hold is not None or booking.start > now:
             return False
-        known = self._now() - self._known[rcm.term][name]
+        known = self._now() - max(self._known[rcm.term][name], self._begun[rcm.term])
         rcs = {rc.name: rc for rc in rcm.core.status().rcs}
         for rc in status.needs:
             if rc not in rcs or not rcs[rc].present:
