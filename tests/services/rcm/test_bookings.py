@@ -29,6 +29,7 @@ from zscout.messages import (
     Unbook,
 )
 from zscout.services.bookings.keeper import MAX_SAVING, BookingKeeper
+from zscout.services.bookings.records import MAX_BYTES
 from zscout.services.rcm.bookings import BookedDanger
 from zscout.services.rcm.candidate import Candidate
 from zscout.types import Grant, Term
@@ -533,5 +534,43 @@ def test_a_booking_right_after_another_stands_though_fleet_time_is_slewed() -> N
             views = await fleet.bookings()
             assert states(views["next"]) == ["open"], f"at {fleet.time() - NOON:g}: {views['next'].dates}"
         assert states(views["first"]) == ["taken"]
+
+    run(story())
+
+
+def test_a_host_that_has_no_room_for_a_booking_does_not_keep_it() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        _, other = await led(fleet, "x", "y")
+        client = fleet.client("one")
+        await do(client, book("b", "robot/a", at=500), BookingView)
+        other._keeper.records.size = MAX_BYTES
+        with pytest.raises(Refusal, match="not_kept"):
+            await do(client, book("c", "robot/b", at=500), BookingView)
+        with pytest.raises(Refusal, match="not_kept"):
+            await do(client, Unbook("b"), BookingView)
+        other._keeper.records.size = 1_000
+        assert (await do(client, Unbook("b"), BookingView)).unbooked
+
+    run(story())
+
+
+def test_a_booking_that_one_leader_could_not_keep_stands_where_another_one_has_it() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        _, y = await led(fleet, "x", "y")
+        here, there = fleet.client("here", "x"), fleet.client("there", "y")
+        fleet.part("y")
+        await until(lambda: y.rcm)
+        fleet.disks["x"].broken = True
+        with pytest.raises(Refusal, match="not_kept"):
+            await do(here, book("b", "robot/a", at=500), BookingView)
+        assert await fleet.bookings() == {}
+        fleet.disks["x"].broken = False
+        # Whoever asked asks again, and finds the leader of the other half.
+        await do(there, book("b", "robot/a", at=500), BookingView)
+        fleet.network.heal()
+        await asyncio.sleep(10)
+        assert states((await fleet.bookings())["b"]) == ["open"]
 
     run(story())

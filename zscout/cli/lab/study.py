@@ -391,7 +391,7 @@ def faults(seeds: range, runs: int | None, guard: str | None, processes: int | N
 
     Candidates, RCs and clients as they are, on a mesh in memory: messages of each kind lost, late, twice;
     partitions, freezes, crashes, clocks that run apart. Every tenth run is one of 5 minutes with 20 programs,
-    and in every tenth nothing fails but nodes, in the steps of a component's move.
+    in every tenth nothing fails but nodes, in the steps of a component's move, and in every fifth programs book.
     One seed is one run, to the byte. Where a promise breaks, `--seed A` leaves out faults until no more can
     be left out, and prints what happened. Exit code 1: a promise was not kept.
 

@@ -47,8 +47,6 @@ class Life:
     """Whether the program has asked to unbook it, whatever became of that."""
     dropped: set[Instant] = field(default_factory=set)
     """The dates that it has asked to give up."""
-    withdrawn: bool = False
-    """Whether the RCM that took it has said that nobody keeps it."""
 
     def dates(self) -> list[Instant]:
         return dates(_as_record(self.book), 0, last_end(_as_record(self.book)))
@@ -108,8 +106,11 @@ class BookingPromises:
         """The latest fleet time that any leader has told."""
         self._known: dict[Term, dict[str, float]] = {}
         """By term and date: since when its leader knows of it."""
+        self._begun: dict[Term, float] = {}
+        """When each was seen first, or a little before: what is held for longer may be handed over in it."""
         self._looked: dict[Term, int] = {}
         self._running: dict[Term, set[Grant]] = {}
+        self._present: dict[Term, set[str]] = {}
         self._records: dict[str, set[str]] = {}
         """By host: the bookings that it knew as it was looked at last."""
 
@@ -121,12 +122,9 @@ class BookingPromises:
     def booked(self, life: Life, view: BookingView) -> None:
         """An RCM has acknowledged it."""
         if view.unbooked:
-            if life.made and not life.given_up and not self.facts[life.book.id, "made"].destroyed:
-                self._broken(f"booking {life.book.name} was acknowledged, and is unbooked though nobody gave it up")
-            life.withdrawn = True
+            if not life.given_up:
+                self._broken(f"booking {life.book.name} is unbooked though nobody gave it up")
             return
-        if life.withdrawn:
-            self._broken(f"booking {life.book.name} was withdrawn, and is told as made again")
         life.made = True
         self._establish(life, "made")
 
@@ -187,6 +185,7 @@ class BookingPromises:
             self._look_at_records(keeper)
         for host, rcm in leaders.items():
             self._look_at_time(host, rcm)
+            self._begun.setdefault(rcm.term, self._now() - GIVEN_UP)
             known = self._known.setdefault(rcm.term, {})
             first = not known
             claims = {booking.id: (booking, arc) for booking, arc in rcm.core.bookings()}
@@ -244,6 +243,10 @@ class BookingPromises:
         before, self._running[rcm.term] = self._running.get(rcm.term, set()), set(running)
         exclusive = {rc.name for rc in status.rcs if rc.present and not rc.sharable}
         has_it = {one.id for one in status.running}
+        # What has begun is kept as long only as all of it is there.
+        present = {rc.name for rc in status.rcs if rc.present}
+        there = present & self._present.get(rcm.term, set())
+        self._present[rcm.term] = present
         # For patterns others may be kept at any time.
         waiting = {
             name: (booking, by)
@@ -260,9 +263,9 @@ class BookingPromises:
                 if (
                     meet
                     and arc.request.priority <= booking.priority
-                    and rcs <= {rc.name for rc in status.rcs if rc.present}
+                    and (booking.start > arc.hold.start or rcs <= there)
                     and rcs & arc.needs.keys() & exclusive
-                    and self._known[rcm.term][name] < began
+                    and max(self._known[rcm.term][name], self._begun[rcm.term]) < began
                 ):
                     booked = self.lives[name.partition("@")[0]].book.name
                     self._broken(f"{arc.name} begins what is not over by the date of {booked}: {name}")
@@ -273,7 +276,7 @@ class BookingPromises:
         status, now = rcm.core.arc(arc), self._inside(host, rcm.mesh.now)
         if status is None or status.hold is not None or booking.start > now:
             return False
-        known = self._now() - self._known[rcm.term][name]
+        known = self._now() - max(self._known[rcm.term][name], self._begun[rcm.term])
         rcs = {rc.name: rc for rc in rcm.core.status().rcs}
         for rc in status.needs:
             if rc not in rcs or not rcs[rc].present:
@@ -311,7 +314,7 @@ class BookingPromises:
             record = records.get(fact.booking)
             if not fact.known_by(record):
                 self._broken(f"{life.book.name} {fact.what} was acknowledged, and is lost")
-            elif fact.what == "made" and not (life.given_up or life.withdrawn):
+            elif fact.what == "made" and not life.given_up:
                 self._is_listed(life, views.get(fact.booking), max(time, self._latest) if jumped else time)
             view = views.get(fact.booking)
             if view is not None and (fact.what == "unbooked" or fact.what in {date.start for date in view.dates}):

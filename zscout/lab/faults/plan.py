@@ -174,7 +174,7 @@ def draw_moves(seed: int, processes: Sequence[str], *, count: int, span: float) 
 
 
 def draw_for_bookings(seed: int, hosts: Sequence[str], span: float, drawn: Sequence[Fault]) -> list[Fault]:
-    """What endangers bookings most, beside the faults that are `drawn`: halves that both go on for some time, and what
+    """The faults that were `drawn`, and what endangers bookings most: halves that both go on for some time, and what
     becomes of disks and clocks."""
     rng = random.Random(f"bookings {seed}")  # noqa: S311
     # An answer on this key may be of any booking, and says nothing of what was asked.

@@ -216,7 +216,7 @@ class BookingHandler:
         return f"not all of {', '.join(date.record.needs)} are free at {told(date.start, date.record.zone)}: {why}"
 
     def _answer_kept(self, query: Query, record: BookingRecord, *, withdraw: bool = False) -> None:
-        """Answers once it is kept; `withdraw`: gives it up where it can't be."""
+        """Answers once it is kept; `withdraw`: forgets it where it can't be."""
         if self._keeping >= MAX_UNDECIDED:
             raise Refused("busy", f"{MAX_UNDECIDED} bookings are being kept already; ask again")
         self._keeping += 1
@@ -231,9 +231,10 @@ class BookingHandler:
         record = self._keeper.records.get(booking)
         if record is None or why:
             if record is not None and withdraw:
-                self._dates.change(record, unbooked=True)
+                # Not given up, which is final: another leader may have made it as well, or may have heard of it.
+                self._keeper.records.remove(booking)
                 self._dates.reconcile()
-            query.refuse(Refused("not_kept", f"nobody keeps this booking: {why}").problem)
+            query.refuse(Refused("not_kept", f"nobody else keeps this booking: {why}").problem)
             return
         query.answer(self._dates.view(record))
 

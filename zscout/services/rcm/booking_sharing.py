@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Final
 
 from zscout.keyexpr import Keys, Role
@@ -15,6 +15,7 @@ from zscout.mesh.supervision import Supervisor, done_within
 from zscout.messages import BookingRecord, BookingsKept, ShareBookings
 from zscout.services.bookings.fleet_clock import DIFFERS, FleetClock, agreed, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.bookings.records import merged
 from zscout.types import SECOND, HostName, Term
 
 log = logging.getLogger(__name__)
@@ -108,13 +109,13 @@ class BookingSharing:
         )
         answers = self._take(replies)
         me = mesh.me.host
-        if not sent or any(one.candidate and one.host != me for one in answers):
+        if not sent or any(one.candidate and one.host != me and _keeps(one, question, sent) for one in answers):
             self._why = ""
             return
         living = await mesh.living(mesh.keys.alive_any(Role.CANDIDATE), timeout=LOOK)
         others = sorted({token.host for token in living} - {me})
         if others:
-            self._why = f"{', '.join(others[:3])} may lead as well, and did not answer"
+            self._why = f"{', '.join(others[:3])} may lead as well, and did not take it"
         else:
             self._why = "" if saved else "no other host may lead, and this one has no disk for it"
 
@@ -132,3 +133,11 @@ class BookingSharing:
         time = self._clock.at(now) / SECOND
         self.clocks = {host: wall - time for host, wall in walls.items() if abs(wall - time) > DIFFERS}
         return answers
+
+
+def _keeps(one: BookingsKept, question: ShareBookings, sent: Mapping[str, BookingRecord]) -> bool:
+    """Whether that host knows all that it was `sent`: there may be no room for it."""
+    if one.digest == question.digest:
+        return True
+    known = {record.id: record for record in one.records}
+    return all(id_ in known and merged(known[id_], record) == known[id_] for id_, record in sent.items())
