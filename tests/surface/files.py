@@ -97,6 +97,11 @@ FLEET: Final[Mapping[str, Mapping[str, Key]]] = {
         "priority": Key(None, ("5",), ("1_000_001", '"5"')),
         "runtime": _number("0.0", "1", "31_622_400", "-1", "31_622_401"),
     },
+    "fair_shares": {
+        "half_life": _number("86_400.0", "60", "31_622_400", "59", "31_622_401"),
+        "weights": Key("{}", ("{ bob = 2 }",), ("{ bob = 0 }", '{ "a/b" = 1 }', "1")),
+        "patience": _number("3600.0", "142", "31_622_400", "141", "31_622_401"),
+    },
     "quotas.bob": {
         "arcs": Key(None, ("5",), ("-1", "100_001", '"5"')),
         "rcs": Key(None, ("5",), ("-1", "100_001", '"5"')),
@@ -125,16 +130,24 @@ NODE: Final[Mapping[str, Mapping[str, Key]]] = {
         "allow_remote": Key("false", ('true\nbind = "0.0.0.0"',), TRUTH),
         "frames": _number("2.0", "0", "30", "-1", "31"),
         "limit": _number("5000", "300", "1_000_000", "299", "1_000_001"),
+        "past": _number("86400.0", "0", "2_678_400", "-1", "2_678_401"),
     },
     "metrics": {
         "bind": Key('"127.0.0.1"', ('"::1"', '"localhost"\nport = 9'), ('"0.0.0.0"', '"anvil"')),
         "port": _number("9464", "1", "65_535", "0", "65_536"),
         "allow_remote": Key("false", ('true\nbind = "0.0.0.0"',), TRUTH),
     },
+    "calendar": {
+        "bind": Key('"127.0.0.1"', ('"::1"', '"localhost"\nport = 9'), ('"0.0.0.0"', '"anvil"')),
+        "port": _number("9465", "1", "65_535", "0", "65_536"),
+        "allow_remote": Key("false", ('true\nbind = "0.0.0.0"',), TRUTH),
+    },
     "notify": {
         "urls": Key("[]", ('["json://localhost"]',), ('"json://localhost"', '["none://a:secret@b"]', '["a:secret@b"]')),
         "events": Key(
-            '["yours_now", "preempted", "certificate_ends"]', ('["preempted"]',), ('["ended"]', '"preempted"')
+            '["yours_now", "preempted", "booking_in_danger", "certificate_ends"]',
+            ('["preempted"]',),
+            ('["ended"]', '"preempted"'),
         ),
         "users": Key(None, ('{ ada = ["json://localhost"] }',), ('{ ada = "json://localhost" }', '["ada"]')),
         "after": _number("60.0", "0", "86_400", "-1", "86_401"),
