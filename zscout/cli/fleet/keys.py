@@ -53,8 +53,9 @@ def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str,
     match token.role:
         case Role.RCM:
             found = [
-                ("query", own.schedule_any, "request, cancel, release, hand over"),
+                ("query", own.schedule_any, "request, cancel, release, hand over, book, unbook, slots"),
                 ("query", own.rcm_state, "who holds, who waits and why"),
+                ("query", own.rcm_bookings, "what is booked"),
                 ("put", own.grants, "holders of each RC touched, revocations, heartbeat"),
                 ("put", own.notice_any, "what becomes of each ARC, to its client"),
                 ("query", own.rank, "the best hosts for a component"),
@@ -85,6 +86,7 @@ def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str,
             found = [("hear", own.grants, "who holds what"), ("hear", own.placements, "how components stand")]
             if token.role == Role.CANDIDATE:
                 found.append(("query", own.history_any(token.host), "holds that are over, if it keeps a journal"))
+                found.append(("query", own.bookings(token.host), "bookings that it keeps"))
         case _:
             found = []
     return [{"how": how, "key": key, "what": what} for how, key, what in found]
