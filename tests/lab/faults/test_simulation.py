@@ -109,3 +109,11 @@ def study(seeds: str, *more: str) -> subprocess.CompletedProcess[str]:
     program = "import sys; from zscout.cli.main import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "study", "faults", "--seed", seeds, "--json", *more]
     return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+def test_only_runs_of_bookings_are_counted_where_those_are_wanted() -> None:
+    told = json.loads(study("2", "--runs", "1", "--bookings").stdout)
+    assert (told["seed"], told["counts"]["booked"] > 5) == (3, True)
+    done = study("5-7", "--bookings")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "in none of these runs programs book" in done.stderr
