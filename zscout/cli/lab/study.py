@@ -6,6 +6,7 @@ import dataclasses
 import sys
 from collections.abc import Callable
 from functools import partial
+from itertools import count, islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -384,9 +385,12 @@ def shares(seeds: range, cases: int, processes: int | None, as_json: bool) -> No
 @seed_option("0-99", "One run, with its transcript; or those of seeds A to B.", MAX_FAULT_RUNS)
 @click.option("--runs", type=click.IntRange(1, MAX_FAULT_RUNS), help="So many runs, from the first seed on.")
 @click.option("--without", "guard", metavar="GUARD", help="Takes a guard of the protocol out (docs/promises.md).")
+@click.option("--bookings", is_flag=True, help="Only runs in which programs book; --runs counts these.")
 @jobs_option
 @common.json_option("Print one JSON object instead of tables.")
-def faults(seeds: range, runs: int | None, guard: str | None, processes: int | None, as_json: bool) -> int:
+def faults(
+    seeds: range, runs: int | None, guard: str | None, bookings: bool, processes: int | None, as_json: bool
+) -> int:
     """Runs a whole fleet under faults in virtual time, and checks every promise (docs/promises.md).
 
     Candidates, RCs and clients as they are, on a mesh in memory: messages of each kind lost, late, twice;
@@ -401,18 +405,24 @@ def faults(seeds: range, runs: int | None, guard: str | None, processes: int | N
       zscout study faults --seed 2000-2999 --json
       zscout study faults --seed 17
       zscout study faults --runs 200 --without promise
+      zscout study faults --runs 1000 --bookings
     """
-    if runs is not None:
-        seeds = range(seeds[0], seeds[0] + runs)
     from zscout.lab.faults.guards import GUARDS, without
     from zscout.lab.faults.runs import FaultRun, FaultStudy, print_report, run, shrink
-    from zscout.lab.faults.simulation import simulate
+    from zscout.lab.faults.simulation import Size, simulate
 
+    if runs is not None:
+        wanted = (seed for seed in count(seeds[0]) if not bookings or Size.of(seed).bookers)
+        chosen = list(islice(wanted, runs))
+    else:
+        chosen = [seed for seed in seeds if not bookings or len(seeds) == 1 or Size.of(seed).bookers]
     if guard is not None and guard not in GUARDS:
         raise BadInput(f"--without {quoted(guard)}: there is no such guard; write one of: {', '.join(GUARDS)}")
-    if len(seeds) == 1:
+    if not chosen:
+        raise BadInput("--seed: in none of these runs programs book; write more, or leave out --bookings")
+    if len(chosen) == 1:
         with without(guard):
-            result = shrink(simulate(seeds[0]))
+            result = shrink(simulate(chosen[0]))
         if as_json:
             terminal.print_json(
                 {name: getattr(result, name) for name in ("seed", "broken", "counts", "digest", "lines")}
@@ -430,7 +440,7 @@ def faults(seeds: range, runs: int | None, guard: str | None, processes: int | N
         for text in one.broken[:1]:  # at once: thousands of runs take an hour
             terminal.print_line(f"seed {one.seed} BROKEN {text}", sys.stderr)
 
-    common.run(run_trials(partial(run, guard=guard), list(seeds), processes, take))
+    common.run(run_trials(partial(run, guard=guard), chosen, processes, take))
     # Not `asdict`: in Python 3.11 it takes counters apart.
     _show(vars(found), None, partial(print_report, found), as_json=as_json)
     return 1 if found.broken else 0
