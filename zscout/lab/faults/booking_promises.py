@@ -186,9 +186,12 @@ class BookingPromises:
         for host, rcm in leaders.items():
             self._look_at_time(host, rcm)
             self._begun.setdefault(rcm.term, self._now() - GIVEN_UP)
+            first = rcm.term not in self._known
             known = self._known.setdefault(rcm.term, {})
-            first = not known
             claims = {booking.id: (booking, arc) for booking, arc in rcm.core.bookings()}
+            # What was in conflict with one that is over is known anew.
+            for name in known.keys() - claims.keys():
+                del known[name]
             for name in claims:
                 before = first and name.partition("@")[0] in self._records.get(host, ())
                 known.setdefault(name, 0.0 if before else self._now())
