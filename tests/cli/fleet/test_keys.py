@@ -12,6 +12,8 @@ from tests.cli.tools import Terminal, zscout_soon
 from tests.hang import HANG
 from tests.live.lab import Lab
 from zscout.messages import (
+    BookingsAsk,
+    BookingsTold,
     ComponentList,
     HostRanking,
     ListComponents,
@@ -54,9 +56,10 @@ def test_what_is_listed_lives_and_answers(tmp_path: Path) -> None:
             queries = [key["key"] for key in rcm["keys"] if key["how"] == "query"]
             assert queries[:2] == [f"{base}/rcm/schedule/*/*", f"{base}/rcm/state"]
             assert await client.mesh.ask_one(queries[1], StateAsk(), RcmState, timeout=HANG) is not None
-            assert queries[2:] == [f"{base}/balancer/rank", f"{base}/placer/component/*/*"]
-            placer = queries[3].replace("*/*", str(client.mesh.me))
-            assert await client.mesh.ask_one(queries[2], RankAsk(), HostRanking, timeout=HANG) is not None
+            assert queries[2:] == [f"{base}/rcm/bookings", f"{base}/balancer/rank", f"{base}/placer/component/*/*"]
+            placer = queries[4].replace("*/*", str(client.mesh.me))
+            assert await client.mesh.ask_one(queries[2], BookingsAsk(), BookingsTold, timeout=HANG) is not None
+            assert await client.mesh.ask_one(queries[3], RankAsk(), HostRanking, timeout=HANG) is not None
             assert await client.mesh.ask_one(placer, ListPlacements(), Placements, timeout=HANG) is not None
             (host,) = [key["key"] for key in alive["anvil", "node", "node"]["keys"]]
             assert await client.mesh.ask_one(host, ListComponents(), ComponentList, timeout=HANG) is not None

@@ -117,7 +117,7 @@ async def led(fleet: BookedFleet, *hosts: str) -> list[Candidate]:
     """Candidates, of which one leads, and two robots that count as there."""
     candidates = [fleet.candidate(host) for host in hosts]
     robots = [fleet.rc(f"robot/{name}") for name in "ab"]
-    await until(lambda: any(one.rcm for one in candidates))
+    await until(lambda: any(one.rcm is not None and one.rcm.bookings.settled for one in candidates))
     await fleet.joined(*robots)
     return candidates
 
@@ -378,6 +378,7 @@ def test_fleet_time_does_not_jump_in_a_reign() -> None:
         x = fleet.candidate("x")
         await until(lambda: x.rcm)
         assert x.rcm is not None
+        await until(lambda: x.rcm and x.rcm.bookings.settled)
         dates = x.rcm.bookings.dates
         assert dates.time == pytest.approx(fleet.time(), abs=0.1)
         fleet.candidate("y"), fleet.candidate("z")
@@ -572,5 +573,36 @@ def test_a_booking_that_one_leader_could_not_keep_stands_where_another_one_has_i
         fleet.network.heal()
         await asyncio.sleep(10)
         assert states((await fleet.bookings())["b"]) == ["open"]
+
+    run(story())
+
+
+def test_after_a_restart_of_all_hosts_nothing_is_decided_by_one_wrong_clock() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y", "z")
+        old = await led(fleet, "x", "y", "z")
+        client = fleet.client("one")
+        await do(client, book("b", "robot/a", at=300, patience=Decimal(30)), BookingView)
+        await do(client, book("c", "robot/b", at=400), BookingView)
+        await asyncio.sleep(1)
+        for one in old:
+            fleet.network.kill(one.mesh)
+        await asyncio.sleep(5)
+        # The first to be back is two days ahead, by which both would be over, and long forgotten.
+        fleet.ahead["x"] = 2 * 86_400
+        first = fleet.candidate("x")
+        await until(lambda: first.rcm)
+        assert first.rcm is not None
+        assert not first.rcm.bookings.settled
+        with pytest.raises(Refusal, match="busy"):
+            await do(client, book("d", "robot/a", at=900), BookingView)
+        others = [fleet.candidate("y"), fleet.candidate("z")]
+        await asyncio.sleep(5)
+        assert len([one for one in (first, *others) if one.rcm]) == 1
+        assert {name: states(view) for name, view in (await fleet.bookings()).items()} == {"b": ["open"], "c": ["open"]}
+        waits = await client.ask("mine", "robot/a", seconds=100, booking="b")
+        assert waits.state == "queued"
+        await asyncio.sleep(NOON + 301 - fleet.time())
+        assert client.notices[-1].state == "running"
 
     run(story())

@@ -225,7 +225,9 @@ class BookingPromises:
                 self._broken(f"{record.name} was given up or over on {keeper.mesh.me}, and is not any more")
 
     def _look_at_time(self, host: str, rcm: Rcm) -> None:
-        now, time = self._now(), self._inside(host, lambda: rcm.bookings.dates.time)
+        now, time = self._now(), self._inside(host, lambda: rcm.bookings.time)
+        if time is None:
+            return  # after a restart of all hosts it is found out first
         self._latest = max(self._latest, time)
         ahead = time - now
         if (before := self._led.get(rcm.term)) is not None:

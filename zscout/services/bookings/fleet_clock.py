@@ -1,6 +1,7 @@
 """Fleet time: what the leader's publications tell, so that all mean the same by a date. Pure.
 
-In a reign it never jumps: it is slewed by at most 1 % towards the median of the hosts' clocks, as `adjtime` does."""
+In a reign it never jumps once it is told: it is slewed by at most 1 % towards the median of the hosts' clocks, as
+`adjtime` does."""
 
 from __future__ import annotations
 
@@ -33,8 +34,7 @@ class FleetClock:
 
     def __init__(self, time: Ns, now: Ns) -> None:
         """`time`: ns since 1970 (UTC) that it is at `now`."""
-        self._offset = self._aim = time - now
-        self._since = now
+        self.step(time, now)
 
     def at(self, now: Ns) -> Ns:
         """Fleet time, in ns since 1970 (UTC)."""
@@ -43,6 +43,11 @@ class FleetClock:
     def local(self, time: Ns, now: Ns) -> Ns:
         """When it will be that fleet time on the host's clock, if nothing is slewed from now on."""
         return time - self._slewed(now)
+
+    def step(self, time: Ns, now: Ns) -> None:
+        """It is `time` at `now`: before anybody goes by it."""
+        self._offset = self._aim = time - now
+        self._since = now
 
     def aim(self, time: Ns, now: Ns) -> None:
         """It should be `time` at `now`: goes there slowly."""

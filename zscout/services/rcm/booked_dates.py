@@ -83,9 +83,11 @@ class BookedDates:
         emit: Callable[..., None],
         vote: Callable[[Iterable[Propose]], None],
         changed: Callable[[Iterable[BookingRecord]], None],
+        settled: Callable[[], bool],
     ) -> None:
+        """Before fleet time is `settled` no date is over."""
         self._core, self._records, self.clock, self._now = core, records, clock, now
-        self._emit, self._vote, self._changed = emit, vote, changed
+        self._emit, self._vote, self._changed, self._settled = emit, vote, changed, settled
         self._strange = SparseLog(log, now)
         self._conflicts: dict[str, str] = {}
         """Dates that are not in the core, with the one that stands; nothing where no RC of a pattern is free."""
@@ -226,8 +228,14 @@ class BookedDates:
         if abs(moved) < REDATED:
             return
         self._dated_by = ahead
-        known = [booking for booking, _ in self._core.bookings()]
-        if events := [Redated(one.id, one.start + moved) for one in known if one.start > now]:
+        known = self._core.bookings()
+        events: list[Event] = [Redated(one.id, one.start + moved) for one, _ in known if one.start > now]
+        if not self._settled():
+            # Nobody has gone by it yet: what seemed to have begun may be to come.
+            begun = [one.id for one, taken in known if taken is None and one.start <= now]
+            dates_ = filter(None, map(self.date, begun))
+            events += [*map(Unbooked, begun), *filter(None, map(self._booked, dates_))]
+        if events:
             self._emit(*events)
 
     def number(self) -> Grant:
@@ -257,11 +265,11 @@ class BookedDates:
                     self._danger.pop(name, None)
                 case BookingThreatened(booking=name, reason=reason):
                     self._danger[name] = str(reason)
-        for booking, starts in over.items():
+        for booking, starts in over.items() if self._settled() else ():
             if (record := self._records.get(booking)) is not None:
                 self.change(record, over=sorted({*record.over, *starts}))
         votes = self._waits_for_votes and any(isinstance(event, (Vote, VoteOverdue)) for event in events)
-        return bool(over) or votes or any(isinstance(event, RcJoined) for event in events)
+        return bool(over and self._settled()) or votes or any(isinstance(event, RcJoined) for event in events)
 
     def dangers(self) -> dict[str, str]:
         """By date, as the core calls it: what may keep it from its start, in words."""

@@ -84,9 +84,11 @@ class BookingHandler:
         supervisor: Supervisor,
         emit: Callable[..., None],
         check_door: Callable[[Mapping[str, Amounts]], None],
+        settled: Callable[[], bool],
     ) -> None:
         self._fleet, self._core, self._keeper, self._dates, self._sharing = fleet, core, keeper, dates_, sharing
         self._authority, self._supervisor, self._emit, self._check_door = authority, supervisor, emit, check_door
+        self._settled = settled
         self._now, self._keys = keeper.mesh.now, keeper.mesh.keys
         self.runtimes: RuntimeEstimator | None = None
         """What is known of how long holds last, for hints."""
@@ -101,6 +103,8 @@ class BookingHandler:
         if self._fleet.strategy != "adaptive":
             words = f'this fleet schedules by "{self._fleet.strategy}", which keeps no bookings; only "adaptive" does'
             raise Refused("wrong_strategy", words)
+        if not self._settled():
+            raise Refused("busy", "after a restart of the whole fleet its dates are not known yet; ask again")
         sender = self._keys.sender_of(query.key)
         match query.message:
             case Book():

@@ -49,10 +49,13 @@ class BookingSharing:
         supervisor: Supervisor,
         on_news: Callable[[], None],
         on_shared: Callable[[], None],
+        settled: Callable[[], bool],
     ) -> None:
-        """`on_news` is called when others told of what was not known here, `on_shared` each time all were asked."""
+        """`on_news` is called when others told of what was not known here, `on_shared` each time all were
+        asked. Before it is `settled` fleet time is what most clocks say, and nothing is forgotten by it."""
         self._mesh, self._term, self._keeper, self._clock = mesh, term, keeper, clock
         self._supervisor, self._on_news, self._on_shared = supervisor, on_news, on_shared
+        self._settled = settled
         self._unshared: dict[str, BookingRecord] = {}
         self._behind = True
         """Whether some host may not have all that is known here."""
@@ -99,9 +102,10 @@ class BookingSharing:
         """Tells all keepers, and hears what they know. `_why` is empty then if what was told is kept."""
         keeper, mesh = self._keeper, self._mesh
         sent, self._unshared = self._unshared, {}
-        time = self._clock.at(mesh.now()) / SECOND
-        # All forget by the time of one question: else what one has forgotten came back from another.
-        keeper.records.forget_old(time)
+        time = self._clock.at(mesh.now()) / SECOND if self._settled() else None
+        if time is not None:
+            # All forget by the time of one question: else what one has forgotten came back from another.
+            keeper.records.forget_old(time)
         records = list(keeper.records) if self._behind else list(sent.values())
         question = ShareBookings(self._term, keeper.records.digest(), records, time)
         saved, replies = await asyncio.gather(
@@ -129,7 +133,10 @@ class BookingSharing:
             self._on_news()
             self._news.set()
         walls = {one.host: one.wall for one in answers} | {self._mesh.me.host: self._keeper.wall()}
-        self._clock.aim(agreed(map(wall_ns, walls.values()), self._clock.at(now)), now)
+        if self._settled():
+            self._clock.aim(agreed(map(wall_ns, walls.values()), self._clock.at(now)), now)
+        else:
+            self._clock.step(agreed(map(wall_ns, walls.values())), now)
         time = self._clock.at(now) / SECOND
         self.clocks = {host: wall - time for host, wall in walls.items() if abs(wall - time) > DIFFERS}
         return answers

@@ -23,6 +23,8 @@ from zscout.types import SECOND, ArcId, Ns, Params, Term
 
 log = logging.getLogger(__name__)
 
+SLACK: Final = 0.01
+"""Seconds: timers may be a little early."""
 LASTS: Final = 3.0
 """Seconds that a danger is waited for to pass: after a change of leader RCs come one after the other."""
 
@@ -64,13 +66,23 @@ class Bookings:
             for proposal in proposals:
                 propose(proposal)
 
-        def redate() -> None:
-            self.dates.redate()
-
-        self._sharing = BookingSharing(mesh, term, keeper, self.clock, supervisor, self._on_news, redate)
-        self.dates = BookedDates(core, keeper.records, self.clock, mesh.now, emit, vote, self._sharing.tell)
+        self._sharing = BookingSharing(
+            mesh, term, keeper, self.clock, supervisor, self._on_news, self._redate, lambda: self.settled
+        )
+        self.dates = BookedDates(
+            core, keeper.records, self.clock, mesh.now, emit, vote, self._sharing.tell, lambda: self.settled
+        )
         self.handler = BookingHandler(
-            fleet, core, keeper, self.dates, self._sharing, authority, supervisor, emit, check_door
+            fleet,
+            core,
+            keeper,
+            self.dates,
+            self._sharing,
+            authority,
+            supervisor,
+            emit,
+            check_door,
+            lambda: self.settled,
         )
         self._reconciling = False
         self._told: dict[str, str] = {}
@@ -84,6 +96,11 @@ class Bookings:
     def settled(self) -> bool:
         """Whether the dates of the fleet are known: after a restart of all its hosts, each knows its own only."""
         return self._known or self._mesh.now() >= self.settles_at
+
+    @property
+    def time(self) -> float | None:
+        """Fleet time, in seconds since 1970 (UTC), as others may go by it; None: it is not settled."""
+        return self.dates.time if self.settled else None
 
     def recovered(self, taken: Collection[str]) -> list[Event]:
         """The events by which the core knows of all dates; `taken`: those that ARCs have taken up."""
@@ -99,6 +116,8 @@ class Bookings:
         self._keeper.on_shared = self._on_shared
         self._sharing.start()
         self._on_news()
+        if not self.settled:
+            self._supervisor.call_later((self.settles_at - mesh.now()) / SECOND + SLACK, self._on_news)
 
     def close(self) -> None:
         self._keeper.on_shared = lambda: None
@@ -129,6 +148,9 @@ class Bookings:
         """One that led elsewhere has told of its bookings before it stepped down."""
         self._sharing.catch_up()
         self._on_news()
+
+    def _redate(self) -> None:
+        self.dates.redate()
 
     def _reconcile(self) -> None:
         self._reconciling = False

@@ -405,7 +405,7 @@ class Rcm:
         now, charged = self.mesh.now(), dict[str, float]()
         if now >= self._told_charged + TELL_CHARGED:
             self._told_charged, charged = now, self.core.charged()
-        time = self.bookings.dates.time
+        time = self.bookings.time
         self._grants.put(
             messages.Grants(self.term, number, self.seq, every, rcs, revoked, instances, [*begun], time, charged)
         )
