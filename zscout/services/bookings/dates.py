@@ -6,6 +6,7 @@ section 3.3.5, which is what Python's `fold=0` means."""
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import datetime, timedelta
 from functools import lru_cache
 from itertools import dropwhile, takewhile
@@ -56,3 +57,10 @@ def _repeated(booking: BookingRecord, after: float) -> Iterator[Instant]:
             return
         yield at
         count += 1
+
+
+def told(time: float, zone: str) -> str:
+    """An instant, for people who live in that zone."""
+    with suppress(ValueError, OverflowError):
+        return datetime.fromtimestamp(time, zone_of(zone)).strftime("%Y-%m-%d %H:%M:%S %Z")
+    return f"{time:.0f} s after 1970"

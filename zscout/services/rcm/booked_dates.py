@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Iterable
+from functools import partial
 from typing import NamedTuple
 
 from msgspec.structs import replace
@@ -34,8 +35,9 @@ from zscout.scheduling.booking import (
 )
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Effect, Event, Propose, Rc, RcJoined, Vote, VoteOverdue
+from zscout.scheduling.reason import Reason
 from zscout.scheduling.votes import HolderSet
-from zscout.services.bookings.dates import dates
+from zscout.services.bookings.dates import dates, told
 from zscout.services.bookings.fleet_clock import FleetClock
 from zscout.services.bookings.records import Records
 from zscout.types import SECOND, ArcId, Grant, Need, Ns, RcName
@@ -263,13 +265,16 @@ class BookedDates:
                     over.setdefault(booking, []).append(int(start))
                 case BookingThreatened(booking=name, reason=None):
                     self._danger.pop(name, None)
-                case BookingThreatened(booking=name, reason=reason):
-                    self._danger[name] = str(reason)
+                case BookingThreatened(name, Reason() as reason) if (date := self.date(name)) is not None:
+                    self._danger[name] = reason.text(partial(self._told, date.record.zone))
         for booking, starts in over.items() if self._settled() else ():
             if (record := self._records.get(booking)) is not None:
                 self.change(record, over=sorted({*record.over, *starts}))
         votes = self._waits_for_votes and any(isinstance(event, (Vote, VoteOverdue)) for event in events)
         return bool(over and self._settled()) or votes or any(isinstance(event, RcJoined) for event in events)
+
+    def _told(self, zone: str, time: Ns) -> str:
+        return told(self.to_fleet(time) / SECOND, zone)
 
     def dangers(self) -> dict[str, str]:
         """By date, as the core calls it: what may keep it from its start, in words."""

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import datetime
 from typing import Final, TypeAlias
 
 from zscout.config.fleet import Fleet
@@ -40,7 +38,7 @@ from zscout.scheduling.core import Core
 from zscout.scheduling.model import Tick
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.services.authority import Authority
-from zscout.services.bookings.dates import DAY, dates, zone_of
+from zscout.services.bookings.dates import DAY, dates, told, zone_of
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.rcm.booked_dates import MAX_CLAIMS, BookedDates, Date
 from zscout.services.rcm.booking_sharing import BookingSharing
@@ -385,13 +383,6 @@ def check_needs(needs: Mapping[str, Amounts], most: int) -> None:
             raise ValueError(f"{need} has more than {MAX_PARAMS} parameters")
         for parameter in params:
             check_name(parameter, f"parameter of {need}")
-
-
-def told(time: float, zone: str) -> str:
-    """An instant, for people who live in that zone."""
-    with suppress(ValueError, OverflowError):
-        return datetime.fromtimestamp(time, zone_of(zone)).strftime("%Y-%m-%d %H:%M:%S %Z")
-    return f"{time:.0f} s after 1970"
 
 
 def _share(one: Booking, other: Booking) -> bool:
