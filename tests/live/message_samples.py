@@ -41,8 +41,8 @@ def sample(kind: inspect.Type, turn: int) -> Any:
             return [sample(of, turn)]
         case inspect.TupleType(item_types=types):
             return [sample(of, turn) for of in types]
-        case inspect.DictType(value_type=of):
-            return {"robot/x": sample(of, turn)}
+        case inspect.DictType(key_type=named, value_type=of):
+            return {"1" if isinstance(named, inspect.IntType) else "robot/x": sample(of, turn)}
         case inspect.StrType():
             return "a/b"
         case inspect.BytesType():

@@ -32,7 +32,7 @@ MISSED = {
     "once": 10,
     "sealed": 10,
     "copied": 3,
-    "unbooked": 13,
+    "unbooked": 164,
     "dates": 33,
     "merged": 3,
     "caught up": 4,

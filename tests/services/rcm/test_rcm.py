@@ -26,11 +26,9 @@ def test_a_grant_is_published_and_the_loser_told_while_its_answer_is_on_the_way(
         first = await survey.ask("survey", "robot/a")
         fleet.log.clear()
         await operator.ask("drive", "robot/a", priority=10)
-        assert fleet.log == [
-            ("all", "grants", "robot/a"),
-            ("survey", "notice", "survey queued"),
-            ("operator", "answer", "drive running"),
-        ]
+        # The first two are under way together, to different processes.
+        assert sorted(fleet.log[:2]) == [("all", "grants", "robot/a"), ("survey", "notice", "survey queued")]
+        assert fleet.log[2:] == [("operator", "answer", "drive running")]
         (preempted,) = survey.notices
         assert (preempted.outcome, preempted.by, preempted.grant) == ("preempted", "desk/operator/drive", first.grant)
         # Why it waits now is told a little later.
