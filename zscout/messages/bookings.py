@@ -190,13 +190,14 @@ class ShareBookings(Message, frozen=True):
 
 class BookingsKept(Message, frozen=True):
     """What a host keeps, once it is on its disk if it has one. `wall` is its clock's time, `time` that of the fleet as
-    it was last heard; `candidate`: it may lead."""
+    it was last heard, which has gone on for `time_age` seconds; `candidate`: it may lead."""
 
     host: str
     candidate: bool
     wall: WallTime
     digest: str
     time: WallTime | None = None
+    time_age: Elapsed = 0.0
     durable: bool = False
     records: Annotated[list[BookingRecord], msgspec.Meta(max_length=MAX_MERGED)] = []
     version: VersionText = ""

@@ -14,7 +14,7 @@ STEPS = st.lists(st.tuples(st.integers(0, 1_000 * SECOND), st.integers(-10_000 *
 
 @given(STEPS)
 def test_it_is_slewed_by_one_percent_at_most(steps: list[tuple[int, int]]) -> None:
-    clock, now = FleetClock(NOON, 0), 0
+    clock, now = FleetClock(NOON, 0, 0), 0
     time = clock.at(now)
     for span, off in steps:
         clock.aim(NOON + now + off, now)
@@ -27,7 +27,7 @@ def test_it_is_slewed_by_one_percent_at_most(steps: list[tuple[int, int]]) -> No
 
 @given(st.integers(-10_000 * SECOND, 10_000 * SECOND))
 def test_it_comes_to_what_it_aims_at_and_stays(off: int) -> None:
-    clock = FleetClock(NOON, 0)
+    clock = FleetClock(NOON, 0, 0)
     clock.aim(NOON + off, 0)
     arrives = abs(off) * SLEW
     assert clock.at(arrives) == NOON + off + arrives
@@ -36,7 +36,7 @@ def test_it_comes_to_what_it_aims_at_and_stays(off: int) -> None:
 
 @given(st.integers(0, 10_000 * SECOND), st.integers(-10 * SECOND, 10 * SECOND))
 def test_a_time_is_where_the_clock_says_it_is(now: int, off: int) -> None:
-    clock = FleetClock(NOON, 0)
+    clock = FleetClock(NOON, 0, 0)
     clock.aim(NOON + off, 0)
     assert clock.local(clock.at(now), now) == now
 

@@ -30,10 +30,12 @@ def test_a_publication_that_comes_late_turns_no_clock_back() -> None:
         assert keeper.time is None
         begun = asyncio.get_running_loop().time()
 
-        def hear(late: float, term: int = 1, ahead: float = 0.0) -> float:
-            """By how much fleet time here is behind what the leader means."""
-            true = NOON + ahead + asyncio.get_running_loop().time() - begun
-            keeper.hear(Grants(Term(term, "x"), 1, 1, 0.5, {}, [], time=true - late))
+        def hear(late: float, term: int = 1, ahead: float = 0.0, age: float = 100.0) -> float:
+            """By how much fleet time here is behind what the leader means. `age`: of its time at the beginning."""
+            gone = asyncio.get_running_loop().time() - begun
+            true = NOON + ahead + gone
+            held = max(0.0, age + gone - late)
+            keeper.hear(Grants(Term(term, "x"), 1, 1, 0.5, {}, [], time=true - late, time_age=held))
             assert keeper.time is not None
             return true - keeper.time / SECOND
 
@@ -44,10 +46,11 @@ def test_a_publication_that_comes_late_turns_no_clock_back() -> None:
         assert hear(5.0) == pytest.approx(0, abs=0.03)
         await asyncio.sleep(0.5)
         assert hear(0.0) == pytest.approx(0, abs=1e-3)
-        # What is slewed is followed, and a leader of another half is believed.
+        # What is slewed is followed. A leader of another half is believed if its time has gone on for longer.
         await asyncio.sleep(10)
         assert hear(0.0, ahead=-0.1) == pytest.approx(0, abs=1e-3)
-        assert hear(0.0, term=2, ahead=-60) == pytest.approx(0, abs=1e-3)
+        assert hear(0.0, term=2, ahead=-60, age=1) == pytest.approx(-60, abs=0.2)
+        assert hear(0.0, term=3, ahead=-60, age=900) == pytest.approx(0, abs=1e-3)
 
     run(story())
 

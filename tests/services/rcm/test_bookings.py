@@ -606,3 +606,28 @@ def test_after_a_restart_of_all_hosts_nothing_is_decided_by_one_wrong_clock() ->
         assert client.notices[-1].state == "running"
 
     run(story())
+
+
+def test_the_older_of_two_fleet_times_goes_on() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y", "z")
+        fleet.ahead["y"] = 7_200
+        x, y, z = await led(fleet, "x", "y", "z")
+        client = fleet.client("one")
+        await do(client, book("b", "robot/a", at=200, patience=Decimal(30)), BookingView)
+        # One that starts anew while it is cut off knows nothing but its own clock, by which that is over.
+        fleet.network.kill(y.mesh)
+        await asyncio.sleep(2)
+        again = fleet.candidate("y")
+        fleet.part("y")
+        await until(lambda: again.rcm and again.rcm.bookings.settled)
+        assert again.rcm is not None
+        assert again.rcm.bookings.dates.time == pytest.approx(fleet.time() + 7_200, abs=1)
+        fleet.network.kill(x.mesh)
+        fleet.network.heal()
+        await asyncio.sleep(70)
+        leaders = [one.rcm for one in (again, z) if one.rcm is not None]
+        assert [one.bookings.time for one in leaders] == [pytest.approx(fleet.time(), abs=2)]
+        assert states((await fleet.bookings())["b"]) == ["open"]
+
+    run(story())

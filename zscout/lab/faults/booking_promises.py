@@ -19,6 +19,7 @@ from zscout.scheduling.booking import Booking
 from zscout.services.bookings.dates import dates, last_end
 from zscout.services.bookings.keeper import BookingKeeper, Disk
 from zscout.services.bookings.records import KEEP, Records
+from zscout.services.rcm.booking_sharing import SAME
 from zscout.types import SECOND, ArcId, Grant, Ns, Term
 
 if TYPE_CHECKING:
@@ -98,6 +99,10 @@ class BookingPromises:
         self.facts: dict[tuple[str, Instant | str], Fact] = {}
         self._final: dict[BookingKeeper, dict[str, BookingRecord]] = {}
         """What each process knew of bookings as it was looked at last."""
+        self._since: dict[Term, Ns] = {}
+        """By term: since when its fleet time had gone on, on its leader's clock."""
+        self._stepped = -1.0
+        """When a leader last took over an older fleet time."""
         self._led: dict[Term, tuple[float, float]] = {}
         """By term: when its leader was looked at last, and by how much fleet time was ahead of virtual time then."""
         self._heard: set[str] = set()
@@ -229,8 +234,13 @@ class BookingPromises:
         if time is None:
             return  # after a restart of all hosts it is found out first
         self._latest = max(self._latest, time)
-        ahead = time - now
-        if (before := self._led.get(rcm.term)) is not None:
+        ahead, since = time - now, self._inside(host, lambda: rcm.bookings.clock.since)
+        older = since < self._since.setdefault(rcm.term, since) - SAME * SECOND
+        self._since[rcm.term] = since
+        if older:
+            # It began where nobody knew the time of the others, and has met them.
+            self._stepped = now
+        elif (before := self._led.get(rcm.term)) is not None:
             at, then = before
             if abs(ahead - then) > RUNS_APART * (now - at) + 1e-6:
                 self._broken(f"fleet time jumps by {ahead - then:g} s in term {rcm.term.counter}")
@@ -246,6 +256,8 @@ class BookingPromises:
         status, local = rcm.core.status(), self._inside(host, rcm.mesh.now)
         running = {one.hold.grant: one for one in status.running if one.hold and one.hold.grant.term == rcm.term}
         before, self._running[rcm.term] = self._running.get(rcm.term, set()), set(running)
+        if self._now() - self._stepped < 1.0:
+            return  # its dates came just now
         exclusive = {rc.name for rc in status.rcs if rc.present and not rc.sharable}
         has_it = {one.id for one in status.running}
         # What has begun is kept as long only as all of it is there.

@@ -32,8 +32,9 @@ def agreed(times: Iterable[Ns], goes_on: Ns | None = None) -> Ns:
 class FleetClock:
     """Fleet time on one host's own clock, on which `now` always is."""
 
-    def __init__(self, time: Ns, now: Ns) -> None:
-        """`time`: ns since 1970 (UTC) that it is at `now`."""
+    def __init__(self, time: Ns, now: Ns, since: Ns) -> None:
+        """`time`: ns since 1970 (UTC) that it is at `now`; it has gone on since `since` on the own clock."""
+        self.since = since
         self.step(time, now)
 
     def at(self, now: Ns) -> Ns:
@@ -45,15 +46,15 @@ class FleetClock:
         return time - self._slewed(now)
 
     def step(self, time: Ns, now: Ns) -> None:
-        """It is `time` at `now`: before anybody goes by it."""
+        """It is `time` at `now`: before anybody goes by it, or where one that is older goes on elsewhere."""
         self._offset = self._aim = time - now
-        self._since = now
+        self._set = now
 
     def aim(self, time: Ns, now: Ns) -> None:
         """It should be `time` at `now`: goes there slowly."""
-        self._offset, self._since = self._slewed(now), now
+        self._offset, self._set = self._slewed(now), now
         self._aim = time - now
 
     def _slewed(self, now: Ns) -> Ns:
-        most = max(0, now - self._since) // SLEW
+        most = max(0, now - self._set) // SLEW
         return self._offset + max(-most, min(most, self._aim - self._offset))

@@ -30,13 +30,15 @@ from zscout.messages import (
     decode_told,
     encode,
 )
-from zscout.services.bookings.fleet_clock import SLEW
+from zscout.services.bookings.fleet_clock import DIFFERS, SLEW
 from zscout.services.bookings.records import Records
 from zscout.types import NO_TERM, SECOND, VERSION, Ns, Term
 
 log = logging.getLogger(__name__)
 
 FILE: Final = "bookings.json"
+SAME: Final = SECOND
+"""A time that has gone on for as long, but for this, is the same."""
 MAX_SAVING: Final = 16
 """Answers that wait for the disk at one time."""
 
@@ -98,6 +100,8 @@ class BookingKeeper:
         """What fleet time is more than the own clock, as it was heard last."""
         self._heard: tuple[Term, Ns] = NO_TERM, 0
         """In which term, and when, that was."""
+        self.since: Ns = 0
+        """Since when it has gone on, on the own clock."""
         self._saved = self.records.digest()
         """What the disk has."""
         self._saving = asyncio.Lock()
@@ -121,15 +125,20 @@ class BookingKeeper:
     # Fleet time
 
     def hear(self, grants: Grants) -> None:
-        """A publication of the leader. One that tells an earlier time than can be was late."""
+        """A publication of the leader. One that tells an earlier time than can be was late; and a leader that knew none
+        as it began tells a younger time than is known here, until it has heard of this one."""
         if grants.time is None:
             return
         now, (term, at) = self.mesh.now(), self._heard
-        offset = round(grants.time * SECOND) - now
-        if self._offset is not None and grants.term == term:
-            # Slewed as far as it may be, on a clock that is as far off again.
-            offset = max(offset, self._offset - 2 * (now - at) // SLEW)
-        self._offset, self._heard = offset, (grants.term, now)
+        offset, since = round(grants.time * SECOND) - now, now - round(grants.time_age * SECOND)
+        if self._offset is not None and since >= self.since - SAME:
+            if grants.term == term:
+                # Slewed as far as it may be, on a clock that is as far off again.
+                offset = max(offset, self._offset - 2 * (now - at) // SLEW)
+            elif abs(offset - self._offset) > DIFFERS * SECOND and since > self.since + SAME:
+                return
+            since = min(since, self.since)
+        self._offset, self._heard, self.since = offset, (grants.term, now), since
 
     @property
     def time(self) -> Ns | None:
@@ -163,6 +172,7 @@ class BookingKeeper:
             self.wall(),
             own,
             time=None if heard is None else heard / SECOND,
+            time_age=0.0 if heard is None else (self.mesh.now() - self.since) / SECOND,
             durable=durable,
             records=[] if own == digest else list(self.records),
             version=VERSION,

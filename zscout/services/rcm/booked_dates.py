@@ -46,9 +46,10 @@ log = logging.getLogger(__name__)
 
 MAX_CLAIMS = 4_000
 """Dates of all bookings within the next 60 days that a leader keeps free."""
+STEPPED: Ns = SECOND
+"""By how much it is moved only where another time goes on."""
 REDATED: Ns = SECOND // 50
 """By how much fleet time is slewed before dates are put right."""
-OVER = (BookingState.USED, BookingState.LAPSED)
 
 
 class Date(NamedTuple):
@@ -85,11 +86,9 @@ class BookedDates:
         emit: Callable[..., None],
         vote: Callable[[Iterable[Propose]], None],
         changed: Callable[[Iterable[BookingRecord]], None],
-        settled: Callable[[], bool],
     ) -> None:
-        """Before fleet time is `settled` no date is over."""
         self._core, self._records, self.clock, self._now = core, records, clock, now
-        self._emit, self._vote, self._changed, self._settled = emit, vote, changed, settled
+        self._emit, self._vote, self._changed = emit, vote, changed
         self._strange = SparseLog(log, now)
         self._conflicts: dict[str, str] = {}
         """Dates that are not in the core, with the one that stands; nothing where no RC of a pattern is free."""
@@ -135,7 +134,7 @@ class BookedDates:
             maintenance=record.maintenance,
         )
 
-    def open_dates(self, record: BookingRecord) -> list[Date]:
+    def open_dates(self, record: BookingRecord, taken: Collection[str] = ()) -> list[Date]:
         """Those of a booking within the next 60 days that are not over."""
         if record.unbooked:
             return []
@@ -148,18 +147,29 @@ class BookedDates:
             self._strange.warning(record.id, "booking %s is not kept: %s", record.id, error)
             return []
         final = {*record.dropped, *record.over}
-        return [Date(record, start) for start in starts if start not in final]
+        left = [Date(record, start) for start in starts if start not in final]
+        return [date for date in left if date.id in taken or not self._lapsed(date)]
+
+    def _lapsed(self, date: Date) -> bool:
+        """Whether nobody took it up in time: that follows from the time alone, and is not kept."""
+        waits = date.record.runtime if date.record.maintenance else min(date.record.patience, date.record.runtime)
+        if self.local(date.start) + round(waits * SECOND) > self._now():
+            return False
+        kept = self._core.booking(date.id)
+        return kept is None or kept.arc is None
 
     # The core's claims
 
     def recovered(self, taken: Collection[str]) -> list[Event]:
         """The events by which a core that begins to lead knows of all dates; `taken`: those that ARCs have taken up."""
-        return [booked for date in self._all() if (booked := self._booked(date, taken=date.id in taken)) is not None]
+        return [
+            booked for date in self._all(taken) if (booked := self._booked(date, taken=date.id in taken)) is not None
+        ]
 
-    def _all(self) -> list[Date]:
+    def _all(self, taken: Collection[str] = ()) -> list[Date]:
         found = list[Date]()
         for record in sorted(self._records, key=lambda one: (-one.priority, one.made, one.id)):
-            found += self.open_dates(record)
+            found += self.open_dates(record, taken)
             if len(found) > MAX_CLAIMS:
                 self._strange.warning("", "more than %d dates are booked: the last are not kept", MAX_CLAIMS)
                 break
@@ -232,8 +242,8 @@ class BookedDates:
         self._dated_by = ahead
         known = self._core.bookings()
         events: list[Event] = [Redated(one.id, one.start + moved) for one, _ in known if one.start > now]
-        if not self._settled():
-            # Nobody has gone by it yet: what seemed to have begun may be to come.
+        if abs(moved) > STEPPED:
+            # Another time goes on: what seemed to have begun may be to come.
             begun = [one.id for one, taken in known if taken is None and one.start <= now]
             dates_ = filter(None, map(self.date, begun))
             events += [*map(Unbooked, begun), *filter(None, map(self._booked, dates_))]
@@ -258,20 +268,23 @@ class BookedDates:
     def note(self, events: Iterable[Event], effects: Iterable[Effect]) -> bool:
         """What became of dates in an instant; whether `reconcile` is to be called, in another one."""
         over: dict[str, list[Instant]] = {}
+        lapsed = False
         for effect in effects:
             match effect:
-                case BookingChanged(booking=name, state=state) if state in OVER:
+                case BookingChanged(state=BookingState.LAPSED):
+                    lapsed = True
+                case BookingChanged(booking=name, state=BookingState.USED):
                     booking, _, start = name.partition("@")
                     over.setdefault(booking, []).append(int(start))
                 case BookingThreatened(booking=name, reason=None):
                     self._danger.pop(name, None)
                 case BookingThreatened(name, Reason() as reason) if (date := self.date(name)) is not None:
                     self._danger[name] = reason.text(partial(self._told, date.record.zone))
-        for booking, starts in over.items() if self._settled() else ():
+        for booking, starts in over.items():
             if (record := self._records.get(booking)) is not None:
                 self.change(record, over=sorted({*record.over, *starts}))
         votes = self._waits_for_votes and any(isinstance(event, (Vote, VoteOverdue)) for event in events)
-        return bool(over and self._settled()) or votes or any(isinstance(event, RcJoined) for event in events)
+        return bool(over) or lapsed or votes or any(isinstance(event, RcJoined) for event in events)
 
     def _told(self, zone: str, time: Ns) -> str:
         return told(self.to_fleet(time) / SECOND, zone)

@@ -16,7 +16,7 @@ from zscout.messages import BookingRecord, BookingsKept, ShareBookings
 from zscout.services.bookings.fleet_clock import DIFFERS, FleetClock, agreed, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.bookings.records import merged
-from zscout.types import SECOND, HostName, Term
+from zscout.types import SECOND, HostName, Ns, Term
 
 log = logging.getLogger(__name__)
 
@@ -27,6 +27,8 @@ AGAIN: Final = 5.0
 SOON: Final = 0.02
 """Seconds that changes are gathered before they are shared."""
 TIMEOUT: Final = 2.0
+SAME: Final = 1.0
+"""Seconds: times that have gone on for as long, but for this, are the same."""
 LOOK: Final = 0.5
 """Seconds within which candidates that live are found."""
 
@@ -35,6 +37,13 @@ def credible(replies: Iterable[Reply[BookingsKept]], keys: Keys) -> list[Booking
     """What keepers answered, each for its own host."""
     told = [(reply.key, reply.message) for reply in replies if reply.message is not None]
     return [message for key, message in told if key == keys.bookings(message.host)]
+
+
+def oldest(answers: Iterable[BookingsKept]) -> tuple[float, Ns] | None:
+    """Of the fleet times that hosts have heard the one that has gone on for longest: for how many seconds, and it."""
+    told = [(one.time_age, wall_ns(one.time)) for one in answers if one.time is not None]
+    age = max((age for age, _ in told), default=None)
+    return None if age is None else (age, agreed(time for other, time in told if other > age - SAME))
 
 
 class BookingSharing:
@@ -56,6 +65,7 @@ class BookingSharing:
         self._mesh, self._term, self._keeper, self._clock = mesh, term, keeper, clock
         self._supervisor, self._on_news, self._on_shared = supervisor, on_news, on_shared
         self._settled = settled
+        self._begun = mesh.now()
         self._unshared: dict[str, BookingRecord] = {}
         self._behind = True
         """Whether some host may not have all that is known here."""
@@ -133,7 +143,12 @@ class BookingSharing:
             self._on_news()
             self._news.set()
         walls = {one.host: one.wall for one in answers} | {self._mesh.me.host: self._keeper.wall()}
-        if self._settled():
+        found, age = oldest(answers), (now - self._clock.since) / SECOND
+        if found is not None and found[0] > age + SAME and abs(found[1] - self._clock.at(now)) > DIFFERS * SECOND:
+            # This reign began where nobody knew the time of the others.
+            self._clock.since = now - round(found[0] * SECOND)
+            self._clock.step(found[1], now)
+        elif self._settled() or age > (now - self._begun) / SECOND + SAME:
             self._clock.aim(agreed(map(wall_ns, walls.values()), self._clock.at(now)), now)
         else:
             self._clock.step(agreed(map(wall_ns, walls.values())), now)

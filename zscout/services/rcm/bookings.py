@@ -18,7 +18,7 @@ from zscout.services.bookings.fleet_clock import FleetClock, agreed, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.rcm.booked_dates import BookedDates
 from zscout.services.rcm.booking_handler import BookingHandler
-from zscout.services.rcm.booking_sharing import BookingSharing
+from zscout.services.rcm.booking_sharing import BookingSharing, oldest
 from zscout.types import SECOND, ArcId, Ns, Params, Term
 
 log = logging.getLogger(__name__)
@@ -59,7 +59,8 @@ class Bookings:
         now, self._known = mesh.now(), _is_known(keeper, kept, fleet)
         self.settles_at: Ns = now + round(fleet.mesh.lease * SECOND)
         """When the dates of the fleet count as known though nobody has told more of them."""
-        self.clock = FleetClock(_time(keeper, kept), now)
+        time, age = _time(keeper, kept)
+        self.clock = FleetClock(time, now, now - round(age * SECOND))
         keeper.records.take(record for one in kept for record in one.records)
 
         def vote(proposals: Iterable[Propose]) -> None:
@@ -69,9 +70,7 @@ class Bookings:
         self._sharing = BookingSharing(
             mesh, term, keeper, self.clock, supervisor, self._on_news, self._redate, lambda: self.settled
         )
-        self.dates = BookedDates(
-            core, keeper.records, self.clock, mesh.now, emit, vote, self._sharing.tell, lambda: self.settled
-        )
+        self.dates = BookedDates(core, keeper.records, self.clock, mesh.now, emit, vote, self._sharing.tell)
         self.handler = BookingHandler(
             fleet,
             core,
@@ -178,14 +177,14 @@ class Bookings:
             self._sharing.catch_up()
 
 
-def _time(keeper: BookingKeeper, kept: Sequence[BookingsKept]) -> Ns:
-    """Fleet time as it goes on, as it was heard here or else elsewhere; where it was not, the median of the clocks."""
-    if (heard := keeper.time) is not None:
-        return heard
-    if heard_elsewhere := [wall_ns(one.time) for one in kept if one.time is not None]:
-        return agreed(heard_elsewhere)
+def _time(keeper: BookingKeeper, kept: Sequence[BookingsKept]) -> tuple[Ns, float]:
+    """Fleet time, and for how many seconds it has gone on: the oldest that was heard, here or elsewhere. Where nobody
+    has heard any it is found out now: the median of the clocks."""
+    found = oldest([*kept, keeper.told("", durable=False)])
+    if found is not None:
+        return found[1], found[0]
     walls = {one.host: one.wall for one in kept} | {keeper.mesh.me.host: keeper.wall()}
-    return agreed(map(wall_ns, walls.values()))
+    return agreed(map(wall_ns, walls.values())), 0.0
 
 
 def _is_known(keeper: BookingKeeper, kept: Sequence[BookingsKept], fleet: Fleet) -> bool:

@@ -405,9 +405,9 @@ class Rcm:
         now, charged = self.mesh.now(), dict[str, float]()
         if now >= self._told_charged + TELL_CHARGED:
             self._told_charged, charged = now, self.core.charged()
-        time = self.bookings.time
+        time, age = self.bookings.time, (now - self.bookings.clock.since) / SECOND
         self._grants.put(
-            messages.Grants(self.term, number, self.seq, every, rcs, revoked, instances, [*begun], time, charged)
+            messages.Grants(self.term, number, self.seq, every, rcs, revoked, instances, [*begun], time, age, charged)
         )
         self.seq, self._published = number, now
 
