@@ -42,6 +42,7 @@ from zscout.lab.faults.promises import LEFT_OVER, Promises
 from zscout.lab.faults.virtual_time import PROCESS, START, Process, VirtualTimeLoop
 from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.messages import MAX_COUNTER, Grants
+from zscout.scheduling.reason import ReasonCode
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.node.component_host import ComponentHost
 from zscout.services.rcm.absence import AT_ONCE
@@ -271,6 +272,16 @@ class Simulation:
             self.network.kill(mesh)
         return self.result
 
+    def _goes_round_dates(self) -> set[str]:
+        """Clients whose ARCs would run into what is booked: the dates of days to come may be near after a month."""
+        leaders = [one.rcm for one in self.candidates.values() if one.rcm is not None]
+        return {
+            arc.request.client
+            for rcm in leaders
+            for arc in rcm.core.status().queued
+            if arc.reason is not None and arc.reason.code in (ReasonCode.MAINTENANCE, ReasonCode.BOOKED)
+        }
+
     async def _served(self) -> None:
         """All faults are mended, and then all that was asked for is served."""
         await asyncio.sleep(self.size.span)
@@ -283,8 +294,10 @@ class Simulation:
             async with asyncio.timeout(SERVED_WITHIN):
                 await self.idle.wait()
         except TimeoutError:
-            waiting = ", ".join(f"{name} {arc}" for name, arcs in self.busy.items() for arc in sorted(arcs))
-            self.broken(f"not served within {SERVED_WITHIN:g} s: {waiting}")
+            excused = self._goes_round_dates()
+            late = [f"{name} {arc}" for name, arcs in self.busy.items() for arc in sorted(arcs) if name not in excused]
+            if late:
+                self.broken(f"not served within {SERVED_WITHIN:g} s: {', '.join(late)}")
         self.result.served_after = self.loop.now - mended
         await asyncio.sleep(LEFT_OVER)
         if self.bookers:
