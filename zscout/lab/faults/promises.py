@@ -6,7 +6,7 @@ leaders believe. Some hold only once they had time to come right: their clocks s
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from itertools import product
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
@@ -277,21 +277,26 @@ class Promises:
                     yield rc.name, "is held by", arc, "which its client has ended"
 
     def at_end(
-        self, clients: Mapping[str, Client], leaders: Mapping[str, Rcm], faults: Sequence[tuple[float, float]]
+        self,
+        clients: Mapping[str, Client],
+        leaders: Mapping[str, Rcm],
+        faults: Sequence[tuple[float, float]],
+        excused: Collection[str] = (),
     ) -> None:
-        """Everything was served, and `LEFT_OVER` is over. `faults`: when each began and was over."""
+        """Everything was served, and `LEFT_OVER` is over. `faults`: when each began and was over; `excused`: clients
+        that wait for good reason."""
         for at in self._begun:
             terms = sum(at <= other < at + TERMS_WITHIN for other in self._begun)
             felt = sum(begin < at + TERMS_WITHIN and end > at for begin, end in faults)
             if terms > TERMS_OF_A_FAULT * max(2, felt):
                 self._broken(f"{terms} terms began within {TERMS_WITHIN:g} s")
         for name, client in clients.items():
-            if left := {*client._store.arcs, *client._store.withdrawn}:
+            if name not in excused and (left := {*client._store.arcs, *client._store.withdrawn}):
                 self._broken(f"{name} still keeps {', '.join(sorted(left))}")
         for host, rcm in leaders.items():
             state, requests = rcm.core.status(), rcm.requests
             left = {arc.id for arc in (*state.running, *state.queued)} | requests.waiting.keys() | requests.given_up
-            if left:
+            if left := {arc for arc in left if arc.rpartition("/")[0] not in excused}:
                 self._broken(f"the leader on {host} still keeps {', '.join(sorted(left))}")
 
 

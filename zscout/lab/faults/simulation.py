@@ -180,6 +180,8 @@ class Simulation:
         self.clients |= dict.fromkeys(bookers)
         self.running: dict[str, tuple[Process, MemoryMesh]] = {}
         self.candidates: dict[str, Candidate] = {}
+        self.excused: set[str] = set()
+        """Clients that need not be served at the end."""
         self.keepers: dict[str, BookingKeeper] = {}
         """By host: those of processes that live."""
         self.rcs: dict[str, ResourceController] = {}
@@ -294,8 +296,10 @@ class Simulation:
             async with asyncio.timeout(SERVED_WITHIN):
                 await self.idle.wait()
         except TimeoutError:
-            excused = self._goes_round_dates()
-            late = [f"{name} {arc}" for name, arcs in self.busy.items() for arc in sorted(arcs) if name not in excused]
+            self.excused = self._goes_round_dates()
+            late = [
+                f"{name} {arc}" for name, arcs in self.busy.items() for arc in sorted(arcs) if name not in self.excused
+            ]
             if late:
                 self.broken(f"not served within {SERVED_WITHIN:g} s: {', '.join(late)}")
         self.result.served_after = self.loop.now - mended
@@ -303,7 +307,7 @@ class Simulation:
         if self.bookers:
             await self._bookings_settled()
         faults = [(START + fault.at, START + fault.at + fault.lasts + plan.RELINK) for fault in self.faults]
-        self.promises.at_end(self._alive(self.programs), self._leaders(), faults)
+        self.promises.at_end(self._alive(self.programs), self._leaders(), faults, self.excused)
         self.result.counts["terms"] += len(self.promises.terms)
 
     async def _bookings_settled(self) -> None:
