@@ -86,7 +86,7 @@ class Unbooked(Struct, frozen=True):
 
 
 class Redated(Struct, frozen=True):
-    """The date of a booking that has not begun is `start` from now on: the fleet's clock was slewed."""
+    """The date of a booking that is not held is `start` from now on: the fleet's clock was slewed."""
 
     booking: str
     start: Ns

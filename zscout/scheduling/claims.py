@@ -69,7 +69,7 @@ class Claims:
 
     def redate(self, booking: str, start: Ns) -> None:
         claim = self._state.claims.get(booking)
-        if claim is None or claim.booking.start <= self._state.now or claim.arc.hold is not None:
+        if claim is None or claim.arc.hold is not None:
             return
         claim.booking = replace(claim.booking, start=start)
         self._state.redated(claim)

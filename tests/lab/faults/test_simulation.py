@@ -33,7 +33,7 @@ MISSED = {
     "sealed": 10,
     "copied": 3,
     "unbooked": 164,
-    "dates": 33,
+    "dates": 103,
     "merged": 3,
     "caught up": 4,
     "one stands": 33,

@@ -232,23 +232,18 @@ class BookedDates:
         """Has RCs vote; `wanted` is not among the claims yet."""
         self._vote(self._core.ask_votes(unknown, wanted))
 
-    def redate(self) -> None:
-        """Puts right the dates that fleet time, which was slewed, has moved."""
+    def redate(self) -> bool:
+        """Puts right the dates that fleet time, which was slewed, has moved; whether another time goes on, by which
+        others may be to come."""
         now = self._now()
         ahead = self.clock.at(now) - now
         moved = self._dated_by - ahead
         if abs(moved) < REDATED:
-            return
+            return False
         self._dated_by = ahead
-        known = self._core.bookings()
-        events: list[Event] = [Redated(one.id, one.start + moved) for one, _ in known if one.start > now]
-        if abs(moved) > STEPPED:
-            # Another time goes on: what seemed to have begun may be to come.
-            begun = [one.id for one, taken in known if taken is None and one.start <= now]
-            dates_ = filter(None, map(self.date, begun))
-            events += [*map(Unbooked, begun), *filter(None, map(self._booked, dates_))]
-        if events:
+        if events := [Redated(one.id, one.start + moved) for one, _ in self._core.bookings()]:
             self._emit(*events)
+        return abs(moved) > STEPPED
 
     def number(self) -> Grant:
         """(term, seq) of what is made or changed now: above all that is known. Where all hosts were started anew terms

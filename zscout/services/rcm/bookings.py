@@ -149,7 +149,8 @@ class Bookings:
         self._on_news()
 
     def _redate(self) -> None:
-        self.dates.redate()
+        if self.dates.redate():
+            self._on_news()
 
     def _reconcile(self) -> None:
         self._reconciling = False
