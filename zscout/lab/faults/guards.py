@@ -189,8 +189,8 @@ async def _keep_later(self: BookingSharing, record: BookingRecord) -> str:
     return ""
 
 
-def _own_wall(keeper: BookingKeeper, _kept: Any) -> Ns:
-    return wall_ns(keeper.wall())
+def _own_wall(keeper: BookingKeeper, _kept: Any) -> tuple[Ns, float]:
+    return wall_ns(keeper.wall()), 0.0
 
 
 def _jumps(self: FleetClock, _now: Ns) -> Ns:
