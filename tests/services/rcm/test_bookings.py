@@ -631,3 +631,26 @@ def test_the_older_of_two_fleet_times_goes_on() -> None:
         assert states((await fleet.bookings())["b"]) == ["open"]
 
     run(story())
+
+
+def test_a_date_in_conflict_is_not_voted_on_again_and_again() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        await led(fleet, "x", "y")
+        radio = fleet.rc("radio/rf0")
+        await fleet.joined(radio)
+        here, there = fleet.client("here", "x"), fleet.client("there", "y")
+        fleet.part("y")
+        await asyncio.sleep(4)
+        await do(here, book("beside", "radio/rf0:1", at=500), BookingView)
+        await do(here, book("low", "radio/rf0:1", "robot/a", at=500), BookingView)
+        await do(there, book("high", "robot/a", at=500, priority=5), BookingView)
+        fleet.network.heal()
+        await asyncio.sleep(70)
+        assert states((await fleet.bookings())["low"]) == ["conflict"]
+        asked = len(radio.proposals)
+        await do(here, book("later", "radio/rf0:1", at=900), BookingView)
+        await asyncio.sleep(10)
+        assert len(radio.proposals) - asked < 10
+
+    run(story())

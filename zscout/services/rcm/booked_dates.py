@@ -92,6 +92,10 @@ class BookedDates:
         self._strange = SparseLog(log, now)
         self._conflicts: dict[str, str] = {}
         """Dates that are not in the core, with the one that stands; nothing where no RC of a pattern is free."""
+        self._judged: dict[str, tuple[str, int]] = {}
+        """In which situation each of those was found to be in conflict."""
+        self._joined = 0
+        """How many times an RC has joined."""
         self._danger: dict[str, str] = {}
         """Why dates may not be kept, in words."""
         self._dated_by: Ns = clock.at(now()) - now()
@@ -187,15 +191,27 @@ class BookedDates:
         wanted = {date.id: date for date in self._all()}
         known = {booking.id for booking, _ in self._core.bookings()}
         gone = [Unbooked(name) for name in known if name not in wanted]
-        coming = [self._booked(date) for name, date in wanted.items() if name not in known and not _unbound(date)]
+        missing = [date for name, date in wanted.items() if name not in known and not self._is_settled(name)]
+        coming = [self._booked(date) for date in missing if not _unbound(date)]
         if events := [*gone, *filter(None, coming)]:
             self._emit(*events)
-        for date in wanted.values():
-            if date.id not in known and _unbound(date):
+        for date in missing:
+            if _unbound(date):
                 self._bind(date, "")
         self._judge(wanted)
         self._conflicts = {name: by for name, by in self._conflicts.items() if name in wanted}
+        self._judged = {name: found for name, found in self._judged.items() if name in self._conflicts}
         self._danger = {name: why for name, why in self._danger.items() if name in wanted}
+
+    def _is_settled(self, name: str) -> bool:
+        """Whether a date is in conflict as it was when that was found: to enter it again would only ask RCs again for
+        votes that are forgotten as it goes."""
+        by = self._conflicts.get(name)
+        stands = by is not None and (not by or self._core.booking(by) is not None)
+        return stands and self._judged.get(name) == self._situation()
+
+    def _situation(self) -> tuple[str, int]:
+        return self._records.digest(), self._joined
 
     def _judge(self, wanted: dict[str, Date]) -> None:
         # What has begun was not moved as fleet time was slewed: what comes right after it would seem to meet it.
@@ -226,7 +242,7 @@ class BookedDates:
                 if (again := self._booked(Date(new, date.start))) is not None:
                     self._emit(again)
                 return
-        self._conflicts[date.id] = by
+        self._conflicts[date.id], self._judged[date.id] = by, self._situation()
 
     def ask(self, unknown: Iterable[tuple[Rc, HolderSet]], wanted: Booking | None = None) -> None:
         """Has RCs vote; `wanted` is not among the claims yet."""
@@ -260,7 +276,7 @@ class BookedDates:
         self._changed([new])
         return self._records.get(record.id) or new
 
-    def note(self, events: Iterable[Event], effects: Iterable[Effect]) -> bool:
+    def note(self, events: Collection[Event], effects: Iterable[Effect]) -> bool:
         """What became of dates in an instant; whether `reconcile` is to be called, in another one."""
         over: dict[str, list[Instant]] = {}
         lapsed = False
@@ -278,8 +294,9 @@ class BookedDates:
         for booking, starts in over.items():
             if (record := self._records.get(booking)) is not None:
                 self.change(record, over=sorted({*record.over, *starts}))
+        self._joined += (joined := sum(isinstance(event, RcJoined) for event in events))
         votes = self._waits_for_votes and any(isinstance(event, (Vote, VoteOverdue)) for event in events)
-        return bool(over) or lapsed or votes or any(isinstance(event, RcJoined) for event in events)
+        return bool(over) or lapsed or votes or bool(joined)
 
     def _told(self, zone: str, time: Ns) -> str:
         return told(self.to_fleet(time) / SECOND, zone)
