@@ -214,7 +214,7 @@ class BookedDates:
         return self._records.digest(), self._joined
 
     def _judge(self, wanted: dict[str, Date]) -> None:
-        # What has begun was not moved as fleet time was slewed: what comes right after it would seem to meet it.
+        # What is held was not moved as fleet time was slewed: what comes right after it would seem to meet it.
         starts = {name: self.local(date.start) for name, date in wanted.items()}
         found = self._core.overlaps(wanted, starts)
         self._waits_for_votes = bool(found.unknown)
@@ -234,6 +234,8 @@ class BookedDates:
             if found.unknown:
                 self._waits_for_votes = True
                 self.ask(found.unknown, booked.booking)
+                if not by:
+                    return  # it is looked at again when they are in
             elif found.found:
                 # Another of its dates may have been bound just now.
                 latest = self._records.get(date.record.id) or date.record

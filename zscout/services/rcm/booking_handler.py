@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 from zscout.config.fleet import Fleet
@@ -65,7 +65,6 @@ class _Undecided:
     decide: Callable[[], bool]
     """Tries; whether it is decided."""
     until: Ns = 0
-    silent: list[str] = field(default_factory=list)
 
 
 class BookingHandler:
