@@ -17,6 +17,7 @@ from zscout.keyexpr import is_pattern
 from zscout.messages import WINDOW, Book, BookedDate, BookingRecord, BookingView, Instant
 from zscout.scheduling.booking import Booking
 from zscout.services.bookings.dates import dates, last_end
+from zscout.services.bookings.fleet_clock import DIFFERS
 from zscout.services.bookings.keeper import BookingKeeper, Disk
 from zscout.services.bookings.records import KEEP, Records
 from zscout.services.rcm.booking_sharing import SAME
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 RUNS_APART: Final = 0.012
 """Of the time: by which fleet time may be faster or slower than virtual time, slewed on a clock that is not true."""
 AGREE: Final = 0.5
-"""Seconds by which the fleet time of a leader may differ from that of the one before, as it begins."""
+"""Seconds by which the fleet time of a leader may differ, as it begins, from one that it goes on."""
 AT_ITS_DATE: Final = 1.5
 """Seconds after its date, or after it was taken up if that was later, within which a booking is held."""
 NOT_EXACT: Final[Ns] = SECOND // 4
@@ -99,12 +100,10 @@ class BookingPromises:
         self.facts: dict[tuple[str, Instant | str], Fact] = {}
         self._final: dict[BookingKeeper, dict[str, BookingRecord]] = {}
         """What each process knew of bookings as it was looked at last."""
-        self._since: dict[Term, Ns] = {}
-        """By term: since when its fleet time had gone on, on its leader's clock."""
         self._stepped = -1.0
         """When a leader last took over an older fleet time."""
-        self._led: dict[Term, tuple[float, float]] = {}
-        """By term: when its leader was looked at last, and by how much fleet time was ahead of virtual time then."""
+        self._times: dict[Term, _FleetTime] = {}
+        """By term: that of its leader as it was looked at last."""
         self._heard: set[str] = set()
         """Hosts whose processes knew fleet time as they were looked at last."""
         self._latest = 0.0
@@ -115,7 +114,8 @@ class BookingPromises:
         """When each was seen first, or a little before: what is held for longer may be handed over in it."""
         self._looked: dict[Term, int] = {}
         self._running: dict[Term, set[Grant]] = {}
-        self._present: dict[Term, set[str]] = {}
+        self._present: dict[Term, dict[str, float]] = {}
+        """By term and RC that is present: since when."""
         self._records: dict[str, set[str]] = {}
         """By host: the bookings that it knew as it was looked at last."""
 
@@ -200,6 +200,9 @@ class BookingPromises:
             for name in claims:
                 before = first and name.partition("@")[0] in self._records.get(host, ())
                 known.setdefault(name, 0.0 if before else self._now())
+            if self._looked.get(rcm.term) != rcm.core.batches:
+                self._looked[rcm.term] = rcm.core.batches
+                self._look_at_grants(host, rcm, claims)
             for name, (booking, arc) in claims.items():
                 id_, _, start = name.partition("@")
                 record = self._keepers[host].records.get(id_)
@@ -207,9 +210,6 @@ class BookingPromises:
                     yield (host, "keeps", name, "for nobody: it was given up"), GIVEN_UP
                 elif calm and arc is not None and self._has_no_excuse(host, rcm, name, booking, arc):
                     yield (name, "is taken up, and its date has come, but", arc, "does not run"), AT_ITS_DATE
-            if self._looked.get(rcm.term) != rcm.core.batches:
-                self._looked[rcm.term] = rcm.core.batches
-                self._look_at_grants(host, rcm, claims)
         self._heard = {host for host, keeper in self._keepers.items() if keeper.time is not None}
         self._records = {host: {one.id for one in keeper.records} for host, keeper in self._keepers.items()}
 
@@ -234,36 +234,32 @@ class BookingPromises:
         if time is None:
             return  # after a restart of all hosts it is found out first
         self._latest = max(self._latest, time)
-        ahead, since = time - now, self._inside(host, lambda: rcm.bookings.clock.since)
-        older = since < self._since.setdefault(rcm.term, since) - SAME * SECOND
-        self._since[rcm.term] = since
-        if older:
-            # It began where nobody knew the time of the others, and has met them.
-            self._stepped = now
-        elif (before := self._led.get(rcm.term)) is not None:
-            at, then = before
-            if abs(ahead - then) > RUNS_APART * (now - at) + 1e-6:
-                self._broken(f"fleet time jumps by {ahead - then:g} s in term {rcm.term.counter}")
-        elif self._led and host in self._heard:
-            at, then = max(self._led.values())
-            if abs(ahead - then) > AGREE + 2 * RUNS_APART * (now - at):
-                text = f"fleet time is {ahead - then:g} s off that of {now - at:g} s ago, of another leader"
-                self._broken(f"{text}, as term {rcm.term.counter} begins")
-        self._led[rcm.term] = now, ahead
+        age = self._inside(host, lambda: rcm.mesh.now() - rcm.bookings.clock.since) / SECOND
+        told, before = _FleetTime(now, time - now, now - age), self._times.get(rcm.term)
+        if before is not None and told.since >= before.since - SAME:
+            if abs(told.ahead - before.ahead) > RUNS_APART * (now - before.at) + 1e-6:
+                self._broken(f"fleet time jumps by {told.ahead - before.ahead:g} s in term {rcm.term.counter}")
+        elif before is not None or host in self._heard:
+            if before is not None:
+                # It began where nobody knew the time of the others, and has met them.
+                self._stepped = now
+            known = self._times.values()
+            if not (any(map(told.agrees, known)) and any(map(told.goes_on, known))):
+                self._broken(f"fleet time is {time:.3f} in term {rcm.term.counter}: none that was told before goes on")
+        self._times[rcm.term] = told
 
     def _look_at_grants(self, host: str, rcm: Rcm, claims: Mapping[str, tuple[Booking, ArcId | None]]) -> None:
         """Nobody starts what would not be over by the date of a booking of its rank that its leader knew of."""
         status, local = rcm.core.status(), self._inside(host, rcm.mesh.now)
+        present = self._present.get(rcm.term, {})
+        there = {rc.name for rc in status.rcs if rc.present and rc.name in present}
+        self._present[rcm.term] = {rc.name: present.get(rc.name, self._now()) for rc in status.rcs if rc.present}
         running = {one.hold.grant: one for one in status.running if one.hold and one.hold.grant.term == rcm.term}
         before, self._running[rcm.term] = self._running.get(rcm.term, set()), set(running)
         if self._now() - self._stepped < 1.0:
             return  # its dates came just now
         exclusive = {rc.name for rc in status.rcs if rc.present and not rc.sharable}
         has_it = {one.id for one in status.running}
-        # What has begun is kept as long only as all of it is there.
-        present = {rc.name for rc in status.rcs if rc.present}
-        there = present & self._present.get(rcm.term, set())
-        self._present[rcm.term] = present
         # For patterns others may be kept at any time.
         waiting = {
             name: (booking, by)
@@ -280,6 +276,7 @@ class BookingPromises:
                 if (
                     meet
                     and arc.request.priority <= booking.priority
+                    # What has begun is kept as long only as all of it is there.
                     and (booking.start > arc.hold.start or rcs <= there)
                     and rcs & arc.needs.keys() & exclusive
                     and max(self._known[rcm.term][name], self._begun[rcm.term]) < began
@@ -289,15 +286,17 @@ class BookingPromises:
 
     def _has_no_excuse(self, host: str, rcm: Rcm, name: str, booking: Booking, arc: ArcId) -> bool:
         """Whether it should be held now, and is not: its date has come, and nobody is in its way of higher priority, or
-        who held before its leader knew of it."""
+        who held before its leader knew of it and had all of it."""
         status, now = rcm.core.arc(arc), self._inside(host, rcm.mesh.now)
         if status is None or status.hold is not None or booking.start > now:
             return False
-        known = self._now() - max(self._known[rcm.term][name], self._begun[rcm.term])
-        rcs = {rc.name: rc for rc in rcm.core.status().rcs}
+        present = self._present[rcm.term]
+        if not status.needs.keys() <= present.keys():
+            return False
+        # While some of it was away the rest was not kept.
+        since = max(self._known[rcm.term][name], self._begun[rcm.term], *(present[rc] for rc in status.needs))
+        known = self._now() - since
         for rc in status.needs:
-            if rc not in rcs or not rcs[rc].present:
-                return False
             for holder in rcm.core.holders(rc):
                 hold = holder.hold
                 if hold is None or holder.request.priority > booking.priority or hold.grant.term != rcm.term:
@@ -366,6 +365,28 @@ class BookingPromises:
             exact = not any(map(is_pattern, one.view.needs)) and sharable.isdisjoint(one.view.needs)
             if exact and not any(other.rank < one.rank and one.meets(other) for other in stands):
                 self._broken(f"{one.view.name} at {one.date.start} is in conflict with none: {one.date.danger}")
+
+
+class _FleetTime(NamedTuple):
+    """As a leader told it."""
+
+    at: float
+    """When, in virtual time."""
+    ahead: float
+    """By how much it was ahead of virtual time."""
+    since: float
+    """Since when it had gone on. There are two where the halves of a fleet began anew."""
+
+    def agrees(self, before: _FleetTime) -> bool:
+        return self.differs(before) <= AGREE
+
+    def goes_on(self, before: _FleetTime) -> bool:
+        """Whether it has gone on for as long, and is the same or one that differs too little to be another."""
+        return abs(self.since - before.since) <= SAME and self.differs(before) <= DIFFERS
+
+    def differs(self, before: _FleetTime) -> float:
+        """By how many seconds more than it may have been slewed."""
+        return abs(self.ahead - before.ahead) - 2 * RUNS_APART * (self.at - before.at)
 
 
 class _Listed(NamedTuple):

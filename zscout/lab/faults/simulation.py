@@ -507,6 +507,8 @@ class Simulation:
         if name in self.bookers:
             await self.bookers[name].run(client, busy)
             await client.close()
+            # What it gave up where nobody led is told by its token.
+            del self.programs[name]
             return
         await asyncio.gather(*(self.work.run(client, f"{mesh.me.client}-{number}", busy) for number in range(2)))
 
