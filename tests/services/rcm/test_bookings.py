@@ -654,3 +654,25 @@ def test_a_date_in_conflict_is_not_voted_on_again_and_again() -> None:
         assert len(radio.proposals) - asked < 10
 
     run(story())
+
+
+def test_a_date_by_pattern_goes_to_another_shared_rc_once_that_has_voted() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        await led(fleet, "x", "y")
+        here, there = fleet.client("here", "x"), fleet.client("there", "y")
+        first = fleet.rc("radio/rf0")
+        await fleet.joined(first)
+        fleet.part("y")
+        await asyncio.sleep(4)
+        await do(here, book("low", "radio/*:1", at=500), BookingView)
+        await fleet.joined(fleet.rc("radio/rf1"))
+        await do(there, book("high", "radio/rf0:1", at=500, priority=5), BookingView)
+        first.accept = False
+        fleet.network.heal()
+        await asyncio.sleep(70)
+        views = await fleet.bookings()
+        assert {name: states(view) for name, view in views.items()} == {"low": ["open"], "high": ["open"]}
+        assert views["low"].dates[0].bound == {"radio/*": "radio/rf1"}
+
+    run(story())

@@ -17,10 +17,9 @@ from zscout.keyexpr import is_pattern
 from zscout.messages import WINDOW, Book, BookedDate, BookingRecord, BookingView, Instant
 from zscout.scheduling.booking import Booking
 from zscout.services.bookings.dates import dates, last_end
-from zscout.services.bookings.fleet_clock import DIFFERS
+from zscout.services.bookings.fleet_clock import DIFFERS, SAME
 from zscout.services.bookings.keeper import BookingKeeper, Disk
 from zscout.services.bookings.records import KEEP, Records
-from zscout.services.rcm.booking_sharing import SAME
 from zscout.types import SECOND, ArcId, Grant, Ns, Term
 
 if TYPE_CHECKING:
@@ -144,7 +143,8 @@ class BookingPromises:
         memory, disk = self._copies(fact)
         enough = len({*memory, *disk} & {*self._candidates}) > 1
         # Of a leader that sees no other candidate its own disk has to do.
-        if not enough and not fact.destroyed and (self._calm() or not disk):
+        kept = enough or fact.destroyed or self._is_over(fact)
+        if not kept and (self._calm() or not disk):
             where = f"the memory of {sorted(memory)}, and on the disk of {sorted(disk)}"
             self._broken(f"{life.book.name} {what} is acknowledged, and is in {where} alone")
 

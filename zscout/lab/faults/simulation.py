@@ -516,16 +516,16 @@ class Simulation:
 
     def watch(self, name: str, client: Client) -> None:
         """Whatever this client is told is held against the promises."""
-        began: dict[str, tuple[Grant | None, float]] = {}
-        """By ARC: its last grant, and since when it was known here."""
+        began: dict[str, tuple[Grant | None, float, list[str]]] = {}
+        """By ARC: its last grant, since when it was known here, and of which RCs it was."""
 
         def told(arc: OpenArc) -> None:
             self.log(f"{arc.name} {arc.state} {arc.outcome or ''} {arc.reason}")
             self.booked.preempted(arc)
-            grant, since = began.get(arc.id, (None, 0.0))
-            self.promises.told(name, arc, client.term, touched=self._touched(since, name, *arc.rcs, *arc.needs))
+            grant, since, rcs = began.get(arc.id, (None, 0.0, []))
+            self.promises.told(name, arc, client.term, touched=self._touched(since, name, *rcs, *arc.rcs, *arc.needs))
             if arc.grant is not None and arc.grant != grant:
-                began[arc.id] = arc.grant, self.loop.now - START
+                began[arc.id] = arc.grant, self.loop.now - START, arc.rcs
 
         client.watch(told)
 

@@ -15,6 +15,8 @@ SLEW: Final = 100
 """One part in so many."""
 DIFFERS: Final = 2.0
 """Seconds by which a host's clock may differ before people are told."""
+SAME: Final = 1.0
+"""Seconds: fleet times that have gone on for as long, but for this, are as old."""
 
 
 def wall_ns(seconds: float) -> Ns:
@@ -40,10 +42,6 @@ class FleetClock:
     def at(self, now: Ns) -> Ns:
         """Fleet time, in ns since 1970 (UTC)."""
         return now + self._slewed(now)
-
-    def local(self, time: Ns, now: Ns) -> Ns:
-        """When it will be that fleet time on the host's clock, if nothing is slewed from now on."""
-        return time - self._slewed(now)
 
     def step(self, time: Ns, now: Ns) -> None:
         """It is `time` at `now`: before anybody goes by it, or where one that is older goes on elsewhere."""

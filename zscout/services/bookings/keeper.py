@@ -30,15 +30,13 @@ from zscout.messages import (
     decode_told,
     encode,
 )
-from zscout.services.bookings.fleet_clock import DIFFERS, SLEW
+from zscout.services.bookings.fleet_clock import DIFFERS, SAME, SLEW
 from zscout.services.bookings.records import Records
 from zscout.types import NO_TERM, SECOND, VERSION, Ns, Term
 
 log = logging.getLogger(__name__)
 
 FILE: Final = "bookings.json"
-SAME: Final = SECOND
-"""A time that has gone on for as long, but for this, is the same."""
 MAX_SAVING: Final = 16
 """Answers that wait for the disk at one time."""
 
@@ -131,11 +129,11 @@ class BookingKeeper:
             return
         now, (term, at) = self.mesh.now(), self._heard
         offset, since = round(grants.time * SECOND) - now, now - round(grants.time_age * SECOND)
-        if self._offset is not None and since >= self.since - SAME:
+        if self._offset is not None and since >= self.since - SAME * SECOND:
             if grants.term == term:
                 # Slewed as far as it may be, on a clock that is as far off again.
                 offset = max(offset, self._offset - 2 * (now - at) // SLEW)
-            elif abs(offset - self._offset) > DIFFERS * SECOND and since > self.since + SAME:
+            elif abs(offset - self._offset) > DIFFERS * SECOND and since > self.since + SAME * SECOND:
                 return
             since = min(since, self.since)
         self._offset, self._heard, self.since = offset, (grants.term, now), since

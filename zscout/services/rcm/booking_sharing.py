@@ -13,7 +13,7 @@ from zscout.keyexpr import Keys, Role
 from zscout.mesh import Mesh, Reply
 from zscout.mesh.supervision import Supervisor, done_within
 from zscout.messages import BookingRecord, BookingsKept, ShareBookings
-from zscout.services.bookings.fleet_clock import DIFFERS, FleetClock, agreed, wall_ns
+from zscout.services.bookings.fleet_clock import DIFFERS, SAME, FleetClock, agreed, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.bookings.records import merged
 from zscout.types import SECOND, HostName, Ns, Term
@@ -27,8 +27,6 @@ AGAIN: Final = 5.0
 SOON: Final = 0.02
 """Seconds that changes are gathered before they are shared."""
 TIMEOUT: Final = 2.0
-SAME: Final = 1.0
-"""Seconds: times that have gone on for as long, but for this, are the same."""
 LOOK: Final = 0.5
 """Seconds within which candidates that live are found."""
 
