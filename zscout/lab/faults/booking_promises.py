@@ -328,10 +328,12 @@ class BookingPromises:
             if fact.destroyed or self._is_over(fact):
                 continue
             record = records.get(fact.booking)
-            if not fact.known_by(record):
+            if record is None or not fact.known_by(record):
                 self._broken(f"{life.book.name} {fact.what} was acknowledged, and is lost")
             elif fact.what == "made" and not life.given_up:
-                self._is_listed(life, views.get(fact.booking), max(time, self._latest) if jumped else time)
+                # By a fleet time that did not go on, of one half, it may have been held.
+                over = {start for start in record.over if start < self._latest}
+                self._is_listed(life, views.get(fact.booking), over, max(time, self._latest) if jumped else time)
             view = views.get(fact.booking)
             if view is not None and (fact.what == "unbooked" or fact.what in {date.start for date in view.dates}):
                 self._broken(f"{life.book.name} {fact.what} is listed, though it was given up")
@@ -340,10 +342,10 @@ class BookingPromises:
         destroyed = sum(fact.destroyed for fact in self.facts.values())
         return states + Counter({"acknowledged, and destroyed": destroyed})
 
-    def _is_listed(self, life: Life, view: BookingView | None, time: float) -> None:
+    def _is_listed(self, life: Life, view: BookingView | None, over: set[Instant], time: float) -> None:
         told = {} if view is None else {date.start: date.state for date in view.dates}
         for start in dates(_as_record(life.book), time + 1, time + WINDOW - 1):
-            if start not in life.dropped and told.get(start) not in ("open", "taken", "conflict"):
+            if start not in life.dropped | over and told.get(start) not in ("open", "taken", "conflict"):
                 self._broken(f"{life.book.name} at {start} is lost: it is {told.get(start, 'not listed')}")
 
     def _look_at_conflicts(self, rcm: Rcm, records: Records, views: Mapping[str, BookingView]) -> None:
