@@ -23,6 +23,7 @@ from zscout.messages import (
     BookingsTold,
     BookingView,
     FindSlots,
+    OpenRequest,
     Operation,
     Release,
     SlotsTold,
@@ -604,6 +605,37 @@ def test_after_a_restart_of_all_hosts_nothing_is_decided_by_one_wrong_clock() ->
         assert waits.state == "queued"
         await asyncio.sleep(NOON + 301 - fleet.time())
         assert client.notices[-1].state == "running"
+
+    run(story())
+
+
+def test_what_ends_by_one_wrong_clock_after_a_restart_of_all_is_not_over() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y", "z")
+        old = await led(fleet, "x", "y", "z")
+        client = fleet.client("one")
+        await do(client, book("m", "robot/a", at=300, maintenance=True), BookingView)
+        await do(client, book("b", "robot/b", at=300, patience=Decimal(100)), BookingView)
+        mine = await client.ask("mine", "robot/b", seconds=100, booking="b")
+        client.open = [
+            OpenRequest("mine", "mine", {"robot/b": {}}, 0, Decimal(100), place=mine.place, booking="b@1800000300")
+        ]
+        for one in old:
+            fleet.network.kill(one.mesh)
+        await asyncio.sleep(5)
+        # By the clock of the first to be back both end as it has just begun to lead.
+        fleet.ahead["x"] = NOON + 399.2 - fleet.time()
+        first = fleet.candidate("x")
+        await until(lambda: first.rcm)
+        await asyncio.sleep(0.5)
+        assert first.rcm is not None
+        assert not first.rcm.bookings.settled
+        assert first.rcm.bookings.dates.time > NOON + 400
+        fleet.candidate("y")
+        fleet.candidate("z")
+        await asyncio.sleep(5)
+        views = await fleet.bookings()
+        assert {name: states(view) for name, view in views.items()} == {"m": ["open"], "b": ["open"]}
 
     run(story())
 

@@ -190,6 +190,7 @@ class Booker:
         else:
             self.lives[operation.id].give_up(operation.start)
         self.work.log(f"{self.name} {operation}")
+        asked = self.promises.now()
         try:
             # If this program dies now, it asks again as it is started anew.
             self.unknown.append(operation)
@@ -205,9 +206,9 @@ class Booker:
         life = self.lives[operation.id]
         if isinstance(operation, Unbook):
             counts["unbooked" if operation.start is None else "dates unbooked"] += 1
-            self.promises.unbooked(life, operation.start, view)
+            self.promises.unbooked(life, operation.start, view, asked)
             return
-        self.promises.booked(life, view)
+        self.promises.booked(life, view, asked)
         if not life.made:
             return
         counts["booked"] += 1

@@ -93,10 +93,12 @@ class BookingPromises:
         calm: Callable[[], bool],
         inside: Callable[[str, Callable[[], Any]], Any],
     ) -> None:
-        self._broken, self._now, self._calm, self._inside = broken, now, calm, inside
+        self._broken, self.now, self._calm, self._inside = broken, now, calm, inside
         self._keepers, self._disks, self._candidates = keepers, disks, candidates
         self.lives: dict[str, Life] = {}
         self.facts: dict[tuple[str, Instant | str], Fact] = {}
+        self._destroyed = 0.0
+        """When copies were last destroyed."""
         self._final: dict[BookingKeeper, dict[str, BookingRecord]] = {}
         """What each process knew of bookings as it was looked at last."""
         self._stepped = -1.0
@@ -123,27 +125,28 @@ class BookingPromises:
     def asked(self, book: Book) -> Life:
         return self.lives.setdefault(book.id, Life(book))
 
-    def booked(self, life: Life, view: BookingView) -> None:
-        """An RCM has acknowledged it."""
+    def booked(self, life: Life, view: BookingView, asked: float) -> None:
+        """An RCM has acknowledged it, as it was `asked` to then."""
         if view.unbooked:
             if not life.given_up:
                 self._broken(f"booking {life.book.name} is unbooked though nobody gave it up")
             return
         life.made = True
-        self._establish(life, "made")
+        self._establish(life, "made", asked)
 
-    def unbooked(self, life: Life, start: Instant | None, view: BookingView) -> None:
-        """An RCM has acknowledged that it, or its date `start`, is given up."""
+    def unbooked(self, life: Life, start: Instant | None, view: BookingView, asked: float) -> None:
+        """An RCM has acknowledged that it, or its date `start`, is given up, as it was `asked` to then."""
         if start is None and not view.unbooked:
             self._broken(f"{life.book.name} is told as booked in the answer to its unbooking")
-        self._establish(life, "unbooked" if start is None else start)
+        self._establish(life, "unbooked" if start is None else start, asked)
 
-    def _establish(self, life: Life, what: Instant | str) -> None:
+    def _establish(self, life: Life, what: Instant | str, asked: float) -> None:
         fact = self.facts.setdefault((life.book.id, what), Fact(life.book.id, what))
         memory, disk = self._copies(fact)
         enough = len({*memory, *disk} & {*self._candidates}) > 1
         # Of a leader that sees no other candidate its own disk has to do.
-        kept = enough or fact.destroyed or self._is_over(fact)
+        # Who has said that it keeps it may be gone as the last are still asked.
+        kept = enough or fact.destroyed or self._is_over(fact) or self._destroyed > asked
         if not kept and (self._calm() or not disk):
             where = f"the memory of {sorted(memory)}, and on the disk of {sorted(disk)}"
             self._broken(f"{life.book.name} {what} is acknowledged, and is in {where} alone")
@@ -173,6 +176,7 @@ class BookingPromises:
             if not any(self._copies(fact)):
                 self._broken(f"{fact} was acknowledged, and nobody knows of it any more")
         yield
+        self._destroyed = self.now()
         for fact in facts:
             fact.destroyed = not any(self._copies(fact))
 
@@ -190,7 +194,7 @@ class BookingPromises:
             self._look_at_records(keeper)
         for host, rcm in leaders.items():
             self._look_at_time(host, rcm)
-            self._begun.setdefault(rcm.term, self._now() - GIVEN_UP)
+            self._begun.setdefault(rcm.term, self.now() - GIVEN_UP)
             first = rcm.term not in self._known
             known = self._known.setdefault(rcm.term, {})
             claims = {booking.id: (booking, arc) for booking, arc in rcm.core.bookings()}
@@ -199,7 +203,7 @@ class BookingPromises:
                 del known[name]
             for name in claims:
                 before = first and name.partition("@")[0] in self._records.get(host, ())
-                known.setdefault(name, 0.0 if before else self._now())
+                known.setdefault(name, 0.0 if before else self.now())
             if self._looked.get(rcm.term) != rcm.core.batches:
                 self._looked[rcm.term] = rcm.core.batches
                 self._look_at_grants(host, rcm, claims)
@@ -230,7 +234,7 @@ class BookingPromises:
                 self._broken(f"{record.name} was given up or over on {keeper.mesh.me}, and is not any more")
 
     def _look_at_time(self, host: str, rcm: Rcm) -> None:
-        now, time = self._now(), self._inside(host, lambda: rcm.bookings.time)
+        now, time = self.now(), self._inside(host, lambda: rcm.bookings.time)
         if time is None:
             return  # after a restart of all hosts it is found out first
         self._latest = max(self._latest, time)
@@ -253,10 +257,10 @@ class BookingPromises:
         status, local = rcm.core.status(), self._inside(host, rcm.mesh.now)
         present = self._present.get(rcm.term, {})
         there = {rc.name for rc in status.rcs if rc.present and rc.name in present}
-        self._present[rcm.term] = {rc.name: present.get(rc.name, self._now()) for rc in status.rcs if rc.present}
+        self._present[rcm.term] = {rc.name: present.get(rc.name, self.now()) for rc in status.rcs if rc.present}
         running = {one.hold.grant: one for one in status.running if one.hold and one.hold.grant.term == rcm.term}
         before, self._running[rcm.term] = self._running.get(rcm.term, set()), set(running)
-        if self._now() - self._stepped < 1.0:
+        if self.now() - self._stepped < 1.0:
             return  # its dates came just now
         exclusive = {rc.name for rc in status.rcs if rc.present and not rc.sharable}
         has_it = {one.id for one in status.running}
@@ -268,7 +272,7 @@ class BookingPromises:
         }
         for arc in (running[grant] for grant in running.keys() - before):
             assert arc.hold is not None  # noqa: S101 - it runs
-            began = self._now() - (local - arc.hold.start) / SECOND
+            began = self.now() - (local - arc.hold.start) / SECOND
             for name, (booking, by) in waiting.items():
                 over = booking.lapses if by is None else booking.end
                 meet = booking.start + NOT_EXACT < arc.hold.end and arc.hold.start + NOT_EXACT < over
@@ -295,7 +299,7 @@ class BookingPromises:
             return False
         # While some of it was away the rest was not kept.
         since = max(self._known[rcm.term][name], self._begun[rcm.term], *(present[rc] for rc in status.needs))
-        known = self._now() - since
+        known = self.now() - since
         for rc in status.needs:
             for holder in rcm.core.holders(rc):
                 hold = holder.hold

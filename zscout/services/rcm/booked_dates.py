@@ -278,17 +278,19 @@ class BookedDates:
         self._changed([new])
         return self._records.get(record.id) or new
 
-    def note(self, events: Collection[Event], effects: Iterable[Effect]) -> bool:
-        """What became of dates in an instant; whether `reconcile` is to be called, in another one."""
+    def note(self, events: Collection[Event], effects: Iterable[Effect], *, settled: bool) -> bool:
+        """What became of dates in an instant; whether `reconcile` is to be called, in another one. What was used by a
+        time that is not `settled` may still be to come."""
         over: dict[str, list[Instant]] = {}
         lapsed = False
         for effect in effects:
             match effect:
-                case BookingChanged(state=BookingState.LAPSED):
-                    lapsed = True
-                case BookingChanged(booking=name, state=BookingState.USED):
+                case BookingChanged(booking=name, state=BookingState.USED, arc=str()) if settled:
                     booking, _, start = name.partition("@")
                     over.setdefault(booking, []).append(int(start))
+                case BookingChanged(state=BookingState.LAPSED | BookingState.USED):
+                    # That follows from the time alone, and so is not kept.
+                    lapsed = True
                 case BookingThreatened(booking=name, reason=None):
                     self._danger.pop(name, None)
                 case BookingThreatened(name, Reason() as reason) if (date := self.date(name)) is not None:

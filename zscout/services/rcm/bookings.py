@@ -126,7 +126,7 @@ class Bookings:
 
     def note(self, events: Collection[Event], effects: Iterable[Effect]) -> None:
         """What has happened in an instant: what follows of it follows in another one."""
-        if self.dates.note(events, effects):
+        if self.dates.note(events, effects, settled=self.settled):
             self._on_news()
         self._tell_soon()
         if self.handler.waits_for_votes and any(isinstance(event, (Vote, VoteOverdue)) for event in events):
