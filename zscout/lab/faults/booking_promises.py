@@ -281,7 +281,7 @@ class BookingPromises:
                     meet
                     and arc.request.priority <= booking.priority
                     # What has begun is kept as long only as all of it is there.
-                    and (booking.start > arc.hold.start or rcs <= there)
+                    and (booking.start > arc.hold.start + NOT_EXACT or rcs <= there)
                     and rcs & arc.needs.keys() & exclusive
                     and max(self._known[rcm.term][name], self._begun[rcm.term]) < began
                 ):
