@@ -54,6 +54,16 @@ def test_with_fair_shares_a_burst_and_a_stream_come_out_equal() -> None:
     assert fair.uses[STEADY].charged > without.uses[STEADY].charged
 
 
+def test_a_burst_is_served_alike_every_time() -> None:
+    def played() -> list[float]:
+        # Who began to starve at one instant is in the order of their names.
+        burst = [iter([job(10 + number % 7, 10 + number % 7, f"robot/{number % 3}")]) for number in range(60)]
+        uses = play([f"robot/{number}" for number in range(3)], {"one": burst}, POLICY, 400 * SECOND)
+        return [uses["one"].waited, uses["one"].longest]
+
+    assert len({tuple(played()) for _ in range(4)}) == 1
+
+
 @pytest.mark.parametrize("seed", range(len(WAYS)))
 def test_a_case_is_the_same_every_time(seed: int) -> None:
     one, two = play_case(seed), play_case(seed)

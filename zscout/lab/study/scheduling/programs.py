@@ -46,6 +46,8 @@ class Use:
 
 @dataclass(slots=True)
 class _Program:
+    name: str
+    """Unique in its run, and the same each time."""
     group: str
     jobs: Iterator[ProgramJob]
     job: ProgramJob
@@ -79,7 +81,7 @@ class _Run:
             return model.Tick()
         if not isinstance(what, _Program):
             return model.Released(what)
-        arc, job = f"{what.group}/{id(what)}.{what.number}", what.job
+        arc, job = f"{what.name}.{what.number}", what.job
         self.programs[arc], what.asked_at = what, now
         needs: dict[RcName, Params] = {rc: {} for rc in job.rcs}
         return model.Requested(model.ArcRequest(arc, f"{what.group}/study", needs, 1, job.asked))
@@ -112,8 +114,8 @@ def play(
     """What each group had by then. Strategy `adaptive`, exclusive RCs, one priority; a group's name is its host's."""
     run = _Run(Core(Adaptive(), policy), uses={group: Use() for group in groups})
     for group, programs in groups.items():
-        for jobs in programs:
-            program = _Program(group, jobs, ProgramJob(0, (), 0, 0))
+        for number, jobs in enumerate(programs):
+            program = _Program(f"{group}/{number}", group, jobs, ProgramJob(0, (), 0, 0))
             run.go_on(program, 0)
     now: Ns = 0
     events: list[model.Event] = [model.RcJoined(rc, sharable=False) for rc in rcs]
