@@ -140,6 +140,16 @@ def test_only_an_rcm_that_is_obeyed_keeps_holds_alive(heard: Grants, refreshed: 
     assert rc.next_expiry() == NOW + LEASE + (2 * SECOND if refreshed else 0)
 
 
+def test_what_is_old_counts_after_a_silence_but_not_where_this_process_stood_still() -> None:
+    """A late publication, read first after a stall, is no sign that a newer one was forged."""
+    late = said(1, touches=False)
+    rc, stalled = holding(HELD), holding(HELD)
+    assert not stalled.apply_grants(late, NOW + LEASE, stood_still=True)
+    assert stalled.seq == holding(HELD).seq
+    assert rc.apply_grants(late, NOW + LEASE).reread
+    assert rc.seq == late.seq
+
+
 @pytest.mark.parametrize(
     ("read", "carries", "now_holds", "presents"),
     [

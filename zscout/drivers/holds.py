@@ -135,12 +135,13 @@ class HoldTable:
         self.seq, self.last_contact = grants.seq, now
         return True
 
-    def apply_grants(self, grants: Grants, now: Ns, *, sharable: bool = True) -> HoldChange:
-        """Takes a publication. Of several holders of an exclusive RC only the newest grant is obeyed."""
+    def apply_grants(self, grants: Grants, now: Ns, *, sharable: bool = True, stood_still: bool = False) -> HoldChange:
+        """Takes a publication. Of several holders of an exclusive RC only the newest grant is obeyed. `stood_still`:
+        this process did until just now, and so has heard nothing."""
         missed = grants.term != self.term or grants.prev > self.seq
         change = HoldChange()
         if not self._accept(grants, change, now):
-            if grants.term == self.term and not self._heard(now):
+            if grants.term == self.term and not stood_still and not self._heard(now):
                 # For a hold lease nothing newer came: what made this old was no RCM's. What stands is read.
                 self.seq, change.reread = grants.seq, True
             return change

@@ -311,7 +311,8 @@ class ResourceController:
 
     def _apply_grants(self, grants: messages.Grants, now: Ns) -> HoldChange:
         self._last_terms.shown(grants.term, self.holds.term)
-        return self.holds.apply_grants(grants, now, sharable=self.driver.sharable)
+        sharable, stood_still = self.driver.sharable, self.stall.fresh()
+        return self.holds.apply_grants(grants, now, sharable=sharable, stood_still=stood_still)
 
     def _on_state_query(self, query: IncomingQuery[messages.RcAsk]) -> None:
         if query.message.above is None:
