@@ -51,6 +51,8 @@ class Step:
     """The task of this hold is done: give it back, and ask for the other."""
     blind: bool = False
     """No picture for too long: give the hold back."""
+    learning: bool = False
+    """It watches, and can't tell yet what moves."""
 
 
 class Alerts:
@@ -210,7 +212,8 @@ class Scout:
         edge, count = self.alerts.see(now, seen.moving), self.alerts.count
         if self.alerts.moving:
             return Step(0, 0, 0, "alert", f"motion {count}", tuple(seen.boxes), alert=edge == "start")
-        return Step(0, 0, 0, "watch", f"{count} alerts so far", quiet=edge == "end")
+        words = f"{count} alerts so far"
+        return Step(0, 0, 0, "watch", words, quiet=edge == "end", learning=seen.learning)
 
     # What outlives a move
 
