@@ -186,7 +186,11 @@ class Scout:
             return
         self._held = True
         self._task = self.task
-        self._detector = MotionDetector()
+        if self._task == "hide":
+            self._detector = MotionDetector()
+        else:
+            # It is where it was, if nobody has moved it: what it knows of its background it need not learn again.
+            self._detector.pause()
         self.hider.resumed(now)
         self.blindness.begin(now)
 

@@ -20,6 +20,7 @@ Fate: TypeAlias = Literal[
 off; its camera was warming up; it was not where it had hidden, or was still looking whether it is; its picture was bad;
 its background was being learned; nothing was, and it was told late or not at all."""
 FATES: Final[tuple[Fate, ...]] = get_args(Fate)
+_AWAY: Final = frozenset[Fate | None]({"off the air", "warming up"})
 LOOK: Final = 0.25
 """Seconds between two looks at who is in view."""
 MOVED, TURNED = 0.1, 0.2
@@ -32,7 +33,7 @@ class CrossingsOf:
 
     fates: Counter[Fate] = field(default_factory=Counter)
     could: int = 0
-    """Of these: began while its camera was on the air and warm, and so could have been told in time."""
+    """Of these: began while its camera was warm, and it was on the air for as long as there was to tell it in."""
 
     @property
     def all(self) -> int:
@@ -102,7 +103,7 @@ class Crossings:
                 place.last_person = now
             if people >= PIXELS and place.since is None:
                 place.since, place.obstacle, place.told_at = now, self._obstacle(robot, place), None
-                self.found[robot].could += place.obstacle not in ("off the air", "warming up")
+                self.found[robot].could += place.obstacle not in _AWAY
             elif place.since is not None and now - place.last_person > CLEAR:
                 self._close(robot, place)
 
@@ -131,6 +132,12 @@ class Crossings:
     def ended(self, robot: str) -> None:
         """Its hold is over."""
         self._doing.pop(robot, None)
+        place = self._places.get(robot)
+        if place is None or place.since is None or place.told_at is not None:
+            return
+        if place.obstacle not in _AWAY and self._world.time - place.since < IN_TIME:
+            place.obstacle = "off the air"
+            self.found[robot].could -= 1
 
 
 def _same(one: Pose, other: Pose) -> bool:
