@@ -50,9 +50,10 @@ def test_nobody_is_no_alarm_and_a_walker_is_one_within_a_second(noise: float, ra
 
 
 def told_after(detector: MotionDetector, scene: Scene, start: float, rate: float = 4.0) -> float | None:
-    """Seconds from the first picture of a walker, who comes at `start`, until he is told."""
+    """Seconds from the first picture of a walker, who comes at `start` and is not much darker than the wall, until he
+    is told."""
     for time in times(rate, 3.0, start):
-        if detector.see(time, scene.picture(20 + 40 * (time - start))).moving:
+        if detector.see(time, scene.picture(20 + 40 * (time - start), shade=80)).moving:
             return time - start
     return None
 
