@@ -47,6 +47,10 @@ OTHER: Final = 4.0
 OTHER_NOISE: Final = 2.0
 """So does one of which half is off by more than so many grey levels, and so many times its noise: the first was of
 something else. A channel may still show the robot that had it before."""
+ALIKE: Final = 1.2
+"""A picture after a pause has at most so many times the noise of the last before it,"""
+CHANGED: Final = 0.2
+"""and is another in at most this share: else it is not of the background that is known."""
 RETURN: Final = 2.0
 """Seconds after a pause in which pictures are waited for that fit what was known before; then all is learned anew."""
 STRONG: Final = 6.5
@@ -122,7 +126,8 @@ class MotionDetector:
         self._begun = self._last = 0.0
         self._pictures = 0
         self._noise = 0.0
-        """The most of the pictures of the first look, in grey levels."""
+        """The most of the pictures of the first look, or that of the last before a pause; in grey levels."""
+        self._latest = self._mean
         self._paused = False
         self._back: float | None = None
         """When the first picture after a pause came."""
@@ -135,7 +140,7 @@ class MotionDetector:
         if self._mean.shape != grey.shape:
             return self._begin(time, grey)
         passed = min(1.0, max(0.0, time - self._last))
-        self._last = time
+        self._last, self._latest = time, grey
         level = _levelled(grey, self._mean)
         away = level - self._mean
         if self._paused:
@@ -173,20 +178,24 @@ class MotionDetector:
     def pause(self) -> None:
         """No pictures come for a while. What is known of the background is kept: the first picture afterwards that
         fits it goes on with it. Until then nothing is reported."""
-        self._paused, self._back = self._pictures >= WARM_PICTURES, None
         self._sightings.clear()
-        if not self._paused:
+        if self._pictures < WARM_PICTURES:
             self._mean = np.empty((0, 0), np.float32)
+        elif not self._paused:
+            self._noise = _noise(self._latest)
+            self._paused = True
+        self._back = None
 
     def _return(self, time: float, grey: _Plane, level: _Plane, away: _Plane) -> Seen:
         self._back = time if self._back is None else self._back
-        noise = _noise(grey)
-        if CLEARER * noise > self._noise or _off(away) > max(OTHER, OTHER_NOISE * noise):
+        score, middle = self._score(away)
+        mask, _ = self._regions(score, level)
+        changed = np.count_nonzero(mask) / mask.size
+        if _noise(grey) > ALIKE * self._noise or middle > ALL_OFF or changed > CHANGED:
             # The camera is warming up, or this is not its picture; or it is not where it was.
             return self._begin(time, grey) if time - self._back > RETURN else Seen(False, learning=True)
         self._paused = False
         # What is another now has become so while nobody looked, and moves no more than the rest.
-        mask, _ = self._regions(self._score(away)[0], level)
         self._mean = np.where(mask > 0, level, self._mean)
         return Seen(False)
 
