@@ -48,9 +48,11 @@ OTHER_NOISE: Final = 2.0
 """So does one of which half is off by more than so many grey levels, and so many times its noise: the first was of
 something else. A channel may still show the robot that had it before."""
 ALIKE: Final = 1.2
-"""A picture after a pause has at most so many times the noise of the last before it,"""
+"""A picture after a pause has at most so many times the noise of the last before it, and at least as much less,"""
 CHANGED: Final = 0.2
 """and is another in at most this share: else it is not of the background that is known."""
+AGREE: Final = (0.15, 1.0)
+"""Seconds, at least and at most, between two such pictures that go on with it: the last of another robot is one alone."""
 RETURN: Final = 2.0
 """Seconds after a pause in which pictures are waited for that fit what was known before; then all is learned anew."""
 STRONG: Final = 6.5
@@ -130,7 +132,9 @@ class MotionDetector:
         self._latest = self._mean
         self._paused = False
         self._back: float | None = None
-        """When the first picture after a pause came."""
+        """When the first picture after a pause came, with no gap since."""
+        self._fits: float | None = None
+        """Since when all have fitted."""
         self._sightings: deque[tuple[float, NDArray[np.uint8]]] = deque(maxlen=RECENT - 1)
 
     def see(self, time: float, picture: Picture) -> Seen:
@@ -144,7 +148,7 @@ class MotionDetector:
         level = _levelled(grey, self._mean)
         away = level - self._mean
         if self._paused:
-            return self._return(time, grey, level, away)
+            return self._return(time, grey, level, away, passed)
         self._pictures += 1
         if self._pictures < WARM_PICTURES or time - self._begun < WARM:
             if self._is_no_first_look(grey, away):
@@ -184,16 +188,23 @@ class MotionDetector:
         elif not self._paused:
             self._noise = _noise(self._latest)
             self._paused = True
-        self._back = None
+        self._back = self._fits = None
 
-    def _return(self, time: float, grey: _Plane, level: _Plane, away: _Plane) -> Seen:
-        self._back = time if self._back is None else self._back
+    def _return(self, time: float, grey: _Plane, level: _Plane, away: _Plane, passed: float) -> Seen:
+        if self._back is None or passed >= AGREE[1]:
+            self._back = time
         score, middle = self._score(away)
         mask, _ = self._regions(score, level)
         changed = np.count_nonzero(mask) / mask.size
-        if _noise(grey) > ALIKE * self._noise or middle > ALL_OFF or changed > CHANGED:
+        alike = 1 / ALIKE <= _noise(grey) / max(self._noise, 1e-3) <= ALIKE
+        if not alike or middle > ALL_OFF or changed > CHANGED:
             # The camera is warming up, or this is not its picture; or it is not where it was.
+            self._fits = None
             return self._begin(time, grey) if time - self._back > RETURN else Seen(False, learning=True)
+        if self._fits is None or time - self._fits > AGREE[1]:
+            self._fits = time
+        if time - self._fits < AGREE[0]:
+            return Seen(False, learning=True)
         self._paused = False
         # What is another now has become so while nobody looked, and moves no more than the rest.
         self._mean = np.where(mask > 0, level, self._mean)
