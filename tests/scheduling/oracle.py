@@ -227,9 +227,7 @@ class Oracle:
         blockers = [one for one in running if exclusive & set(one.needs)]
         if not all(may_displace(one) for one in blockers):
             return None
-        candidates = [
-            one for one in running if one not in blockers and sharable & set(one.needs) and may_displace(one)
-        ]
+        candidates = [one for one in running if one not in blockers and sharable & set(one.needs) and may_displace(one)]
         stay = [one for one in running if one not in blockers and one not in candidates]
         if not self.accepted(sharable, [*stay, a]):
             return None
@@ -243,8 +241,7 @@ class Oracle:
         """Whether each of these RCs would carry those of `together` that need it."""
         return all(
             not excess(
-                self.rcs[name].capacity,
-                [(one.request.arc, one.needs[name]) for one in together if name in one.needs],
+                self.rcs[name].capacity, [(one.request.arc, one.needs[name]) for one in together if name in one.needs]
             )
             for name in sharable
         )

@@ -253,7 +253,9 @@ def test_the_fewest_and_lowest_ranked_end_of_all_choices(strategy: StrategyName,
             how = {"priority": draw.randint(1, 3), "seconds": draw.randint(1, 9), "rate": draw.randint(1, 6)}
             wanted = structs.replace(request(f"a{number}", *needs, **how), keep=draw.random() < 0.7)
             _answered(core, number, capacity, Requested(wanted))
-        named = draw.sample(rcs, draw.randint(0, 2)) + draw.sample(sorted(capacity), draw.randint(0, min(1, len(capacity))))
+        named = draw.sample(rcs, draw.randint(0, 2)) + draw.sample(
+            sorted(capacity), draw.randint(0, min(1, len(capacity)))
+        )
         patterns = draw.sample(["fg/*", "fg/*#2", "fg/a$*", "video/*", "robot/*"], draw.randint(1, 3))
         patterns += ["radio/*"] if capacity and draw.random() < 0.3 else []
         wanted = request("last", *named, *patterns, priority=draw.randint(2, 4), rate=draw.randint(1, 6))

@@ -41,8 +41,8 @@ WARM: Final = 1.0
 """Seconds of the first look: all is background, and nothing is reported."""
 WARM_PICTURES: Final = 4
 CLEARER: Final = 0.7
-"""A picture of the first look whose noise is less than this part of the first one's begins it anew: the camera was still
-warming up, and what its noise taught would hide what moves for a long time."""
+"""A picture of the first look whose noise is less than this part of the first one's begins it anew: the camera was
+still warming up, and what its noise taught would hide what moves for a long time."""
 OTHER: Final = 4.0
 OTHER_NOISE: Final = 2.0
 """So does one of which half is off by more than so many grey levels, and so many times its noise: the first was of
@@ -52,7 +52,7 @@ ALIKE: Final = 1.2
 CHANGED: Final = 0.2
 """and is another in at most this share: else it is not of the background that is known."""
 AGREE: Final = (0.15, 1.0)
-"""Seconds, at least and at most, between two such pictures that go on with it: the last of another robot is one alone."""
+"""Seconds, at least and at most, between two such pictures that go on with it: the last of another robot is alone."""
 RETURN: Final = 2.0
 """Seconds after a pause in which pictures are waited for that fit what was known before; then all is learned anew."""
 STRONG: Final = 6.5

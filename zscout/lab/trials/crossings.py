@@ -1,5 +1,5 @@
-"""Where the crossings of a sensor net go: of each person who walks through what a placed robot would see, whether it was
-told in time, and if not, why. Judged by the building's own truth, which no robot knows."""
+"""Where the crossings of a sensor net go: of each person who walks through what a placed robot would see, whether it
+was told in time, and if not, why. Judged by the building's own truth, which no robot knows."""
 
 from __future__ import annotations
 

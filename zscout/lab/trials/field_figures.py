@@ -115,11 +115,7 @@ class Judge:
         """Compares a look of a watching robot, one every `interval` seconds, with what was in its view."""
         watches = step.doing in ("watch", "alert", "blind")
         self._crossings.looked(
-            robot,
-            watches=watches,
-            picture=step.doing != "blind",
-            learning=step.learning,
-            alert=step.doing == "alert",
+            robot, watches=watches, picture=step.doing != "blind", learning=step.learning, alert=step.doing == "alert"
         )
         if step.doing in ("watch", "alert"):
             self.outcomes.watched += interval
