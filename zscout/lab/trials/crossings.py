@@ -39,6 +39,11 @@ class CrossingsOf:
     def all(self) -> int:
         return self.fates.total()
 
+    @property
+    def in_time(self) -> float:
+        """Share of all; NaN of none."""
+        return self.fates["in time"] / self.all if self.all else math.nan
+
     def add(self, other: CrossingsOf) -> None:
         """Makes it the sum of both."""
         self.fates += other.fates
