@@ -7,6 +7,7 @@ and then *watches* for motion.
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Literal, TypeAlias
@@ -151,10 +152,12 @@ class Blindness:
         return self._in_row >= SUSPECTS
 
     def choose(self, now: float, channels: Iterable[str]) -> str | None:
-        """A channel to ask for by name, because another one is to be avoided; None: any will do."""
+        """A channel to ask for by name, because another one is to be avoided; None: any will do. Where all are, the
+        one that showed nothing the longest ago."""
         self._bad = {channel: at for channel, at in self._bad.items() if now - at < BAD_FOR}
-        good = sorted(set(channels) - self._bad.keys())
-        return good[0] if self._bad and good else None
+        if self._bad.keys().isdisjoint(channels := set(channels)):
+            return None
+        return min(channels, key=lambda channel: (self._bad.get(channel, -math.inf), channel))
 
     def memory(self) -> dict[str, Any]:
         return {"bad": self._bad, "in_row": self._in_row}
