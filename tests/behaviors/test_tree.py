@@ -138,7 +138,9 @@ def test_a_robot_that_no_channel_shows_is_dead() -> None:
         blind.begin(start)
         assert blind.see(start + 5, False, channel)
     assert blind.dead
-    assert blind.choose(16, ["video/ch1", "video/ch2"]) is None
+    assert blind.choose(16, ["video/ch1", "video/ch2"]) == "video/ch1", "it was bad first"
+    assert blind.choose(5 + BAD_FOR, ["video/ch1", "video/ch2"]) == "video/ch1"
+    assert blind.choose(15 + BAD_FOR, ["video/ch1", "video/ch2"]) is None
     other = Blindness(5.0)
     other.recall(blind.memory())
     assert other.dead

@@ -6,8 +6,9 @@ real core does faster has to come out as this does.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import product
 
 from zscout.config.scheduling_policy import FairShares
 from zscout.keyexpr import is_pattern, matcher
@@ -16,7 +17,7 @@ from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.fair_shares import LITTLE, NEAR
 from zscout.scheduling.model import QUANTUM, ArcRequest, Outcome
-from zscout.types import SECOND, Ns, RcName
+from zscout.types import SECOND, Ns, Params, RcName
 
 
 @dataclass
@@ -81,6 +82,11 @@ class Contender:
     start: Ns | None = None
     position: int = 0
     """Of its group, when it last waited."""
+    needs: Mapping[str, Params] = field(default_factory=dict)
+    """What it holds; while it waits, what was tried last."""
+
+    def __post_init__(self) -> None:
+        self.needs = self.needs or self.request.needs
 
     @property
     def rank(self) -> tuple[int, int, Ns, int]:
@@ -111,7 +117,7 @@ class Oracle:
     def instant(self, now: Ns, asked: list[ArcRequest]) -> None:
         """First what ends, then what was asked, then one pass."""
         if self.shares is not None:
-            holds = [(one.request, one.request.needs) for one in self.running()]
+            holds = [(one.request, one.needs) for one in self.running()]
             waiting = [one.request for one in self.contenders if one.start is None]
             self.shares.pass_time(now, holds, waiting, {*self.rcs})
         for one in self.running():
@@ -163,7 +169,7 @@ class Oracle:
 
     def close(self, one: Contender, now: Ns, outcome: Outcome) -> None:
         assert one.start is not None
-        rcs = tuple(sorted(one.request.needs))
+        rcs = tuple(sorted(one.needs))
         self.holds.append(HoldRecord(one.request.arc, one.start, now, outcome, rcs))
         one.start = None
 
@@ -178,9 +184,10 @@ class Oracle:
             self.visit(first, now)
 
     def visit(self, a: Contender, now: Ns) -> None:
-        victims = self.victims(a, now)
-        if victims is None:
+        choice = self.choose(a, now)
+        if choice is None:
             return
+        victims, a.needs = choice
         for victim in victims:
             if victim.past_min_runtime(now):
                 self.finish(victim, now)
@@ -190,12 +197,26 @@ class Oracle:
         a.start = now
         self.note_waiting(now)
 
+    def choose(self, a: Contender, now: Ns) -> tuple[list[Contender], Mapping[str, Params]] | None:
+        """Whom it would preempt, and what it would hold, by the best of all choices; None when it has to wait."""
+        choices = []
+        for needs in bindings(a.request, self.rcs):
+            a.needs = needs
+            if (victims := self.victims(a, now)) is not None:
+                choices.append((victims, needs))
+        return max(choices, key=lambda choice: self.worth(choice[0], now), default=None)
+
+    def worth(self, victims: list[Contender], now: Ns) -> tuple[int, int, list[tuple[int, int, Ns, int]]]:
+        """Of two choices the one with fewer preemptions, then with fewer that end, then with lower ranks among them."""
+        preempted = sum(not one.past_min_runtime(now) for one in victims)
+        return -preempted, -len(victims), sorted(one.rank for one in victims)
+
     def victims(self, a: Contender, now: Ns) -> list[Contender] | None:
         """Whom `a` would preempt; None when it has to wait (steps 1 to 3)."""
-        if any(name not in self.rcs for name in a.request.needs):
+        if any(name not in self.rcs for name in a.needs):
             return None
-        exclusive = {name for name in a.request.needs if not self.rcs[name].sharable}
-        sharable = {name for name in a.request.needs if self.rcs[name].sharable}
+        exclusive = {name for name in a.needs if not self.rcs[name].sharable}
+        sharable = {name for name in a.needs if self.rcs[name].sharable}
         running = self.running()
 
         def may_displace(other: Contender) -> bool:
@@ -203,12 +224,10 @@ class Oracle:
                 return a.request.priority >= other.request.priority
             return a.request.priority > other.request.priority
 
-        blockers = [one for one in running if exclusive & set(one.request.needs)]
+        blockers = [one for one in running if exclusive & set(one.needs)]
         if not all(may_displace(one) for one in blockers):
             return None
-        candidates = [
-            one for one in running if one not in blockers and sharable & set(one.request.needs) and may_displace(one)
-        ]
+        candidates = [one for one in running if one not in blockers and sharable & set(one.needs) and may_displace(one)]
         stay = [one for one in running if one not in blockers and one not in candidates]
         if not self.accepted(sharable, [*stay, a]):
             return None
@@ -222,11 +241,19 @@ class Oracle:
         """Whether each of these RCs would carry those of `together` that need it."""
         return all(
             not excess(
-                self.rcs[name].capacity,
-                [(one.request.arc, one.request.needs[name]) for one in together if name in one.request.needs],
+                self.rcs[name].capacity, [(one.request.arc, one.needs[name]) for one in together if name in one.needs]
             )
             for name in sharable
         )
+
+
+def bindings(request: ArcRequest, rcs: Iterable[RcName]) -> Iterator[dict[str, Params]]:
+    """All ways to meet the needs of a request, by trying."""
+    names = list(rcs)
+    choices = [[rc for rc in names if matcher(need)(rc)] if is_pattern(need) else [need] for need in request.needs]
+    for chosen in product(*choices):
+        if len(set(chosen)) == len(chosen):
+            yield dict(zip(chosen, request.needs.values(), strict=True))
 
 
 def play(workload: Workload, *, one_by_one: bool = False, fair: FairShares | None = None) -> Replay:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
 import random
-from collections.abc import Iterator
 from fractions import Fraction
 
 import pytest
+from msgspec import structs
 
 from tests.scheduling.invariants import Ledger
+from tests.scheduling.oracle import Contender, Oracle, bindings
 from tests.scheduling.validate import validate
 from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy, StrategyName
-from zscout.keyexpr import is_pattern, matcher
 from zscout.lab.replay import replay
 from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.core import Core
@@ -23,6 +22,7 @@ from zscout.scheduling.model import (
     Effect,
     Event,
     Granted,
+    HoldEnded,
     LeadTaken,
     Propose,
     RcJoined,
@@ -203,18 +203,10 @@ def workload(seed: int) -> Workload:
     return Workload((*map(WorkloadRc, grabbers + robots), *radios), tuple(arrivals))
 
 
-def bindings(arc: Arc, rcs: list[str]) -> Iterator[set[str]]:
-    """All ways to meet an ARC's needs, by trying."""
-    choices = [[rc for rc in rcs if matcher(need)(rc)] if is_pattern(need) else [need] for need in arc.request.needs]
-    for chosen in itertools.product(*choices):
-        if len(set(chosen)) == len(chosen):
-            yield set(chosen)
-
-
 def could_start(core: Core, arc: Arc, work: Workload) -> bool:
     """Whether some choice of RCs is free as it stands: nobody has to give way, and every radio has room."""
     capacity = {rc.name: rc.capacity["rate"] for rc in work.rcs if rc.sharable}
-    for chosen in bindings(arc, [rc.name for rc in work.rcs]):
+    for chosen in bindings(arc.request, [rc.name for rc in work.rcs]):
         free = True
         for name in chosen:
             holders = core._state.rc(name).holders.values()
@@ -243,19 +235,51 @@ def test_nobody_waits_while_some_choice_is_free(strategy: StrategyName, seed: in
 
     played = replay(work, watch, strategy=STRATEGIES[strategy](), policy=SchedulingPolicy(patience=None))
     assert set(played.unserved) == {
-        one.request.arc for one in work.arrivals if not any(bindings(_arc(one.request), [rc.name for rc in work.rcs]))
+        one.request.arc for one in work.arrivals if not any(bindings(one.request, [rc.name for rc in work.rcs]))
     }
 
 
-def _arc(wanted: ArcRequest) -> Arc:
-    return Arc(wanted, Place(TERM, 1), 0)
+@pytest.mark.parametrize("strategy", ALL)
+@pytest.mark.parametrize("first", range(0, times(340), 170))
+def test_the_fewest_and_lowest_ranked_end_of_all_choices(strategy: StrategyName, first: int) -> None:
+    for seed in range(first, first + 170):
+        draw = random.Random(seed)  # noqa: S311
+        rcs = ["fg/a1", "fg/a2", "fg/b1", "video/1", "video/2", "robot/x", "robot/y"]
+        # Which of those who share a radio end the others decide by what is in use then.
+        capacity = {"radio/a": 10, "radio/b": 10} if strategy == "priority" else {}
+        core = core_of(strategy, *rcs, *capacity)
+        for number in range(draw.randint(2, 8)):
+            needs = draw.sample([*rcs, *capacity], draw.randint(1, 3))
+            how = {"priority": draw.randint(1, 3), "seconds": draw.randint(1, 9), "rate": draw.randint(1, 6)}
+            wanted = structs.replace(request(f"a{number}", *needs, **how), keep=draw.random() < 0.7)
+            _answered(core, number, capacity, Requested(wanted))
+        named = draw.sample(rcs, draw.randint(0, 2)) + draw.sample(
+            sorted(capacity), draw.randint(0, min(1, len(capacity)))
+        )
+        patterns = draw.sample(["fg/*", "fg/*#2", "fg/a$*", "video/*", "robot/*"], draw.randint(1, 3))
+        patterns += ["radio/*"] if capacity and draw.random() < 0.3 else []
+        wanted = request("last", *named, *patterns, priority=draw.randint(2, 4), rate=draw.randint(1, 6))
+        now = 5 * SECOND
+        _answered(core, now, capacity, Tick())
+        oracle = Oracle([*map(WorkloadRc, rcs), *(WorkloadRc(rc, True, {"rate": Fraction(10)}) for rc in capacity)])
+        for arc in core._state.running.values():
+            assert arc.hold is not None
+            oracle.contenders.append(Contender(arc.request, arc.place.arrival, arc.hold.start, 0, arc.needs))
+        best = oracle.choose(Contender(wanted, 1000), now)
+        effects = _answered(core, now, capacity, Requested(wanted))
+        assert ("last" in core._state.running) is (best is not None), seed
+        if best is not None:
+            by_last = {effect.arc for effect in effects if isinstance(effect, HoldEnded) and effect.by == "last"}
+            ended = [one for one in oracle.running() if one.request.arc in by_last]
+            assert oracle.worth(ended, now) == oracle.worth(best[0], now), seed
 
 
-def _answered(core: Core, now: Ns, capacity: dict[str, int], *events: Event) -> None:
-    """A batch with every vote that it takes: a radio of unknown capacity accepts all."""
-    batch = list(events)
+def _answered(core: Core, now: Ns, capacity: dict[str, int], *events: Event) -> list[Effect]:
+    """A batch with every vote that it takes, and its effects: a radio of unknown capacity accepts all."""
+    batch, all_effects = list(events), list[Effect]()
     while batch:
         effects = core.handle(now, *batch)
+        all_effects += effects
         batch = [
             Vote(
                 effect.proposal,
@@ -264,3 +288,4 @@ def _answered(core: Core, now: Ns, capacity: dict[str, int], *events: Event) -> 
             for effect in effects
             if isinstance(effect, Propose)
         ]
+    return all_effects

@@ -8,14 +8,20 @@ The worst of an ARC's choices counts (`Fitness`): of two bindings, the one that 
 by augmenting paths (Kuhn's algorithm), so that an ARC never waits where some choice of free RCs would let it run.
 Between equals, the RC that fewest wait for by name: they have no other choice.
 
+Where holds have to end, the fewest and lowest-ranked do (`_least_ending`). Whoever holds an exclusive RC that the ARC
+names ends anyway, and so all else that it holds is as good as free.
+
 `optimal` is exact for the binding of the instant; it does not search all bindings of all ARCs.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from enum import IntEnum
+from operator import attrgetter
+from typing import Final, NamedTuple
 
-from zscout.scheduling.model import Arc, Rc, absences
+from zscout.scheduling.model import Arc, Rank, Rc, absences, union
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.state import SchedulerState
@@ -26,52 +32,141 @@ class Fitness(IntEnum):
     """How well an RC would do, the best first."""
 
     FREE = 0
-    CLAIMED = 1
+    FREED = 1
+    """Held by one that ends for it anyway."""
+    CLAIMED = 2
     """Bound already to one that ranks before in this pass."""
-    PREEMPTIBLE = 2
+    PREEMPTIBLE = 3
     """Held by one that is preempted for it."""
-    RESERVED = 3
+    RESERVED = 4
     """Reserved for another, or its vote is not known and it does not answer."""
-    HELD = 4
+    HELD = 5
     """Held by one that is not preempted for it, or it has refused."""
+
+
+MAX_TRIED: Final = 200
+"""Choices looked at for who has to end."""
+
+
+class _Choice(NamedTuple):
+    """An RC for a pattern. The least is the best."""
+
+    fitness: Fitness
+    tie: float
+    """Decides between equals."""
+    bit: int
+    rc: Rc
 
 
 def bind(state: SchedulerState, arc: Arc, reserved: Reservations | None, *, without: int = 0, claimed: int = 0) -> bool:
     """Binds `arc` to the best RCs there are but those of `without`; others are bound to those of `claimed` already (bit
     masks), and some its owner may not hold. False: there is no such binding; the old one stays."""
     taken = without | state.barred(arc) | arc.named_mask
-    options: dict[Need, list[tuple[int, float, int, Rc]]] = {}
+    ending = set(_exclusive_victims(state, arc, arc.named_mask))
+    options: dict[Need, list[_Choice]] = {}
     for need in arc.patterns:
         matching = (rc for rc in state.matching(need) if rc.present and not rc.bit & taken)
-        options[need] = sorted((*_fitness(state, arc, rc, reserved, claimed), rc.bit, rc) for rc in matching)
+        options[need] = sorted(_choice(state, arc, rc, reserved, claimed, ending) for rc in matching)
     for worst in Fitness:
-        allowed = {need: [rc for fitness, _, _, rc in found if fitness <= worst] for need, found in options.items()}
+        allowed = {need: [one.rc for one in found if one.fitness <= worst] for need, found in options.items()}
         if all(allowed.values()) and (chosen := distinct(allowed)) is not None:
+            if worst <= Fitness.PREEMPTIBLE and state.running:
+                chosen = _least_ending(state, arc, chosen, options, claimed if worst < Fitness.CLAIMED else 0)
             state.bind(arc, {need: rc.name for need, rc in chosen.items()})
             return True
     return False
 
 
-def _fitness(
-    state: SchedulerState, arc: Arc, rc: Rc, reserved: Reservations | None, claimed: int
-) -> tuple[Fitness, float]:
-    """How well `rc` would do, and what decides between equals."""
+def _choice(
+    state: SchedulerState, arc: Arc, rc: Rc, reserved: Reservations | None, claimed: int, ending: Collection[Arc]
+) -> _Choice:
+    """How well `rc` would do, where those who are `ending` do so anyway."""
     non_preemptible = rc.non_preemptible_holders(arc, state.now)
     closed = reserved is not None and reserved.reserves(rc, arc)
     if rc.sharable:
         answer = state.votes.known(rc.name, frozenset((*(holder.id for holder in non_preemptible), arc.id)))
         if closed or (answer is None and rc.name in state.votes.unresponsive):
-            return Fitness.RESERVED, rc.demand
+            return _Choice(Fitness.RESERVED, rc.demand, rc.bit, rc)
         if answer is not None and not answer.accept:
-            return Fitness.HELD, rc.demand
-        return Fitness.FREE, len(rc.holders) + (answer is None)
+            return _Choice(Fitness.HELD, rc.demand, rc.bit, rc)
+        return _Choice(Fitness.FREE, len(rc.holders) + (answer is None), rc.bit, rc)
     if non_preemptible:
-        return Fitness.HELD, max(0 if one.hold is None else one.hold.end for one in non_preemptible)
+        held_until = max(0 if one.hold is None else one.hold.end for one in non_preemptible)
+        return _Choice(Fitness.HELD, held_until, rc.bit, rc)
     if closed:
-        return Fitness.RESERVED, rc.demand
-    if rc.holders:
-        return Fitness.PREEMPTIBLE, max(one.priority for one in rc.holders.values())
-    return (Fitness.CLAIMED if rc.bit & claimed else Fitness.FREE), rc.demand
+        return _Choice(Fitness.RESERVED, rc.demand, rc.bit, rc)
+    if others := [holder for holder in rc.holders.values() if holder not in ending]:
+        return _Choice(Fitness.PREEMPTIBLE, max(one.priority for one in others), rc.bit, rc)
+    if rc.bit & claimed:
+        return _Choice(Fitness.CLAIMED, rc.demand, rc.bit, rc)
+    return _Choice(Fitness.FREED if rc.holders else Fitness.FREE, rc.demand, rc.bit, rc)
+
+
+def _exclusive_victims(state: SchedulerState, arc: Arc, mask: int) -> Iterator[Arc]:
+    """Who holds exclusive RCs of these, and is preempted for `arc`."""
+    for rc in state.rcs_in(mask & ~state.sharable):
+        yield from (one for one in rc.holders.values() if one.preemptible_by(arc, state.now))
+
+
+def _victims(state: SchedulerState, arc: Arc, mask: int) -> set[Arc]:
+    """Who ends if `arc` starts with these RCs, by steps 3b and 3c of `priority`. A vote that is not known counts as a
+    yes: it is asked before anybody is preempted."""
+    ending = set(_exclusive_victims(state, arc, mask))
+    sharables, now = list(state.rcs_in(mask & state.sharable)), state.now
+    kept = {rc: {arc.id, *(one.id for one in rc.non_preemptible_holders(arc, now))} for rc in sharables}
+    sharers = {one for rc in sharables for one in rc.holders.values() if one.preemptible_by(arc, now)} - ending
+    for sharer in sorted(sharers, key=attrgetter("rank")):
+        shared = [rc for rc in sharables if sharer.id in rc.holders]
+        answers = [state.votes.known(rc.name, frozenset((*kept[rc], sharer.id))) for rc in shared]
+        if all(answer is None or answer.accept for answer in answers):
+            for rc in shared:
+                kept[rc].add(sharer.id)
+        else:
+            ending.add(sharer)
+    return ending
+
+
+def _least_ending(
+    state: SchedulerState, arc: Arc, start: dict[Need, Rc], options: Mapping[Need, Sequence[_Choice]], claimed: int
+) -> dict[Need, Rc]:
+    """An RC of its own for each need, none of those `claimed`, so that the fewest holds end: first of those within
+    their minimum runtimes, then of all, then the lowest-ranked. Branch and bound from `start`, the best of
+    MAX_TRIED choices."""
+    now, best = state.now, start
+
+    def cost(ending: Collection[Arc]) -> tuple[int, int]:
+        return sum(not one.past_min_runtime(now) for one in ending), len(ending)
+
+    least = _victims(state, arc, arc.named_mask | union(rc.bit for rc in start.values()))
+    if cost(least) == cost(set(_exclusive_victims(state, arc, arc.named_mask))):
+        return start
+    needs = sorted(options, key=lambda need: (len(options[need]), need))
+    bits = {
+        need: [(one.rc, one.bit) for one in found if one.fitness <= Fitness.PREEMPTIBLE and not one.bit & claimed]
+        for need, found in options.items()
+    }
+    tried = 0
+
+    def place(at: int, mask: int, chosen: dict[Need, Rc]) -> None:
+        nonlocal best, least, tried
+        if at == len(needs):
+            ending = _victims(state, arc, mask)
+            if (cost(ending), _ranks(least)) < (cost(least), _ranks(ending)):
+                best, least = chosen, ending
+            return
+        for rc, bit in bits[needs[at]]:
+            tried += 1
+            if tried > MAX_TRIED:
+                return
+            if not bit & mask and cost(set(_exclusive_victims(state, arc, mask | bit))) <= cost(least):
+                place(at + 1, mask | bit, {**chosen, needs[at]: rc})
+
+    place(0, arc.named_mask, {})
+    return best
+
+
+def _ranks(arcs: Iterable[Arc]) -> list[Rank]:
+    return sorted(arc.rank for arc in arcs)
 
 
 def bind_all(state: SchedulerState, reserved: Reservations | None = None) -> None:

@@ -49,6 +49,72 @@ def test_nobody_is_no_alarm_and_a_walker_is_one_within_a_second(noise: float, ra
     assert best > 0.5
 
 
+def told_after(detector: MotionDetector, scene: Scene, start: float, rate: float = 4.0) -> float | None:
+    """Seconds from the first picture of a walker, who comes at `start` and is not much darker than the wall, until he
+    is told."""
+    for time in times(rate, 3.0, start):
+        if detector.see(time, scene.picture(20 + 40 * (time - start), shade=80)).moving:
+            return time - start
+    return None
+
+
+def test_what_a_camera_shows_as_it_warms_up_is_not_learned() -> None:
+    scene, detector = Scene(3, noise=3.0), MotionDetector()
+    other = Scene(30, noise=3.0)
+    # The channel still shows another robot, then comes what is half snow, then a good picture.
+    detector.see(0.0, other.picture())
+    for time, snow in ((1.75, 20.0), (2.0, 9.0)):
+        spoiled = scene.picture() + scene.rng.normal(0, snow, scene.wall.shape)
+        detector.see(time, np.clip(spoiled, 0, 255).astype(np.uint8))
+    assert not any(detector.see(time, scene.picture()).moving for time in times(4.0, 1.75, 2.25))
+    told = told_after(detector, scene, 4.0)
+    assert told is not None
+    assert told <= 0.5
+
+
+def test_after_a_pause_the_background_is_known() -> None:
+    scene = Scene(4)
+    detector = settled(scene, rate=4.0, seconds=8.0)
+    detector.pause()
+    # Somebody else's picture, and what is half snow, are waited out.
+    assert detector.see(60.0, Scene(40).picture()).learning
+    spoiled = scene.picture() + scene.rng.normal(0, 20, scene.wall.shape)
+    assert detector.see(61.75, np.clip(spoiled, 0, 255).astype(np.uint8)).learning
+    assert detector.see(62.0, scene.picture()).learning
+    assert not detector.see(62.25, scene.picture()).learning
+    told = told_after(detector, scene, 62.5)
+    assert told is not None
+    assert told <= 0.5
+
+
+def test_what_has_changed_in_a_pause_is_no_motion() -> None:
+    scene = Scene(5)
+    detector = settled(scene, rate=4.0, seconds=8.0)
+    detector.pause()
+    assert not any(detector.see(time, scene.picture(70)).moving for time in times(4.0, 10.0, 60.0))
+    told = told_after(detector, scene, 80.0)
+    assert told is not None
+    assert told <= 1.0
+
+
+def test_who_was_moved_in_a_pause_learns_anew() -> None:
+    detector = settled(Scene(6), rate=4.0, seconds=8.0)
+    detector.pause()
+    scene = Scene(60)
+    assert not any(detector.see(time, scene.picture()).moving for time in times(4.0, 6.0, 60.0))
+    told = told_after(detector, scene, 66.0)
+    assert told is not None
+    assert told <= 0.5
+
+
+def test_who_paused_before_he_knew_anything_learns_anew() -> None:
+    scene, detector = Scene(7), MotionDetector()
+    detector.see(0.0, Scene(70).picture())
+    detector.pause()
+    assert not any(detector.see(time, scene.picture()).moving for time in times(4.0, 3.0, 10.0))
+    assert told_after(detector, scene, 13.0) is not None
+
+
 def test_pictures_at_uneven_times_with_gaps() -> None:
     scene, detector = Scene(2), MotionDetector()
     moments = np.cumsum(np.random.default_rng(2).exponential(0.3, 100))

@@ -38,7 +38,7 @@ class SharedParams(Struct, kw_only=True):
     command_rate: Annotated[float, key("Commands in a second.", 0.5, 50)] = 5.0
     hide_priority: Priority = 2
     watch_priority: Priority = 1
-    hide_slot: Slot = 30.0
+    hide_slot: Slot = 60.0
     watch_slot: Slot = 20.0
     speed: Annotated[float, key("Seconds in one of ours.", 0.01, 100)] = 1.0
 

@@ -40,6 +40,21 @@ ABSORB: Final = 30.0
 WARM: Final = 1.0
 """Seconds of the first look: all is background, and nothing is reported."""
 WARM_PICTURES: Final = 4
+CLEARER: Final = 0.7
+"""A picture of the first look whose noise is less than this part of the first one's begins it anew: the camera was
+still warming up, and what its noise taught would hide what moves for a long time."""
+OTHER: Final = 4.0
+OTHER_NOISE: Final = 2.0
+"""So does one of which half is off by more than so many grey levels, and so many times its noise: the first was of
+something else. A channel may still show the robot that had it before."""
+ALIKE: Final = 1.2
+"""A picture after a pause has at most so many times the noise of the last before it, and at least as much less,"""
+CHANGED: Final = 0.2
+"""and is another in at most this share: else it is not of the background that is known."""
+AGREE: Final = (0.15, 1.0)
+"""Seconds, at least and at most, between two such pictures that go on with it: the last of another robot is alone."""
+RETURN: Final = 2.0
+"""Seconds after a pause in which pictures are waited for that fit what was known before; then all is learned anew."""
 STRONG: Final = 6.5
 """Standard deviations that begin a region."""
 WEAK: Final = 3.2
@@ -112,6 +127,14 @@ class MotionDetector:
         self._variance = self._mean
         self._begun = self._last = 0.0
         self._pictures = 0
+        self._noise = 0.0
+        """The most of the pictures of the first look, or that of the last before a pause; in grey levels."""
+        self._latest = self._mean
+        self._paused = False
+        self._back: float | None = None
+        """When the first picture after a pause came, with no gap since."""
+        self._fits: float | None = None
+        """Since when all have fitted."""
         self._sightings: deque[tuple[float, NDArray[np.uint8]]] = deque(maxlen=RECENT - 1)
 
     def see(self, time: float, picture: Picture) -> Seen:
@@ -121,11 +144,15 @@ class MotionDetector:
         if self._mean.shape != grey.shape:
             return self._begin(time, grey)
         passed = min(1.0, max(0.0, time - self._last))
-        self._last = time
-        self._pictures += 1
+        self._last, self._latest = time, grey
         level = _levelled(grey, self._mean)
         away = level - self._mean
+        if self._paused:
+            return self._return(time, grey, level, away, passed)
+        self._pictures += 1
         if self._pictures < WARM_PICTURES or time - self._begun < WARM:
+            if self._is_no_first_look(grey, away):
+                return self._begin(time, grey)
             self._learn(away, None, 1.0 / self._pictures, 1.0)
             return Seen(False, learning=True)
         score, middle = self._score(away)
@@ -146,11 +173,48 @@ class MotionDetector:
         )
         return Seen(self._sure(time, mask), boxes)
 
+    def _is_no_first_look(self, grey: _Plane, away: _Plane) -> bool:
+        """Whether the background so far is of something else, or of a camera that was still warming up."""
+        noise, before = _noise(grey), self._noise
+        self._noise = max(before, noise)
+        return noise < CLEARER * before or _off(away) > max(OTHER, OTHER_NOISE * noise)
+
+    def pause(self) -> None:
+        """No pictures come for a while. What is known of the background is kept: the first picture afterwards that
+        fits it goes on with it. Until then nothing is reported."""
+        self._sightings.clear()
+        if self._pictures < WARM_PICTURES:
+            self._mean = np.empty((0, 0), np.float32)
+        elif not self._paused:
+            self._noise = _noise(self._latest)
+            self._paused = True
+        self._back = self._fits = None
+
+    def _return(self, time: float, grey: _Plane, level: _Plane, away: _Plane, passed: float) -> Seen:
+        if self._back is None or passed >= AGREE[1]:
+            self._back = time
+        score, middle = self._score(away)
+        mask, _ = self._regions(score, level)
+        changed = np.count_nonzero(mask) / mask.size
+        alike = 1 / ALIKE <= _noise(grey) / max(self._noise, 1e-3) <= ALIKE
+        if not alike or middle > ALL_OFF or changed > CHANGED:
+            # The camera is warming up, or this is not its picture; or it is not where it was.
+            self._fits = None
+            return self._begin(time, grey) if time - self._back > RETURN else Seen(False, learning=True)
+        if self._fits is None or time - self._fits > AGREE[1]:
+            self._fits = time
+        if time - self._fits < AGREE[0]:
+            return Seen(False, learning=True)
+        self._paused = False
+        # What is another now has become so while nobody looked, and moves no more than the rest.
+        self._mean = np.where(mask > 0, level, self._mean)
+        return Seen(False)
+
     def _begin(self, time: float, grey: _Plane) -> Seen:
         self._mean = grey.copy()
         self._variance = np.full_like(grey, FLOOR**2)
         self._begun = self._last = time
-        self._pictures = 1
+        self._pictures, self._noise, self._paused = 1, _noise(grey), False
         self._sightings.clear()
         return Seen(False, learning=True)
 
@@ -216,6 +280,17 @@ def reduced(picture: Picture) -> tuple[_Plane, float, float]:
     if picture.ndim == 3:
         picture = np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8)
     return picture.astype(np.float32), width / picture.shape[1], height / picture.shape[0]
+
+
+def _noise(grey: _Plane) -> float:
+    """Standard deviation of a picture's noise and fine texture, in grey levels: by what lines differ from the mean of
+    their neighbours."""
+    return float(np.mean(np.abs(np.diff(grey, 2, axis=0)))) / 1.954
+
+
+def _off(away: _Plane) -> float:
+    """By how many grey levels half of a smoothed picture is off."""
+    return float(np.median(np.abs(cv2.GaussianBlur(away, (3, 3), 0))))
 
 
 def _levelled(grey: _Plane, mean: _Plane) -> _Plane:

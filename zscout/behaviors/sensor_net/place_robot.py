@@ -44,7 +44,7 @@ class Slots:
 
     hide_priority: int = 2
     watch_priority: int = 1
-    hide: float = 30.0
+    hide: float = 60.0
     watch: float = 20.0
 
     def of(self, task: Task) -> tuple[int, float]:

@@ -7,6 +7,7 @@ and then *watches* for motion.
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Literal, TypeAlias
@@ -51,6 +52,8 @@ class Step:
     """The task of this hold is done: give it back, and ask for the other."""
     blind: bool = False
     """No picture for too long: give the hold back."""
+    learning: bool = False
+    """It watches, and can't tell yet what moves."""
 
 
 class Alerts:
@@ -149,10 +152,12 @@ class Blindness:
         return self._in_row >= SUSPECTS
 
     def choose(self, now: float, channels: Iterable[str]) -> str | None:
-        """A channel to ask for by name, because another one is to be avoided; None: any will do."""
+        """A channel to ask for by name, because another one is to be avoided; None: any will do. Where all are, the
+        one that showed nothing the longest ago."""
         self._bad = {channel: at for channel, at in self._bad.items() if now - at < BAD_FOR}
-        good = sorted(set(channels) - self._bad.keys())
-        return good[0] if self._bad and good else None
+        if self._bad.keys().isdisjoint(channels := set(channels)):
+            return None
+        return min(channels, key=lambda channel: (self._bad.get(channel, -math.inf), channel))
 
     def memory(self) -> dict[str, Any]:
         return {"bad": self._bad, "in_row": self._in_row}
@@ -184,7 +189,11 @@ class Scout:
             return
         self._held = True
         self._task = self.task
-        self._detector = MotionDetector()
+        if self._task == "hide":
+            self._detector = MotionDetector()
+        else:
+            # It is where it was, if nobody has moved it: what it knows of its background it need not learn again.
+            self._detector.pause()
         self.hider.resumed(now)
         self.blindness.begin(now)
 
@@ -210,7 +219,8 @@ class Scout:
         edge, count = self.alerts.see(now, seen.moving), self.alerts.count
         if self.alerts.moving:
             return Step(0, 0, 0, "alert", f"motion {count}", tuple(seen.boxes), alert=edge == "start")
-        return Step(0, 0, 0, "watch", f"{count} alerts so far", quiet=edge == "end")
+        words = f"{count} alerts so far"
+        return Step(0, 0, 0, "watch", words, quiet=edge == "end", learning=seen.learning)
 
     # What outlives a move
 

@@ -168,11 +168,11 @@ class World:
         """Whether its camera looks at the lit part of the room; the rule is `Truth.faces_light`'s."""
         return self.truth.faces_light(*self.bodies[robot].pose)
 
-    def people_in_view(self, robot: str) -> int:
-        """Pixels of the robot's picture that show somebody walking, unhidden."""
+    def people_in_view(self, robot: str, pose: Pose | None = None) -> int:
+        """Pixels of the robot's picture that show somebody walking, unhidden; or that would if it stood elsewhere."""
         if not any(walker.here for walker in self.walkers):
             return 0
-        pose, shapes = self.bodies[robot].pose, self._moving(robot)
+        pose, shapes = pose or self.bodies[robot].pose, self._moving(robot)
         parts = [columns_of(*pose, shape) for shape in shapes if shape.person]
         within = [part for part in parts if part is not None]
         if not within:

@@ -22,6 +22,7 @@ from zscout.lab.building.drawn import drawn_plan
 from zscout.lab.building.plan import Plan
 from zscout.lab.building.plan_file import load_plan, shipped_plans
 from zscout.lab.trials import hide
+from zscout.lab.trials.crossings import FATES, CrossingsOf, Fate
 from zscout.lab.trials.field import Field, FieldRun, crewed
 from zscout.lab.trials.field_figures import Outcomes
 
@@ -39,6 +40,8 @@ SLOT_ROBOTS: Final = 4
 SLOT_CHANNELS: Final = 1
 SECONDS: Final = 180.0
 ENOUGH_BAUD: Final = 9_600
+FEW: Final = 20
+"""Crossings of a robot's place from which its share in time is told."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +162,14 @@ class FieldFigures:
     crossings: int
     alerted: float
     """Share of the crossings of a watching robot's picture that were alerted within a second."""
+    account: dict[Fate, int]
+    """All crossings of placed robots' places, held or not, by what became of them."""
+    in_time: float
+    """Share of them."""
+    best: float
+    """Share of them that could have been in time, as the robot was on the air, and its camera warm."""
+    least: float
+    """Share in time of the robot with the least, as a part of the mean of all robots; over those with FEW or more."""
     watched: float
     """Hours of watching, all robots of all runs."""
     false_alarms: float
@@ -207,6 +218,7 @@ def _summed(field: Field, runs: Sequence[Outcomes]) -> FieldFigures:
     placed = [robot for run in runs for robot, at in run.placed.items() if at is not None]
     hours = sum(run.watched for run in runs) / 3600
     walks, crossings = sum(run.walks for run in runs), sum(run.crossings for run in runs)
+    whole, of_robots = _account(runs)
     return FieldFigures(
         robots=field.robots,
         channels=field.channels,
@@ -223,6 +235,10 @@ def _summed(field: Field, runs: Sequence[Outcomes]) -> FieldFigures:
         noticed_spread=quantiles_of([run.noticed / run.walks for run in runs if run.walks]),
         crossings=crossings,
         alerted=_share(sum(run.alerted for run in runs), crossings),
+        account={fate: whole.fates[fate] for fate in FATES},
+        in_time=whole.in_time,
+        best=_share(whole.could, whole.all),
+        least=min((_share(one.in_time, whole.in_time) for one in of_robots), default=math.nan),
         watched=hours,
         false_alarms=_share(sum(run.false_alarms for run in runs), hours),
         robot_alarms=_share(sum(run.robot_alarms for run in runs), hours),
@@ -231,6 +247,17 @@ def _summed(field: Field, runs: Sequence[Outcomes]) -> FieldFigures:
         turned_unheld=sum(run.turned_unheld for run in runs) / len(runs),
         longest_stop=max(run.longest_stop for run in runs),
     )
+
+
+def _account(runs: Sequence[Outcomes]) -> tuple[CrossingsOf, list[CrossingsOf]]:
+    """Of all runs together, and of each robot over all of them, if it has FEW or more."""
+    whole, of_robots = CrossingsOf(), dict[int, CrossingsOf]()
+    for run in runs:
+        # Buildings have names of their own for their robots.
+        for number, one in enumerate(run.account.values()):
+            whole.add(one)
+            of_robots.setdefault(number, CrossingsOf()).add(one)
+    return whole, [one for one in of_robots.values() if one.all >= FEW]
 
 
 def start_figures(trials: Iterable[RobotsTrial]) -> list[StartFigures]:

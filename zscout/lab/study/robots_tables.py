@@ -8,6 +8,7 @@ from typing import Final
 
 from zscout import terminal
 from zscout.lab.study.robots import FieldFigures, Quantiles, RobotsReport
+from zscout.lab.trials.crossings import FATES
 
 COLUMNS: Final = (
     "all placed (10-90 %)",
@@ -39,6 +40,7 @@ def print_report(found: RobotsReport, names: Sequence[str], seeds: int, seconds:
             [[*(f"{getattr(one, key):g}" for key in keys), *_cells(one)] for one in figures],
             title=title,
         )
+        _print_account(keys, figures)
     if found.starts:
         terminal.print_table(
             ["building", "starts", "truly dark", "and facing the light", "seconds (10-90 %)", "bumps"],
@@ -55,6 +57,24 @@ def print_report(found: RobotsReport, names: Sequence[str], seeds: int, seconds:
             ],
             title="One robot, random starts: hidden within 120 s",
         )
+
+
+def _print_account(keys: Sequence[str], figures: Sequence[FieldFigures]) -> None:
+    """Where the crossings of placed robots went, and what share of them could have been in time."""
+    told = [one for one in figures if sum(one.account.values())]
+    if not told:
+        return
+    fates = [fate for fate in FATES if any(one.account[fate] for one in told)]
+    rows = []
+    for one in told:
+        whole = sum(one.account.values())
+        shares = (percent(one.account[fate] / whole) for fate in fates)
+        rows.append(
+            [*(f"{getattr(one, key):g}" for key in keys), str(whole), *shares, percent(one.best), percent(one.least)]
+        )
+    terminal.print_line("")
+    heads = [*(key.replace("command_rate", "commands/s") for key in keys), "crossings", *fates, "best", "least robot"]
+    terminal.print_table(heads, rows, title="Where the crossings of placed robots went")
 
 
 def _means(figures: Sequence[FieldFigures]) -> str:

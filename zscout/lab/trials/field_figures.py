@@ -15,6 +15,7 @@ from zscout.lab.building.casting import EYE, VIEW
 from zscout.lab.building.light import hidden
 from zscout.lab.building.solids import cuboids_of
 from zscout.lab.building.world import World
+from zscout.lab.trials.crossings import Crossings, CrossingsOf
 from zscout.lab.trials.watch import CLEAR, IN_TIME, PIXELS
 
 SETTLED: Final = 120.0
@@ -47,6 +48,8 @@ class Outcomes:
     """Of a watching robot's picture, by people."""
     alerted: int = 0
     """Of these: within IN_TIME."""
+    account: dict[str, CrossingsOf] = field(default_factory=dict)
+    """By robot: where all crossings of its place went, whether it was held or not."""
     false_alarms: int = 0
     """Alerts with nothing in view that moved."""
     robot_alarms: int = 0
@@ -84,6 +87,8 @@ class Judge:
         self._walks: dict[int, bool | None] = {}
         """By number of the walker who is here: whether that was noticed; None if it doesn't count."""
         self._boxes = cuboids_of(world.plan)
+        self._crossings = Crossings(world, list(outcomes.placed))
+        outcomes.account = self._crossings.found
 
     def placed(self, robot: str) -> None:
         """It reports that it is hidden; only the first time counts."""
@@ -91,6 +96,7 @@ class Judge:
             self.outcomes.placed[robot] = self._world.time
             self.outcomes.dark[robot] = self._world.is_dark(robot)
             self.outcomes.facing[robot] = self._world.faces_light(robot)
+        self._crossings.hidden(robot)
 
     def held(self, robot: str) -> None:
         self.outcomes.holds += 1
@@ -101,11 +107,16 @@ class Judge:
     def ended(self, robot: str, *, preempted: bool) -> None:
         self.outcomes.preemptions += preempted
         self._unheld_since[robot] = self._world.time
+        self._crossings.ended(robot)
         if _turns(self._world.bodies[robot]):
             self._turned.add(robot)
 
     def looked(self, robot: str, step: Step, interval: float) -> None:
         """Compares a look of a watching robot, one every `interval` seconds, with what was in its view."""
+        watches = step.doing in ("watch", "alert", "blind")
+        self._crossings.looked(
+            robot, watches=watches, picture=step.doing != "blind", learning=step.learning, alert=step.doing == "alert"
+        )
         if step.doing in ("watch", "alert"):
             self.outcomes.watched += interval
             people = self._world.people_in_view(robot)
@@ -134,6 +145,7 @@ class Judge:
                 if now - since > RUN_OUT:
                     del self._unheld_since[name]
         self._follow_walks(alarm)
+        self._crossings.stepped()
 
     def _follow_walks(self, alarm: bool) -> None:
         out, now = self.outcomes, self._world.time
