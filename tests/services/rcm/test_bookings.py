@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeClient, FakeFleet, Refusal, request
 from zscout.keyexpr import Role, Token
-from zscout.lab.faults.memory import MemoryMesh
+from zscout.lab.faults.memory import MemoryMesh, MemoryTransport
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import (
     Book,
@@ -706,5 +706,29 @@ def test_a_date_by_pattern_goes_to_another_shared_rc_once_that_has_voted() -> No
         views = await fleet.bookings()
         assert {name: states(view) for name, view in views.items()} == {"low": ["open"], "high": ["open"]}
         assert views["low"].dates[0].bound == {"radio/*": "radio/rf1"}
+
+    run(story())
+
+
+def test_a_keeper_that_nobody_asks_joins_the_mesh_anew() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        await led(fleet, "x", "y")
+        client = fleet.client("one", "x")
+        await asyncio.sleep(1)
+        # The link to y has come back without what y had declared to be asked by.
+        (y,) = (mesh for mesh in fleet.meshes if mesh.me.host == "y")
+        session = y._transport.current
+        assert isinstance(session, MemoryTransport)
+        forgotten = {one for one in session.queryables.all if "/bookings" in str(one)}
+        assert forgotten
+        for other in fleet.network.nodes:
+            fleet.network.between(session, other).hidden |= forgotten
+        with pytest.raises(Refusal, match="not_kept"):
+            await do(client, book("b", "robot/a", at=500), BookingView)
+        await asyncio.sleep(60)
+        await do(client, book("c", "robot/a", at=700), BookingView)
+        await asyncio.sleep(1)
+        assert [record.id for record in fleet.disks["y"].records][-1] == "c"
 
     run(story())

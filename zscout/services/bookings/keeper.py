@@ -39,6 +39,10 @@ log = logging.getLogger(__name__)
 FILE: Final = "bookings.json"
 MAX_SAVING: Final = 16
 """Answers that wait for the disk at one time."""
+UNASKED: Final[Ns] = 40 * SECOND
+"""After which a keeper that hears a leader, and is not asked by it, is not seen: each is asked every 30 s."""
+LEFT: Final[Ns] = 5 * SECOND
+"""Silence after which a leader counts as heard anew."""
 
 
 class _BookingFile(msgspec.Struct):
@@ -100,6 +104,10 @@ class BookingKeeper:
         """In which term, and when, that was."""
         self.since: Ns = 0
         """Since when it has gone on, on the own clock."""
+        self._leader: tuple[Term, Ns, Ns] = NO_TERM, 0, 0
+        """Who is heard, since when, and when last."""
+        self._asked: Ns = 0
+        """When a leader asked last."""
         self._saved = self.records.digest()
         """What the disk has."""
         self._saving = asyncio.Lock()
@@ -128,6 +136,10 @@ class BookingKeeper:
         if grants.time is None:
             return
         now, (term, at) = self.mesh.now(), self._heard
+        leader, since, last = self._leader
+        self._leader = grants.term, since if leader == grants.term and now - last < LEFT else now, now
+        unasked = now - max(self._asked, self._leader[1]) > UNASKED
+        self.mesh.suspicions.suspect("a leader is heard that asks nothing about bookings", so=unasked)
         offset, since = round(grants.time * SECOND) - now, now - round(grants.time_age * SECOND)
         if self._offset is not None and since >= self.since - SAME * SECOND:
             if grants.term == term:
@@ -177,6 +189,7 @@ class BookingKeeper:
         )
 
     def _on_shared(self, query: IncomingQuery[ShareBookings]) -> None:
+        self._asked = self.mesh.now()
         if self._waiting >= MAX_SAVING:
             raise Refused("busy", "this host is still writing bookings to its disk; ask again")
         if query.message.time is not None:
