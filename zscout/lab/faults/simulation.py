@@ -72,8 +72,8 @@ FORGOTTEN: Final = 0.3
 SETTLE: Final = 2.0
 """Seconds that RCs settle."""
 SETTLED_WITHIN: Final = 60.0
-"""Seconds after all was served in which all keepers know the same bookings: all are asked every 30 s, and one that is not
-for 40 s joins the mesh anew."""
+"""Seconds after all was served in which all keepers know the same bookings: all are asked every 30 s, and one that is
+not for 40 s joins the mesh anew."""
 COPIED_AT: Final = 10.0
 """Seconds after the beginning at which disks are copied."""
 LOOK_EVERY: Final = 0.05
