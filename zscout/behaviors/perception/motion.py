@@ -28,6 +28,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from zscout.behaviors.perception.outline import Mask, Outlines
+
 WIDTH: Final = 160
 """Columns of the picture that is looked at; larger ones are reduced to it."""
 MAX_SIDE: Final = 8_192
@@ -100,6 +102,8 @@ class Seen(NamedTuple):
     """Where, largest first; of a sighting that is not sure yet as well."""
     learning: bool = False
     """Nothing is known yet, or not any more: the background is new."""
+    mask: Mask | None = None
+    """Which pixels of the picture move, if that was asked for, and all is known."""
 
 
 class Event(NamedTuple):
@@ -122,7 +126,9 @@ class Event(NamedTuple):
 
 
 class MotionDetector:
-    def __init__(self) -> None:
+    def __init__(self, *, outlines: bool = False) -> None:
+        """With `outlines` it tells the very pixels that move, and boxes close around them."""
+        self._outlines = Outlines() if outlines else None
         self._mean: _Plane = np.empty((0, 0), np.float32)
         self._variance = self._mean
         self._begun = self._last = 0.0
@@ -140,25 +146,37 @@ class MotionDetector:
     def see(self, time: float, picture: Picture) -> Seen:
         """Takes a picture of shape (height, width), or (height, width, 3) in BGR, made at `time` in seconds
         of any clock. Raises ValueError for what is no picture."""
+        passed = min(1.0, max(0.0, time - self._last))
+        seen, regions = self._look(time, picture, passed)
+        if self._outlines is None:
+            return seen
+        if regions is None:
+            if not self._paused:
+                self._outlines.learn(picture, 1.0 / self._pictures)
+            return seen
+        mask = self._outlines.trace(picture, regions, passed / LEARN)
+        return seen._replace(boxes=tuple(_fitted(box, mask) for box in seen.boxes), mask=mask)
+
+    def _look(self, time: float, picture: Picture, passed: float) -> tuple[Seen, Mask | None]:
+        """And where something moves in the reduced picture, if that is known."""
         grey, across, down = reduced(picture)
         if self._mean.shape != grey.shape:
-            return self._begin(time, grey)
-        passed = min(1.0, max(0.0, time - self._last))
+            return self._begin(time, grey), None
         self._last, self._latest = time, grey
         level = _levelled(grey, self._mean)
         away = level - self._mean
         if self._paused:
-            return self._return(time, grey, level, away, passed)
+            return self._return(time, grey, level, away, passed), None
         self._pictures += 1
         if self._pictures < WARM_PICTURES or time - self._begun < WARM:
             if self._is_no_first_look(grey, away):
-                return self._begin(time, grey)
+                return self._begin(time, grey), None
             self._learn(away, None, 1.0 / self._pictures, 1.0)
-            return Seen(False, learning=True)
+            return Seen(False, learning=True), None
         score, middle = self._score(away)
         mask, regions = self._regions(score, level)
         if middle > ALL_OFF or np.count_nonzero(mask) / mask.size > UPHEAVAL:
-            return self._begin(time, grey)
+            return self._begin(time, grey), None
         self._learn(away, mask, passed / LEARN, passed / ABSORB)
         largest = sorted(regions.tolist(), key=lambda one: -one[cv2.CC_STAT_AREA])[:MAX_BOXES]
         height, width = picture.shape[:2]
@@ -171,7 +189,7 @@ class MotionDetector:
             )
             for x, y, w, h, _ in largest
         )
-        return Seen(self._sure(time, mask), boxes)
+        return Seen(self._sure(time, mask), boxes), mask
 
     def _is_no_first_look(self, grey: _Plane, away: _Plane) -> bool:
         """Whether the background so far is of something else, or of a camera that was still warming up."""
@@ -211,7 +229,7 @@ class MotionDetector:
         return Seen(False)
 
     def _begin(self, time: float, grey: _Plane) -> Seen:
-        self._mean = grey.copy()
+        self._mean, self._latest = grey.copy(), grey
         self._variance = np.full_like(grey, FLOOR**2)
         self._begun = self._last = time
         self._pictures, self._noise, self._paused = 1, _noise(grey), False
@@ -264,6 +282,14 @@ class MotionDetector:
         agree = sum(time - at <= MEMORY and bool(np.any(earlier & near)) for at, earlier in self._sightings)
         self._sightings.append((time, mask))
         return bool(np.any(mask)) and 1 + agree >= SURE
+
+
+def _fitted(box: Box, mask: Mask) -> Box:
+    """A box drawn close around what moves in it, or within a rim around it; as it was, if nothing does."""
+    rim_x, rim_y = box.width // 4 + 1, box.height // 4 + 1
+    left, top = max(0, box.x - rim_x), max(0, box.y - rim_y)
+    x, y, width, height = cv2.boundingRect(mask[top : box.y + box.height + rim_y, left : box.x + box.width + rim_x])
+    return Box(left + x, top + y, width, height) if width else box
 
 
 def reduced(picture: Picture) -> tuple[_Plane, float, float]:
