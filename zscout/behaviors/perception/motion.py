@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from zscout.behaviors.perception.outline import Mask, Outlines
+from zscout.behaviors.perception.presence import Presence
 
 WIDTH: Final = 160
 """Columns of the picture that is looked at; larger ones are reduced to it."""
@@ -102,6 +103,8 @@ class Seen(NamedTuple):
     """Where, largest first; of a sighting that is not sure yet as well."""
     learning: bool = False
     """Nothing is known yet, or not any more: the background is new."""
+    present: bool = False
+    """Nothing moves, but what moved last is still there."""
     mask: Mask | None = None
     """Which pixels of the picture move, if that was asked for, and all is known."""
 
@@ -141,6 +144,7 @@ class MotionDetector:
         """When the first picture after a pause came, with no gap since."""
         self._fits: float | None = None
         """Since when all have fitted."""
+        self._presence = Presence()
         self._sightings: deque[tuple[float, NDArray[np.uint8]]] = deque(maxlen=RECENT - 1)
 
     def see(self, time: float, picture: Picture) -> Seen:
@@ -189,7 +193,10 @@ class MotionDetector:
             )
             for x, y, w, h, _ in largest
         )
-        return Seen(self._sure(time, mask), boxes), mask
+        moving = self._sure(time, mask)
+        noise = _noise(grey) if self._presence.expects(moving) else 0.0
+        present = self._presence.see(time, level, self._mean, mask if moving else None, noise)
+        return Seen(moving, boxes, present=present), mask
 
     def _is_no_first_look(self, grey: _Plane, away: _Plane) -> bool:
         """Whether the background so far is of something else, or of a camera that was still warming up."""
@@ -201,6 +208,7 @@ class MotionDetector:
         """No pictures come for a while. What is known of the background is kept: the first picture afterwards that
         fits it goes on with it. Until then nothing is reported."""
         self._sightings.clear()
+        self._presence.clear()
         if self._pictures < WARM_PICTURES:
             self._mean = np.empty((0, 0), np.float32)
         elif not self._paused:
@@ -234,6 +242,7 @@ class MotionDetector:
         self._begun = self._last = time
         self._pictures, self._noise, self._paused = 1, _noise(grey), False
         self._sightings.clear()
+        self._presence.clear()
         return Seen(False, learning=True)
 
     def _score(self, away: _Plane) -> tuple[_Plane, float]:
