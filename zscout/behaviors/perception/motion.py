@@ -28,6 +28,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from zscout.behaviors.perception.outline import Mask, Outlines
+from zscout.behaviors.perception.presence import Presence
+
 WIDTH: Final = 160
 """Columns of the picture that is looked at; larger ones are reduced to it."""
 MAX_SIDE: Final = 8_192
@@ -100,6 +103,10 @@ class Seen(NamedTuple):
     """Where, largest first; of a sighting that is not sure yet as well."""
     learning: bool = False
     """Nothing is known yet, or not any more: the background is new."""
+    present: bool = False
+    """Nothing moves, but what moved last is still there."""
+    mask: Mask | None = None
+    """Which pixels of the picture move, if that was asked for, and all is known."""
 
 
 class Event(NamedTuple):
@@ -122,7 +129,9 @@ class Event(NamedTuple):
 
 
 class MotionDetector:
-    def __init__(self) -> None:
+    def __init__(self, *, outlines: bool = False) -> None:
+        """With `outlines` it tells the very pixels that move, and boxes close around them."""
+        self._outlines = Outlines() if outlines else None
         self._mean: _Plane = np.empty((0, 0), np.float32)
         self._variance = self._mean
         self._begun = self._last = 0.0
@@ -135,30 +144,43 @@ class MotionDetector:
         """When the first picture after a pause came, with no gap since."""
         self._fits: float | None = None
         """Since when all have fitted."""
+        self._presence = Presence()
         self._sightings: deque[tuple[float, NDArray[np.uint8]]] = deque(maxlen=RECENT - 1)
 
     def see(self, time: float, picture: Picture) -> Seen:
         """Takes a picture of shape (height, width), or (height, width, 3) in BGR, made at `time` in seconds
         of any clock. Raises ValueError for what is no picture."""
+        passed = min(1.0, max(0.0, time - self._last))
+        seen, regions = self._look(time, picture, passed)
+        if self._outlines is None:
+            return seen
+        if regions is None:
+            if not self._paused:
+                self._outlines.learn(picture, 1.0 / self._pictures)
+            return seen
+        mask = self._outlines.trace(picture, regions, passed / LEARN)
+        return seen._replace(boxes=tuple(_fitted(box, mask) for box in seen.boxes), mask=mask)
+
+    def _look(self, time: float, picture: Picture, passed: float) -> tuple[Seen, Mask | None]:
+        """And where something moves in the reduced picture, if that is known."""
         grey, across, down = reduced(picture)
         if self._mean.shape != grey.shape:
-            return self._begin(time, grey)
-        passed = min(1.0, max(0.0, time - self._last))
+            return self._begin(time, grey), None
         self._last, self._latest = time, grey
         level = _levelled(grey, self._mean)
         away = level - self._mean
         if self._paused:
-            return self._return(time, grey, level, away, passed)
+            return self._return(time, grey, level, away, passed), None
         self._pictures += 1
         if self._pictures < WARM_PICTURES or time - self._begun < WARM:
             if self._is_no_first_look(grey, away):
-                return self._begin(time, grey)
+                return self._begin(time, grey), None
             self._learn(away, None, 1.0 / self._pictures, 1.0)
-            return Seen(False, learning=True)
+            return Seen(False, learning=True), None
         score, middle = self._score(away)
         mask, regions = self._regions(score, level)
         if middle > ALL_OFF or np.count_nonzero(mask) / mask.size > UPHEAVAL:
-            return self._begin(time, grey)
+            return self._begin(time, grey), None
         self._learn(away, mask, passed / LEARN, passed / ABSORB)
         largest = sorted(regions.tolist(), key=lambda one: -one[cv2.CC_STAT_AREA])[:MAX_BOXES]
         height, width = picture.shape[:2]
@@ -171,7 +193,10 @@ class MotionDetector:
             )
             for x, y, w, h, _ in largest
         )
-        return Seen(self._sure(time, mask), boxes)
+        moving = self._sure(time, mask)
+        noise = _noise(grey) if self._presence.expects(moving) else 0.0
+        present = self._presence.see(time, level, self._mean, mask if moving else None, noise)
+        return Seen(moving, boxes, present=present), mask
 
     def _is_no_first_look(self, grey: _Plane, away: _Plane) -> bool:
         """Whether the background so far is of something else, or of a camera that was still warming up."""
@@ -183,6 +208,7 @@ class MotionDetector:
         """No pictures come for a while. What is known of the background is kept: the first picture afterwards that
         fits it goes on with it. Until then nothing is reported."""
         self._sightings.clear()
+        self._presence.clear()
         if self._pictures < WARM_PICTURES:
             self._mean = np.empty((0, 0), np.float32)
         elif not self._paused:
@@ -211,11 +237,12 @@ class MotionDetector:
         return Seen(False)
 
     def _begin(self, time: float, grey: _Plane) -> Seen:
-        self._mean = grey.copy()
+        self._mean, self._latest = grey.copy(), grey
         self._variance = np.full_like(grey, FLOOR**2)
         self._begun = self._last = time
         self._pictures, self._noise, self._paused = 1, _noise(grey), False
         self._sightings.clear()
+        self._presence.clear()
         return Seen(False, learning=True)
 
     def _score(self, away: _Plane) -> tuple[_Plane, float]:
@@ -264,6 +291,14 @@ class MotionDetector:
         agree = sum(time - at <= MEMORY and bool(np.any(earlier & near)) for at, earlier in self._sightings)
         self._sightings.append((time, mask))
         return bool(np.any(mask)) and 1 + agree >= SURE
+
+
+def _fitted(box: Box, mask: Mask) -> Box:
+    """A box drawn close around what moves in it, or within a rim around it; as it was, if nothing does."""
+    rim_x, rim_y = box.width // 4 + 1, box.height // 4 + 1
+    left, top = max(0, box.x - rim_x), max(0, box.y - rim_y)
+    x, y, width, height = cv2.boundingRect(mask[top : box.y + box.height + rim_y, left : box.x + box.width + rim_x])
+    return Box(left + x, top + y, width, height) if width else box
 
 
 def reduced(picture: Picture) -> tuple[_Plane, float, float]:

@@ -17,8 +17,10 @@ GONE: Final = "it is not on the mesh"
 RETRY: Final = 60.0
 """Seconds after which one that failed may be tried again, where there is nobody else."""
 
-HIDDEN: Final = frozenset({"hidden", "watch", "alert", "blind"})
-"""Status of a robot that has found its place."""
+WATCHING: Final = frozenset({"watch", "alert", "present"})
+"""Status of a robot that watches; `present`: who moved stands still."""
+HIDDEN: Final = WATCHING | {"hidden", "blind"}
+"""Status of one that has found its place."""
 PAUSED: Final = frozenset({"wait", "lost", ""})
 """Status that does not show whether it is hidden."""
 
@@ -68,7 +70,7 @@ class SensorNet:
 
     @property
     def watching(self) -> int:
-        return sum(member.doing in ("watch", "alert") for member in self._active)
+        return sum(member.doing in WATCHING for member in self._active)
 
     @property
     def alerts(self) -> int:

@@ -219,6 +219,8 @@ class Scout:
         edge, count = self.alerts.see(now, seen.moving), self.alerts.count
         if self.alerts.moving:
             return Step(0, 0, 0, "alert", f"motion {count}", tuple(seen.boxes), alert=edge == "start")
+        if seen.present:
+            return Step(0, 0, 0, "present", f"who moved stands still, motion {count}", quiet=edge == "end")
         words = f"{count} alerts so far"
         return Step(0, 0, 0, "watch", words, quiet=edge == "end", learning=seen.learning)
 

@@ -109,7 +109,7 @@ def watch(source: str, as_json: bool, record: Path | None, limit: float | None) 
 def _watch(source: VideoFile | LiveSource, report: _WatchReport, over: Callable[[float], bool]) -> None:
     from zscout.behaviors.perception.motion import EventTracker, MotionDetector
 
-    detector, tracker = MotionDetector(), EventTracker()
+    detector, tracker = MotionDetector(outlines=True), EventTracker()
     for time, picture in source.shots():
         if over(time):
             break

@@ -16,6 +16,7 @@ from typing import Any, Final
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
+from zscout.behaviors.sensor_net.net import HIDDEN, WATCHING
 from zscout.behaviors.teleop import Pilot, Teleop, Way
 from zscout.lab.building.bodies import WARM_UP
 from zscout.lab.building.node_file import RADIO, device_tables, framegrabber_name
@@ -254,12 +255,12 @@ class RobotsDemo(DemoRunner):
                 self.event(f"{robot} goes on: {status.doing}")
         if status.doing:
             seen.doing[robot] = status.doing
-        (seen.watching.add if status.doing in ("watch", "alert") else seen.watching.discard)(robot)
-        if status.doing in ("hidden", "watch", "alert") and robot not in seen.hidden:
+        (seen.watching.add if status.doing in WATCHING else seen.watching.discard)(robot)
+        if status.doing in WATCHING | {"hidden"} and robot not in seen.hidden:
             seen.hidden.add(robot)
             found = status.detail.removeprefix("hidden: ") if status.doing == "hidden" else ""
             self.event(f"{robot} is hidden" + (f": {found}" if found else ""))
-        elif status.doing not in ("hidden", "watch", "alert", "blind", "wait", "") and robot in seen.hidden:
+        elif status.doing not in HIDDEN | {"wait", ""} and robot in seen.hidden:
             seen.hidden.discard(robot)
             self.event(f"{robot} is not hidden any more")
         if len(seen.hidden) == len(self.robots) and seen.placed_at is None:
@@ -268,7 +269,7 @@ class RobotsDemo(DemoRunner):
         if status.alert:
             seen.alerts += 1
             self.event(f"ALERT: {robot} sees {status.detail}")
-        elif status.doing != before and status.doing not in ("", "wait", "watch", "alert", "hidden"):
+        elif status.doing != before and status.doing not in WATCHING | {"", "wait", "hidden"}:
             self.event(f"{robot} {status.doing}" + (f": {status.detail}" if status.detail else ""))
         self._news.set()
 

@@ -29,6 +29,7 @@ STYLES: Final = {
     "hidden": "green",
     "watch": "bold green",
     "alert": "bold white on red",
+    "present": "bold black on yellow",
     "wait": "bright_black",
     "lost": "bold red",
 }

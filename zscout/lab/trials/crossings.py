@@ -71,7 +71,8 @@ class Crossings:
         self._world = world
         self._places: dict[str, _Place] = {}
         self._doing: dict[str, Fate | None] = {}
-        """What keeps each robot that is held from telling of a crossing, as it looked last."""
+        """What keeps each robot that is held from telling of a crossing, as it looked last. One that has not looked is
+        not held, though its transmitter may take a moment to hear of that."""
         self._looked = 0.0
 
     def hidden(self, robot: str) -> None:
@@ -114,13 +115,13 @@ class Crossings:
 
     def _obstacle(self, robot: str, place: _Place) -> Fate | None:
         body = self._world.bodies[robot]
-        if body.camera is None:
+        if body.camera is None or robot not in self._doing:
             return "off the air"
         if body.warmth(self._world.time) < SOLID:
             return "warming up"
         if not _same(place.pose, body.pose):
             return "not hidden"
-        return self._doing.get(robot)
+        return self._doing[robot]
 
     def _close(self, robot: str, place: _Place) -> None:
         """The crossing is over, if there is one."""

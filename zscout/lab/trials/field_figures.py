@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 
+from zscout.behaviors.sensor_net.net import WATCHING
 from zscout.behaviors.sensor_net.scout import Step
 from zscout.lab.building.bodies import Body
 from zscout.lab.building.casting import EYE, VIEW
@@ -113,11 +114,11 @@ class Judge:
 
     def looked(self, robot: str, step: Step, interval: float) -> None:
         """Compares a look of a watching robot, one every `interval` seconds, with what was in its view."""
-        watches = step.doing in ("watch", "alert", "blind")
+        watches = step.doing in WATCHING or step.doing == "blind"
         self._crossings.looked(
             robot, watches=watches, picture=step.doing != "blind", learning=step.learning, alert=step.doing == "alert"
         )
-        if step.doing in ("watch", "alert"):
+        if step.doing in WATCHING:
             self.outcomes.watched += interval
             people = self._world.people_in_view(robot)
             self._watchers[robot].look(

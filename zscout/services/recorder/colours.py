@@ -71,6 +71,7 @@ DOING: Final[dict[str, int]] = {
     "watch": 0xA6DB4EFF,
     "wait": STATES["waiting"],
     "alert": ALERT,
+    "present": 0xF2D98CFF,
     "blind": 0x6C7886FF,
     "lost": 0xC3C7D0FF,
     "operator": OPERATOR,
