@@ -344,7 +344,7 @@ class Pass:
     def _blamed(self, arc: Arc, verdict: _Verdict) -> int:
         """Bits of those RCs of a binding that keep the ARC out, where others might not."""
         match verdict:
-            case Inadmissible(rc, _, None):
+            case Inadmissible(rc, _, proposal) if proposal is None or rc.name in self.votes.unresponsive:
                 bits = rc.bit
             case "off limits":
                 bits = self.off_limits
@@ -373,9 +373,11 @@ class Pass:
 
     def _apply(self, arc: Arc, check: AdmissionCheck, verdict: _Verdict) -> None:
         match verdict:
-            case Inadmissible(rc, _, proposal) if proposal is not None:
+            case Inadmissible(rc, reason, proposal) if proposal is not None:
+                # An RC that has not answered in time is asked again now and then: no change there would call the ARC.
+                silent = rc.name in self.votes.unresponsive
                 self.index.put(arc, ArcState.READY)
-                self.actions.wait(arc, VOTING, settled=False)
+                self.actions.wait(arc, reason if silent else VOTING, settled=silent)
                 self.actions.propose(rc, proposal)
             case Inadmissible(rc, reason, _, early):
                 pattern = next((need for need, name in arc.bound.items() if name == rc.name), None)

@@ -261,8 +261,7 @@ class Reservations:
             for together in self._together(rc, arc, before):
                 answer = self._votes.known(rc.name, together)
                 if answer is None or not answer.accept:
-                    is_open = answer is None and rc.name not in self._votes.unresponsive
-                    return Inadmissible(rc, reason, together if is_open else None, early)
+                    return Inadmissible(rc, reason, together if answer is None else None, early)
         return None
 
     def _binding(self, rc: Rc, arc: Arc) -> tuple[list[Reservation], bool]:
