@@ -17,6 +17,9 @@ from zscout.lab.faults.simulation import Simulation, simulate
 SEEDS = [seed for seed in range(1, 200) if seed % 10 != 9]
 """Small runs; every tenth is one of many programs."""
 BLOCK = 20
+FOUND = [302274, 302324, 302513, 400894, 407164, 434963, 435554, 440263]
+"""Runs that once broke a promise: a keeper that nobody asked, an old publication read after a standstill, a silent radio
+beside a date, maintenance that one wrong clock ended, a conflict with what was kept elsewhere by then."""
 MISSED = {
     "order": 15,
     "grant": 1,
@@ -46,9 +49,9 @@ MISSED = {
 `zscout study faults --without` tries the others."""
 
 
-@pytest.mark.parametrize("first", range(0, len(SEEDS), BLOCK))
+@pytest.mark.parametrize("first", range(0, len(SEEDS) + len(FOUND), BLOCK))
 def test_promises_are_kept_under_faults(first: int) -> None:
-    broken = {seed: simulate(seed).broken for seed in SEEDS[first : first + BLOCK]}
+    broken = {seed: simulate(seed).broken for seed in [*SEEDS, *FOUND][first : first + BLOCK]}
     assert {seed: texts for seed, texts in broken.items() if texts} == {}, "zscout study faults --seed SEED"
 
 

@@ -5,7 +5,7 @@ What of two halves of a fleet can't both be is not in the core: higher priority 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from typing import NamedTuple
 
@@ -92,7 +92,7 @@ class BookedDates:
         self._strange = SparseLog(log, now)
         self._conflicts: dict[str, str] = {}
         """Dates that are not in the core, with the one that stands; nothing where no RC of a pattern is free."""
-        self._judged: dict[str, tuple[str, int]] = {}
+        self._judged: dict[str, tuple[str, int, Mapping[Need, RcName]]] = {}
         """In which situation each of those was found to be in conflict."""
         self._joined = 0
         """How many times an RC has joined."""
@@ -207,11 +207,14 @@ class BookedDates:
         """Whether a date is in conflict as it was when that was found: to enter it again would only ask RCs again for
         votes that are forgotten as it goes."""
         by = self._conflicts.get(name)
-        stands = by is not None and (not by or self._core.booking(by) is not None)
-        return stands and self._judged.get(name) == self._situation()
+        if by is None or (by and self._core.booking(by) is None):
+            return False
+        return self._judged.get(name) == self._situation(by)
 
-    def _situation(self) -> tuple[str, int]:
-        return self._records.digest(), self._joined
+    def _situation(self, by: str) -> tuple[str, int, Mapping[Need, RcName]]:
+        """What a conflict with that date follows from. For its patterns other RCs may be kept later."""
+        kept = self._core.booking(by)
+        return self._records.digest(), self._joined, {} if kept is None else kept.bound
 
     def _judge(self, wanted: dict[str, Date]) -> None:
         # What is held was not moved as fleet time was slewed: what comes right after it would seem to meet it.
@@ -244,7 +247,7 @@ class BookedDates:
                 if (again := self._booked(Date(new, date.start))) is not None:
                     self._emit(again)
                 return
-        self._conflicts[date.id], self._judged[date.id] = by, self._situation()
+        self._conflicts[date.id], self._judged[date.id] = by, self._situation(by)
 
     def ask(self, unknown: Iterable[tuple[Rc, HolderSet]], wanted: Booking | None = None) -> None:
         """Has RCs vote; `wanted` is not among the claims yet."""
@@ -300,7 +303,8 @@ class BookedDates:
                 self.change(record, over=sorted({*record.over, *starts}))
         self._joined += (joined := sum(isinstance(event, RcJoined) for event in events))
         votes = self._waits_for_votes and any(isinstance(event, (Vote, VoteOverdue)) for event in events)
-        return bool(over) or lapsed or votes or bool(joined)
+        relieved = not all(map(self._is_settled, self._conflicts))
+        return bool(over) or lapsed or votes or bool(joined) or relieved
 
     def _told(self, zone: str, time: Ns) -> str:
         return told(self.to_fleet(time) / SECOND, zone)
