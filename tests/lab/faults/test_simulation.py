@@ -35,7 +35,6 @@ MISSED = {
     "once": 10,
     "sealed": 10,
     "copied": 3,
-    "unbooked": 1164,
     "dates": 103,
     "merged": 3,
     "caught up": 4,
