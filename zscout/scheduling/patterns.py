@@ -66,7 +66,9 @@ def bind(state: SchedulerState, arc: Arc, reserved: Reservations | None, *, with
     options: dict[Need, list[_Choice]] = {}
     for need in arc.patterns:
         matching = (rc for rc in state.matching(need) if rc.present and not rc.bit & taken)
-        options[need] = sorted(_choice(state, arc, rc, reserved, claimed, ending) for rc in matching)
+        options[need] = sorted(
+            _Choice(*_fitness(state, arc, rc, reserved, claimed, ending), rc.bit, rc) for rc in matching
+        )
     for worst in Fitness:
         allowed = {need: [one.rc for one in found if one.fitness <= worst] for need, found in options.items()}
         if all(allowed.values()) and (chosen := distinct(allowed)) is not None:
@@ -77,29 +79,29 @@ def bind(state: SchedulerState, arc: Arc, reserved: Reservations | None, *, with
     return False
 
 
-def _choice(
+def _fitness(
     state: SchedulerState, arc: Arc, rc: Rc, reserved: Reservations | None, claimed: int, ending: Collection[Arc]
-) -> _Choice:
-    """How well `rc` would do, where those who are `ending` do so anyway."""
+) -> tuple[Fitness, float]:
+    """How well `rc` would do, where those who are `ending` do so anyway; and what decides between equals."""
     non_preemptible = rc.non_preemptible_holders(arc, state.now)
     closed = reserved is not None and reserved.reserves(rc, arc)
     if rc.sharable:
         answer = state.votes.known(rc.name, frozenset((*(holder.id for holder in non_preemptible), arc.id)))
         if closed or (answer is None and rc.name in state.votes.unresponsive):
-            return _Choice(Fitness.RESERVED, rc.demand, rc.bit, rc)
+            return Fitness.RESERVED, rc.demand
         if answer is not None and not answer.accept:
-            return _Choice(Fitness.HELD, rc.demand, rc.bit, rc)
-        return _Choice(Fitness.FREE, len(rc.holders) + (answer is None), rc.bit, rc)
+            return Fitness.HELD, rc.demand
+        return Fitness.FREE, len(rc.holders) + (answer is None)
     if non_preemptible:
         held_until = max(0 if one.hold is None else one.hold.end for one in non_preemptible)
-        return _Choice(Fitness.HELD, held_until, rc.bit, rc)
+        return Fitness.HELD, held_until
     if closed:
-        return _Choice(Fitness.RESERVED, rc.demand, rc.bit, rc)
+        return Fitness.RESERVED, rc.demand
     if others := [holder for holder in rc.holders.values() if holder not in ending]:
-        return _Choice(Fitness.PREEMPTIBLE, max(one.priority for one in others), rc.bit, rc)
+        return Fitness.PREEMPTIBLE, max(one.priority for one in others)
     if rc.bit & claimed:
-        return _Choice(Fitness.CLAIMED, rc.demand, rc.bit, rc)
-    return _Choice(Fitness.FREED if rc.holders else Fitness.FREE, rc.demand, rc.bit, rc)
+        return Fitness.CLAIMED, rc.demand
+    return Fitness.FREED if rc.holders else Fitness.FREE, rc.demand
 
 
 def _exclusive_victims(state: SchedulerState, arc: Arc, mask: int) -> Iterator[Arc]:
