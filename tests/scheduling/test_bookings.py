@@ -368,6 +368,28 @@ def test_a_sharable_rc_that_refuses_is_told_before_the_date_and_asked_when_its_r
     assert "one" not in fleet.dangers
 
 
+def test_a_date_that_runs_is_in_the_way_where_it_is_and_not_where_it_was_to_be() -> None:
+    fleet = Fleet()
+    fleet.send(*(RcJoined(rc, sharable=False) for rc in ROBOTS[:2]))
+    first = Booking("first", {"robot/*": {}}, 0, 10, 10, 5, 0, {"robot/*": "robot/a"})
+    fleet.send(Booked(first))
+    fleet.until(10)
+    fleet.send(
+        Requested(ArcRequest("operator", "h/operator", {"robot/a": {}}, 9, 30)),
+        Requested(ArcRequest("taker", "h/taker", first.needs, 0, 10, booking="first")),
+    )
+    status = fleet.core.booking("first")
+    assert status is not None
+    assert (status.arc, status.bound) == ("taker", {"robot/*": "robot/b"})
+    others = [Booking(rc, {rc: {}}, 0, 10, 10, 5, 1) for rc in ROBOTS[:2]]
+    fits = [bool(fleet.slots(one, 10, 1, bookings_only=True)) for one in others]
+    fleet.send(*map(Booked, others))
+    losers = fleet.core.overlaps(["first", *ROBOTS[:2]]).losers
+    assert (fits, losers) == ([True, False], {"robot/b": "first"})
+    # What it has for a pattern it loses to nobody: it runs.
+    assert fleet.core.overlaps([*ROBOTS[:2], "first"]).losers == {}
+
+
 def test_maintenance_is_of_rcs_by_name() -> None:
     with pytest.raises(ValueError, match=r"booking m: maintenance needs RCs by name, not robot/\*"):
         Booking("m", {"robot/*": {}}, 10, 10, 10, 5, 0, maintenance=True)

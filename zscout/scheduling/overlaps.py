@@ -33,15 +33,16 @@ def overlaps(state: SchedulerState, order: Iterable[str], starts: Mapping[str, N
     for name in order:
         if (claim := state.claims.get(name)) is None:
             continue
-        rcs = [rc for rc in state.rcs_in(claim.kept) if rc.present]
-        for rc in rcs:
+        # What it has for a pattern while it runs, it has.
+        needed = claim.kept if claim.arc.hold is None else claim.arc.named_mask
+        for rc in state.rcs_in(needed & state.present):
             near = (standing.get((rc.bit, day), ()) for day in _days(claim, starts))
             before = list({one.booking.id: one for one in chain(*near) if _meet(one, claim, starts)}.values())
             if before and (not rc.sharable or _excluded(claim, before) or _refused(state, rc, claim, before, result)):
                 result.losers[name] = before[0].booking.id
                 break
         else:
-            for key in product((rc.bit for rc in rcs), _days(claim, starts)):
+            for key in product((rc.bit for rc in state.rcs_in(claim.mask & state.present)), _days(claim, starts)):
                 standing.setdefault(key, []).append(claim)
     return result
 
