@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from decimal import Decimal
+from typing import Any
 
 import pytest
 from msgspec.structs import replace
@@ -339,7 +340,23 @@ def test_what_goes_on_in_another_client_has_its_id_and_its_place(known_as: str, 
     """Taken back from a client that is gone it has a new id: the device is made safe in between."""
     goes_on = replace(holder(3, "h/two", place=2), id=known_as)
     change = holding(HELD).apply_grants(said(3, goes_on), NOW)
-    assert (change.interrupts, bool(change.removed_not_handed_over)) == (interrupted, interrupted)
+    assert (change.interrupts, bool(change.over)) == (interrupted, interrupted)
+
+
+@pytest.mark.parametrize(
+    ("after", "goes_on"),
+    [
+        ({"continues": "arc2"}, True),
+        ({"continues": ""}, False),
+        ({"continues": "another"}, False),
+        ({"continues": "arc2", "client": "h/two"}, False),
+        ({"continues": "arc2", "direct": True}, False),
+    ],
+)
+def test_a_device_goes_on_in_another_arc_of_its_client_that_says_so(after: dict[str, Any], goes_on: bool) -> None:
+    after_it = replace(holder(3, "h/one", place=3), **after)
+    change = holding(HELD).apply_grants(said(3, after_it), NOW)
+    assert (change.interrupts, bool(change.over)) == (not goes_on, not goes_on)
 
 
 def test_a_grant_that_a_snapshot_names_is_not_refused_before_its_publication_comes() -> None:

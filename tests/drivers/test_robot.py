@@ -189,6 +189,39 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
     asyncio.run(asyncio.wait_for(story(), HANG))
 
 
+@pytest.mark.parametrize("said", [True, False])
+def test_a_camera_that_warmed_up_under_one_hold_stays_on_in_the_one_that_continues_it(
+    tmp_path: Path, said: bool
+) -> None:
+    async def story() -> None:
+        line = PtyLine(tmp_path / "tty")
+        async with Lab(tmp_path) as lab:
+            mast(lab, line)
+            cart(lab, "cart", 1)
+            lab.node("desk", "framegrabber/f")
+            client = await lab.client()
+            await lab.ready(client, *GANG, "framegrabber/f")
+            warm, grant = await held(client, "warm", GANG, priority=-1, min_runtime=0.01)
+            await client.command("robot/r1", grant, {"name": "camera", "on": True})
+            await line.until(transmitting(1))
+            since = len(line.heard)
+            more = GANG | {"framegrabber/f": {}}
+            arc, watching = await held(client, "watch", more, priority=0, continues=warm.name if said else "")
+            await client.command("robot/r1", watching, TURN)
+            await line.until(is_in(DrivePacket), since=since)
+            kinds = {type(packet) for packet in line.packets[since:]}
+            assert (HaltPacket in kinds) is not said
+            assert await answer(client.command("robot/r1", grant, TURN)) == "ended"
+            # And as ever when nobody holds it any more.
+            since = len(line.heard)
+            await client.end(warm)
+            await client.end(arc)
+            await line.until(is_in(HaltPacket), since=since)
+        line.unplug()
+
+    asyncio.run(asyncio.wait_for(story(), HANG))
+
+
 def turning(packets: list[Packet]) -> Packet | None:
     """The first packet that turns a robot's wheels, if there is one."""
     return next((packet for packet in packets if isinstance(packet, DrivePacket) and packet.left), None)

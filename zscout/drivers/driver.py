@@ -95,9 +95,14 @@ class Driver:
         commands, other than `stop` and `halt`, is refused as `settling`."""
         return 0.0
 
+    async def carry_on(self, before: Holder, after: Holder) -> None:
+        """What `before` held goes on in `after`, with no safe state between: in another client, or in another ARC of
+        the same one. Unless a driver has it otherwise, `after` begins."""
+        await self.begin(after)
+
     async def end(self, holder: Holder) -> None:
-        """Somebody ceases to hold the device; `safe` follows if nobody else does. Not called for a hold
-        that was handed over."""
+        """Somebody ceases to hold the device; `safe` follows if nobody else does. Not called for a hold that goes
+        on in another."""
 
     async def safe(self) -> None:
         """Nobody holds the device any more: motors stopped, transmitter off. Must not raise."""

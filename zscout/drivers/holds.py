@@ -83,20 +83,23 @@ class HoldChange:
         return bool(self.began or self.removed)
 
     @property
-    def removed_not_handed_over(self) -> list[Holder]:
-        """Of the removed, those that do not go on in another client: there the same ARC has the same id and place.
-        (What was taken back from a client that is gone has its place only.)"""
-        after = {_arc(holder): holder.client for holder in self.began}
-        return [holder for holder in self.removed if after.get(_arc(holder), holder.client) == holder.client]
+    def over(self) -> list[Holder]:
+        """Of the removed, those that go on in none that began."""
+        return [holder for holder in self.removed if not any(goes_on(holder, other) for other in self.began)]
 
     @property
     def interrupts(self) -> bool:
         """Whether the device serves nobody between what was before and what is after."""
-        return not self.stayed and self.removed_not_handed_over == self.removed
+        return not self.stayed and self.over == self.removed
 
 
-def _is_handed_over(before: Holder, after: Holder) -> bool:
-    return _arc(before) == _arc(after) and before.client != after.client
+def goes_on(before: Holder, after: Holder) -> bool:
+    """Whether one hold goes on in another, with no safe state in between: it was handed over (the same ARC has the same
+    id and place at another client; what was taken back from a client that is gone has its place only), or its client
+    has said so of another ARC of its own. The program of a direct one is not known to be the same."""
+    if _arc(before) == _arc(after):
+        return before.client != after.client
+    return before.client == after.client and before.arc == after.continues and not (before.direct or after.direct)
 
 
 def _arc(holder: Holder) -> tuple[str, Place]:
@@ -349,7 +352,7 @@ class HoldTable:
         self._events += 1
         entry = HoldEntry(holder, now + round(holder.remaining * SECOND), self._events)
         for before in change.entries:
-            if _is_handed_over(before.holder, holder):
+            if goes_on(before.holder, holder):
                 # It goes on: it is held back by no more than it was, and its program may be the one of before.
                 entry.since, entry.gone_by = before.since, before.gone_by
         self.held[holder.grant] = entry
@@ -376,8 +379,7 @@ class HoldTable:
         change.removed.append(holder)
         change.entries.append(entry)
         self._events += 1
-        handed_over = any(_is_handed_over(holder, other) for other in to)
-        if entry.gone_by is not None and entry.gone_by > now and not handed_over:
+        if entry.gone_by is not None and entry.gone_by > now and not any(goes_on(holder, other) for other in to):
             self.settling[grant] = Settling(holder.client, self._events, entry.gone_by)
         change.stayed = len(self.held) > len(change.began)
         if expired is not None:

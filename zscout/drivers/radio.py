@@ -107,11 +107,16 @@ class RadioDriver(Driver):
         ]
 
     async def begin(self, holder: Holder) -> None:
+        self._air.join(holder.place, self._share_of(holder), self._rc.mesh.now())
+
+    async def carry_on(self, before: Holder, after: Holder) -> None:
+        self._air.pass_on(before.place, after.place, self._share_of(after), self._rc.mesh.now())
+
+    def _share_of(self, holder: Holder) -> Share:
         try:
-            share = share_of(holder.params, self._default)
+            return share_of(holder.params, self._default)
         except ValueError:  # it was never voted for
-            share = Share(Fraction(0), Fraction(MAX_PACKET))
-        self._air.join(holder.place, share, self._rc.mesh.now())
+            return Share(Fraction(0), Fraction(MAX_PACKET))
 
     async def end(self, holder: Holder) -> None:
         """What waits for this holder is dropped, and the robots that it drove are halted: their own RCs do so

@@ -19,7 +19,7 @@ from zscout import messages, trace
 from zscout.config import devices
 from zscout.drivers.confirm_server import CommandQuery, ConfirmServer
 from zscout.drivers.driver import Driver, RcDirectory
-from zscout.drivers.holds import HoldChange, HoldTable
+from zscout.drivers.holds import HoldChange, HoldTable, goes_on
 from zscout.drivers.instances import Instances, InstanceState
 from zscout.drivers.last_holder import LastHolder
 from zscout.drivers.repeated import CommandMemory
@@ -526,21 +526,22 @@ class ResourceController:
     # Holds
 
     async def _carry_out_change(self, change: HoldChange) -> None:
-        ended = change.removed_not_handed_over
+        ended = change.over
         for holder in ended:
             if holder.grant in self._at_driver:
                 await self._guard(self.driver.end(holder))
         before = {one.grant for one in change.removed} & self._at_driver
-        go_on = {(one.id, one.place) for one in change.removed if one not in ended and one.grant in before}
+        going_on = [one for one in change.removed if one not in ended and one.grant in before]
         self._at_driver -= before
         for holder in change.removed:
             self._held_back.pop(holder.grant, None)
-        # A device that still serves others, or goes on in another client, stays as it is.
+        # A device that still serves others, or goes on in another hold, stays as it is.
         if (before and change.interrupts) or (change.settled and not self._at_driver):
             await self._make_safe()
         for holder in change.began:
-            if (holder.id, holder.place) in go_on:
-                await self._begin(holder)
+            if (one := next((one for one in going_on if goes_on(one, holder)), None)) is not None:
+                self._at_driver.add(holder.grant)
+                await self._guard(self.driver.carry_on(one, holder))
             else:
                 self._held_back[holder.grant] = holder
         await self._begin_held_back(at_once=change.began)

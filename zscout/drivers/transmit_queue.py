@@ -168,6 +168,12 @@ class TransmitQueue:
             self.members[place] = _HolderQueue(share, now, full=not self._queue and not self._urgent)
             self._reserve.size = Fraction(urgent_burst(len(self.members)))
 
+    def pass_on(self, before: Place, after: Place, share: Share, now: Ns) -> None:
+        """What a holder made robots do goes on under another one; what waits for the first is dropped."""
+        robots = self.leave(before) if before != after else set()
+        self.join(after, share, now)
+        self.members[after].robots |= robots
+
     def leave(self, place: Place) -> set[int]:
         """A holder is gone, and what waits for it. Returns the robots that it made do something."""
         if place not in self.members:

@@ -22,6 +22,8 @@ MAX_OTHERS = 255
 
 Seal: TypeAlias = Annotated[str, msgspec.Meta(max_length=128)]
 RequestId: TypeAlias = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+ContinuedArc: TypeAlias = Annotated[str, msgspec.Meta(max_length=130)]
+"""An ARC's name, or empty."""
 BookingRef: TypeAlias = Annotated[str, msgspec.Meta(max_length=96)]
 MAX_WHO = 64
 """Characters of a user's, a host's or a command's name."""
@@ -87,6 +89,9 @@ class Ask(_Asked, frozen=True, tag_field="op", tag="request"):
     """One of those has shown itself to the client anew: what was held back for them need wait no more."""
     direct: bool = False
     """Its program touches devices past their RCs, which settle when its hold ends."""
+    continues: ContinuedArc = ""
+    """The name of another ARC of its client's from which it goes on: a device that passes from that one to this in one
+    step is not made safe in between. Neither is direct."""
     unserved: bool = False
     """The time of `grant` went by while RCs of it settled: nobody made use of it."""
     who: Who | None = None
@@ -238,6 +243,8 @@ class Holder(_ArcParty, frozen=True):
     bound: dict[str, str] = {}
     direct: bool = False
     """As asked: its RCs settle when it ends."""
+    continues: ContinuedArc = ""
+    """As asked: what the same client held by that name goes on in it."""
     who: Who | None = None
     booking: BookingRef = ""
 
@@ -310,6 +317,7 @@ class HoldView(_ArcParty, frozen=True):
     keep: bool = False
     bound: dict[str, str] = {}
     direct: bool = False
+    continues: ContinuedArc = ""
     who: Who | None = None
     booking: BookingRef = ""
     ends_in: Seconds | None = None
@@ -402,6 +410,7 @@ class OpenRequest(_Wanted, frozen=True):
     rcs: Annotated[list[str], msgspec.Meta(max_length=MAX_OTHERS)] = []
     """The RCs of `grant`."""
     direct: bool = False
+    continues: ContinuedArc = ""
     who: Who | None = None
     seal: Seal | None = None
     was: RequestId | None = None

@@ -53,6 +53,8 @@ class ArcRequest(Struct, frozen=True):
     """What people call it; the core only prints it."""
     direct: bool = False
     """Whether its program touches devices past their RCs; the core only keeps it."""
+    continues: str = ""
+    """The name of the ARC of the same client's that it goes on from; likewise."""
     booking: str = ""
     """The booking that it takes up; its needs and its priority are that booking's."""
     who: Who | None = None

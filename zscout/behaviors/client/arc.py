@@ -157,15 +157,19 @@ class Attempt:
         """Whether its ARC is to be waited for once more."""
         return self._anew or (self.arc is not None and self.arc.open)
 
+    async def asked(self) -> OpenArc:
+        """The request, made now where it was not yet, for who wants to know of it while it waits. Raises
+        RequestRefused."""
+        if self._anew or self.arc is None:
+            self.arc, self._anew = None, False
+            self.arc = await self._client.request(**self._ask)
+        return self.arc
+
     async def granted(self) -> Held:
         """Waits for the grant, requested where it was not yet. Raises Revoked, RequestRefused, TimeoutError."""
-        if self._anew:
-            self.arc, self._anew = None, False
         try:
             async with asyncio.timeout(self._timeout):
-                if self.arc is None:
-                    self.arc = await self._client.request(**self._ask)
-                grant = await self._client.granted(self.arc, confirmed=self._confirmed)
+                grant = await self._client.granted(await self.asked(), confirmed=self._confirmed)
         except (asyncio.CancelledError, TimeoutError) as error:
             why = self.arc.reason if self.arc is not None else "no RCM has answered"
             if self.arc is not None:
@@ -173,6 +177,7 @@ class Attempt:
             if isinstance(error, asyncio.CancelledError):
                 raise
             raise TimeoutError(f"{self._ask['name']} was not granted within {self._timeout:g} s: {why}") from None
+        assert self.arc is not None  # noqa: S101 - it was asked for
         if grant is None:
             raise Revoked(self.arc)
         return Held(self._client, self.arc, grant)
@@ -277,10 +282,13 @@ async def holds(
     comment: str = "",
     wait_for_device: bool | None = None,
     booking: str = "",
+    estimate: bool = False,
+    continues: str = "",
 ) -> AsyncIterator[Attempt]:
     """The same, entered again whenever it was ended for others and is granted again, until a body ends by itself, or
-    without `keep` has had its time."""
+    without `keep` has had its time. `estimate` and `continues` as `Client.request` has them."""
     ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device, booking)
+    ask |= {"estimate": estimate, "continues": continues}
     attempt = Attempt(client, ask, again=True, confirmed=confirmed)
     yield attempt
     while attempt.goes_on:

@@ -233,6 +233,7 @@ class Client(MovableClient):
         comment: str = "",
         wait_for_device: bool | None = None,
         booking: str = "",
+        continues: str = "",
     ) -> OpenArc:
         """Asks for an ARC and returns when the RCM has answered, for as long as that takes.
 
@@ -244,8 +245,10 @@ class Client(MovableClient):
         see `direct_hold`. The `comment` is shown to others. What can never start is refused at once: a parameter that
         its RC does not know, more of one than that ever carries, and, unless it is to `wait_for_device` (default:
         `waits_for_devices`), a need that nobody knows. With a `booking`, by its id, it takes that up, whose needs and
-        priority it has (`BookingsClient.terms`), and waits for its next date. Raises RequestRefused where the request
-        can't be taken as it is, ValueError for too long a comment.
+        priority it has (`BookingsClient.terms`), and waits for its next date. It `continues` this client's ARC of that
+        name, which holds less at a lower priority: where it takes over that one's RCs in one step, their devices are
+        not made safe in between. Raises RequestRefused where the request can't be taken as it is, ValueError for too
+        long a comment.
 
         An ARC of this name and these needs that another client hands over is returned instead, as it is."""
         wanted = amounts(needs)
@@ -254,7 +257,7 @@ class Client(MovableClient):
         if arc is None:
             seconds, now = self._protected(min_runtime), self.mesh.now()
             arc = OpenArc(new_instance(), name, wanted, priority, seconds, keep, estimate, direct, since=now)
-            arc.who, arc.booking = who, booking
+            arc.who, arc.booking, arc.continues = who, booking, continues
             arc.check, arc.wait_for_device = True, self._waits(wait_for_device)
             self._store.add(arc)
         try:

@@ -69,6 +69,8 @@ class OpenArc:
     """Whether the RCM is asked to estimate when it will start."""
     direct: bool = False
     """Whether its program touches devices past their RCs (`direct.py`)."""
+    continues: str = ""
+    """The name of another ARC of its client's, from which it goes on."""
     who: Who | None = None
     """Who asks, as others are told."""
     booking: str = ""
@@ -130,7 +132,7 @@ class OpenArc:
             check_need(need)
         id_, name = check_name(request.id, "id"), check_name(request.arc, "arc")
         arc = cls(id_, name, request.needs, request.priority, request.min_runtime, request.keep, place=request.place)
-        arc.direct, arc.booking = request.direct, request.booking
+        arc.direct, arc.continues, arc.booking = request.direct, request.continues, request.booking
         arc.who = request.who and msgspec.structs.replace(request.who, host="")
         arc.state, arc.reason = "expected", "another client is to hand it over"
         arc.since, arc.waits_since = now, now - round(request.waited * SECOND)
@@ -290,6 +292,7 @@ class OpenArc:
             "grant": grant,
             "rcs": self.rcs if grant is not None else [],
             "direct": self.direct,
+            "continues": self.continues,
             "who": self.who,
             "booking": self.booking,
         }

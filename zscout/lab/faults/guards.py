@@ -107,7 +107,7 @@ def _miss_nothing(self: HoldTable, *args: Any, **how: Any) -> HoldChange:
 async def _begin_first(self: ResourceController, change: HoldChange) -> None:
     for holder in change.began:
         await self._guard(self.driver.begin(holder))
-    for holder in change.removed_not_handed_over:
+    for holder in change.over:
         await self._guard(self.driver.end(holder))
     if change.removed and change.interrupts:
         await self._guard(self.driver.safe())

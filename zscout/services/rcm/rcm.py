@@ -515,6 +515,7 @@ def holders_of(arcs: Iterable[ArcStatus], rc: str, now: Ns) -> list[messages.Hol
             params=messages.decimals(arc.needs[rc]),
             bound=dict(arc.bound),
             direct=arc.request.direct,
+            continues=arc.request.continues,
         )
         for arc in arcs
         if arc.hold is not None
@@ -547,6 +548,7 @@ def _hold_view(arc: ArcStatus, hold: Hold, now: Ns, runtimes: RuntimeEstimator |
         keep=arc.request.keep,
         bound=dict(arc.bound),
         direct=arc.request.direct,
+        continues=arc.request.continues,
         ends_in=None if end is None else (end - now) / SECOND,
     )
 

@@ -201,6 +201,7 @@ def _request(arc: str, client: str, needs: dict[str, Amounts], source: OpenReque
         keep=source.keep,
         label=source.arc,
         direct=source.direct,
+        continues=source.continues,
         booking=source.booking,
         who=source.who,
     )

@@ -516,6 +516,9 @@ def admit(
         check_place(ask.place, core)
     try:
         check_name(ask.arc, "arc")
+        continues = ask.continues if isinstance(ask, Ask) else ""
+        if continues:
+            check_name(continues, "continues")
         for name, params in ask.needs.items():
             check_need(name)
             if len(params) > MAX_PARAMS:
@@ -532,6 +535,7 @@ def admit(
             keep=ask.keep,
             label=ask.arc,
             direct=isinstance(ask, Ask) and ask.direct,
+            continues=continues,
             who=who,
         )
     except (BadName, ValueError) as error:
