@@ -2,27 +2,31 @@
 
 Sensing and acting go through ARCs only. To hide, and to watch, it holds robot, radio, video channel and
 framegrabber for a slot, and keeps them while nobody of its rank waits: with more robots than framegrabbers
-they take turns. Hiding ranks above watching. `Scout` decides what to do with what is seen.
+they take turns. Hiding ranks above watching. Just before its turn to watch a robot's camera warms up, if a channel is
+free: a third ARC, below all others, without a framegrabber. `Scout` decides what to do with what is seen.
 """
 
 from __future__ import annotations
 
 import asyncio
-from contextlib import closing
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, closing, suppress
 from dataclasses import dataclass
 from typing import Any, Final
 
 import cv2
 import numpy as np
 
-from zscout.behaviors.client.arc import Held, Revoked, holds
+from zscout.behaviors.client.arc import Held, Revoked, hold, holds
 from zscout.behaviors.client.client import CommandRefused, RequestRefused
+from zscout.behaviors.client.request import OpenArc
 from zscout.behaviors.perception.lens import COLUMNS, ROWS, grey_picture
 from zscout.behaviors.sensor_net.held_robot import HeldRobot, RobotNeeds
 from zscout.behaviors.sensor_net.scout import NO_PICTURE_TIMEOUT, Scout, Task
 from zscout.behaviors.tree import Behavior, BehaviorContext, CarriedClock
 from zscout.mesh import FrameWatch
-from zscout.mesh.supervision import supervised
+from zscout.mesh.supervision import done_within, supervised
+from zscout.types import SECOND
 
 LOOK: Final = 0.5
 """Seconds that a picture is waited for."""
@@ -30,6 +34,11 @@ RETRY_AFTER: Final = 1.0
 """Seconds before it asks again after a refusal."""
 GIVEN_UP: Final = 60.0
 """Seconds before a robot that was given up is tried again: its battery may have been changed."""
+WARM_AHEAD: Final = 4.0
+"""Seconds before a turn to watch, as it is foretold, in which the camera warms up: it takes two, and turns may begin
+earlier than foretold."""
+BRIEF: Final = 0.1
+"""Seconds of the minimum runtime of that: whoever wants the channel may have it."""
 IDLE: Final = 0.1
 """Seconds from one safe point to the next while it waits."""
 
@@ -50,6 +59,11 @@ class Slots:
     def of(self, task: Task) -> tuple[int, float]:
         """Priority and minimum runtime in seconds of a task's ARC."""
         return (self.watch_priority, self.watch) if task == "watch" else (self.hide_priority, self.hide)
+
+    @property
+    def warm_priority(self) -> int:
+        """Below whatever its own robots do."""
+        return min(self.watch_priority, self.hide_priority) - 1
 
 
 class PlaceRobot(Behavior):
@@ -117,8 +131,18 @@ class RobotTask(Behavior):
         self.report("wait", "for its turn", robot=place.needs.robot)
         name, needs = f"{place.name}-{self.task}", place.needs.needs(video=video)
         seconds = round(slot / context.speed, 3)
-        async for attempt in holds(context.client, name, needs, priority=priority, min_runtime=seconds, keep=True):
-            async with attempt as held:
+        warm = f"{place.name}-warm" if self.task == "watch" else ""
+        async for attempt in holds(
+            context.client,
+            name,
+            needs,
+            priority=priority,
+            min_runtime=seconds,
+            keep=True,
+            estimate=bool(warm),
+            continues=warm,
+        ):
+            async with self._warming(context, warm, await attempt.asked()), attempt as held:
                 channel = held.rc(video or place.needs.video)
                 # It may be about to be moved: nothing changes before that is over.
                 await context.safe_point()
@@ -130,6 +154,29 @@ class RobotTask(Behavior):
                 await context.client.end(attempt.arc)
                 scout.no_signal = False
                 raise CameraBlind(f"{channel} shows nothing at all")
+
+    @asynccontextmanager
+    async def _warming(self, context: BehaviorContext, name: str, turn: OpenArc) -> AsyncIterator[None]:
+        """While `turn` is waited for, its camera is warmed up under an ARC of this `name`, if it has one."""
+        async with supervised(self.path) as supervisor:
+            if name:
+                supervisor.spawn(self._warm_up(context, name, turn))
+            yield
+
+    async def _warm_up(self, context: BehaviorContext, name: str, turn: OpenArc) -> None:
+        client, place = context.client, self.place
+        needs = {need: params for need, params in turn.needs.items() if need != place.needs.framegrabber}
+        priority, ahead = place.slots.warm_priority, WARM_AHEAD / context.speed
+        while turn.open and turn.grant is None:
+            left = None if turn.start is None else (turn.start - client.mesh.now()) / SECOND - ahead
+            if left is None or left > 0:
+                await done_within(left, client.changed(turn))
+                continue
+            with suppress(Revoked, RequestRefused, CommandRefused):
+                async with hold(client, name, needs, priority=priority, min_runtime=BRIEF) as held:
+                    await held.command(place.needs.robot, {"name": "camera", "on": True})
+                    await held.over()
+            await asyncio.sleep(RETRY_AFTER)
 
     async def _use(self, context: BehaviorContext, held: Held, video: str | None) -> None:
         place, scout = self.place, self.place.scout

@@ -17,7 +17,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from zscout.behaviors.sensor_net.place_robot import GIVEN_UP, RETRY_AFTER, Slots
+from zscout.behaviors.sensor_net.place_robot import BRIEF, GIVEN_UP, RETRY_AFTER, WARM_AHEAD, Slots
 from zscout.behaviors.sensor_net.scout import Scout, Step
 from zscout.drivers.airtime import BITS_PER_BYTE, Share, line_rate, objection
 from zscout.drivers.packets import MAX_PACKET, OVERHEAD
@@ -28,8 +28,10 @@ from zscout.lab.building.world import MAX_STEP, World
 from zscout.lab.trials.field_figures import Judge, Outcomes
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.core import Core
+from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import (
     ArcRequest,
+    Cancelled,
     Effect,
     Event,
     Granted,
@@ -43,7 +45,7 @@ from zscout.scheduling.model import (
     Vote,
     WakeAt,
 )
-from zscout.types import SECOND, ArcId, Ns
+from zscout.types import SECOND, ArcId, Ns, Params
 
 MAX_CHANNELS: Final = 16
 LATENCY: Final = 0.1
@@ -65,7 +67,9 @@ class Field:
 
     robots: int = 4
     channels: int = 2
-    """Video channels, and as many framegrabbers."""
+    """Video channels."""
+    framegrabbers: int = 0
+    """0: one for each channel."""
     baud: int = 9_600
     command_rate: float = 5.0
     """Drive packets a second that each robot's behavior asks for."""
@@ -78,8 +82,15 @@ class Field:
     def __post_init__(self) -> None:
         if not 1 <= self.robots <= MAX_ROBOTS or not 1 <= self.channels <= MAX_CHANNELS:
             raise ValueError(f"1 to {MAX_ROBOTS} robots and 1 to {MAX_CHANNELS} channels are taken")
+        if not 0 <= self.framegrabbers <= self.channels:
+            raise ValueError(f"framegrabbers are 1 to the {self.channels} channels, or 0 for one each")
         if self.baud < 1 or self.command_rate <= 0 or self.frame_rate <= 0 or not 0 <= self.loss < 1:
             raise ValueError("rates are above 0, the loss is 0 or more and below 1")
+
+    @property
+    def receivers(self) -> int:
+        """How many framegrabbers there are."""
+        return self.framegrabbers or self.channels
 
     @property
     def bound(self) -> Fraction:
@@ -101,6 +112,10 @@ class Player:
         self.name, self.scout = name, Scout(seed=seed)
         self.asked: ArcId | None = None
         self.held: Granted | None = None
+        self.warm: ArcId | None = None
+        """What was asked for to warm its camera up before its turn."""
+        self.warmed: Granted | None = None
+        """That hold, while it lasts."""
         self.transmits: Granted | None = None
         """The last hold whose command to transmit the robot has received."""
         self.video: str | None = None
@@ -108,21 +123,24 @@ class Player:
         self.turns = 0
         self.asks_at: float | None = 0.0
         """When it asks anew; None while it waits or holds."""
+        self.warms_at: float | None = None
+        """When its camera is to begin to warm up."""
         self.next_picture = 0.0
         self.next_drive = 0.0
         self.stood = False
         """Whether the last command of this hold is a stop."""
 
-    def rc(self, kind: str) -> str:
-        """What it holds of this kind. Raises RuntimeError where it holds nothing."""
-        if self.held is None:
-            raise RuntimeError(f"{self.name} holds nothing")
-        return next(rc for rc in self.held.rcs if rc.startswith(f"{kind}/"))
-
     @property
     def channel(self) -> int:
-        """The number of the video channel that it holds."""
-        return int(self.rc("video").removeprefix("video/ch"))
+        """The number of the video channel that it holds. Raises RuntimeError where it holds nothing."""
+        if self.held is None:
+            raise RuntimeError(f"{self.name} holds nothing")
+        return _channel(self.held)
+
+
+def _channel(hold: Granted) -> int:
+    """The number of its video channel."""
+    return next(int(rc.removeprefix("video/ch")) for rc in hold.rcs if rc.startswith("video/"))
 
 
 class FieldRun:
@@ -152,7 +170,7 @@ class FieldRun:
         self._judge = Judge(self.world, self.outcomes)
         self._handle(
             *(RcJoined(f"robot/{name}", sharable=False) for name in names),
-            *(RcJoined(f"framegrabber/f{number + 1}", sharable=False) for number in range(field.channels)),
+            *(RcJoined(f"framegrabber/f{number + 1}", sharable=False) for number in range(field.receivers)),
             *(RcJoined(channel, sharable=True) for channel in self.channels),
             RcJoined(RADIO, sharable=True),
         )
@@ -181,8 +199,8 @@ class FieldRun:
         for player in self.players.values():
             if player.held is not None:
                 times.append(player.next_picture)
-            elif player.asks_at is not None:
-                times.append(player.asks_at)
+            else:
+                times += [at for at in (player.asks_at, player.warms_at) if at is not None]
         return min(times)
 
     def _play(self) -> None:
@@ -193,6 +211,8 @@ class FieldRun:
         for player in self.players.values():
             if player.asks_at is not None and player.asks_at <= now + _SOON:
                 self._ask(player)
+            if player.warms_at is not None and player.warms_at <= now + _SOON:
+                self._warm_up(player)
         if self._wake / SECOND <= now + _SOON:
             self._handle(Tick())
         for player in self.players.values():
@@ -210,18 +230,47 @@ class FieldRun:
         self._by_arc[player.asked] = player
         player.video = player.scout.blindness.choose(self.world.time, self.channels)
         priority, slot = self.field.slots.of(task)
-        needs = {
-            f"robot/{player.name}": {},
-            RADIO: {"command_rate": Fraction(str(self.field.command_rate)), "packet_size": Fraction(MAX_PACKET)},
-            player.video or "video/*": {"transmitters": Fraction(1)},
-            "framegrabber/*": {},
-        }
+        needs = self._needs(player) | {"framegrabber/*": {}}
         request = ArcRequest(player.asked, player.name, needs, priority, round(slot * SECOND), keep=True)
         self._handle(Requested(request))
 
+    def _needs(self, player: Player) -> dict[str, Params]:
+        """What it needs to transmit."""
+        return {
+            f"robot/{player.name}": {},
+            RADIO: {"command_rate": Fraction(str(self.field.command_rate)), "packet_size": Fraction(MAX_PACKET)},
+            player.video or "video/*": {"transmitters": Fraction(1)},
+        }
+
+    def _warm_up(self, player: Player) -> None:
+        """Its turn is near, and its camera is to be warm by then."""
+        player.warms_at, player.warm = None, f"{player.name}-warm.{player.turns}"
+        self._by_arc[player.warm] = player
+        priority, runtime = self.field.slots.warm_priority, round(BRIEF * SECOND)
+        request = ArcRequest(player.warm, player.name, self._needs(player), priority, runtime, keep=True)
+        self._handle(Requested(request))
+
+    def _foresee(self, now: Ns) -> None:
+        """When cameras are to begin to warm up: `place_robot` goes by the same forecast."""
+        waiting = [one for one in self.players.values() if one.held is None and one.asked and one.warm is None]
+        waiting = [one for one in waiting if one.asks_at is None and one.scout.task == "watch"]
+        starts = forecast(self._core, now).starts if waiting else {}
+        for player in waiting:
+            start = starts.get(player.asked or "")
+            player.warms_at = None if start is None else max(self.world.time, start / SECOND - WARM_AHEAD)
+
     def _handle(self, *events: Event) -> None:
-        """One instant at the RCM, with every vote that it takes."""
+        """What comes of events at the RCM, and of what follows from them."""
+        left = self._instant(*events)
+        while left:
+            left = self._instant(*left)
+        if self.field.receivers < self.field.channels:
+            self._foresee(round(self.world.time * SECOND))
+
+    def _instant(self, *events: Event) -> list[Event]:
+        """One instant at the RCM, with every vote that it takes; and what its clients give up then."""
         batch: list[Event] = list(events)
+        warmed = [player for player in self.players.values() if player.warmed is not None]
         now: Ns = round(self.world.time * SECOND)
         while batch:
             votes: list[Event] = []
@@ -237,6 +286,16 @@ class FieldRun:
                     case _:
                         self._heed(effect)
             batch = votes or ([Tick()] if again else [])
+        given_up: list[Event] = []
+        for player in self.players.values():
+            if player in warmed and player.held is None and player.warmed is None:
+                self._halt(player)
+            if player.warm is not None and player.held is not None:
+                # Its turn has come before it was warm.
+                given_up.append(Cancelled(player.warm))
+                del self._by_arc[player.warm]
+                player.warm = None
+        return given_up
 
     def _vote(self, asked: Propose) -> Vote:
         holders = asked.holders.values()
@@ -253,13 +312,23 @@ class FieldRun:
         match effect:
             case Granted(arc=arc):
                 player = self._by_arc[arc]
+                if arc == player.warm:
+                    player.warmed = effect
+                    self._transmit(player, effect)
+                    return
                 player.held = effect
                 player.next_picture, player.next_drive, player.stood = now, now, False
                 player.scout.held(now)
                 self._judge.held(player.name)
-                self._transmit(player, effect, player.channel)
+                self._transmit(player, effect)
             case HoldEnded(arc=arc, outcome=outcome, requeued=requeued):
                 player = self._by_arc[arc]
+                if arc == player.warm:
+                    player.warmed = None
+                    if not requeued:
+                        del self._by_arc[arc]
+                        player.warm = None
+                    return
                 player.held = None
                 player.scout.released(now)
                 self._judge.ended(player.name, preempted=outcome is Outcome.PREEMPTED)
@@ -301,9 +370,11 @@ class FieldRun:
             player.stood = False
             self.send(MAX_PACKET, lambda: body.command(step.left, step.right, step.lasts, self.world.time))
 
-    def _transmit(self, player: Player, hold: Granted, channel: int) -> None:
+    def _transmit(self, player: Player, hold: Granted) -> None:
+        channel = _channel(hold)
+
         def switch() -> None:
-            if player.held is hold:
+            if hold in (player.held, player.warmed):
                 player.transmits = hold
                 self.world.bodies[player.name].transmit(channel, self.world.time)
 
@@ -312,7 +383,8 @@ class FieldRun:
     def _halt(self, player: Player) -> None:
         def halt() -> None:
             # A newer command to the same robot ends the repeats of an older one.
-            if player.held is None or player.transmits is not player.held:
+            current = player.held or player.warmed
+            if current is None or player.transmits is not current:
                 body = self.world.bodies[player.name]
                 body.command(0, 0, 0, self.world.time)
                 body.transmit(None, self.world.time)
