@@ -39,7 +39,7 @@ class SharedParams(Struct, kw_only=True):
     hide_priority: Priority = 2
     watch_priority: Priority = 1
     hide_slot: Slot = 60.0
-    watch_slot: Slot = 20.0
+    watch_slot: Slot = 30.0
     speed: Annotated[float, key("Seconds in one of ours.", 0.01, 100)] = 1.0
 
     def needs(self, robot: str) -> RobotNeeds:

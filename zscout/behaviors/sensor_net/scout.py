@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import math
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Literal, TypeAlias
@@ -30,6 +31,9 @@ NO_SIGNAL_TIMEOUT: Final = 4.0
 REMIND: Final = 4.0
 """Seconds without a good picture, above any warm-up, after which a robot may not have received the command to
 transmit."""
+
+LATELY: Final = 2
+"""Turns to watch back to which what was seen counts."""
 
 Task: TypeAlias = Literal["hide", "watch"]
 
@@ -175,6 +179,10 @@ class Scout:
         self._detector = MotionDetector()
         self._task: Task = "hide"
         """Of the present hold."""
+        self._alerts = 0
+        """Before the present turn."""
+        self._turns: deque[bool] = deque(maxlen=LATELY)
+        """Of its last turns to watch: whether it saw somebody."""
         self._held = self.no_signal = False
         """The last hold ended without any picture, not even snow, so its channel is to be left."""
 
@@ -183,13 +191,20 @@ class Scout:
         """What it would be held for now."""
         return "watch" if self.hider.state == "hidden" else "hide"
 
+    @property
+    def saw_somebody(self) -> bool:
+        """Whether it has lately."""
+        return any(self._turns)
+
     def held(self, now: float) -> None:
         """A hold begins, or goes on elsewhere after a move. `now` in seconds, by the clock of all calls."""
         if self._held:
             return
         self._held = True
         self._task = self.task
+        self._alerts = self.alerts.count
         if self._task == "hide":
+            self._turns.clear()
             self._detector = MotionDetector()
         else:
             # It is where it was, if nobody has moved it: what it knows of its background it need not learn again.
@@ -199,6 +214,8 @@ class Scout:
 
     def released(self, now: float) -> None:
         """The hold is over, for whatever reason: the wheels are stopped, and others may move the robot."""
+        if self._held and self._task == "watch":
+            self._turns.append(self.alerts.count > self._alerts)
         self._held = False
         self.no_signal = self.blindness.end(now)
         self.hider.interrupted(now)
@@ -230,7 +247,7 @@ class Scout:
         """All but what the detector has learned: that begins anew."""
         return {
             "hider": base64.b64encode(self.hider.checkpoint()).decode(),
-            "alerts": {"count": self.alerts.count},
+            "alerts": {"count": self.alerts.count, "before": self._alerts, "turns": list(self._turns)},
             "blindness": self.blindness.memory(),
             "task": self._task,
             "held": self._held,
@@ -239,7 +256,10 @@ class Scout:
     def recall(self, memory: dict[str, Any]) -> None:
         """Raises ValueError for what is no such memory."""
         self.hider = Hider.restore(base64.b64decode(memory["hider"]))
-        self.alerts.count = int(memory["alerts"]["count"])
+        alerts = memory["alerts"]
+        self.alerts.count = int(alerts["count"])
+        self._alerts = int(alerts.get("before", self.alerts.count))
+        self._turns.extend(map(bool, alerts.get("turns", ())))
         self.blindness.recall(memory["blindness"])
         self._task = "watch" if memory["task"] == "watch" else "hide"
         self._held = bool(memory["held"])

@@ -229,7 +229,7 @@ class FieldRun:
         player.asked = f"{player.name}-{task}.{player.turns}"
         self._by_arc[player.asked] = player
         player.video = player.scout.blindness.choose(self.world.time, self.channels)
-        priority, slot = self.field.slots.of(task)
+        priority, slot = self.field.slots.of(task, sooner=player.scout.saw_somebody)
         needs = self._needs(player) | {"framegrabber/*": {}}
         request = ArcRequest(player.asked, player.name, needs, priority, round(slot * SECOND), keep=True)
         self._handle(Requested(request))
