@@ -8,7 +8,8 @@ from zscout.behaviors.sensor_net.scout import LATELY, Scout
 
 def watch_once(scout: Scout, *, somebody: bool) -> None:
     """One turn of a robot that is hidden."""
-    scout.recall(scout.memory() | {"task": "watch", "held": True})
+    alerts = scout.memory()["alerts"] | {"before": scout.alerts.count}
+    scout.recall(scout.memory() | {"task": "watch", "held": True, "alerts": alerts})
     scout.alerts.see(1.0, somebody)
     scout.released(2.0)
 

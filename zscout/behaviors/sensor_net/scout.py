@@ -259,7 +259,7 @@ class Scout:
         alerts = memory["alerts"]
         self.alerts.count = int(alerts["count"])
         self._alerts = int(alerts.get("before", self.alerts.count))
-        self._turns.extend(map(bool, alerts.get("turns", ())))
+        self._turns = deque(map(bool, alerts.get("turns", ())), maxlen=LATELY)
         self.blindness.recall(memory["blindness"])
         self._task = "watch" if memory["task"] == "watch" else "hide"
         self._held = bool(memory["held"])
