@@ -18,16 +18,11 @@ def test_who_lately_saw_somebody_goes_before_the_others_for_a_while() -> None:
     slots = Slots()
     quiet, lively = slots.of("watch"), slots.of("watch", sooner=True)
     assert (quiet[0], quiet[1] > lively[1]) == (lively[0], True)
-    scout = Scout()
-    watch_once(scout, somebody=False)
-    assert not scout.saw_somebody
-    watch_once(scout, somebody=True)
-    for _ in range(LATELY - 1):
-        assert scout.saw_somebody
-        watch_once(scout, somebody=False)
-    assert scout.saw_somebody
-    watch_once(scout, somebody=False)
-    assert not scout.saw_somebody
+    scout, found = Scout(), []
+    for somebody in (False, True, *[False] * LATELY):
+        watch_once(scout, somebody=somebody)
+        found.append(scout.saw_somebody)
+    assert found == [False, *[True] * LATELY, False]
 
 
 def test_a_hide_begins_anew() -> None:
