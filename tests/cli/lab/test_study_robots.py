@@ -57,7 +57,7 @@ def test_a_pipe_gets_plain_tables(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_starts_are_shown_with_their_shares(capsys: pytest.CaptureFixture[str]) -> None:
     starts = StartFigures("office", 40, 38, 37, Quantiles(20.2, 41.0, 77.7), 0.25)
-    print_report(RobotsReport([], [], [], [starts]), ["office"], 40, 120)
+    print_report(RobotsReport([], [], [], [], [starts]), ["office"], 40, 120)
     shown = capsys.readouterr().out
     assert "office    40      38 (95%)    37 (92%)              41 s (20-78)       0.2 s\n" in shown
 

@@ -24,6 +24,7 @@ from zscout.lab.study.robots import (
     plan_of,
     quantiles_of,
     radio,
+    receivers,
     run,
     start_figures,
     turns,
@@ -39,10 +40,12 @@ def test_more_channels_than_robots_are_left_out_and_a_field_is_run_once() -> Non
     fields = grid([4, 1, 2, 2], [4, 2, 1])
     assert [(one.robots, one.channels) for one in fields] == [(1, 1), (2, 1), (2, 2), (4, 1), (4, 2), (4, 4)]
     assert [(one.robots, one.channels) for one in grid([1], [3])] == [(1, 3)]
+    assert [(one.channels, one.receivers) for one in receivers([4, 1, 5])] == [(4, 1), (4, 4)]
+    assert receivers([4])[0] in grid([4], [4])
     radios = radio([9_600, 300])
     assert len(radios) == len(set(radios)) == 4
     assert [(one.robots, one.channels, one.slots.hide) for one in turns([60, 30])] == [(4, 1, 30), (4, 1, 60)]
-    planned = StudyPlan(fields, radios).jobs(["office", DRAWN], range(2), 60.0)
+    planned = StudyPlan(fields, radio=radios).jobs(["office", DRAWN], range(2), 60.0)
     # Four robots, four channels and 9600 baud are in both.
     assert len(planned) == len(set(planned)) == (6 + 4 - 1) * 2 * 2
     assert [job.seed for job in planned] == sorted(job.seed for job in planned)

@@ -255,7 +255,8 @@ def placement(seeds: range, as_json: bool, rrd: Path | None) -> None:
 @study.command()
 @seeds_option("2", "Runs of each kind in each building: so many, or those of seeds A to B.", MAX_SEEDS)
 @numbers_option("--robots", 1, MAX_CREW, "How many robots, as in 1-4,8. Default: 1,2,4,6,8.")
-@numbers_option("--channels", 1, MAX_CREW, "How many video channels and framegrabbers. Default: 1-4.")
+@numbers_option("--channels", 1, MAX_CREW, "How many video channels, with a framegrabber each. Default: 1-4.")
+@numbers_option("--framegrabbers", 1, 4, "How many framegrabbers for four robots and four channels. Default: 1-4.")
 @numbers_option("--baud", MIN_BAUD, MAX_BAUD, "Rates of the radio. Default: 300,600,1200,2400,9600.")
 @numbers_option("--slot", 1, MAX_SLOT, "Seconds of a robot's turn to hide in. Default: 30,60,90.")
 @click.option(
@@ -287,6 +288,7 @@ def robots(
     seeds: range,
     robots: list[int] | None,
     channels: list[int] | None,
+    framegrabbers: list[int] | None,
     baud: list[int] | None,
     slot: list[int] | None,
     buildings: tuple[str, ...],
@@ -299,11 +301,11 @@ def robots(
 ) -> None:
     """Measures Place Sensor Net in simulated buildings: how soon robots are hidden, and what they then see.
 
-    Against the number of robots and of video channels with a framegrabber each; against the rate of the
-    radio, with four robots and four channels; and against the length of their turns, with four robots on one
-    channel. Whatever of --robots, --channels, --baud and --slot is given, only that is tried. Mind, votes and
-    scheduling are those that run live; the mesh is left out, and time is virtual. docs/robots.md says what
-    was found.
+    Against the number of robots and of video channels with a framegrabber each; against the number of
+    framegrabbers, and the rate of the radio, with four robots and four channels; and against the length of their
+    turns, with four robots on one channel. Whatever of --robots, --channels, --framegrabbers, --baud and --slot is
+    given, only that is tried. Mind, votes and scheduling are those that run live; the mesh is left out, and time is
+    virtual. docs/robots.md says what was found.
 
     \b
     Examples:
@@ -325,7 +327,7 @@ def robots(
             raise BadInput(f"--building {name}: there is no robot in it to start; add a [[robot]]")
     plan = nets.StudyPlan()
     if starts is None:
-        plan = nets.StudyPlan.of(robots or [], channels or [], baud or [], slot or [])
+        plan = nets.StudyPlan.of(robots or [], channels or [], framegrabbers or [], baud or [], slot or [])
     planned = plan.jobs(names, numbers, seconds)
     if len(planned) > MAX_NETS:
         raise BadInput(f"--seeds: {len(planned)} runs are more than {MAX_NETS}; ask for fewer of something")

@@ -31,11 +31,12 @@ DRAWN: Final = "drawn"
 ROBOTS: Final = (1, 2, 4, 6, 8)
 CHANNELS: Final = (1, 2, 3, 4)
 BAUDS: Final = (300, 600, 1_200, 2_400, 9_600)
+FRAMEGRABBERS: Final = (1, 2, 3, 4)
 COMMAND_RATES: Final = (5.0, 2.5)
 RADIO_ROBOTS: Final = 4
 RADIO_CHANNELS: Final = 4
 SLOTS: Final = (30, 60, 90)
-"""Seconds of the slot in which a robot hides; 30 is the default of `place_robot`."""
+"""Seconds of the slot in which a robot hides; 60 is the default of `place_robot`."""
 SLOT_ROBOTS: Final = 4
 SLOT_CHANNELS: Final = 1
 SECONDS: Final = 180.0
@@ -119,6 +120,15 @@ def radio(bauds: Iterable[int]) -> list[Field]:
     ]
 
 
+def receivers(framegrabbers: Iterable[int]) -> list[Field]:
+    """Four robots with a channel each, and fewer framegrabbers: the next camera can warm up."""
+    return [
+        Field(robots=RADIO_ROBOTS, channels=RADIO_CHANNELS, framegrabbers=one % RADIO_CHANNELS)
+        for one in sorted(set(framegrabbers))
+        if one <= RADIO_CHANNELS
+    ]
+
+
 def turns(slots: Iterable[int]) -> list[Field]:
     """Four robots that take turns on one channel, with longer and shorter slots to hide in."""
     return [
@@ -141,6 +151,7 @@ class FieldFigures:
 
     robots: int
     channels: int
+    framegrabbers: int
     baud: int
     command_rate: float
     slot: float
@@ -222,6 +233,7 @@ def _summed(field: Field, runs: Sequence[Outcomes]) -> FieldFigures:
     return FieldFigures(
         robots=field.robots,
         channels=field.channels,
+        framegrabbers=field.receivers,
         baud=field.baud,
         command_rate=field.command_rate,
         slot=field.slots.hide,
@@ -281,9 +293,11 @@ def start_figures(trials: Iterable[RobotsTrial]) -> list[StartFigures]:
 
 @dataclass(frozen=True, slots=True)
 class RobotsReport:
-    """What a study found: by robots and channels, by radio, by the length of turns, and of single robots."""
+    """What a study found: by robots and channels, by framegrabbers, by radio, by the length of turns, and of single
+    robots."""
 
     grid: list[FieldFigures]
+    receivers: list[FieldFigures]
     radio: list[FieldFigures]
     turns: list[FieldFigures]
     starts: list[StartFigures]
@@ -294,22 +308,30 @@ class StudyPlan:
     """Fields to try; without any, random starts of one robot."""
 
     grid: Sequence[Field] = ()
+    receivers: Sequence[Field] = ()
     radio: Sequence[Field] = ()
     turns: Sequence[Field] = ()
 
     @staticmethod
-    def of(robots: Sequence[int], channels: Sequence[int], bauds: Sequence[int], slots: Sequence[int]) -> StudyPlan:
+    def of(
+        robots: Sequence[int],
+        channels: Sequence[int],
+        framegrabbers: Sequence[int],
+        bauds: Sequence[int],
+        slots: Sequence[int],
+    ) -> StudyPlan:
         """Only what is given is tried; without anything, all."""
-        everything = not (robots or channels or bauds or slots)
+        everything = not (robots or channels or framegrabbers or bauds or slots)
         return StudyPlan(
             grid(robots or ROBOTS, channels or CHANNELS) if robots or channels or everything else (),
+            receivers(framegrabbers or FRAMEGRABBERS) if framegrabbers or everything else (),
             radio(bauds or BAUDS) if bauds or everything else (),
             turns(slots or SLOTS) if slots or everything else (),
         )
 
     def jobs(self, names: Sequence[str], seeds: Iterable[int], seconds: float) -> list[RobotsJob]:
         """Every field in every building with every seed; a field that comes twice is run once."""
-        fields = list(dict.fromkeys([*self.grid, *self.radio, *self.turns]))
+        fields = list(dict.fromkeys([*self.grid, *self.receivers, *self.radio, *self.turns]))
         # Seed by seed, so that what is there when somebody stops early is a whole study of fewer seeds.
         places = [(name, seed) for seed in seeds for name in names]
         if not fields:
@@ -320,6 +342,7 @@ class StudyPlan:
         by_field = field_figures(trials)
         return RobotsReport(
             grid=[by_field[one] for one in self.grid],
+            receivers=[by_field[one] for one in self.receivers],
             radio=[by_field[one] for one in self.radio],
             turns=[by_field[one] for one in self.turns],
             starts=start_figures(trials),

@@ -25,9 +25,10 @@ COLUMNS: Final = (
 
 def print_report(found: RobotsReport, names: Sequence[str], seeds: int, seconds: float) -> None:
     where = f"{seconds:g} s, {seeds} seed{'s' * (seeds != 1)} in each of {', '.join(names)}"
-    radio, turns = found.radio[:1], found.turns[:1]
+    receivers, radio, turns = found.receivers[:1], found.radio[:1], found.turns[:1]
     tables: list[tuple[str, tuple[str, ...], list[FieldFigures]]] = [
         (f"Robots and video channels: {where}", ("robots", "channels"), found.grid),
+        (f"Framegrabbers, {_means(receivers)}: {where}", ("framegrabbers",), found.receivers),
         (f"The radio, {_means(radio)}: {where}", ("baud", "command_rate"), found.radio),
         (f"Turns, {_means(turns)}: {where}", ("slot",), found.turns),
     ]
