@@ -179,6 +179,23 @@ def test_slots_are_the_times_between_bookings() -> None:
     run(story())
 
 
+def test_a_date_that_is_not_repeated_is_kept_free_however_far_ahead() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x")
+        await led(fleet, "x")
+        client = fleet.client("one")
+        far = 300 * 86_400
+        await do(client, book("b", "robot/a", at=far), BookingView)
+        assert states((await fleet.bookings())["b"]) == ["open"]
+        with pytest.raises(Refusal, match=r"not_free.*booked then: b of desk"):
+            await do(client, book("c", "robot/a", at=far + 50), BookingView)
+        assert (await do(client, Unbook("b"), BookingView)).unbooked
+        await do(client, book("c", "robot/a", at=far + 50), BookingView)
+        assert set(await fleet.bookings()) == {"c"}
+
+    run(story())
+
+
 def test_slots_go_by_what_was_asked_for_and_tell_what_is_likely() -> None:
     async def story() -> None:
         fleet = BookedFleet("x")
