@@ -75,6 +75,33 @@ def test_what_can_never_start_is_refused_with_what_to_mend(need: str, params: di
     assert refusal(need, params=params).startswith(words)
 
 
+@pytest.mark.parametrize(
+    ("needs", "words"),
+    [
+        (["radio/*", "radio/*#2"], ""),
+        (["radio/*", "robot/arm1"], ""),
+        (
+            ["radio/*", "radio/*#2", "radio/*#3"],
+            "unknown_device: 3 RCs that meet radio/* are asked for, and only radio/rf0, radio/rf1 can be had for it",
+        ),
+        (["robot/*", "robot/arm1"], "unknown_device: robot/* is asked for, and none but those that are named"),
+        (["tank/x"], "unknown_device: nobody knows tank/x; zscout status lists"),
+    ],
+)
+def test_what_never_waits_for_a_device_is_refused_where_too_few_meet_a_pattern(needs: list[str], words: str) -> None:
+    wanted: dict[str, Amounts] = {need: {} for need in needs}
+    try:
+        check_door(wanted, KNOWN, lambda _: False, KNOWN.get, waits=False, may_wait=False)
+    except Refused as refused:
+        assert f"{refused.problem.code}: {refused.problem.message}".startswith(words)
+        assert words
+    else:
+        assert not words
+    # Who may wait for one does.
+    if "tank/x" not in needs:
+        check_door(wanted, KNOWN, lambda _: False, KNOWN.get, waits=False)
+
+
 def test_who_waits_for_a_device_is_still_told_of_bad_parameters() -> None:
     assert refusal("robot/nowhere", waits=True) == ""
     assert refusal("radio/rf0", waits=True, params={"command_rate": 11}).startswith("too_much")
