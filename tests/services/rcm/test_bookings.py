@@ -465,6 +465,31 @@ def test_a_booking_is_in_danger_while_what_it_needs_is_away() -> None:
     run(story())
 
 
+def test_of_all_dates_of_a_booking_a_danger_is_told_once_and_the_next_dates_first() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x")
+        (leader,) = await led(fleet, "x")
+        assert leader.rcm is not None
+        dangers: list[BookedDanger] = []
+        leader.rcm.bookings.on_danger = dangers.append
+        far = fleet.rc("robot/far")
+        await fleet.joined(far)
+        client = fleet.client("one")
+        for name, at in (("a", 3_000), ("z", 300)):
+            until = round(NOON + at + 4 * 86_400)
+            await do(client, book(name, "robot/far", at=at, every=1, until=until), BookingView)
+        await do(client, book("m", "robot/far", at=200 * 86_400), BookingView)
+        fleet.network.kill(far.mesh)
+        await asyncio.sleep(10)
+        assert [(one.record.id, one.start - NOON, one.later) for one in dangers] == [
+            ("z", 300, 4),
+            ("a", 3_000, 4),
+            ("m", 200 * 86_400, 0),
+        ]
+
+    run(story())
+
+
 def test_what_is_long_over_is_forgotten_by_all_who_keep_bookings() -> None:
     async def story() -> None:
         fleet = BookedFleet("x", "y")
