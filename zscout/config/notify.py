@@ -101,8 +101,9 @@ def _written(urls: tuple[str, ...], folder: Path, at: Where) -> Iterator[_Writte
         if "://" in url:
             yield _Written(url, here)
             continue
+        file = folder / _file_name(url, here)
         try:
-            lines = read_text(folder / _file_name(url, here), max_bytes=MAX_URLS * MAX_URL).splitlines()
+            lines = read_text(file, max_bytes=MAX_URLS * MAX_URL).splitlines()
         except BadInput as error:
             named_by = f"{here.source}: {here.key}"
             raise BadInput(f"{error} (named by {named_by})") from None
