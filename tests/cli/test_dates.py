@@ -227,6 +227,9 @@ def test_words() -> None:
     assert date_words(start, NEW_YORK) == "Tue 2026-12-01 08:00"
     assert span_words(start, start + 7200, BERLIN) == "Tue 2026-12-01 14:00 to 16:00"
     assert span_words(start, start + 86_400 + 5, BERLIN) == "Tue 2026-12-01 14:00 to Wed 2026-12-02 14:00:05"
+    # As clocks are put back its end is by the clock where it began.
+    twice = datetime(2027, 10, 31, 2, 30, tzinfo=BERLIN).timestamp()
+    assert span_words(twice, twice + 3600, BERLIN) == "Sun 2027-10-31 02:30 to 02:30+01:00"
 
 
 def test_a_zone_is_one_of_the_database() -> None:

@@ -73,6 +73,10 @@ BAD = {
         'rc[0].driver (arm/a): no driver "amr" is installed here; did you mean "arm"? Install the package that brings '
         f'it into this environment, or write one of {NAMES}, "radio", "robot", "twice", "video"'
     ),
+    "sonar": (
+        'rc[0].driver (arm/a): no driver "sonar" is installed here; install the package that brings it into this '
+        f'environment, or write one of {NAMES}, "radio", "robot", "twice", "video"'
+    ),
     "broken": (
         "rc[0].driver (arm/a): broken:Arm of package broken 1.0 can't be loaded: ModuleNotFoundError: No module named "
         "'no_such_vendor'; mend that package, or install what it needs; --log-level debug shows more"

@@ -228,7 +228,8 @@ def date_words(at: float, zone: ZoneInfo | None) -> str:
 
 
 def span_words(start: float, end: float, zone: ZoneInfo | None) -> str:
-    """`Tue 2026-12-01 14:00 to 16:00`."""
-    same_day = in_zone(start, zone).date() == in_zone(end, zone).date()
-    words = date_words(end, zone)
-    return f"{date_words(start, zone)} to {words.split()[-1] if same_day else words}"
+    """`Tue 2026-12-01 14:00 to 16:00`; with the end's offset where clocks are changed between them, on one day."""
+    first, last, words = in_zone(start, zone), in_zone(end, zone), date_words(end, zone)
+    if first.date() == last.date():
+        words = words.split()[-1] + (last.isoformat()[-6:] if first.utcoffset() != last.utcoffset() else "")
+    return f"{date_words(start, zone)} to {words}"

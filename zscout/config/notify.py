@@ -12,7 +12,7 @@ from msgspec import Meta, Struct
 
 from zscout.config.apprise_process import NoAnswer, usable
 from zscout.config.packages import check_installed
-from zscout.config.strict import Where, key, quoted, read_text, seconds, secret
+from zscout.config.strict import BadInput, Where, key, quoted, read_text, seconds, secret
 from zscout.types import SECOND, Ns
 
 MAX_URLS: Final = 20
@@ -101,7 +101,12 @@ def _written(urls: tuple[str, ...], folder: Path, at: Where) -> Iterator[_Writte
         if "://" in url:
             yield _Written(url, here)
             continue
-        lines = read_text(folder / _file_name(url, here), max_bytes=MAX_URLS * MAX_URL).splitlines()
+        file = folder / _file_name(url, here)
+        try:
+            lines = read_text(file, max_bytes=MAX_URLS * MAX_URL).splitlines()
+        except BadInput as error:
+            named_by = f"{here.source}: {here.key}"
+            raise BadInput(f"{error} (named by {named_by})") from None
         found = [(count, line.strip()) for count, line in enumerate(lines, 1)]
         found = [(count, line) for count, line in found if line and not line.startswith("#")]
         if not 0 < len(found) <= MAX_URLS:

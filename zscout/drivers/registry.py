@@ -70,11 +70,11 @@ def _plugin(rc: PluginRc) -> type[Driver]:
     if not places:
         names = sorted({*known, *BUILT_IN})
         near = difflib.get_close_matches(rc.driver, names, n=1)
-        meant = f"did you mean {quoted(near[0])}? " if near else ""
+        meant = f"did you mean {quoted(near[0])}? Install" if near else "install"
         there = ", ".join(map(quoted, names))
         raise at.bad(
             f"no driver {quoted(rc.driver)} is installed here",
-            f"{meant}Install the package that brings it into this environment, or write one of {there}",
+            f"{meant} the package that brings it into this environment, or write one of {there}",
         )
     if len(places) > 1:
         packages = " and ".join(map(_origin, places))

@@ -136,7 +136,8 @@ class BookedDate(Message, frozen=True):
 
 class BookingView(_Booking, frozen=True):
     """A booking as the leader knows it. `owner` is the host, or the name of the certificate, that made it; `since`
-    when. `dates` are those that are not over, within the next 60 days; `dropped` all that were given up."""
+    when. `dates` are those that are not over, of what is repeated within the next 60 days; `dropped` all that were
+    given up."""
 
     owner: str = ""
     since: Instant = 0

@@ -91,7 +91,7 @@ AT = ("--for", "1h", "--at", "tue 14:00")
         (("book", "robot/a", *AT, "--name", "a b"), "--name"),
         (("maintain", "robot/*", *AT), "robot/* may be any one RC; name those"),
         (("maintain", "robot/a", "robot/a", *AT), "an RC is named twice"),
-        (("slots", "robot/a", "--for", "1h", "--within", "500d"), "--within"),
+        (("slots", "robot/a", "--for", "1h", "--within", "500d"), "--within: 500 d is not from 1.0 s to 366 d; write"),
         (("slots", "robot/a", "--for", "1h", "--limit", "0"), "--limit"),
         (("unbook", "x" * 65), "names no booking"),
         (("unbook", "x", "--date", "someday"), "--date: "),

@@ -134,6 +134,11 @@ def test_what_is_repeated_is_given_up_date_by_date(fleet: CliFleet) -> None:
     made = said(fleet, "book", "robot/c", "--for", "1h", "--at", "tomorrow 9:00", "--every", "day", "--until", "in 4d")
     assert re.search(r"^c \(", made)
     assert re.search(r"^it is repeated every day until \w\w\w [-\d]+: [34] dates within 60 days$", made, re.MULTILINE)
+    # In whichever zone the list is read, its last day is that of its own.
+    listed = [said(fleet, "bookings", "--zone", zone) for zone in ("Pacific/Honolulu", "Pacific/Kiritimati")]
+    days = re.findall(r"every day until ([-\d]+)", "".join(listed))
+    assert len(days) == 2
+    assert len(set(days)) == 1
     again = said(fleet, "book", "robot/b", "--for", "1h", "--at", "in 2d", "--name", "c")
     assert again.splitlines()[-1].startswith("you have another booking called c: name it by its id")
     assert '2 bookings are called "c": ' in said(fleet, "unbook", "c", code=1)

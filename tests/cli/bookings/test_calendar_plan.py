@@ -14,6 +14,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from msgspec import structs
 
+from zscout.cli.bookings.calendar import parse_needs
 from zscout.cli.bookings.calendar_file import read_calendar
 from zscout.cli.bookings.calendar_plan import ImportOptions, ImportPlan, Pairs, Wanted, plan_import
 from zscout.config.strict import BadInput
@@ -150,6 +151,13 @@ def test_what_options_say_goes_before_what_an_event_names() -> None:
     assert plan_of(event.replace("robot/arm2", "the arm 12"), mapped={"rm 12": ARM}).wanted == []
 
 
+def test_a_pattern_that_is_written_twice_is_two_rcs() -> None:
+    wanted = parse_needs("camera/*,camera/*,radio/rf0:command_rate=5", "--needs")
+    assert [need for need, _ in wanted] == ["camera/*", "camera/*#2", "radio/rf0"]
+    with pytest.raises(BadInput, match="robot/a is named twice"):
+        parse_needs("robot/a,robot/a", "--needs")
+
+
 def test_maintenance_is_of_rcs_by_name() -> None:
     event = "DTSTART:20261201T080000Z\nDURATION:PT1H"
     (one,) = plan_of(event, maintenance=True).wanted
@@ -172,6 +180,18 @@ def test_maintenance_is_of_rcs_by_name() -> None:
 )
 def test_what_should_have_been_booked_and_can_not_be_is_told(event: str, why: str) -> None:
     assert skipped(plan_of(event)) == [f"arm 1: {why} (failed)"]
+
+
+@pytest.mark.parametrize(
+    ("start", "rule", "why"),
+    [
+        ("20261201", "FREQ=YEARLY;BYMONTH=2;BYMONTHDAY=30", "without a date to come"),
+        ("20201201", "FREQ=WEEKLY;UNTIL=20210101T000000Z", "without a date to come"),
+        ("20301201", "FREQ=WEEKLY", "more than a year ahead: import it again then"),
+    ],
+)
+def test_what_is_repeated_without_a_date_to_come_is_counted(start: str, rule: str, why: str) -> None:
+    assert skipped(plan_of(f"DTSTART:{start}T080000Z\nDURATION:PT1H\nRRULE:{rule}")) == [f"arm 1: {why}"]
 
 
 def test_a_day_is_as_long_as_it_is() -> None:

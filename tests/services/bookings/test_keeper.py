@@ -14,7 +14,7 @@ from tests.mesh.kit import run
 from zscout.keyexpr import Sender
 from zscout.lab.faults.memory import MemoryNetwork
 from zscout.messages import BookingRecord, Grants
-from zscout.services.bookings.keeper import FILE, BookingFile, BookingKeeper
+from zscout.services.bookings.keeper import ASIDE, FILE, BookingFile, BookingKeeper
 from zscout.types import SECOND, Term
 
 NOON = 1_800_000_000.0
@@ -72,6 +72,7 @@ def test_a_file_of_another_fleet_is_not_used(tmp_path: Path, caplog: pytest.LogC
     asyncio.run(BookingFile(tmp_path, "other").write([record("one")]))
     assert BookingFile(tmp_path, "zscout").read() == []
     assert "is of fleet other, and is not used" in caplog.text
+    assert (tmp_path / ASIDE).exists()
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
@@ -81,6 +82,10 @@ def test_half_a_file_is_not_used(tmp_path: Path, share: float, caplog: pytest.Lo
     (tmp_path / FILE).write_bytes(content[: int(share * len(content))])
     assert BookingFile(tmp_path, "zscout").read() == []
     assert "can't be read, and is not used" in caplog.text
+    # What is written next does not end what is left of it.
+    asyncio.run(BookingFile(tmp_path, "zscout").write([]))
+    assert (tmp_path / ASIDE).read_bytes() == content[: int(share * len(content))]
+    assert (tmp_path / ASIDE).stat().st_mode & 0o777 == 0o600
 
 
 def test_a_damaged_record_is_left_out_and_all_others_are_kept(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -91,3 +96,4 @@ def test_a_damaged_record_is_left_out_and_all_others_are_kept(tmp_path: Path, ca
     assert [one.id for one in BookingFile(tmp_path, "zscout").read()] == ["one", "three"]
     assert "a booking in" in caplog.text
     assert "is left out" in caplog.text
+    assert (tmp_path / ASIDE).read_bytes() == (tmp_path / FILE).read_bytes()

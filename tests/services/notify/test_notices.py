@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from decimal import Decimal
 
+from msgspec.structs import replace
+
 from tests.services.metrics.test_figures import began, over
 from zscout.messages import BookingRecord, LoadReport, Who
 from zscout.scheduling.model import ArcRequest, Outcome
@@ -94,6 +96,9 @@ def test_whose_booking_is_in_danger_is_told_why_and_when_it_is_safe_again() -> N
             "robot/a from 2027-01-15 09:00 CET on",
         ),
     ]
+    # A zone that only others know.
+    mars = booking_notice("lab", BookedDanger(replace(record, zone="Mars/Olympus"), record.start, "robot/a is away", 2))
+    assert mars.body == "robot/a from 2027-01-15 08:00 UTC on, and 2 later dates: robot/a is away"
 
 
 def test_others_words_are_one_line_and_bounded() -> None:

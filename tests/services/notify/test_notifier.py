@@ -157,6 +157,10 @@ def test_urls_may_stand_in_a_file_of_their_own(tmp_path: Path) -> None:
         f"{tmp_path / 'lab.urls'} line 4",
         "notify.urls[1]",
     ]
+    with pytest.raises(
+        BadInput, match=r"no\.urls: there is no such file; .* \(named by anvil.toml: notify.urls\[1\]\)$"
+    ):
+        read_notify(NotifyTable(("lab.urls", "no.urls")), tmp_path, WHERE)
 
 
 @pytest.mark.parametrize(("table", "package"), [("metrics", "prometheus-client"), ("notify", "apprise")])

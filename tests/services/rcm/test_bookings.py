@@ -179,6 +179,23 @@ def test_slots_are_the_times_between_bookings() -> None:
     run(story())
 
 
+def test_a_date_that_is_not_repeated_is_kept_free_however_far_ahead() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x")
+        await led(fleet, "x")
+        client = fleet.client("one")
+        far = 300 * 86_400
+        await do(client, book("b", "robot/a", at=far), BookingView)
+        assert states((await fleet.bookings())["b"]) == ["open"]
+        with pytest.raises(Refusal, match=r"not_free.*booked then: b of desk"):
+            await do(client, book("c", "robot/a", at=far + 50), BookingView)
+        assert (await do(client, Unbook("b"), BookingView)).unbooked
+        await do(client, book("c", "robot/a", at=far + 50), BookingView)
+        assert set(await fleet.bookings()) == {"c"}
+
+    run(story())
+
+
 def test_slots_go_by_what_was_asked_for_and_tell_what_is_likely() -> None:
     async def story() -> None:
         fleet = BookedFleet("x")
@@ -444,6 +461,31 @@ def test_a_booking_is_in_danger_while_what_it_needs_is_away() -> None:
         await fleet.joined(fleet.rc("robot/far"))
         await asyncio.sleep(10)
         assert [(one.record.id, bool(one.why)) for one in dangers] == [("b", True), ("b", False)]
+
+    run(story())
+
+
+def test_of_all_dates_of_a_booking_a_danger_is_told_once_and_the_next_dates_first() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x")
+        (leader,) = await led(fleet, "x")
+        assert leader.rcm is not None
+        dangers: list[BookedDanger] = []
+        leader.rcm.bookings.on_danger = dangers.append
+        far = fleet.rc("robot/far")
+        await fleet.joined(far)
+        client = fleet.client("one")
+        for name, at in (("a", 3_000), ("z", 300)):
+            until = round(NOON + at + 4 * 86_400)
+            await do(client, book(name, "robot/far", at=at, every=1, until=until), BookingView)
+        await do(client, book("m", "robot/far", at=200 * 86_400), BookingView)
+        fleet.network.kill(far.mesh)
+        await asyncio.sleep(10)
+        assert [(one.record.id, one.start - NOON, one.later) for one in dangers] == [
+            ("z", 300, 4),
+            ("a", 3_000, 4),
+            ("m", 200 * 86_400, 0),
+        ]
 
     run(story())
 

@@ -27,11 +27,12 @@ KNOWN: dict[str, Parameters | None] = {
 }
 
 
-def refusal(need: str, *, waits: bool = False, params: Mapping[str, float] | None = None) -> str:
+def refusal(*needs: str, waits: bool = False, may_wait: bool = True, params: Mapping[str, float] | None = None) -> str:
     """The code and the text; empty where it is let in."""
     amounts: Amounts = {name: Decimal(str(value)) for name, value in (params or {}).items()}
+    wanted = dict.fromkeys(needs, amounts)
     try:
-        check_door({need: amounts}, KNOWN, lambda _: False, KNOWN.get, waits=waits)
+        check_door(wanted, KNOWN, lambda _: False, KNOWN.get, waits=waits, may_wait=may_wait)
     except Refused as refused:
         return f"{refused.problem.code}: {refused.problem.message}"
     return ""
@@ -73,6 +74,29 @@ def test_what_may_start_is_let_in(need: str, params: dict[str, float]) -> None:
 )
 def test_what_can_never_start_is_refused_with_what_to_mend(need: str, params: dict[str, float], words: str) -> None:
     assert refusal(need, params=params).startswith(words)
+
+
+@pytest.mark.parametrize(
+    ("needs", "words"),
+    [
+        (["radio/*", "radio/*#2"], ""),
+        (["radio/*", "robot/arm1"], ""),
+        (
+            ["radio/*", "radio/*#2", "radio/*#3"],
+            "unknown_device: 3 RCs that meet radio/* are asked for, and only radio/rf0, radio/rf1 can be had for it",
+        ),
+        (["robot/*", "robot/arm1"], "unknown_device: robot/* is asked for, and none but those that are named"),
+        (["tank/x"], "unknown_device: nobody knows tank/x; zscout status lists"),
+    ],
+)
+def test_what_never_waits_for_a_device_is_refused_where_too_few_meet_a_pattern(needs: list[str], words: str) -> None:
+    said = refusal(*needs, may_wait=False)
+    assert said.startswith(words)
+    assert bool(said) is bool(words)
+
+
+def test_who_may_wait_for_a_device_may_ask_for_more_than_there_are() -> None:
+    assert refusal("radio/*", "radio/*#2", "radio/*#3") == ""
 
 
 def test_who_waits_for_a_device_is_still_told_of_bad_parameters() -> None:

@@ -24,7 +24,7 @@ from zscout.cli.bookings.calendar_file import MAX_BYTES, read_calendar
 from zscout.cli.bookings.calendar_plan import ImportOptions, ImportPlan, Pairs, Wanted, plan_import
 from zscout.cli.common import Failed, NobodyThere, Parsed
 from zscout.cli.dates import date_words, every_words, host_zone
-from zscout.cli.requests.options import parse_duration, parse_need
+from zscout.cli.requests.options import gather_needs, parse_duration, parse_need
 from zscout.cli.requests.request import MAX_PRIORITY
 from zscout.config.state_folder import write_durably
 from zscout.config.strict import BadInput, quoted, read_bytes
@@ -126,12 +126,11 @@ def _write(path: Path, text: bytes) -> bool:
 # In
 
 
-def _needs(text: str, option: str) -> Pairs:
-    """`robot/arm1,framegrabber/*,radio/rf0:command_rate=5`. Raises BadInput."""
-    found = tuple(parse_need(one, option) for one in _NEXT_NEED.split(text))
+def parse_needs(text: str, option: str) -> Pairs:
+    """`robot/arm1,framegrabber/*,radio/rf0:command_rate=5`; a pattern that comes again is one more. Raises BadInput."""
     if not text:
         raise BadInput(f"{option}: names no RC")
-    return found
+    return tuple(gather_needs([parse_need(one, option) for one in _NEXT_NEED.split(text)]).items())
 
 
 def _mapping(text: str, option: str) -> tuple[str, Pairs]:
@@ -139,7 +138,7 @@ def _mapping(text: str, option: str) -> tuple[str, Pairs]:
     words, equals, needs = text.partition("=")
     if not equals or not 1 <= len(words.strip()) <= MAX_WORDS:
         raise BadInput(f"{option}: {quoted(text)} maps nothing; write words of the calendar, as in 'Arm 1=robot/arm1'")
-    return " ".join(words.split()), _needs(needs, option)
+    return " ".join(words.split()), parse_needs(needs, option)
 
 
 @dataclass(slots=True)
@@ -228,7 +227,11 @@ class _Import:
 @calendar.command("import")
 @click.argument("file", type=click.Path(path_type=Path, allow_dash=True))
 @click.option(
-    "--needs", "needs", multiple=True, type=Parsed("needs", _needs), help="What every event needs: robot/a,'camera/*'."
+    "--needs",
+    "needs",
+    multiple=True,
+    type=Parsed("needs", parse_needs),
+    help="What every event needs: robot/a,'camera/*'.",
 )
 @click.option(
     "--map",
@@ -288,7 +291,7 @@ async def import_(
             client.fleet.name,
             name or file.stem,
             zone,
-            tuple(one for some in needs for one in some),
+            tuple(gather_needs([one for some in needs for one in some]).items()),
             _merged(mapped),
             client.fleet.operator_priority if maintenance else priority,
             patience,

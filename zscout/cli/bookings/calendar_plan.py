@@ -36,6 +36,7 @@ LOOK_BACK: Final = 31 * DAY
 """Seconds: what began so long ago may not be over yet."""
 OVER, FREE, CANCELLED = "over, or begun", "of people who are free then", "cancelled"
 NO_RC = "naming no RC"
+NO_DATE = "without a date to come"
 LATER = "more than a year ahead: import it again then"
 
 Pairs = tuple[tuple[str, dict[str, Decimal]], ...]
@@ -166,6 +167,9 @@ class _Planned:
         event = self._event
         given_up = moved | {self._instant(one) for one in event.without}
         single: set[Instant] = {self._instant(one) for one in event.more}
+        if event.rule is not None and not single and next(self._dates(), None) is None:
+            later = self._start.instant(self._zone) > self._now + MAX_AHEAD
+            self._plan.skipped.append(Skipped(self._title, LATER if later else NO_DATE))
         if event.rule is None:
             single.add(self._start.instant(self._zone))
         elif event.rule.step:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 from zoneinfo import ZoneInfo
 
@@ -32,7 +33,7 @@ from zscout.cli.common import Failed
 from zscout.cli.dates import WrittenDate, date_words, every_words, host_zone, in_zone, span_words
 from zscout.config.strict import BadInput
 from zscout.messages import MAX_AHEAD, WINDOW, BookedDate, BookingRecord, BookingView
-from zscout.services.bookings.dates import dates
+from zscout.services.bookings.dates import dates, zone_of
 from zscout.terminal import Table, clean
 
 
@@ -105,6 +106,8 @@ def _row(booking: BookingView, date: BookedDate, zone: ZoneInfo | None) -> Seque
 def _repeated(booking: BookingView, zone: ZoneInfo | None) -> str:
     if not booking.every:
         return "-"
+    with suppress(ValueError):  # not known here
+        zone = zone_of(booking.zone)  # its last day is one there
     until = f" until {in_zone(booking.until, zone):%Y-%m-%d}" if booking.until is not None else ""
     return every_words(booking.every) + until
 

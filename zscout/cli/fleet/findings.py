@@ -392,7 +392,8 @@ def _clock(seen: Evidence) -> Iterator[Finding]:
         yield Finding("clock", "ok", "this host's clock is kept")
     elif seen.clock_kept is False:
         says = f"nothing keeps this host's clock, which says {shown(seen.at)}"
-        yield Finding("clock", "note", says, "only certificates need it; start a time service (timedatectl)")
+        needs = "dates of bookings, the journal and certificates go by it"
+        yield Finding("clock", "note", says, f"{needs}; start a time service (timedatectl)")
 
 
 def _open(seen: Evidence) -> Iterator[Finding]:

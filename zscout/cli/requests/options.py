@@ -24,6 +24,7 @@ from zscout.config.strict import DURATIONS, BadInput, quoted
 from zscout.keyexpr import BadName, check_name, check_need, is_pattern, valid_name
 from zscout.messages import MAX_NEEDS, MAX_PARAMS, Who
 from zscout.scheduling.needs import check_patterns
+from zscout.terminal import span
 
 Needs = dict[str, dict[str, Decimal]]
 
@@ -59,7 +60,7 @@ def seconds_within(low: float, high: float) -> Parsed[float]:
     def parse(text: str, option: str) -> float:
         seconds = float(parse_duration(text, option))
         if not low <= seconds <= high:
-            raise BadInput(f"{option}: {seconds:g} s is not from {low:g} to {high:g} s; write {DURATIONS}")
+            raise BadInput(f"{option}: {span(seconds)} is not from {span(low)} to {span(high)}; write {DURATIONS}")
         return seconds
 
     return Parsed("duration", parse)

@@ -6,8 +6,8 @@ written in hours: days would be longer or shorter where clocks change."""
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from datetime import UTC, date, datetime, timedelta
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from typing import Final, NamedTuple
 from zoneinfo import ZoneInfo
@@ -97,18 +97,61 @@ def _until(view: BookingView) -> Instant:
 
 @lru_cache(1_024)  # it takes milliseconds, and there are 600 zones
 def _timezone(name: str, first: int, last: int) -> Timezone:
-    """As it is in these years."""
-    timezone = Timezone.from_tzid(name, first_date=date(first - 1, 1, 1), last_date=date(last + 2, 1, 1))
-    for part in timezone.subcomponents:
-        assert isinstance(part, TimezoneStandard | TimezoneDaylight)  # noqa: S101 - from_tzid makes no others
-        # icalendar 7 tells where a gap ends, and not the local time at which it begins.
-        gap = max(timedelta(), part.TZOFFSETTO - part.TZOFFSETFROM)
-        later = [at - gap for at, _ in part.rdates]
-        part.DTSTART -= gap
-        if later:
-            del part["RDATE"]
-            part.add("RDATE", later)
+    """As it is in these years, by rules where its clocks are changed on the same Sunday of each: some programs know no
+    others, and of dates the first alone. icalendar's own misses times of few weeks, as Morocco's in Ramadan."""
+    zone, timezone = zone_of(name), Timezone()
+    timezone.add("TZID", name)
+    begins, ends = (datetime(year, 1, 1, tzinfo=UTC) for year in (first - 1, last + 2))
+    changes = dict[tuple[timedelta, timedelta, str], list[datetime]]()
+    for at in _changes(zone, begins, ends):
+        before, after = _offset(at - timedelta(seconds=1), zone), _offset(at, zone)
+        told = before, after, at.astimezone(zone).tzname() or ""
+        changes.setdefault(told, []).append((at + before).replace(tzinfo=None))
+    if not any(times[0].year < first for times in changes.values()):
+        offset = _offset(begins, zone)
+        told = offset, offset, begins.astimezone(zone).tzname() or ""
+        changes = {told: [(begins + offset).replace(tzinfo=None)], **changes}
+    for (before, after, called), times in changes.items():
+        part = TimezoneDaylight() if after > before else TimezoneStandard()
+        part.add("DTSTART", times[0])
+        if len(times) > 1:
+            rule = _rule(times) if [at.year for at in times] == [*range(first - 1, last + 2)] else None
+            part.add("RDATE" if rule is None else "RRULE", rule or times[1:])
+        part.add("TZNAME", called)
+        part.add("TZOFFSETFROM", before)
+        part.add("TZOFFSETTO", after)
+        timezone.add_component(part)
     return timezone
+
+
+def _offset(at: datetime, zone: ZoneInfo) -> timedelta:
+    return at.astimezone(zone).utcoffset() or timedelta()
+
+
+def _changes(zone: ZoneInfo, begins: datetime, ends: datetime) -> Iterator[datetime]:
+    """The instants at which its offset is another than in the second before."""
+    day = timedelta(days=1)
+    while begins < ends:
+        low, high = begins, begins + day
+        if _offset(low, zone) != (after := _offset(high, zone)):
+            while high - low > timedelta(seconds=1):
+                middle = (low + (high - low) / 2).replace(microsecond=0)
+                low, high = (low, middle) if _offset(middle, zone) == after else (middle, high)
+            yield high
+        begins += day
+
+
+def _rule(times: Sequence[datetime]) -> vRecur | None:
+    """That of these local times, one a year; None: there is none."""
+    if len({(at.month, at.weekday(), at.time()) for at in times}) > 1:
+        return None
+    weeks = {(at.day - 1) // 7 + 1 for at in times}
+    if all(at.month != (at + timedelta(days=7)).month for at in times):
+        weeks = {-1}
+    if len(weeks) > 1:
+        return None
+    day = ("MO", "TU", "WE", "TH", "FR", "SA", "SU")[times[0].weekday()]
+    return vRecur({"FREQ": "YEARLY", "BYMONTH": times[0].month, "BYDAY": f"{weeks.pop()}{day}"})
 
 
 def _repeated(fleet: str, view: BookingView, zone: ZoneInfo) -> list[Event]:

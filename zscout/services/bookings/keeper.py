@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -37,6 +38,7 @@ from zscout.types import NO_TERM, SECOND, VERSION, Ns, Term
 log = logging.getLogger(__name__)
 
 FILE: Final = "bookings.json"
+ASIDE: Final = "bookings.damaged.json"
 MAX_SAVING: Final = 16
 """Answers that wait for the disk at one time."""
 UNASKED: Final[Ns] = 40 * SECOND
@@ -61,7 +63,8 @@ class Disk(Protocol):
 
 
 class BookingFile:
-    """A file of one fleet's bookings. A record that can't be read is left out, and told in the log."""
+    """A file of one fleet's bookings. A record that can't be read is left out, and told in the log; as the next write
+    would be its end, a copy of such a file is kept."""
 
     def __init__(self, folder: Path, fleet: str) -> None:
         self._path, self._fleet = folder / FILE, fleet
@@ -72,10 +75,10 @@ class BookingFile:
         try:
             kept: _BookingFile = decode(read_bytes(self._path, max_bytes=MAX_STATE), _BookingFile, MAX_STATE)
         except (BadInput, Malformed) as error:
-            log.warning("%s can't be read, and is not used: %s", self._path, error)
+            log.warning("%s can't be read, and is not used%s: %s", self._path, self._set_aside(), error)
             return []
         if kept.fleet != self._fleet:
-            log.warning("%s is of fleet %s, and is not used", self._path, kept.fleet)
+            log.warning("%s is of fleet %s, and is not used%s", self._path, kept.fleet, self._set_aside())
             return []
         found: list[BookingRecord] = []
         for raw in kept.records:
@@ -83,7 +86,17 @@ class BookingFile:
                 found.append(decode_told(bytes(raw), BookingRecord))
             except Malformed as error:
                 log.warning("a booking in %s can't be read, and is left out: %s", self._path, error)
+        if len(found) < len(kept.records):
+            log.warning("%s is not used whole%s", self._path, self._set_aside())
         return found
+
+    def _set_aside(self) -> str:
+        """Keeps a copy; the last one stays. What is to be said of it."""
+        try:
+            shutil.copy(self._path, self._path.with_name(ASIDE))
+        except OSError as error:
+            return f" (and can't be set aside: {error.strerror})"
+        return f" (a copy stays as {ASIDE})"
 
     async def write(self, records: list[BookingRecord]) -> None:
         content = encode(_BookingFile(self._fleet, [msgspec.Raw(encode(record)) for record in records]))

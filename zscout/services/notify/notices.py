@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from datetime import datetime
+from contextlib import suppress
+from datetime import UTC, datetime, tzinfo
 from typing import Final, NamedTuple
 
 from zscout.config.notify import NotifyEvent
@@ -56,10 +57,14 @@ class HoldNotices:
 
 def booking_notice(fleet: str, danger: BookedDanger) -> Notification:
     """That a booking may not be kept, or is safe again; its date in the zone of who made it."""
-    record, why = danger.record, danger.why
+    record, why, later = danger.record, danger.why, danger.later
     title = f"zscout {fleet}: your booking {record.name} is {'in danger' if why else 'safe again'}"
-    at = datetime.fromtimestamp(danger.start, zone_of(record.zone)).strftime("%Y-%m-%d %H:%M %Z")
-    body = f"{_listed(record.needs)} from {at} on{': ' if why else ''}{why}"
+    zone: tzinfo = UTC
+    with suppress(ValueError):  # not known here
+        zone = zone_of(record.zone)
+    at = datetime.fromtimestamp(danger.start, zone).strftime("%Y-%m-%d %H:%M %Z")
+    more = f", and {later} later date{'s' * (later > 1)}" if later else ""
+    body = f"{_listed(record.needs)} from {at} on{more}{': ' if why else ''}{why}"
     return notification("booking_in_danger", (record.who.user if record.who else "") or record.owner, title, body)
 
 

@@ -37,7 +37,7 @@ from zscout.scheduling.core import Core
 from zscout.scheduling.model import Effect, Event, Propose, Rc, RcJoined, Vote, VoteOverdue
 from zscout.scheduling.reason import Reason
 from zscout.scheduling.votes import HolderSet
-from zscout.services.bookings.dates import dates, told
+from zscout.services.bookings.dates import DAY, dates, told
 from zscout.services.bookings.fleet_clock import FleetClock
 from zscout.services.bookings.records import Records
 from zscout.types import SECOND, ArcId, Grant, Need, Ns, RcName
@@ -45,7 +45,7 @@ from zscout.types import SECOND, ArcId, Grant, Need, Ns, RcName
 log = logging.getLogger(__name__)
 
 MAX_CLAIMS = 4_000
-"""Dates of all bookings within the next 60 days that a leader keeps free."""
+"""Dates of all bookings that a leader keeps free: of what is repeated those of the next 60 days."""
 STEPPED: Ns = SECOND
 """By how much it is moved only where another time goes on."""
 REDATED: Ns = SECOND // 50
@@ -139,14 +139,15 @@ class BookedDates:
         )
 
     def open_dates(self, record: BookingRecord, taken: Collection[str] = ()) -> list[Date]:
-        """Those of a booking within the next 60 days that are not over."""
+        """Those of a booking that are not over; of what is repeated within the next 60 days."""
         if record.unbooked:
             return []
         time = self.time
         if not 0 < record.runtime <= MAX_AHEAD:
             return []
         try:
-            starts = dates(record, time - float(record.runtime), time + WINDOW)
+            ahead = WINDOW if record.every else MAX_AHEAD + DAY  # the clock that it was booked by may have been ahead
+            starts = dates(record, time - float(record.runtime), time + ahead)
         except (ValueError, OverflowError) as error:
             self._strange.warning(record.id, "booking %s is not kept: %s", record.id, error)
             return []

@@ -176,10 +176,10 @@ class BookingHandler:
         if len(records) >= MAX_BOOKINGS or records.size >= MAX_KEPT:
             raise Refused("too_many", f"this fleet keeps {len(records)} bookings already; unbook some")
         if len(self._core.bookings()) + len(self._dates.open_dates(record)) > MAX_CLAIMS:
-            raise Refused("too_many", f"{MAX_CLAIMS} dates are booked within 60 days; repeat it less often")
+            raise Refused("too_many", f"{MAX_CLAIMS} dates are booked; repeat it less often")
 
     def _decide(self, query: Query, record: BookingRecord) -> bool:
-        """Whether it is decided: all dates of the next 60 days are free, or one is not."""
+        """Whether it is decided: all its dates that are kept free from now on are free, or one is not."""
         unknown, bound = [], dict[int, dict[str, str]]()
         self._emit(Tick())
         # Maintenance goes before what is booked: who is in its way is told.

@@ -129,7 +129,10 @@ class BookingSharing:
         if others:
             self._why = f"{', '.join(others[:3])} may lead as well, and did not take it"
         else:
-            self._why = "" if saved else "no other host may lead, and this one has no disk for it"
+            alone = (
+                "no other host may lead, and this one has no disk for it: is its `state` a folder that it may write?"
+            )
+            self._why = "" if saved else alone
 
     def _take(self, replies: Collection[Reply[BookingsKept]]) -> list[BookingsKept]:
         """What keepers answered."""

@@ -16,7 +16,7 @@ from zscout.scheduling.model import Effect, Event, Propose, Vote, VoteOverdue
 from zscout.services.authority import Authority
 from zscout.services.bookings.fleet_clock import FleetClock, agreed, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
-from zscout.services.rcm.booked_dates import BookedDates
+from zscout.services.rcm.booked_dates import BookedDates, Date
 from zscout.services.rcm.booking_handler import BookingHandler
 from zscout.services.rcm.booking_sharing import BookingSharing, oldest
 from zscout.types import SECOND, ArcId, Ns, Params, Term
@@ -35,6 +35,8 @@ class BookedDanger(NamedTuple):
     record: BookingRecord
     start: Instant
     why: str
+    later: int = 0
+    """Dates after that of which the same is to be told."""
 
 
 class Bookings:
@@ -163,15 +165,23 @@ class Bookings:
             self._supervisor.call_later(LASTS, self._tell)
 
     def _tell(self) -> None:
-        """Tells what is not as it was told last, and has been so for a while."""
+        """Tells what is not as it was told last, and has been so for a while: the next dates first, as there are bounds
+        to what people are told, and once of all dates of a booking."""
         self._telling = False
         before, self._told = self._told, self.dates.dangers()
-        for name in sorted(before.keys() | self._told.keys()):
+        news = dict[tuple[str, str], list[Date]]()
+        for name in before.keys() | self._told.keys():
             why, date = self._told.get(name, ""), self.dates.date(name)
             if why != before.get(name, "") and date is not None:
-                words = f"is in danger: {why}" if why else "is safe again"
-                log.warning("booking %s of %s %s", date.record.name, date.record.owner, words)
-                self.on_danger(BookedDanger(date.record, date.start, why))
+                news.setdefault((date.record.id, why), []).append(date)
+        found = [
+            BookedDanger(*min(dates, key=lambda date: date.start), why, len(dates) - 1)
+            for (_, why), dates in news.items()
+        ]
+        for danger in sorted(found, key=lambda one: (one.start, one.record.id, one.why)):
+            words = f"is in danger: {danger.why}" if danger.why else "is safe again"
+            log.warning("booking %s of %s %s", danger.record.name, danger.record.owner, words)
+            self.on_danger(danger)
 
     def _on_token(self, token: Token, alive: bool) -> None:
         if alive and token.host != self._mesh.me.host:

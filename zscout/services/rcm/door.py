@@ -5,7 +5,8 @@ Only who asks for it is refused so (`Ask.check`): others are queued, whatever th
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Collection, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
 from decimal import Decimal
 
 from zscout.keyexpr import is_pattern, matcher
@@ -24,8 +25,11 @@ def check_door(
     parameters_of: Callable[[RcName], Parameters | None],
     *,
     waits: bool,
+    may_wait: bool = True,
 ) -> None:
-    """Raises Refused for what is neither among those that are expected nor there; with `waits`, it is waited for."""
+    """Raises Refused for what is neither among those that are expected nor there; with `waits`, it is waited for. What
+    never waits (`may_wait` is false) has enough RCs for all its patterns, too."""
+    wanted = Counter(need.partition("#")[0] for need in needs if is_pattern(need))
     for need, params in needs.items():
         if not params and (is_there(need) or need in expected):
             continue
@@ -34,18 +38,32 @@ def check_door(
         else:
             matching = [need] if need in expected or is_there(need) else []
         if not matching and not waits:
-            raise _unknown(need, expected)
+            raise _unknown(need, expected, may_wait=may_wait)
+        left = [rc for rc in matching if rc not in needs]
+        if is_pattern(need) and not waits and not may_wait and len(left) < wanted[need.partition("#")[0]]:
+            raise _too_few(need.partition("#")[0], left, wanted)
         refusals = [_objection(rc, params, parameters_of(rc)) for rc in matching]
         # One that takes it is enough.
         if refusals and all(refusals):
             raise next(filter(None, refusals))
 
 
-def _unknown(need: Need, known: Collection[RcName]) -> Refused:
+def _too_few(pattern: str, left: Sequence[RcName], wanted: Mapping[str, int]) -> Refused:
+    what = (
+        f"{wanted[pattern]} RCs that meet {pattern} are asked for" if wanted[pattern] > 1 else f"{pattern} is asked for"
+    )
+    there = f"only {', '.join(left[:MAX_NAMED])}" if left else "none but those that are named"
+    return Refused("unknown_device", f"{what}, and {there} can be had for it; ask for less")
+
+
+def _unknown(need: Need, known: Collection[RcName], *, may_wait: bool) -> Refused:
     near = difflib.get_close_matches(need, known, n=3)
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     what = f"an RC that meets {need}" if is_pattern(need) else need
-    return Refused("unknown_device", f"nobody knows {what}; {hint}to wait until it comes, say so (--wait-for-device)")
+    remedy = (
+        "to wait until it comes, say so (--wait-for-device)" if may_wait else "zscout status lists all that are known"
+    )
+    return Refused("unknown_device", f"nobody knows {what}; {hint}{remedy}")
 
 
 def _objection(rc: RcName, params: Amounts, parameters: Parameters | None) -> Refused | None:

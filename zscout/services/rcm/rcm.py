@@ -149,7 +149,7 @@ class Rcm:
             supervisor,
             receive,
             self._propose,
-            self.requests.check_door,
+            partial(self.requests.check_door, may_wait=False),
         )
         self.bookings.handler.runtimes = runtimes
         self._heartbeat = fleet.timing.heartbeat

@@ -219,10 +219,12 @@ class RequestHandler:
         self._strange.warning(client, "%s shows a place that is not its own: it has none for that", client)
         return None
 
-    def check_door(self, needs: Mapping[str, Amounts], *, waits: bool = False) -> None:
+    def check_door(self, needs: Mapping[str, Amounts], *, waits: bool = False, may_wait: bool = True) -> None:
         """Raises Refused for what can never start."""
         waits = waits or self.mesh.now() < self._knows_all
-        check_door(needs, self._devices.names, self._membership.is_known, self._parameters, waits=waits)
+        check_door(
+            needs, self._devices.names, self._membership.is_known, self._parameters, waits=waits, may_wait=may_wait
+        )
 
     def _parameters(self, rc: RcName) -> Parameters | None:
         state = self._membership.reported(rc)
