@@ -165,6 +165,18 @@ def held(hold: PastHold, now: float) -> float:
     return max(0.0, (now if hold.ended is None else hold.ended) - hold.began)
 
 
+def used(hold: PastHold, now: float) -> dict[str, float | None]:
+    """Seconds for which each RC was used, no longer than it is known to have been held; None: it did not tell."""
+    most = held(hold, now)
+    return {rc: round(min(hold.used[rc], most), 3) if rc in hold.used else None for rc in hold.rcs}
+
+
+def used_sum(hold: PastHold, now: float) -> float | None:
+    """RC-seconds of it; None: not all told."""
+    told = [seconds for seconds in used(hold, now).values() if seconds is not None]
+    return round(sum(told), 3) if len(told) == len(hold.rcs) else None
+
+
 def ending(hold: PastHold) -> str:
     """How it ended, in a few words."""
     if hold.ended is None:
@@ -179,7 +191,8 @@ def ending(hold: PastHold) -> str:
 
 def hold_json(hold: PastHold, now: float) -> dict[str, Any]:
     """As `--json` prints it: times in UTC, spans in seconds."""
-    return structs.asdict(hold) | _times(hold.began, hold.ended) | {"held": round(held(hold, now), 3)}
+    spans = {"held": round(held(hold, now), 3), "used": used(hold, now), "used_rc_seconds": used_sum(hold, now)}
+    return structs.asdict(hold) | _times(hold.began, hold.ended) | spans
 
 
 def _times(began: float, ended: float | None) -> dict[str, str | None]:

@@ -14,7 +14,7 @@ from zscout.drivers.instances import Instances
 from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import Declaration, Mesh, Refused, Supervisor
 from zscout.messages import Amounts, Figures, Holder, Parameter, ProposedHolder
-from zscout.types import SECOND, Ns
+from zscout.types import SECOND, Grant, Ns
 
 __all__ = ["Driver", "Figures", "Holder", "Parameter", "ProposedHolder", "RcDirectory", "RcHandle", "Refused"]
 
@@ -48,6 +48,10 @@ class RcHandle(Protocol):
 
     def rules_changed(self) -> None:
         """The driver votes by other rules from now on: earlier votes are void."""
+
+    def used(self, grant: Grant) -> None:
+        """The device has just done something under a hold, beside its commands, which are counted without this: it
+        published a picture, say. From any one thread."""
 
 
 class NoOptions(Struct, frozen=True):

@@ -13,8 +13,9 @@ import math
 import statistics
 import threading
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from fractions import Fraction
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Self
 
 import cv2
@@ -208,7 +209,9 @@ class FramegrabberDriver(Driver):
         if capture is None or source != self._source:
             capture = self._open(source)
         head = FrameHead(self._before["number"], time=0, width=0, height=0, grant=holder.grant, source=source)
-        self._pump = FramePump(self._publisher, capture, self._meter, head, rate=self._rate, quality=self._quality)
+        used = partial(self._rc.used, holder.grant)
+        rate, quality = self._rate, self._quality
+        self._pump = FramePump(self._publisher, capture, self._meter, head, used, rate=rate, quality=quality)
 
     def _open(self, source: str) -> Capture:
         self._let_go()
@@ -316,15 +319,25 @@ class FrameMeter:
 
 class FramePump:
     """Publishes the pictures of a capture that are read from now on, until it is stopped; in a thread of its
-    own. `head` is what the heads of frames have in common; their numbers go on from its number.
+    own. `head` is what the heads of frames have in common; their numbers go on from its number. `published` is
+    called with each frame that went out, in that thread.
 
     At most `rate` frames a second, with JPEG `quality` 1..100, and only while somebody subscribes: otherwise nothing is
     even encoded."""
 
     def __init__(
-        self, to: FramePublisher, capture: Capture, meter: FrameMeter, head: FrameHead, *, rate: float, quality: int
+        self,
+        to: FramePublisher,
+        capture: Capture,
+        meter: FrameMeter,
+        head: FrameHead,
+        published: Callable[[], object],
+        *,
+        rate: float,
+        quality: int,
     ) -> None:
         self._publisher, self._capture, self._meter, self._head = to, capture, meter, head
+        self._published = published
         self._quality = quality
         self._pace = pace_of(rate)
         self._after = capture.number
@@ -375,6 +388,7 @@ class FramePump:
             if not self._stopped and now - captured.time <= MAX_AGE:
                 self._publisher.put(head, jpeg)
                 self._meter.count(head, len(jpeg), now)
+                self._published()
 
     def _complain(self, words: str) -> None:
         if not self._complained:

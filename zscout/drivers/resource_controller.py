@@ -23,6 +23,7 @@ from zscout.drivers.holds import HoldChange, HoldTable, goes_on
 from zscout.drivers.instances import Instances, InstanceState
 from zscout.drivers.last_holder import LastHolder
 from zscout.drivers.repeated import CommandMemory
+from zscout.drivers.use import UseCounter
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor, Tally
 from zscout.mesh.renewal import UNHEARD
@@ -157,6 +158,7 @@ class ResourceController:
         self.queue, self._memory = WorkQueue(), CommandMemory()
         self.tally = Tally()
         """How its commands ended."""
+        self._use = UseCounter()
         self.directory = RcDirectory(mesh) if driver.relays else None
         self.stall, self._on_failure = stall, on_failure
         self.supervisor = Supervisor(name, self._failed)
@@ -278,6 +280,10 @@ class ResourceController:
         self._apply(change)
         self.publish()
 
+    def used(self, grant: Grant) -> None:
+        now = self.mesh.now()
+        self._use.carried_out(grant, now, now)
+
     def recover(self) -> None:
         if self.health != "ok":
             log.info("%s is well", self.name)
@@ -285,7 +291,7 @@ class ResourceController:
         self.publish()
 
     def publish(self, ended: list[messages.EndedHold] | None = None) -> None:
-        self._published = self.mesh.now()
+        self._published, self._use.news = self.mesh.now(), False
         self._state.put(self._rc_state(ended or []))
 
     # What the RCM sends
@@ -363,6 +369,7 @@ class ResourceController:
             settle=self._settle / SECOND,
             parameters=None if leaving else self.driver.parameters(),
             version=VERSION,
+            used=self._use.told(self.mesh.now()),
         )
 
     def _figures(self) -> messages.Figures:
@@ -432,7 +439,17 @@ class ResourceController:
         warming = max(0.0, (self._warm_at - self.mesh.now()) / SECOND)
         if warming and not self.driver.usable_cold(command.do):
             raise Refused("warming", f"{self.name} is warming up; {warming:.1f} s are left")
-        return await self.driver.command(self.holds.held[command.grant].holder, command.do)
+        grant, began = command.grant, self.mesh.now()
+        result = await self.driver.command(self.holds.held[grant].holder, command.do)
+        if isinstance(result, asyncio.Future):
+            result.add_done_callback(lambda done: self._on_done(grant, began, done))
+        else:
+            self._use.carried_out(grant, began, self.mesh.now())
+        return result
+
+    def _on_done(self, grant: Grant, began: Ns, done: asyncio.Future[Any]) -> None:
+        if not done.cancelled() and done.exception() is None:
+            self._use.carried_out(grant, began, self.mesh.now())
 
     def _hear_program(self, grant: Grant, client: str, *, gone: bool) -> messages.Done:
         """What the client of a direct hold says of its program. Raises Refused."""
@@ -563,6 +580,8 @@ class ResourceController:
 
     async def _begin(self, holder: messages.Holder) -> None:
         self._at_driver.add(holder.grant)
+        if holder.direct:
+            self._use.direct_began(holder.grant, self.mesh.now())
         await self._guard(self.driver.begin(holder))
 
     async def _make_safe(self) -> None:
@@ -602,6 +621,10 @@ class ResourceController:
         if change.named is not None:
             self.instances.take(change.named, change.named_host)
         if change or change.settled:
+            for holder in change.removed:
+                self._use.hold_ended(holder.grant, self.mesh.now())
+            for holder in change.began:
+                self._use.hold_began(holder.grant)
             if change.began and change.interrupts:
                 self._warm_at = self.mesh.now() + round(self.driver.activation * SECOND)
             self.queue.put_change(change)
@@ -678,7 +701,9 @@ class ResourceController:
         while True:
             published = self._figures()
             await asyncio.sleep(FIGURES_PERIOD)
-            if self._figures() != published or self.mesh.now() - self._published > SAY_AGAIN * SECOND:
+            silent = self.mesh.now() - self._published > SAY_AGAIN * SECOND
+            # How much a hold that stands was used grows all the time: that is said with what is said anyway.
+            if self._figures() != published or self._use.news or silent:
                 self.publish()
 
     async def _keep_looking(self) -> None:

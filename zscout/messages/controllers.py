@@ -13,6 +13,8 @@ from zscout.types import NO_TERM, Grant, Term
 MAX_FIGURES = 32
 MAX_ID = 64
 """Characters of a command's id."""
+MAX_USES = 256
+"""Grants of which one state tells how long the RC was used under them."""
 MAX_FRAME = 2_000_000
 """Bytes of one frame."""
 Figures: TypeAlias = Annotated[dict[str, float], Meta(max_length=MAX_FIGURES)]
@@ -99,6 +101,15 @@ class EndedHold(Message, frozen=True):
     why: str
 
 
+class HoldUse(Message, frozen=True):
+    """For how many `seconds` an RC was used under a grant so far: from the beginning of the first command that it
+    carried out under it, or frame that it published, to the end of the last; all of the hold if that is direct. It only
+    grows."""
+
+    grant: Grant
+    seconds: Elapsed = 0.0
+
+
 class RcState(Message, frozen=True):
     """The state of an RC. `term`, `seq`: the newest publication received, or term promised."""
 
@@ -128,6 +139,8 @@ class RcState(Message, frozen=True):
     parameters: Parameters | None = None
     """All bandwidth parameters that it knows; None: it does not say."""
     version: VersionText = ""
+    used: Annotated[list[HoldUse], Meta(max_length=MAX_USES)] = []
+    """Under grants that it holds, and that ended within the last half minute; of others it does not say."""
 
 
 class FrameHead(Message, frozen=True):

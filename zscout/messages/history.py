@@ -69,6 +69,8 @@ class PastHold(Message, frozen=True):
     waited: Elapsed | None = None
     """How long its ARC was queued before, in seconds; None: not told."""
     who: Who | None = None
+    used: dict[str, Elapsed] = {}
+    """For how long each RC was used under it, as the RC told (see HoldUse); of one that is missing it is not known."""
 
 
 class JournalGap(Message, frozen=True):

@@ -18,7 +18,7 @@ def by_arc(*holds: PastHold) -> list[Account]:
 
 def test_a_hold_within_the_window() -> None:
     held = past(1, 110.0, 140.0, "completed", rcs=["robot/a", "radio/b", "video/c"], waited=7.0)
-    assert by_arc(held) == [Account("survey", 1, 30.0, 90.0, 7.0)]
+    assert by_arc(held) == [Account("survey", 1, 30.0, 90.0, 7.0, used_unknown=1)]
 
 
 def test_what_lies_outside_is_not_counted() -> None:
@@ -28,7 +28,7 @@ def test_what_lies_outside_is_not_counted() -> None:
     assert (account.holds, account.held, account.waited) == (2, 50.0 + 30.0, 0.0)
     assert (account.preempted, account.preempted_seconds, account.thrown_away) == (1, 30.0, 30.0)
     ends_later = past(5, 150.0, 210.0, "preempted", min_runtime=600.0)
-    assert by_arc(ends_later) == [Account("survey", 1, 50.0, 50.0, 0.0)]
+    assert by_arc(ends_later) == [Account("survey", 1, 50.0, 50.0, 0.0, used_unknown=1)]
 
 
 def test_thrown_away_is_what_was_taken_back_before_its_time() -> None:

@@ -15,7 +15,7 @@ from zscout.messages import HistoryAsk, PastHold
 MAX_LIMIT = 100_000
 COLUMNS = (
     *("began", "ended", "held", "waited", "arc", "id", "client", "user", "host", "command", "priority", "min_runtime"),
-    *("rcs", "outcome", "reason", "by_arc", "by_client", "by_user", "late"),
+    *("rcs", "outcome", "reason", "by_arc", "by_client", "by_user", "late", "used", "used_rc_seconds"),
 )
 
 
@@ -55,6 +55,10 @@ async def history(
     Every node that may lead keeps a journal; all that are there are asked, and a hold that several know is shown once.
     Times are by the clocks of those hosts. Lines tell of what times no journal knows all. What was granted in the last
     second may be missing, and a request that never held anything is not listed.
+
+    --json and --csv tell as `used` for how many seconds each RC was used: from the beginning of the first command that
+    it carried out under the hold (or picture that it published) to the end of the last; all of a hold that is direct.
+    It is null, or empty, where the RC did not tell. `used_rc_seconds` is the sum.
 
     \b
     Examples:
@@ -104,4 +108,6 @@ def _cells(hold: PastHold, now: float) -> tuple[object, ...]:
         *(hold.priority, hold.min_runtime, " ".join(hold.rcs), hold.outcome, hold.reason),
         *((by.arc, by.client, by.who.user if by.who is not None else "") if by is not None else ("", "", "")),
         int(hold.late),
+        " ".join(f"{rc}={'' if seconds is None else seconds}" for rc, seconds in journals.used(hold, now).items()),
+        journals.used_sum(hold, now),
     )

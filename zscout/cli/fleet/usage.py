@@ -1,4 +1,4 @@
-"""`zscout usage`: accounts of who held what for how long, from the journals of the candidates."""
+"""`zscout usage`: accounts of who held and used what for how long, from the journals of the candidates."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from zscout.terminal import Table, span
 MAX_HOLDS = 200_000
 """That are added up; of more the latest."""
 NO_GROUP = "(no group)"
+MAX_NAMED = 8
+"""Accounts of which one line tells what is not known."""
 
 
 @click.command()
@@ -30,25 +32,27 @@ NO_GROUP = "(no group)"
 @journals.formats
 @common.runs
 async def usage(by: str, since: float, until: float, as_json: bool, as_csv: bool) -> None:
-    """Sum up who held what for how long. Spans are counted within the time that is asked for, and told in seconds by
-    --json and --csv.
+    """Sum up who held what for how long, and how much of that was used. Spans are counted within the time that is asked
+    for, and told in seconds by --json and --csv.
 
     \b
     HOLDS        holds that stood at some time of it
     HELD         for how long, two at one time counted twice
     RC TIME      the same for each RC of them: 3 RCs for 10 s are 30 s
+    USED         how much of that: at each RC from the beginning of the first command that it carried out under a hold
+                 (or picture that it published) to the end of the last; all of a hold that is direct
     WAITED       in the queue before those that began in it; of requests that never held anything nothing is known
     PREEMPTED    how many were taken for another ARC before their minimum runtime was over, and how long they had stood
     THROWN AWAY  for how long those had stood that ended before their minimum runtime, preempted or by a lost RC
 
     A user is the name of the certificate in a secured fleet, else what programs say; who is in several groups is
-    counted in each. What was done with a device while it was held is not published, so nothing is told of it.
+    counted in each. What RCs did not tell of their use is not counted, and a line says of how many holds.
 
     \b
     Examples:
       zscout usage --since 7d
       zscout usage --by rc --since 2025-11-01 --until 2025-12-01 --csv > november.csv
-      zscout usage --by group --since 30d --json | jq '.accounts[] | {key, held}'
+      zscout usage --by group --since 30d --json | jq '.accounts[] | {key, rc_seconds, used}'
     """
     journals.check_formats(as_json=as_json, as_csv=as_csv)
     journals.check_window(since, until)
@@ -61,10 +65,10 @@ async def usage(by: str, since: float, until: float, as_json: bool, as_csv: bool
         terminal.print_json(journals.as_json(told, client.fleet.name, by=by, accounts=[_rounded(one) for one in found]))
     elif as_csv:
         journals.print_csv([by, *names[1:]], ([*_rounded(one).values()] for one in found))
-        _print_remarks(told, err=True)
+        _print_remarks(told, found, err=True)
     else:
         _table(found, by, told).print()
-        _print_remarks(told)
+        _print_remarks(told, found)
 
 
 def _keys(fleet: Fleet, by: str) -> Callable[[PastHold], Iterable[str]]:
@@ -86,18 +90,29 @@ def _rounded(account: Account) -> dict[str, object]:
 def _table(found: list[Account], by: str, told: Told) -> Table:
     rows = [
         (
-            *(one.key, str(one.holds), span(one.held), span(one.rc_seconds), span(one.waited)),
+            *(one.key, str(one.holds), span(one.held), span(one.rc_seconds)),
+            *("?" if one.used is None else span(one.used), span(one.waited)),
             f"{one.preempted} ({span(one.preempted_seconds)})" if one.preempted else "-",
             span(one.thrown_away) if one.thrown_away else "-",
         )
         for one in found
     ]
-    columns = (by.upper(), "HOLDS", "HELD", "RC TIME", "WAITED", "PREEMPTED", "THROWN AWAY")
+    columns = (by.upper(), "HOLDS", "HELD", "RC TIME", "USED", "WAITED", "PREEMPTED", "THROWN AWAY")
     title = f"Usage from {journals.local(told.window.began)} to {journals.local(told.window.ended)}"
     return Table(title, columns, rows)
 
 
-def _print_remarks(told: Told, *, err: bool = False) -> None:
+def _unknown_use(found: list[Account]) -> str:
+    """How much of it is not in what was used; empty: nothing."""
+    some = [f"{one.key} {one.used_unknown} of {one.holds}" for one in found if one.used_unknown]
+    more = f", and {len(some) - MAX_NAMED} more" if len(some) > MAX_NAMED else ""
+    words = "holds whose RCs did not all tell how much they were used, which is not counted then"
+    return f"{words}: {', '.join(some[:MAX_NAMED])}{more}" if some else ""
+
+
+def _print_remarks(told: Told, found: list[Account], *, err: bool = False) -> None:
+    if words := _unknown_use(found):
+        click.secho(terminal.clean(words), fg="yellow", err=err)
     if told.more:
         click.secho(f"only the latest {MAX_HOLDS} holds are counted; ask for less time", fg="yellow", err=err)
     journals.print_remarks(told, err=err)

@@ -1,7 +1,6 @@
-"""Who held what for how long, from a list of holds: pure.
+"""Who held what for how long, and how much of it was used, from a list of holds: pure.
 
-All times are seconds within the window that is accounted for; what lies outside is not counted. The commands that a
-holder had carried out are not published, so nothing is said of what was *used*."""
+All times are seconds within the window that is accounted for; what lies outside is not counted."""
 
 from __future__ import annotations
 
@@ -37,6 +36,11 @@ class Account:
     thrown_away: float = 0.0
     """Seconds for which holds had stood that ended in the window, before their minimum runtime, because they were
     preempted or an RC was lost. What their programs had done until then is counted as lost, though some keep it."""
+    used: float | None = None
+    """Of `rc_seconds`, for how much RCs were used, as far as they told; None: none told anything. Of a hold that lies
+    partly in the window the same part."""
+    used_unknown: int = 0
+    """Holds of which not all of these RCs told it: what the others did is not counted."""
 
 
 def accounts(
@@ -59,6 +63,11 @@ def accounts(
             one.rc_seconds += held if by_rc else held * len(hold.rcs)
             if hold.waited is not None and hold.began >= window.began:
                 one.waited += hold.waited
+            rcs = [key] if by_rc else hold.rcs
+            if told := [hold.used[rc] for rc in rcs if rc in hold.used]:
+                part = held / stood if (stood := ended - hold.began) > 0 else 1.0
+                one.used = (one.used or 0.0) + sum(min(seconds * part, held) for seconds in told)
+            one.used_unknown += len(told) < len(rcs)
             if ends_here and hold.outcome == "preempted":
                 one.preempted += 1
                 one.preempted_seconds += held

@@ -1,11 +1,12 @@
 """What a candidate hears, as changes of its journal: pure; times are passed in.
 
 A publication tells that holds begin and end. Where some were missed, the RCM's state is read: what stands there and is
-not known began unheard, what is known and does not stand there has ended unheard."""
+not known began unheard, what is known and does not stand there has ended unheard. RCs tell for how long they were used
+under a hold, which may be before it is heard of, or after its end."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from decimal import Decimal
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
@@ -22,12 +23,14 @@ from zscout.messages import (
     Revocation,
     Who,
 )
-from zscout.types import NO_TERM, Grant, clean
+from zscout.types import NO_TERM, Grant, RcName, clean
 
 N = TypeVar("N", int, Decimal)
 
 MAX_OPEN: Final = 20_000
 """Holds that are followed at one time. More are kept, but may be written again and again."""
+MAX_EARLY: Final = 10_000
+"""Words of RCs that are kept for holds which are still to be heard of."""
 MAX_TEXT: Final = 200
 """Characters that are kept of a name or a reason."""
 MAX_RCS: Final = 1_000
@@ -51,6 +54,12 @@ class StateRead(NamedTuple):
 
     at: float
     state: RcmState
+
+
+class UseHeard(NamedTuple):
+    """RCs told for how long they were used: (RC, grant, seconds), each as the key told which RC it is."""
+
+    words: Sequence[tuple[RcName, Grant, float]]
 
 
 class HoldSeen(NamedTuple):
@@ -78,7 +87,16 @@ class GapSeen(NamedTuple):
     gap: JournalGap
 
 
-Change: TypeAlias = HoldSeen | HoldOver | EndUnheard | GapSeen
+class HoldUsed(NamedTuple):
+    """An RC was used under a hold for `seconds` or longer, if that hold is known and the RC is one of it."""
+
+    grant: Grant
+    rc: RcName
+    seconds: float
+
+
+Heard: TypeAlias = PublicationHeard | StateRead | UseHeard
+Change: TypeAlias = HoldSeen | HoldOver | EndUnheard | HoldUsed | GapSeen
 
 
 class Follower:
@@ -93,14 +111,20 @@ class Follower:
         """When the journal was left, until something is heard again."""
         self._doubt: float | None = None
         """Since when ends may have been missed."""
+        self._early: dict[tuple[Grant, RcName], float] = {}
+        """Uses under grants that are not followed: over by now, or not heard of yet. The last MAX_EARLY."""
         self.must_read = False
         """Whether the RCM's state is to be read, and told with a `StateRead`."""
 
-    def take(self, event: PublicationHeard | StateRead) -> Iterator[Change]:
+    def take(self, event: Heard) -> Iterator[Change]:
         """What is to be kept of it; nothing of what an RCM of an earlier term says."""
-        if isinstance(event, PublicationHeard):
-            return self._heard(event)
-        return self._read(event)
+        match event:
+            case PublicationHeard():
+                return self._heard(event)
+            case StateRead():
+                return self._read(event)
+            case UseHeard():
+                return self._used(event)
 
     def _heard(self, event: PublicationHeard) -> Iterator[Change]:
         at, grants = event.at, event.grants
@@ -118,11 +142,12 @@ class Follower:
             for holder in holders:
                 if holder.grant not in self._open and _is_sane(holder.grant):
                     ours = holder.grant.term == grants.term
-                    yield self._stands(_held(holder, at, waited.get(holder.grant.seq) if ours else None, grants))
+                    yield from self._stands(_held(holder, at, waited.get(holder.grant.seq) if ours else None, grants))
         for revoked in grants.revoked:
             if _is_sane(revoked.grant):
                 self._open.pop(revoked.grant, None)
-                yield HoldOver(_over(revoked, at))
+                yield HoldOver(hold := _over(revoked, at))
+                yield from self._used_early(hold)
 
     def _gap_before(self, event: PublicationHeard) -> JournalGap | None:
         at, grants = event.at, event.grants
@@ -150,17 +175,33 @@ class Follower:
             yield EndUnheard(grant, at if since is None else since)
         for hold in state.holds:
             if hold.grant not in self._open and _is_sane(hold.grant):
-                yield self._stands(_viewed(hold, at))
+                yield from self._stands(_viewed(hold, at))
 
     def lost(self, gap: JournalGap) -> Iterator[Change]:
         """Changes could not be kept: ends may be among them."""
         self._doubt, self.must_read = gap.began if self._doubt is None else min(self._doubt, gap.began), True
         yield GapSeen(gap)
 
-    def _stands(self, hold: PastHold) -> HoldSeen:
+    def _stands(self, hold: PastHold) -> Iterator[Change]:
         if len(self._open) < MAX_OPEN:
             self._open[hold.grant] = None
-        return HoldSeen(hold)
+        yield HoldSeen(hold)
+        yield from self._used_early(hold)
+
+    def _used(self, event: UseHeard) -> Iterator[Change]:
+        for rc, grant, seconds in event.words:
+            if _is_sane(grant) and 0 <= seconds <= MAX_NUMBER:
+                yield HoldUsed(grant, rc, seconds)
+                if grant not in self._open:
+                    self._early[grant, rc] = seconds
+                    if len(self._early) > MAX_EARLY:
+                        del self._early[next(iter(self._early))]
+
+    def _used_early(self, hold: PastHold) -> Iterator[Change]:
+        if self._early:
+            for rc in hold.rcs:
+                if (seconds := self._early.pop((hold.grant, rc), None)) is not None:
+                    yield HoldUsed(hold.grant, rc, seconds)
 
 
 def _is_sane(grant: Grant) -> bool:

@@ -1,4 +1,4 @@
-"""A candidate's journal: gathers what its leader publishes, commits it in a thread, answers questions.
+"""A candidate's journal: gathers what its leader and the RCs publish, commits it in a thread, answers questions.
 
 The event loop only appends. Once a second, at most, a thread works out what has changed and commits it as one."""
 
@@ -17,10 +17,10 @@ from zscout.config.node import JournalConfig
 from zscout.keyexpr import check_need
 from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError, Refused
 from zscout.mesh.supervision import Supervisor, done_within
-from zscout.messages import Grants, HistoryAsk, JournalGap, PastHold, Problem, RcmState, StateAsk
-from zscout.services.journal.follower import Change, Follower, PublicationHeard, StateRead
+from zscout.messages import Grants, HistoryAsk, JournalGap, PastHold, Problem, RcmState, RcState, StateAsk
+from zscout.services.journal.follower import Change, Follower, Heard, PublicationHeard, StateRead, UseHeard
 from zscout.services.journal.store import Damaged, JournalStore, Unwritable
-from zscout.types import NO_TERM, SECOND, Ns, Term
+from zscout.types import NO_TERM, SECOND, Grant, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +34,9 @@ AGAIN_AFTER: Final = 30.0
 """Seconds until a disk that failed is tried again."""
 MAX_GATHERED: Final = 100_000
 """Holders and ends that wait to be committed: more are dropped, and the journal has a gap."""
+MAX_USES: Final = 20_000
+"""Words of RCs on their use that wait to be committed, and that are remembered so that one is not written twice: an RC
+says again what is more."""
 MAX_TOLD: Final = 5_000
 """Holds that a journal tells of when it is opened."""
 MAX_ASKING: Final = 16
@@ -52,9 +55,13 @@ class Journal:
         self._mesh, self._silent, self._wall = mesh, silent, wall
         self._store = JournalStore(folder, config.max_age / SECOND, config.max_size * MEGABYTE)
         self._supervisor = Supervisor("the journal", lambda _: log.error("no journal is kept until this node restarts"))
-        self._gathered: list[PublicationHeard | StateRead] = []
+        self._gathered: list[Heard] = []
         self._weight = 0
         """Of what is gathered."""
+        self._uses: dict[tuple[RcName, Grant], float] = {}
+        """Seconds of use, as they were heard since the last commit: of each RC and grant the most."""
+        self._said: dict[tuple[RcName, Grant], float] = {}
+        """The same of all that was heard: an RC says it again and again."""
         self._number: tuple[Term, int] = NO_TERM, 0
         self._at: Ns | None = None
         """When the last publication was heard, by the mesh's clock."""
@@ -74,20 +81,24 @@ class Journal:
         self._not_before: Ns = 0
         self._read_at: Ns = 0
         self._asking = 0
+        self._used_last = False
+        """Whether there is a last word of an RC among them, of a hold that is over."""
         self._ending = asyncio.Event()
-        self._served: Declaration | None = None
+        self._declared: list[Declaration] = []
 
     def start(self) -> None:
-        mesh = self._mesh
-        self._served = mesh.serve(
-            mesh.keys.history_any(mesh.me.host), HistoryAsk, self._supervisor.guard(self._on_asked)
-        )
+        mesh, guard = self._mesh, self._supervisor.guard
+        self._declared = [
+            mesh.serve(mesh.keys.history_any(mesh.me.host), HistoryAsk, guard(self._on_asked)),
+            # Its candidate has the same subscription: a state is decoded once.
+            mesh.subscribe(mesh.keys.rc_state_any, RcState, guard(self._on_rc_state)),
+        ]
         self._keeping = self._supervisor.spawn(self._keep())
 
     async def stop(self) -> None:
         """What was heard until now is on disk on return."""
-        if self._served is not None:
-            self._served.close()
+        for declared in self._declared:
+            declared.close()
         self._ending.set()
         await asyncio.wait([self._keeping], timeout=ENDS_WITHIN)
         await self._supervisor.close()
@@ -119,6 +130,19 @@ class Journal:
         self._weight += weight
         self._gathered.append(event)
 
+    def _on_rc_state(self, key: str, state: RcState) -> None:
+        if not state.used or self._mesh.keys.rc_of(key) != state.rc:
+            return
+        holds = {holder.grant for holder in state.holders}
+        for use in state.used:
+            word = state.rc, use.grant
+            if use.seconds <= self._said.get(word, -1.0) or (word not in self._uses and len(self._uses) >= MAX_USES):
+                continue
+            self._said[word] = self._uses[word] = use.seconds
+            if len(self._said) > MAX_USES:
+                del self._said[next(iter(self._said))]
+            self._used_last |= state.leaving or use.grant not in holds
+
     # To disk
 
     async def _keep(self) -> None:
@@ -126,6 +150,8 @@ class Journal:
             await done_within(COMMIT_EVERY, self._ending.wait())
             now = self._mesh.now()
             news = self._gathered or self._pending or self._dropped or self._heard - self._committed > HEARD_EVERY
+            # What is said of holds that stand grows all the time, and is written with what else there is.
+            news = news or self._used_last
             last = self._ending.is_set() and self._heard > self._committed
             # It is opened before anything is heard: what is asked is answered.
             if last or (now >= self._not_before and (news or self._follower is None)):
@@ -154,10 +180,13 @@ class Journal:
 
     async def _write(self, follower: Follower) -> None:
         """All that is gathered and pending. Raises Unwritable."""
-        events, self._gathered, self._weight = self._gathered, [], 0
+        events, self._gathered, self._weight, heard = self._gathered, [], 0, self._heard
+        if self._uses and heard:
+            # Behind the beginnings and ends that were heard before.
+            events.append(UseHeard([(*word, seconds) for word, seconds in self._uses.items()]))
+            self._uses, self._used_last = {}, False
         dropped, self._dropped = self._dropped, 0
         gap = JournalGap(self._dropped_since, self._wall(), "dropped", dropped) if dropped else None
-        heard = self._heard
 
         def write() -> None:
             for event in events:
@@ -175,6 +204,7 @@ class Journal:
         if isinstance(error, Damaged):
             # The new file knows nothing of what stood, nor of what was pending.
             self._follower, self._pending, self._first = None, [], self._wall()
+            self._said.clear()
             return
         self._not_before = self._mesh.now() + round(AGAIN_AFTER * SECOND)
         if self._troubled != str(error):

@@ -1,13 +1,16 @@
 """What several journals tell of one fleet, as one: pure.
 
 Each candidate writes by its own clock, and has its own gaps. A hold is one by its grant; of what several know of it the
-one who knows most is believed, whole, so that its times are of one clock."""
+one who knows most is believed, whole, so that its times are of one clock. Only how long RCs were used, by their own
+clocks, is the most that any heard."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import reduce
 from typing import NamedTuple
+
+from msgspec import structs
 
 from zscout.messages import UNHEARD, History, PastHold
 from zscout.types import HostName
@@ -25,8 +28,12 @@ def merged(journals: Iterable[Iterable[PastHold]]) -> list[PastHold]:
     best: dict[object, PastHold] = {}
     for hold in (hold for journal in journals for hold in journal):
         known = best.get(hold.grant)
-        if known is None or _knowledge(hold) > _knowledge(known):
+        if known is None:
             best[hold.grant] = hold
+            continue
+        more = hold if _knowledge(hold) > _knowledge(known) else known
+        used = {rc: max(one.used.get(rc, 0.0) for one in (known, hold)) for rc in {**known.used, **hold.used}}
+        best[hold.grant] = more if more.used == used else structs.replace(more, used=used)
     return sorted(best.values(), key=lambda hold: (hold.began, hold.grant))
 
 

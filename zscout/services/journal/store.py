@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import sqlite3
 import threading
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
@@ -29,8 +29,8 @@ from zscout.messages import (
     ReasonParty,
     Who,
 )
-from zscout.services.journal.follower import Change, EndUnheard, GapSeen, HoldOver, HoldSeen
-from zscout.types import Grant, Term
+from zscout.services.journal.follower import Change, EndUnheard, GapSeen, HoldOver, HoldSeen, HoldUsed
+from zscout.types import Grant, RcName, Term
 
 log = logging.getLogger(__name__)
 
@@ -63,12 +63,15 @@ CREATE INDEX holds_ended ON holds (ended);
 CREATE TABLE gaps (began REAL NOT NULL, ended REAL NOT NULL, cause TEXT NOT NULL, count INTEGER NOT NULL);
 CREATE TABLE facts (name TEXT PRIMARY KEY, at REAL NOT NULL);
 """
+_USED: Final = "ALTER TABLE holds ADD COLUMN used TEXT"
+"""Seconds, in a line for each RC of `rcs`; an empty one: not known. A journal without that column gets it when it is
+opened; versions that do not know it read on."""
 _COLUMNS: Final = (
     "term, rcm, seq, request, arc, client, owner, rcs, began, late, ended, outcome, reason, taken_for, priority, "
-    "min_runtime, waited, user, host, command"
+    "min_runtime, waited, user, host, command, used"
 )
 _INSERT: Final = (
-    f"INSERT INTO holds ({_COLUMNS}) VALUES ({', '.join('?' * 20)}) ON CONFLICT (term, rcm, seq) DO UPDATE SET "  # noqa: S608 - constants
+    f"INSERT INTO holds ({_COLUMNS}) VALUES ({', '.join('?' * 21)}) ON CONFLICT (term, rcm, seq) DO UPDATE SET "  # noqa: S608 - constants
 )
 # What was taken for over, or known by its end alone, is told in full now.
 _BEGAN: Final = f"""{_INSERT}
@@ -184,6 +187,8 @@ class JournalStore:
             (sound,) = db.execute("PRAGMA quick_check(1)").fetchone()
             if sound != "ok":
                 raise _damaged(sound)
+            if not db.execute("SELECT 1 FROM pragma_table_info('holds') WHERE name = 'used'").fetchone():
+                db.execute(_USED)
             db.create_function("any_rc", 2, _any_rc, deterministic=True)
         except BaseException:
             db.close()
@@ -275,6 +280,7 @@ class JournalStore:
             holds.append(hold)
             last = (hold.began, row[0])
             size += 400 + len(row[8]) + len(row[13]) + len(row[14] or "")
+            size += 2 * len(row[8]) if row[21] else 0
         return History(host, now, since, holds, more, [] if asked.before is not None else _gaps(db, low, high))
 
 
@@ -299,8 +305,27 @@ def _apply(db: sqlite3.Connection, change: Change) -> None:
             db.execute(_ENDED, _row(hold))
         case EndUnheard(Grant(term, seq), at):
             db.execute(_UNHEARD, (at, term.counter, term.rcm, seq))
+        case HoldUsed(grant, rc, seconds):
+            _use(db, grant, rc, seconds)
         case GapSeen(gap):
             db.execute("INSERT INTO gaps VALUES (?, ?, ?, ?)", (gap.began, gap.ended, gap.cause, gap.count))
+
+
+def _use(db: sqlite3.Connection, grant: Grant, rc: RcName, seconds: float) -> None:
+    sql = "SELECT id, rcs, used FROM holds WHERE term = ? AND rcm = ? AND seq = ?"
+    row = db.execute(sql, (grant.term.counter, grant.term.rcm, grant.seq)).fetchone()
+    rcs = row[1].split("\n") if row is not None else []
+    known = _used_by_rc(rcs, row[2]) if row is not None else {}
+    if rc in rcs and seconds > known.get(rc, -1.0):
+        db.execute("UPDATE holds SET used = ? WHERE id = ?", (_used_text(rcs, known | {rc: seconds}), row[0]))
+
+
+def _used_text(rcs: list[str], used: Mapping[RcName, float]) -> str | None:
+    return "\n".join(f"{round(used[rc], 3)}" if rc in used else "" for rc in rcs) if used else None
+
+
+def _used_by_rc(rcs: list[str], text: str | None) -> dict[RcName, float]:
+    return {rc: float(seconds) for rc, seconds in zip(rcs, (text or "").split("\n"), strict=False) if seconds}
 
 
 def _row(hold: PastHold) -> tuple[object, ...]:
@@ -326,18 +351,20 @@ def _row(hold: PastHold) -> tuple[object, ...]:
         who.user or None,
         who.host or None,
         who.command or None,
+        _used_text(hold.rcs, hold.used),
     )
 
 
 def _hold(row: tuple[Any, ...]) -> PastHold:
     (term, rcm, seq, number, arc, client, _, rcs, began, late, ended, outcome, reason, by, priority, runtime) = row[:16]
-    waited, user, host, command = row[16:]
+    waited, user, host, command, used = row[16:]
+    held = rcs.split("\n") if rcs else []
     return PastHold(
         Grant(Term(term, rcm), seq),
         number,
         arc,
         client,
-        rcs.split("\n") if rcs else [],
+        held,
         began,
         bool(late),
         ended,
@@ -348,6 +375,7 @@ def _hold(row: tuple[Any, ...]) -> PastHold:
         runtime,
         waited,
         Who(user or "", host or "", command or "") if user or host or command else None,
+        _used_by_rc(held, used),
     )
 
 
