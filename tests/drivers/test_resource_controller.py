@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, cast
 
 import pytest
@@ -26,7 +26,7 @@ from zscout.keyexpr import Role, Sender
 from zscout.lab.faults.link import Disturbance
 from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
 from zscout.mesh import IncomingQuery, Mesh, Refused
-from zscout.messages import Command, Done, Grants, Malformed, RcAsk, RcmState, RcState
+from zscout.messages import Command, Done, Grants, Holder, Malformed, RcAsk, RcmState, RcState
 from zscout.types import SECOND, Grant
 
 Story = Callable[[Rcm, ResourceController, Device, Mesh], Awaitable[None]]
@@ -271,6 +271,76 @@ def test_figures_are_published_when_they_change() -> None:
         await asyncio.sleep(5)
         assert seen == [2.0]
         await close(rc, watcher)
+
+    run(story())
+
+
+def test_how_long_it_was_used_is_told_within_a_second_of_the_end() -> None:
+    async def story(rcm: Rcm, rc: ResourceController, device: Device, client: Mesh) -> None:
+        states: list[RcState] = []
+        client.subscribe(client.keys.rc_state_any, RcState, lambda _key, state: states.append(state))
+        assert await answer(client, grant(1), {"name": "confirm"}) == "done"
+        await asyncio.sleep(0.2)
+        assert await answer(client, grant(1), {"name": "slow", "seconds": 0.5}) == "done"
+        await asyncio.sleep(1)
+        rcm.publish(holder(1))  # the hold lease goes on
+        for _ in range(10):
+            assert await answer(client, grant(1)) == "done"
+        # What is refused, confirmed or another's is no use.
+        await asyncio.sleep(0.5)
+        device.broken.add("echo 1")
+        assert await answer(client, grant(1)) == "failed"
+        assert await answer(client, grant(1), {"name": "confirm"}) == "done"
+        assert await answer(client, grant(2)) == "not_holder"
+        # Commands have nothing published.
+        assert states == []
+        rcm.publish(holder(2, "two"))
+        await until(lambda: states, within=1.1)
+        assert [(use.grant, use.seconds) for use in states[0].used] == [
+            (grant(1), pytest.approx(1.5, abs=0.01)),
+            (grant(2), 0.0),
+        ]
+        await asyncio.sleep(1.9)
+        assert len(states) == 1
+
+    play(story)
+
+
+def test_a_command_that_takes_its_time_counts_once_it_is_carried_out() -> None:
+    class Slow(Device):
+        """Answers a command some seconds later, beside others."""
+
+        async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
+            async def take() -> str:
+                await asyncio.sleep(do["seconds"])
+                if do["name"] == "fail":
+                    raise Refused("failed", "in vain")
+                return "done"
+
+            return asyncio.ensure_future(take())
+
+    async def story() -> None:
+        network = MemoryNetwork()
+        rcm, client = Rcm(network), network.open("f", Sender("h", "client"))
+        rc = await started(network, Slow())
+        rcm.publish(holder(1))
+        await until(lambda: rc.holds.held)
+
+        async def used() -> float:
+            reply = await client.ask_one(client.keys.rc_state("robot/x"), RcAsk(), RcState, timeout=5)
+            assert reply is not None
+            assert reply.message is not None
+            (use,) = reply.message.used
+            return use.seconds
+
+        assert await answer(client, grant(1), {"name": "fail", "seconds": 1}) == "failed"
+        assert await used() == 0.0
+        long = asyncio.create_task(answer(client, grant(1), {"name": "do", "seconds": 1}))
+        assert await answer(client, grant(1), {"name": "do", "seconds": 0.5}) == "done"
+        assert await used() == pytest.approx(0.5, abs=0.01)
+        assert await long == "done"
+        assert await used() == pytest.approx(1.0, abs=0.01)
+        await close(rc, rcm.mesh, client)
 
     run(story())
 

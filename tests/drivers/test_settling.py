@@ -17,7 +17,7 @@ from zscout.drivers.resource_controller import SETTLE, ResourceController
 from zscout.keyexpr import Sender
 from zscout.lab.faults.memory import MemoryNetwork
 from zscout.mesh import Mesh
-from zscout.messages import Command, Done, Grants, Holder, Problem, RcState, Revocation
+from zscout.messages import Command, Done, Grants, Holder, Problem, RcAsk, RcState, Revocation
 from zscout.types import SECOND, Grant
 
 CONFIRM: Mapping[str, Any] = {"name": "confirm"}
@@ -499,3 +499,24 @@ def test_an_rc_that_ends_while_a_program_may_touch_its_device_leaves_it_to_no_ot
         await close(rc, rcm.mesh, at.client, at.other)
 
     run(test())
+
+
+def test_a_direct_hold_is_used_from_when_it_could_begin() -> None:
+    """While a program of before may touch the device, nobody else does."""
+
+    async def story(place: Place) -> None:
+        assert await place.word(place.client, 1) == "done"
+        await asyncio.sleep(5)
+        place.next_holder(direct=True)
+        waited = await place.settled_after()
+        await asyncio.sleep(4)
+        key = place.client.keys.rc_state("robot/x")
+        reply = await place.client.ask_one(key, RcAsk(), RcState, timeout=5)
+        assert reply is not None
+        assert reply.message is not None
+        first, second = reply.message.used
+        assert first.seconds == pytest.approx(5, abs=0.1)
+        assert waited > 1
+        assert second.seconds == pytest.approx(4, abs=0.1)
+
+    play(story)

@@ -26,7 +26,7 @@ from zscout.keyexpr import Sender
 from zscout.mesh import ZenohMesh
 from zscout.mesh.frames import Frame, FrameWatch
 from zscout.mesh.transport import Quality
-from zscout.messages import MAX_FRAME, FrameHead
+from zscout.messages import MAX_FRAME, FrameHead, RcAsk, RcState
 from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.recovery import RecoveredState
 from zscout.types import Term
@@ -286,6 +286,12 @@ def test_frames_are_published_while_somebody_holds_and_somebody_looks(
                 await at.client.end(first)
                 await at.client.end(second)
                 await until(lambda: at.driver._holder is None)
+                # Nothing was commanded under it: from its first frame to its last it was used.
+                keys = at.client.mesh.keys
+                reply = await at.client.mesh.ask_one(keys.rc_state(GRABBER), RcAsk(), RcState, timeout=HANG)
+                assert reply is not None
+                assert reply.message is not None
+                assert {use.grant: use.seconds for use in reply.message.used}[newer] > 0
                 watch.take()
                 published = at.driver.figures()["published"]
                 await sends(at.two, 10)

@@ -62,3 +62,29 @@ def test_by_rc_and_by_several_keys() -> None:
         return ["arms", "arms", "legs"]
 
     assert [(row.key, row.holds) for row in accounts([gang], twice, WINDOW)] == [("arms", 1), ("legs", 1)]
+
+
+def test_what_was_used_is_counted_by_rc_as_far_as_it_is_told() -> None:
+    rcs = ["robot/a", "radio/b"]
+    whole = past(1, 110.0, 120.0, "completed", rcs=rcs, used={"robot/a": 4.0, "radio/b": 2.5})
+    some = past(2, 130.0, 140.0, "completed", rcs=rcs, used={"robot/a": 1.0})
+    idle, unknown = past(3, 150.0, 160.0, used={"robot/a": 0.0}), past(4, 170.0, 180.0)
+    (account,) = by_arc(whole, some, idle, unknown)
+    assert (account.used, account.used_unknown) == (7.5, 2)
+    rows = accounts([whole, some, idle, unknown], lambda hold: hold.rcs, WINDOW, by_rc=True)
+    assert [(row.key, row.used, row.used_unknown) for row in rows] == [("robot/a", 5.0, 1), ("radio/b", 2.5, 1)]
+    (nothing,) = by_arc(unknown)
+    assert (nothing.used, nothing.used_unknown) == (None, 1)
+    (none,) = by_arc(past(5, 150.0, 160.0, "completed", used={"robot/a": 0.0}))
+    assert (none.used, none.used_unknown) == (0.0, 0)
+
+
+def test_use_is_never_more_than_was_held_and_in_part_where_the_hold_is() -> None:
+    absurd = past(1, 110.0, 120.0, "completed", used={"robot/a": 1e9, "robot/z": 5.0})
+    half = past(2, 80.0, 120.0, "completed", used={"robot/a": 30.0})
+    assert by_arc(absurd)[0].used == 10.0
+    assert by_arc(half)[0].used == 15.0
+    # What lies in one window or the next is all of it.
+    before = accounts([half], lambda hold: [hold.arc], Span(0.0, 100.0))
+    assert before[0].used == 15.0
+    assert by_arc(past(3, 110.0, 110.0, "completed", used={"robot/a": 0.0}))[0].used == 0.0

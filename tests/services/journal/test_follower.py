@@ -8,21 +8,24 @@ from typing import Any
 from tests.services.journal.kit import LATER, TERM, grant, heard, holder, over, published
 from zscout.messages import HoldView, JournalGap, RcmState, ReasonInfo, ReasonParty
 from zscout.services.journal.follower import (
+    MAX_EARLY,
     Change,
     EndUnheard,
     Follower,
     GapSeen,
+    Heard,
     HoldOver,
     HoldSeen,
-    PublicationHeard,
+    HoldUsed,
     StateRead,
+    UseHeard,
 )
 from zscout.types import Grant, Place, Term
 
 SILENT = 2.0
 
 
-def told(follower: Follower, *events: PublicationHeard | StateRead) -> list[Change]:
+def told(follower: Follower, *events: Heard) -> list[Change]:
     return [change for event in events for change in follower.take(event)]
 
 
@@ -155,3 +158,38 @@ def test_hostile_publications_are_cut_or_ignored() -> None:
     far: Any = published(2**60, prev=2**60 - 1)
     (gap,) = gaps(told(follower, heard(2.0, far)))
     assert gap.count == 10**9
+
+
+def test_use_of_a_hold_that_is_followed_and_of_one_that_is_over() -> None:
+    follower = Follower(SILENT)
+    told(follower, heard(100.0, published(1, [holder(1, "robot/a")])))
+    assert told(follower, UseHeard([("robot/a", grant(1), 2.5)])) == [HoldUsed(grant(1), "robot/a", 2.5)]
+    told(follower, heard(107.0, published(2, revoked=[over(1, "released", "robot/a")])))
+    assert told(follower, UseHeard([("robot/a", grant(1), 4.0)])) == [HoldUsed(grant(1), "robot/a", 4.0)]
+
+
+def test_use_that_is_heard_before_its_hold_is_told_again_behind_it() -> None:
+    follower = Follower(SILENT)
+    told(follower, heard(100.0, published(1)), StateRead(100.1, state(1)))
+    words = [("robot/a", grant(number), float(number)) for number in (2, 3, 4)]
+    told(follower, UseHeard([*words, ("robot/b", grant(2), 9.0)]))
+    _, used = told(follower, heard(101.0, published(2, [holder(2, "robot/a")])))
+    assert used == HoldUsed(grant(2), "robot/a", 2.0)
+    over_too = over(3, "released", "robot/a")
+    assert told(follower, heard(102.0, published(4, revoked=[over_too], prev=2)))[1:] == [
+        HoldUsed(grant(3), "robot/a", 3.0)
+    ]
+    told(follower, heard(103.0, published(9, prev=8)))
+    assert told(follower, StateRead(104.0, state(9, grant(2), grant(4))))[1:] == [HoldUsed(grant(4), "robot/a", 4.0)]
+    # Once it is known, nothing of it is kept.
+    assert told(follower, heard(105.0, published(10, revoked=[over(4, "released", "robot/a")], prev=9)))[1:] == []
+
+
+def test_absurd_words_on_use_are_nothing_and_early_ones_are_bounded() -> None:
+    follower = Follower(SILENT)
+    for seconds in (-1.0, float("nan"), float("inf"), 1e12):
+        assert told(follower, UseHeard([("robot/a", grant(1), seconds)])) == []
+    assert told(follower, UseHeard([("robot/a", grant(2**64), 1.0)])) == []
+    told(follower, UseHeard([("robot/a", grant(number), 1.0) for number in range(MAX_EARLY + 1)]))
+    assert len(told(follower, heard(100.0, published(1, [holder(0, "robot/a")])))) == 1
+    assert len(told(follower, heard(100.1, published(2, [holder(1, "robot/a")])))) == 2

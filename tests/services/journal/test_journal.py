@@ -12,17 +12,22 @@ import pytest
 
 from tests.mesh.kit import run, until
 from tests.services.journal.kit import holder, published
-from tests.services.rcm.kit import FakeFleet
+from tests.services.rcm.kit import FakeFleet, grant_of
 from tests.services.rcm.test_candidate import open_request
 from zscout.config.node import JournalConfig
+from zscout.drivers.generic import ExclusiveDriver
+from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
 from zscout.lab.faults.memory import MemoryMesh
-from zscout.messages import UNHEARD, History, HistoryAsk, Release, Who
+from zscout.mesh.supervision import StallWatch
+from zscout.messages import UNHEARD, Command, Done, History, HistoryAsk, HoldUse, Release, Who
 from zscout.services.journal import journal as journal_module
+from zscout.services.journal.accounts import accounts
 from zscout.services.journal.journal import Journal
+from zscout.services.journal.merging import Span
 from zscout.services.journal.store import FILE
 from zscout.services.rcm.candidate import Candidate
-from zscout.types import SECOND
+from zscout.types import SECOND, Grant
 
 START = 1_700_000_000.0
 """The wall clock when the story begins."""
@@ -167,6 +172,110 @@ def test_what_was_heard_is_on_disk_when_a_node_stops(tmp_path: Path) -> None:
         told.start("x")
         (hold,) = (await told.tells(lambda answer: answer.holds)).holds
         assert (hold.arc, hold.outcome) == ("short", "released")
+        await told.close()
+
+    run(story())
+
+
+def test_how_long_a_hold_was_used_from_its_commands_to_its_account(tmp_path: Path) -> None:
+    async def story() -> None:
+        told = Told(tmp_path, "x", "y")
+        # What it is told in heartbeats keeps its hold.
+        mesh = told.fleet.mesh("devices", "node")
+        stall = StallWatch(mesh.now).start()
+        rc = ResourceController(mesh, "robot/a", ExclusiveDriver(), hold_lease=3.0, stall=stall)
+        await rc.start()
+        old = told.fleet.rc("robot/b")  # of before there was use
+        await until(lambda: told.candidates["x"].rcm)
+        await told.fleet.joined(old)
+        client = told.fleet.client("one")
+        await told.tells(lambda answer: answer.since is not None)
+        grant = grant_of(await client.ask("survey", "robot/a", "robot/b", seconds=600))
+
+        async def echo() -> None:
+            command = Command({"name": "echo"}, grant, ttl=5.0)
+            reply = await client.mesh.ask_one(mesh.keys.command("robot/a", client.mesh.me), command, Done, timeout=5)
+            assert reply is not None
+            assert reply.message is not None, reply.problem
+
+        await asyncio.sleep(5)
+        await echo()
+        await asyncio.sleep(7)
+        await echo()
+        await asyncio.sleep(20)
+        # It is told while the hold stands as well.
+        (standing,) = (await told.tells(lambda answer: answer.holds and answer.holds[0].used)).holds
+        assert standing.ended is None
+        await client.do(Release("survey"))
+        for host in ("x", "y"):
+            done = await told.tells(lambda answer: answer.holds[0].ended and answer.holds[0].used, host)
+            (hold,) = done.holds
+            assert hold.used == {"robot/a": pytest.approx(7, abs=0.1)}
+            (account,) = accounts(done.holds, lambda one: [one.arc], Span(START, done.now))
+            assert account.held == pytest.approx(32, abs=0.3)
+            assert (account.used, account.used_unknown) == (hold.used["robot/a"], 1)
+        await rc.stop()
+        stall.stop()
+        await told.close()
+
+    run(story())
+
+
+def test_only_an_rc_tells_of_its_own_use_and_only_ends_wake_the_disk(tmp_path: Path) -> None:
+    async def story() -> None:
+        told = Told(tmp_path, "x")
+        rc, other = told.fleet.rc("robot/a"), told.fleet.rc("robot/b")
+        await until(lambda: told.candidates["x"].rcm)
+        await told.fleet.joined(rc, other)
+        client = told.fleet.client("one")
+        grant = grant_of(await client.ask("survey", "robot/a", "robot/b", seconds=600))
+        await told.tells(lambda answer: answer.holds)
+        journal = told.journals["x"]
+        await until(lambda: not journal._gathered)
+        committed = journal._committed
+        for seconds in range(1, 6):
+            rc.publish(used=[HoldUse(grant, float(seconds))])
+            other.publisher.put(rc.state(used=[HoldUse(grant, 1e6)]))
+            await asyncio.sleep(1)
+        assert journal._committed == committed
+        await client.do(Release("survey"))
+        rc.publish(used=[HoldUse(grant, 5.5)])
+        answer = await told.tells(lambda answer: answer.holds[0].used)
+        assert answer.holds[0].used == {"robot/a": 5.5}
+        await until(lambda: not journal._uses)
+        committed = journal._committed
+        # Nor does what is said again.
+        for _ in range(3):
+            rc.publish(used=[HoldUse(grant, 5.5)])
+            await asyncio.sleep(1)
+        assert journal._committed == committed
+        rc.publish(used=[HoldUse(grant, 6.0)])
+        await told.tells(lambda answer: answer.holds[0].used == {"robot/a": 6.0})
+        await told.close()
+
+    run(story())
+
+
+def test_no_flood_of_words_on_use_takes_room_without_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(journal_module, "MAX_USES", 20)
+
+    async def story() -> None:
+        told = Told(tmp_path, "x")
+        rc = told.fleet.rc("robot/a")
+        await until(lambda: told.candidates["x"].rcm)
+        await told.fleet.joined(rc)
+        client = told.fleet.client("one")
+        grant = grant_of(await client.ask("survey", "robot/a", seconds=600))
+        await told.tells(lambda answer: answer.holds)
+        rc.publish(used=[HoldUse(Grant(grant.term, 10**6 + number), 1.0) for number in range(200)])
+        journal = told.journals["x"]
+        await until(lambda: len(journal._uses) == len(journal._said) == 20)
+        await until(lambda: not journal._uses)
+        rc.publish(used=[HoldUse(grant, 5.5)])
+        await until(lambda: journal._uses)
+        await client.do(Release("survey"))
+        await told.tells(lambda answer: answer.holds[0].used == {"robot/a": 5.5})
+        assert len(journal._said) == 20
         await told.close()
 
     run(story())

@@ -26,6 +26,14 @@ def test_a_hold_is_told_once_by_who_knows_most() -> None:
     assert merged([[past(1, 100.0, 105.0, UNHEARD)], [past(1, 100.0)]]) == [past(1, 100.0)]
 
 
+def test_of_what_was_used_the_most_is_told_whoever_heard_it() -> None:
+    one = past(1, 100.0, 110.0, "completed", used={"robot/a": 3.0, "robot/b": 1.0})
+    other = past(1, 100.5, 105.0, UNHEARD, used={"robot/a": 2.0, "robot/c": 0.0})
+    told = past(1, 100.0, 110.0, "completed", used={"robot/a": 3.0, "robot/b": 1.0, "robot/c": 0.0})
+    assert merged([[one], [other]]) == merged([[other], [one]]) == [told]
+    assert merged([[past(1, 100.0)], [past(1, 100.0)]])[0].used == {}
+
+
 def test_holds_stand_in_the_order_in_which_they_began() -> None:
     first, second, third = past(3, 100.0), past(1, 101.0), past(2, 102.0)
     assert merged([[third, first], [second]]) == [first, second, third]

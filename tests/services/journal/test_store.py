@@ -4,15 +4,39 @@ from __future__ import annotations
 
 import logging
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from tests.services.journal.kit import grant, past
 from zscout.messages import UNHEARD, HistoryAsk, JournalGap, ReasonParty, Who
-from zscout.services.journal.follower import Change, EndUnheard, GapSeen, HoldOver, HoldSeen
+from zscout.services.journal.follower import Change, EndUnheard, GapSeen, HoldOver, HoldSeen, HoldUsed
 from zscout.services.journal.store import ASIDE, FILE, MAX_KEPT_GAPS, JournalStore, Unwritable
 
+BEFORE_USE = """
+PRAGMA auto_vacuum = INCREMENTAL;
+PRAGMA journal_mode = WAL;
+CREATE TABLE holds (
+    id INTEGER PRIMARY KEY, term INTEGER NOT NULL, rcm TEXT NOT NULL, seq INTEGER NOT NULL,
+    request TEXT NOT NULL, arc TEXT NOT NULL, client TEXT NOT NULL, owner TEXT NOT NULL, rcs TEXT NOT NULL,
+    began REAL NOT NULL, late INTEGER NOT NULL, ended REAL, outcome TEXT NOT NULL, reason TEXT NOT NULL, taken_for TEXT,
+    priority INTEGER NOT NULL, min_runtime REAL, waited REAL, user TEXT, host TEXT, command TEXT,
+    UNIQUE (term, rcm, seq)
+);
+CREATE INDEX holds_asked ON holds (began, ended, owner, user, rcs);
+CREATE INDEX holds_arc ON holds (arc);
+CREATE INDEX holds_request ON holds (request);
+CREATE INDEX holds_ended ON holds (ended);
+CREATE TABLE gaps (began REAL NOT NULL, ended REAL NOT NULL, cause TEXT NOT NULL, count INTEGER NOT NULL);
+CREATE TABLE facts (name TEXT PRIMARY KEY, at REAL NOT NULL);
+PRAGMA user_version = 1;
+INSERT INTO holds VALUES
+    (1, 1, 'rcm', 1, 'id-1', 'survey', 'desk/one', 'desk', 'robot/a', 999970.0, 0, NULL, '', '', NULL, 0, 60.0, 0.0,
+     NULL, NULL, NULL);
+INSERT INTO facts VALUES ('since', 999000.0), ('heard', 1000000.0);
+"""
+"""A file of the version before."""
 DAY = 86_400.0
 NOW = 1_000_000.0
 
@@ -76,6 +100,40 @@ def test_news_correct_what_was_taken_for_over(tmp_path: Path) -> None:
     commit(store, HoldOver(past(1, NOW, NOW, "lost")), EndUnheard(grant(1), NOW), HoldSeen(hold))
     (kept,) = store.answer("anvil", HistoryAsk(), NOW).holds
     assert (kept.began, kept.ended, kept.outcome) == (NOW - 30, NOW - 3, "completed")
+
+
+def used(store: JournalStore) -> list[dict[str, float]]:
+    return [hold.used for hold in store.answer("anvil", HistoryAsk(), NOW).holds]
+
+
+def test_how_long_rcs_were_used_only_grows(tmp_path: Path) -> None:
+    store = opened(tmp_path)
+    gang = past(1, NOW - 30, rcs=["robot/a", "radio/b", "video/c"])
+    commit(store, HoldSeen(gang), HoldUsed(grant(1), "radio/b", 0.0), HoldUsed(grant(1), "video/c", 1234567.125))
+    commit(store, HoldUsed(grant(1), "radio/b", 2.5), HoldUsed(grant(1), "video/c", 3.0))
+    # Of an RC that is none of it, and of a hold that there is not, nothing is kept.
+    commit(store, HoldUsed(grant(1), "robot/z", 2.0), HoldUsed(grant(7), "robot/a", 2.0))
+    assert used(store) == [{"radio/b": 2.5, "video/c": 1234567.125}]
+    commit(store, HoldOver(past(1, NOW, NOW - 3, "completed")), HoldUsed(grant(1), "robot/a", 0.25), HoldSeen(gang))
+    store.close()
+    assert used(opened(tmp_path)) == [{"robot/a": 0.25, "radio/b": 2.5, "video/c": 1234567.125}]
+
+
+def test_a_journal_of_before_there_was_use_is_read_on(tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / FILE)) as db:
+        db.executescript(BEFORE_USE)
+    store = JournalStore(tmp_path, 90 * DAY, 64_000_000)
+    assert store.open() == ([grant(1)], NOW)
+    commit(store, HoldUsed(grant(1), "robot/a", 2.5), HoldSeen(past(2, NOW)))
+    assert arcs(store) == [2, 1]
+    assert used(store) == [{}, {"robot/a": 2.5}]
+    store.close()
+    assert used(opened(tmp_path)) == [{}, {"robot/a": 2.5}]
+    assert not (tmp_path / ASIDE).exists()
+    # And by the version that wrote it.
+    with closing(sqlite3.connect(tmp_path / FILE)) as db:
+        assert db.execute("PRAGMA user_version").fetchone() == (1,)
+        assert db.execute("SELECT count(*) FROM holds").fetchone() == (2,)
 
 
 def test_what_is_asked_for(tmp_path: Path) -> None:
