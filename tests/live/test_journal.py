@@ -56,6 +56,10 @@ def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> None:
             await lab.held_by(client, "robot/b", "survey")
             take = await client.request("take", {"robot/b": {}}, priority=10, min_runtime=600)
             await lab.held_by(client, "robot/b", "take")
+            granted = await client.granted(take)
+            assert granted is not None
+            for _ in range(20):
+                await client.command("robot/b", granted, {"name": "echo"})
             both = {"anvil", "bellows"}
             first = await told(
                 lab,
@@ -73,8 +77,15 @@ def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> None:
             await client.end(take)
             await lab.held_by(client, "robot/b", "survey")
             later = await told(
-                lab, lambda found: [one["outcome"] for one in found["holds"]] == ["preempted", "released", ""]
+                lab,
+                lambda found: (
+                    [one["outcome"] for one in found["holds"]] == ["preempted", "released", ""]
+                    and None not in [one["used_rc_seconds"] for one in found["holds"][:2]]
+                ),
             )
+            used = [one["used"]["robot/b"] for one in later["holds"][:2]]
+            assert used[0] == 0.0
+            assert 0 < used[1] == later["holds"][1]["used_rc_seconds"] <= later["holds"][1]["held"]
             # By the clock of another candidate, which heard it a moment sooner or later.
             assert later["holds"][0]["grant"] == first["holds"][0]["grant"]
             assert later["holds"][0]["held"] == pytest.approx(first["holds"][0]["held"], abs=1.0)
@@ -110,11 +121,13 @@ def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> None:
                 ("take", "released", "robot/b"),
                 ("survey", "", "robot/b"),
             ]
+            assert (rows[1]["used"], rows[1]["used_rc_seconds"]) == (f"robot/b={used[1]}", str(used[1]))
             assert (await zscout_soon("history", "--rc", "robot/a", env=lab.env)).stdout.startswith("no holds since ")
 
             by_rc = json.loads((await zscout_soon("usage", "--by", "rc", "--json", env=lab.env)).stdout)
             (account,) = by_rc["accounts"]
             assert (account["key"], account["holds"], account["preempted"]) == ("robot/b", 3, 1)
+            assert account["used"] >= used[1]
             assert (
                 account["thrown_away"]
                 == account["preempted_seconds"]
@@ -123,6 +136,7 @@ def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> None:
             by_user = (await zscout_soon("usage", env=lab.env)).stdout.splitlines()
             assert by_user[1].split()[:2] == ["USER", "HOLDS"]
             assert by_user[2].split()[1] == "3"
+            assert by_user[1].split()[5:7] == ["USED", "WAITED"]
 
             # A leader that begins anew remembers nothing of it; the journals do.
             await client.end(survey)
