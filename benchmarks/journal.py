@@ -1,7 +1,7 @@
 """`python -m benchmarks.journal`: what a journal of 100,000 holds costs: its commits, its file, its answers.
 
-Each hold comes as two publications, its grant and its end, of two RCs; commits have as many as a second of a busy fleet
-gives. Answers are timed with their encoding, as a candidate gives them."""
+Each hold comes as two publications, its grant and its end, of two RCs, which tell for how long they were used; commits
+have as many as a second of a busy fleet gives. Answers are timed with their encoding, as a candidate gives them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from decimal import Decimal
 from pathlib import Path
 
 from zscout.messages import MAX_PAGE, Grants, HistoryAsk, Holder, Revocation, Who, encode
-from zscout.services.journal.follower import Change, Follower, PublicationHeard
+from zscout.services.journal.follower import Change, Follower, Heard, PublicationHeard, UseHeard
 from zscout.services.journal.store import JournalStore
 from zscout.types import Grant, Place, Term
 
@@ -29,7 +29,8 @@ SIZE = 10**9
 AGE = 3.2e7
 
 
-def publications(count: int) -> Iterator[PublicationHeard]:
+def publications(count: int, *, used: bool) -> Iterator[tuple[float, list[Heard]]]:
+    """For each hold when it began, and what is heard of it."""
     for number in range(count):
         at, seq, client = START + APART * number, 2 * number + 1, f"ws{number % 20}/request-0123456789ab"
         grant, rcs = Grant(TERM, seq), [f"robot/scout{number % 50}", "radio/rf0"]
@@ -38,25 +39,25 @@ def publications(count: int) -> Iterator[PublicationHeard]:
         holder = Holder(name, arc, client, grant, Place(TERM, seq), rcs, Decimal(60), 60.0, number % 5, who=who)
         instances = dict.fromkeys(rcs, "0123456789ab")
         begun = [(seq, 12.5)]
-        yield PublicationHeard(
-            at, 0.2, Grants(TERM, seq, seq - 1, 0.5, {rc: [holder] for rc in rcs}, [], instances, begun)
-        )
+        begins = Grants(TERM, seq, seq - 1, 0.5, {rc: [holder] for rc in rcs}, [], instances, begun)
         over = Revocation(name, arc, client, grant, rcs, "completed", "its minimum runtime is over")
         free: dict[str, list[Holder]] = {rc: [] for rc in rcs}
-        yield PublicationHeard(at + 30, 0.2, Grants(TERM, seq + 1, seq, 0.5, free, [over], instances))
+        ends = Grants(TERM, seq + 1, seq, 0.5, free, [over], instances)
+        heard: list[Heard] = [PublicationHeard(at, 0.2, begins), PublicationHeard(at + 30, 0.2, ends)]
+        yield at, heard + ([UseHeard([(rc, grant, 27.125) for rc in rcs])] if used else [])
 
 
-def fill(store: JournalStore, count: int) -> tuple[list[float], list[float]]:
+def fill(store: JournalStore, count: int, *, used: bool) -> tuple[list[float], list[float]]:
     """Seconds to work out what each commit keeps, and to commit it."""
-    follower, heard = Follower(1e9), publications(count)
+    follower, heard = Follower(1e9), publications(count, used=used)
     worked, committed = [], []
     for _ in range(count // PER_COMMIT):
-        batch = [next(heard) for _ in range(2 * PER_COMMIT)]
+        batch = [next(heard) for _ in range(PER_COMMIT)]
         began = time.perf_counter()
-        changes: list[Change] = [change for event in batch for change in follower.take(event)]
+        changes: list[Change] = [change for _, of in batch for event in of for change in follower.take(event)]
         worked.append(time.perf_counter() - began)
         began = time.perf_counter()
-        store.commit(changes, START, batch[-1].at, batch[-1].at)
+        store.commit(changes, START, batch[-1][0], batch[-1][0])
         committed.append(time.perf_counter() - began)
     return worked, committed
 
@@ -88,11 +89,13 @@ def answers(store: JournalStore, now: float) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--holds", type=int, default=HOLDS)
-    count = parser.parse_args().holds
+    parser.add_argument("--without-use", action="store_true", help="RCs do not tell for how long they were used.")
+    args = parser.parse_args()
+    count = args.holds
     with tempfile.TemporaryDirectory(prefix="zscout-bench-") as folder:
         store = JournalStore(Path(folder), AGE, SIZE)
         store.open()
-        worked, committed = fill(store, count)
+        worked, committed = fill(store, count, used=not args.without_use)
         print(f"{count} holds in commits of {PER_COMMIT}, two publications each")
         work, commit = 1e6 * sum(worked) / count, 1e6 * sum(committed) / count
         print(f"to work one out: {work:.0f} us of a thread; to commit it: {commit:.0f} us")

@@ -6,6 +6,7 @@ under a hold, which may be before it is heard of, or after its end."""
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from decimal import Decimal
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
@@ -111,7 +112,7 @@ class Follower:
         """When the journal was left, until something is heard again."""
         self._doubt: float | None = None
         """Since when ends may have been missed."""
-        self._early: dict[tuple[Grant, RcName], float] = {}
+        self._early: OrderedDict[tuple[Grant, RcName], float] = OrderedDict()
         """Uses under grants that are not followed: over by now, or not heard of yet. The last MAX_EARLY."""
         self.must_read = False
         """Whether the RCM's state is to be read, and told with a `StateRead`."""
@@ -195,7 +196,7 @@ class Follower:
                 if grant not in self._open:
                     self._early[grant, rc] = seconds
                     if len(self._early) > MAX_EARLY:
-                        del self._early[next(iter(self._early))]
+                        self._early.popitem(last=False)
 
     def _used_early(self, hold: PastHold) -> Iterator[Change]:
         if self._early:

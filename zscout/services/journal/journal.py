@@ -7,6 +7,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
+from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -60,7 +61,7 @@ class Journal:
         """Of what is gathered."""
         self._uses: dict[tuple[RcName, Grant], float] = {}
         """Seconds of use, as they were heard since the last commit: of each RC and grant the most."""
-        self._said: dict[tuple[RcName, Grant], float] = {}
+        self._said: OrderedDict[tuple[RcName, Grant], float] = OrderedDict()
         """The same of all that was heard: an RC says it again and again."""
         self._number: tuple[Term, int] = NO_TERM, 0
         self._at: Ns | None = None
@@ -140,7 +141,7 @@ class Journal:
                 continue
             self._said[word] = self._uses[word] = use.seconds
             if len(self._said) > MAX_USES:
-                del self._said[next(iter(self._said))]
+                self._said.popitem(last=False)
             self._used_last |= state.leaving or use.grant not in holds
 
     # To disk
