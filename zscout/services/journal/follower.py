@@ -30,7 +30,7 @@ N = TypeVar("N", int, Decimal)
 
 MAX_OPEN: Final = 20_000
 """Holds that are followed at one time. More are kept, but may be written again and again."""
-MAX_EARLY: Final = 10_000
+MAX_EARLY: Final = 2_000
 """Words of RCs that are kept for holds which are still to be heard of."""
 MAX_TEXT: Final = 200
 """Characters that are kept of a name or a reason."""

@@ -35,9 +35,9 @@ AGAIN_AFTER: Final = 30.0
 """Seconds until a disk that failed is tried again."""
 MAX_GATHERED: Final = 100_000
 """Holders and ends that wait to be committed: more are dropped, and the journal has a gap."""
-MAX_USES: Final = 20_000
-"""Words of RCs on their use that wait to be committed, and that are remembered so that one is not written twice: an RC
-says again what is more."""
+MAX_USES: Final = 10_000
+"""Words of RCs on their use that wait to be committed, and that are remembered so that none is written twice: more are
+said again, or written again."""
 MAX_TOLD: Final = 5_000
 """Holds that a journal tells of when it is opened."""
 MAX_ASKING: Final = 16
@@ -61,8 +61,9 @@ class Journal:
         """Of what is gathered."""
         self._uses: dict[tuple[RcName, Grant], float] = {}
         """Seconds of use, as they were heard since the last commit: of each RC and grant the most."""
-        self._said: OrderedDict[tuple[RcName, Grant], float] = OrderedDict()
-        """The same of all that was heard: an RC says it again and again."""
+        self._said: OrderedDict[RcName, dict[Grant, tuple[float, bool]]] = OrderedDict()
+        """What each RC said last, and whether that hold was over: it says it again and again."""
+        self._said_count = 0
         self._number: tuple[Term, int] = NO_TERM, 0
         self._at: Ns | None = None
         """When the last publication was heard, by the mesh's clock."""
@@ -132,17 +133,23 @@ class Journal:
         self._gathered.append(event)
 
     def _on_rc_state(self, key: str, state: RcState) -> None:
-        if not state.used or self._mesh.keys.rc_of(key) != state.rc:
+        if self._mesh.keys.rc_of(key) != state.rc or not (state.used or state.rc in self._said):
             return
-        holds = {holder.grant for holder in state.holders}
+        holds, said, before = {holder.grant for holder in state.holders}, {}, self._said.pop(state.rc, {})
         for use in state.used:
-            word = state.rc, use.grant
-            if use.seconds <= self._said.get(word, -1.0) or (word not in self._uses and len(self._uses) >= MAX_USES):
-                continue
-            self._said[word] = self._uses[word] = use.seconds
-            if len(self._said) > MAX_USES:
-                self._said.popitem(last=False)
-            self._used_last |= state.leaving or use.grant not in holds
+            ended = state.leaving or use.grant not in holds
+            if (use.seconds, ended) > before.get(use.grant, (-1.0, False)):
+                word = state.rc, use.grant
+                if word not in self._uses and len(self._uses) >= MAX_USES:
+                    continue  # it is said again
+                self._uses[word] = max(use.seconds, self._uses.get(word, 0.0))
+                self._used_last |= ended
+            said[use.grant] = use.seconds, ended
+        if said:
+            self._said[state.rc] = said
+        self._said_count += len(said) - len(before)
+        while self._said_count > MAX_USES:
+            self._said_count -= len(self._said.popitem(last=False)[1])
 
     # To disk
 
@@ -206,6 +213,7 @@ class Journal:
             # The new file knows nothing of what stood, nor of what was pending.
             self._follower, self._pending, self._first = None, [], self._wall()
             self._said.clear()
+            self._said_count = 0
             return
         self._not_before = self._mesh.now() + round(AGAIN_AFTER * SECOND)
         if self._troubled != str(error):
