@@ -131,9 +131,9 @@ class BookingKeeper:
     # Fleet time
 
     def hear(self, grants: Grants) -> None:
-        """A publication of the leader. One that tells an earlier time than can be was late, be it of another leader than
-        the last: it may have waited here while this process stood still. And a leader that knew none as it began tells
-        a younger time than is known here, until it has heard of this one."""
+        """A publication of the leader. One that tells an earlier time than can be was late, be it of another leader
+        than the last: it may have waited here while this process stood still. And a leader that knew none as it began
+        tells a younger time than is known here, until it has heard of this one."""
         if grants.time is None:
             return
         now, (term, at) = self.mesh.now(), self._heard
