@@ -19,8 +19,6 @@ SEEDS = [seed for seed in range(1, 200) if seed % 10 != 9]
 BLOCK = 20
 FOUND = [1923, 302274, 302324, 302513, 400894, 407164, 434963, 435554, 440263, 600943]
 """Runs that once broke a promise: a keeper that nobody asked, an old publication read after a standstill, a silent
-FOUND = [1923, 302274, 302324, 302513, 400894, 407164, 434963, 435554, 440263, 600943]
-"""Runs that once broke a promise: a keeper that nobody asked, an old publication read after a standstill, a silent
 radio beside a date, maintenance that one wrong clock ended, a conflict with what was kept elsewhere by then; one that
 had no end, as a date that ran was in the way where it had been kept, and not where it was; a number of a component that
 two placers gave."""
