@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from decimal import Decimal
+from itertools import product
 from typing import Any
 
 from tests.mesh.kit import run, until
@@ -13,8 +14,8 @@ from zscout.drivers.instances import InstanceState
 from zscout.drivers.resource_controller import ResourceController
 from zscout.lab.faults.memory import MemoryMesh
 from zscout.mesh.supervision import StallWatch
-from zscout.messages import Command, Done, Holder, OpenRequest
-from zscout.types import SECOND, Grant
+from zscout.messages import Command, Done, Grants, Holder, OpenRequest
+from zscout.types import SECOND, Grant, Place, Term
 
 RC = "robot/a"
 
@@ -125,6 +126,38 @@ def test_of_two_that_did_not_see_each_other_the_one_that_was_taken_in_first_goes
         # As it leaves, the device is the other one's holder's.
         await second.stop()
         assert told(second) == []
+
+    run(story())
+
+
+def test_what_another_half_was_granted_ends_though_the_instance_that_is_meant_has_just_gone() -> None:
+    """The one of the other half is taken in when that one's holder can't command any more: until then the leader knows
+    of no hold of it, and tells its client so (seed 413304)."""
+
+    async def story() -> None:
+        fleet, term = FakeFleet(), Term(1, "other")
+        rcm, first = fleet.rcm(2), await offer(fleet, "h2")
+        await until(lambda: rcm.core.status().rcs)
+        apart, other = fleet.mesh("h1"), fleet.mesh("other")
+        for one, two in product((apart, other), (first.mesh, rcm.mesh)):
+            fleet.network.cut(one, two)
+            fleet.network.cut(two, one)
+        second = ResourceController(apart, RC, Recorded(), hold_lease=3.0, stall=StallWatch(apart.now).start())
+        await second.start()
+        held = Holder("tally", "tally", "other/one", Grant(term, 1), Place(term, 1), [RC], Decimal(60), 50.0)
+        other.put(other.keys.grants, Grants(term, 1, 1, 0.5, {RC: [held]}, []))
+        await until(lambda: told(second))
+        kill(fleet, first)
+        killed = fleet.watcher.now()
+        await until(lambda: rcm.membership.reported(RC) is None)
+        fleet.network.heal()
+        healed = fleet.watcher.now()
+        await until(lambda: "safe" in told(second))
+        assert fleet.watcher.now() - healed < SECOND
+        assert (second.holds.held, second.instances.state) == ({}, InstanceState.STANDS_BY)
+        await until(lambda: second.instances.state is InstanceState.SERVES)
+        assert fleet.watcher.now() - killed >= fleet.fleet.timing.hold_lease
+        assert told(second) == ["begin tally", "safe"]
 
     run(story())
 

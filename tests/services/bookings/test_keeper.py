@@ -51,6 +51,16 @@ def test_a_publication_that_comes_late_turns_no_clock_back() -> None:
         assert hear(0.0, ahead=-0.1) == pytest.approx(0, abs=1e-3)
         assert hear(0.0, term=2, ahead=-60, age=1) == pytest.approx(-60, abs=0.2)
         assert hear(0.0, term=3, ahead=-60, age=900) == pytest.approx(0, abs=1e-3)
+        # What another leader said first may have waited here while this process stood still: in seed 523 for 1.1 s.
+        await asyncio.sleep(1)
+        assert hear(1.4, term=4, ahead=-60, age=900) == pytest.approx(0, abs=0.03)
+        await asyncio.sleep(0.5)
+        assert hear(0.8, term=5, ahead=-60, age=900) == pytest.approx(0, abs=0.04)
+        # It is gone towards where that leader is behind in truth.
+        await asyncio.sleep(0.5)
+        assert hear(0.0, term=6, ahead=-61, age=900) == pytest.approx(-1, abs=0.05)
+        await asyncio.sleep(60)
+        assert hear(0.0, term=6, ahead=-61, age=900) == pytest.approx(0, abs=1e-3)
 
     run(story())
 

@@ -63,17 +63,19 @@ class Deeds:
     """Whether nothing is to be asked for any more."""
     busy: dict[str, set[str]]
     """By process: its ARCs that are not over."""
-    done: dict[str, dict[str, int]] = field(default_factory=dict)
-    """By component: how much each of its processes had done, the one that acted last at the end."""
+    done: dict[str, dict[Process, int]] = field(default_factory=dict)
+    """By component: how much each of its processes had done, the one that acted last at the end. Of two one may have
+    died before the other began with its number: their placers did not see each other."""
 
-    def act(self, component: str, process: str, done: int, restored: int | None) -> None:
+    def act(self, component: str, process: Process, done: int, restored: int | None) -> None:
         """`restored`: what it took over of another one, if it was moved."""
         others = self.done.setdefault(component, {})
         if process not in others:
             if restored is not None and restored not in others.values():
-                self.broken(f"{process} goes on from {restored}, which no other one had done: {others}")
-        elif process != next(reversed(others)) and self.calm() > SUPERSEDED_WITHIN:
-            self.broken(f"{process} acts again after {next(reversed(others))}")
+                known = [(one.name, count) for one, count in others.items()]
+                self.broken(f"{process.name} goes on from {restored}, which no other one had done: {known}")
+        elif process is not (last := next(reversed(others))) and self.calm() > SUPERSEDED_WITHIN:
+            self.broken(f"{process.name} acts again after {last.name}")
         others.pop(process, None)
         others[process] = done
 
@@ -107,10 +109,10 @@ class Worker(Component):
         needs = NEEDS[sum(context.component.encode()) % len(NEEDS)]
         try:
             while self.handed or not deeds.over():
-                deeds.busy[_here()] = {"work"}
+                deeds.busy[_here().name] = {"work"}
                 arc = self.arc = await client.request("work", needs, priority=-1, min_runtime=LONGER, keep=False)
                 if self.handed not in ("", arc.id):
-                    deeds.broken(f"{_here()} asks anew for what was handed to it as {self.handed}")
+                    deeds.broken(f"{_here().name} asks anew for what was handed to it as {self.handed}")
                 self.handed = ""
                 while not deeds.over() and (grant := await client.granted(arc)) is not None:
                     while arc.grant == grant and not deeds.over():
@@ -121,9 +123,9 @@ class Worker(Component):
                 # What is being handed over may come back.
                 if arc.open or client.paused:
                     await client.end(arc)
-                del deeds.busy[_here()]
+                del deeds.busy[_here().name]
         except (RequestRefused, CommandRefused) as refused:
-            deeds.broken(f"what {_here()} asked for was thrown away: {refused.code}: {refused}")
+            deeds.broken(f"what {_here().name} asked for was thrown away: {refused.code}: {refused}")
 
     def checkpoint(self) -> bytes:
         arc = self.arc.id if self.arc is not None and self.arc.open and self.arc.place is not None else ""
@@ -134,10 +136,10 @@ class Worker(Component):
         self.done = self.restored = int(done)
 
 
-def _here() -> str:
+def _here() -> Process:
     process = PROCESS.get()
     assert process is not None  # noqa: S101 - components run in processes
-    return process.name
+    return process
 
 
 class SimulatedComponent(ComponentProcess):

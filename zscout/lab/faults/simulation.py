@@ -411,7 +411,7 @@ class Simulation:
             # In this order: nothing that would clean up says anything.
             self.network.kill(mesh, reached)
             process.kill()
-        if "." in name:  # a component's: no other has its name
+        if "." in name:  # a component's: no other that lives has its name
             self.running.pop(name, None)
 
     def _start(self, process: Process, name: str, mesh: MemoryMesh) -> None:
@@ -665,7 +665,7 @@ class Simulation:
                 with self.booked.destroying():
                     for name in names:
                         self._take_down(name)
-                DEEDS.get().done.clear()  # numbers of incarnations begin anew
+                DEEDS.get().done.clear()  # nothing goes on from what was done before
                 self.equipment.pass_by(fault.jump)
                 end = partial(self._start_all, names)
             case "disk":

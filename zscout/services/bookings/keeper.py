@@ -144,8 +144,9 @@ class BookingKeeper:
     # Fleet time
 
     def hear(self, grants: Grants) -> None:
-        """A publication of the leader. One that tells an earlier time than can be was late; and a leader that knew none
-        as it began tells a younger time than is known here, until it has heard of this one."""
+        """A publication of the leader. One that tells an earlier time than can be was late, be it of another leader
+        than the last: it may have waited here while this process stood still. And a leader that knew none as it began
+        tells a younger time than is known here, until it has heard of this one."""
         if grants.time is None:
             return
         now, (term, at) = self.mesh.now(), self._heard
@@ -154,11 +155,12 @@ class BookingKeeper:
         unasked = now - max(self._asked, self._leader[1]) > UNASKED
         self.mesh.suspicions.suspect("a leader is heard that asks nothing about bookings", so=unasked)
         offset, since = round(grants.time * SECOND) - now, now - round(grants.time_age * SECOND)
-        if self._offset is not None and since >= self.since - SAME * SECOND:
-            if grants.term == term:
+        if self._offset is not None:
+            near = abs(offset - self._offset) <= DIFFERS * SECOND
+            if near or (grants.term == term and since >= self.since - SAME * SECOND):
                 # Slewed as far as it may be, on a clock that is as far off again.
                 offset = max(offset, self._offset - 2 * (now - at) // SLEW)
-            elif abs(offset - self._offset) > DIFFERS * SECOND and since > self.since + SAME * SECOND:
+            elif since > self.since + SAME * SECOND:
                 return
             since = min(since, self.since)
         self._offset, self._heard, self.since = offset, (grants.term, now), since

@@ -544,6 +544,9 @@ class Membership:
         known, gone = self._joined.get(name), self._departed.get(name)
         if gone is not None and gone.instance == state.instance and state.leaving:
             self._free(gone)
+        elif gone is not None and gone.host != state.host and state.holders and self._supervisor.active:
+            # It holds by the word of an RCM of another half, and is not the one that is meant.
+            self.on_named(name)
         if known is None or known.instance != state.instance:
             return
         self._joined[name] = state
