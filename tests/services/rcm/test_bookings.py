@@ -15,6 +15,7 @@ from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeClient, FakeFleet, Refusal, request
 from zscout.keyexpr import Role, Token
 from zscout.lab.faults.memory import MemoryMesh, MemoryTransport
+from zscout.mesh import IncomingQuery
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import (
     Book,
@@ -26,6 +27,7 @@ from zscout.messages import (
     OpenRequest,
     Operation,
     Release,
+    ShareBookings,
     SlotsTold,
     Unbook,
 )
@@ -89,6 +91,12 @@ class BookedFleet(FakeFleet):
         candidate = Candidate(mesh, self.fleet, keeper=keeper, **how)
         candidate.start()
         return candidate
+
+    def silent(self) -> list[IncomingQuery[ShareBookings]]:
+        """A host that answers no question about bookings: those that it was asked."""
+        mesh, asked = self.mesh("silent"), list[IncomingQuery[ShareBookings]]()
+        mesh.serve(mesh.keys.bookings("silent"), ShareBookings, asked.append)
+        return asked
 
     async def bookings(self, **asked: Any) -> dict[str, BookingView]:
         key = self.watcher.keys.rcm_bookings
@@ -698,11 +706,28 @@ def test_the_older_of_two_fleet_times_goes_on() -> None:
         assert again.rcm is not None
         assert again.rcm.bookings.dates.time == pytest.approx(fleet.time() + 7_200, abs=1)
         fleet.network.kill(x.mesh)
+        # All that others answer is as old as the question to this one.
+        fleet.silent()
         fleet.network.heal()
         await asyncio.sleep(70)
         leaders = [one.rcm for one in (again, z) if one.rcm is not None]
-        assert [one.bookings.time for one in leaders] == [pytest.approx(fleet.time(), abs=2)]
+        assert [one.bookings.time for one in leaders] == [pytest.approx(fleet.time(), abs=0.1)]
         assert states((await fleet.bookings())["b"]) == ["open"]
+
+    run(story())
+
+
+def test_a_host_that_does_not_answer_turns_no_clock_back() -> None:
+    """What others have answered is older by as long as it was waited for."""
+
+    async def story() -> None:
+        fleet = BookedFleet("x", "y", "z")
+        x, *_ = await led(fleet, "x", "y", "z")
+        asked = fleet.silent()
+        await asyncio.sleep(120)
+        assert asked
+        assert x.rcm is not None
+        assert x.rcm.bookings.time == pytest.approx(fleet.time(), abs=0.02)
 
     run(story())
 

@@ -9,6 +9,8 @@ import logging
 from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Final
 
+from msgspec.structs import replace
+
 from zscout.keyexpr import Keys, Role
 from zscout.mesh import Mesh, Reply
 from zscout.mesh.supervision import Supervisor, done_within
@@ -31,10 +33,17 @@ LOOK: Final = 0.5
 """Seconds within which candidates that live are found."""
 
 
-def credible(replies: Iterable[Reply[BookingsKept]], keys: Keys) -> list[BookingsKept]:
-    """What keepers answered, each for its own host."""
-    told = [(reply.key, reply.message) for reply in replies if reply.message is not None]
-    return [message for key, message in told if key == keys.bookings(message.host)]
+def credible(replies: Iterable[Reply[BookingsKept]], keys: Keys, now: Ns) -> list[BookingsKept]:
+    """What keepers answered, each for its own host, with the times of `now`: some have waited for the others."""
+    told = [(reply, reply.message) for reply in replies if reply.message is not None]
+    own = [(now - reply.arrived, message) for reply, message in told if reply.key == keys.bookings(message.host)]
+    return [_aged(message, waited / SECOND) for waited, message in own]
+
+
+def _aged(one: BookingsKept, seconds: float) -> BookingsKept:
+    if one.time is None:
+        return replace(one, wall=one.wall + seconds)
+    return replace(one, wall=one.wall + seconds, time=one.time + seconds, time_age=one.time_age + seconds)
 
 
 def oldest(answers: Iterable[BookingsKept]) -> tuple[float, Ns] | None:
@@ -136,7 +145,8 @@ class BookingSharing:
 
     def _take(self, replies: Collection[Reply[BookingsKept]]) -> list[BookingsKept]:
         """What keepers answered."""
-        now, answers = self._mesh.now(), credible(replies, self._mesh.keys)
+        now = self._mesh.now()
+        answers = credible(replies, self._mesh.keys, now)
         changed = self._keeper.records.take(record for one in answers for record in one.records)
         digest = self._keeper.records.digest()
         self._behind = any(reply.message is None or reply.message.digest != digest for reply in replies)

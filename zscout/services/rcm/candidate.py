@@ -307,7 +307,7 @@ class Candidate:
         states = [aged(state, now - arrived) for state, arrived in answers]
         open_requests = self._credible(clients, lambda one: keys.requests(client_of(one.client)))
         asking = [one for one, _ in open_requests if one.term in (term, NO_TERM)]
-        self._lead(term, states, asking, credible(keepers, keys))
+        self._lead(term, states, asking, credible(keepers, keys, now))
         return True
 
     async def _refused(self, key: str, term: Term) -> None:
