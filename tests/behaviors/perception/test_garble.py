@@ -10,10 +10,13 @@ import pytest
 
 from tests.behaviors.perception.rooms import room, sofa
 from zscout.behaviors.perception.lens import Picture, garbled
-from zscout.lab.building.air import Air
+from zscout.behaviors.sensor_net.scout import NO_PICTURE_TIMEOUT, Scout
+from zscout.lab.building.air import Air, tear
 from zscout.lab.building.bodies import Pose
 from zscout.lab.building.plan import Robot
+from zscout.lab.building.plan_file import load_plan, shipped_plans
 from zscout.lab.building.world import World
+from zscout.lab.trials.watch import hide_at_random
 
 CHANNEL = 1
 
@@ -61,6 +64,45 @@ def test_two_transmitters_on_one_channel(world: World) -> None:
     finally:
         world.bodies["other"].transmit(None, world.time)
     assert found.count(None) <= 1
+
+
+@pytest.mark.parametrize("noise", [0.5, 1.0, 2.0])
+def test_lines_that_are_all_torn_and_few_that_are(noise: float) -> None:
+    plan = load_plan(shipped_plans()["office"])
+    plan = msgspec.structs.replace(plan, noise=msgspec.structs.replace(plan.noise, sensor=noise, analog=noise))
+    found: dict[int, list[str | None]] = {0: [], 1: [], 2: [], 4: [], 120: []}
+    for seed in range(20):
+        world, air, rng = World(plan, seed=seed), Air(seed=seed), np.random.default_rng(seed)
+        robot = hide_at_random(world, rng)
+        world.bodies[robot].transmit(CHANNEL, -60.0)
+        for _ in range(3):
+            world.step(0.1)
+            picture = air.receive(world, CHANNEL)
+            for bands, words in found.items():
+                spoiled = picture.copy()
+                tear(spoiled, rng, bands=bands)
+                words.append(garbled(spoiled))
+    all_torn = found.pop(120)
+    assert all(words == [None] * 60 for words in found.values())
+    assert all_torn.count("torn") >= 57
+
+
+def test_a_receiver_without_sync_teaches_nothing_and_is_given_up(world: World) -> None:
+    """As it is one that shows snow."""
+    world.bodies["scout"].place(*Pose(3.2, 2.0, math.pi))
+    air, rng, scout = Air(seed=6), np.random.default_rng(6), Scout()
+    scout.held(0.0)
+    for number in range(1, 60):
+        world.step(0.1)
+        picture = air.receive(world, CHANNEL)
+        tear(picture, rng, bands=120)
+        step = scout.see(number / 4, picture, "video/ch1")
+        if step.blind:
+            break
+        assert (step.left, step.right) == (0, 0)
+    assert step.blind
+    assert number / 4 == pytest.approx(NO_PICTURE_TIMEOUT, abs=0.5)
+    assert scout.blindness.choose(20.0, ["video/ch1", "video/ch2"]) == "video/ch2"
 
 
 @pytest.mark.parametrize("grey", [0, 16, 128, 255])

@@ -153,6 +153,33 @@ def test_torn_lines_are_no_motion() -> None:
         assert not detector.see(time, picture).moving, time
 
 
+def test_who_is_in_one_picture_only_is_told() -> None:
+    for seed in range(10):
+        scene = Scene(seed)
+        detector = settled(scene, rate=4.0)
+        assert detector.see(4.0, scene.picture(30 + 10 * seed)).moving
+        assert not any(detector.see(time, scene.picture()).moving for time in times(4.0, 3.0, 4.25))
+
+
+@pytest.mark.parametrize("rate", [4.0, 10.0])
+def test_a_fault_in_one_picture_is_no_motion(rate: float) -> None:
+    """Of the transmission: it lies along the lines, or they stand aside."""
+    scene, rng = Scene(15), np.random.default_rng(15)
+    detector = settled(scene, rate=rate)
+    for number, time in enumerate(times(rate, 240 / rate, 4)):
+        picture, first = scene.picture(), int(rng.integers(0, 80))
+        rows = slice(first, first + int(rng.integers(4, 40)))
+        match number % 12:
+            case 0:
+                picture[rows] = np.roll(picture[rows], int(rng.integers(3, 26)), axis=1)
+            case 4:
+                for row in range(rows.start, rows.stop):
+                    picture[row] = np.roll(picture[row], int(rng.integers(-25, 26)))
+            case 8:
+                picture[rows] = rng.integers(0, 256, picture[rows].shape)
+        assert not detector.see(time, picture).moving, (number, time)
+
+
 def test_a_moved_camera_is_learned_anew() -> None:
     scene, elsewhere = Scene(6), Scene(66)
     detector = settled(scene)

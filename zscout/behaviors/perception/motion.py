@@ -13,7 +13,7 @@ Canny's hysteresis), with what a real camera needs beside it:
 - A pixel counts by how many standard deviations of its own noise it is off, never by grey levels: no tuning.
 - Lines that fit the background when moved aside are torn by the transmission.
 - A change of most of the picture at once is a switched light or a moved camera: it is learned at once.
-- Something moves once it was seen in two of three pictures, in about the same place.
+- Something moves once it was seen in two of three pictures, in about the same place; or in one, upright and clear.
 
 What stays is learned as that pixel's noise: whoever stops is no motion any more after a second or two, and
 leaves no ghost behind on leaving. The background itself follows within half a minute.
@@ -75,8 +75,13 @@ UPHEAVAL: Final = 0.55
 """Share of the picture that changes where it is not something in it that moves."""
 ALL_OFF: Final = 4.0
 """Standard deviations by which the median pixel is off in a picture of something else."""
+UPRIGHT: Final = 0.15
+CERTAIN: Final = 0.005
+"""Shares of the picture, in height and in all, that a region has at least which is told at first sight. It is no wider
+than high as well, and half of it is above STRONG: what is spoiled on the way lies along the lines, and noise is nowhere
+like it."""
 SURE: Final = 2
-"""Pictures of the last RECENT in which something is seen in one place."""
+"""Pictures of the last RECENT in which anything else is seen in one place."""
 RECENT: Final = 3
 MEMORY: Final = 1.2
 """Seconds after which an earlier sighting confirms nothing."""
@@ -86,6 +91,8 @@ GAP: Final = 1.0
 
 Picture = NDArray[np.uint8]
 _Plane = NDArray[np.float32]
+_Regions = NDArray[np.int32]
+"""Left, top, width, height and area of each."""
 
 
 class Box(NamedTuple):
@@ -178,7 +185,7 @@ class MotionDetector:
             self._learn(away, None, 1.0 / self._pictures, 1.0)
             return Seen(False, learning=True), None
         score, middle = self._score(away)
-        mask, regions = self._regions(score, level)
+        mask, regions, clear = self._regions(score, level)
         if middle > ALL_OFF or np.count_nonzero(mask) / mask.size > UPHEAVAL:
             return self._begin(time, grey), None
         self._learn(away, mask, passed / LEARN, passed / ABSORB)
@@ -193,7 +200,7 @@ class MotionDetector:
             )
             for x, y, w, h, _ in largest
         )
-        moving = self._sure(time, mask)
+        moving = self._sure(time, mask) or any(not self._stands_aside(level, region) for region in clear.tolist())
         noise = _noise(grey) if self._presence.expects(moving) else 0.0
         present = self._presence.see(time, level, self._mean, mask if moving else None, noise)
         return Seen(moving, boxes, present=present), mask
@@ -220,7 +227,7 @@ class MotionDetector:
         if self._back is None or passed >= AGREE[1]:
             self._back = time
         score, middle = self._score(away)
-        mask, _ = self._regions(score, level)
+        mask, _, _ = self._regions(score, level)
         changed = np.count_nonzero(mask) / mask.size
         alike = 1 / ALIKE <= _noise(grey) / max(self._noise, 1e-3) <= ALIKE
         if not alike or middle > ALL_OFF or changed > CHANGED:
@@ -266,24 +273,31 @@ class MotionDetector:
         self._mean += rate * away
         self._variance += rate * (away * away - self._variance)
 
-    def _regions(self, score: _Plane, level: _Plane) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
-        """Where the score is above WEAK, connected, and somewhere in it above STRONG: 255, elsewhere 0. And
-        left, top, width, height and area of each region."""
+    def _regions(self, score: _Plane, level: _Plane) -> tuple[NDArray[np.uint8], _Regions, _Regions]:
+        """Where the score is above WEAK, connected, and somewhere in it above STRONG: 255, elsewhere 0. Left, top,
+        width, height and area of each region. And the same of those that are certain at first sight."""
         weak = (score > WEAK).astype(np.uint8)
         # A line that is torn, or a single hot pixel, is thinner than anything that moves.
         thick = cv2.morphologyEx(weak, cv2.MORPH_OPEN, np.ones((3, 2), np.uint8))
         weak = np.asarray(cv2.morphologyEx(thick, cv2.MORPH_CLOSE, np.ones((7, 5), np.uint8)), np.uint8)
-        count, labels, stats, _ = cv2.connectedComponentsWithStats(weak, connectivity=8)
+        count, labels, found, _ = cv2.connectedComponentsWithStats(weak, connectivity=8)
+        stats: _Regions = np.asarray(found, np.int32)
         strong = np.bincount(labels.ravel(), weights=(score > STRONG).ravel(), minlength=count)
         area = stats[:, cv2.CC_STAT_AREA]
         keep = (area >= SMALLEST * score.size) & (strong >= 0.15 * area)
         # A thin band along the lines is a fault of the transmission.
         for region in np.flatnonzero(keep & (stats[:, cv2.CC_STAT_HEIGHT] <= THIN * score.shape[0])):
-            top, high = stats[region, cv2.CC_STAT_TOP], stats[region, cv2.CC_STAT_HEIGHT]
-            wide = stats[region, cv2.CC_STAT_WIDTH] > BAND * high
-            keep[region] = not (wide or _torn(level[top : top + high], self._mean[top : top + high]))
+            wide = stats[region, cv2.CC_STAT_WIDTH] > BAND * stats[region, cv2.CC_STAT_HEIGHT]
+            keep[region] = not (wide or self._stands_aside(level, stats[region]))
         keep[0] = False
-        return np.where(keep[labels], np.uint8(255), np.uint8(0)), np.asarray(stats[keep], np.int32)
+        clear = keep & (strong >= 0.5 * area) & (area >= CERTAIN * score.size)
+        clear &= stats[:, cv2.CC_STAT_HEIGHT] >= np.maximum(UPRIGHT * score.shape[0], stats[:, cv2.CC_STAT_WIDTH])
+        return np.where(keep[labels], np.uint8(255), np.uint8(0)), stats[keep], stats[clear]
+
+    def _stands_aside(self, level: _Plane, region: _Regions | list[int]) -> bool:
+        """Whether lines of a region are torn."""
+        top, high = region[cv2.CC_STAT_TOP], region[cv2.CC_STAT_HEIGHT]
+        return _torn(level[top : top + high], self._mean[top : top + high])
 
     def _sure(self, time: float, mask: NDArray[np.uint8]) -> bool:
         """Whether what is seen was seen lately, near there."""

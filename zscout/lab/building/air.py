@@ -68,15 +68,8 @@ class Air:
         grain[:, 1:] = 0.8 * grain[:, 1:] + 0.6 * grain[:, :-1]
         signal += (GRAIN + WEAK * weakness**2) * analog * grain
         if rng.random() < min(0.5, TORN * analog * (1 + 8 * weakness)):
-            self._tear(signal)
+            tear(signal, rng, bands=int(rng.integers(1, 3)))
         return _picture(signal)
-
-    def _tear(self, signal: Floats) -> None:
-        """Some lines lose their sync: they stand aside, one or two bands of them."""
-        for _ in range(int(self._rng.integers(1, 3))):
-            first = int(self._rng.integers(0, ROWS - 2))
-            last = min(ROWS, first + int(self._rng.integers(1, 5)))
-            signal[first:last] = np.roll(signal[first:last], int(self._rng.integers(-25, 26)), axis=1)
 
     def _jam(self, pictures: list[Floats]) -> Picture:
         """Two carriers beat: bars roll through, lines lose their sync, and both pictures shine through."""
@@ -95,6 +88,14 @@ class Air:
 
     def _snow(self) -> Picture:
         return _picture(110 + 62 * self._rng.standard_normal((ROWS, COLUMNS), dtype=np.float32))
+
+
+def tear(signal: Floats | Picture, rng: np.random.Generator, *, bands: int) -> None:
+    """Some lines lose their sync: so many bands of them stand aside."""
+    for _ in range(bands):
+        first = int(rng.integers(0, ROWS - 2))
+        last = min(ROWS, first + int(rng.integers(1, 5)))
+        signal[first:last] = np.roll(signal[first:last], int(rng.integers(-25, 26)), axis=1)
 
 
 def strength_at(plan: Plan, x: float, y: float) -> float:
