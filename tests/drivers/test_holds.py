@@ -359,6 +359,14 @@ def test_a_device_goes_on_in_another_arc_of_its_client_that_says_so(after: dict[
     assert (change.interrupts, bool(change.over)) == (not goes_on, not goes_on)
 
 
+def test_of_two_holds_of_one_name_one_goes_on_and_one_is_over() -> None:
+    """At a sharable device, a radio say, that still counts what is not ended."""
+    two = replace(holder(3, "h/one"), arc="arc2")
+    rc = holding(said(2, ONE), said(3, ONE, two))
+    change = rc.apply_grants(said(4, replace(holder(4, "h/one"), continues="arc2")), NOW)
+    assert (change.removed, change.over, change.interrupts) == ([ONE, two], [two], False)
+
+
 def test_a_grant_that_a_snapshot_names_is_not_refused_before_its_publication_comes() -> None:
     """A confirmation may overtake the publication: the snapshot read for it must not decide against it."""
     rc = holding(HELD)

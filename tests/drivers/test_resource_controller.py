@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, cast
 
 import pytest
+from msgspec.structs import replace
 
 from tests.drivers.rcs import ECHO, LEASE, TERM, Device, Rcm, answer, close, holder, started
 from tests.hang import HANG
@@ -69,6 +70,60 @@ def test_the_safe_state_waits_for_no_command_though_the_rcm_hangs() -> None:
         assert len(rcm.asked) == asked
 
     play(story)
+
+
+class Carrying(Device):
+    """Says, too, what goes on in what."""
+
+    async def carry_on(self, before: Holder, after: Holder) -> None:
+        await self._do(f"{before.arc} of {before.client} goes on in {after.arc} of {after.client}")
+
+
+@pytest.mark.parametrize("kind", [Carrying, Device])
+def test_what_goes_on_in_another_hold_is_neither_ended_nor_made_safe(kind: type[Device]) -> None:
+    async def story() -> None:
+        network = MemoryNetwork()
+        rcm, device = Rcm(network), kind()
+        client = network.open("f", Sender("h", "client"))
+        rc = await started(network, device)
+        warm, turn = holder(1, "warm"), replace(holder(2, "turn"), continues="warm")
+        moved = replace(turn, client="h/other", grant=grant(3))
+        begins = ["begin turn", "begin turn"]
+        if kind is Carrying:
+            begins = ["warm of h/client goes on in turn of h/client", "turn of h/client goes on in turn of h/other"]
+        expected = ["begin warm", *begins, "end turn", "safe", "begin last"]
+        for one, calls in (warm, 1), (turn, 2), (moved, 3), (holder(4, "last", "h/other"), 6):
+            rcm.publish(one)
+            await until(lambda calls=calls: len(device.calls) >= calls)
+        assert device.calls == expected
+        assert await answer(client, turn.grant) == "ended"
+        await close(rc, rcm.mesh, client)
+
+    run(story())
+
+
+def test_a_hold_that_was_held_back_begins_in_the_one_that_continues_it() -> None:
+    """And what was the device's still is made safe before it: nothing was warm yet."""
+
+    class Slow(Carrying):
+        async def safe(self) -> None:
+            await asyncio.sleep(1)
+            await super().safe()
+
+    async def story() -> None:
+        network = MemoryNetwork()
+        rcm, device = Rcm(network), Slow()
+        rc = await started(network, device, settle=2.0)
+        rcm.publish(holder(1))
+        await until(lambda: device.calls)
+        rcm.publish(holder(2, "warm"))
+        await asyncio.sleep(0.5)
+        rcm.publish(replace(holder(3, "turn"), continues="warm"))
+        await until(lambda: len(device.calls) >= 4)
+        assert device.calls == ["begin one", "end one", "safe", "begin turn"]
+        await close(rc, rcm.mesh)
+
+    run(story())
 
 
 def test_the_safe_state_goes_before_commands_that_wait() -> None:

@@ -520,3 +520,15 @@ def test_a_direct_hold_is_used_from_when_it_could_begin() -> None:
         assert second.seconds == pytest.approx(4, abs=0.1)
 
     play(story)
+
+
+def test_a_direct_hold_that_was_handed_over_is_used_by_its_new_client() -> None:
+    async def story(place: Place) -> None:
+        place.rcm.publish(replace(direct(2, client="h/other"), place=direct(1).place))
+        await asyncio.sleep(2)
+        reply = await place.client.ask_one(place.client.keys.rc_state("robot/x"), RcAsk(), RcState, timeout=5)
+        assert reply is not None
+        assert reply.message is not None
+        assert [use.seconds for use in reply.message.used][1:] == [pytest.approx(2, abs=0.1)]
+
+    play(story)

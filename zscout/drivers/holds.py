@@ -83,9 +83,20 @@ class HoldChange:
         return bool(self.began or self.removed)
 
     @property
+    def going_on(self) -> dict[Grant, Holder]:
+        """Of the removed, those that go on, each by the grant of the one that it goes on in."""
+        found: dict[Grant, Holder] = {}
+        for holder in self.removed:
+            into = (one.grant for one in self.began if one.grant not in found and goes_on(holder, one))
+            if (grant := next(into, None)) is not None:
+                found[grant] = holder
+        return found
+
+    @property
     def over(self) -> list[Holder]:
         """Of the removed, those that go on in none that began."""
-        return [holder for holder in self.removed if not any(goes_on(holder, other) for other in self.began)]
+        going_on = {holder.grant for holder in self.going_on.values()}
+        return [holder for holder in self.removed if holder.grant not in going_on]
 
     @property
     def interrupts(self) -> bool:
@@ -99,7 +110,8 @@ def goes_on(before: Holder, after: Holder) -> bool:
     has said so of another ARC of its own. The program of a direct one is not known to be the same."""
     if _arc(before) == _arc(after):
         return before.client != after.client
-    return before.client == after.client and before.arc == after.continues and not (before.direct or after.direct)
+    said = before.client == after.client and before.arc == after.continues
+    return said and not (before.direct or after.direct)
 
 
 def _arc(holder: Holder) -> tuple[str, Place]:

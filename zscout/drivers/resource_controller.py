@@ -19,7 +19,7 @@ from zscout import messages, trace
 from zscout.config import devices
 from zscout.drivers.confirm_server import CommandQuery, ConfirmServer
 from zscout.drivers.driver import Driver, RcDirectory
-from zscout.drivers.holds import HoldChange, HoldTable, goes_on
+from zscout.drivers.holds import HoldChange, HoldTable
 from zscout.drivers.instances import Instances, InstanceState
 from zscout.drivers.last_holder import LastHolder
 from zscout.drivers.repeated import CommandMemory
@@ -543,12 +543,11 @@ class ResourceController:
     # Holds
 
     async def _carry_out_change(self, change: HoldChange) -> None:
-        ended = change.over
-        for holder in ended:
+        for holder in change.over:
             if holder.grant in self._at_driver:
                 await self._guard(self.driver.end(holder))
         before = {one.grant for one in change.removed} & self._at_driver
-        going_on = [one for one in change.removed if one not in ended and one.grant in before]
+        going_on = change.going_on
         self._at_driver -= before
         for holder in change.removed:
             self._held_back.pop(holder.grant, None)
@@ -556,9 +555,9 @@ class ResourceController:
         if (before and change.interrupts) or (change.settled and not self._at_driver):
             await self._make_safe()
         for holder in change.began:
-            if (one := next((one for one in going_on if goes_on(one, holder)), None)) is not None:
-                self._at_driver.add(holder.grant)
-                await self._guard(self.driver.carry_on(one, holder))
+            former = going_on.get(holder.grant)
+            if former is not None and former.grant in before:
+                await self._begin(holder, self.driver.carry_on(former, holder))
             else:
                 self._held_back[holder.grant] = holder
         await self._begin_held_back(at_once=change.began)
@@ -576,13 +575,13 @@ class ResourceController:
                 if not self._at_driver and holder not in at_once:
                     # The device warms up from now on, though it was granted before.
                     self._warm_at = self.mesh.now() + round(self.driver.activation * SECOND)
-                await self._begin(holder)
+                await self._begin(holder, self.driver.begin(holder))
 
-    async def _begin(self, holder: messages.Holder) -> None:
+    async def _begin(self, holder: messages.Holder, how: Awaitable[None]) -> None:
         self._at_driver.add(holder.grant)
         if holder.direct:
             self._use.direct_began(holder.grant, self.mesh.now())
-        await self._guard(self.driver.begin(holder))
+        await self._guard(how)
 
     async def _make_safe(self) -> None:
         """Makes the device safe. Where that takes its time, it goes on beside what comes next, which it holds back."""
