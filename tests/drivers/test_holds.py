@@ -351,11 +351,15 @@ def test_what_goes_on_in_another_client_has_its_id_and_its_place(known_as: str, 
         ({"continues": "another"}, False),
         ({"continues": "arc2", "client": "h/two"}, False),
         ({"continues": "arc2", "direct": True}, False),
+        ({"continues": "arc2", "rcs": [RC, "video/1", "framegrabber/1"]}, True),
+        ({"continues": "arc2", "rcs": [RC, "video/2"]}, False),
     ],
 )
 def test_a_device_goes_on_in_another_arc_of_its_client_that_says_so(after: dict[str, Any], goes_on: bool) -> None:
-    after_it = replace(holder(3, "h/one", place=3), **after)
-    change = holding(HELD).apply_grants(said(3, after_it), NOW)
+    """And that has all that the first had: a camera must not transmit on another's channel."""
+    gang = [RC, "video/1"]
+    warm, after_it = replace(ONE, rcs=gang), replace(holder(3, "h/one", place=3), rcs=gang)
+    change = holding(said(2, warm)).apply_grants(said(3, replace(after_it, **after)), NOW)
     assert (change.interrupts, bool(change.over)) == (not goes_on, not goes_on)
 
 

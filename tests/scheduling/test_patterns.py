@@ -122,6 +122,17 @@ def test_a_radio_that_refuses_sends_it_to_the_next(strategy: StrategyName) -> No
 
 
 @pytest.mark.parametrize("strategy", ALL)
+@pytest.mark.parametrize(("said", "given"), [("warm", "radio/b"), ("", "radio/a")])
+def test_what_continues_another_goes_on_with_what_that_has(strategy: StrategyName, said: str, given: str) -> None:
+    core = core_of(strategy, "robot/x", "radio/a", "radio/b", "radio/c")
+    warm = structs.replace(request("w", "robot/x", "radio/b", priority=0, rate=1), label="warm", keep=True)
+    turn = structs.replace(request("turn", "robot/x", "radio/*", rate=1), continues=said)
+    for wanted in (warm, turn):
+        _answered(core, 0, {}, Requested(wanted))
+    assert held(core) == {"turn": {"robot/x", given}}
+
+
+@pytest.mark.parametrize("strategy", ALL)
 def test_a_silent_radio_keeps_nobody_who_could_do_with_another(strategy: StrategyName) -> None:
     core = core_of(strategy, "radio/a", "radio/b")
     events: list[Event] = [Requested(request("any", "radio/*", rate=5))]

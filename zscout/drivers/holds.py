@@ -107,11 +107,12 @@ class HoldChange:
 def goes_on(before: Holder, after: Holder) -> bool:
     """Whether one hold goes on in another, with no safe state in between: it was handed over (the same ARC has the same
     id and place at another client; what was taken back from a client that is gone has its place only), or its client
-    has said so of another ARC of its own. The program of a direct one is not known to be the same."""
+    has said so of another ARC of its own, which has all RCs of the first: a camera that goes on transmits on the
+    channel that it had. The program of a direct one is not known to be the same."""
     if _arc(before) == _arc(after):
         return before.client != after.client
     said = before.client == after.client and before.arc == after.continues
-    return said and not (before.direct or after.direct)
+    return said and not (before.direct or after.direct) and set(before.rcs) <= set(after.rcs)
 
 
 def _arc(holder: Holder) -> tuple[str, Place]:

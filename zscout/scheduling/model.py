@@ -54,7 +54,7 @@ class ArcRequest(Struct, frozen=True):
     direct: bool = False
     """Whether its program touches devices past their RCs; the core only keeps it."""
     continues: str = ""
-    """The name of the ARC of the same client's that it goes on from; likewise."""
+    """The name of the ARC of the same client's that it goes on from, where it can with what that has."""
     booking: str = ""
     """The booking that it takes up; its needs and its priority are that booking's."""
     who: Who | None = None
@@ -66,6 +66,9 @@ class ArcRequest(Struct, frozen=True):
     @property
     def name(self) -> str:
         return self.label or self.arc
+
+    def goes_on_from(self, other: ArcRequest) -> bool:
+        return self.continues == other.name and self.client == other.client
 
 
 class Hold(Struct, frozen=True):

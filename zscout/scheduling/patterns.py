@@ -6,7 +6,8 @@ on with the next best. A hold keeps its binding to its end.
 
 The worst of an ARC's choices counts (`Fitness`): of two bindings, the one that gets by without the worse kind is taken,
 by augmenting paths (Kuhn's algorithm), so that an ARC never waits where some choice of free RCs would let it run.
-Between equals, the RC that fewest wait for by name: they have no other choice.
+Between equals, the RC that fewest wait for by name: they have no other choice. Of sharable ones, the one that the ARC
+has already which it continues; else that of the fewest holders.
 
 Where holds have to end, the fewest and lowest-ranked do (`_least_ending`). Whoever holds an exclusive RC that the ARC
 names ends anyway, and so all else that it holds is as good as free.
@@ -91,7 +92,10 @@ def _fitness(
             return Fitness.RESERVED, rc.demand
         if answer is not None and not answer.accept:
             return Fitness.HELD, rc.demand
-        return Fitness.FREE, len(rc.holders) + (answer is None)
+        # What it continues ends for it; its device goes on only where it has the same RC.
+        asked = arc.request
+        goes_on = bool(asked.continues) and any(asked.goes_on_from(one.request) for one in rc.holders.values())
+        return Fitness.FREE, -1 if goes_on else len(rc.holders) + (answer is None)
     if non_preemptible:
         held_until = max(0 if one.hold is None else one.hold.end for one in non_preemptible)
         return Fitness.HELD, held_until

@@ -246,9 +246,9 @@ class Client(MovableClient):
         its RC does not know, more of one than that ever carries, and, unless it is to `wait_for_device` (default:
         `waits_for_devices`), a need that nobody knows. With a `booking`, by its id, it takes that up, whose needs and
         priority it has (`BookingsClient.terms`), and waits for its next date. It `continues` this client's ARC of that
-        name, which holds less at a lower priority: where it takes over that one's RCs in one step, their devices are
-        not made safe in between. Raises RequestRefused where the request can't be taken as it is, ValueError for too
-        long a comment.
+        name, which holds less at a lower priority: where it takes over all RCs of that one in one step, their devices
+        are not made safe in between. Raises RequestRefused where the request can't be taken as it is, ValueError for
+        too long a comment.
 
         An ARC of this name and these needs that another client hands over is returned instead, as it is."""
         wanted = amounts(needs)

@@ -231,7 +231,9 @@ class FieldRun:
         player.video = player.scout.blindness.choose(self.world.time, self.channels)
         priority, slot = self.field.slots.of(task, sooner=player.scout.saw_somebody)
         needs = self._needs(player) | {"framegrabber/*": {}}
-        request = ArcRequest(player.asked, player.name, needs, priority, round(slot * SECOND), keep=True)
+        warm = f"{player.name}-warm.{player.turns}" if task == "watch" else ""
+        seconds = round(slot * SECOND)
+        request = ArcRequest(player.asked, player.name, needs, priority, seconds, keep=True, continues=warm)
         self._handle(Requested(request))
 
     def _needs(self, player: Player) -> dict[str, Params]:
