@@ -271,6 +271,28 @@ def test_a_faster_holder_replaces_its_own_waiting_packet_and_nobody_elses() -> N
     assert lefts[-1] == 49 / 50
 
 
+def test_what_a_holder_made_robots_do_is_passed_on_and_what_waits_for_it_is_not() -> None:
+    queue = TransmitQueue(line_rate(9600))
+    share = Share(Fraction(5), Fraction(10))
+    for number in (1, 2):
+        queue.join(place(number), share, 0)
+    queue.offer(place(1), grant(1), RadioCamera(1, 3), 0)
+    sent = queue.next(0, lambda _: True)
+    assert sent is not None
+    queue.offer(place(1), grant(1), drive(1), 0)
+    queue.pass_on(place(1), place(3), share, SECOND)
+    assert (set(queue.members), queue.waiting, queue.dropped) == ({place(2), place(3)}, 0, 1)
+    assert queue.leave(place(1)) == set()
+    # To another client that is all one holder, and nothing of it is dropped.
+    queue.offer(place(3), grant(3), drive(1), SECOND)
+    queue.pass_on(place(3), place(3), share, SECOND)
+    assert (queue.waiting, queue.dropped) == (1, 1)
+    # Whom another drives since then is not halted with the first.
+    queue.offer(place(2), grant(2), drive(2), SECOND)
+    queue.pass_on(place(3), place(2), share, SECOND)
+    assert queue.leave(place(2)) == {1, 2}
+
+
 def test_halts_and_stops_go_first_and_void_what_waits_for_their_robot() -> None:
     queue = TransmitQueue(line_rate(1200))
     fill(queue, 4)
