@@ -260,6 +260,9 @@ class Client(MovableClient):
             arc.who, arc.booking, arc.continues = who, booking, continues
             arc.check, arc.wait_for_device = True, self._waits(wait_for_device)
             self._store.add(arc)
+        elif estimate:
+            # Nobody has said that of it here: from the next asking on.
+            arc.estimate = True
         try:
             await self._rcm.submit(arc)
         except BaseException as error:
