@@ -73,6 +73,29 @@ async def over(watching: asyncio.Task[Any]) -> None:
         await watching
 
 
+def test_what_warms_up_is_its_own_again_where_a_move_has_failed() -> None:
+    """It was left to nobody: held for as long as the client lived."""
+
+    async def test() -> None:
+        async with robot_fleet("robot", "other", "new", "asks") as (fleet, (client, other, new, _asks)):
+            await other.request("other", {"framegrabber/f": {}}, priority=5, min_runtime=3.9, keep=False)
+            watching = watches(client)
+            await asyncio.sleep(1)
+            assert await fleet.arcs("z-warm") == ["running"]
+            client.pause()
+            new.expect(client.open_requests())
+            await client.hand_over_all(new.mesh.me)
+            # By now all of it is somebody else's, who does not come to anything.
+            await asyncio.sleep(2)
+            await new.close()
+            client.take_back()
+            await asyncio.sleep(0.5)
+            await over(watching)
+            assert await fleet.arcs("z-warm") == []
+
+    run(test())
+
+
 def test_a_camera_warms_up_after_a_move_too() -> None:
     async def test() -> None:
         async with robot_fleet("old", "other", "new", "asks") as (fleet, (old, other, new, _asks)):

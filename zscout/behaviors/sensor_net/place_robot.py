@@ -181,6 +181,8 @@ class RobotTask(Behavior):
                 async with hold(client, name, needs, priority=priority, min_runtime=BRIEF) as held:
                     await held.command(place.needs.robot, {"name": "camera", "on": True})
                     await held.over()
+                    # What is handed over may come back: then it is given back.
+                    await held.resumed()
             await asyncio.sleep(RETRY_AFTER)
 
     async def _use(self, context: BehaviorContext, held: Held, video: str | None) -> None:
