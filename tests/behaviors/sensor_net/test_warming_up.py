@@ -73,6 +73,24 @@ async def over(watching: asyncio.Task[Any]) -> None:
         await watching
 
 
+def test_a_camera_that_did_not_come_to_warm_up_is_not_waited_for_any_more() -> None:
+    """All channels were taken until its turn came: it would begin to warm up as that is over."""
+
+    async def test() -> None:
+        async with robot_fleet("robot", "other", "asks") as (fleet, (client, other, _asks)):
+            needs: dict[str, Any] = {"framegrabber/f": {}, "video/1": {}, "video/2": {}}
+            await other.request("other", needs, priority=5, min_runtime=3, keep=False)
+            watching = watches(client)
+            await asyncio.sleep(1)
+            assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [["queued"], ["queued"]]
+            await asyncio.sleep(3)
+            assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [["running"], []]
+            await over(watching)
+            assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [[], []]
+
+    run(test())
+
+
 def test_what_warms_up_is_its_own_again_where_a_move_has_failed() -> None:
     """It was left to nobody: held for as long as the client lived."""
 

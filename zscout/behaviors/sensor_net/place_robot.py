@@ -25,7 +25,7 @@ from zscout.behaviors.sensor_net.held_robot import HeldRobot, RobotNeeds
 from zscout.behaviors.sensor_net.scout import NO_PICTURE_TIMEOUT, Scout, Task
 from zscout.behaviors.tree import Behavior, BehaviorContext, CarriedClock
 from zscout.mesh import FrameWatch
-from zscout.mesh.supervision import done_within, supervised
+from zscout.mesh.supervision import Supervisor, done_within, supervised
 from zscout.types import SECOND
 
 LOOK: Final = 0.5
@@ -147,7 +147,9 @@ class RobotTask(Behavior):
             estimate=bool(warm),
             continues=warm,
         ):
-            async with self._warming(context, warm, await attempt.asked()), attempt as held:
+            async with self._warming(context, warm, await attempt.asked()) as warming, attempt as held:
+                # What has not begun by now would begin when this is over.
+                warming.cancel()
                 channel = held.rc(video or place.needs.video)
                 # It may be about to be moved: nothing changes before that is over.
                 await context.safe_point()
@@ -161,12 +163,13 @@ class RobotTask(Behavior):
                 raise CameraBlind(f"{channel} shows nothing at all")
 
     @asynccontextmanager
-    async def _warming(self, context: BehaviorContext, name: str, turn: OpenArc) -> AsyncIterator[None]:
-        """While `turn` is waited for, its camera is warmed up under an ARC of this `name`, if it has one."""
+    async def _warming(self, context: BehaviorContext, name: str, turn: OpenArc) -> AsyncIterator[Supervisor]:
+        """While `turn` is waited for, its camera is warmed up under an ARC of this `name`, if it has one; until that is
+        cancelled."""
         async with supervised(self.path) as supervisor:
             if name:
                 supervisor.spawn(self._warm_up(context, name, turn))
-            yield
+            yield supervisor
 
     async def _warm_up(self, context: BehaviorContext, name: str, turn: OpenArc) -> None:
         client, place = context.client, self.place
