@@ -197,6 +197,30 @@ def test_a_group_has_its_quota_of_rcs(strategy: StrategyName) -> None:
     assert running(core) == {"one", "third", "theirs"}
 
 
+@pytest.mark.parametrize("strategy", ALL)
+@pytest.mark.parametrize(
+    "policy",
+    [SchedulingPolicy(max_running_per_host=2), SchedulingPolicy(rc_quotas=_shared_quota(4, "h"))],
+    ids=["arcs", "rcs"],
+)
+def test_what_ends_for_the_one_that_continues_it_is_not_in_its_way_by_a_quota(
+    strategy: StrategyName, policy: SchedulingPolicy
+) -> None:
+    """Nobody else would end it."""
+    core = core_of(strategy, policy, "robot/a", "robot/b", "robot/c", "robot/d", "fg")
+    kept = {
+        "watching": request("watching", "robot/a", "fg"),
+        "warm": request("warm", "robot/b", priority=0, seconds=1),
+        "turn": structs.replace(request("turn", "robot/b", "fg"), continues="warm"),
+        # It says the same, and would run beside it.
+        "aside": structs.replace(request("aside", "robot/c", "robot/d", priority=0), continues="warm"),
+    }
+    core.handle(0, *(Requested(structs.replace(one, keep=True)) for one in kept.values()))
+    assert running(core) == {"watching", "warm"}
+    core.handle(10 * SECOND, Tick())
+    assert running(core) == {"turn", "aside"}
+
+
 def held_by(core: Core, arc: str) -> set[str]:
     known = core.arc(arc)
     return set() if known is None else {*known.needs}

@@ -585,15 +585,28 @@ class SchedulerState:
         quota = self.policy.max_running_per_host
         if quota is None or self.operator(arc.priority):
             return None
-        return max(0, quota - self.running_by_owner[arc.owner])
+        return max(0, quota - self.running_by_owner[arc.owner] + (self.continued(arc) is not None))
 
     def rc_quota(self, arc: Arc, starting: Mapping[str, int] = MappingProxyType({})) -> RcQuota | None:
         """The quota of RCs that has no room for `arc`, beside the RCs of each owner that are `starting` as well."""
-        for quota in self.policy.rc_quotas.get(arc.owner, ()):
-            held = sum(self.held_by_owner[owner] + starting.get(owner, 0) for owner in quota.owners)
+        quotas = self.policy.rc_quotas.get(arc.owner, ())
+        ends = len(continued.rcs) if quotas and (continued := self.continued(arc)) is not None else 0
+        for quota in quotas:
+            held = sum(self.held_by_owner[owner] + starting.get(owner, 0) for owner in quota.owners) - ends
             if held + len(arc.request.needs) > quota.rcs:
                 return quota
         return None
+
+    def continued(self, arc: Arc) -> Arc | None:
+        """The running ARC that `arc` continues, and that ends when it starts: no quota counts it against `arc`."""
+        if not arc.request.continues:
+            return None
+        mask = arc.mask & ~self.sharable
+        holders = (one for rc in self.rcs_in(mask) for one in rc.holders.values())
+        return next(
+            (one for one in holders if arc.request.goes_on_from(one.request) and one.preemptible_by(arc, self.now)),
+            None,
+        )
 
     def barred(self, arc: Arc) -> int:
         """Bits of the RCs to which no pattern of `arc` is bound."""
