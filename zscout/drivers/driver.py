@@ -101,7 +101,8 @@ class Driver:
 
     async def carry_on(self, before: Holder, after: Holder) -> None:
         """What `before` held goes on in `after`, with no safe state between: in another client, or in another ARC of
-        the same one. Unless a driver has it otherwise, `after` begins."""
+        the same one. Unless a driver has it otherwise, `after` begins; a sharable one that keeps something for each
+        holder lets go of what it has for `before`, unless both have one place."""
         await self.begin(after)
 
     async def end(self, holder: Holder) -> None:
