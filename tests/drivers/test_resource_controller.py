@@ -85,6 +85,10 @@ def test_what_goes_on_in_another_hold_is_neither_ended_nor_made_safe(kind: type[
         network = MemoryNetwork()
         rcm, device = Rcm(network), kind()
         client = network.open("f", Sender("h", "client"))
+
+        async def told(count: int) -> None:
+            await until(lambda: len(device.calls) >= count)
+
         rc = await started(network, device)
         warm, turn = holder(1, "warm"), replace(holder(2, "turn"), continues="warm")
         moved = replace(turn, client="h/other", grant=grant(3))
@@ -94,7 +98,7 @@ def test_what_goes_on_in_another_hold_is_neither_ended_nor_made_safe(kind: type[
         expected = ["begin warm", *begins, "end turn", "safe", "begin last"]
         for one, calls in (warm, 1), (turn, 2), (moved, 3), (holder(4, "last", "h/other"), 6):
             rcm.publish(one)
-            await until(lambda calls=calls: len(device.calls) >= calls)
+            await told(calls)
         assert device.calls == expected
         assert await answer(client, turn.grant) == "ended"
         await close(rc, rcm.mesh, client)
