@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import subprocess
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 from tests.cli import tools
+from tests.hang import HANG
 from tests.live.lab import PATIENT, Lab
 from zscout.behaviors.client.blocking import connect
 from zscout.messages import RcmState
@@ -27,6 +29,13 @@ class CliFleet:
     def zscout(self, *args: str, stdin: str = "") -> subprocess.CompletedProcess[str]:
         """Runs a command to its end, away from any terminal."""
         return tools.zscout(*args, env=self.lab.env, stdin=stdin)
+
+    def shown(self, *args: str, until: Callable[[str], bool]) -> str:
+        """What a command prints as soon as it is so: run again until then."""
+        began = time.monotonic()
+        while not until(said := self.zscout(*args).stdout):
+            assert time.monotonic() - began < HANG, said
+        return said
 
     def start(self, *args: str) -> subprocess.Popen[str]:
         """Starts a command; stdout and stderr come out of `.stdout`."""

@@ -7,18 +7,20 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import psutil
 import pytest
 
+from tests.hang import HANG
 from tests.services.recorder.paper_run import lanes
 from zscout.lab.building.plan_file import shipped_plans
 
 pytestmark = pytest.mark.live
 
 LONGEST = 45.0
-"""Seconds after which the demo is ended from outside: this machine is busy with other work."""
+"""Seconds of recording after which the demo is ended from outside: this machine is busy with other work."""
 ENDING = 30.0
 EMPTY = """\
 name = "den"
@@ -68,6 +70,9 @@ def test_robots_hide_on_a_live_mesh_and_nothing_is_left(tmp_path: Path) -> None:
     demo = start(tmp_path, "--json", "--building", "den.toml", "--speed", "3", "--out", "mine/demo.rrd")
     recording = tmp_path / "mine" / "demo.rrd"
     ended = True
+    begun = time.monotonic()
+    while demo.poll() is None and not list(tmp_path.rglob("*.rrd")) and time.monotonic() - begun < HANG:
+        time.sleep(0.1)  # until it records: ended before that it leaves nothing to look at
     try:
         out, error = demo.communicate(timeout=LONGEST)
     except subprocess.TimeoutExpired:

@@ -192,12 +192,15 @@ def test_status_names_components_and_cordoned_hosts(fleet: CliFleet) -> None:
     assert drained.returncode == 1
     assert "zscout: anvil is not empty: seen stays (it can't be moved; anvil is drained); " in drained.stderr
     assert fleet.zscout("drain", "anvli").returncode == 1
-    shown = fleet.zscout("status")
-    assert re.search(r"^anvil +leads, cordoned .* node, 1 RC, seen$", shown.stdout, re.MULTILINE), shown.stdout
-    (anvil,) = (
-        host for host in json.loads(fleet.zscout("status", "--json").stdout)["hosts"] if host["host"] == "anvil"
-    )
-    assert (anvil["components"], anvil["cordoned"]) == (["seen"], True)
+    # Its process shows itself to a newcomer as soon as both are linked.
+    shown = fleet.shown("status", until=lambda text: ", seen\n" in text)
+    assert re.search(r"^anvil +leads, cordoned .* node, 1 RC, seen$", shown, re.MULTILINE), shown
+
+    def anvil(text: str) -> tuple[list[str], bool]:
+        (one,) = (host for host in json.loads(text)["hosts"] if host["host"] == "anvil")
+        return one["components"], one["cordoned"]
+
+    assert anvil(fleet.shown("status", "--json", until=lambda text: bool(anvil(text)[0]))) == (["seen"], True)
     assert fleet.zscout("uncordon", "anvil").stdout == "anvil is used again\n"
     assert "cordoned" not in fleet.zscout("status").stdout
     assert fleet.zscout("stop", "seen").returncode == 0
