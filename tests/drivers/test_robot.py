@@ -67,8 +67,10 @@ def test_a_second_node_that_offers_a_held_robot_leaves_it_alone(tmp_path: Path) 
             client = await lab.client()
             await lab.ready(client, "robot/r1", "radio/rf0", "video/ch1")
             _, grant = await held(client, "drives", GANG)
-            halts = [packet for packet in line.packets if isinstance(packet, HaltPacket)]
             assert await answer(client.command("robot/r1", grant, TURN)) == "done"
+            # Until it drives, the halt from before it was held is repeated.
+            await line.until(is_in(DrivePacket))
+            halts = [packet for packet in line.packets if isinstance(packet, HaltPacket)]
             cart(lab, "other", 1)
             await lab.logged("other", "robot/r1 stands by: duplicate of robot/r1 at cart")
             await lab.logged("other", "other is on the mesh")
