@@ -6,8 +6,9 @@ on with the next best. A hold keeps its binding to its end.
 
 The worst of an ARC's choices counts (`Fitness`): of two bindings, the one that gets by without the worse kind is taken,
 by augmenting paths (Kuhn's algorithm), so that an ARC never waits where some choice of free RCs would let it run.
-Between equals, the RC that fewest wait for by name: they have no other choice. Of sharable ones, the one that the ARC
-has already which it continues; else that of the fewest holders.
+Between equals, the RC that is kept for the ARC's booking: others may be booked. Else the one that fewest wait for by
+name: they have no other choice. Of sharable ones, the one that the ARC has already which it continues; else that of the
+fewest holders.
 
 Where holds have to end, the fewest and lowest-ranked do (`_least_ending`). Whoever holds an exclusive RC that the ARC
 names ends anyway, and so all else that it holds is as good as free.
@@ -86,6 +87,7 @@ def _fitness(
     """How well `rc` would do, where those who are `ending` do so anyway; and what decides between equals."""
     non_preemptible = rc.non_preemptible_holders(arc, state.now)
     closed = reserved is not None and reserved.reserves(rc, arc)
+    kept = arc.claim is not None and bool(rc.bit & arc.claim.kept)
     if rc.sharable:
         answer = state.votes.known(rc.name, frozenset((*(holder.id for holder in non_preemptible), arc.id)))
         if closed or (answer is None and rc.name in state.votes.unresponsive):
@@ -95,7 +97,7 @@ def _fitness(
         # What it continues ends for it; its device goes on only where it has the same RC.
         asked = arc.request
         goes_on = bool(asked.continues) and any(asked.goes_on_from(one.request) for one in rc.holders.values())
-        return Fitness.FREE, -1 if goes_on else len(rc.holders) + (answer is None)
+        return Fitness.FREE, -1 if goes_on or kept else len(rc.holders) + (answer is None)
     if non_preemptible:
         held_until = max(0 if one.hold is None else one.hold.end for one in non_preemptible)
         return Fitness.HELD, held_until
@@ -105,7 +107,7 @@ def _fitness(
         return Fitness.PREEMPTIBLE, max(one.priority for one in others)
     if rc.bit & claimed:
         return Fitness.CLAIMED, rc.demand
-    return Fitness.FREED if rc.holders else Fitness.FREE, rc.demand
+    return Fitness.FREED if rc.holders else Fitness.FREE, -1 if kept else rc.demand
 
 
 def _exclusive_victims(state: SchedulerState, arc: Arc, mask: int) -> Iterator[Arc]:

@@ -111,6 +111,8 @@ class BookingPromises:
         """The latest fleet time that any leader has told."""
         self._known: dict[Term, dict[str, float]] = {}
         """By term and date: since when its leader knows of it."""
+        self._kept: dict[Term, dict[str, Booking]] = {}
+        """By term and date: as it was looked at last."""
         self._begun: dict[Term, float] = {}
         """When each was seen first, or a little before: what is held for longer may be handed over in it."""
         self._looked: dict[Term, int] = {}
@@ -198,9 +200,13 @@ class BookingPromises:
             first = rcm.term not in self._known
             known = self._known.setdefault(rcm.term, {})
             claims = {booking.id: (booking, arc) for booking, arc in rcm.core.bookings()}
-            # What was in conflict with one that is over is known anew.
-            for name in known.keys() - claims.keys():
-                del known[name]
+            # What was in conflict with one that is over is known anew: it was not there, or it is another object.
+            kept = self._kept.get(rcm.term, {})
+            for name in [*known]:
+                booking, _ = claims.get(name, (None, None))
+                if booking is None or (name in kept and booking is not kept[name] and booking == kept[name]):
+                    del known[name]
+            self._kept[rcm.term] = {name: booking for name, (booking, _) in claims.items()}
             for name in claims:
                 before = first and name.partition("@")[0] in self._records.get(host, ())
                 known.setdefault(name, 0.0 if before else self.now())
