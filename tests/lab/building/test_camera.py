@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from tests.lab.building.rooms import CARTON, LAMP, SOFA, TABLE, column_at, room, shipped
+from zscout.lab.building.camera import MAX_VIEWS
 from zscout.lab.building.casting import (
+    ALL,
     EYE,
     FIRST_BOX,
     FOCAL,
@@ -18,6 +20,7 @@ from zscout.lab.building.casting import (
     WIDTH,
     Caster,
     Cylinder,
+    Geometry,
     columns_of,
 )
 from zscout.lab.building.plan import Furniture, Light, Noise, Plan
@@ -32,13 +35,17 @@ def caster(plan: Plan) -> Caster:
     return Caster(plan, cuboids_of(plan))
 
 
+def cast(view: Caster, x: float, y: float, heading: float, moving: list[Cylinder], columns: slice = ALL) -> Geometry:
+    return view.with_moving(view.cast(x, y, heading, columns), x, y, moving)
+
+
 def linear(world: World, robot: str) -> Floats:
     """A picture with its gamma undone."""
     return np.asarray((world.picture(robot) / 255) ** GAMMA, np.float32)
 
 
 def test_a_wall_is_as_far_as_trigonometry_says() -> None:
-    seen = caster(room()).cast(1.0, 1.5, 0.0, [])
+    seen = caster(room()).cast(1.0, 1.5, 0.0)
     # 3 m ahead is wall 3, numbered from 2.
     middle = seen.surface[:, WIDTH // 2]
     assert (middle[HORIZON - 1], seen.depth[HORIZON - 1, WIDTH // 2]) == (3, pytest.approx(3.0, rel=1e-5))
@@ -50,7 +57,7 @@ def test_a_wall_is_as_far_as_trigonometry_says() -> None:
 
 
 def test_a_box_covers_the_columns_and_rows_that_it_should() -> None:
-    seen = caster(room(BLOCK)).cast(1.0, 1.5, 0.0, [])
+    seen = caster(room(BLOCK)).cast(1.0, 1.5, 0.0)
     rows, columns = np.nonzero(seen.surface == FIRST_BOX)
     near = 3.0 - BLOCK.width / 2 - 1.0
     edge = math.atan2(BLOCK.depth / 2, near)
@@ -60,7 +67,7 @@ def test_a_box_covers_the_columns_and_rows_that_it_should() -> None:
     assert rows.max() == pytest.approx(HORIZON + EYE / near * FOCAL, abs=1)
     assert seen.depth[HORIZON, WIDTH // 2] == pytest.approx(near, rel=1e-5)
     # Turned away there is none of it.
-    assert not np.any(caster(room(BLOCK)).cast(1.0, 1.5, math.pi, []).surface == FIRST_BOX)
+    assert not np.any(caster(room(BLOCK)).cast(1.0, 1.5, math.pi).surface == FIRST_BOX)
 
 
 def test_the_nearer_thing_hides_the_farther() -> None:
@@ -68,7 +75,7 @@ def test_the_nearer_thing_hides_the_farther() -> None:
     before = behind._replace(x=2.0)
     view = caster(room(BLOCK))
     for body, shown in ((behind, False), (before, True)):
-        surface = view.cast(1.0, 1.5, 0.0, [body]).surface
+        surface = cast(view, 1.0, 1.5, 0.0, [body]).surface
         assert np.any(surface == view.first_moving) == shown
 
 
@@ -80,7 +87,7 @@ def test_the_columns_of_a_cylinder_are_where_it_is_seen() -> None:
             rng.uniform(0.3, 3.7), rng.uniform(0.3, 2.7), rng.uniform(0.03, 0.3), 0, 1, 0.5, 0.5, person=True
         )
         part = columns_of(x, y, heading, body)
-        shown = np.flatnonzero((bare.cast(x, y, heading, [body]).surface == bare.first_moving).any(0))
+        shown = np.flatnonzero((cast(bare, x, y, heading, [body]).surface == bare.first_moving).any(0))
         if part is None:
             assert not len(shown)
             continue
@@ -88,8 +95,8 @@ def test_the_columns_of_a_cylinder_are_where_it_is_seen() -> None:
             seen += 1
             assert part.start <= shown[0] <= part.start + 3
             assert part.stop - 4 <= shown[-1] < part.stop
-        whole = view.cast(x, y, heading, [body])
-        some = view.cast(x, y, heading, [body], part)
+        whole = cast(view, x, y, heading, [body])
+        some = cast(view, x, y, heading, [body], part)
         assert np.array_equal(some.surface, whole.surface[:, part])
         assert np.array_equal(some.depth, whole.depth[:, part])
     assert seen > 40
@@ -158,6 +165,34 @@ def test_windows_follow_the_day_and_lamps_do_not() -> None:
             world.picture("r1")
             gains.append(world._sensors["r1"].gain)
         assert (max(gains) > 2 * min(gains)) == changes
+
+
+def test_a_camera_that_stands_sees_what_one_does_that_has_just_come() -> None:
+    world, both, rng = World(shipped("office"), seed=3), 0, np.random.default_rng(4)
+    names = list(world.bodies)
+    for name in names:
+        world.bodies[name].place(*world.random_start(rng))
+    for _ in range(100):
+        for _ in range(5):
+            world.step(0.1)
+        for name in names:
+            pose, moving, light = world.bodies[name].pose, world._moving(name), rng.uniform(0.5, 1.5, 2)
+            stands = world._camera.linear(*pose, moving, *light)
+            world._camera._views.clear()
+            comes = world._camera.linear(*pose, moving, *light)
+            assert np.allclose(stands, comes, rtol=1e-5, atol=1e-6)
+            world._camera.linear(*pose, moving, *light)
+            both += world.crossing(name)
+    assert both > 5
+
+
+def test_of_views_the_last_looked_at_are_kept() -> None:
+    camera = World(room(SOFA))._camera
+    for number in range(3 * MAX_VIEWS):
+        camera.linear(1.0, 1.0, 0.5, [], 1.0, 1.0)
+        camera.linear(1.0, 1.0, number / 100, [], 1.0, 1.0)
+    assert len(camera._views) == MAX_VIEWS
+    assert camera._views[1.0, 1.0, 0.5].lit is not None
 
 
 def test_another_robot_is_seen_and_shades_the_floor() -> None:
@@ -251,7 +286,7 @@ def test_who_walks_is_counted_as_the_whole_picture_shows() -> None:
             continue
         for name, body in list(world.bodies.items())[:2]:
             shapes = world._moving(name)
-            surface = view.cast(*body.pose, shapes).surface
+            surface = cast(view, *body.pose, shapes).surface
             numbers = [view.first_moving + at for at, shape in enumerate(shapes) if shape.person]
             pixels = int(np.isin(surface, numbers).sum())
             assert world.people_in_view(name) == pixels

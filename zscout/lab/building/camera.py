@@ -1,11 +1,14 @@
 """A robot's camera as light: what the rays of `casting` meet, painted with the light of `light`.
 
 Light and texture are sampled between their cells by OpenCV's remap. The result is linear; `sensor` makes grey
-levels of it.
+levels of it. So of a camera that stands, all that stands is painted once in the light of each kind, and what moves is
+painted over their sum.
 """
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from dataclasses import dataclass
 from typing import Final
 
 import cv2
@@ -39,8 +42,22 @@ _FAR_ROWS: Final = 14
 _SUBROWS: Final = 4
 _SHADE: Final = 5.0
 """Radii from the middle of what moves to where nothing is left of its shadow."""
+MAX_VIEWS: Final = 64
+"""Poses of which is kept what is seen from there: more than cameras that stand and are looked through, 0.5 MB each."""
 _GRAIN_FADE: Final = (1 / (1 + (FLOOR_DEPTH**2 / (EYE * FOCAL) / 0.008) ** 2)).astype(np.float32)[:, None]
 """What is left of the floor's grain, by row: a pixel that covers much of it shows its mean."""
+
+
+@dataclass(slots=True)
+class _View:
+    """What is seen from one pose of all that stands."""
+
+    seen: Geometry
+    at_x: Floats
+    """Of each pixel below the horizon the place on the floor, metres, shape (60, 160)."""
+    at_y: Floats
+    lit: tuple[Floats, Floats] | None = None
+    """It in the light of the lamps and of the windows; None before it is looked at again."""
 
 
 class Camera:
@@ -62,54 +79,76 @@ class Camera:
         self._columns = lit.patches[:, 2].astype(np.float32) - 1
         lengths = np.stack((boxes.half_width, boxes.half_depth, boxes.half_width, boxes.half_depth), 1) * 2
         self._lengths = lengths
-        self._sources = np.zeros(2, np.float32)
-        self._floor_now = self._floor[0]
-        self._atlas_now = self._atlas[0]
+        self._views: OrderedDict[tuple[float, float, float], _View] = OrderedDict()
 
     def linear(
         self, x: float, y: float, heading: float, moving: list[Cylinder], lamps: float, windows: float
     ) -> Floats:
         """The picture as linear light, shape (120, 160), before the camera's own doing; `lamps` and `windows`
         are factors on their light."""
-        now = np.array([lamps, windows], np.float32)
-        if not np.array_equal(now, self._sources):
-            self._sources = now
-            self._floor_now = cv2.addWeighted(self._floor[0], lamps, self._floor[1], windows, 0)
-            self._atlas_now = cv2.addWeighted(self._atlas[0], lamps, self._atlas[1], windows, 0)
-        seen = self.caster.cast(x, y, heading, moving)
-        picture = np.empty((HEIGHT, WIDTH), np.float32)
-        self._paint_floor(x, y, heading, seen, moving, picture)
-        picture[:HORIZON] = 0.8 * float(self._lit.ambient @ now)
-        self._paint_upright(x, y, seen, moving, picture)
+        view = self._views.pop((x, y, heading), None)
+        if view is None:
+            view = self._cast(x, y, heading)
+            floor = cv2.addWeighted(self._floor[0], lamps, self._floor[1], windows, 0)
+            atlas = cv2.addWeighted(self._atlas[0], lamps, self._atlas[1], windows, 0)
+            ambient = self._lit.ambient @ np.array([lamps, windows], np.float32)
+            picture = self._paint(x, y, view, floor, atlas, float(ambient))
+        else:
+            if view.lit is None:
+                first, second = (
+                    self._paint(x, y, view, self._floor[kind], self._atlas[kind], float(self._lit.ambient[kind]))
+                    for kind in (0, 1)
+                )
+                view.lit = first, second
+            picture = np.asarray(cv2.addWeighted(view.lit[0], lamps, view.lit[1], windows, 0), np.float32)
+        self._views[x, y, heading] = view
+        if len(self._views) > MAX_VIEWS:
+            self._views.popitem(last=False)
+        if moving:
+            self._shade(x, y, heading, view, moving, picture)
+            self._paint_moving(x, y, self.caster.with_moving(view.seen, x, y, moving), moving, picture)
         return picture
+
+    def _cast(self, x: float, y: float, heading: float) -> _View:
+        seen = self.caster.cast(x, y, heading)
+        depths = seen.depth[HORIZON:]
+        return _View(seen, x + depths * seen.ways[0], y + depths * seen.ways[1])
 
     # Light
 
-    def _paint_floor(
-        self, x: float, y: float, heading: float, seen: Geometry, moving: list[Cylinder], picture: Floats
-    ) -> None:
-        cell = self._lit.cell
-        depths = seen.depth[HORIZON:]
-        at_x = x + depths * seen.ways[0]
-        at_y = y + depths * seen.ways[1]
-        light = _between(self._floor_now, at_x / cell - 0.5, at_y / cell - 0.5)
+    def _paint(self, x: float, y: float, view: _View, floor: Floats, atlas: Floats, ambient: float) -> Floats:
+        """All that stands, in the light that the floor, the atlas and the ceiling have."""
+        picture = np.empty((HEIGHT, WIDTH), np.float32)
+        self._paint_floor(x, y, view, floor, picture)
+        picture[:HORIZON] = 0.8 * ambient
+        self._paint_upright(x, y, view.seen, atlas, picture)
+        return picture
+
+    def _paint_floor(self, x: float, y: float, view: _View, floor: Floats, picture: Floats) -> None:
+        cell, ways = self._lit.cell, view.seen.ways
+        light = _between(floor, view.at_x / cell - 0.5, view.at_y / cell - 0.5)
         below = np.arange(_FAR_ROWS)[:, None] + (np.arange(_SUBROWS) + 0.5) / _SUBROWS
         part = (EYE * FOCAL / below).astype(np.float32).reshape(-1, 1)
-        far_x, far_y = x + part * seen.ways[0], y + part * seen.ways[1]
-        far = _between(self._floor_now, far_x / cell - 0.5, far_y / cell - 0.5)
+        far_x, far_y = x + part * ways[0], y + part * ways[1]
+        far = _between(floor, far_x / cell - 0.5, far_y / cell - 0.5)
         light[:_FAR_ROWS] = far.reshape(_FAR_ROWS, _SUBROWS, WIDTH).mean(1)
         # 4 mm to a cell of grain, and the finer the farther: it fades where a pixel covers more.
-        fine = _between(self._grain, at_x * 250, at_y * 250, tiled=True)
-        light *= 1 + fine * _GRAIN_FADE
+        fine = _between(self._grain, view.at_x * 250, view.at_y * 250, tiled=True)
+        picture[HORIZON:] = light * (1 + fine * _GRAIN_FADE)
+
+    def _shade(self, x: float, y: float, heading: float, view: _View, moving: list[Cylinder], picture: Floats) -> None:
+        """The shadows on the floor of what moves."""
+        floor = view.seen.surface[HORIZON:] == 0
         for body in moving:
             shaded = columns_of(x, y, heading, body._replace(radius=_SHADE * body.radius))
             if body.low > 0.1 or shaded is None:
                 continue
-            square = (at_x[:, shaded] - body.x) ** 2 + (at_y[:, shaded] - body.y) ** 2
-            light[:, shaded] *= 1 - 0.6 * np.exp(square * (-0.5 / (body.radius * 1.3) ** 2))
-        picture[HORIZON:] = light
+            square = (view.at_x[:, shaded] - body.x) ** 2 + (view.at_y[:, shaded] - body.y) ** 2
+            left = 1 - 0.6 * np.exp(square * (-0.5 / (body.radius * 1.3) ** 2))
+            light = picture[HORIZON:, shaded]
+            np.multiply(light, left, out=light, where=floor[:, shaded])
 
-    def _paint_upright(self, x: float, y: float, seen: Geometry, moving: list[Cylinder], picture: Floats) -> None:
+    def _paint_upright(self, x: float, y: float, seen: Geometry, atlas: Floats, picture: Floats) -> None:
         flat = seen.surface.ravel()
         pixels = np.flatnonzero(flat >= 2)
         if not len(pixels):
@@ -119,18 +158,14 @@ class Camera:
         number = flat[pixels].astype(np.intp)
         height = EYE + SLOPE[row] * depth
         map_x, map_y, run = self._wall_maps(x, y, seen, height, column, depth, number)
-        count = len(self._boxes)
-        standing = np.flatnonzero((number >= FIRST_BOX) & (number < FIRST_BOX + count))
+        standing = np.flatnonzero(number >= FIRST_BOX)
         self._box_maps(x, y, seen, standing, number, column, depth, height, map_x, map_y, run)
-        light = _between(self._atlas_now, map_x, map_y).ravel()
+        light = _between(atlas, map_x, map_y).ravel()
         texture = _between(self._grain, run * 40, height * 40, tiled=True).ravel()
         broad = _between(self._grain, run * 5, height * 3, tiled=True).ravel()
         light *= 1 + 0.35 * texture + 0.6 * broad
         skirting = (number < FIRST_BOX) & (height < 0.07)
         light[skirting] *= 0.7
-        bodies = np.flatnonzero(number >= FIRST_BOX + count)
-        if len(bodies):
-            self._paint_moving(x, y, seen, moving, bodies, number - FIRST_BOX - count, column, depth, light)
         picture.ravel()[pixels] = light
 
     def _wall_maps(
@@ -194,26 +229,18 @@ class Camera:
         map_y[standing] = self._first[face] + np.clip(share_v, 0, 1) * self._rows[face]
         run[standing] = along + box * 1.7
 
-    def _paint_moving(
-        self,
-        x: float,
-        y: float,
-        seen: Geometry,
-        moving: list[Cylinder],
-        bodies: NDArray[np.intp],
-        which: NDArray[np.intp],
-        column: NDArray[np.intp],
-        depth: Floats,
-        light: Floats,
-    ) -> None:
+    def _paint_moving(self, x: float, y: float, seen: Geometry, moving: list[Cylinder], picture: Floats) -> None:
         """A cylinder is brightest on one and the same side: where the light comes from matters little for
         what moves, but that it looks round does."""
-        table = np.array([(b.x, b.y, b.radius, b.shade * b.light) for b in moving], np.float32)[which[bodies]]
-        at = column[bodies]
-        dx = x + depth[bodies] * seen.ways[0][at] - table[:, 0]
-        dy = y + depth[bodies] * seen.ways[1][at] - table[:, 1]
+        flat = seen.surface.ravel()
+        pixels = np.flatnonzero(flat >= self.caster.first_moving)
+        column, depth = pixels % WIDTH, seen.depth.ravel()[pixels]
+        bodies = np.array([(b.x, b.y, b.radius, b.shade * b.light) for b in moving], np.float32)
+        table = bodies[flat[pixels] - self.caster.first_moving]
+        dx = x + depth * seen.ways[0][column] - table[:, 0]
+        dy = y + depth * seen.ways[1][column] - table[:, 1]
         round_ = (dx * 0.6 + dy * 0.8) / table[:, 2]
-        light[bodies] = table[:, 3] * (0.65 + 0.35 * np.clip(round_, -1, 1))
+        picture.ravel()[pixels] = table[:, 3] * (0.65 + 0.35 * np.clip(round_, -1, 1))
 
 
 def _between(image: Floats, x: Floats, y: Floats, *, tiled: bool = False) -> Floats:

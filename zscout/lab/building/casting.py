@@ -8,7 +8,7 @@ thing can cover at all. Depths are along the optical axis, which is level; the h
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -81,8 +81,10 @@ class Geometry:
     """Metres along the optical axis, shape (120, columns)."""
     ways: Floats
     """Plan direction of each column per metre of depth, shape (2, columns)."""
+    stop: Floats
+    """Depth in each column behind which nothing is seen: a wall, or what fills it from floor to the picture's top."""
     entry: Floats
-    """Depth at which each column meets the sides of each box and cylinder, shape (n, columns)."""
+    """Depth at which each column meets the sides of each box, shape (boxes, columns)."""
     side: NDArray[np.int8]
     """Which side of a box that is, as `Lit.patches` has it."""
     along: Floats
@@ -98,25 +100,15 @@ class Caster:
         self.first_moving = FIRST_BOX + len(boxes)
         """Number of the surface of the first thing that moves."""
 
-    def cast(self, x: float, y: float, heading: float, moving: list[Cylinder], columns: slice = ALL) -> Geometry:
-        """What is seen from (x, y) along `heading`, with what moves beside the plan's own boxes; `columns`
-        limits it, and all shapes of the answer, to a part of the picture."""
+    def cast(self, x: float, y: float, heading: float, columns: slice = ALL) -> Geometry:
+        """What is seen from (x, y) along `heading` of all that stands; `columns` limits it, and all shapes of the
+        answer, to a part of the picture."""
         forward = np.array([np.cos(heading), np.sin(heading)], np.float32)
         left = np.array([-forward[1], forward[0]], np.float32)
         ways = forward[:, None] + left[:, None] * LATERAL[columns]
         wall, wall_depth = self._walls(x, y, ways)
         entry, leave, side, along = self._meet(x, y, ways)
-        boxes = self._boxes
-        low, high = boxes.low, boxes.high
-        if moving:
-            table = np.array([body[:5] for body in moving], np.float32)
-            enter_round, leave_round = _meet_round(x, y, ways, table)
-            entry, leave = np.concatenate((entry, enter_round)), np.concatenate((leave, leave_round))
-            blank = np.zeros(enter_round.shape)
-            side = np.concatenate((side, blank.astype(np.int8)))
-            along = np.concatenate((along, blank.astype(np.float32)))
-            low, high = np.concatenate((low, table[:, 3])), np.concatenate((high, table[:, 4]))
-        # Nothing is seen behind a wall, or behind what fills its column from floor to the picture's top.
+        low, high = self._boxes.low, self._boxes.high
         tall = (low[:, None] <= 0.001) & (high[:, None] >= EYE + entry * _STEEPEST) & (entry > NEAR)
         stop = np.minimum(np.where(tall & (entry < leave), entry, np.inf).min(0, initial=np.inf), wall_depth)
         seen = (entry < leave) & (entry <= stop)
@@ -132,7 +124,20 @@ class Caster:
                 int(number) + FIRST_BOX, seen[number], entry[number], leave[number], float(low[number]),
                 float(high[number]), depth, surface,
             )  # fmt: skip
-        return Geometry(surface, depth, ways, entry, side, along)
+        return Geometry(surface, depth, ways, stop, entry, side, along)
+
+    def with_moving(self, seen: Geometry, x: float, y: float, moving: list[Cylinder]) -> Geometry:
+        """What was cast from (x, y), and before it what moves."""
+        table = np.array([body[:5] for body in moving], np.float32).reshape(-1, 5)
+        entry, leave = _meet_round(x, y, seen.ways, table)
+        here = (entry < leave) & (entry <= seen.stop)
+        depth, surface = seen.depth.copy(), seen.surface.copy()
+        for number in np.flatnonzero(here.any(1)):
+            _draw(
+                int(number) + self.first_moving, here[number], entry[number], leave[number], float(table[number, 3]),
+                float(table[number, 4]), depth, surface,
+            )  # fmt: skip
+        return replace(seen, surface=surface, depth=depth)
 
     def _walls(self, x: float, y: float, ways: Floats) -> tuple[NDArray[np.intp], Floats]:
         plan = self._plan

@@ -179,7 +179,7 @@ class World:
             return 0
         columns = slice(min(part.start for part in within), max(part.stop for part in within))
         caster = self._camera.caster
-        surface = caster.cast(*pose, shapes, columns).surface
+        surface = caster.with_moving(caster.cast(*pose, columns), pose.x, pose.y, shapes).surface
         people = np.array([shape.person for shape in shapes])
         moving = surface[surface >= caster.first_moving] - caster.first_moving
         return int(np.count_nonzero(people[moving]))
