@@ -8,6 +8,7 @@ import random
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from decimal import Decimal
+from functools import lru_cache
 from typing import Any, Final
 
 from zscout.behaviors.client.arc import Revoked, hold
@@ -39,6 +40,11 @@ REFUSED: Final = frozenset({"not_free", "bad_date", "not_kept", "unknown_booking
 NOT_TAKEN: Final = frozenset({"unknown_booking"})
 
 
+@lru_cache(1 << 12)
+def _record(raw: bytes) -> BookingRecord:
+    return decode_told(raw, BookingRecord)
+
+
 class MemoryDisk:
     """What outlives the processes of a host. What was not written to the end when its process died is not there."""
 
@@ -48,7 +54,7 @@ class MemoryDisk:
         self._takes = takes
 
     def read(self) -> list[BookingRecord]:
-        return [decode_told(raw, BookingRecord) for raw in self.content]
+        return [_record(raw) for raw in self.content]
 
     async def write(self, records: list[BookingRecord]) -> None:
         content = [encode(record) for record in records]

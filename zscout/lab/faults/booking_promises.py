@@ -99,8 +99,8 @@ class BookingPromises:
         self.facts: dict[tuple[str, Instant | str], Fact] = {}
         self._destroyed = 0.0
         """When copies were last destroyed."""
-        self._final: dict[BookingKeeper, dict[str, BookingRecord]] = {}
-        """What each process knew of bookings as it was looked at last."""
+        self._final: dict[BookingKeeper, tuple[str, dict[str, BookingRecord]]] = {}
+        """What each process knew of bookings as it was looked at last, and its digest."""
         self._stepped = -1.0
         """When a leader last took over an older fleet time."""
         self._times: dict[Term, _FleetTime] = {}
@@ -111,8 +111,10 @@ class BookingPromises:
         """The latest fleet time that any leader has told."""
         self._known: dict[Term, dict[str, float]] = {}
         """By term and date: since when its leader knows of it."""
-        self._kept: dict[Term, dict[str, Booking]] = {}
-        """By term and date: as it was looked at last."""
+        self._claims: dict[Term, dict[str, tuple[Booking, ArcId | None]]] = {}
+        """By term and date: as it was looked at last, with the ARC that has taken it up."""
+        self._unwanted: dict[Term, tuple[tuple[str, int], list[str]]] = {}
+        """By term: dates that are kept though they were given up, and for which records and batch that is."""
         self._begun: dict[Term, float] = {}
         """When each was seen first, or a little before: what is held for longer may be handed over in it."""
         self._looked: dict[Term, int] = {}
@@ -121,6 +123,8 @@ class BookingPromises:
         """By term and RC that is present: since when."""
         self._records: dict[str, set[str]] = {}
         """By host: the bookings that it knew as it was looked at last."""
+        self._news: dict[str, set[str]] = {}
+        """Likewise, while it is looked at."""
 
     # What programs are told
 
@@ -192,42 +196,33 @@ class BookingPromises:
     def look(self, leaders: Mapping[str, Rcm], *, calm: bool) -> Iterator[tuple[tuple[object, ...], float]]:
         """What may not last, each with for how long it may. `leaders`: by host, of processes that do not stand
         still."""
-        for keeper in self._keepers.values():
-            self._look_at_records(keeper)
+        for host, keeper in self._keepers.items():
+            self._look_at_records(host, keeper)
         for host, rcm in leaders.items():
             self._look_at_time(host, rcm)
             self._begun.setdefault(rcm.term, self.now() - GIVEN_UP)
-            first = rcm.term not in self._known
-            known = self._known.setdefault(rcm.term, {})
-            claims = {booking.id: (booking, arc) for booking, arc in rcm.core.bookings()}
-            # What was in conflict with one that is over is known anew: it was not there, or it is another object.
-            kept = self._kept.get(rcm.term, {})
-            for name in [*known]:
-                booking, _ = claims.get(name, (None, None))
-                if booking is None or (name in kept and booking is not kept[name] and booking == kept[name]):
-                    del known[name]
-            self._kept[rcm.term] = {name: booking for name, (booking, _) in claims.items()}
-            for name in claims:
-                before = first and name.partition("@")[0] in self._records.get(host, ())
-                known.setdefault(name, 0.0 if before else self.now())
             if self._looked.get(rcm.term) != rcm.core.batches:
                 self._looked[rcm.term] = rcm.core.batches
-                self._look_at_grants(host, rcm, claims)
-            for name, (booking, arc) in claims.items():
-                id_, _, start = name.partition("@")
-                record = self._keepers[host].records.get(id_)
-                if record is None or record.unbooked or int(start) in record.dropped:
-                    yield (host, "keeps", name, "for nobody: it was given up"), GIVEN_UP
-                elif calm and arc is not None and self._has_no_excuse(host, rcm, name, booking, arc):
+                self._look_at_claims(host, rcm)
+                self._look_at_grants(host, rcm)
+            for name in self._given_up(host, rcm):
+                yield (host, "keeps", name, "for nobody: it was given up"), GIVEN_UP
+            now = self._inside(host, rcm.mesh.now)
+            for name, (booking, arc) in self._claims[rcm.term].items() if calm else ():
+                if arc is not None and booking.start <= now and self._has_no_excuse(rcm, name, booking, arc, now):
                     yield (name, "is taken up, and its date has come, but", arc, "does not run"), AT_ITS_DATE
         self._heard = {host for host, keeper in self._keepers.items() if keeper.time is not None}
-        self._records = {host: {one.id for one in keeper.records} for host, keeper in self._keepers.items()}
+        self._records = {host: known for host, known in (self._records | self._news).items() if host in self._keepers}
+        self._news = {}
 
-    def _look_at_records(self, keeper: BookingKeeper) -> None:
+    def _look_at_records(self, host: str, keeper: BookingKeeper) -> None:
         """What is final of a booking stays, wherever it has been heard."""
-        before_it = self._final.get(keeper, {})
+        digest, before_it = self._final.get(keeper, ("", {}))
+        if keeper.records.digest() == digest and host in self._records:
+            return
         # What was over long ago may be forgotten, and may be heard once more of a host that was away.
-        self._final[keeper] = {record.id: record for record in keeper.records}
+        self._final[keeper] = keeper.records.digest(), {record.id: record for record in keeper.records}
+        self._news[host] = {record.id for record in keeper.records}
         for record in keeper.records:
             before = before_it.get(record.id)
             if before is record:
@@ -238,6 +233,36 @@ class BookingPromises:
                 or not {*before.over} <= {*record.over}
             ):
                 self._broken(f"{record.name} was given up or over on {keeper.mesh.me}, and is not any more")
+
+    def _look_at_claims(self, host: str, rcm: Rcm) -> None:
+        """Since when its leader knows of each date."""
+        first = rcm.term not in self._known
+        known, kept = self._known.setdefault(rcm.term, {}), self._claims.get(rcm.term, {})
+        claims = {booking.id: (booking, arc) for booking, arc in rcm.core.bookings()}
+        # What was in conflict with one that is over is known anew: it was not there, or it is another object.
+        for name in [*known]:
+            booking, _ = claims.get(name, (None, None))
+            before, _ = kept.get(name, (booking, None))
+            if booking is None or (booking is not before and booking == before):
+                del known[name]
+        for name in claims:
+            heard = first and name.partition("@")[0] in self._records.get(host, ())
+            known.setdefault(name, 0.0 if heard else self.now())
+        self._claims[rcm.term] = claims
+
+    def _given_up(self, host: str, rcm: Rcm) -> list[str]:
+        """What a leader keeps of which it knows that it was given up."""
+        records = self._keepers[host].records
+        of = records.digest(), rcm.core.batches
+        if self._unwanted.get(rcm.term, ((), ()))[0] != of:
+            found = []
+            for name in self._claims[rcm.term]:
+                id_, _, start = name.partition("@")
+                record = records.get(id_)
+                if record is None or record.unbooked or int(start) in record.dropped:
+                    found.append(name)
+            self._unwanted[rcm.term] = of, found
+        return self._unwanted[rcm.term][1]
 
     def _look_at_time(self, host: str, rcm: Rcm) -> None:
         now, time = self.now(), self._inside(host, lambda: rcm.bookings.time)
@@ -258,7 +283,7 @@ class BookingPromises:
                 self._broken(f"fleet time is {time:.3f} in term {rcm.term.counter}: none that was told before goes on")
         self._times[rcm.term] = told
 
-    def _look_at_grants(self, host: str, rcm: Rcm, claims: Mapping[str, tuple[Booking, ArcId | None]]) -> None:
+    def _look_at_grants(self, host: str, rcm: Rcm) -> None:
         """Nobody starts what would not be over by the date of a booking of its rank that its leader knew of."""
         status, local = rcm.core.status(), self._inside(host, rcm.mesh.now)
         present = self._present.get(rcm.term, {})
@@ -273,7 +298,7 @@ class BookingPromises:
         # For patterns others may be kept at any time.
         waiting = {
             name: (booking, by)
-            for name, (booking, by) in claims.items()
+            for name, (booking, by) in self._claims[rcm.term].items()
             if by not in has_it and not any(map(is_pattern, booking.needs))
         }
         for arc in (running[grant] for grant in running.keys() - before):
@@ -294,11 +319,11 @@ class BookingPromises:
                     booked = self.lives[name.partition("@")[0]].book.name
                     self._broken(f"{arc.name} begins what is not over by the date of {booked}: {name}")
 
-    def _has_no_excuse(self, host: str, rcm: Rcm, name: str, booking: Booking, arc: ArcId) -> bool:
-        """Whether it should be held now, and is not: its date has come, and nobody is in its way of higher priority, or
-        who held before its leader knew of it and had all of it."""
-        status, now = rcm.core.arc(arc), self._inside(host, rcm.mesh.now)
-        if status is None or status.hold is not None or booking.start > now:
+    def _has_no_excuse(self, rcm: Rcm, name: str, booking: Booking, arc: ArcId, now: Ns) -> bool:
+        """Whether a booking whose date has come should be held now, and is not: nobody is in its way of higher
+        priority, or who held before its leader knew of it and had all of it."""
+        status = rcm.core.arc(arc)
+        if status is None or status.hold is not None:
             return False
         present = self._present[rcm.term]
         if not status.needs.keys() <= present.keys():
