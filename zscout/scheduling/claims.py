@@ -43,6 +43,8 @@ class Claims:
         """What was reserved when dangers were looked for last."""
         self._endangered: dict[Claim, None] = {}
         """The bookings of which it was told last that they are in danger."""
+        self._wanting: dict[str, list[Arc]] = {}
+        """By booking: ARCs that would take it up, and can't: it is not there at present, or another has it."""
 
     def stand_in(self, booking: Booking) -> Arc:
         """What stands for a booking before it is taken up."""
@@ -62,6 +64,7 @@ class Claims:
         self._state.claim(Claim(booking, arc, arc.mask))
         if booking.maintenance:
             self._keep_others(arc.mask)
+        self._offer(booking.id)
 
     def unbook(self, booking: str) -> None:
         if (claim := self._state.claims.get(booking)) is not None:
@@ -80,9 +83,14 @@ class Claims:
         self.expire()
 
     def take_up(self, booking: str, arc: Arc) -> None:
-        """An ARC, which waits or runs, stands for its booking from now on, if that is open. It waits for the date."""
+        """An ARC, which waits or runs, stands for its booking from now on, or as soon as that is there and open.
+        It waits for the date."""
         claim = self._state.claims.get(booking)
-        if claim is None or claim.is_taken or claim.booking.maintenance:
+        if not booking or (claim is not None and (claim.booking.maintenance or claim is arc.claim)):
+            return
+        if claim is None or claim.is_taken:
+            wanting = self._wanting.setdefault(booking, [])
+            wanting += [arc] if arc not in wanting else []
             return
         for rc in self._state.possible_sharables(claim.arc):
             self._state.votes.rename_arc(rc.name, claim.arc.id, arc.id)
@@ -90,6 +98,11 @@ class Claims:
         self._state.claims_changed()
         self._emit(BookingChanged(claim.booking.id, BookingState.TAKEN, arc.id))
         self._wait_for_date(claim)
+
+    def _offer(self, booking: str) -> None:
+        """It is there and open: who wants it has it."""
+        for arc in self._wanting.pop(booking, ()):
+            self.take_up(booking, arc)
 
     def _wait_for_date(self, claim: Claim) -> None:
         if claim.booking.start > self._state.now and claim.arc.id in self._state.queued:
@@ -99,16 +112,23 @@ class Claims:
     def give_up(self, arc: Arc, outcome: Outcome, *, had_it: bool) -> None:
         """An ARC is over. What it had taken up is open again if its program is gone, or gave up before it had it."""
         claim = arc.claim
-        if claim is None:
-            return
-        again = (outcome is Outcome.CLIENT_LOST or not had_it) and self._state.now < claim.booking.lapses
-        if not again:
+        again = outcome is Outcome.CLIENT_LOST or not had_it
+        if claim is not None and not (again and self._state.now < claim.booking.lapses):
             self._end(claim, BookingState.USED)
-            return
-        arc.claim = None
-        claim.arc = self.stand_in(claim.booking)
-        self._state.claims_changed()
-        self._emit(BookingChanged(claim.booking.id, BookingState.OPEN, arc.id))
+        else:
+            self.leave(arc)
+
+    def leave(self, arc: Arc) -> None:
+        """An ARC is over, or another object stands for it: what it had taken up is open."""
+        name, claim = arc.request.booking, arc.claim
+        if wanting := [one for one in self._wanting.pop(name, ()) if one is not arc]:
+            self._wanting[name] = wanting
+        if claim is not None:
+            arc.claim = None
+            claim.arc = self.stand_in(claim.booking)
+            self._state.claims_changed()
+            self._emit(BookingChanged(claim.booking.id, BookingState.OPEN, arc.id))
+            self._offer(name)
 
     def _end(self, claim: Claim, state: BookingState) -> None:
         arc = claim.arc if claim.is_taken else None
@@ -117,6 +137,8 @@ class Claims:
         self._state.unclaim(claim)
         self._endangered.pop(claim, None)
         self._emit(BookingChanged(claim.booking.id, state, None if arc is None else arc.id))
+        if arc is not None and state is BookingState.UNBOOKED:
+            self.take_up(claim.booking.id, arc)
         if arc is not None and arc.held_back is not None and not arc.held_back[1]:
             self._state.consider_again(arc)
 

@@ -432,6 +432,7 @@ class Core:
                 return
             self._state.dequeue(existing)
             self._forget(existing)
+            self._claims.leave(existing)
         if arc.hold is None:
             self._effects.append(model.Dropped(arc.id, arc.request.client, Outcome.HANDED_OVER, reason))
         else:
@@ -469,13 +470,17 @@ class Core:
         if known is not None:
             self._state.dequeue(known)
             self._forget(known)
+            self._claims.leave(known)
             held = replace(held, place=min(known.place, held.place))
         arc = self._take_up(held)
         if known is not None and arc.hold is None and self._state.arc(arc.id) is arc:
             # As its client asked: of an RC that is absent the others of its gang know no parameters.
             self._state.dequeue(arc)
             self._forget(arc)
-            self._state.enqueue(self._new_arc(known.request, held.place), self._state.now)
+            self._claims.leave(arc)
+            arc = self._new_arc(known.request, held.place)
+            self._state.enqueue(arc, self._state.now)
+            self._claims.take_up(known.request.booking, arc)
         if arc.hold is not None and (arc.request.keep or not arc.past_min_runtime(self._state.now)):
             self._effects.append(self._granted(arc, arc.hold))
         self._expire()

@@ -289,6 +289,9 @@ class BookingPromises:
         present = self._present.get(rcm.term, {})
         there = {rc.name for rc in status.rcs if rc.present and rc.name in present}
         self._present[rcm.term] = {rc.name: present.get(rc.name, self.now()) for rc in status.rcs if rc.present}
+        for arc in (*status.running, *status.queued):
+            if self._claims[rcm.term].get(arc.request.booking, (None, arc.id))[1] is None:
+                self._broken(f"{arc.name} would take up {arc.request.booking}, which is open, and has not")
         running = {one.hold.grant: one for one in status.running if one.hold and one.hold.grant.term == rcm.term}
         before, self._running[rcm.term] = self._running.get(rcm.term, set()), set(running)
         if self.now() - self._stepped < 1.0:

@@ -25,6 +25,7 @@ from zscout.drivers.repeated import CommandMemory
 from zscout.drivers.resource_controller import ResourceController
 from zscout.mesh.renewal import Suspicions
 from zscout.messages import BookingRecord, Problem
+from zscout.scheduling.claims import Claims
 from zscout.scheduling.state import SchedulerState
 from zscout.services.bookings import records
 from zscout.services.bookings.fleet_clock import FleetClock, wall_ns
@@ -278,6 +279,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
             "a leader knows of all dates before it grants", {(Bookings, "recovered"): _none_recovered}
         ),
         "one stands": Guard("of two bookings that can't both be one stands", {(BookedDates, "_judge"): _nothing}),
+        "had again": Guard("who has taken up a date has it again once it can be", {(Claims, "_offer"): _nothing}),
         "withdrawn": Guard(
             "what nobody asks for is given back",
             {(RcmLink, "give_back"): _do_nothing, (Membership, "ask_requests"): _nothing},
