@@ -77,7 +77,10 @@ class Fleet:
 
     def send(self, *events: Event) -> list[Effect]:
         """All that comes of one instant."""
-        self.made |= {event.booking.id: event.booking for event in events if isinstance(event, Booked)}
+        for event in events:
+            if isinstance(event, Booked):
+                self.made[event.booking.id] = event.booking
+                self.dangers.pop(event.booking.id, None)
         since = {arc.id: arc.since for arc in self.core._state.all_arcs() if arc.hold is None}
         came = list(itertools.chain.from_iterable(play_instant(self.core, self.now, events, vote)))
         for effect in came:
@@ -208,6 +211,7 @@ def story(seed: int) -> Iterator[tuple[Fleet, Booking, bool]]:
     fleet = Fleet()
     fleet.send(*(RcJoined(rc, sharable=False) for rc in ROBOTS), RcJoined(RADIO, sharable=True))
     asked = 0
+    gone: list[Booking] = []
     for number in range(60):
         fleet.until(fleet.now + draw.randint(0, 6))
         what = draw.random()
@@ -237,17 +241,22 @@ def story(seed: int) -> Iterator[tuple[Fleet, Booking, bool]]:
             rc = draw.choice(ROBOTS)
             there = fleet.core._state.rc(rc).present
             events = [RcLost(rc) if there else RcJoined(rc, sharable=False)]
-        elif what < 0.97:
+        elif what < 0.96:
             events = [Booked(maintenance(draw, number, fleet.now))]
-        elif what < 0.99 and open_ones:
+        elif what < 0.975 and open_ones:
             one = draw.choice(open_ones)
             # Maintenance is put off only: who had begun by its first date is not in its way.
             by = draw.randint(1 if one.maintenance else -2, 2)
             if one.start > fleet.now:
                 fleet.redated.add(one.id)
             events = [Redated(one.id, one.start + by)]
+        elif gone and (one := gone.pop()).end > fleet.now and fleet.core.booking(one.id) is None:
+            # As after a conflict: others may have begun meanwhile what is not over by its date.
+            fleet.redated.add(one.id)
+            events = [Booked(one)]
         elif fleet.core.bookings():
-            events = [Unbooked(draw.choice(fleet.core.bookings())[0].id)]
+            gone.append(draw.choice(fleet.core.bookings())[0])
+            events = [Unbooked(gone[-1].id)]
         fleet.send(*events)
         for one, arc_id in fleet.core.bookings():
             if arc_id is not None and one.start <= fleet.now:
