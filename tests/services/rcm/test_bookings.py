@@ -607,6 +607,30 @@ def test_a_host_that_has_no_room_for_a_booking_does_not_keep_it() -> None:
     run(story())
 
 
+def test_what_becomes_of_one_booking_is_not_told_of_another() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        leader, other = await led(fleet, "x", "y")
+        await do(fleet.client("one"), book("b", "robot/a", at=500), BookingView)
+        (known,) = other._keeper.records
+        other._keeper.records.size = MAX_BYTES
+        assert leader.rcm is not None
+        sharing = leader.rcm.bookings._sharing
+
+        async def catch_up() -> str:
+            async with sharing._sharing:
+                await sharing._share()
+            return ""
+
+        # The second tells of the fourth as well, and the third of nothing.
+        new = leader._keeper.records.take(replace(known, id=name) for name in "cde")
+        keeping = [sharing.keep(record) for record in new]
+        kept = await asyncio.gather(*keeping[:2], catch_up(), keeping[2])
+        assert [*map(bool, kept)] == [True, True, False, True]
+
+    run(story())
+
+
 def test_a_booking_that_one_leader_could_not_keep_stands_where_another_one_has_it() -> None:
     async def story() -> None:
         fleet = BookedFleet("x", "y")

@@ -76,8 +76,8 @@ class BookingSharing:
         self._unshared: dict[str, BookingRecord] = {}
         self._behind = True
         """Whether some host may not have all that is known here."""
-        self._why = ""
-        """Why what was told last is not kept; empty: it is."""
+        self._not_kept: dict[str, str] = {}
+        """By booking: why it is not kept, as it was told last."""
         self._news = asyncio.Event()
         self._sharing = asyncio.Lock()
         self.clocks: dict[HostName, float] = {}
@@ -102,7 +102,7 @@ class BookingSharing:
         async with self._sharing:
             if record.id in self._unshared:
                 await self._share()
-            return self._why
+            return self._not_kept.get(record.id, "")
 
     async def _keep_sharing(self) -> None:
         while True:
@@ -110,13 +110,13 @@ class BookingSharing:
                 await asyncio.sleep(SOON)
             self._news.clear()
             async with self._sharing:
-                await self._share()
+                why = await self._share()
             self._on_shared()
-            if self._why:
-                log.warning("bookings are kept by this host alone: %s", self._why)
+            if why:
+                log.warning("bookings are kept by this host alone: %s", why)
 
-    async def _share(self) -> None:
-        """Tells all keepers, and hears what they know. `_why` is empty then if what was told is kept."""
+    async def _share(self) -> str:
+        """Tells all keepers, and hears what they know. Returns why what was told is not kept; empty: it is."""
         keeper, mesh = self._keeper, self._mesh
         sent, self._unshared = self._unshared, {}
         time = self._clock.at(mesh.now()) / SECOND if self._settled() else None
@@ -128,20 +128,17 @@ class BookingSharing:
         saved, replies = await asyncio.gather(
             keeper.save(), mesh.ask(mesh.keys.bookings_any, question, BookingsKept, timeout=TIMEOUT)
         )
-        answers = self._take(replies)
-        me = mesh.me.host
-        if not sent or any(one.candidate and one.host != me and _keeps(one, question, sent) for one in answers):
-            self._why = ""
-            return
-        living = await mesh.living(mesh.keys.alive_any(Role.CANDIDATE), timeout=LOOK)
-        others = sorted({token.host for token in living} - {me})
-        if others:
-            self._why = f"{', '.join(others[:3])} may lead as well, and did not take it"
-        else:
-            alone = (
-                "no other host may lead, and this one has no disk for it: is its `state` a folder that it may write?"
-            )
-            self._why = "" if saved else alone
+        answers, me, why = self._take(replies), mesh.me.host, ""
+        if sent and not any(one.candidate and one.host != me and _keeps(one, question, sent) for one in answers):
+            living = await mesh.living(mesh.keys.alive_any(Role.CANDIDATE), timeout=LOOK)
+            if others := sorted({token.host for token in living} - {me}):
+                why = f"{', '.join(others[:3])} may lead as well, and did not take it"
+            elif not saved:
+                why = "no other host may lead, and this one has no disk for it: is its `state` a folder to write to?"
+        for booking in sent:
+            self._not_kept.pop(booking, None)
+        self._not_kept |= dict.fromkeys(sent, why) if why else {}
+        return why
 
     def _take(self, replies: Collection[Reply[BookingsKept]]) -> list[BookingsKept]:
         """What keepers answered."""
