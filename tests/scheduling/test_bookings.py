@@ -154,7 +154,8 @@ def needs(draw: random.Random, *, patterns: bool = False) -> dict[str, Params]:
 def booking(draw: random.Random, number: int, now: Ns) -> Booking:
     start, runtime = now + draw.randint(0, 30), draw.randint(1, 20)
     patience = draw.randint(1, 10)
-    return Booking(f"b{number}", needs(draw, patterns=True), draw.randint(0, 2), start, runtime, patience, now)
+    wanted = needs(draw, patterns=True)
+    return Booking(f"b{number}", wanted, draw.randint(0, 2), start, runtime, patience, now, owner="h")
 
 
 def maintenance(draw: random.Random, number: int, now: Ns) -> Booking:
@@ -256,7 +257,7 @@ def story(seed: int) -> Iterator[tuple[Fleet, Booking, bool]]:
             events = [Booked(one)]
         elif fleet.core.bookings():
             gone.append(draw.choice(fleet.core.bookings())[0])
-            events = [Unbooked(gone[-1].id)]
+            events = [Unbooked(gone[-1].id, at_present=draw.random() < 0.8)]
         fleet.send(*events)
         for one, arc_id in fleet.core.bookings():
             if arc_id is not None and one.start <= fleet.now:

@@ -10,11 +10,11 @@
     adopt ARC ... grant=TERM.N start=S         place ARC TERM.N             unconfirmed ARC TERM.N RC,...
     lead TERM
     book ID NEED,... start=S [runtime=S] [patience=S] [priority=N] [since=S] [bound=RC,...] [maintenance]
-    unbook ID           redate ID S            slots ID NEED,... start=S until=S [runtime=S] [priority=N] [bookings]
+    unbook ID [now]     redate ID S            slots ID NEED,... start=S until=S [runtime=S] [priority=N] [bookings]
     strategy NAME [patience=S] [half_life=S]   a new core; without it, it is `priority`; a half-life: with fair shares
 
-What is `bound` are the RCs kept for the patterns, in their order. A NEED is `kind/name`, with parameters
-`kind/name{rate=5 width=0.1}`; a TERM is `COUNTER:RCM`.
+What is unbooked `now` can't be at present. What is `bound` are the RCs kept for the patterns, in their order. A NEED
+is `kind/name`, with parameters `kind/name{rate=5 width=0.1}`; a TERM is `COUNTER:RCM`.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ class CorePlayer:
             case "redate":
                 return Redated(first, ns(second))
             case "unbook":
-                return Unbooked(first)
+                return Unbooked(first, at_present=_flag(second, "now"))
             case "strategy":
                 options = settings(second.split(), "patience", "half_life")
                 patience = ns(options["patience"]) if "patience" in options else DEFAULT.patience
@@ -194,6 +194,7 @@ def _booking(text: str, now: Ns) -> tuple[Booking, dict[str, str]]:
         ns(options.get("patience", "5")),
         ns(options["since"]) if "since" in options else now,
         dict(zip(patterns, bound, strict=bool(bound))),
+        owner="host",
         maintenance="maintenance" in text.split(),
     )
     return booking, options

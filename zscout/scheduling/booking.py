@@ -80,9 +80,11 @@ class Booked(Struct, frozen=True):
 
 
 class Unbooked(Struct, frozen=True):
-    """A booking is given up. Who has taken it up goes on as if it had asked without."""
+    """A booking is given up: who has taken it up goes on as if it had asked without. Or it can't be `at_present`: who
+    has taken it up waits for its date, and has it again if it is booked once more."""
 
     booking: str
+    at_present: bool = False
 
 
 class Redated(Struct, frozen=True):

@@ -64,11 +64,11 @@ class Claims:
         self._state.claim(Claim(booking, arc, arc.mask))
         if booking.maintenance:
             self._keep_others(arc.mask)
-        self._offer(booking.id)
+        self._offer(self._state.claims[booking.id])
 
-    def unbook(self, booking: str) -> None:
+    def unbook(self, booking: str, *, at_present: bool) -> None:
         if (claim := self._state.claims.get(booking)) is not None:
-            self._end(claim, BookingState.UNBOOKED)
+            self._end(claim, BookingState.UNBOOKED, at_present=at_present)
 
     def redate(self, booking: str, start: Ns) -> None:
         claim = self._state.claims.get(booking)
@@ -76,10 +76,8 @@ class Claims:
             return
         claim.booking = replace(claim.booking, start=start)
         self._state.redated(claim)
-        arc = claim.arc
-        if arc.held_back is not None and not arc.held_back[1]:
-            self._state.consider_again(arc)
-            self._wait_for_date(claim)
+        if claim.arc.held_back is not None:
+            self._wait_again(claim.arc, start)
         self.expire()
 
     def take_up(self, booking: str, arc: Arc) -> None:
@@ -91,23 +89,38 @@ class Claims:
         if claim is None or claim.is_taken:
             wanting = self._wanting.setdefault(booking, [])
             wanting += [arc] if arc not in wanting else []
+            self._wait_until(arc, arc.request.not_before)
             return
         for rc in self._state.possible_sharables(claim.arc):
             self._state.votes.rename_arc(rc.name, claim.arc.id, arc.id)
         claim.arc, arc.claim = arc, claim
         self._state.claims_changed()
         self._emit(BookingChanged(claim.booking.id, BookingState.TAKEN, arc.id))
-        self._wait_for_date(claim)
+        self._wait_again(arc, claim.booking.start)
 
-    def _offer(self, booking: str) -> None:
-        """It is there and open: who wants it has it."""
-        for arc in self._wanting.pop(booking, ()):
-            self.take_up(booking, arc)
+    def _offer(self, claim: Claim) -> None:
+        """It is there and open: who wants it has it. What such a one was told of it elsewhere was not checked here."""
+        booking = claim.booking
+        for arc in self._wanting.pop(booking.id, ()):
+            asked = arc.request
+            same = asked.needs == booking.needs and asked.priority == booking.priority
+            if same and asked.client.partition("/")[0] == booking.owner:
+                self.take_up(booking.id, arc)
 
-    def _wait_for_date(self, claim: Claim) -> None:
-        if claim.booking.start > self._state.now and claim.arc.id in self._state.queued:
-            self._state.hold_back(claim.arc, claim.booking.start, ())
-            self._actions.wait(claim.arc, Reason(ReasonCode.NOT_YET))
+    def _wait_until(self, arc: Arc, date: Ns) -> None:
+        if date > self._state.now and arc.id in self._state.queued:
+            self._state.hold_back(arc, date, ())
+            self._actions.wait(arc, Reason(ReasonCode.NOT_YET))
+
+    def _wait_again(self, arc: Arc, date: Ns) -> None:
+        """Until that date instead of another one."""
+        self._go_on(arc)
+        self._wait_until(arc, date)
+
+    def _go_on(self, arc: Arc) -> None:
+        """It waits for no date any more."""
+        if arc.held_back is not None and not arc.held_back[1]:
+            self._state.consider_again(arc)
 
     def give_up(self, arc: Arc, outcome: Outcome, *, had_it: bool) -> None:
         """An ARC is over. What it had taken up is open again if its program is gone, or gave up before it had it."""
@@ -128,19 +141,19 @@ class Claims:
             claim.arc = self.stand_in(claim.booking)
             self._state.claims_changed()
             self._emit(BookingChanged(claim.booking.id, BookingState.OPEN, arc.id))
-            self._offer(name)
+            self._offer(claim)
 
-    def _end(self, claim: Claim, state: BookingState) -> None:
+    def _end(self, claim: Claim, state: BookingState, *, at_present: bool = False) -> None:
         arc = claim.arc if claim.is_taken else None
         for rc in [] if arc is not None else list(self._state.possible_sharables(claim.arc)):
             self._state.votes.forget_arc(rc.name, claim.arc.id)
         self._state.unclaim(claim)
         self._endangered.pop(claim, None)
         self._emit(BookingChanged(claim.booking.id, state, None if arc is None else arc.id))
-        if arc is not None and state is BookingState.UNBOOKED:
-            self.take_up(claim.booking.id, arc)
-        if arc is not None and arc.held_back is not None and not arc.held_back[1]:
-            self._state.consider_again(arc)
+        if arc is not None and at_present:
+            self._wanting[claim.booking.id] = [*self._wanting.get(claim.booking.id, ()), arc]
+        elif arc is not None:
+            self._go_on(arc)
 
     def expire(self) -> None:
         """Ends the bookings whose time is over, or whose owner's to take them up."""

@@ -339,8 +339,8 @@ class Core:
                 self._adopt(held)
             case Booked(booking):
                 self._claims.book(booking)
-            case Unbooked(booking):
-                self._claims.unbook(booking)
+            case Unbooked(booking, at_present):
+                self._claims.unbook(booking, at_present=at_present)
             case Redated(booking, start):
                 self._claims.redate(booking, start)
             case model.Tick():
@@ -351,7 +351,7 @@ class Core:
         if self._state.arc(asked.request.arc) is not None:
             return
         arc = self._new_arc(asked.request, asked.place)
-        if alone and asked.since is None and self._state.is_free(arc):
+        if alone and asked.since is None and not asked.request.booking and self._state.is_free(arc):
             # What any strategy would do, without a queue of one.
             self._state.enter(arc)
             self.start(arc)

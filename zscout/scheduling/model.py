@@ -57,6 +57,8 @@ class ArcRequest(Struct, frozen=True):
     """The name of the ARC of the same client's that it goes on from, where it can with what that has."""
     booking: str = ""
     """The booking that it takes up; its needs and its priority are that booking's."""
+    not_before: Ns = 0
+    """Of a booking that is not there yet, or can't be at present: the date that is waited for all the same."""
     who: Who | None = None
     """Who asked, as people are told; the core only prints it."""
 

@@ -35,7 +35,7 @@ from zscout.services.bookings.keeper import MAX_SAVING, BookingKeeper
 from zscout.services.bookings.records import MAX_BYTES
 from zscout.services.rcm.bookings import BookedDanger
 from zscout.services.rcm.candidate import Candidate
-from zscout.types import Grant, Term
+from zscout.types import Grant, Place, Term
 
 R = TypeVar("R")
 FIELDS = Book.__struct_fields__
@@ -325,6 +325,55 @@ def test_two_halves_book_the_same_and_the_earlier_of_the_higher_priority_stands(
         await do(there, Unbook("higher"), BookingView)
         await asyncio.sleep(1)
         assert states((await fleet.bookings())["low"]) == ["open"]
+
+    run(story())
+
+
+def test_who_took_up_a_date_that_is_in_conflict_waits_for_it_and_has_it_once_it_stands() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        _, y = await led(fleet, "x", "y")
+        here, there = fleet.client("here", "x"), fleet.client("there", "y")
+        fleet.part("y")
+        await until(lambda: y.rcm)
+        await do(here, book("low", "robot/a", at=500), BookingView)
+        waits = await here.ask("mine", "robot/a", seconds=100, booking="low")
+        await do(there, book("higher", "robot/a", at=500, priority=2), BookingView)
+        fleet.network.heal()
+        await asyncio.sleep(70)
+        place, booking = waits.place, waits.booking
+        again = await here.ask("mine", "robot/a", seconds=100, place=place, booking=booking)
+        assert (again.state, again.booking) == ("queued", "low@1800000500")
+        await asyncio.sleep(70)
+        assert states((await fleet.bookings())["low"]) == ["conflict"]
+        assert [notice.state for notice in here.notices].count("running") == 0
+        await do(there, Unbook("higher"), BookingView)
+        await asyncio.sleep(1)
+        assert states((await fleet.bookings())["low"]) == ["taken"]
+        await asyncio.sleep(NOON + 501 - fleet.time())
+        assert here.notices[-1].state == "running"
+
+    run(story())
+
+
+def test_who_took_up_a_date_that_its_leader_does_not_know_yet_waits_for_it_and_has_it() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        (leader,) = await led(fleet, "x")
+        await do(fleet.client("there", "y"), book("b", "robot/b", at=500), BookingView)
+        (known,) = leader._keeper.records
+        hers, not_hers = (fleet.client("one", host) for host in ("y", "z"))
+        for number, client in enumerate((hers, not_hers), 1):
+            place = Place(Term(0, "elsewhere"), number)
+            told = await client.ask("mine", "robot/a", seconds=100, place=place, booking="late@1800000500")
+            assert (told.state, told.reason) == ("queued", "the time of its booking is still to come")
+        leader._keeper.records.take([replace(known, id="late", name="late", needs={"robot/a": {}})])
+        leader._keeper.on_shared()
+        await asyncio.sleep(1)
+        assert states((await fleet.bookings())["late"]) == ["taken"]
+        await asyncio.sleep(NOON + 501 - fleet.time())
+        assert hers.notices[-1].state == "running"
+        assert "running" not in {notice.state for notice in not_hers.notices}
 
     run(story())
 

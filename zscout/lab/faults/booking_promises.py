@@ -5,6 +5,7 @@ all faults but those that destroy every copy: in the memory of a process that ke
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -33,6 +34,8 @@ AT_ITS_DATE: Final = 1.5
 """Seconds after its date, or after it was taken up if that was later, within which a booking is held."""
 NOT_EXACT: Final[Ns] = SECOND // 4
 """By how much a date may be put off, as fleet time is slewed."""
+EARLY: Final = 0.5
+"""By which who has taken up a booking may begin before its date: fleet time is slewed."""
 GIVEN_UP: Final = 0.1
 """Seconds within which a leader that has heard that a booking is given up keeps nothing for it."""
 
@@ -157,8 +160,14 @@ class BookingPromises:
             where = f"the memory of {sorted(memory)}, and on the disk of {sorted(disk)}"
             self._broken(f"{life.book.name} {what} is acknowledged, and is in {where} alone")
 
-    def preempted(self, arc: OpenArc) -> None:
+    def news(self, arc: OpenArc) -> None:
         """A program has news of a request."""
+        booking, _, start = arc.booking.partition("@")
+        mine = self.lives.get(booking)
+        if mine is not None and start and arc.state == "running" and not (mine.given_up or int(start) in mine.dropped):
+            now = max((self.now() + told.ahead for told in self._times.values()), default=math.inf)
+            if now < int(start) - EARLY:
+                self._broken(f"{arc.name} begins {int(start) - now:.1f} s before the date of {mine.book.name}")
         life = self.lives.get((arc.by or "").partition("@")[0])
         if life is not None and arc.outcome == "preempted" and not life.book.maintenance:
             self._broken(f"{arc.name} is preempted for {life.book.name}, which nobody has taken up")

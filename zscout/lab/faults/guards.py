@@ -26,6 +26,7 @@ from zscout.drivers.resource_controller import ResourceController
 from zscout.mesh.renewal import Suspicions
 from zscout.messages import BookingRecord, Problem
 from zscout.scheduling.claims import Claims
+from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.state import SchedulerState
 from zscout.services.bookings import records
 from zscout.services.bookings.fleet_clock import FleetClock, wall_ns
@@ -160,6 +161,10 @@ def _confirmed_once(self: HoldTable, grant: Grant, now: Ns) -> None:
 _merged = records.merged
 
 
+def _undated(_self: BookedDates, request: ArcRequest) -> ArcRequest:
+    return request
+
+
 def _newer(one: BookingRecord, other: BookingRecord) -> BookingRecord:
     return max(one, other, key=lambda record: record.changed)
 
@@ -279,6 +284,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
             "a leader knows of all dates before it grants", {(Bookings, "recovered"): _none_recovered}
         ),
         "one stands": Guard("of two bookings that can't both be one stands", {(BookedDates, "_judge"): _nothing}),
+        "awaited": Guard("who has taken up a date does not begin before it", {(BookedDates, "dated"): _undated}),
         "had again": Guard("who has taken up a date has it again once it can be", {(Claims, "_offer"): _nothing}),
         "withdrawn": Guard(
             "what nobody asks for is given back",

@@ -34,7 +34,7 @@ from zscout.scheduling.booking import (
     Unbooked,
 )
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import Effect, Event, Propose, Rc, RcJoined, Vote, VoteOverdue
+from zscout.scheduling.model import ArcRequest, Effect, Event, Propose, Rc, RcJoined, Vote, VoteOverdue
 from zscout.scheduling.reason import Reason
 from zscout.scheduling.votes import HolderSet
 from zscout.services.bookings.dates import DAY, dates, told
@@ -46,6 +46,8 @@ log = logging.getLogger(__name__)
 
 MAX_CLAIMS = 4_000
 """Dates of all bookings that a leader keeps free: of what is repeated those of the next 60 days."""
+MAX_DIGITS = 11
+"""Of an instant."""
 STEPPED: Ns = SECOND
 """By how much it is moved only where another time goes on."""
 REDATED: Ns = SECOND // 50
@@ -138,6 +140,11 @@ class BookedDates:
             maintenance=record.maintenance,
         )
 
+    def dated(self, request: ArcRequest) -> ArcRequest:
+        """With the date that it waits for where what it takes up is not in the core."""
+        start = start_of(request.booking)
+        return request if start is None else replace(request, not_before=self.local(start))
+
     def open_dates(self, record: BookingRecord, taken: Collection[str] = ()) -> list[Date]:
         """Those of a booking that are not over; of what is repeated within the next 60 days."""
         if record.unbooked:
@@ -225,7 +232,7 @@ class BookedDates:
         self.ask(found.unknown)
         self._conflicts = {name: by for name, by in self._conflicts.items() if self._core.booking(name) is None}
         for name, by in found.losers.items():
-            self._emit(Unbooked(name))
+            self._emit(Unbooked(name, at_present=True))
             self._bind(wanted[name], by)
 
     def _bind(self, date: Date, by: str) -> None:
@@ -350,6 +357,12 @@ class BookedDates:
     def taken_by(self, date: Date) -> ArcId | None:
         kept = self._core.booking(date.id)
         return kept.arc if kept is not None else None
+
+
+def start_of(name: str) -> Instant | None:
+    """When the date begins that the core calls so, as others may tell of it; None: it is none."""
+    _, _, start = name.partition("@")
+    return int(start) if start.isascii() and start.isdecimal() and len(start) <= MAX_DIGITS else None
 
 
 def _unbound(date: Date) -> bool:

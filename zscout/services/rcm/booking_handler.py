@@ -40,7 +40,7 @@ from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.services.authority import Authority
 from zscout.services.bookings.dates import DAY, dates, told, zone_of
 from zscout.services.bookings.keeper import BookingKeeper
-from zscout.services.rcm.booked_dates import MAX_CLAIMS, BookedDates, Date
+from zscout.services.rcm.booked_dates import MAX_CLAIMS, BookedDates, Date, start_of
 from zscout.services.rcm.booking_sharing import BookingSharing
 from zscout.types import SECOND, Ns
 
@@ -328,14 +328,14 @@ class BookingHandler:
     # Taking up
 
     def take_up(self, ask: Ask, sender: Sender) -> str:
-        """The date that an ARC takes up, as the core calls it; empty where one that goes on finds it over. Raises
-        Refused."""
+        """The date that an ARC takes up, as the core calls it; empty where one that goes on finds it over. To that one
+        it may be that it is not known here yet. Raises Refused."""
         booking, _, start = ask.booking.partition("@")
         record = self._keeper.records.get(booking)
         goes_on = ask.place is not None or ask.grant is not None
         if record is None or record.unbooked:
             if goes_on:
-                return ""
+                return ask.booking if record is None and start_of(ask.booking) is not None else ""
             raise Refused("unknown_booking", f"there is no booking {booking}, or it was given up; see zscout bookings")
         self._check_owner(sender, record, "take it up")
         if record.maintenance:
@@ -347,7 +347,7 @@ class BookingHandler:
         if free:
             return free[0].id
         if goes_on:
-            return ""
+            return next((date.id for date in self._dates.open_dates(record) if str(date.start) == start), "")
         why = "somebody has taken it up" if dates_ else "its dates are over, or another booking stands"
         raise Refused("unknown_booking", f"{record.name} can't be taken up: {why}; see zscout bookings")
 

@@ -189,7 +189,8 @@ class Rcm:
             if request.client not in recovered.answered:
                 self._recover(request)
         self.requests.believed = recovered.believed
-        lead = LeadTaken(self.term, tuple(recovered.holds), tuple(recovered.waiting), recovered.charged)
+        waiting = (replace(one, request=self.bookings.dates.dated(one.request)) for one in recovered.waiting)
+        lead = LeadTaken(self.term, tuple(recovered.holds), tuple(waiting), recovered.charged)
         booked = self.bookings.recovered({request.booking for request in requests if request.booking})
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
         self._decide([*joined, *booked, lead], named=recovered.rcs)

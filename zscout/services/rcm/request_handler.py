@@ -187,6 +187,7 @@ class RequestHandler:
         request = admit(ask, client, arc, self.core, self.limits, self._authority.known_as(sender, ask.who))
         if ask.booking:
             request = replace(request, booking=self.bookings.handler.take_up(ask, sender))
+            request = self.bookings.dates.dated(request)
         place, replaced, since = None, None, None
         if ask.place is not None and (place := self._own_place(ask, client)) is not None:
             since = self.mesh.now() - round(ask.waited * SECOND)
