@@ -256,8 +256,9 @@ def story(seed: int) -> Iterator[tuple[Fleet, Booking, bool]]:
             fleet.redated.add(one.id)
             events = [Booked(one)]
         elif fleet.core.bookings():
-            gone.append(draw.choice(fleet.core.bookings())[0])
-            events = [Unbooked(gone[-1].id, at_present=draw.random() < 0.8)]
+            one = draw.choice(fleet.core.bookings())[0]
+            gone += [one] if (at_present := draw.random() < 0.8) else []
+            events = [Unbooked(one.id, at_present=at_present)]
         fleet.send(*events)
         for one, arc_id in fleet.core.bookings():
             if arc_id is not None and one.start <= fleet.now:
