@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from tests.behaviors.perception.rooms import room, sofa
-from zscout.behaviors.perception.lens import Picture, garbled
+from zscout.behaviors.perception.garble import garbled
+from zscout.behaviors.perception.lens import Picture
 from zscout.behaviors.sensor_net.scout import NO_PICTURE_TIMEOUT, Scout
 from zscout.lab.building.air import Air, tear
 from zscout.lab.building.bodies import Pose

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from zscout.behaviors.perception.lens import noise_of
+from zscout.behaviors.perception.garble import noise_of
 
 AROUND: Final = 9
 """Pixels of the reduced picture by which a region is widened: its rim is smoothed away there."""

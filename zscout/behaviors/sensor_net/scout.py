@@ -13,8 +13,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Final, Literal, TypeAlias
 
+from zscout.behaviors.perception.garble import garbled
 from zscout.behaviors.perception.hiding.hider import Hider
-from zscout.behaviors.perception.lens import Picture, garbled
+from zscout.behaviors.perception.lens import Picture
 from zscout.behaviors.perception.motion import Box, MotionDetector
 
 NO_PICTURE_TIMEOUT: Final = 10.0

@@ -13,7 +13,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from zscout.behaviors.perception.lens import garbled
+from zscout.behaviors.perception.garble import garbled
 from zscout.behaviors.perception.motion import MotionDetector
 from zscout.lab.building.air import Air
 from zscout.lab.building.drawn import drawn_plan

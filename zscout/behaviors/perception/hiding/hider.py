@@ -18,10 +18,11 @@ import msgspec
 import numpy as np
 
 from zscout.behaviors.perception.darkness import View, analyse
+from zscout.behaviors.perception.garble import garbled
 from zscout.behaviors.perception.hiding import phases
 from zscout.behaviors.perception.hiding.compass import BANDS, strip_and_tones
 from zscout.behaviors.perception.hiding.state import FORM, MAX_CHECKPOINT, HidingState, Phase, Step, WheelCommand
-from zscout.behaviors.perception.lens import COLUMNS, ROWS, Picture, garbled
+from zscout.behaviors.perception.lens import COLUMNS, ROWS, Picture
 
 
 class PhaseCode(NamedTuple):
