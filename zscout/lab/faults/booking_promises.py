@@ -248,11 +248,13 @@ class BookingPromises:
         first = rcm.term not in self._known
         known, kept = self._known.setdefault(rcm.term, {}), self._claims.get(rcm.term, {})
         claims = {booking.id: (booking, arc) for booking, arc in rcm.core.bookings()}
-        # What was in conflict with one that is over is known anew: it was not there, or it is another object.
-        for name in [*known]:
-            booking, _ = claims.get(name, (None, None))
-            before, _ = kept.get(name, (booking, None))
-            if booking is None or (booking is not before and booking == before):
+        # What was in conflict with one that is over is known anew: it was not there, or it is another object. So is
+        # what has other RCs for its patterns.
+        for name in known.keys() - claims.keys():
+            del known[name]
+        for name in known.keys() & kept.keys():
+            (booking, _), (before, _) = claims[name], kept[name]
+            if booking.bound != before.bound or (booking is not before and booking == before):
                 del known[name]
         for name in claims:
             heard = first and name.partition("@")[0] in self._records.get(host, ())
@@ -338,20 +340,21 @@ class BookingPromises:
         if status is None or status.hold is not None:
             return False
         present = self._present[rcm.term]
-        if not status.needs.keys() <= present.keys():
+        # Those that are kept for its patterns.
+        rcs = {booking.bound.get(need, need) for need in booking.needs}
+        if not rcs <= present.keys():
             return False
         # While some of it was away the rest was not kept.
-        since = max(self._known[rcm.term][name], self._begun[rcm.term], *(present[rc] for rc in status.needs))
+        since = max(self._known[rcm.term][name], self._begun[rcm.term], *(present[rc] for rc in rcs))
         known = self.now() - since
-        for rc in status.needs:
+        for rc in rcs:
             for holder in rcm.core.holders(rc):
                 hold = holder.hold
                 if hold is None or holder.request.priority > booking.priority or hold.grant.term != rcm.term:
                     return False
                 if known < (now - hold.start) / SECOND + GIVEN_UP:
                     return False
-        # A pattern may be bound to any.
-        return not any(map(is_pattern, booking.needs)) and len(status.needs) == len(booking.needs)
+        return True
 
     # What is so at the end
 
