@@ -352,7 +352,8 @@ class BookingPromises:
                 hold = holder.hold
                 if hold is None or holder.request.priority > booking.priority or hold.grant.term != rcm.term:
                     return False
-                if known < (now - hold.start) / SECOND + GIVEN_UP:
+                # Who keeps what he has beyond his minimum runtime yields.
+                if hold.end > now and known < (now - hold.start) / SECOND + GIVEN_UP:
                     return False
         return True
 
