@@ -9,7 +9,7 @@
     standing ARC ... grant=TERM.N start=S      waiting ARC ...              for the `lead` that follows
     adopt ARC ... grant=TERM.N start=S         place ARC TERM.N             unconfirmed ARC TERM.N RC,...
     lead TERM
-    book ID NEED,... start=S [runtime=S] [patience=S] [priority=N] [since=S] [bound=RC,...] [maintenance]
+    book ID NEED,... start=S [runtime=S] [patience=S] [priority=N] [since=S] [bound=RC,...] [maintenance] [tentative]
     unbook ID [now]     redate ID S            slots ID NEED,... start=S until=S [runtime=S] [priority=N] [bookings]
     strategy NAME [patience=S] [half_life=S]   a new core; without it, it is `priority`; a half-life: with fair shares
 
@@ -156,7 +156,7 @@ class CorePlayer:
             case "ended":
                 return RcReported(first, ended=tuple(second.split(",")))
             case "book":
-                return Booked(_booking(rest, self.now)[0])
+                return Booked(_booking(rest, self.now)[0], tentative="tentative" in rest.split())
             case "redate":
                 return Redated(first, ns(second))
             case "unbook":
@@ -214,7 +214,7 @@ def _request(text: str) -> tuple[ArcRequest, dict[str, str]]:
             raise ValueError(f"not a need: {need}")
         pairs = (pair.split("=") for pair in (match[2] or "").split())
         wanted[match[1]] = {key: Fraction(value) for key, value in pairs}
-    words = (word for word in rest if word not in {"keep", "maintenance", "bookings"})
+    words = (word for word in rest if word not in {"keep", "maintenance", "bookings", "tentative"})
     known = (
         "priority",
         "runtime",

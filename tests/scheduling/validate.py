@@ -39,7 +39,7 @@ def validate(core: Core) -> None:
     for arc in (*state.queued.values(), *state.held_back.values(), *state.running.values()):
         assert arc.claim is None or state.claims.get(arc.claim.booking.id) is arc.claim, f"{arc.id}: no such booking"
         wanted = state.claims.get(arc.request.booking)
-        if wanted is not None and not wanted.booking.maintenance:
+        if wanted is not None and not (wanted.booking.maintenance or wanted.tentative):
             assert wanted.is_taken, f"{arc.id} has not taken up {wanted.booking.id}, which is open"
     open_arcs = [*state.queued.values(), *state.held_back.values(), *state.running.values()]
     for wanting in core._claims._wanting.values():

@@ -74,9 +74,11 @@ class BookingState(StrEnum):
 
 
 class Booked(Struct, frozen=True):
-    """A booking that was made, by this RCM or an earlier one."""
+    """A booking that was made, by this RCM or an earlier one. `tentative`: whether it can be is still to be seen; who
+    would take it up waits until it is booked again, for certain."""
 
     booking: Booking
+    tentative: bool = False
 
 
 class Unbooked(Struct, frozen=True):

@@ -53,18 +53,21 @@ class Claims:
             self._state.bind(arc, booking.bound)
         return arc
 
-    def book(self, booking: Booking) -> None:
-        if booking.id in self._state.claims:
+    def book(self, booking: Booking, *, tentative: bool = False) -> None:
+        if (known := self._state.claims.get(booking.id)) is not None:
+            known.tentative = tentative
+            self._offer(known)
             return
         if booking.lapses <= self._state.now:
             state = BookingState.USED if booking.maintenance else BookingState.LAPSED
             self._emit(BookingChanged(booking.id, state))
             return
         arc = self.stand_in(booking)
-        self._state.claim(Claim(booking, arc, arc.mask))
+        claim = Claim(booking, arc, arc.mask, tentative)
+        self._state.claim(claim)
         if booking.maintenance:
             self._keep_others(arc.mask)
-        self._offer(self._state.claims[booking.id])
+        self._offer(claim)
 
     def unbook(self, booking: str, *, at_present: bool) -> None:
         if (claim := self._state.claims.get(booking)) is not None:
@@ -86,7 +89,7 @@ class Claims:
         claim = self._state.claims.get(booking)
         if not booking or (claim is not None and (claim.booking.maintenance or claim is arc.claim)):
             return
-        if claim is None or claim.is_taken:
+        if claim is None or claim.is_taken or claim.tentative:
             wanting = self._wanting.setdefault(booking, [])
             wanting += [arc] if arc not in wanting else []
             self._wait_until(arc, arc.request.not_before)
@@ -98,10 +101,13 @@ class Claims:
         self._emit(BookingChanged(claim.booking.id, BookingState.TAKEN, arc.id))
         self._wait_again(arc, claim.booking.start)
 
+    def is_wanted(self, booking: str) -> bool:
+        return booking in self._wanting
+
     def _offer(self, claim: Claim) -> None:
-        """It is there and open: who wants it has it. What such a one was told of it elsewhere was not checked here."""
+        """It is there and open: who wants it has it, if it is its owner's. Nobody here has checked that before."""
         booking = claim.booking
-        for arc in self._wanting.pop(booking.id, ()):
+        for arc in [] if claim.tentative else self._wanting.pop(booking.id, ()):
             asked = arc.request
             same = asked.needs == booking.needs and asked.priority == booking.priority
             if same and asked.client.partition("/")[0] == booking.owner:

@@ -257,6 +257,10 @@ class Core:
         bound = claim.booking.bound if claim.arc.hold is None else claim.arc.bound
         return BookingStatus(claim.booking, claim.arc.id if claim.is_taken else None, bound)
 
+    def is_wanted(self, name: str) -> bool:
+        """Whether an ARC would take up that booking, and could not yet."""
+        return self._claims.is_wanted(name)
+
     def charged(self) -> dict[str, float]:
         """By group: RC-seconds that it lately had and others waited for; empty where fair shares are off."""
         return self._state.charged()
@@ -337,8 +341,8 @@ class Core:
                 self._take_lead(event)
             case model.Adopted(held):
                 self._adopt(held)
-            case Booked(booking):
-                self._claims.book(booking)
+            case Booked(booking, tentative):
+                self._claims.book(booking, tentative=tentative)
             case Unbooked(booking, at_present):
                 self._claims.unbook(booking, at_present=at_present)
             case Redated(booking, start):

@@ -247,6 +247,8 @@ class Claim:
     """Who has taken it up; before, an ARC that stands for it in reservations and votes, and never waits nor runs."""
     kept: int
     """Bits of the RCs that are kept for it; who has taken it up may choose others for its patterns."""
+    tentative: bool = False
+    """Whether it is still to be seen if it can be: nobody takes it up."""
     danger: Reason | None = None
     """What keeps it from its start, as last told."""
 

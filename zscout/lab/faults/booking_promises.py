@@ -21,7 +21,7 @@ from zscout.services.bookings.dates import dates, last_end
 from zscout.services.bookings.fleet_clock import DIFFERS, SAME
 from zscout.services.bookings.keeper import BookingKeeper, Disk
 from zscout.services.bookings.records import KEEP, Records
-from zscout.types import SECOND, ArcId, Grant, Ns, Term
+from zscout.types import SECOND, ArcId, Grant, Ns, Place, Term
 
 if TYPE_CHECKING:
     from zscout.services.rcm.rcm import Rcm
@@ -121,7 +121,8 @@ class BookingPromises:
         self._begun: dict[Term, float] = {}
         """When each was seen first, or a little before: what is held for longer may be handed over in it."""
         self._looked: dict[Term, int] = {}
-        self._running: dict[Term, set[Grant]] = {}
+        self._running: dict[Term, set[tuple[Place, Ns]]] = {}
+        """By term: places and beginnings of holds; who hands one over gives both away."""
         self._present: dict[Term, dict[str, float]] = {}
         """By term and RC that is present: since when."""
         self._records: dict[str, set[str]] = {}
@@ -303,7 +304,7 @@ class BookingPromises:
         for arc in (*status.running, *status.queued):
             if self._claims[rcm.term].get(arc.request.booking, (None, arc.id))[1] is None:
                 self._broken(f"{arc.name} would take up {arc.request.booking}, which is open, and has not")
-        running = {one.hold.grant: one for one in status.running if one.hold and one.hold.grant.term == rcm.term}
+        running = {(one.place, one.hold.start): one for one in status.running if one.hold}
         before, self._running[rcm.term] = self._running.get(rcm.term, set()), set(running)
         if self.now() - self._stepped < 1.0:
             return  # its dates came just now
@@ -315,8 +316,10 @@ class BookingPromises:
             for name, (booking, by) in self._claims[rcm.term].items()
             if by not in has_it and not any(map(is_pattern, booking.needs))
         }
-        for arc in (running[grant] for grant in running.keys() - before):
+        for arc in (running[hold] for hold in running.keys() - before):
             assert arc.hold is not None  # noqa: S101 - it runs
+            if arc.hold.grant.term != rcm.term:
+                continue
             began = self.now() - (local - arc.hold.start) / SECOND
             for name, (booking, by) in waiting.items():
                 over = booking.lapses if by is None else booking.end

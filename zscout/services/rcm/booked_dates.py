@@ -200,13 +200,17 @@ class BookedDates:
         known = {booking.id for booking, _ in self._core.bookings()}
         gone = [Unbooked(name) for name in known if name not in wanted]
         missing = [date for name, date in wanted.items() if name not in known and not self._is_settled(name)]
-        coming = [self._booked(date) for date in missing if not _unbound(date)]
-        if events := [*gone, *filter(None, coming)]:
+        found = (self._booked(date) for date in missing if not _unbound(date))
+        coming = [replace(one, tentative=self._core.is_wanted(one.booking.id)) for one in found if one is not None]
+        if events := [*gone, *coming]:
             self._emit(*events)
         for date in missing:
             if _unbound(date):
                 self._bind(date, "")
         self._judge(wanted)
+        left = [one for one in coming if one.tentative and self._core.booking(one.booking.id) is not None]
+        if left:
+            self._emit(*(replace(one, tentative=False) for one in left))
         self._conflicts = {name: by for name, by in self._conflicts.items() if name in wanted}
         self._judged = {name: found for name, found in self._judged.items() if name in self._conflicts}
         self._danger = {name: why for name, why in self._danger.items() if name in wanted}
