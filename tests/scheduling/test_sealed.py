@@ -36,7 +36,7 @@ SURFACE = {
     "charged",
     "charged_in_all",
 }
-SURFACE |= {"as_events", "expects_yes", "number", "batches", "term", "seq", "strategy", "policy"}
+SURFACE |= {"as_events", "is_wanted", "expects_yes", "number", "batches", "term", "seq", "strategy", "policy"}
 ACTIONS = {"start", "preempt", "wait", "propose", "run_again"}
 
 
