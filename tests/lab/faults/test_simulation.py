@@ -44,7 +44,7 @@ MISSED = {
     "one stands": 33,
     "awaited": 103,
     "had again": 13,
-    "dates first": 134,
+    "dates first": 94,
     "fleet time": 4,
     "late": 173,
     "slewed": 3,
