@@ -43,6 +43,14 @@ def test_json_has_the_figures_and_every_run_and_the_plots_are_written(
     assert {"/summary", "/grid/placed/1", "/radio/placed/300_baud_2_5_per_second"} <= entities
 
 
+def test_json_tells_what_became_of_crossings(capsys: pytest.CaptureFixture[str]) -> None:
+    some = ("--robots", "1", "--channels", "1", "--seconds", "100", "--json")
+    assert zscout_here(*LITTLE[:2], "--seeds", "3-3", "--building", "living_room", "--jobs", "1", *some) == 0
+    told: dict[str, Any] = json.loads(capsys.readouterr().out)
+    (account,) = told["runs"][0]["outcomes"]["account"].values()
+    assert sum(account["fates"].values()) > 0
+
+
 def test_a_pipe_gets_plain_tables(capsys: pytest.CaptureFixture[str]) -> None:
     assert zscout_here(*LITTLE, "--baud", "300", "--slot", "45") == 0
     shown = capsys.readouterr()

@@ -342,7 +342,8 @@ def robots(
         from zscout.lab.plots.robots_svg import write
 
         write(svg, found.grid, found.radio)
-    shown = {**dataclasses.asdict(found), "runs": [dataclasses.asdict(trial) for trial in trials]}
+    # Not `asdict`: in Python 3.11 it takes counters apart.
+    shown = {one.name: getattr(found, one.name) for one in dataclasses.fields(found)} | {"runs": trials}
     _show(shown, rrd, partial(print_report, found, names, len(numbers), seconds), as_json=as_json)
 
 
