@@ -108,8 +108,8 @@ class BookingPromises:
         """When a leader last took over an older fleet time."""
         self._times: dict[Term, _FleetTime] = {}
         """By term: that of its leader as it was looked at last."""
-        self._heard: set[str] = set()
-        """Hosts whose processes knew fleet time as they were looked at last."""
+        self._heard: dict[str, Term] = {}
+        """Hosts whose processes knew fleet time as they were looked at last, and of whom they had heard it."""
         self._latest = 0.0
         """The latest fleet time that any leader has told."""
         self._known: dict[Term, dict[str, float]] = {}
@@ -221,7 +221,7 @@ class BookingPromises:
             for name, (booking, arc) in self._claims[rcm.term].items() if calm else ():
                 if arc is not None and booking.start <= now and self._has_no_excuse(rcm, name, booking, arc, now):
                     yield (name, "is taken up, and its date has come, but", arc, "does not run"), AT_ITS_DATE
-        self._heard = {host for host, keeper in self._keepers.items() if keeper.time is not None}
+        self._heard = {host: one.heard[0] for host, one in self._keepers.items() if one.time is not None}
         self._records = {host: known for host, known in (self._records | self._news).items() if host in self._keepers}
         self._news = {}
 
@@ -286,7 +286,7 @@ class BookingPromises:
         if before is not None and told.since >= before.since - SAME:
             if abs(told.ahead - before.ahead) > RUNS_APART * (now - before.at) + 1e-6:
                 self._broken(f"fleet time jumps by {told.ahead - before.ahead:g} s in term {rcm.term.counter}")
-        elif before is not None or host in self._heard:
+        elif before is not None or self._heard.get(host, rcm.term) != rcm.term:  # itself: it told it, and stood still
             if before is not None:
                 # It began where nobody knew the time of the others, and has met them.
                 self._stepped = now

@@ -113,7 +113,7 @@ class BookingKeeper:
         self.records = Records()
         self._offset: Ns | None = None
         """What fleet time is more than the own clock, as it was heard last."""
-        self._heard: tuple[Term, Ns] = NO_TERM, 0
+        self.heard: tuple[Term, Ns] = NO_TERM, 0
         """In which term, and when, that was."""
         self.since: Ns = 0
         """Since when it has gone on, on the own clock."""
@@ -149,7 +149,7 @@ class BookingKeeper:
         tells a younger time than is known here, until it has heard of this one."""
         if grants.time is None:
             return
-        now, (term, at) = self.mesh.now(), self._heard
+        now, (term, at) = self.mesh.now(), self.heard
         leader, since, last = self._leader
         self._leader = grants.term, since if leader == grants.term and now - last < LEFT else now, now
         unasked = now - max(self._asked, self._leader[1]) > UNASKED
@@ -163,7 +163,7 @@ class BookingKeeper:
             elif since > self.since + SAME * SECOND:
                 return
             since = min(since, self.since)
-        self._offset, self._heard, self.since = offset, (grants.term, now), since
+        self._offset, self.heard, self.since = offset, (grants.term, now), since
 
     @property
     def time(self) -> Ns | None:
