@@ -74,12 +74,15 @@ class Fleet:
     """By booking: what was told of it last."""
     redated: set[str] = field(default_factory=set)
     made: dict[str, Booking] = field(default_factory=dict)
+    entered: dict[str, Ns] = field(default_factory=dict)
+    """By booking: when the core heard of it last. One that had been given up for a while was not there meanwhile."""
 
     def send(self, *events: Event) -> list[Effect]:
         """All that comes of one instant."""
         for event in events:
             if isinstance(event, Booked):
                 self.made[event.booking.id] = event.booking
+                self.entered[event.booking.id] = self.now
                 self.dangers.pop(event.booking.id, None)
         since = {arc.id: arc.since for arc in self.core._state.all_arcs() if arc.hold is None}
         came = list(itertools.chain.from_iterable(play_instant(self.core, self.now, events, vote)))
@@ -99,18 +102,18 @@ class Fleet:
 
     def check_maintenance(self) -> None:
         """Who holds what is in maintenance began before, and has a higher priority or not had its minimum runtime: then
-        it began before the maintenance was made."""
+        it began before the core heard of the maintenance."""
         state = self.core._state
         for claim in state.maintenance.values():
             one = claim.booking
             for rc in state.rcs_in(claim.kept) if one.start <= self.now else ():
                 for holder in rc.holders.values():
-                    hold = holder.hold
+                    hold, entered = holder.hold, self.entered[one.id]
                     assert hold is not None
-                    assert hold.start < one.start or hold.start <= one.since, f"{holder.id} began in {one.id}"
+                    assert hold.start < one.start or hold.start <= entered, f"{holder.id} began in {one.id}"
                     if holder.priority <= one.priority:
                         assert self.now < hold.end, f"{holder.id} outstays its time in {one.id}"
-                        assert hold.start <= one.since, f"{holder.id} is not over by the date of {one.id}"
+                        assert hold.start <= entered, f"{holder.id} is not over by the date of {one.id}"
 
     def until(self, now: Ns) -> None:
         """Time passes, and the core is woken as it asked."""
