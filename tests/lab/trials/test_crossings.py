@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 
 from zscout.lab.building.world import World
-from zscout.lab.trials.crossings import Crossings, CrossingsOf, Fate
+from zscout.lab.trials.crossings import LOOK, Crossings, CrossingsOf, Fate
 from zscout.lab.trials.watch import Case, hide_at_random, plan_of
 
 SECONDS = 60.0
 
 
-def played(act: Callable[[World, Crossings, str, float | None], None]) -> CrossingsOf:
+def played(act: Callable[[World, Crossings, str, float | None], None], seconds: float = SECONDS) -> CrossingsOf:
     """One hidden robot; `act` is called each tenth of a second, with for how long somebody is in view."""
     world = World(plan_of(Case("living_room", 1.0, 3)), seed=3)
     robot = hide_at_random(world, np.random.default_rng(3))
     crossings = Crossings(world, [robot])
     crossings.hidden(robot)
     since = None
-    while world.time < SECONDS:
+    while world.time < seconds:
         world.step(0.1)
         if not world.crossing(robot):
             since = None
@@ -104,3 +104,17 @@ def test_a_hold_that_ends_as_somebody_comes_could_not_have_told(there: int) -> N
     found = played(act)
     assert found.fates == {"off the air": there}
     assert found.could == 0
+
+
+def test_a_crossing_that_the_runs_end_cuts_is_none() -> None:
+    within: list[float] = []
+
+    def act(world: World, crossings: Crossings, robot: str, seen_for: float | None) -> None:
+        world.bodies[robot].transmit(1, -60.0)
+        watching(crossings, robot)
+        if seen_for is not None and seen_for > 2 * LOOK:
+            within.append(world.time)
+
+    played(act)
+    found = played(act, seconds=within[0])
+    assert (found.all, found.could) == (0, 0)

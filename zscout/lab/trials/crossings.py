@@ -109,7 +109,6 @@ class Crossings:
                 place.last_person = now
             if people >= PIXELS and place.since is None:
                 place.since, place.obstacle, place.told_at = now, self._obstacle(robot, place), None
-                self.found[robot].could += place.obstacle not in _AWAY
             elif place.since is not None and now - place.last_person > CLEAR:
                 self._close(robot, place)
 
@@ -133,6 +132,7 @@ class Crossings:
         else:
             fate = place.obstacle or ("not told" if place.told_at is None else "told late")
         self.found[robot].fates[fate] += 1
+        self.found[robot].could += place.obstacle not in _AWAY
         place.since = None
 
     def ended(self, robot: str) -> None:
@@ -143,7 +143,6 @@ class Crossings:
             return
         if place.obstacle not in _AWAY and self._world.time - place.since < IN_TIME:
             place.obstacle = "off the air"
-            self.found[robot].could -= 1
 
 
 def _same(one: Pose, other: Pose) -> bool:
