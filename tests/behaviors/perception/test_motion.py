@@ -135,6 +135,19 @@ def test_light_that_flickers_drifts_and_is_switched_moves_nothing() -> None:
     assert not any(told)
 
 
+@pytest.mark.parametrize("light", [1.06, 0.94])
+@pytest.mark.parametrize("noise", [1.0, 6.0])
+def test_white_has_no_gain(light: float, noise: float) -> None:
+    scene = Scene(8, noise=noise)
+    scene.wall[10:40, 30:100] = 320  # a window
+    detector = settled(scene, rate=5.0, seconds=8.0)
+    for time in times(5.0, 2.0, 8.0):
+        assert not detector.see(time, scene.picture(gain=light)).boxes
+    assert any(
+        detector.see(time, scene.picture(20 + 40 * (time - 10), gain=light)).moving for time in times(5.0, 1.0, 10.0)
+    )
+
+
 def test_a_walker_is_seen_while_the_exposure_follows_him() -> None:
     scene = Scene(4)
     detector = settled(scene)

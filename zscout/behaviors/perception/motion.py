@@ -36,6 +36,8 @@ WIDTH: Final = 160
 MAX_SIDE: Final = 8_192
 BLOCKS: Final = 20
 """Blocks across, by which brightness is compared."""
+WHITE: Final = 240.0
+"""Grey levels from which noise may be cut off at the top, and so a pixel does not follow the light as others do."""
 LEARN: Final = 6.0
 """Seconds in which the background follows what is no motion."""
 ABSORB: Final = 30.0
@@ -360,7 +362,15 @@ def _levelled(grey: _Plane, mean: _Plane) -> _Plane:
         offset = float(y.mean() - gain * x.mean())
         off = np.abs(now - gain * was - offset)
         fits = lit & (off <= max(1.5, 2.5 * float(np.median(off[fits]))))
-    return ((grey - np.float32(offset)) / np.float32(gain)).astype(np.float32)
+    level = ((grey - np.float32(offset)) / np.float32(gain)).astype(np.float32)
+    expected = np.float32(gain) * mean + np.float32(offset)
+    white = np.maximum(mean, expected) > WHITE
+    if np.any(white):
+        # White may be brighter than it can be told: it stays as it was, or becomes what it should be.
+        was, should = mean[white], expected[white]
+        off = grey[white] - np.clip(grey[white], np.minimum(was, should), np.maximum(was, should))
+        level[white] = was + off / np.float32(gain)
+    return level
 
 
 def _torn(lines: _Plane, mean: _Plane) -> bool:
