@@ -186,6 +186,27 @@ def test_a_walk_counts_when_it_is_over_and_began_when_all_were_placed(room: Plan
     assert (judge.outcomes.walks, judge.outcomes.noticed) == (2, 1)
 
 
+@pytest.mark.parametrize(("moved", "resumed"), [(False, [0.5]), (True, [])])
+def test_a_turn_is_taken_up_again_from_when_the_camera_is_warm(room: Plan, moved: bool, resumed: list[float]) -> None:
+    world = World(crewed(room, 1), seed=0)
+    (name,) = world.bodies
+    body = world.bodies[name]
+    judge = Judge(world, Outcomes(placed={name: None}))
+    judge.held(name)
+    judge.placed(name)
+    judge.looked(name, Step(0, 0, 0, "watch", ""), 0.25)
+    assert judge.outcomes.resumed == [], "its first turn is none that is taken up again"
+    judge.ended(name, preempted=False)
+    world.step(0.1)
+    judge.held(name)
+    body.transmit(1, world.time)
+    body.x += moved
+    for number in range(26):
+        judge.looked(name, Step(0, 0, 0, "watch", "", learning=number < 25), 0.1)
+        world.step(0.1)
+    assert judge.outcomes.resumed == pytest.approx(resumed)
+
+
 def test_the_time_to_stand_is_that_after_the_hold(room: Plan) -> None:
     world = World(crewed(room, 1), seed=0)
     (name,) = world.bodies

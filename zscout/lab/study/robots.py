@@ -181,6 +181,8 @@ class FieldFigures:
     """Share of them that could have been in time, as the robot was on the air, and its camera warm."""
     least: float
     """Share in time of the robot with the least, as a part of the mean of all robots; over those with FEW or more."""
+    resumed: Quantiles
+    """Seconds from a turn's warm camera until the robot could tell of motion, where it still stood as it had hidden."""
     watched: float
     """Hours of watching, all robots of all runs."""
     false_alarms: float
@@ -251,6 +253,7 @@ def _summed(field: Field, runs: Sequence[Outcomes]) -> FieldFigures:
         in_time=whole.in_time,
         best=_share(whole.could, whole.all),
         least=min((_share(one.in_time, whole.in_time) for one in of_robots), default=math.nan),
+        resumed=quantiles_of([one for run in runs for one in run.resumed]),
         watched=hours,
         false_alarms=_share(sum(run.false_alarms for run in runs), hours),
         robot_alarms=_share(sum(run.robot_alarms for run in runs), hours),

@@ -70,11 +70,17 @@ def _print_account(keys: Sequence[str], figures: Sequence[FieldFigures]) -> None
     for one in told:
         whole = sum(one.account.values())
         shares = (percent(one.account[fate] / whole) for fate in fates)
-        rows.append(
-            [*(f"{getattr(one, key):g}" for key in keys), str(whole), *shares, percent(one.best), percent(one.least)]
-        )
+        cells = [percent(one.best), percent(one.least), spread_text(one.resumed, 1)]
+        rows.append([*(f"{getattr(one, key):g}" for key in keys), str(whole), *shares, *cells])
     terminal.print_line("")
-    heads = [*(key.replace("command_rate", "commands/s") for key in keys), "crossings", *fates, "best", "least robot"]
+    heads = [
+        *(key.replace("command_rate", "commands/s") for key in keys),
+        "crossings",
+        *fates,
+        "best",
+        "least robot",
+        "resumes in",
+    ]
     terminal.print_table(heads, rows, title="Where the crossings of placed robots went")
 
 
@@ -102,11 +108,11 @@ def percent(share: float) -> str:
     return "-" if math.isnan(share) else f"{share:.0%}"
 
 
-def spread_text(spread: Quantiles) -> str:
+def spread_text(spread: Quantiles, digits: int = 0) -> str:
     """`41 s (30-77)`; what never came to an end is `never`."""
     if math.isnan(spread.median):
         return "-"
     low, median, high = (
-        f"{value:.0f}" if math.isfinite(value) else "never" for value in (spread.low, spread.median, spread.high)
+        f"{value:.{digits}f}" if math.isfinite(value) else "never" for value in (spread.low, spread.median, spread.high)
     )
     return f"{median}{' s' * (median != 'never')} ({low}-{high})"

@@ -80,7 +80,7 @@ class Crossings:
         place, pose = self._places.get(robot), self._world.bodies[robot].pose
         if place is None:
             self._places[robot] = _Place(pose)
-        elif not _same(place.pose, pose):
+        elif not same_place(place.pose, pose):
             self._close(robot, place)
             self._places[robot] = _Place(pose)
 
@@ -118,7 +118,7 @@ class Crossings:
             return "off the air"
         if body.warmth(self._world.time) < SOLID:
             return "warming up"
-        if not _same(place.pose, body.pose):
+        if not same_place(place.pose, body.pose):
             return "not hidden"
         return self._doing[robot]
 
@@ -145,6 +145,7 @@ class Crossings:
             place.obstacle = "off the air"
 
 
-def _same(one: Pose, other: Pose) -> bool:
+def same_place(one: Pose, other: Pose) -> bool:
+    """Whether a robot that stands here has not left that place."""
     apart = math.hypot(one.x - other.x, one.y - other.y)
     return apart <= MOVED and abs(math.remainder(one.heading - other.heading, math.tau)) <= TURNED

@@ -11,12 +11,12 @@ import numpy as np
 
 from zscout.behaviors.sensor_net.net import WATCHING
 from zscout.behaviors.sensor_net.scout import Step
-from zscout.lab.building.bodies import Body
+from zscout.lab.building.bodies import WARM_UP, Body, Pose
 from zscout.lab.building.casting import EYE, VIEW
 from zscout.lab.building.light import hidden
 from zscout.lab.building.solids import cuboids_of
 from zscout.lab.building.world import World
-from zscout.lab.trials.crossings import Crossings, CrossingsOf
+from zscout.lab.trials.crossings import Crossings, CrossingsOf, same_place
 from zscout.lab.trials.watch import CLEAR, IN_TIME, PIXELS
 
 SETTLED: Final = 120.0
@@ -49,6 +49,9 @@ class Outcomes:
     """Of a watching robot's picture, by people."""
     alerted: int = 0
     """Of these: within IN_TIME."""
+    resumed: list[float] = field(default_factory=list)
+    """Of each turn of a robot that still stood where it had hidden: seconds from when it was held and its camera warm
+    until it could tell of motion."""
     account: dict[str, CrossingsOf] = field(default_factory=dict)
     """By robot: where all crossings of its place went, whether it was held or not."""
     false_alarms: int = 0
@@ -81,6 +84,9 @@ class Judge:
         self._world = world
         self._watchers = {name: Watcher() for name in outcomes.placed}
         self._moved_at = dict.fromkeys(world.bodies, -math.inf)
+        self._resuming: dict[str, tuple[float, Pose]] = {}
+        """Robots that were placed before and can't tell of motion yet: since when they are held, and where they stood
+        then."""
         self._unheld_since: dict[str, float] = {}
         """Robots whose hold ended less than RUN_OUT ago, and when."""
         self._turned: set[str] = set()
@@ -101,6 +107,8 @@ class Judge:
 
     def held(self, robot: str) -> None:
         self.outcomes.holds += 1
+        if self.outcomes.placed[robot] is not None:
+            self._resuming[robot] = self._world.time, self._world.bodies[robot].pose
         self._unheld_since.pop(robot, None)
         self._turned.discard(robot)
         self._watchers[robot] = Watcher()
@@ -108,6 +116,7 @@ class Judge:
     def ended(self, robot: str, *, preempted: bool) -> None:
         self.outcomes.preemptions += preempted
         self._unheld_since[robot] = self._world.time
+        self._resuming.pop(robot, None)
         self._crossings.ended(robot)
         if _turns(self._world.bodies[robot]):
             self._turned.add(robot)
@@ -119,6 +128,10 @@ class Judge:
             robot, watches=watches, picture=step.doing != "blind", learning=step.learning, alert=step.doing == "alert"
         )
         if step.doing in WATCHING:
+            if not step.learning and (resuming := self._resuming.pop(robot, None)) is not None:
+                (since, pose), body = resuming, self._world.bodies[robot]
+                if same_place(pose, body.pose):
+                    self.outcomes.resumed.append(self._world.time - max(since, body.camera_on_since + WARM_UP))
             self.outcomes.watched += interval
             people = self._world.people_in_view(robot)
             self._watchers[robot].look(
