@@ -14,7 +14,7 @@ from tests.hang import HANG
 from tests.live.lab import PATIENT, Lab
 from zscout.behaviors.client.blocking import connect
 from zscout.cli import common
-from zscout.messages import RcmState
+from zscout.messages import MAX_RANKED, HostRanking, RankAsk, RcmState
 
 NOBODY_THERE = common.NobodyThere.exit_code
 
@@ -85,6 +85,20 @@ class CliFleet:
     def state(self, until: Callable[[RcmState], bool]) -> RcmState:
         """The RCM's state as soon as `until` holds of it."""
         return self._eye.run(self.lab.state(self._eye.client, until))
+
+    def balanced(self, *hosts: str) -> None:
+        """Waits until components can be placed on these hosts: who leads has heard of their loads."""
+
+        async def heard() -> None:
+            mesh, ranked = self._eye.client.mesh, set[str]()
+            async with asyncio.timeout(HANG):
+                while not ranked.issuperset(hosts):
+                    asked = RankAsk(at_most=MAX_RANKED, reports=True)
+                    reply = await mesh.ask_one(mesh.keys.rank, asked, HostRanking, timeout=1)
+                    told = reply.message.reports if reply is not None and reply.message is not None else None
+                    ranked = {one.report.host for one in told or ()}
+
+        self._eye.run(heard())
 
     def idle(self, *rcs: str) -> bool:
         """Returns when nobody holds or waits for these RCs."""
