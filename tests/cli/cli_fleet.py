@@ -20,7 +20,8 @@ NOBODY_THERE = common.NobodyThere.exit_code
 
 
 def patient_timing(hold_lease: float | None = None) -> str:
-    """The table [timing] of a fleet whose RCs vote, though they stand still for a second or two."""
+    """The table [timing] of a fleet with the lease PATIENT, whose RCs vote, though they stand still for a second or
+    two."""
     lease = 3 * PATIENT if hold_lease is None else hold_lease
     return f"[timing]\nhold_lease = {lease}\nrebuild = {PATIENT / 5}\nvote_timeout = 2"
 

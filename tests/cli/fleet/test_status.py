@@ -17,7 +17,7 @@ import pytest
 from tests.cli.cli_fleet import patient_timing
 from tests.cli.tools import CLOCK, COMMAND, Terminal, ours, zscout_soon_until
 from tests.hang import HANG
-from tests.live.lab import Lab
+from tests.live.lab import PATIENT, Lab
 
 pytestmark = pytest.mark.live
 
@@ -31,7 +31,7 @@ def section(text: str, title: str) -> list[list[str]]:
 
 def test_the_fleet_is_shown_to_people_and_programs(tmp_path: Path) -> None:
     async def story() -> None:
-        async with Lab(tmp_path, extra=patient_timing()) as lab:
+        async with Lab(tmp_path, lease=PATIENT, extra=patient_timing()) as lab:
             lab.node("anvil", "robot/a", "radio/rf0:rate=10")
             # One alone may lead: of two that begin together each may for a while.
             lab.node("bellows", "robot/b", extra="candidate = false")

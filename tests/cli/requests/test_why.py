@@ -11,7 +11,7 @@ import pytest
 
 from tests.cli.cli_fleet import patient_timing
 from tests.cli.tools import CLOCK, ours, zscout_here, zscout_soon
-from tests.live.lab import Lab
+from tests.live.lab import PATIENT, Lab
 
 pytestmark = pytest.mark.live
 US = re.escape(ours())
@@ -20,7 +20,7 @@ SOON = r"\d+(\.\d)? s"
 
 def test_the_story_of_an_arc(tmp_path: Path) -> None:
     async def story() -> None:
-        async with Lab(tmp_path, extra=patient_timing()) as lab:
+        async with Lab(tmp_path, lease=PATIENT, extra=patient_timing()) as lab:
             lab.node("anvil", "robot/a", "robot/b", "radio/rf0:rate=10")
             client, other = await lab.client("program"), await lab.client("other")
             await lab.ready(client, "robot/a", "robot/b", "radio/rf0")
