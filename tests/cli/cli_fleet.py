@@ -62,14 +62,18 @@ class CliFleet:
 
     def holder(self, name: str, *args: str) -> subprocess.Popen[str]:
         """A request that holds already when this returns."""
+        process, _ = self.begun(f"{name} holds", "request", "--name", name, *args)
+        return process
+
+    def begun(self, words: str, *args: str) -> tuple[subprocess.Popen[str], list[str]]:
+        """A command that has said that, and its lines so far; started again where it saw no RCM."""
         while True:
-            process = self.start("request", "--name", name, *args)
-            said = ""
+            process, lines = self.start(*args), list[str]()
             for line in tools.out_of(process):
-                if f"{name} holds" in line:
-                    return process
-                said += line
-            assert process.wait(HANG) == NOBODY_THERE, said
+                lines.append(line.rstrip("\n"))
+                if words in line:
+                    return process, lines
+            assert process.wait(HANG) == NOBODY_THERE, lines
 
     def waits(self, name: str, *args: str, until: Callable[[str], object] = bool) -> str:
         """What a request prints first, by which it says that it waits; it is ended then. Asked again until that is so:

@@ -107,8 +107,9 @@ def test_who_shares_may_stay_and_equals_are_waited_for(fleet: CliFleet) -> None:
 
 def test_a_take_that_must_wait_says_so_and_then_holds(fleet: CliFleet) -> None:
     peer = fleet.holder("peer", "robot/b", "--priority", "10")
-    taker = fleet.start("take", "robot/b", "--name", "operator", "--", "true")
-    lines = read_until(taker, f"operator waits for {named('peer')}: robot/b, until ")
+    taker, lines = fleet.begun(
+        f"operator waits for {named('peer')}: robot/b, until ", "take", "robot/b", "--name", "operator", "--", "true"
+    )
     assert any(f"operator waits for {named('peer')}, priority 10, " in line for line in lines)
     end(peer)
     read_until(taker, "operator holds robot/b")

@@ -59,8 +59,7 @@ def test_who_waits_hears_who_has_all_that_match_and_gets_the_first(fleet: CliFle
     assert [(holder["rc"], holder["arc"]) for holder in need["holders"]] == [(F1, "first"), (F2, "second")]
     assert 500 < waits["starts_in"] < 600
 
-    waiting = fleet.start("request", "--name", "next", *asked)
-    read_until(waiting, '"waits"')
+    waiting, _ = fleet.begun('"waits"', "request", "--name", "next", *asked)
     queued, held = json.loads(fleet.zscout("status", "--json").stdout), {F1: "first", F2: "second"}
     assert [wait["needs"] for wait in queued["queue"]] == [{ANY: {}}]
     assert {hold["arc"]: (hold["needs"], hold["bound"]) for hold in queued["holds"]} == {

@@ -74,8 +74,7 @@ def test_in_a_pipe_it_says_who_is_in_the_way_and_since_when(fleet: CliFleet) -> 
         rf"robot/a: {who}, priority 0, since {CLOCK} \(.* s\), until {CLOCK} \((\d\d s|1 min)\) at the latest",
         line,
     )
-    waiting = fleet.start("request", "robot/a", "--name", "next", "--", "true")
-    read_until(waiting, "next waits")
+    waiting, _ = fleet.begun("next waits", "request", "robot/a", "--name", "next", "--", "true")
     end(blocker)
     read_until(waiting, "next holds robot/a")
     assert waiting.wait(HANG) == 0
@@ -128,8 +127,7 @@ def test_an_estimate_that_ticks_down_prints_nothing_and_asks_for_nothing(fleet: 
 
 def test_a_command_is_ended_when_its_grant_is_taken(fleet: CliFleet) -> None:
     script = "trap 'echo told; exit 3' TERM; echo pid $$; while :; do sleep 0.05; done"
-    victim = fleet.start("request", "robot/a", "--name", "victim", "--", "sh", "-c", script)
-    read_until(victim, "pid")
+    victim, _ = fleet.begun("pid", "request", "robot/a", "--name", "victim", "--", "sh", "-c", script)
     taker = fleet.zscout("request", "robot/a", "--priority", "5", "--name", "boss", "--", "true")
     assert taker.returncode == 0
     lines = out_of(victim).read()
@@ -149,8 +147,9 @@ def test_a_command_whose_time_is_over_is_ended(fleet: CliFleet) -> None:
 
 def test_a_command_goes_on_past_its_minimum_runtime_until_an_equal_waits(fleet: CliFleet) -> None:
     script = "trap 'echo told; exit 3' TERM; echo pid $$; while :; do sleep 0.05; done"
-    kept = fleet.start("request", "robot/a", "--name", "kept", "--min-runtime", "300ms", "--", "sh", "-c", script)
-    first = read_until(kept, "pid")
+    kept, first = fleet.begun(
+        "pid", "request", "robot/a", "--name", "kept", "--min-runtime", "300ms", "--", "sh", "-c", script
+    )
     assert re.fullmatch(
         rf"kept holds robot/a: yours for 0\.\d s \(until {CLOCK}\), then until somebody waits for it", first[0]
     )
@@ -171,8 +170,8 @@ def test_a_command_goes_on_past_its_minimum_runtime_until_an_equal_waits(fleet: 
 def test_again_asks_anew_for_what_was_kept_and_ended_for_another(fleet: CliFleet, tmp_path: Path) -> None:
     script = f"if mkdir {tmp_path}/first; then echo run $$; sleep 1000; fi; echo run $$; exit 4"
     options = ["--again", "--name", "kept", "--min-runtime", "300ms"]
-    kept = fleet.start("request", "robot/b", *options, "--", "sh", "-c", script)
-    first = read_until(kept, "run ")[-1]
+    kept, said_first = fleet.begun("run ", "request", "robot/b", *options, "--", "sh", "-c", script)
+    first = said_first[-1]
     assert fleet.zscout("request", "robot/b", "--", "true").returncode == 0
     lines = read_until(kept, "run ")
     assert any(line.endswith("; asking anew") for line in lines)
@@ -182,8 +181,7 @@ def test_again_asks_anew_for_what_was_kept_and_ended_for_another(fleet: CliFleet
 
 def test_what_an_operator_releases_is_not_asked_for_again(fleet: CliFleet) -> None:
     options = ["--again", "--name", "kept", "--min-runtime", "100ms"]
-    kept = fleet.start("request", "robot/b", *options, "--", "sh", "-c", "echo run; sleep 1000")
-    read_until(kept, "run")
+    kept, _ = fleet.begun("run", "request", "robot/b", *options, "--", "sh", "-c", "echo run; sleep 1000")
     fleet.state(lambda state: [hold.remaining < 0 for hold in state.holds] == [True])
     assert fleet.zscout("release", "kept").returncode == 0
     assert kept.wait(HANG) == 124
@@ -191,8 +189,7 @@ def test_what_an_operator_releases_is_not_asked_for_again(fleet: CliFleet) -> No
 
 
 def test_without_a_command_what_is_kept_ends_in_order(fleet: CliFleet) -> None:
-    kept = fleet.start("request", "robot/b", "--name", "kept", "--min-runtime", "100ms", "--json")
-    read_until(kept, '"granted"')
+    kept, _ = fleet.begun('"granted"', "request", "robot/b", "--name", "kept", "--min-runtime", "100ms", "--json")
     assert fleet.zscout("request", "robot/b", "--", "true").returncode == 0
     (ended,) = events(out_of(kept).read())
     assert (ended["event"], ended["outcome"], ended["again"]) == ("ended", "completed", False)
@@ -201,8 +198,8 @@ def test_without_a_command_what_is_kept_ends_in_order(fleet: CliFleet) -> None:
 
 def test_what_ignores_sigterm_is_killed_after_the_grace_with_its_children(fleet: CliFleet) -> None:
     options = ["--name", "victim", "--grace", "300ms"]
-    victim = fleet.start("request", "robot/a", *options, "--", "sh", "-c", STUBBORN)
-    pids = [int(pid) for pid in read_until(victim, "pid")[-1].split()[1:]]
+    victim, said_first = fleet.begun("pid", "request", "robot/a", *options, "--", "sh", "-c", STUBBORN)
+    pids = [int(pid) for pid in said_first[-1].split()[1:]]
     assert fleet.zscout("release", "victim").returncode == 0
     assert victim.wait(HANG) == 75
     assert len(pids) == 2
@@ -211,8 +208,10 @@ def test_what_ignores_sigterm_is_killed_after_the_grace_with_its_children(fleet:
 
 def test_again_runs_the_command_again_after_a_preemption(fleet: CliFleet, tmp_path: Path) -> None:
     script = f"if mkdir {tmp_path}/first; then echo run $$; sleep 1000; fi; echo run $$; exit 4"
-    victim = fleet.start("request", "robot/b", "--again", "--name", "victim", "--", "sh", "-c", script)
-    first = read_until(victim, "run")[-1]
+    victim, said_first = fleet.begun(
+        "run", "request", "robot/b", "--again", "--name", "victim", "--", "sh", "-c", script
+    )
+    first = said_first[-1]
     assert fleet.zscout("request", "robot/b", "--priority", "5", "--", "true").returncode == 0
     lines = read_until(victim, "run")
     assert any("waiting again" in line for line in lines)
@@ -221,8 +220,8 @@ def test_again_runs_the_command_again_after_a_preemption(fleet: CliFleet, tmp_pa
 
 
 def test_what_a_command_leaves_running_is_ended(fleet: CliFleet) -> None:
-    left = fleet.start("request", "robot/a", "--", "sh", "-c", "sleep 1000 & echo pid $!")
-    pid = int(read_until(left, "pid")[-1].split()[1])
+    left, said_first = fleet.begun("pid", "request", "robot/a", "--", "sh", "-c", "sleep 1000 & echo pid $!")
+    pid = int(said_first[-1].split()[1])
     assert left.wait(HANG) == 0
     assert gone(pid)
 
@@ -230,8 +229,7 @@ def test_what_a_command_leaves_running_is_ended(fleet: CliFleet) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_while_it_waits_leaves_nothing(fleet: CliFleet, number: signal.Signals) -> None:
     blocker = fleet.holder("blocker", "robot/a", "robot/b")
-    waiting = fleet.start("request", "robot/a", "--name", "waiting", "--", "true")
-    read_until(waiting, "waiting waits")
+    waiting, _ = fleet.begun("waiting waits", "request", "robot/a", "--name", "waiting", "--", "true")
     waiting.send_signal(number)
     assert "Traceback" not in out_of(waiting).read()
     assert waiting.wait(HANG) == 128 + number
@@ -240,8 +238,8 @@ def test_a_signal_while_it_waits_leaves_nothing(fleet: CliFleet, number: signal.
 
 
 def test_a_signal_ends_the_command_and_gives_back(fleet: CliFleet) -> None:
-    running = fleet.start("request", "robot/a", "--", "sh", "-c", "echo pid $$; sleep 1000")
-    pid = int(read_until(running, "pid")[-1].split()[1])
+    running, said_first = fleet.begun("pid", "request", "robot/a", "--", "sh", "-c", "echo pid $$; sleep 1000")
+    pid = int(said_first[-1].split()[1])
     running.send_signal(signal.SIGTERM)
     assert running.wait(HANG) == 143
     assert gone(pid)
@@ -261,8 +259,8 @@ def test_a_second_signal_does_not_wait_for_a_stubborn_command(fleet: CliFleet) -
 
 
 def test_a_command_does_not_outlive_zscout(fleet: CliFleet) -> None:
-    running = fleet.start("request", "robot/a", "--", "sh", "-c", "echo pid $$; exec sleep 1000")
-    pid = int(read_until(running, "pid")[-1].split()[1])
+    running, said_first = fleet.begun("pid", "request", "robot/a", "--", "sh", "-c", "echo pid $$; exec sleep 1000")
+    pid = int(said_first[-1].split()[1])
     running.kill()
     assert gone(pid)
     assert fleet.idle("robot/a")
