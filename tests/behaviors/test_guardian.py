@@ -139,13 +139,14 @@ def test_all_of_it_is_killed_when_the_client_is_gone(tmp_path: Path) -> None:
 
 def test_a_stubborn_one_is_told_first_and_killed_after_the_grace(tmp_path: Path) -> None:
     script = "trap 'echo told' TERM; echo ready; while :; do sleep 0.02; done"
-    with guarded(*shell(tmp_path, script), grace=0.3) as command:
+    # Within the grace the shell has to come to its trap, though it stands still.
+    with guarded(*shell(tmp_path, script), grace=4) as command:
         command.out.readline()
         before = now()
         command.say(f"end {now()}")
         assert command.out.readline() == "told\n"
         assert command.hears_rest()[1:] == ["ending client", "exited -9", "gone"]
-        assert now() - before >= 0.3 * SECOND
+        assert now() - before >= 4 * SECOND
 
 
 def test_who_may_not_wait_kills_at_once(tmp_path: Path) -> None:

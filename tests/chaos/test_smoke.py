@@ -11,6 +11,7 @@ import pytest
 
 from tests.chaos import net
 from tests.chaos.__main__ import main
+from tests.hang import HANG
 
 try:
     net.check()
@@ -27,7 +28,7 @@ pytestmark = pytest.mark.live
 def test_a_leader_is_killed_and_nothing_is_left() -> None:
     command = [sys.executable, "-m", "tests.chaos", "--count", "1", "--only", "leader killed", "--json"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    told, _ = process.communicate(timeout=120)
+    told, _ = process.communicate(timeout=5 * HANG)
     found = json.loads(told)
     # On a busy machine what is promised within a time may come late; what may never be may not be there either.
     assert not [text for text in found["violations"] if int(re.findall(r"\[(\d+) ", text)[0]) in NEVER]

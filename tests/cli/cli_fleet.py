@@ -13,29 +13,38 @@ from tests.cli import tools
 from tests.hang import HANG
 from tests.live.lab import PATIENT, Lab
 from zscout.behaviors.client.blocking import connect
-from zscout.messages import RcmState
+from zscout.cli import common
+from zscout.messages import MAX_RANKED, HostRanking, RankAsk, RcmState
+
+NOBODY_THERE = common.NobodyThere.exit_code
+
+
+def patient_timing(hold_lease: float | None = None) -> str:
+    """The table [timing] of a fleet with the lease PATIENT, whose RCs vote, though they stand still for a second or
+    two."""
+    lease = 3 * PATIENT if hold_lease is None else hold_lease
+    return f"[timing]\nhold_lease = {lease}\nrebuild = {PATIENT / 5}\nvote_timeout = 2"
 
 
 class CliFleet:
     """One node with RCs, and `zscout` processes that use it."""
 
     def __init__(self, folder: Path, hold_lease: float | None = None) -> None:
-        timing = "" if hold_lease is None else f"[timing]\nhold_lease = {hold_lease}"
-        self.lab = Lab(folder, lease=PATIENT, extra=timing)
+        self.lab = Lab(folder, lease=PATIENT, extra=patient_timing(hold_lease))
         self.folder = folder
         self._started: list[subprocess.Popen[str]] = []
         self._eye = connect("eye", fleet=self.lab.fleet, host="test")
 
     def zscout(self, *args: str, stdin: str = "") -> subprocess.CompletedProcess[str]:
-        """Runs a command to its end, away from any terminal."""
-        return tools.zscout(*args, env=self.lab.env, stdin=stdin)
+        """Runs a command to its end, away from any terminal; again where it saw no RCM in its two seconds, though one
+        is there: nothing was done then."""
+        return tools.zscout_until(lambda done: done.returncode != NOBODY_THERE, *args, env=self.lab.env, stdin=stdin)
 
-    def shown(self, *args: str, until: Callable[[str], bool]) -> str:
+    def shown(self, *args: str, until: Callable[[str], object]) -> str:
         """What a command prints as soon as it is so: run again until then."""
-        began = time.monotonic()
-        while not until(said := self.zscout(*args).stdout):
-            assert time.monotonic() - began < HANG, said
-        return said
+        return tools.zscout_until(
+            lambda done: done.returncode != NOBODY_THERE and until(done.stdout), *args, env=self.lab.env
+        ).stdout
 
     def start(self, *args: str) -> subprocess.Popen[str]:
         """Starts a command; stdout and stderr come out of `.stdout`."""
@@ -53,13 +62,48 @@ class CliFleet:
 
     def holder(self, name: str, *args: str) -> subprocess.Popen[str]:
         """A request that holds already when this returns."""
-        process = self.start("request", "--name", name, *args)
-        tools.read_until(process, f"{name} holds")
+        process, _ = self.begun(f"{name} holds", "request", "--name", name, *args)
         return process
+
+    def begun(self, words: str, *args: str) -> tuple[subprocess.Popen[str], list[str]]:
+        """A command that has said that, and its lines so far; started again where it saw no RCM."""
+        while True:
+            process, lines = self.start(*args), list[str]()
+            for line in tools.out_of(process):
+                lines.append(line.rstrip("\n"))
+                if words in line:
+                    return process, lines
+            assert process.wait(HANG) == NOBODY_THERE, lines
+
+    def waits(self, name: str, *args: str, until: Callable[[str], object] = bool) -> str:
+        """What a request prints first, by which it says that it waits; it is ended then. Asked again until that is so:
+        who is in the way is told by an RCM that answers within a second."""
+        began = time.monotonic()
+        while True:
+            process = self.start("request", "--name", name, *args)
+            first = tools.out_of(process).readline().rstrip("\n")
+            tools.end(process)
+            if process.returncode != NOBODY_THERE and until(first):
+                return first
+            assert time.monotonic() - began < HANG, first
 
     def state(self, until: Callable[[RcmState], bool]) -> RcmState:
         """The RCM's state as soon as `until` holds of it."""
         return self._eye.run(self.lab.state(self._eye.client, until))
+
+    def balanced(self, *hosts: str) -> None:
+        """Waits until components can be placed on these hosts: who leads has heard of their loads."""
+
+        async def heard() -> None:
+            mesh, ranked = self._eye.client.mesh, set[str]()
+            async with asyncio.timeout(HANG):
+                while not ranked.issuperset(hosts):
+                    asked = RankAsk(at_most=MAX_RANKED, reports=True)
+                    reply = await mesh.ask_one(mesh.keys.rank, asked, HostRanking, timeout=1)
+                    told = reply.message.reports if reply is not None and reply.message is not None else None
+                    ranked = {one.report.host for one in told or ()}
+
+        self._eye.run(heard())
 
     def idle(self, *rcs: str) -> bool:
         """Returns when nobody holds or waits for these RCs."""

@@ -15,7 +15,7 @@ import subprocess
 import sys
 import termios
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
@@ -40,6 +40,33 @@ def zscout(*args: object, env: Mapping[str, str] | None = None, stdin: str = "")
     """Runs it in a pipe, to its end."""
     command = [*COMMAND, *map(str, args)]
     return subprocess.run(command, env=env, input=stdin, capture_output=True, text=True, timeout=HANG)
+
+
+def zscout_until(
+    condition: Callable[[subprocess.CompletedProcess[str]], object],
+    *args: object,
+    env: Mapping[str, str] | None = None,
+    stdin: str = "",
+) -> subprocess.CompletedProcess[str]:
+    """Runs it again until what came of it is so, as people do: a session that was just opened sees one host after the
+    other, and each has a second or two for its answer."""
+    began = time.monotonic()
+    while not condition(done := zscout(*args, env=env, stdin=stdin)):
+        assert time.monotonic() - began < HANG, done
+    return done
+
+
+def program_until_in_time(
+    *command: str, env: Mapping[str, str], cwd: Path | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Runs a program that holds and commands to its end, again where it says that a node which stood still was too
+    late: to confirm its grant within a second, or to do as it is told within one."""
+    began = time.monotonic()
+    while True:
+        done = subprocess.run(command, env=env, cwd=cwd, capture_output=True, text=True, timeout=HANG)
+        late = any(word in done.stderr for word in ("CommandRefused: ", "Revoked: ", "NoRcm: "))
+        if done.returncode == 0 or not late or time.monotonic() - began > HANG:
+            return done
 
 
 def by(command: str) -> str:
@@ -68,6 +95,13 @@ def zscout_here(*args: object) -> int:
 async def zscout_soon(*args: object, env: Mapping[str, str]) -> subprocess.CompletedProcess[str]:
     """The same, while this process's own clients go on."""
     return await asyncio.to_thread(zscout, *args, env=env)
+
+
+async def zscout_soon_until(
+    condition: Callable[[subprocess.CompletedProcess[str]], object], *args: object, env: Mapping[str, str]
+) -> subprocess.CompletedProcess[str]:
+    """`zscout_until`, while this process's own clients go on."""
+    return await asyncio.to_thread(zscout_until, condition, *args, env=env)
 
 
 class Terminal:
@@ -176,6 +210,11 @@ def out_of(process: subprocess.Popen[str]) -> IO[str]:
 def events(text: str) -> list[dict[str, Any]]:
     """What `--json` printed, line by line."""
     return [json.loads(line) for line in text.splitlines()]
+
+
+def course(text: str) -> list[dict[str, Any]]:
+    """The same without how it waited: an RC that stood still confirms a grant too late, which is asked for again."""
+    return [event for event in events(text) if event["event"] not in ("waits", "settling")]
 
 
 def gone(pid: int) -> bool:

@@ -85,6 +85,12 @@ class Machine:
         assert done.returncode == 0, f"{command}: {done.stdout}{done.stderr}\n{self.log()}"
         return done.stdout
 
+    def until_says(self, text: str, *command: str) -> None:
+        """Runs a program there until it ends with 0 and writes that: what it asks may not have begun."""
+        end = time.monotonic() + HANG
+        while (done := self._run(*command)).returncode or text not in done.stdout:
+            assert time.monotonic() < end, f"{command}: {done.stdout}{done.stderr}\n{self.log()}"
+
     def fails(self, *command: str, timeout: float = HANG) -> str:
         """Runs a program that has to fail; returns what it says of it."""
         done = self._run(*command, timeout=timeout)

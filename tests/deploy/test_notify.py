@@ -48,7 +48,7 @@ def test_a_node_says_that_it_is_ready_that_it_lives_and_that_it_ends(tmp_path: P
                 node = start(lab, heard, "anvil", TABLE % told)
                 ready = await heard.until("READY")
                 assert ready["STATUS"] == f"anvil is on the mesh of fleet {lab.fleet.name}"
-                assert ready["STATUS"] in lab.log("anvil")
+                await lab.logged("anvil", ready["STATUS"])
                 for _ in range(BEATS):
                     assert await heard.until("WATCHDOG") == {"WATCHDOG": "1"}
                 # Another one that speaks as often is the clock.
@@ -105,7 +105,7 @@ def test_hangup_reads_the_files_again_and_never_ends_the_node(tmp_path: Path) ->
                     node.send_signal(signal.SIGHUP)
                     await heard.until("RELOADING")
                     assert said in (await heard.until("READY"))["STATUS"]
-                    assert said in lab.log("anvil")
+                    await lab.logged("anvil", said)
                 # In its last moments too.
                 node.terminate()
                 while node.poll() is None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import os
 import shutil
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -24,7 +23,9 @@ from tests.drivers.mjpeg import numbered
 from tests.hang import HANG
 from tests.live.closed import make_keys
 from tests.live.lab import Lab
+from tests.ports import free_port
 from zscout.behaviors.client.client import Client
+from zscout.cli.common import NobodyThere
 from zscout.config.certificate_authority import CertificateAuthority
 from zscout.config.fleet import load_fleet
 from zscout.keyexpr import Role
@@ -107,7 +108,7 @@ def machine(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mach
     folder.chmod(0o755)
     with Machine(folder) as machine:
         machine.write("/etc/zscout/fleet.toml", lab.fleet_file.read_text())
-        machine.write("/etc/zscout/node.toml", NODE % (20_000 + os.getpid() % 10_000))
+        machine.write("/etc/zscout/node.toml", NODE % free_port())
         film(machine.path("/etc/zscout/film.avi"))
         yield machine
 
@@ -129,6 +130,9 @@ def test_a_node_does_all_that_it_does_as_its_unit_has_it(machine: Machine, lab: 
     assert (status["NoNewPrivs"], status["Seccomp"]) == ("1", "2")
     assert "0" not in status["Uid"].split()
 
+    def saw_the_rcm(done: subprocess.CompletedProcess[str]) -> bool:
+        return done.returncode != NobodyThere.exit_code
+
     async def story() -> None:
         async with lab:
             client = await lab.client()
@@ -136,11 +140,13 @@ def test_a_node_does_all_that_it_does_as_its_unit_has_it(machine: Machine, lab: 
             # The framegrabber publishes while it is held: until a line comes out of the pipe.
             until = ("--", "sh", "-c", f"read line <{pipe}")
             with closing(client.mesh.frames(client.mesh.keys.frame("framegrabber/f"))) as frames:
-                holding = asyncio.create_task(tools.zscout_soon("request", *RCS, *until, env=lab.env))
+                holding = asyncio.create_task(
+                    tools.zscout_soon_until(saw_the_rcm, "request", *RCS, *until, env=lab.env)
+                )
                 assert await frames.next(HANG) is not None
                 await asyncio.to_thread(pipe.write_text, "enough\n")
                 assert (held := await holding).returncode == 0, held.stderr
-            started = await tools.zscout_soon("start", "counter", env=lab.env)
+            started = await tools.zscout_soon_until(saw_the_rcm, "start", "counter", env=lab.env)
             assert started.returncode == 0, started.stderr
 
     asyncio.run(story())
@@ -163,7 +169,7 @@ def test_reload_goes_on_and_a_bad_file_is_told(machine: Machine) -> None:
 
 @pytest.mark.live
 def test_a_frozen_node_is_started_anew_and_one_with_a_bad_file_is_not(machine: Machine) -> None:
-    drop_in = "[Service]\nWatchdogSec=3\nTimeoutAbortSec=1\nExecStopPost=sh -c 'echo ended: $SERVICE_RESULT'\n"
+    drop_in = "[Service]\nWatchdogSec=8\nTimeoutAbortSec=1\nExecStopPost=sh -c 'echo ended: $SERVICE_RESULT'\n"
     machine.write("/etc/systemd/system/zscout-node.service.d/zz-soon.conf", drop_in)
     machine.write("/etc/zscout/node.toml", SMALL)
     machine.run("systemctl", "daemon-reload")
@@ -205,8 +211,7 @@ def test_a_certificate_that_ends_soon_is_among_what_failed(machine: Machine, tmp
 
 @pytest.mark.live
 def test_the_sample_relay_joins_two_sites_as_its_unit_has_it(machine: Machine, tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        endpoint = f"tls/127.0.0.1:{free.getsockname()[1]}"
+    endpoint = f"tls/127.0.0.1:{free_port()}"
     sample = PROJECT / "deploy" / "sample"
     text = with_sites((sample / "fleet.toml").read_text())
     machine.write("/etc/zscout/fleet.toml", text.replace("[mesh]", "[mesh]\nmulticast = false"))

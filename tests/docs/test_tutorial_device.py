@@ -13,7 +13,8 @@ import pytest
 from tests.cli import tools
 from tests.hang import HANG
 from tests.live.lab import Lab
-from tests.live.test_recorder import ended, free_port, recorded, recording, until
+from tests.live.test_recorder import ended, recorded, recording, until
+from tests.ports import free_port
 from tests.services.recorder.paper_run import lanes, rows
 
 PAGE = (Path(__file__).parents[2] / "docs" / "tutorial-device.md").read_text()
@@ -77,20 +78,17 @@ def test_a_device_of_ones_own_is_held_commanded_and_on_the_timeline(
             program, _, rest = request.partition(" --name ")
             assert (program, rest.split()[:2]) == ("zscout request lamp/desk", ["reading", "--"])
             script = rest.partition("sh -c ")[2].strip("'")
-            held = await tools.zscout_soon(
-                "request", "lamp/desk", "--name", "reading", "--", "sh", "-c", script, env=lab.env
-            )
+            ask = ("request", "lamp/desk", "--name", "reading", "--", "sh", "-c", script)
+            held = await tools.zscout_soon_until(lambda done: done.returncode != 3, *ask, env=lab.env)
             assert (held.returncode, held.stdout.splitlines()[-1:]) == (0, ["I hold lamp/desk"]), held.stderr
 
-            blinked = await asyncio.to_thread(
-                subprocess.run, [sys.executable, "blink.py"], env=lab.env, capture_output=True, text=True, timeout=HANG
-            )
+            blink_py = (sys.executable, "blink.py")
+            blinked = await asyncio.to_thread(tools.program_until_in_time, *blink_py, env=lab.env)
             assert blinked.returncode == 0, blinked.stderr
             assert blinked.stdout == blocks("text")[0]
             await lab.held_by(client, "lamp/desk")
             await until(lambda: lamp.read_text() == "0\n")
-            status = await tools.zscout_soon("status", env=lab.env)
-            assert "lamp/desk" in status.stdout
+            await tools.zscout_soon_until(lambda done: "lamp/desk" in done.stdout, "status", env=lab.env)
             await recorded(
                 tmp_path / "runs",
                 lambda path: {50.0, 200.0, 0.0} <= bright(path) and "blink" in str(lanes(path, "/rc/**")),

@@ -112,7 +112,7 @@ def test_a_stalled_stream_is_opened_again() -> None:
     with MjpegServer() as server, capturing(server.url, read_timeout=0.4) as capture:
         before = later(capture)
         server.mode = "stall"
-        until(lambda: capture.stalls == 1)
+        until(lambda: capture.stalls >= 1)
         until(lambda: re.match(r"no picture from http://127\.0\.0\.1:.* 0\.4 s", capture.health) is not None)
         server.mode = "run"
         after = picture_of(capture, capture.number)
@@ -141,8 +141,9 @@ def test_half_a_picture_is_no_picture(mode: str) -> None:
     # The number stands in either half: FFmpeg fills what is missing from an older picture.
     twice = 257
     with (
-        MjpegServer(picture=lambda number: jpeg(numbered(twice * number) + texture)) as server,
-        capturing(server.url, open_timeout=0.4, read_timeout=0.4) as capture,
+        # So slow that this is over before there are too many for 16 bits.
+        MjpegServer(rate=8, picture=lambda number: jpeg(numbered(twice * number) + texture)) as server,
+        capturing(server.url, open_timeout=0.8, read_timeout=0.8) as capture,
     ):
         seen = picture_of(capture)
         server.mode = mode
@@ -183,10 +184,9 @@ def test_the_first_picture_may_be_garbled() -> None:
 def test_a_page_that_is_not_there_is_told_and_tried_again_ever_more_rarely() -> None:
     with MjpegServer() as server:
         server.mode = "404"
+        began = time.monotonic()
         with capturing(server.url) as capture:
-            until(lambda: server.accepted >= 1)
-            began, accepted = time.monotonic(), server.accepted
-            until(lambda: server.accepted >= accepted + 2)
+            until(lambda: server.accepted >= 3)
             # 0.2 and 0.4 s: a busy machine makes it longer, never shorter.
             assert time.monotonic() - began > 0.5
             assert "can't be opened" in capture.health

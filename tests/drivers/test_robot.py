@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.drivers.post import GANG, TURN, held, is_in
+from tests.drivers.post import GANG, TURN, held, is_in, obeyed
 from tests.drivers.ptys import PtyLine
 from tests.hang import HANG
 from tests.live.bench import answer
@@ -67,7 +67,7 @@ def test_a_second_node_that_offers_a_held_robot_leaves_it_alone(tmp_path: Path) 
             client = await lab.client()
             await lab.ready(client, "robot/r1", "radio/rf0", "video/ch1")
             _, grant = await held(client, "drives", GANG)
-            assert await answer(client.command("robot/r1", grant, TURN)) == "done"
+            assert await answer(obeyed(client, "robot/r1", grant, TURN)) == "done"
             # Until it drives, the halt from before it was held is repeated.
             await line.until(is_in(DrivePacket))
             halts = [packet for packet in line.packets if isinstance(packet, HaltPacket)]
@@ -75,7 +75,7 @@ def test_a_second_node_that_offers_a_held_robot_leaves_it_alone(tmp_path: Path) 
             await lab.logged("other", "robot/r1 stands by: duplicate of robot/r1 at cart")
             await lab.logged("other", "other is on the mesh")
             for _ in range(20):
-                assert await answer(client.command("robot/r1", grant, TURN)) == "done"
+                assert await answer(obeyed(client, "robot/r1", grant, TURN)) == "done"
                 await asyncio.sleep(0.1)
             assert [packet for packet in line.packets if isinstance(packet, HaltPacket)] == halts
 
@@ -95,7 +95,7 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
             assert isinstance(await line.until(lambda packets: packets and packets[0]), HaltPacket)
 
             def drive(grant: Grant, **how: Any) -> Any:
-                return client.command("robot/r1", grant, TURN | how)
+                return obeyed(client, "robot/r1", grant, TURN | how)
 
             async def driving(order: Awaitable[Any]) -> int:
                 """Waits until the robot drives by this order; what it hears from then on has this number."""
@@ -115,10 +115,10 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
                 pytest.approx(-0.5, abs=0.01),
                 0.3,
             )
-            await client.command("robot/r1", grant, {"name": "camera", "on": True})
+            await obeyed(client, "robot/r1", grant, {"name": "camera", "on": True})
             await line.until(transmitting(1), since=since)
             since = len(line.heard)
-            await client.command("robot/r1", grant, {"name": "camera", "on": False})
+            await obeyed(client, "robot/r1", grant, {"name": "camera", "on": False})
             await line.until(transmitting(0), since=since)
 
             for do, word in (
@@ -128,17 +128,17 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
                 ({"name": "camera"}, "bad_command"),
                 ({"name": "halt"}, "unknown_command"),
             ):
-                assert await answer(client.command("robot/r1", grant, do)) == word
+                assert await answer(obeyed(client, "robot/r1", grant, do)) == word
 
             # A command that lasts, and no other: the dead man's stop.
             began = clock.now()
             since = await driving(drive(grant))
             await line.until(is_in(StopPacket), since=since)
             assert line_time(line, StopPacket, since) - began > 0.4 * SECOND
-            await client.command("robot/r1", grant, TURN | {"left": 0, "right": 0})
+            await obeyed(client, "robot/r1", grant, TURN | {"left": 0, "right": 0})
 
             # The hold ends while it drives.
-            since = await driving(client.command("robot/r1", grant, TURN))
+            since = await driving(obeyed(client, "robot/r1", grant, TURN))
             began = clock.now()
             await client.end(arc)
             await line.until(is_in(HaltPacket), since=since)
@@ -150,7 +150,7 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
             # Taken over while it drives.
             again, grant = await held(client, "patrol", GANG)
             operator = await lab.client()
-            since = await driving(client.command("robot/r1", grant, TURN))
+            since = await driving(obeyed(client, "robot/r1", grant, TURN))
             began = clock.now()
             over, his = await held(operator, "operator", GANG, priority=10)
             await line.until(is_in(HaltPacket), since=since)
@@ -158,7 +158,7 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
             await lab.held_by(client, "robot/r1", "operator")
             assert await answer(drive(grant)) == "ended"
             # No halt of the earlier hold, repeated or late, stops the robot under the next one.
-            since = await driving(operator.command("robot/r1", his, TURN))
+            since = await driving(obeyed(operator, "robot/r1", his, TURN))
             await line.until(is_in(StopPacket), since=since)
             assert HaltPacket not in {type(packet) for packet in line.packets[since:]}
             await operator.end(over)
@@ -167,7 +167,7 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
             holder = await brief
             await holder.order("ask", arc="brief", needs=GANG, priority=5, min_runtime=600)
             await holder.event("entered")
-            since = await driving(holder.order("command", rc="robot/r1", do=TURN))
+            since = await driving(holder.order("command", rc="robot/r1", do=TURN, ttl=10))
             began = holder.kill()
             await line.until(is_in(HaltPacket), since=since)
             worst.append(("client killed", line_time(line, HaltPacket, since) - began))
@@ -175,7 +175,7 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
             # The robot's node is killed while it drives: its radio halts what was driven under the hold.
             patrol = await client.granted(again)
             assert patrol is not None
-            since = await driving(client.command("robot/r1", patrol, TURN))
+            since = await driving(obeyed(client, "robot/r1", patrol, TURN))
             figures = (await lab.rc(client, "robot/r1")).figures
             assert figures["commands"] >= 5
             assert figures["halts"] >= 3
@@ -188,7 +188,7 @@ def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_i
         assert max(wait for _, wait in worst) < HANG * SECOND
         line.unplug()
 
-    asyncio.run(asyncio.wait_for(story(), HANG))
+    asyncio.run(asyncio.wait_for(story(), 3 * HANG))
 
 
 @pytest.mark.parametrize("said", [True, False])
@@ -204,16 +204,16 @@ def test_a_camera_that_warmed_up_under_one_hold_stays_on_in_the_one_that_continu
             client = await lab.client()
             await lab.ready(client, *GANG, "framegrabber/f")
             warm, grant = await held(client, "warm", GANG, priority=-1, min_runtime=0.01)
-            await client.command("robot/r1", grant, {"name": "camera", "on": True})
+            await obeyed(client, "robot/r1", grant, {"name": "camera", "on": True})
             await line.until(transmitting(1))
             since = len(line.heard)
             more = GANG | {"framegrabber/f": {}}
             arc, watching = await held(client, "watch", more, priority=0, continues=warm.name if said else "")
-            await client.command("robot/r1", watching, TURN)
+            await obeyed(client, "robot/r1", watching, TURN)
             await line.until(is_in(DrivePacket), since=since)
             kinds = {type(packet) for packet in line.packets[since:]}
             assert (HaltPacket in kinds) is not said
-            assert await answer(client.command("robot/r1", grant, TURN)) == "ended"
+            assert await answer(obeyed(client, "robot/r1", grant, TURN)) == "ended"
             # And as ever when nobody holds it any more.
             since = len(line.heard)
             await client.end(warm)
@@ -221,7 +221,7 @@ def test_a_camera_that_warmed_up_under_one_hold_stays_on_in_the_one_that_continu
             await line.until(is_in(HaltPacket), since=since)
         line.unplug()
 
-    asyncio.run(asyncio.wait_for(story(), HANG))
+    asyncio.run(asyncio.wait_for(story(), 3 * HANG))
 
 
 def turning(packets: list[Packet]) -> Packet | None:

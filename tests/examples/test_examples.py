@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -12,7 +11,6 @@ import pytest
 
 from tests.cli import tools
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.hang import HANG
 from zscout.config.fleet import load_fleet
 from zscout.config.node import load_node
 
@@ -35,8 +33,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
     ],
 )
 def test_a_program_holds_and_commands(fleet: CliFleet, program: str, words: list[str]) -> None:
-    command = [sys.executable, str(EXAMPLES / program)]
-    done = subprocess.run(command, env=fleet.lab.env, capture_output=True, text=True, check=False, timeout=HANG)
+    done = tools.program_until_in_time(sys.executable, str(EXAMPLES / program), env=fleet.lab.env)
     assert done.returncode == 0, done.stderr
     for word in words:
         assert word in done.stdout

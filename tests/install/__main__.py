@@ -19,9 +19,11 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final
 
+from tests.cli.tools import program_until_in_time
 from tests.deploy.machine import Machine, missing
 from tests.docs.test_tutorial_device import files
 from tests.hang import HANG
+from tests.ports import free_port
 from zscout.config.certificate_authority import CertificateAuthority
 from zscout.keyexpr import new_instance
 
@@ -114,10 +116,11 @@ class Fleet:
     def __init__(self, programs: Path, folder: Path) -> None:
         self.programs, self.folder = programs, folder
         folder.mkdir()
-        port = 20_000 + os.getpid() % 40_000
+        # Leases that outlast a process that stands still for a second or two, and votes that come within that.
         (folder / "fleet.toml").write_text(
             f'[fleet]\nname = "install-{new_instance()}"\n'
-            f'[mesh]\nmulticast_address = "224.0.0.224:{port}"\ninterface = "lo"\n'
+            f'[mesh]\nmulticast_address = "224.0.0.224:{free_port()}"\ninterface = "lo"\nlease = 10.0\n'
+            "[timing]\nhold_lease = 30.0\nrebuild = 2.0\nvote_timeout = 2.0\n"
         )
 
     def file(self, rcs: str) -> Path:
@@ -150,13 +153,16 @@ class Fleet:
             node.kill()
             node.wait()
 
-    def request(self, *args: str) -> subprocess.CompletedProcess[str]:
-        """Asks until the node is there and serves it."""
+    def until(self, *args: str, said: str = "") -> subprocess.CompletedProcess[str]:
+        """Runs a command until the node is there and serves it, and it says that."""
         deadline = time.monotonic() + HANG
-        while (done := self.zscout("request", *args, check=False)).returncode:
+        while (done := self.zscout(*args, check=False)).returncode or said not in done.stdout:
             log = (self.folder / "node.log").read_text()
-            expect(time.monotonic() < deadline, f"request {args}: {done.returncode} {done.stderr}\n{log}")
+            expect(time.monotonic() < deadline, f"{args}: {done.returncode} {done.stdout}{done.stderr}\n{log}")
         return done
+
+    def request(self, *args: str) -> subprocess.CompletedProcess[str]:
+        return self.until("request", *args)
 
 
 @contextmanager
@@ -219,9 +225,9 @@ def check_light(programs: Path, folder: Path) -> None:
             "    print(held.command('robot/a', {'name': 'echo', 'value': 'hello'}))\n"
         )
         env = CLEAN | {"ZSCOUT_FLEET": str(folder / "fleet.toml")}
-        said = run(programs / "python", "-c", client, cwd=folder, env=env)
-        expect(said.stdout == "hello\n", f"the client got {said.stdout!r}")
-        expect("psu/bench" in fleet.zscout("status").stdout, "status does not show it")
+        said = program_until_in_time(str(programs / "python"), "-c", client, env=env, cwd=folder)
+        expect(said.stdout == "hello\n", f"the client got {said.stdout!r}{said.stderr}")
+        fleet.until("status", said="psu/bench")
     told = (folder / "told").read_text().split()
     expect(told[:4] == ["safe", "start", "stop", "safe"], f"the commands were run as {told}")
     # What is missing is named, with the command that brings it.
@@ -260,8 +266,7 @@ def check_host(wheel: Path, folder: Path) -> None:
         expect("/etc/zscout/node.toml" in said and "/etc/systemd/system/zscout-node.service" in said, said)
         host.until("zscout-node", ActiveState="active", SubState="running", UnitFileState="enabled")
         host.until("zscout-cert-renew.timer", ActiveState="active", UnitFileState="enabled")
-        status = host.run("zscout", "status")
-        expect("anvil" in status, f"status says {status}")
+        host.until_says("anvil", "zscout", "status")
         files = ("/etc/zscout", "/etc/zscout/keys", "/etc/zscout/renew-certificate", "/etc/zscout/keys/key.pem")
         modes = host.run("stat", "-c", "%a %U:%G", *files).splitlines()
         expect(modes == ["755 root:root", "750 root:zscout", "755 root:root", "640 root:zscout"], f"modes are {modes}")

@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 
 from msgspec.structs import replace
 
+from tests.hang import HANG
 from tests.mesh import kit
 from tests.mesh.kit import until
 from zscout import messages
@@ -23,7 +24,7 @@ from zscout.mesh.transport import Collector
 from zscout.messages import Message
 from zscout.types import SECOND
 
-LONG = 10.0
+LONG = HANG
 """Seconds: a timeout that nothing should reach."""
 SHORT = 0.3
 """Seconds: a timeout that is meant to be reached."""
@@ -78,7 +79,8 @@ class World:
 
 class Zenoh(World):
     _ports: list[int]
-    lease = MeshConfig().lease
+    lease = 10.0
+    """Seconds: the process of all of them may stand still for some."""
 
     async def _open(self, me: Sender) -> Mesh:
         self._ports = getattr(self, "_ports", [])

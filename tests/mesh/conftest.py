@@ -8,6 +8,7 @@ from contextlib import AsyncExitStack
 
 import pytest
 
+from tests.hang import HANG
 from tests.mesh import kit
 from tests.mesh.both_meshes import Memory, Story, Zenoh
 
@@ -16,7 +17,7 @@ from tests.mesh.both_meshes import Memory, Story, Zenoh
 def play(request: pytest.FixtureRequest) -> Callable[[Story], None]:
     def play(story: Story) -> None:
         async def main() -> None:
-            async with AsyncExitStack() as stack, asyncio.timeout(60):
+            async with AsyncExitStack() as stack, asyncio.timeout(2 * HANG):
                 await story(request.param(stack))
 
         (kit.run if request.param is Memory else asyncio.run)(main())

@@ -5,11 +5,12 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
+from tests.hang import HANG
 from zscout.lab.faults.virtual_time import run
 
 __all__ = ["run", "until"]
 
-WITHIN = 20.0
+WITHIN = HANG
 """Seconds in which anything that is waited for must have come true, on a busy machine."""
 
 

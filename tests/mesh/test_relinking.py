@@ -52,7 +52,7 @@ class _World:
         port = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
         port.bind(("127.0.0.1", 0))  # held, so that no other test on this machine is given its number
         address = f"224.0.0.224:{port.getsockname()[1]}"
-        self._config = MeshConfig(multicast_address=address, interface="lo", lease=0.5, site="a")
+        self._config = MeshConfig(multicast_address=address, interface="lo", lease=10.0, site="a")
         self._peers: list[ZenohTransport] = []
         self._connect: list[str] = []
 

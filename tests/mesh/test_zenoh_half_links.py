@@ -14,8 +14,10 @@ from contextlib import ExitStack, suppress
 import pytest
 import zenoh
 
+from tests.hang import HANG
+from tests.ports import free_port
+
 HOST = "127.0.0.1"
-WITHIN = 10.0
 
 
 def _open(stack: ExitStack, listen: list[str], connect: list[str]) -> zenoh.Session:
@@ -29,12 +31,6 @@ def _open(stack: ExitStack, listen: list[str], connect: list[str]) -> zenoh.Sess
     }.items():
         settings.insert_json5(key, json.dumps(value))
     return stack.enter_context(zenoh.open(settings))
-
-
-def _free_port() -> int:
-    with socket.socket() as one:
-        one.bind((HOST, 0))
-        return int(one.getsockname()[1])
 
 
 class _Relay:
@@ -69,7 +65,7 @@ class _Relay:
 
 
 def _until(condition: Callable[[], object]) -> None:
-    deadline = time.monotonic() + WITHIN
+    deadline = time.monotonic() + HANG
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.005)
@@ -82,7 +78,7 @@ def stack() -> Iterator[ExitStack]:
 
 
 def test_what_was_declared_stays_unknown_where_one_end_alone_lost_the_link(stack: ExitStack) -> None:
-    ports = {"a": _free_port(), "b": _free_port()}
+    ports = {"a": free_port(), "b": free_port()}
     own = {name: f"tcp/{HOST}:{port}" for name, port in ports.items()}
     a = _open(stack, [own["a"]], [])
     relay = _Relay(stack, ports["a"])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from datetime import datetime, timedelta
+import time
+from datetime import datetime
 from decimal import Decimal
 from zoneinfo import ZoneInfo
 
@@ -68,9 +69,10 @@ def test_hours_that_a_day_has_not_or_twice_are_told() -> None:
 
 
 def test_a_year_of_days_is_told_in_a_moment() -> None:
-    began = datetime.now(BERLIN)
+    # In the time that this process ran.
+    began = time.process_time()
     asked("2026-12-01 14:00", 1).remarks()
-    assert datetime.now(BERLIN) - began < timedelta(seconds=2)
+    assert time.process_time() - began < 2
 
 
 AT = ("--for", "1h", "--at", "tue 14:00")

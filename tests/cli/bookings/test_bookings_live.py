@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import end, read_until
+from tests.cli.tools import end
 from tests.hang import HANG
 from zscout.behaviors.client.blocking import connect
 from zscout.behaviors.client.bookings import BookingsClient
@@ -78,9 +78,9 @@ def test_booked_listed_found_taken_up_and_given_up(fleet: CliFleet) -> None:
     assert line == "zscout: within 2 h there is no time at which all are free together\n"
 
     # Taken up before its date it waits; given up, it goes on waiting as any other.
-    waiting = fleet.start("request", "--booking", "survey", "--", "sleep", "1")
+    waiting, said_first = fleet.begun("survey waits", "request", "--booking", "survey", "--", "sleep", "1")
     try:
-        waits = read_until(waiting, "survey waits")[-1]
+        waits = said_first[-1]
         assert re.search(
             r"waits: the time of its booking is still to come; starts at .* \(in 2 h 59 min\)|\(in 3 h\)", waits
         )
@@ -156,9 +156,9 @@ def test_what_is_repeated_is_given_up_date_by_date(fleet: CliFleet) -> None:
 def test_who_would_run_into_maintenance_is_told_until_when(fleet: CliFleet) -> None:
     made = said(fleet, "maintain", "robot/c", "--at", "in 10m", "--for", "1h", "--comment", "new gripper")
     assert re.search(r"^maintenance \([0-9a-f]{8}\) is kept free: robot/c: .* in 1\d min", made)
-    waiting = fleet.start("request", "robot/c", "--min-runtime", "20m")
+    waiting, said_first = fleet.begun("request waits", "request", "robot/c", "--min-runtime", "20m")
     try:
-        waits = read_until(waiting, "request waits")[-1]
+        waits = said_first[-1]
         assert re.search(r"^request waits: maintenance of robot/c by .*, until .* at the latest; starts at ", waits)
     finally:
         end(waiting)

@@ -7,13 +7,14 @@ import re
 import subprocess
 import threading
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.behaviors.components.kit import ROOT
+from tests.cli import tools
 from tests.cli.cli_fleet import CliFleet
 from tests.cli.tools import end, out_of, read_until
 from tests.hang import HANG
@@ -32,6 +33,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
         fleet.lab.node("anvil", "robot/a")
         fleet.lab.node("bellows", "robot/b")
         fleet.state(lambda state: {view.rc for view in state.rcs if view.present} == {"robot/a", "robot/b"})
+        fleet.balanced("anvil", "bellows")
         yield fleet
     finally:
         fleet.close()
@@ -73,6 +75,31 @@ def follow(fleet: CliFleet, name: str, *args: str) -> subprocess.Popen[str]:
     return process
 
 
+def counted(follower: subprocess.Popen[str], number: int) -> list[str]:
+    """The lines up to the first count that is so high: what a process says of its standing still has digits, too."""
+    lines: list[str] = []
+    for line in out_of(follower):
+        lines.append(line.rstrip("\n"))
+        if numbers(line) and numbers(line)[0] >= number:
+            return lines
+    raise AssertionError(f"it never counted to {number}: {lines}")
+
+
+def kept_by(fleet: CliFleet, host: str, name: str, *, until: Callable[[list[int]], object] = bool) -> list[int]:
+    """What the counter that ran there last has counted, as its host keeps it; as soon as that is so."""
+    logs = ("logs", name, "--host", host)
+    return numbers(tools.zscout_until(lambda done: until(numbers(done.stdout)), *logs, env=fleet.lab.env).stdout)
+
+
+def migrate(fleet: CliFleet, *args: str) -> subprocess.CompletedProcess[str]:
+    """Asks for a move, again where no host would do: one that stood still has not reported its load lately."""
+
+    def begun(done: subprocess.CompletedProcess[str]) -> bool:
+        return "can't move there" not in done.stderr and "no other host will do" not in done.stderr
+
+    return tools.zscout_until(begun, "migrate", *args, env=fleet.lab.env)
+
+
 def told(done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
     assert done.returncode == 0, done.stderr
     found: dict[str, Any] = json.loads(done.stdout)
@@ -83,13 +110,15 @@ def test_migrating_keeps_the_count_and_followed_output_goes_along(fleet: CliFlee
     here = start(fleet, "wanderer", "--set", "period=0.02", "--set", "rc=robot/a")
     there = OTHER[here]
     follower = follow(fleet, "wanderer")
-    read_until(follower, "20")
+    lines = counted(follower, 20)
 
-    went = fleet.zscout("migrate", "wanderer", "--to", there)
+    went = migrate(fleet, "wanderer", "--to", there)
     assert (went.returncode, went.stderr) == (0, "")
     assert re.fullmatch(rf"wanderer went from {here} to {there}, out of work for \d+ ms", went.stdout.splitlines()[-1])
-    lines = read_until(follower, f"-- wanderer goes on on {there}")
-    back = told(fleet.zscout("migrate", "wanderer", "--json"))
+    lines += read_until(follower, f"-- wanderer goes on on {there}")
+    (begins, *_) = kept_by(fleet, there, "wanderer")
+    first = kept_by(fleet, here, "wanderer", until=lambda counts: counts[-1:] == [begins - 1])
+    back = told(migrate(fleet, "wanderer", "--json"))
     assert (back["from"], back["host"], back["moves"]) == (there, here, 2)
     assert 0 < back["dead"] < HANG
     lines += read_until(follower, f"-- wanderer goes on on {here}")
@@ -98,19 +127,26 @@ def test_migrating_keeps_the_count_and_followed_output_goes_along(fleet: CliFlee
     assert follower.wait(HANG) == 0
     lines += out_of(follower).read().splitlines()
     assert lines[-1].startswith("-- wanderer has ended")
+    # Every count once and in order, over three processes on two hosts, as these have kept it.
+    third = kept_by(fleet, here, "wanderer")
+    second = kept_by(fleet, there, "wanderer", until=lambda counts: counts[-1:] == [third[0] - 1])
+    kept = [*first, *second, *third]
+    assert kept == list(range(1, kept[-1] + 1))
+    # Who follows misses what came last on a host that stood still as it was asked for that, and nothing comes twice.
     counts = numbers("\n".join(lines))
-    # Every count once and in order, over three processes on two hosts.
-    assert counts == list(range(counts[0], counts[-1] + 1))
+    assert counts == sorted(set(counts))
+    assert set(counts) <= set(kept)
+    assert counts[-1] == kept[-1]
 
 
 def test_the_example_of_the_docs_moves_with_its_hold(fleet: CliFleet) -> None:
     done = fleet.zscout("start", "survey", "--set", "robot=robot/a", "--json")
     assert done.returncode == 0, done.stderr
     here = json.loads(done.stdout)["host"]
-    (before,) = fleet.state(lambda state: len(state.holds) == 1).holds
-    moved = fleet.zscout("migrate", "survey")
+    (before,) = fleet.state(lambda state: [hold.arc for hold in state.holds] == ["survey"]).holds
+    moved = migrate(fleet, "survey")
     assert moved.returncode == 0, moved.stderr
-    (after,) = fleet.state(lambda state: len(state.holds) == 1).holds
+    (after,) = fleet.state(lambda state: [hold.client.split("/")[0] for hold in state.holds] == [OTHER[here]]).holds
     assert (before.arc, before.client) == ("survey", f"{here}/{before.client.split('/')[1]}")
     assert (after.id, after.client.split("/")[0]) == (before.id, OTHER[here])
     assert after.held > before.held, "it is the same hold"
@@ -121,10 +157,15 @@ def test_the_example_of_the_docs_moves_with_its_hold(fleet: CliFleet) -> None:
 def test_what_can_not_be_migrated_is_one_line(fleet: CliFleet) -> None:
     here = start(fleet, "stayer")
     assert fleet.zscout("migrate", "stayer", "--to", here).stdout == f"stayer is on {here} already\n"
-    nowhere = fleet.zscout("migrate", "stayer", "--to", "nowhere")
+
+    def both_seen(done: subprocess.CompletedProcess[str]) -> bool:
+        return "anvil, bellows" in done.stderr or "bellows?" in done.stderr
+
+    env = fleet.lab.env
+    nowhere = tools.zscout_until(both_seen, "migrate", "stayer", "--to", "nowhere", env=env)
     assert (nowhere.returncode, nowhere.stdout) == (2, "")
     assert nowhere.stderr.startswith('zscout: --to: there is no host "nowhere"; there are: anvil, bellows')
-    near = fleet.zscout("migrate", "stayer", "--to", "bellow")
+    near = tools.zscout_until(both_seen, "migrate", "stayer", "--to", "bellow", env=env)
     assert (near.returncode, near.stderr) == (2, 'zscout: --to: there is no host "bellow"; did you mean bellows?\n')
     nobody = fleet.zscout("migrate", "stayr")
     assert (nobody.returncode, nobody.stdout) == (1, "")
@@ -141,6 +182,9 @@ def test_drain_empties_a_host_and_names_what_stays(fleet: CliFleet) -> None:
     assert pinned == hosts["one"]
     here, there = pinned, OTHER[pinned]
 
+    fleet.zscout("drain", here, "--timeout", "1")
+    # Why it stays is known to who is told it anew.
+    fleet.shown("components", "--json", until=lambda text: "no other host will do: " in text)
     late = fleet.zscout("drain", here, "--timeout", "3")
     assert late.returncode == 1
     assert late.stderr.startswith(f"zscout: {here} is not empty after 3.0 s: ")
@@ -176,17 +220,18 @@ def numbers(output: str) -> list[int]:
 def test_logs_of_what_runs_and_of_what_has_ended(fleet: CliFleet) -> None:
     here = start(fleet, "speaker", "--set", "period=0.01")
     follower = follow(fleet, "speaker", "--lines", "0")
-    read_until(follower, "50")
+    counted(follower, 50)
     stop(fleet, "speaker")
     assert follower.wait(HANG) == 0
-    every = fleet.zscout("logs", "speaker")
-    assert every.returncode == 0, every.stderr
+
+    def answered(done: subprocess.CompletedProcess[str]) -> bool:
+        return done.returncode == 0
+
+    every = tools.zscout_until(answered, "logs", "speaker", env=fleet.lab.env)
     counts = numbers(every.stdout)
     assert counts == list(range(1, len(counts) + 1))
-    assert (
-        fleet.zscout("logs", "speaker", "--lines", "2", "--host", here).stdout.splitlines()
-        == every.stdout.splitlines()[-2:]
-    )
+    some = tools.zscout_until(answered, "logs", "speaker", "--lines", "2", "--host", here, env=fleet.lab.env)
+    assert some.stdout.splitlines() == every.stdout.splitlines()[-2:]
     elsewhere = fleet.zscout("logs", "speaker", "--host", OTHER[here])
     assert (elsewhere.returncode, elsewhere.stdout) == (1, "")
     assert elsewhere.stderr.startswith(f"zscout: {OTHER[here]} knows no output of speaker; leave --host out")
@@ -204,7 +249,7 @@ def test_followed_output_begins_when_the_component_does(fleet: CliFleet) -> None
     follower = follow(fleet, "later")
     clamp = fleet.lab.node("clamp")
     try:
-        read_until(follower, "1")
+        counted(follower, 1)
         stop(fleet, "later")
         assert follower.wait(HANG) == 0
     finally:
@@ -220,13 +265,13 @@ def test_followed_output_goes_over_when_a_host_dies(fleet: CliFleet) -> None:
     stop(fleet, "first")
     hosts = ("--host", "clamp", "--host", "bellows")
     if start(fleet, "survivor", "--set", "period=0.02", *hosts) != "clamp":
-        assert fleet.zscout("migrate", "survivor").returncode == 0
+        assert migrate(fleet, "survivor").returncode == 0
     follower = follow(fleet, "survivor")
-    read_until(follower, "20")
+    counted(follower, 20)
     clamp.kill()
     lines = read_until(follower, "-- survivor goes on on bellows")
     # It was not handed over: it begins anew.
-    assert numbers("\n".join(read_until(follower, "3")))[0] == 1
+    assert numbers("\n".join(counted(follower, 3))) == [1, 2, 3]
     # What it still wrote there, if that was read before its host died.
     assert all(number > 20 for number in numbers("\n".join(lines[:-1])))
     stop(fleet, "survivor")

@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 import re
 import signal
-import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import pytest
 
 from tests.behaviors.components.kit import ROOT, register_odd_kinds
+from tests.cli import tools
 from tests.cli.cli_fleet import CliFleet
-from tests.cli.tools import read_until, zscout
+from tests.cli.tools import read_until, zscout_until
 from tests.hang import HANG
 from zscout.behaviors.client.blocking import connect
 
@@ -29,6 +29,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
         fleet.lab.env["PYTHONPATH"] = f"{fleet.folder / 'site'}:{ROOT}"
         fleet.lab.node("anvil", "robot/a")
         fleet.state(lambda state: any(view.present for view in state.rcs))
+        fleet.balanced("anvil")
         yield fleet
     finally:
         fleet.close()
@@ -48,20 +49,20 @@ def test_start_list_and_stop(fleet: CliFleet) -> None:
     fleet.state(lambda state: [hold.arc for hold in state.holds] == ["counter"])
 
     # What it needs is measured a little later.
-    until = time.monotonic() + HANG
-    while (one := listed(fleet)[0])["memory"] is None and time.monotonic() < until:
-        pass
+    def measured(text: str) -> bool:
+        (one,) = json.loads(text)["components"]
+        return one["memory"] is not None and one["uptime"] is not None
+
+    (one,) = json.loads(fleet.shown("components", "--json", until=measured))["components"]
     assert (one["component"], one["state"], one["host"], one["movable"]) == ("counter", "running", "anvil", True)
     assert one["spec"]["kind"] == "counter"
     assert one["spec"]["params"] == {"period": 0.1, "rc": "robot/a"}
     assert 0 < one["uptime"] < HANG
     assert one["memory"] > 1_000_000
 
-    plain = fleet.zscout("components")
-    assert re.search(r"^Fleet test-\w+: 1 of 1 run on 1 host$", plain.stdout, re.MULTILINE)
-    assert re.search(
-        r"^counter  counter  running  anvil +[0-9:]+ \([0-9.]+ s\) +0 +0 +[0-9.]+ +\d+ MiB", plain.stdout, re.MULTILINE
-    )
+    row = r"^counter  counter  running  anvil +[0-9:]+ \([0-9.]+ s\) +0 +0 +[0-9.]+ +\d+ MiB"
+    plain = fleet.shown("components", until=lambda text: re.search(row, text, re.MULTILINE))
+    assert re.search(r"^Fleet test-\w+: 1 of 1 run on 1 host$", plain, re.MULTILINE)
 
     again = fleet.zscout("start", "counter", "--set", "period=0.1", "--set", "rc=robot/a")
     assert (again.returncode, again.stdout) == (0, "counter already runs on anvil\n")
@@ -135,17 +136,18 @@ def test_what_is_done_soon_is_no_failure(fleet: CliFleet) -> None:
     done = fleet.zscout("start", "brief", "--set", "how=return", "--json")
     assert (done.returncode, done.stderr) == (0, "")
     assert json.loads(done.stdout)["state"] in ("running", "ended")
-    followed = fleet.zscout("logs", "brief", "--follow")
-    assert (followed.returncode, followed.stdout) == (0, "last words\n")
+    followed = tools.zscout_until(lambda done: done.returncode == 0, "logs", "brief", "--follow", env=fleet.lab.env)
+    # Beside its own words there may be that its process stood still.
+    assert [line for line in followed.stdout.splitlines() if "stood still" not in line] == ["last words"]
     assert followed.stderr.startswith("-- brief has ended")
 
 
 def test_waiting_for_a_host_says_why_and_stays_placed(fleet: CliFleet) -> None:
-    late = fleet.zscout("start", "counter", "--name", "picky", "--label", "gpu", "--timeout", "1")
+    late = fleet.zscout("start", "counter", "--name", "picky", "--label", "gpu", "--timeout", "6")
     assert late.returncode == 1
     assert late.stdout.startswith("picky waits for a host: ")
     assert "gpu" in late.stdout
-    assert late.stderr.startswith("zscout: picky does not run after 1.0 s: waits for a host: ")
+    assert late.stderr.startswith("zscout: picky does not run after 6.0 s: waits for a host: ")
     assert late.stderr.endswith("; picky stays placed; to end it: zscout stop picky\n")
     assert listed(fleet, "picky")[0]["state"] == "waiting"
 
@@ -193,14 +195,14 @@ def test_status_names_components_and_cordoned_hosts(fleet: CliFleet) -> None:
     assert "zscout: anvil is not empty: seen stays (it can't be moved; anvil is drained); " in drained.stderr
     assert fleet.zscout("drain", "anvli").returncode == 1
     # Its process shows itself to a newcomer as soon as both are linked.
-    shown = fleet.shown("status", until=lambda text: ", seen\n" in text)
-    assert re.search(r"^anvil +leads, cordoned .* node, 1 RC, seen$", shown, re.MULTILINE), shown
+    row = r"^anvil +leads, cordoned .* node, 1 RC, seen$"
+    fleet.shown("status", until=lambda text: re.search(row, text, re.MULTILINE))
 
     def anvil(text: str) -> tuple[list[str], bool]:
         (one,) = (host for host in json.loads(text)["hosts"] if host["host"] == "anvil")
         return one["components"], one["cordoned"]
 
-    assert anvil(fleet.shown("status", "--json", until=lambda text: bool(anvil(text)[0]))) == (["seen"], True)
+    fleet.shown("status", "--json", until=lambda text: anvil(text) == (["seen"], True))
     assert fleet.zscout("uncordon", "anvil").stdout == "anvil is used again\n"
     assert "cordoned" not in fleet.zscout("status").stdout
     assert fleet.zscout("stop", "seen").returncode == 0
@@ -209,20 +211,21 @@ def test_status_names_components_and_cordoned_hosts(fleet: CliFleet) -> None:
 def test_tab_offers_components_hosts_and_kinds(fleet: CliFleet) -> None:
     assert fleet.zscout("start", "counter", "--name", "offered").returncode == 0
 
-    def offered(*words: str) -> list[str]:
+    def offers(*words: str, it: Sequence[str]) -> None:
+        """Tab again, until that is offered: at each it looks for two seconds at most."""
         line = {"COMP_WORDS": " ".join(words), "COMP_CWORD": str(len(words) - 1)}
         env = fleet.lab.env | line | {"_ZSCOUT_COMPLETE": "bash_complete"}
-        return zscout(env=env).stdout.split()
+        zscout_until(lambda done: done.stdout.split() == [f"plain,{one}" for one in it], env=env)
 
-    assert offered("zscout", "stop", "off") == ["plain,offered"]
-    assert offered("zscout", "stop", "offered", "off") == []
-    assert offered("zscout", "logs", "off") == ["plain,offered"]
-    assert offered("zscout", "drain", "an") == ["plain,anvil"]
-    assert offered("zscout", "start", "coun") == ["plain,counter"]
-    assert offered("zscout", "request", "ro") == ["plain,robot/a"]
-    assert offered("zscout", "status", "an") == ["plain,anvil"]
-    assert offered("zscout", "status", "anvil", "an") == []
+    offers("zscout", "stop", "off", it=["offered"])
+    offers("zscout", "stop", "offered", "off", it=[])
+    offers("zscout", "logs", "off", it=["offered"])
+    offers("zscout", "drain", "an", it=["anvil"])
+    offers("zscout", "start", "coun", it=["counter"])
+    offers("zscout", "request", "ro", it=["robot/a"])
+    offers("zscout", "status", "an", it=["anvil"])
+    offers("zscout", "status", "anvil", "an", it=[])
     with connect("desk", fleet=fleet.lab.fleet, host="test") as lab, lab.hold("surveying", {"robot/a": {}}):
-        assert offered("zscout", "why", "surv") == ["plain,surveying"]
-        assert offered("zscout", "status", "surv") == ["plain,surveying"]
+        offers("zscout", "why", "surv", it=["surveying"])
+        offers("zscout", "status", "surv", it=["surveying"])
     assert fleet.zscout("stop", "offered").returncode == 0

@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import json
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from tests.cli.fleet.test_status import section
-from tests.cli.tools import COMMAND, zscout_soon
+from tests.cli.tools import COMMAND, zscout_soon_until
 from tests.hang import HANG
 from tests.live.bench import Bench, Stand, until
 from tests.live.lab import Lab
@@ -64,30 +65,44 @@ def test_health_and_figures_of_devices(tmp_path: Path) -> None:
                 watcher.terminate()
                 await watcher.wait()
 
-                plain, every, story, machine = await asyncio.gather(
-                    zscout_soon("status", env=lab.env),
-                    zscout_soon("status", "--devices", env=lab.env),
-                    zscout_soon("why", "look", env=lab.env),
-                    zscout_soon("status", "--json", env=lab.env),
+                ill_row = ["framegrabber/ill", "the lens is dirty", "frames_per_second=9.8, opened=3"]
+
+                def plain(text: str) -> bool:
+                    rows = {row[0]: row[1:] for row in section(text, "RCs")}
+                    return (
+                        rows["framegrabber/ill"] == ["exclusive", "lost", "bench"]
+                        and rows["framegrabber/well"] == ["exclusive", "free", "bench"]
+                        # Without being asked for, only what is wrong is shown.
+                        and section(text, "Devices") == [ill_row]
+                    )
+
+                def every(text: str) -> bool:
+                    return section(text, "Devices") == [ill_row, ["framegrabber/well", "ok", "frames_per_second=4.5"]]
+
+                def why(text: str) -> bool:
+                    told = {"  framegrabber/ill: the lens is dirty", "  robot/a: no other ARC holds it"}
+                    return told <= set(text.splitlines())
+
+                def machine(text: str) -> bool:
+                    rcs = {rc["rc"]: rc for rc in json.loads(text)["rcs"]}
+                    ill, robot = rcs["framegrabber/ill"], rcs["robot/a"]
+                    return (
+                        ill["health"] == "the lens is dirty"
+                        and ill["figures"] == {"frames_per_second": 9.8, "dropped": 0, "opened": 3}
+                        and ill["present"] is False
+                        and (robot["health"], robot["figures"]) == ("ok", {})
+                    )
+
+                def shows(is_so: Callable[[str], bool]) -> Callable[[subprocess.CompletedProcess[str]], bool]:
+                    return lambda done: done.returncode == 0 and is_so(done.stdout)
+
+                # Each RC has half a second to tell a newcomer of its device.
+                await asyncio.gather(
+                    zscout_soon_until(shows(plain), "status", env=lab.env),
+                    zscout_soon_until(shows(every), "status", "--devices", env=lab.env),
+                    zscout_soon_until(shows(why), "why", "look", env=lab.env),
+                    zscout_soon_until(shows(machine), "status", "--json", env=lab.env),
                 )
-                rows = {row[0]: row[1:] for row in section(plain.stdout, "RCs")}
-                assert rows["framegrabber/ill"] == ["exclusive", "lost", "bench"]
-                assert rows["framegrabber/well"] == ["exclusive", "free", "bench"]
-                # Without being asked for, only what is wrong is shown.
-                assert section(plain.stdout, "Devices") == [
-                    ["framegrabber/ill", "the lens is dirty", "frames_per_second=9.8, opened=3"]
-                ]
-                assert section(every.stdout, "Devices") == [
-                    ["framegrabber/ill", "the lens is dirty", "frames_per_second=9.8, opened=3"],
-                    ["framegrabber/well", "ok", "frames_per_second=4.5"],
-                ]
-                assert "  framegrabber/ill: the lens is dirty" in story.stdout.splitlines()
-                assert "  robot/a: no other ARC holds it" in story.stdout.splitlines()
-                rcs = {rc["rc"]: rc for rc in json.loads(machine.stdout)["rcs"]}
-                assert rcs["framegrabber/ill"]["health"] == "the lens is dirty"
-                assert rcs["framegrabber/ill"]["figures"] == {"frames_per_second": 9.8, "dropped": 0, "opened": 3}
-                assert rcs["framegrabber/ill"]["present"] is False
-                assert (rcs["robot/a"]["health"], rcs["robot/a"]["figures"]) == ("ok", {})
 
     asyncio.run(story())
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import json
+import subprocess
 from pathlib import Path
 
 import pytest
 
-from tests.cli.tools import Terminal, zscout_soon
+from tests.cli.tools import Terminal, zscout_soon, zscout_soon_until
 from tests.hang import HANG
 from tests.live.lab import Lab
 from zscout.messages import (
@@ -35,12 +36,7 @@ def test_what_is_listed_lives_and_answers(tmp_path: Path) -> None:
             lab.node("anvil", "robot/a", "radio/rf0:rate=10")
             client = await lab.client("program")
             state = await lab.ready(client, "robot/a", "radio/rf0")
-            shown = json.loads((await zscout_soon("keys", "--json", env=lab.env)).stdout)
-            base = f"zscout/{lab.fleet.name}"
-            assert (shown["fleet"], shown["base"]) == (lab.fleet.name, base)
-            assert shown["links"] >= 1
-            alive = {(one["host"], one["role"], one["name"]): one for one in shown["alive"]}
-            assert set(alive) == {
+            everybody = {
                 ("anvil", "node", "node"),
                 ("anvil", "candidate", "node"),
                 ("anvil", "rcm", "node"),
@@ -51,6 +47,20 @@ def test_what_is_listed_lives_and_answers(tmp_path: Path) -> None:
                 ("anvil", "session", "node"),
                 ("test", "session", "program"),
             }
+
+            def all_seen(done: subprocess.CompletedProcess[str]) -> bool:
+                alive = json.loads(done.stdout)["alive"] if done.returncode == 0 else []
+                seen = {(one["host"], one["role"], one["name"]): one["keys"] for one in alive}
+                # That one RC does not vote is known from the RCM.
+                known = {len(keys) for (_, role, _), keys in seen.items() if role == "rc"} == {4, 5}
+                return seen.keys() == everybody and known
+
+            shown = json.loads((await zscout_soon_until(all_seen, "keys", "--json", env=lab.env)).stdout)
+            base = f"zscout/{lab.fleet.name}"
+            assert (shown["fleet"], shown["base"]) == (lab.fleet.name, base)
+            assert shown["links"] >= 1
+            alive = {(one["host"], one["role"], one["name"]): one for one in shown["alive"]}
+            assert alive.keys() == everybody
             rcm = alive["anvil", "rcm", "node"]
             assert rcm["token"] == f"{base}/alive/anvil/rcm/node/{state.term.rcm}"
             queries = [key["key"] for key in rcm["keys"] if key["how"] == "query"]
@@ -70,13 +80,15 @@ def test_what_is_listed_lives_and_answers(tmp_path: Path) -> None:
                 assert key in served
                 assert await client.mesh.ask_one(key, RcAsk(), RcState, timeout=HANG) is not None
 
-            plain = await zscout_soon("keys", env=lab.env)
+            def the_same(done: subprocess.CompletedProcess[str]) -> bool:
+                lines = [line.split() for line in done.stdout.splitlines()[3:]]
+                listed = {(host, role, name, how, f"{base}/{key}") for host, role, name, how, key, *_ in lines}
+                return {line for line in listed if line[3] != "-"} == {
+                    (*who, key["how"], key["key"]) for who, one in alive.items() for key in one["keys"]
+                }
+
+            plain = await zscout_soon_until(the_same, "keys", env=lab.env)
             assert plain.returncode == 0
-            lines = [line.split() for line in plain.stdout.splitlines()[3:]]
-            listed = {(host, role, name, how, f"{base}/{key}") for host, role, name, how, key, *_ in lines}
-            assert {line for line in listed if line[3] != "-"} == {
-                (*who, key["how"], key["key"]) for who, one in alive.items() for key in one["keys"]
-            }
 
     asyncio.run(story())
 
@@ -87,14 +99,18 @@ def test_at_a_narrow_terminal_every_key_can_be_copied(tmp_path: Path) -> None:
             lab.node("anvil", "robot/a-rather-long-name-for-a-robot")
             client = await lab.client("program")
             await lab.ready(client, "robot/a-rather-long-name-for-a-robot")
-            with Terminal("keys", env=lab.env, columns=80) as terminal:
-                assert await asyncio.to_thread(terminal.code) == 0
-            lines = terminal.text.splitlines()[1:]
-            assert max(map(len, lines)) <= 80
-            assert "…" not in terminal.text
-            begin = next(line for line in lines if line.startswith("HOST")).index("KEY")
-            keys = "".join(line[begin:].strip() for line in lines if "HOST" not in line)
-            assert "rc/robot/a-rather-long-name-for-a-robot/command/*/*" in keys
+            keys = ""
+            async with asyncio.timeout(HANG):
+                # It lists what its session sees in a second or two.
+                while "rc/robot/a-rather-long-name-for-a-robot/command/*/*" not in keys:
+                    with Terminal("keys", env=lab.env, columns=80) as terminal:
+                        if await asyncio.to_thread(terminal.code):
+                            continue
+                    lines = terminal.text.splitlines()[1:]
+                    assert max(map(len, lines)) <= 80
+                    assert "…" not in terminal.text
+                    begin = next(line for line in lines if line.startswith("HOST")).index("KEY")
+                    keys = "".join(line[begin:].strip() for line in lines if "HOST" not in line)
 
     asyncio.run(story())
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import COMMAND, Terminal, by, end, events, named, out_of, read_until
+from tests.cli.tools import COMMAND, Terminal, by, course, end, events, named, out_of, read_until
 from tests.hang import HANG
 
 pytestmark = pytest.mark.live
@@ -58,9 +58,9 @@ def test_without_a_terminal_it_needs_yes(fleet: CliFleet) -> None:
     assert refused.returncode == 1
     assert "add --yes" in refused.stderr
     assert survey.poll() is None
-    taken = fleet.zscout("take", "robot/a", "--yes", "--no-keep", "--min-runtime", "2", "--json")
+    taken = fleet.zscout("take", "robot/a", "--yes", "--no-keep", "--min-runtime", "8", "--json")
     assert taken.returncode == 0
-    preview, granted, ended = events(taken.stdout)
+    preview, granted, ended = course(taken.stdout)
     assert [(hold["arc"], hold["priority"]) for hold in preview["preempts"]] == [("survey", 0)]
     assert (granted["event"], granted["keep"], ended["outcome"]) == ("granted", False, "completed")
     assert survey.wait(HANG) == 1
@@ -81,7 +81,7 @@ def test_who_is_asked_sees_whom_it_takes_from_when_the_json_goes_elsewhere(fleet
         fleet.state(lambda _: "granted" in out.read_text())
         terminal.press("\x03")
         assert terminal.code() == 130
-    assert [event["event"] for event in events(out.read_text())] == ["preview", "granted", "ended"]
+    assert [event["event"] for event in course(out.read_text())] == ["preview", "granted", "ended"]
     assert survey.wait(HANG) == 1
 
 
@@ -107,8 +107,9 @@ def test_who_shares_may_stay_and_equals_are_waited_for(fleet: CliFleet) -> None:
 
 def test_a_take_that_must_wait_says_so_and_then_holds(fleet: CliFleet) -> None:
     peer = fleet.holder("peer", "robot/b", "--priority", "10")
-    taker = fleet.start("take", "robot/b", "--name", "operator", "--", "true")
-    lines = read_until(taker, f"operator waits for {named('peer')}: robot/b, until ")
+    taker, lines = fleet.begun(
+        f"operator waits for {named('peer')}: robot/b, until ", "take", "robot/b", "--name", "operator", "--", "true"
+    )
     assert any(f"operator waits for {named('peer')}, priority 10, " in line for line in lines)
     end(peer)
     read_until(taker, "operator holds robot/b")

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import end, out_of, read_until
+from tests.cli.tools import end, out_of
 from tests.hang import HANG
 
 pytestmark = pytest.mark.live
@@ -21,8 +21,9 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
 
 
 def test_release_ends_a_hold_and_its_command(fleet: CliFleet) -> None:
-    running = fleet.start("request", "robot/a", "--name", "survey", "--", "sh", "-c", "echo on; exec sleep 1000")
-    read_until(running, "on")
+    running, _ = fleet.begun(
+        "works", "request", "robot/a", "--name", "survey", "--", "sh", "-c", "echo works; exec sleep 1000"
+    )
     done = fleet.zscout("release", "survey")
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("survey (")
@@ -34,8 +35,7 @@ def test_release_ends_a_hold_and_its_command(fleet: CliFleet) -> None:
 
 def test_cancel_ends_a_wait_by_id(fleet: CliFleet) -> None:
     blocker = fleet.holder("blocker", "robot/a")
-    waiting = fleet.start("request", "robot/a", "--name", "survey")
-    read_until(waiting, "survey waits")
+    waiting, _ = fleet.begun("survey waits", "request", "robot/a", "--name", "survey")
     (view,) = fleet.state(lambda state: len(state.queue) == 1).queue
     refused = fleet.zscout("release", "survey")
     assert refused.returncode == 1

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import CLOCK, end, events, named, out_of, read_until, zscout_here
+from tests.cli.tools import CLOCK, course, end, events, named, out_of, read_until, zscout_here
 from tests.hang import HANG
 from zscout.cli.operator.take import takeover_cost
 from zscout.cli.requests.options import HoldOptions
@@ -51,15 +51,15 @@ def test_a_command_is_told_which_device_meets_which_pattern(fleet: CliFleet) -> 
 
 @pytest.mark.live
 def test_who_waits_hears_who_has_all_that_match_and_gets_the_first(fleet: CliFleet) -> None:
-    first, second = fleet.holder("first", F1), fleet.holder("second", ANY)
-    waiting = fleet.start("request", ANY, "--name", "next", "--json", "--", "true")
-    (line,) = read_until(waiting, '"waits"')
-    (waits,) = events(line)
+    first, second = (fleet.holder(name, rc, "--min-runtime", "10m") for name, rc in (("first", F1), ("second", ANY)))
+    asked = (ANY, "--json", "--", "true")
+    (waits,) = events(fleet.waits("next", *asked, until=lambda line: events(line)[0].get("needs")))
     (need,) = waits["needs"]
     assert (need["need"], need["rc"], need["present"], need["free"]) == (ANY, None, True, [])
     assert [(holder["rc"], holder["arc"]) for holder in need["holders"]] == [(F1, "first"), (F2, "second")]
-    assert 50 < waits["starts_in"] < 60
+    assert 500 < waits["starts_in"] < 600
 
+    waiting, _ = fleet.begun('"waits"', "request", "--name", "next", *asked)
     queued, held = json.loads(fleet.zscout("status", "--json").stdout), {F1: "first", F2: "second"}
     assert [wait["needs"] for wait in queued["queue"]] == [{ANY: {}}]
     assert {hold["arc"]: (hold["needs"], hold["bound"]) for hold in queued["holds"]} == {
@@ -74,7 +74,7 @@ def test_who_waits_hears_who_has_all_that_match_and_gets_the_first(fleet: CliFle
     assert re.search(rf"^1 +next .* waits for one of {text}  ", shown, re.MULTILINE)
 
     end(second)
-    granted, ended = events(out_of(waiting).read())
+    granted, ended = course(out_of(waiting).read())
     assert (granted["event"], granted["rcs"], granted["bound"]) == ("granted", [F2], {ANY: F2})
     assert (ended["event"], ended["outcome"]) == ("ended", "released")
     assert waiting.wait(HANG) == 0
@@ -85,13 +85,11 @@ def test_who_waits_hears_who_has_all_that_match_and_gets_the_first(fleet: CliFle
 @pytest.mark.live
 def test_in_a_pipe_and_at_a_terminal_those_in_the_way_are_named_once(fleet: CliFleet) -> None:
     first, robot = fleet.holder("first", F1), fleet.holder("robot", "robot/a")
-    late = fleet.zscout("request", ANY, ANY, "--name", "both", "--timeout", "0.3")
-    (line,) = late.stdout.splitlines()
+    line = fleet.waits("both", ANY, ANY, until=lambda line: f"; {F1}: " in line)
     blocker = rf"{F1}: {re.escape(named('first'))}, priority 0, since {CLOCK} [^;]*, until {CLOCK} [^;]* at the latest"
     assert re.search(rf"starts at {CLOCK} .*; {blocker}$", line)
     # One framegrabber is free: who has the other is in nobody's way.
-    easy = fleet.zscout("request", ANY, "robot/a", "--name", "easy", "--timeout", "0.3")
-    (line,) = easy.stdout.splitlines()
+    line = fleet.waits("easy", ANY, "robot/a", until=lambda line: "; robot/a: " in line)
     assert f"; robot/a: {named('robot')}, priority 0, " in line
     assert "framegrabber" not in line
     end(robot)
@@ -155,8 +153,8 @@ def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
     would = fleet.zscout("request", ANY, "--priority", "5", "--dry-run")
     assert would.stdout == f"request would start at once\nit would preempt low of {named('low')}\n"
     assert fleet.zscout("take", ANY).returncode == 1
-    taken = fleet.zscout("take", ANY, "--yes", "--no-keep", "--min-runtime", "2", "--json")
-    preview, granted, _ = events(taken.stdout)
+    taken = fleet.zscout("take", ANY, "--yes", "--no-keep", "--min-runtime", "8", "--json")
+    preview, granted, _ = course(taken.stdout)
     assert (preview["preempts"], preview["waits_for"], preview["absent"]) == ([], [], [])
     assert [hold["arc"] for hold in preview["may_preempt"]] == ["low", "high"]
     assert granted["bound"] == {ANY: F1}

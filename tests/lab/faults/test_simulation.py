@@ -10,6 +10,7 @@ import sys
 
 import pytest
 
+from tests.hang import HANG
 from zscout.lab.faults.guards import GUARDS, without
 from zscout.lab.faults.runs import shrink
 from zscout.lab.faults.simulation import Simulation, simulate
@@ -115,7 +116,7 @@ def test_a_run_that_breaks_a_promise_is_told_with_its_seed() -> None:
 def study(seeds: str, *more: str) -> subprocess.CompletedProcess[str]:
     program = "import sys; from zscout.cli.main import main; sys.exit(main())"
     command = [sys.executable, "-c", program, "study", "faults", "--seed", seeds, "--json", *more]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+    return subprocess.run(command, capture_output=True, text=True, timeout=3 * HANG)
 
 
 def test_only_runs_of_bookings_are_counted_where_those_are_wanted() -> None:
