@@ -66,6 +66,8 @@ class Lab:
         self.others: list[subprocess.Popen[bytes]] = []
         self.clients: list[Client] = []
         self.holders: list[HolderProcess] = []
+        self.sessions = 0
+        """Of this process, besides those of `clients`."""
         self.fleet_file = folder / "fleet.toml"
         names = ", ".join(f'"{name}"' for name in candidates)
         self._port = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -128,8 +130,8 @@ class Lab:
         return clock.now()
 
     async def candidates(self, client: Client, *hosts: str) -> None:
-        """Waits until these hosts may lead, and have links to all other nodes and to all clients: one that has none to
-        an RC yet would lead without it."""
+        """Waits until these hosts may lead, and have links to all other nodes and to all sessions of this process: one
+        that has none to an RC yet would lead without it."""
         await self.living(client, Role.CANDIDATE, lambda found: set(hosts) <= set(found))
         async with asyncio.timeout(HANG):
             while True:
@@ -139,7 +141,8 @@ class Lab:
 
     def _is_linked(self, host: str) -> bool:
         ends = {one.raddr for one in _connections(self.nodes[host].pid)}
-        wanted = {node.pid: 1 for name, node in self.nodes.items() if name != host} | {os.getpid(): len(self.clients)}
+        wanted = {node.pid: 1 for name, node in self.nodes.items() if name != host and node.poll() is None}
+        wanted[os.getpid()] = len(self.clients) + self.sessions
         return all(sum(one.laddr in ends for one in _connections(pid)) >= number for pid, number in wanted.items())
 
     async def logged(self, host: str, text: str) -> None:

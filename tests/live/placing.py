@@ -154,6 +154,7 @@ class WitnessRc:
         fleet = self.lab.fleet
         self._stall = StallWatch(clock.now).start()
         self._mesh = await ZenohMesh.open(fleet, Sender("devices", "node"))
+        self.lab.sessions += 1
         self._rc = ResourceController(
             self._mesh, self.name, self.witness, hold_lease=fleet.timing.hold_lease / SECOND, stall=self._stall
         )
@@ -162,6 +163,7 @@ class WitnessRc:
 
     async def __aexit__(self, *exc: object) -> None:
         await self._rc.stop()
+        self.lab.sessions -= 1
         await self._mesh.close()
         self._stall.stop()
 

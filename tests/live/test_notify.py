@@ -34,7 +34,7 @@ async def take_turns(client: Client, name: str) -> None:
 def test_who_leads_tells_each_thing_once_and_the_next_leader_goes_on(tmp_path: Path) -> None:
     async def story() -> None:
         with Receiver() as receiver:
-            async with Lab(tmp_path, candidates=("a", "b"), lease=1) as lab:
+            async with Lab(tmp_path, candidates=("a", "b")) as lab:
                 node(lab, "a", receiver)
                 client = await lab.client("worker")
                 await lab.state(client, lambda state: state.host == "a")
