@@ -130,8 +130,8 @@ class Lab:
         return clock.now()
 
     async def candidates(self, client: Client, *hosts: str) -> None:
-        """Waits until these hosts may lead, and have links to all other nodes and to all sessions of this process: one
-        that has none to an RC yet would lead without it."""
+        """Waits until these hosts may lead, and have links to all other nodes, to holders, and to all sessions of this
+        process: one that has none to an RC yet would lead without it."""
         await self.living(client, Role.CANDIDATE, lambda found: set(hosts) <= set(found))
         async with asyncio.timeout(HANG):
             while True:
@@ -142,6 +142,7 @@ class Lab:
     def _is_linked(self, host: str) -> bool:
         ends = {one.raddr for one in _connections(self.nodes[host].pid)}
         wanted = {node.pid: 1 for name, node in self.nodes.items() if name != host and node.poll() is None}
+        wanted |= {one.process.pid: 1 for one in self.holders if one.process.returncode is None}
         wanted[os.getpid()] = len(self.clients) + self.sessions
         return all(sum(one.laddr in ends for one in _connections(pid)) >= number for pid, number in wanted.items())
 
