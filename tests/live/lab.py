@@ -77,10 +77,11 @@ class Lab:
             lease = 1.0 if "hold_lease" in extra else PATIENT
         if "[placement]" not in extra:
             extra += f"\n[placement]\nstart_timeout = {HANG}"
-        if "[timing]" not in extra:  # as much longer as in the default fleet
-            extra += f"\n[timing]\nhold_lease = {3 * lease}\nrebuild = {lease / 5}"
-        if "vote_timeout" not in extra:
-            extra = extra.replace("[timing]", f"[timing]\nvote_timeout = {VOTE_TIMEOUT}")
+        # As much longer as in the default fleet; but each may be said.
+        timing = {"hold_lease": 3 * lease, "rebuild": lease / 5, "vote_timeout": VOTE_TIMEOUT}
+        lines = "".join(f"{name} = {seconds}\n" for name, seconds in timing.items() if f"{name} = " not in extra)
+        before, _, after = extra.partition("[timing]\n")
+        extra = f"{before}\n[timing]\n{lines}{after}"
         self.fleet_file.write_text(
             f'[fleet]\nname = "test-{new_instance()}"\ncandidates = [{names}]\nstrategy = "{strategy}"\n'
             f'[mesh]\nmulticast_address = "224.0.0.224:{port}"\n'
