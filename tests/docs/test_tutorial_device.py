@@ -13,7 +13,8 @@ import pytest
 from tests.cli import tools
 from tests.hang import HANG
 from tests.live.lab import Lab
-from tests.live.test_recorder import ended, free_port, recorded, recording, until
+from tests.live.test_recorder import ended, recorded, recording, until
+from tests.ports import free_port
 from tests.services.recorder.paper_run import lanes, rows
 
 PAGE = (Path(__file__).parents[2] / "docs" / "tutorial-device.md").read_text()

@@ -17,7 +17,7 @@ from icalendar import Calendar, Event
 from tests.cli import tools
 from tests.hang import HANG
 from tests.live.lab import Lab
-from tests.live.test_metrics import free_port
+from tests.ports import free_port
 from zscout.behaviors.client.bookings import BookingsClient
 from zscout.behaviors.client.client import Client
 

@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -26,6 +25,7 @@ from tests.hang import HANG
 from tests.live.closed import DAY, ClosedLab, make_authority
 from tests.live.lab import Lab
 from tests.live.test_closed_doors import bare, tls
+from tests.ports import free_port
 from zscout.config.certificates import KEYS_VARIABLE, read_cas
 from zscout.keyexpr import Role
 from zscout.mesh.zenoh_mesh import zenoh_config
@@ -130,9 +130,7 @@ def test_why_nobody_leads_is_told_and_what_a_node_should_offer_is_missed(tmp_pat
 
 def test_beside_a_node_that_listens_where_the_file_says_commands_listen_elsewhere(tmp_path: Path) -> None:
     async def story() -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            address = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+        address = f"tcp/127.0.0.1:{free_port()}"
         async with Lab(tmp_path) as lab:
             text = lab.fleet_file.read_text()
             lab.fleet_file.write_text(

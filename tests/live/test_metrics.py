@@ -19,6 +19,7 @@ import pytest
 
 from tests.hang import HANG
 from tests.live.lab import Lab
+from tests.ports import free_port
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import CommandRefused, RequestRefused
 
@@ -28,12 +29,6 @@ PROJECT = Path(__file__).parents[2]
 CONFIG = PROJECT / "deploy" / "prometheus" / "prometheus.yml"
 PROMETHEUS = shutil.which("prometheus")
 without = pytest.mark.skipif(PROMETHEUS is None, reason="prometheus is missing: install the package prometheus")
-
-
-def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
 
 
 def get(url: str) -> str:
