@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.live.bench import comes_to
 from tests.live.lab import Lab
 from tests.services.notify.receiver import Receiver
 from zscout.behaviors.client.client import Client
@@ -26,6 +27,7 @@ async def take_turns(client: Client, name: str) -> None:
     await client.granted(first)
     second = await client.request(f"{name}-second", {"robot/a": {}}, priority=5, min_runtime=60)
     await client.granted(second)
+    await comes_to(first, "queued")  # what it is told of its own may come after that
     await client.end(second)
     await client.granted(first)
     await client.end(first)
