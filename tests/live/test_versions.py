@@ -57,7 +57,7 @@ async def enters(holder: HolderProcess, arc: str, needs: dict[str, Any], *, prio
         event = await holder.event("entered", "not_entered", "refused")
         if event["event"] == "entered":
             return event
-        assert event["code"] == "unknown", event
+        assert event["code"] in ("unknown", "stale"), event
 
 
 async def commands(holder: HolderProcess, *rcs: str) -> None:
