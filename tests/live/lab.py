@@ -16,6 +16,7 @@ from typing import Any, Self
 
 import psutil
 
+from tests.cli.tools import zscout_soon
 from tests.hang import HANG
 from tests.live.holder import linked
 from zscout.behaviors.client import confirmation
@@ -33,6 +34,8 @@ VOTE_TIMEOUT = 2.0
 """Seconds, for the same reason, where no vote is to be late."""
 CONFIRM_TIMEOUT = 5.0
 """Seconds that clients give an RC to confirm a grant: after one, as the product has it, they give the grant back."""
+NO_RCM = 3
+"""The exit code of a command that saw none."""
 TTL = 60.0
 """Seconds, as long as a command can be good."""
 
@@ -116,6 +119,15 @@ class Lab:
             out.close()
         self.others.append(process)
         return process
+
+    async def zscout(self, *args: object, env: Mapping[str, str] | None = None) -> subprocess.CompletedProcess[str]:
+        """Runs a command to its end; anew where it saw no RCM in the few seconds for which it looks, as a node that
+        does not run then has no link to it: it has done nothing."""
+        async with asyncio.timeout(HANG):
+            while True:
+                done = await zscout_soon(*args, env=env or self.env)
+                if done.returncode != NO_RCM:
+                    return done
 
     def log(self, host: str) -> str:
         return (self.folder / f"{host}.log").read_text()

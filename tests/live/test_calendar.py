@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 from icalendar import Calendar, Event
 
-from tests.cli import tools
 from tests.hang import HANG
 from tests.live.lab import Lab
 from tests.ports import free_port
@@ -39,7 +38,7 @@ class Fleet:
         self.lab, self.client, self.port = lab, client, port
 
     async def zscout(self, *args: object, code: int = 0) -> str:
-        done = await asyncio.to_thread(tools.zscout, "calendar", *args, env=self.lab.env)
+        done = await self.lab.zscout("calendar", *args)
         assert done.returncode == code, done
         return done.stdout
 

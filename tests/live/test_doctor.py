@@ -158,7 +158,7 @@ def test_beside_a_node_that_listens_where_the_file_says_commands_listen_elsewher
             told = await told_of(lab, "leader", "anvil leads, term 1", lab.folder / "anvil.toml")
             assert told.code == 0
             assert told.of("multicast") == [("note", "it is off: only the hosts under `connect` are found")]
-            done = await zscout_soon("status", env=lab.env)
+            done = await lab.zscout("status")
             assert (done.returncode, done.stderr) == (0, "")
 
     asyncio.run(story())
@@ -300,14 +300,14 @@ def test_status_and_doctor_warn_of_every_certificate_that_ends_soon(tmp_path: Pa
             lab.node("cart")
             await shown(lab, "bob", "anvil", "cart")
             env = lab.env | {KEYS_VARIABLE: str(tmp_path / "keys" / "ada")}
-            done = await zscout_soon("status", env=env)
+            done = await lab.zscout("status", env=env)
             _, warnings = done.stdout.split("\nWarnings\n")
             said = [line.split("  ") for line in warnings.split("\n\n")[0].splitlines()[1:]]
             assert [(about, words.partition(" ends in ")[0]) for about, words in said] == [
                 ("certificate", "the certificate of anvil"),
                 ("certificate", "the certificate of ada"),
             ]
-            state = json.loads((await zscout_soon("status", "--json", env=env)).stdout)
+            state = json.loads((await lab.zscout("status", "--json", env=env)).stdout)
             assert [one["name"] for one in state["ending"]] == ["anvil", "ada"]
             assert all(3000 < one["ends_in"] <= 3600 for one in state["ending"])
             assert state["advisory"] is False
@@ -327,9 +327,9 @@ def test_status_says_that_roles_are_advisory_where_nothing_proves_a_name(tmp_pat
         async with Lab(tmp_path, extra='[roles]\nmanager = ["anvil"]\nclient = ["bob"]') as lab:
             lab.node("anvil")
             await lab.ready(await lab.client())
-            done = await zscout_soon("status", env=lab.env)
+            done = await lab.zscout("status")
             assert "roles  they are advisory: nobody proves a name where [security] is not set" in done.stdout
-            assert json.loads((await zscout_soon("status", "--json", env=lab.env)).stdout)["advisory"] is True
+            assert json.loads((await lab.zscout("status", "--json")).stdout)["advisory"] is True
 
     asyncio.run(story())
 

@@ -19,7 +19,7 @@ import pytest
 
 from tests.chaos.net import Net, NoNamespaces, Processes, check
 from tests.cli.fleet.test_status import section
-from tests.cli.tools import COMMAND, zscout_soon
+from tests.cli.tools import COMMAND
 from tests.hang import HANG
 from tests.live.lab import TTL, Lab
 from zscout import trace
@@ -58,7 +58,7 @@ def test_the_one_that_is_not_named_obeys_nothing_and_says_so(tmp_path: Path) -> 
             assert [await answers(client, grant) for _ in range(20)] == [[1]] * 20
 
             await lab.state(client, lambda state: [view.duplicates for view in state.rcs] == [["ws1"]])
-            plain = await zscout_soon("status", env=lab.env)
+            plain = await lab.zscout("status")
             (row,) = section(plain.stdout, "RCs")
             assert row[:4] == [RC, "exclusive", "held", "ws2"]
             assert [row[:2] for row in section(plain.stdout, "Devices")] == [

@@ -19,7 +19,7 @@ import pytest
 
 from tests.behaviors.components.kit import Hosts, counts, counts_on
 from tests.cli.fleet.test_status import section
-from tests.cli.tools import COMMAND, zscout_soon
+from tests.cli.tools import COMMAND
 from tests.hang import HANG
 from tests.live import message_samples
 from tests.live.bench import comes_to, running, until
@@ -269,7 +269,7 @@ def test_status_names_who_runs_which_version_where_they_differ(tmp_path: Path, f
             lab.node("a", "robot/a")
             client = await lab.client()
             await lab.ready(client, "robot/a")
-            alone = await zscout_soon("status", env=lab.env)
+            alone = await lab.zscout("status")
             assert "they differ" not in alone.stdout
             with lab.at("old"):
                 lab.node("b", "robot/b")
@@ -277,10 +277,10 @@ def test_status_names_who_runs_which_version_where_they_differ(tmp_path: Path, f
             words = f"they differ: older than 0.2.0 on b; version {VERSION} on a; this zscout is {VERSION}"
             # The link of a command that has just come to one of the nodes may be too young for what that one tells.
             async with asyncio.timeout(HANG):
-                while words not in (mixed := await zscout_soon("status", env=lab.env)).stdout:
+                while words not in (mixed := await lab.zscout("status")).stdout:
                     pass
             assert section(mixed.stdout, "Warnings") == [["versions", words]]
-            shown = json.loads((await zscout_soon("status", "--json", env=lab.env)).stdout)
+            shown = json.loads((await lab.zscout("status", "--json")).stdout)
             assert shown["version"] == VERSION
             assert shown["versions"] == [{"version": None, "hosts": ["b"]}, {"version": VERSION, "hosts": ["a"]}]
 
