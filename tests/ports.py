@@ -1,18 +1,25 @@
-"""Ports for what is told its port in a file, before it listens there."""
+"""Ports for servers that tests have others start."""
 
 from __future__ import annotations
 
 import random
 import socket
-from contextlib import suppress
 from pathlib import Path
+from typing import Final
+
+LOWEST: Final = 10_000
 
 
 def free_port() -> int:
-    """One that nobody has now, and that the system gives to nobody by itself: it lies below those it gives away."""
-    first = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
+    """A TCP port of this machine that nobody listens on. It is below those that the system gives away by itself, so
+    no connection that is made meanwhile gets it; a random one, so no test beside this one takes the same."""
+    given_away = int(Path("/proc/sys/net/ipv4/ip_local_port_range").read_text().split()[0])
+    numbers = random.SystemRandom()
     while True:
-        # Workers side by side take others: random numbers here have no secret.
-        port = random.SystemRandom().randrange(10_000, first)
-        with suppress(OSError), socket.create_server(("127.0.0.1", port)):
-            return port
+        port = numbers.randrange(LOWEST, given_away)
+        with socket.socket() as one:
+            try:
+                one.bind(("127.0.0.1", port))
+            except OSError:
+                continue
+        return port

@@ -12,7 +12,7 @@ import pytest
 from tests.fuzz.fleet import ROWS
 from tests.fuzz.hostile import Hostile, Names, is_one
 from tests.hang import HANG
-from tests.live.lab import Lab
+from tests.live.lab import TTL, Lab
 from tests.live.stranger import LIMITS, Stranger
 from tests.live.test_recorder import recorder
 from tests.thorough import times
@@ -79,7 +79,7 @@ def test_a_node_serves_on_after_a_burst_of_what_is_no_message(tmp_path: Path) ->
                     assert (after.term, client.term) == (before.term, before.term)
                     assert held.active
                     assert standing(held) == first
-                    assert (await held.command("robot/b", {"name": "echo", "value": 7})).result == 7
+                    assert (await held.command("robot/b", {"name": "echo", "value": 7}, ttl=TTL)).result == 7
             finally:
                 await asyncio.to_thread(stranger.close)
             assert node.poll() is None

@@ -68,12 +68,14 @@ class Stand:
         fleet = self.lab.fleet
         self.stall = StallWatch(clock.now).start()
         self.mesh = await ZenohMesh.open(fleet, Sender("bench", "node"))
+        self.lab.sessions += 1
         return self
 
     async def __aexit__(self, *exc: object) -> None:
         for rc in self.rcs:
             await rc.stop()
         self.stall.stop()
+        self.lab.sessions -= 1
         await self.mesh.close()
 
     async def rc(self, name: str, driver: Driver) -> ResourceController:

@@ -14,8 +14,7 @@ import zenoh
 from msgspec.structs import replace
 
 from tests.hang import HANG
-from tests.live.lab import Lab
-from zscout.behaviors.client.client import Client
+from tests.live.lab import Lab, PatientClient
 from zscout.config.certificate_authority import CertificateAuthority
 from zscout.config.fleet import Fleet
 
@@ -74,9 +73,9 @@ class ClosedLab(Lab):
         """The fleet as this person or machine joins it."""
         return replace(self.fleet, security=self.folder / "keys" / name)
 
-    async def person(self, name: str, client: str | None = None) -> Client:
+    async def person(self, name: str, client: str | None = None) -> PatientClient:
         """A program of this person."""
-        made = await Client.connect(client, fleet=self.fleet_of(name))
+        made = await PatientClient.connect(client, fleet=self.fleet_of(name))
         self.clients.append(made)
         return made
 

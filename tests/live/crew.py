@@ -38,7 +38,7 @@ class Body:
 
     async def _beat(self, held: Held) -> None:
         number = len(self.beats)
-        done = await held.command(self.rc, {"name": "echo", "value": number}, ttl=5)
+        done = await held.command(self.rc, {"name": "echo", "value": number}, ttl=60)
         assert done.result == number
         self.beats.append(clock.now())
         await asyncio.sleep(BEAT)

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import pytest
+
+from tests.hang import HANG
+from tests.live.bench import until
+from zscout.behaviors.client import handover
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import OpenArc
 from zscout.keyexpr import Sender
@@ -31,7 +36,16 @@ async def settle_down(old: Client, new: Client, names: Sequence[str]) -> dict[st
 
 
 async def claimed(client: Client, names: Sequence[str]) -> dict[str, OpenArc]:
-    return {name: await client.request(name, NEEDS[name], min_runtime=600) for name in names}
+    arcs = {name: await client.request(name, NEEDS[name], min_runtime=600) for name in names}
+    # A vote may come later than the answer.
+    await until(lambda: all(arc.state == "running" for name, arc in arcs.items() if name != "later"))
+    return arcs
+
+
+def patiently(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nobody dies, all comes: it is waited for until then, however long a process does not run."""
+    for name in ("HAND_OVER", "EXPECT_TIMEOUT", "TOKEN_GRACE", "CLAIM_TIMEOUT"):
+        monkeypatch.setattr(handover, name, HANG)
 
 
 def holding(state: RcmState) -> dict[str, tuple[str, Grant]]:

@@ -21,6 +21,7 @@ from typing import Any
 
 import msgspec
 
+from zscout.behaviors.client import confirmation
 from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
 from zscout.behaviors.client.request import OpenArc
 from zscout.keyexpr import Role, Token
@@ -31,6 +32,8 @@ from zscout.types import Grant
 HOST = sys.argv[2] if len(sys.argv) > 2 else None
 BEAT = 0.02
 """Seconds between two commands of a program at work."""
+PATIENT = 10.0
+"""Seconds that an RC may take to answer."""
 
 
 def say(event: str, **details: Any) -> None:
@@ -107,7 +110,7 @@ class Holder:
             while asked.grant == grant:
                 await self.client.changed(asked)
 
-    async def _command(self, rc: str, do: dict[str, Any], ttl: float = 1.0, *, anew: bool = False) -> None:
+    async def _command(self, rc: str, do: dict[str, Any], ttl: float = PATIENT, *, anew: bool = False) -> None:
         assert self.grant is not None
         if anew:
             key = self.client.mesh.keys.command(rc, self.client.mesh.me)
@@ -115,7 +118,7 @@ class Holder:
             say("command", code="done")
             return
         try:
-            done = await self.client.command(rc, self.grant, do, ttl=ttl)
+            done = await self.client.command(rc, self.grant, do, ttl=ttl, timeout=ttl)
         except CommandRefused as refused:
             say("command", code=refused.code, reason=str(refused))
         else:
@@ -127,7 +130,9 @@ class Holder:
         assert grant is not None
         while self.arc.grant == grant:
             try:
-                await self.client.command(next(commands), grant, {"name": "echo", "value": 1}, ttl=5)
+                await self.client.command(
+                    next(commands), grant, {"name": "echo", "value": 1}, ttl=PATIENT, timeout=PATIENT
+                )
             except CommandRefused as refused:
                 say("disturbed", code=refused.code, reason=str(refused))
                 return
@@ -149,6 +154,7 @@ class Holder:
 
 
 async def main() -> None:
+    confirmation.CONFIRM_TIMEOUT = PATIENT / 2
     loop = asyncio.get_running_loop()
     orders = asyncio.StreamReader()
     await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(orders), sys.stdin)

@@ -9,25 +9,44 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import psutil
 
+from tests.cli.tools import zscout_soon
 from tests.hang import HANG
 from tests.live.holder import linked
+from zscout.behaviors.client import confirmation
 from zscout.behaviors.client.client import Client
 from zscout.config.fleet import Fleet, load_fleet
 from zscout.config.scheduling_policy import StrategyName
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import clock
-from zscout.messages import RcAsk, RcmState, RcState
-from zscout.types import Ns
+from zscout.messages import Done, RcAsk, RcmState, RcState
+from zscout.types import Grant, Ns
 
 PATIENT = 10.0
 """Seconds of leases where none is to end: on a busy machine a process may not run for a second or two."""
+VOTE_TIMEOUT = 2.0
+"""Seconds, for the same reason, where no vote is to be late."""
+CONFIRM_TIMEOUT = 5.0
+"""Seconds that clients give an RC to confirm a grant: after one, as the product has it, they give the grant back."""
+NO_RCM = 3
+"""The exit code of a command that saw none."""
+TTL = 60.0
+"""Seconds, as long as a command can be good."""
+
+
+class PatientClient(Client):
+    """A client whose commands wait for an RC that does not run for a while, unless they say how long."""
+
+    async def command(
+        self, rc: str, grant: Grant, do: Mapping[str, Any], *, ttl: float = TTL, timeout: float = HANG
+    ) -> Done:
+        return await super().command(rc, grant, do, ttl=ttl, timeout=timeout)
 
 
 class Lab:
@@ -50,6 +69,8 @@ class Lab:
         self.others: list[subprocess.Popen[bytes]] = []
         self.clients: list[Client] = []
         self.holders: list[HolderProcess] = []
+        self.sessions = 0
+        """Of this process, besides those of `clients`."""
         self.fleet_file = folder / "fleet.toml"
         names = ", ".join(f'"{name}"' for name in candidates)
         self._port = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -59,8 +80,11 @@ class Lab:
             lease = 1.0 if "hold_lease" in extra else PATIENT
         if "[placement]" not in extra:
             extra += f"\n[placement]\nstart_timeout = {HANG}"
-        if "[timing]" not in extra:  # as much longer as in the default fleet
-            extra += f"\n[timing]\nhold_lease = {3 * lease}\nrebuild = {lease / 5}"
+        # As much longer as in the default fleet; but each may be said.
+        timing = {"hold_lease": 3 * lease, "rebuild": lease / 5, "vote_timeout": VOTE_TIMEOUT}
+        lines = "".join(f"{name} = {seconds}\n" for name, seconds in timing.items() if f"{name} = " not in extra)
+        before, _, after = extra.partition("[timing]\n")
+        extra = f"{before}\n[timing]\n{lines}{after}"
         self.fleet_file.write_text(
             f'[fleet]\nname = "test-{new_instance()}"\ncandidates = [{names}]\nstrategy = "{strategy}"\n'
             f'[mesh]\nmulticast_address = "224.0.0.224:{port}"\n'
@@ -70,6 +94,7 @@ class Lab:
         self.env = os.environ | {"ZSCOUT_FLEET": str(self.fleet_file), "XDG_STATE_HOME": str(folder / "state")}
         self.cwd: Path | None = None
         """Of what is started. `python -m` looks there first."""
+        self._confirm_timeout = confirmation.CONFIRM_TIMEOUT
 
     def node(self, host: str, *rcs: str, extra: str = "") -> subprocess.Popen[bytes]:
         """Starts a node. `rcs` are names, or `name:param=bound` for a sharable one with a capacity."""
@@ -95,11 +120,20 @@ class Lab:
         self.others.append(process)
         return process
 
+    async def zscout(self, *args: object, env: Mapping[str, str] | None = None) -> subprocess.CompletedProcess[str]:
+        """Runs a command to its end; anew where it saw no RCM in the few seconds for which it looks, as a node that
+        does not run then has no link to it: it has done nothing."""
+        async with asyncio.timeout(HANG):
+            while True:
+                done = await zscout_soon(*args, env=env or self.env)
+                if done.returncode != NO_RCM:
+                    return done
+
     def log(self, host: str) -> str:
         return (self.folder / f"{host}.log").read_text()
 
     async def client(self, name: str | None = None) -> Client:
-        client = await Client.connect(name, fleet=self.fleet, host="test")
+        client = await PatientClient.connect(name, fleet=self.fleet, host="test")
         self.clients.append(client)
         return client
 
@@ -109,8 +143,8 @@ class Lab:
         return clock.now()
 
     async def candidates(self, client: Client, *hosts: str) -> None:
-        """Waits until these hosts may lead, and have links to all other nodes and to all clients: one that has none to
-        an RC yet would lead without it."""
+        """Waits until these hosts may lead, and have links to all other nodes, to holders, and to all sessions of this
+        process: one that has none to an RC yet would lead without it."""
         await self.living(client, Role.CANDIDATE, lambda found: set(hosts) <= set(found))
         async with asyncio.timeout(HANG):
             while True:
@@ -120,7 +154,9 @@ class Lab:
 
     def _is_linked(self, host: str) -> bool:
         ends = {one.raddr for one in _connections(self.nodes[host].pid)}
-        wanted = {node.pid: 1 for name, node in self.nodes.items() if name != host} | {os.getpid(): len(self.clients)}
+        wanted = {node.pid: 1 for name, node in self.nodes.items() if name != host and node.poll() is None}
+        wanted |= {one.process.pid: 1 for one in self.holders if one.process.returncode is None}
+        wanted[os.getpid()] = len(self.clients) + self.sessions
         return all(sum(one.laddr in ends for one in _connections(pid)) >= number for pid, number in wanted.items())
 
     async def logged(self, host: str, text: str) -> None:
@@ -164,9 +200,10 @@ class Lab:
         """An RC's own word about itself."""
         async with asyncio.timeout(HANG):
             while True:
-                reply = await client.mesh.ask_one(client.mesh.keys.rc_state(name), RcAsk(), RcState, timeout=0.5)
+                reply = await client.mesh.ask_one(client.mesh.keys.rc_state(name), RcAsk(), RcState, timeout=PATIENT)
                 if reply is not None and reply.message is not None:
                     return reply.message
+                await asyncio.sleep(0.02)
 
     async def held_by(self, client: Client, name: str, *arcs: str) -> None:
         """Waits until an RC names exactly these ARCs as its holders: it may hear of them after the client."""
@@ -184,7 +221,7 @@ class Lab:
         try:
             async with asyncio.timeout(HANG):
                 while True:
-                    seen = await client.state(timeout=0.5) or seen
+                    seen = await client.state() or seen
                     if seen is not None and until(seen):
                         return seen
                     await asyncio.sleep(0.02)
@@ -200,11 +237,13 @@ class Lab:
         return state
 
     async def __aenter__(self) -> Self:
+        confirmation.CONFIRM_TIMEOUT = CONFIRM_TIMEOUT
         return self
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        confirmation.CONFIRM_TIMEOUT = self._confirm_timeout
         for holder in self.holders:
             holder.kill()
         await asyncio.gather(*(holder.process.wait() for holder in self.holders))

@@ -1,5 +1,5 @@
-"""For tests of the placer on a real mesh: asking it, an RC that writes down what it was told, and a kind of
-component that can be held up at every step of its life."""
+"""For tests of the placer on a real mesh: asking it, an RC that writes down what it was told, and kinds of components:
+one that can be held up at every step of its life, and one that counts, however long its RC does not run."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ from typing import Any, Self, TypeVar
 import msgspec
 
 from tests.hang import HANG
-from tests.live.lab import Lab
-from zscout.behaviors.client.arc import Revoked, holds
+from tests.live.lab import CONFIRM_TIMEOUT, Lab
+from zscout.behaviors.client import confirmation
+from zscout.behaviors.client.arc import Held, Revoked, holds
 from zscout.behaviors.client.client import Client, CommandRefused
 from zscout.behaviors.components.component import Component, ComponentContext
+from zscout.behaviors.components.shipped import Counter
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
@@ -40,6 +42,8 @@ from zscout.messages import (
 from zscout.types import SECOND
 
 R = TypeVar("R")
+LONGEST = 60.0
+"""Seconds for which the placer lets anybody wait, and an RC keeps a command."""
 
 
 class Placing:
@@ -68,9 +72,11 @@ class Placing:
 
     async def place(self, component: str, kind: str, params: Mapping[str, Any] | None = None, **spec: Any) -> Placement:
         """Has it run; returns how it stands when it does, or can't."""
-        return await self.get(
-            PlaceComponent(component, ComponentSpec(kind, dict(params or {}), **spec), wait=15), Placement
-        )
+        operation = PlaceComponent(component, ComponentSpec(kind, dict(params or {}), **spec), wait=LONGEST)
+        async with asyncio.timeout(2 * HANG):
+            while (placed := await self.get(operation, Placement)).state == "starting":
+                pass
+        return placed
 
     async def placement(self, component: str) -> Placement:
         listed = await self.get(ListPlacements(component), Placements)
@@ -154,6 +160,7 @@ class WitnessRc:
         fleet = self.lab.fleet
         self._stall = StallWatch(clock.now).start()
         self._mesh = await ZenohMesh.open(fleet, Sender("devices", "node"))
+        self.lab.sessions += 1
         self._rc = ResourceController(
             self._mesh, self.name, self.witness, hold_lease=fleet.timing.hold_lease / SECOND, stall=self._stall
         )
@@ -162,8 +169,23 @@ class WitnessRc:
 
     async def __aexit__(self, *exc: object) -> None:
         await self._rc.stop()
+        self.lab.sessions -= 1
         await self._mesh.close()
         self._stall.stop()
+
+
+class Tally(Counter):
+    """A counter that counts at its RC's pace: it gives up no hold because a busy machine did not let the RC run."""
+
+    def __init__(self, params: dict[str, Any]) -> None:
+        super().__init__(params)
+        confirmation.CONFIRM_TIMEOUT = CONFIRM_TIMEOUT
+
+    async def _step(self, context: ComponentContext, held: Held | None = None) -> None:
+        if held is not None and self.rc is not None:
+            count = {"name": "echo", "value": self.count + 1}
+            await context.client.command(self.rc, held.grant, count, ttl=LONGEST, timeout=LONGEST)
+        await super()._step(context)
 
 
 class Stepper(Component):
@@ -171,6 +193,7 @@ class Stepper(Component):
     stays there for as long as there is a file `hold-STEP`. Steps: init, checkpoint, restore."""
 
     def __init__(self, params: dict[str, Any]) -> None:
+        confirmation.CONFIRM_TIMEOUT = CONFIRM_TIMEOUT
         self.folder, self.rc, self.count = Path(params["folder"]), params["rc"], 0
         self._step("init")
 
@@ -186,7 +209,7 @@ class Stepper(Component):
                     async with attempt as held:
                         while True:
                             count = {"name": "echo", "value": self.count + 1}
-                            await context.client.command(self.rc, held.grant, count, ttl=60, timeout=60)
+                            await context.client.command(self.rc, held.grant, count, ttl=LONGEST, timeout=LONGEST)
                             self.count += 1
                             await context.safe_point()
                             await asyncio.sleep(0.005)
@@ -203,9 +226,11 @@ class Stepper(Component):
 
 
 def register(lab: Lab) -> None:
-    """Makes `stepper` a kind that the lab's nodes can start, as if it were installed."""
+    """Makes `stepper` and `tally` kinds that the lab's nodes can start, as if they were installed."""
     info = lab.folder / "site" / "stepper-1.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stepper\nVersion: 1\n")
-    (info / "entry_points.txt").write_text("[zscout.components]\nstepper = tests.live.placing:Stepper\n")
+    (info / "entry_points.txt").write_text(
+        "[zscout.components]\nstepper = tests.live.placing:Stepper\ntally = tests.live.placing:Tally\n"
+    )
     lab.env["PYTHONPATH"] = f"{lab.folder / 'site'}:{Path(__file__).parents[2]}"

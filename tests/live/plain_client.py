@@ -32,7 +32,7 @@ import zenoh
 MAX_COUNTER = 2**52 - 1
 MAX_JUMP = 1_000_000
 ASK_AGAIN = 5.0
-QUERY_TIMEOUT = 1.0
+QUERY_TIMEOUT = 5.0
 TRY_AGAIN = ("busy", "not_leading", "internal", "queue_full")
 GRACE = 0.25
 GREATER_CONNECTS = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
@@ -255,7 +255,7 @@ class PlainClient:
 
     def command(self, rc: str, grant: Any, action: Json) -> Json:
         key = f"{self.base}/rc/{rc}/command/{self.host}/{self.name}"
-        replies = self.get(key, "Command", {"grant": grant, "do": action, "ttl": 1.0})
+        replies = self.get(key, "Command", {"grant": grant, "do": action, "ttl": 30.0})
         return replies[0][1] if replies else {"code": "unknown", "message": "no answer"}
 
     def end(self, op: str, request_id: str) -> None:

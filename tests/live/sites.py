@@ -203,7 +203,7 @@ class Sites:
         roles = ROLES.replace('"keys"', '"certificates/ada"') if self.secured else ""
         (self.folder / f"{name}.fleet.toml").write_text(
             f'[fleet]\nname = "{fleet}"\ncandidates = ["a1", "b1"]\n[mesh]\nlease = {lease}\n{mesh}\n'
-            f"[timing]\nhold_lease = {3 * lease}\n{roles}"
+            f"[timing]\nhold_lease = {3 * lease}\nrebuild = {lease / 5}\n{roles}"
         )
 
     async def __aenter__(self) -> Self:

@@ -11,7 +11,7 @@ from typing import Any
 import zenoh
 
 from tests.hang import HANG
-from tests.live.lab import Lab
+from tests.live.lab import TTL, Lab
 from zscout.mesh.zenoh_mesh import zenoh_config
 
 LIMITS = "[limits]\nmax_needs = 8\nmax_queued = 20\nmax_requests_per_client = 5\nmax_requests_per_host = 15\n"
@@ -47,7 +47,7 @@ class Stranger:
             priority=zenoh.Priority.INTERACTIVE_HIGH,
             congestion_control=zenoh.CongestionControl.BLOCK,
             express=True,
-            timeout=5.0,
+            timeout=30.0,
         ):
             if reply.ok is not None:
                 found.append(("ok", json.loads(reply.ok.payload.to_bytes())))
@@ -96,7 +96,7 @@ class Stranger:
         request = good_ask(id=f"good-{self.number}", needs={"robot/a": {}, "radio/a": {"rate": 10}}, priority=9)
         notice = self.ask("rcm/schedule/t/good", request)
         assert notice["state"] == "running", notice
-        command = {"grant": notice["grant"], "do": {"name": "echo", "value": self.number}}
+        command = {"grant": notice["grant"], "do": {"name": "echo", "value": self.number}, "ttl": TTL}
         assert self.ask("rc/robot/a/command/t/good", command) == {"result": self.number}
         released = self.ask("rcm/schedule/t/good", {"op": "release", "id": request["id"]})
         assert released["outcome"] == "released"

@@ -24,7 +24,7 @@ async def ranked(client: Client, asked: RankAsk, hosts: set[str]) -> HostRanking
     answer: HostRanking | None = None
     async with asyncio.timeout(HANG):
         while answer is None or {one.host for one in answer.hosts} != hosts:
-            reply = await client.mesh.ask_one(client.mesh.keys.rank, asked, HostRanking, timeout=1)
+            reply = await client.mesh.ask_one(client.mesh.keys.rank, asked, HostRanking, timeout=HANG)
             answer = reply.message if reply is not None else None
             await asyncio.sleep(0.05)
     return answer
@@ -57,6 +57,7 @@ async def _ranks(tmp_path: Path) -> None:
         assert (len(reply.message.hosts), reply.message.more) == (1, 2)
 
         # A host that dies is named no more; a new leader's balancer knows the others from their reports.
+        await lab.candidates(client, "h2")
         lab.signal("h1", signal.SIGKILL)
         await lab.living(client, Role.RCM, lambda hosts: hosts == ["h2"])
         await ranked(client, RankAsk(), {"h2", "h3"})

@@ -124,7 +124,7 @@ def test_a_sleep_is_interrupted_when_the_hold_is_preempted(fleet: CliFleet) -> N
     assert fleet.idle("robot/a")
 
 
-@pytest.mark.parametrize(("how", "waits"), [("min_runtime=0.3", True), ("min_runtime=0.3, keep=False", False)])
+@pytest.mark.parametrize(("how", "waits"), [("min_runtime=3", True), ("min_runtime=3, keep=False", False)])
 def test_a_body_whose_time_is_over_is_interrupted(fleet: CliFleet, how: str, *, waits: bool) -> None:
     text = f"""
         with zscout.connect() as lab:
@@ -148,7 +148,7 @@ def test_a_hold_that_had_its_time_by_this_host_s_clock_is_completed_though_no_rc
     text = """
         with zscout.connect() as lab:
             try:
-                with lab.hold("survey", {"robot/a": {}}, min_runtime=2, keep=False, confirmed=True) as held:
+                with lab.hold("survey", {"robot/a": {}}, min_runtime=10, keep=False, confirmed=True) as held:
                     say("entered")
                     time.sleep(LONGER)
             except zscout.Revoked as revoked:
@@ -170,7 +170,7 @@ def test_what_is_kept_goes_on_past_its_minimum_runtime(fleet: CliFleet) -> None:
         with zscout.connect() as lab, lab.hold("survey", {"robot/a": {}}, min_runtime=0.1) as held:
             while held.remaining > -1:
                 assert not held.wait(0.1)
-            say("still", held.active, held.command("robot/a", {"name": "echo", "value": 5}))
+            say("still", held.active, held.command("robot/a", {"name": "echo", "value": 5}, ttl=60))
     """
     assert rest_of(script(fleet.lab, text)) == ["still True 5"]
 
@@ -184,7 +184,7 @@ def test_the_end_of_an_inner_hold_leaves_the_outer_one(fleet: CliFleet) -> None:
                     time.sleep(LONGER)
             except zscout.Revoked as revoked:
                 say("inner", revoked.outcome, outer.active)
-            say(outer.command("robot/a", {"name": "echo", "value": 5}))
+            say(outer.command("robot/a", {"name": "echo", "value": 5}, ttl=60))
     """
     nested = script(fleet.lab, text)
     read_until(nested, "entered")

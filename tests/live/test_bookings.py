@@ -42,9 +42,11 @@ async def listed(bookings: BookingsClient, until: Callable[[dict[str, BookingVie
 
 
 async def fleet_of_two(lab: Lab) -> tuple[Client, BookingsClient]:
-    for host, rc in zip(BOTH, ("robot/a", "robot/b"), strict=True):
-        lab.node(host, rc)
+    """The first leads: the other comes when it does."""
+    lab.node(BOTH[0], "robot/a")
     client = await lab.client("program")
+    await lab.ready(client, "robot/a")
+    lab.node(BOTH[1], "robot/b")
     await lab.ready(client, "robot/a", "robot/b")
     await lab.candidates(client, *BOTH)
     return client, BookingsClient(client)
@@ -60,7 +62,7 @@ async def taken_up(client: Client, booking: BookingView) -> float:
 
 def test_a_booking_outlives_its_leader(tmp_path: Path) -> None:
     async def story() -> None:
-        async with Lab(tmp_path, candidates=BOTH, lease=1.0) as lab:
+        async with Lab(tmp_path, candidates=BOTH) as lab:
             client, bookings = await fleet_of_two(lab)
             booked = await bookings.book({"robot/b": {}}, in_seconds(SOON), 120, name="survey")
             leader = (await lab.state(client, lambda _: True)).host
@@ -77,7 +79,7 @@ def test_a_booking_outlives_its_leader(tmp_path: Path) -> None:
 
 def test_bookings_outlive_a_restart_of_every_node_one_after_the_other(tmp_path: Path) -> None:
     async def story() -> None:
-        async with Lab(tmp_path, candidates=BOTH, lease=1.0) as lab:
+        async with Lab(tmp_path, candidates=BOTH) as lab:
             client, bookings = await fleet_of_two(lab)
             weekly = await bookings.book(
                 {"robot/*": {}}, in_seconds(3600), 600, name="weekly", every=7, until=in_seconds(30 * 86_400)
@@ -105,7 +107,7 @@ def test_bookings_outlive_a_restart_of_every_node_one_after_the_other(tmp_path: 
 
 def test_a_fleet_that_was_killed_whole_keeps_what_was_booked(tmp_path: Path) -> None:
     async def story() -> None:
-        async with Lab(tmp_path, candidates=BOTH, lease=1.0) as lab:
+        async with Lab(tmp_path, candidates=BOTH) as lab:
             client, bookings = await fleet_of_two(lab)
             booked = await bookings.book({"robot/a": {}, "robot/b": {}}, in_seconds(SOON), 120, name="survey")
             gone = await bookings.book({"robot/a": {}}, in_seconds(7200), 600, name="gone")

@@ -14,10 +14,9 @@ from typing import Any
 import pytest
 from icalendar import Calendar, Event
 
-from tests.cli import tools
 from tests.hang import HANG
 from tests.live.lab import Lab
-from tests.live.test_metrics import free_port
+from tests.ports import free_port
 from zscout.behaviors.client.bookings import BookingsClient
 from zscout.behaviors.client.client import Client
 
@@ -39,7 +38,7 @@ class Fleet:
         self.lab, self.client, self.port = lab, client, port
 
     async def zscout(self, *args: object, code: int = 0) -> str:
-        done = await asyncio.to_thread(tools.zscout, "calendar", *args, env=self.lab.env)
+        done = await self.lab.zscout("calendar", *args)
         assert done.returncode == code, done
         return done.stdout
 

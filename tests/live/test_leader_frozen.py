@@ -13,7 +13,7 @@ import zenoh
 
 from tests.hang import HANG
 from tests.live.crew import Crew, Stand
-from tests.live.lab import Lab, LeaderWatch
+from tests.live.lab import PATIENT, Lab, LeaderWatch
 from tests.live.test_leader_killed import APART, RUNNING, WAITING, grant_of
 from zscout.behaviors.client.client import CommandRefused
 from zscout.keyexpr import Role, Sender
@@ -29,8 +29,8 @@ ROBOTS = [f"robot/r{number}" for number in range(RUNNING)]
 
 def test_a_frozen_leader_is_followed_and_steps_down_when_it_wakes(tmp_path: Path) -> None:
     async def story() -> None:
-        timing = "[timing]\nhold_lease = 10\n"
-        async with Lab(tmp_path, lease=1.0, candidates=("a", "b"), extra=timing) as lab:
+        timing = "[timing]\nhold_lease = 30\n"
+        async with Lab(tmp_path, lease=4.0, candidates=("a", "b"), extra=timing) as lab:
             lab.node("c", *ROBOTS, "robot/free", "robot/short", extra=APART)
             lab.node("a")
             client = await lab.client("asker")
@@ -41,7 +41,7 @@ def test_a_frozen_leader_is_followed_and_steps_down_when_it_wakes(tmp_path: Path
             await crew.assemble(lab, ROBOTS, waiting=WAITING)
             await lab.candidates(client, "b")
             # Its time is over while the leader sleeps; at its waking the leader would give the RC away.
-            short = await client.request("short", {"robot/short": {}}, min_runtime=0.3, keep=False)
+            short = await client.request("short", {"robot/short": {}}, min_runtime=10, keep=False)
             heir = await client.request("heir", {"robot/short": {}}, min_runtime=600)
             assert (short.state, heir.state) == ("running", "queued")
             before = await lab.state(client, lambda state: len(state.queue) == WAITING + 1)
@@ -142,4 +142,4 @@ def _any_request() -> bytes:
 
 
 def _get(session: zenoh.Session, key: str, payload: bytes = b"{}") -> list[zenoh.Reply]:
-    return list(session.get(key, payload=payload, timeout=1))
+    return list(session.get(key, payload=payload, timeout=PATIENT))

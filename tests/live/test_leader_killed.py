@@ -10,7 +10,7 @@ import pytest
 
 from tests.live.bench import running, until
 from tests.live.crew import Crew, Stand
-from tests.live.lab import Lab, LeaderWatch
+from tests.live.lab import PATIENT, Lab, LeaderWatch
 from tests.live.unpublished import deaths
 from zscout.behaviors.client.client import Client
 from zscout.mesh import clock
@@ -80,7 +80,7 @@ def test_a_leader_killed_between_answer_and_publication_has_granted_nothing(tmp_
 def test_the_only_rcm_killed_and_started_again_finds_everything(tmp_path: Path) -> None:
     async def story() -> None:
         # A process takes its time to start on a busy machine; holds must last that long.
-        async with Lab(tmp_path, extra="[timing]\nhold_lease = 15\n") as lab:
+        async with Lab(tmp_path, lease=PATIENT, extra="[timing]\nhold_lease = 60\n") as lab:
             lab.node("c", *ROBOTS, extra=APART)
             lab.node("a")
             client = await lab.client("asker")
@@ -105,7 +105,7 @@ def test_the_only_rcm_killed_and_started_again_finds_everything(tmp_path: Path) 
 
 def test_what_is_given_up_while_nobody_leads_is_free_under_the_next_rcm(tmp_path: Path) -> None:
     async def story() -> None:
-        async with Lab(tmp_path, extra="[timing]\nhold_lease = 15\n") as lab:
+        async with Lab(tmp_path, lease=PATIENT, extra="[timing]\nhold_lease = 60\n") as lab:
             lab.node("c", "robot/x", "robot/y", extra=APART)
             lab.node("a")
             client = await lab.client("asker")
@@ -118,8 +118,10 @@ def test_what_is_given_up_while_nobody_leads_is_free_under_the_next_rcm(tmp_path
             await lab.held_by(client, "robot/x", "kept")
             lab.nodes["a"].wait()
             lab.node("a")
-            state = await lab.ready(client, "robot/x", "robot/y")
-            assert [(hold.arc, hold.grant) for hold in state.holds] == [("stays", stays)]
+            await lab.ready(client, "robot/x", "robot/y")
+            await lab.state(
+                client, lambda state: [(hold.arc, hold.grant) for hold in state.holds] == [("stays", stays)]
+            )
             await lab.held_by(client, "robot/x")
             await lab.held_by(client, "robot/y", "stays")
 

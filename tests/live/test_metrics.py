@@ -18,7 +18,9 @@ from typing import Any
 import pytest
 
 from tests.hang import HANG
+from tests.live.bench import comes_to
 from tests.live.lab import Lab
+from tests.ports import free_port
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import CommandRefused, RequestRefused
 
@@ -28,12 +30,6 @@ PROJECT = Path(__file__).parents[2]
 CONFIG = PROJECT / "deploy" / "prometheus" / "prometheus.yml"
 PROMETHEUS = shutil.which("prometheus")
 without = pytest.mark.skipif(PROMETHEUS is None, reason="prometheus is missing: install the package prometheus")
-
-
-def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
 
 
 def get(url: str) -> str:
@@ -122,6 +118,7 @@ async def measured(folder: Path) -> AsyncIterator[tuple[Lab, Client, int]]:
         assert await client.granted(second, confirmed=True) is not None
         urgent = await client.request("urgent", {"robot/a": {}}, priority=5, min_runtime=60)
         assert await client.granted(urgent, confirmed=True) is not None
+        await comes_to(second, "queued")  # what it is told of its own may come after that
         await client.end(urgent)
         assert await client.granted(second, confirmed=True) is not None
         await client.end(second)

@@ -12,8 +12,9 @@ import psutil
 import pytest
 
 from tests.hang import HANG
+from tests.live.bench import until
 from tests.live.lab import Lab
-from tests.live.placing import Placing, WitnessRc, register
+from tests.live.placing import LONGEST, Placing, WitnessRc, register
 from tests.thorough import times
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import OpenArc
@@ -62,20 +63,23 @@ def test_a_component_that_moves_keeps_its_count_and_its_hold(tmp_path: Path) -> 
 
 async def _moves(tmp_path: Path) -> None:
     async with Lab(tmp_path, candidates=["h0"]) as lab, WitnessRc(lab, RC) as rc:
+        register(lab)
         for host in ("h0", "h1", "h2"):
             lab.node(host)
         client = await lab.client()
         placing = Placing(client)
         await lab.ready(client, RC)
         await placing.hosts(3)
-        placed = await placing.place(ARC, "counter", {"rc": RC, "period": 0.005}, hosts=["h1", "h2"])
+        placed = await placing.place(ARC, "tally", {"rc": RC, "period": 0.005}, hosts=["h1", "h2"])
         assert placed.state == "running"
+        # It may be seen to run before its node has told what it can.
+        await placing.until(ARC, lambda one: one.movable)
         await rc.witness.more()
         rival = await rival_of(lab)
         dead, grants = [], set[Grant]()
         for number in range(MOVES):
             to = "h1" if placed.host == "h2" else "h2"
-            placed = await placing.get(MigrateComponent(ARC, to), Placement)
+            placed = await placing.get(MigrateComponent(ARC, to, wait=LONGEST), Placement)
             assert (placed.state, placed.host, placed.moves) == ("running", to, number + 1), placed
             assert placed.dead is not None
             dead.append(placed.dead)
@@ -140,7 +144,7 @@ async def _target_dies(folder: Path, victim: str, steps: Sequence[str]) -> None:
                 await _dies_at(step, made, lab, placing, rc, victim)
             except Exception as error:
                 raise AssertionError(f"{victim} killed, {step}: {error!r}") from error
-            await placing.get(EndComponent(ARC), Placement)
+            await placing.get(EndComponent(ARC, wait=LONGEST), Placement)
             await lab.held_by(client, RC)
 
 
@@ -152,9 +156,10 @@ async def _dies_at(step: str, folder: Path, lab: Lab, placing: Placing, rc: Witn
     source, target = placed.host, "h1" if placed.host == "h2" else "h2"
     assert source is not None
     await rc.witness.more()
+    await placing.until(ARC, lambda one: one.movable)
     released = rc.witness.released
     (folder / "at-init").unlink()
-    moving = asyncio.create_task(placing.ask(MigrateComponent(ARC, target), Placement))
+    moving = asyncio.create_task(placing.ask(MigrateComponent(ARC, target, wait=LONGEST), Placement))
     await MOVE_TO[step](lab, placing, folder, target)
     await kill(lab, target, victim)
     let_go(folder)
@@ -224,7 +229,8 @@ async def at_handed_over(lab: Lab, placing: Placing, folder: Path, target: str) 
     lab.signal("h0", signal.SIGSTOP)
     (folder / "hold-restore").unlink()
     await appears(folder / "restored")
-    await asyncio.sleep(0.05)
+    # Nothing shows that its node, and the source's, have heard so: they may not have run meanwhile.
+    await asyncio.sleep(2)
     for child in psutil.Process(lab.nodes[target].pid).children(recursive=True):
         child.suspend()
     lab.signal("h0", signal.SIGCONT)
@@ -254,6 +260,7 @@ def test_drain_empties_a_host_without_a_lost_grant(tmp_path: Path) -> None:
 async def _drains(tmp_path: Path) -> None:
     names = [f"part-{number}" for number in range(4)]
     async with Lab(tmp_path, candidates=["h0"]) as lab:
+        register(lab)
         lab.node("h0", *(f"robot/{name}" for name in names))
         lab.node("h1")
         client = await lab.client()
@@ -261,8 +268,8 @@ async def _drains(tmp_path: Path) -> None:
         await lab.ready(client, *(f"robot/{name}" for name in names))
         await placing.hosts(2)
         both = ["h0", "h1"]
-        placed = await asyncio.gather(
-            *(placing.place(name, "counter", {"rc": f"robot/{name}", "period": 0.01}, hosts=both) for name in names)
+        await asyncio.gather(
+            *(placing.place(name, "tally", {"rc": f"robot/{name}", "period": 0.01}, hosts=both) for name in names)
         )
         revoked: list[str] = []
 
@@ -270,13 +277,19 @@ async def _drains(tmp_path: Path) -> None:
             revoked.extend(one.outcome for one in said.revoked)
 
         client.mesh.subscribe(client.mesh.keys.grants, Grants, on_grants)
-        for name in names:
-            await placing.until(name, lambda one: one.movable)
+        placed = [await placing.until(name, lambda one: one.state == "running" and one.movable) for name in names]
         elsewhere = [one.component for one in placed if one.host == "h0"]
-        await asyncio.gather(*(placing.get(MigrateComponent(name, "h1"), Placement) for name in elsewhere))
+        await asyncio.gather(
+            *(placing.get(MigrateComponent(name, "h1", wait=LONGEST), Placement) for name in elsewhere)
+        )
+        # What is published comes to this client when it comes.
+        await until(lambda: revoked == ["handed_over"] * len(elsewhere))
         revoked.clear()
+        for name in names:
+            await placing.until(name, lambda one: (one.state, one.host, one.movable) == ("running", "h1", True))
         drained = await placing.get(DrainHost("h1"), Placements)
         assert drained.cordoned == ["h1"]
         for name in names:
             await placing.until(name, lambda one: (one.state, one.host) == ("running", "h0"))
+        await until(lambda: len(revoked) >= len(names))
         assert revoked == ["handed_over"] * len(names)

@@ -12,8 +12,7 @@ import pytest
 from tests.behaviors.components.kit import ComponentLab, lives
 from tests.hang import HANG
 from tests.live.lab import Lab
-from tests.live.placing import Placing, WitnessRc
-from zscout.keyexpr import Role
+from tests.live.placing import Placing, WitnessRc, register
 from zscout.mesh import clock
 from zscout.messages import (
     ComponentSpec,
@@ -123,15 +122,16 @@ def test_what_ran_on_a_host_that_dies_runs_elsewhere(tmp_path: Path) -> None:
 
 
 async def _host_dies(tmp_path: Path) -> None:
-    async with ComponentLab(tmp_path) as lab, WitnessRc(lab, RC) as rc:
-        lab.node("h0")
-        for host in ("h1", "h2"):
+    # The leader is not the one that dies.
+    async with ComponentLab(tmp_path, candidates=["h0"]) as lab, WitnessRc(lab, RC) as rc:
+        register(lab)
+        for host in ("h0", "h1", "h2"):
             lab.node(host)
         client = await lab.client()
         await lab.ready(client, RC)
         placing = Placing(client)
         await placing.hosts(3)
-        held = await placing.place("held", "counter", {"rc": RC, "period": 0.02}, hosts=["h1", "h2"])
+        held = await placing.place("held", "tally", {"rc": RC, "period": 0.02}, hosts=["h1", "h2"])
         victim = held.host
         assert victim is not None
         await rc.witness.more()
@@ -156,14 +156,13 @@ def test_the_leader_dies_with_a_component_and_the_next_placer_knows(tmp_path: Pa
 async def _leader_dies(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path) as lab:
         placing = await three(lab)
-        (leader,) = {
-            token.host
-            for token in await placing.client.mesh.living(placing.client.mesh.keys.alive_any(Role.RCM), timeout=1)
-        }
+        leader = (await lab.state(placing.client, lambda state: bool(state.host))).host
         others = sorted({"h0", "h1", "h2"} - {leader})
         lost = await placing.place("lost", "counter", hosts=[leader, others[0]])
         kept = await placing.place("kept", "counter", hosts=[others[1]])
         doomed = [leader] if lost.host == leader else []
+        # Who leads next sees the other, and what runs there.
+        await lab.candidates(placing.client, *others)
         await host_dies(lab, leader)
         moved = await placing.until("lost", lambda one: one.state == "running" and one.host == others[0])
         assert (moved.incarnation > lost.incarnation) is bool(doomed)

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.live
 
 def test_an_rc_that_died_while_the_lead_was_taken_is_lost_within_a_lease(tmp_path: Path) -> None:
     async def story() -> None:
-        async with Lab(tmp_path, lease=0.5) as lab, Stand(lab) as stand:
+        async with Lab(tmp_path, lease=4) as lab, Stand(lab) as stand:
             rc = await stand.rc("robot/real", Bench())
             client = await lab.client()
             leader = await ZenohMesh.open(lab.fleet, Sender("leader", "node"))

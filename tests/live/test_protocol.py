@@ -23,6 +23,7 @@ from zscout import messages
 from zscout.behaviors.client.arc import hold
 from zscout.keyexpr import Keys, Role, Sender
 from zscout.messages import RcmState
+from zscout.types import SECOND
 
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
 STRUCTS: dict[str, Any] = {
@@ -101,7 +102,8 @@ class PlainProcess:
     async def start(cls, lab: Lab, name: str) -> PlainProcess:
         mesh = lab.fleet.mesh
         program = str(Path(__file__).with_name("plain_client.py"))
-        arguments = [lab.fleet.name, "elsewhere", name, mesh.multicast_address, str(mesh.lease)]
+        hold_lease = lab.fleet.timing.hold_lease / SECOND
+        arguments = [lab.fleet.name, "elsewhere", name, mesh.multicast_address, str(mesh.lease), str(hold_lease)]
         process = await asyncio.create_subprocess_exec(
             sys.executable, program, *arguments, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
         )

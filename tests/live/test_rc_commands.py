@@ -73,14 +73,14 @@ def test_every_refusal(tmp_path: Path) -> None:
 
                 _, warming = await running(client, "warm", "robot/warm")
                 done = await client.command("robot/warm", warming, {"name": "confirm"})
-                assert 590 < done.warming <= 600
+                assert 300 < done.warming <= 600
                 assert await answer(client.command("robot/warm", warming, ECHO)) == "warming"
 
                 await client.end(arc)
                 await lab.held_by(client, "robot/bench")
                 assert await answer(echo(grant)) == "ended"
                 await until(lambda: bench.calls == ["begin one", "safe"])
-                _, brief = await running(client, "brief", "robot/bench", min_runtime=0.2, keep=False)
+                _, brief = await running(client, "brief", "robot/bench", min_runtime=5, keep=False)
                 await until(lambda: not rc.holds.held)
                 assert await answer(echo(brief)) == "ended"
                 assert warm.calls == ["begin warm"]
@@ -122,7 +122,7 @@ async def _malformed(lab: Lab, client: Client, grant: Grant) -> None:
 
 def test_what_piles_up_while_a_node_stands_still_is_refused(tmp_path: Path) -> None:
     async def story() -> None:
-        async with Lab(tmp_path, lease=5, extra="[timing]\nhold_lease = 10\n") as lab:
+        async with Lab(tmp_path) as lab:
             lab.node("a")
             lab.node("c", "robot/x", extra="candidate = false")
             client = await lab.client()
@@ -135,7 +135,7 @@ def test_what_piles_up_while_a_node_stands_still_is_refused(tmp_path: Path) -> N
             assert not any(task.done() for task in old)
             lab.signal("c", signal.SIGCONT)
             assert [await answer(task) for task in old] == ["stale"] * 5
-            assert await answer(client.command("robot/x", grant, ECHO, ttl=5)) == "done"
+            assert await answer(client.command("robot/x", grant, ECHO)) == "done"
             assert arc.grant == grant
 
     asyncio.run(story())
@@ -158,9 +158,11 @@ def test_a_failing_device_ends_the_whole_gang_which_waits_for_it(tmp_path: Path)
                 assert arc.ending is not None
                 assert (arc.ending.outcome, arc.place) == ("lost", place)
                 assert "smoke comes out of it" in arc.ending.reason
-                assert bench.calls == ["begin gang", "safe"]
-                waits = await lab.state(client, lambda state: [wait.arc for wait in state.queue] == ["gang"])
-                assert waits.queue[0].reason == "robot/bench is lost: smoke comes out of it"
+                await until(lambda: bench.calls == ["begin gang", "safe"])
+                why = "robot/bench is lost: smoke comes out of it"
+                await lab.state(
+                    client, lambda state: [(wait.arc, wait.reason) for wait in state.queue] == [("gang", why)]
+                )
                 await lab.held_by(client, "robot/a")
                 for name in ("robot/a", "robot/bench"):
                     assert await answer(client.command(name, grant, ECHO)) == "ended"
@@ -212,7 +214,8 @@ def test_one_of_two_holders_ends_and_the_device_serves_the_other(tmp_path: Path)
 
 def test_holds_end_at_rc_and_client_when_no_rcm_is_heard_for_the_hold_lease(tmp_path: Path) -> None:
     async def story() -> None:
-        async with Lab(tmp_path, extra="[timing]\nhold_lease = 1.5\n") as lab:
+        lease = 8.0
+        async with Lab(tmp_path, lease=lease / 2, extra=f"[timing]\nhold_lease = {lease}\n") as lab:
             lab.node("a")
             lab.node("c", "robot/x", "robot/y", extra="candidate = false")
             client = await lab.client()
@@ -236,9 +239,11 @@ def test_holds_end_at_rc_and_client_when_no_rcm_is_heard_for_the_hold_lease(tmp_
                         async with asyncio.timeout(HANG):
                             await asyncio.Event().wait()
                 assert revoked.value.outcome == "lost"
-                # The last word may have been half a second old when the RCM died.
-                assert 0.9 < (clock.now() - killed) / SECOND < HANG
-                await until(lambda: set(ended) == {"robot/x", "robot/y", "robot/bench"})
+                # The last word may have been half a second old when the RCM died, and some more where it stood still.
+                assert lease / 2 < (clock.now() - killed) / SECOND
+                await until(
+                    lambda: {rc for rc, holds in ended.items() if holds} == {"robot/x", "robot/y", "robot/bench"}
+                )
                 assert {(hold.why, hold.grant) for holds in ended.values() for hold in holds} == {
                     ("lease", grants[0]),
                     ("lease", kept_grant),

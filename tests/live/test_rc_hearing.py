@@ -116,7 +116,9 @@ def test_a_question_that_nobody_answered_is_asked_again(tmp_path: Path, monkeypa
     asyncio.run(story())
 
 
-def test_a_command_newer_than_the_rc_knows_makes_it_read(tmp_path: Path) -> None:
+def test_a_command_newer_than_the_rc_knows_makes_it_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resource_controller, "REREAD_TIMEOUT", HANG)
+
     async def story() -> None:
         async with Lab(tmp_path) as lab:
             client = await lab.client()

@@ -24,6 +24,7 @@ from rerun.chunk import RrdReader
 
 from tests.hang import HANG
 from tests.live.lab import Lab
+from tests.ports import free_port
 from tests.services.recorder.paper_run import colours, events, lanes, rows
 from zscout.behaviors.client.arc import hold
 from zscout.config.fleet import MeshConfig, beside
@@ -38,11 +39,6 @@ from zscout.types import SECOND
 pytestmark = pytest.mark.live
 
 MARK = " (operator)"
-
-
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        return int(free.getsockname()[1])
 
 
 def recorder(folder: str = "runs") -> str:
@@ -129,11 +125,11 @@ def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
             both = {"robot/a": {}, "robot/b": {}, "radio/a": {"rate": 4}}
             survey = await client.request("survey", both, min_runtime=60)
             listen = await client.request("listen", {"radio/a": {"rate": 5}}, min_runtime=60)
-            later = await client.request("later", {"robot/b": {}}, min_runtime=0.3, keep=False)
+            later = await client.request("later", {"robot/b": {}}, min_runtime=2, keep=False)
             # On a busy machine a vote may be overdue at first.
             await until(lambda: (survey.state, listen.state, later.state) == ("running", "running", "queued"))
             await told_why.wait()
-            async with hold(client, "operator", {"robot/a": {}}, priority=10, min_runtime=0.5, keep=False):
+            async with hold(client, "operator", {"robot/a": {}}, priority=10, min_runtime=8, keep=False):
                 await lab.state(client, lambda state: {wait.arc for wait in state.queue} == {"survey"})
                 await asyncio.Event().wait()
             await lab.state(client, lambda state: "survey" in {held.arc for held in state.holds})
@@ -205,6 +201,7 @@ def test_a_recorder_starts_in_the_middle_and_outlives_the_leader(tmp_path: Path)
             waiter = await client.request("waiter", {"robot/b": {}}, min_runtime=60)
             lab.node("c", extra="candidate = false\n" + recorder())
             await recording(lab)
+            await lab.candidates(client, "b")
             lab.nodes["a"].kill()
             await lab.state(client, lambda state: state.host == "b" and len(state.holds) == 2)
             await client.end(first)
@@ -249,7 +246,7 @@ def test_what_ends_while_no_rcm_is_there_is_seen_from_the_devices(tmp_path: Path
     runs = tmp_path / "runs"
 
     async def story() -> None:
-        async with Lab(tmp_path, lease=1.0, candidates=["a"]) as lab:
+        async with Lab(tmp_path, lease=4.0, candidates=["a"]) as lab:
             lab.node("a")
             lab.node("b", "robot/b", extra="candidate = false\n" + recorder())
             client = await lab.client("crew")

@@ -7,6 +7,7 @@ import asyncio
 import json
 import subprocess
 import sys
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, get_args
@@ -25,7 +26,7 @@ from zscout.types import SECOND, Grant
 pytestmark = pytest.mark.live
 SHOWN = "import ssl; print(ssl.get_server_certificate(('127.0.0.1', 7447), timeout=5))"
 """The certificate that a relay shows who links to it."""
-LEASE = 3.0
+LEASE = 5.0
 """Seconds. A site is on its own when it is over, and no process here is to stand still for so long."""
 DOORS = pytest.mark.parametrize("secured", [False, True], ids=["plain", "secured"])
 
@@ -90,8 +91,11 @@ def test_the_next_in_the_other_site_follows_a_holder_that_was_killed(tmp_path: P
                 await following.asks("next", "robot/a1", "robot/b2")
                 await following.event("queued")
                 killed = first.kill()
-                # Its token's going counts at once: no lease has passed.
-                assert await following.enters() - killed < PATIENT * SECOND
+                # Its token's going counts at once: no lease has passed. A leader that stood still itself leaves who is
+                # gone a lease to come back.
+                took = await following.enters() - killed
+                leaders = [(tmp_path / f"{host}.log").read_text() for host in ("a1", "b1")]
+                assert took < PATIENT * SECOND or any("stood still" in log for log in leaders)
                 await following.gives_back()
 
     asyncio.run(story())
@@ -122,7 +126,19 @@ def test_what_two_relays_bring_twice_is_carried_out_once(tmp_path: Path) -> None
                     while carried_out() < number:  # noqa: ASYNC110
                         await asyncio.sleep(0.05)
 
-            await reaches(2)  # the question whether it knows of the grant
+            async def both_bring() -> bool:
+                """Whether what is asked once is carried out twice before long: the second relay may come later."""
+                before = carried_out()
+                await commands(1, anew=True)
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(5):
+                        while carried_out() < before + 2:  # noqa: ASYNC110
+                            await asyncio.sleep(0.05)
+                return carried_out() >= before + 2
+
+            async with asyncio.timeout(HANG):
+                while not await both_bring():
+                    pass
             before = carried_out()
             await commands(count, anew=True)
             await reaches(before + 2 * count)  # so it arrives twice
@@ -158,15 +174,18 @@ def test_each_site_leads_itself_without_the_relay_and_the_merge_ends_no_hold(
             assert [await program.works_on() for program in inside] == [[], []]
 
             sites.bring_relay_back(fault)
-            merged = await sites.whole(*inside, *late, across)
-            assert held(merged) == {program.name: program.grant for program in (*inside, *late)}
+            await sites.whole(*inside, *late, across)
+            # Of a hold the RCM may hear later than of its RCs.
+            kept = {program.name: program.grant for program in (*inside, *late)}
+            await sites.sees(across, lambda state: held(state) == kept)
             assert [await program.works_on() for program in (*inside, *late)] == [[]] * 4
 
             # What needs both sites is granted when it can be.
             for program in late:
                 await program.gives_back()
             await across.enters()
-            assert held(await sites.whole(across)) == {one.name: one.grant for one in (*inside, across)}
+            stand = {one.name: one.grant for one in (*inside, across)}
+            await sites.sees(across, lambda state: held(state) == stand)
 
     asyncio.run(story())
 
@@ -190,7 +209,7 @@ def test_a_relay_whose_certificate_is_renewed_ends_no_hold(tmp_path: Path) -> No
                     if shown.stdout.split() == fresh.split():
                         break
             newcomer = await sites.program("b", "newcomer")
-            state = await sites.whole(across, newcomer)
-            assert held(state) == {"across": across.grant}
+            await sites.whole(across, newcomer)
+            await sites.sees(newcomer, lambda state: held(state) == {"across": across.grant})
 
     asyncio.run(story())

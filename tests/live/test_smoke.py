@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.hang import HANG
-from tests.live.lab import Lab
+from tests.live.lab import TTL, Lab
 from zscout.behaviors.client.arc import Revoked, hold
 from zscout.messages import LoadReport
 
@@ -34,7 +34,7 @@ def test_a_gang_over_two_nodes_is_granted_commanded_and_preempted(tmp_path: Path
             async def survey() -> None:
                 nonlocal operator
                 async with hold(client, "survey", needs, min_runtime=30) as held:
-                    done = await held.command("robot/a", {"name": "echo", "value": [1, 2]})
+                    done = await held.command("robot/a", {"name": "echo", "value": [1, 2]}, ttl=TTL)
                     assert done.result == [1, 2]
                     operator = asyncio.create_task(take())
                     await asyncio.Event().wait()

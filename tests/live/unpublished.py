@@ -35,7 +35,7 @@ from zscout.types import Grant
 
 RCS = ("robot/a", "robot/b")
 HOSTS = ("h1", "h2")
-OUT = 0.02
+OUT = 1.0
 """Seconds for which the answer may take to leave the process: nothing else leaves it meanwhile."""
 ECHO = {"name": "echo", "value": 1}
 BOTH: dict[str, dict[str, int]] = {rc: {} for rc in RCS}
@@ -135,7 +135,7 @@ class Deaths:
 
 
 async def deaths(folder: Path, times: int, tell: Callable[[Death], object]) -> list[Death]:
-    async with Lab(folder, lease=1.0, candidates=HOSTS) as lab:
+    async with Lab(folder, candidates=HOSTS) as lab:
         fleet = Deaths(lab)
         await fleet.assemble()
         found = []

@@ -17,6 +17,7 @@ from unittest.mock import patch
 
 import click
 
+from tests.ports import free_port
 from tests.surface.tree import PROJECT
 
 WIDTH: Final = 100
@@ -215,9 +216,11 @@ def calls() -> dict[str, Any]:
     """Exit code, stdout and stderr of each call of `CALLS`: help on wrong words, and what needs no mesh."""
     programs = scripts()
     found: dict[str, Any] = {}
-    with plain(), tempfile.TemporaryDirectory() as folder, _inside(folder):
+    with tempfile.TemporaryDirectory() as folder, plain(ZSCOUT_FLEET=f"{folder}/alone.toml"), _inside(folder):
         for name, text in BAD_FILES.items():
             Path(name).write_text(text)
+        # As the default fleet, but where nobody else on this machine is heard.
+        Path("alone.toml").write_text(f'[mesh]\nmulticast_address = "224.0.0.224:{free_port()}"\ninterface = "lo"\n')
         for words in CALLS:
             name, _, rest = words.partition(" ")
             program, args = ("zscout-node", rest) if name == "node" else ("zscout", words)

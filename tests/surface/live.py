@@ -13,7 +13,6 @@ import argparse
 import json
 import os
 import re
-import socket
 import subprocess
 import sys
 import tempfile
@@ -25,6 +24,7 @@ from pathlib import Path
 from typing import IO, Any, Final, Self
 
 from tests.hang import HANG
+from tests.ports import free_port
 from tests.surface.commands import plain, printed, scripts
 from tests.surface.compare import SEPARATOR, Difference
 from tests.surface.record import text as as_text
@@ -53,11 +53,14 @@ class Story:
     def __enter__(self) -> Self:
         self._stack.enter_context(plain(ZSCOUT_HOST="desk"))
         self.folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            address = f'"tcp/127.0.0.1:{free.getsockname()[1]}"'
+        address = f'"tcp/127.0.0.1:{free_port()}"'
         name = f"surface-{os.getpid()}"
-        self._file("fleet", f'[fleet]\nname = "{name}"\n[mesh]\nmulticast = false\nconnect = [{address}]\n')
+        # No lease is to end, and no vote to be late, where a process does not run for a while.
+        self._file(
+            "fleet",
+            f'[fleet]\nname = "{name}"\n[mesh]\nmulticast = false\nlease = 10\nconnect = [{address}]\n'
+            "[timing]\nhold_lease = 30\nrebuild = 2\nvote_timeout = 2\n",
+        )
         self._file(
             "anvil",
             f'[node]\nhost = "anvil"\nfleet = "fleet.toml"\n[mesh]\nlisten = [{address}]\nconnect = []\n'

@@ -25,12 +25,6 @@ from zscout.types import Ns
 
 P = TypeVar("P", bound=Packet)
 
-RULES = """
-[placement]
-start_timeout = 120
-[timing]
-hold_lease = 2.0
-"""
 ROLLS = 0.01
 """Metres a second from which on a wheel turns."""
 CLOSET = Plan(
@@ -141,8 +135,17 @@ def like(heard: Iterable[Heard], **fields: float) -> list[Heard]:
 class RobotLab(Lab):
     """A lab with a building of its own in the test's process. Give it a plan, and `Served`'s arguments."""
 
-    def __init__(self, folder: Path, plan: Plan = CLOSET, *, candidates: Sequence[str] = (), **how: Any) -> None:
-        super().__init__(folder, candidates=candidates, extra=RULES)
+    def __init__(
+        self,
+        folder: Path,
+        plan: Plan = CLOSET,
+        *,
+        lease: float | None = None,
+        candidates: Sequence[str] = (),
+        extra: str = "",
+        **how: Any,
+    ) -> None:
+        super().__init__(folder, lease=lease, candidates=candidates, extra=extra)
         self.env["PYTHONPATH"] = str(ROOT)
         self.building = Building(plan, radio_link=folder / "radio0", **how)
         self._stack = AsyncExitStack()
@@ -166,7 +169,7 @@ class RobotLab(Lab):
 
     async def __aenter__(self) -> Self:
         await self._stack.enter_async_context(self.building)
-        return self
+        return await super().__aenter__()
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

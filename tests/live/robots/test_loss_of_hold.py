@@ -94,7 +94,8 @@ class Losses:
         await asyncio.gather(turning.end(), self.client.end(rivals[0]))
 
     async def time_over(self) -> None:
-        turning = await self.driving(min_runtime=1.0, keep=False)
+        # Within that it is confirmed, tunes, warms up and drives.
+        turning = await self.driving(min_runtime=10.0, keep=False)
 
         async def over() -> None:
             assert turning.arc is not None
@@ -151,7 +152,9 @@ def at_once(act: Callable[[], object]) -> Callable[[], Awaitable[None]]:
 
 def test_none_drives_on_after_losing_its_hold(tmp_path: Path) -> None:
     async def story() -> None:
-        async with RobotLab(tmp_path, candidates=["lead"], frame_rate=1) as lab:
+        # The lease ends in this test, and for nobody whose process only stands still for a while.
+        lease = "[timing]\nhold_lease = 8\n"
+        async with RobotLab(tmp_path, lease=4, candidates=["lead"], extra=lease, frame_rate=1) as lab:
             lab.node("lead")
             lab.devices("mast", "radio", "video", "framegrabber")
             lab.devices("cart", "robot")

@@ -55,6 +55,7 @@ def test_a_net_at_work(tmp_path: Path) -> None:
             placing = Placing(client)
             await lab.ready(client, *ROBOTS, "radio/rf0", "video/ch1", "framegrabber/fgrab1")
             await lab.living(client, "node", lambda hosts: set(hosts) == {"a", "b"})
+            await placing.hosts(2)
             said: list[tuple[str, BehaviorSaid]] = []
             keys = client.mesh.keys
             client.mesh.subscribe(

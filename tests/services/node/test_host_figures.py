@@ -173,12 +173,16 @@ def test_a_limit_counts_where_it_is_less_than_the_host(tmp_path: Path) -> None:
 def test_a_container_that_uses_all_it_may_is_busy_on_an_idle_host(tmp_path: Path) -> None:
     files = {"cpu.max": "1000 100000", "cpu.stat": "usage_usec 0"}
     cgroup = group(tmp_path, "0::/", files)
+    before = time.monotonic()
     meter, start = CpuMeter(cgroup), time.monotonic()
     while time.monotonic() - start < 0.1:
         pass
     # As much as 0.01 cores give at most in the time that went by.
-    (tmp_path / "sys" / "cpu.stat").write_text(f"usage_usec {round((time.monotonic() - start) * 10_000)}")
-    assert 90 < meter.percent(0.01) <= 100
+    used = time.monotonic() - start
+    (tmp_path / "sys" / "cpu.stat").write_text(f"usage_usec {round(used * 10_000)}")
+    percent = meter.percent(0.01)
+    # What went by besides is the system's, which may have let others run.
+    assert 99 * used / (time.monotonic() - before) < percent <= 100
     assert 0 <= meter.percent(0.01) <= 100
 
 

@@ -16,6 +16,7 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
+from tests.hang import HANG
 from tests.services.recorder.paper_run import (
     RCS,
     RERUN,
@@ -277,16 +278,20 @@ def test_live_viewers_get_what_the_file_gets(tmp_path: Path) -> None:
 
 
 def becomes_equal(viewer: subprocess.Popen[bytes], path: Path, copy: Path) -> bool:
-    """Whether Table 2 and its colours come to both files within half a minute, while all are still open."""
-    deadline = time.monotonic() + 30
+    """Whether Table 2 and its colours come to both files, while all are still open."""
+    deadline = time.monotonic() + HANG
     while time.monotonic() < deadline and viewer.poll() is None:
         # A file that is being written has no footer, and at first not even a store.
         with suppress(ValueError, RuntimeError, OSError, KeyError), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             shown = lanes(copy, "/rc/**")
             table = {rc: second_by_second(shown[f"/rc/{rc}"]) for rc in RCS}
-            if table == TABLE2 and shown == lanes(path, "/rc/**"):
-                return colours(copy, "/rc/**") == colours(path, "/rc/**")
+            if (
+                table == TABLE2
+                and shown == lanes(path, "/rc/**")
+                and colours(copy, "/rc/**") == colours(path, "/rc/**")
+            ):
+                return True
         time.sleep(0.02)
     return False
 

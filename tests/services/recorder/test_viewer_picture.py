@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -21,6 +20,8 @@ import pytest
 from PIL import Image, ImageChops
 from rerun.experimental import ViewerClient
 
+from tests.hang import HANG
+from tests.ports import free_port
 from tests.services.recorder.paper_run import (
     FGRAB1,
     FGRAB2,
@@ -70,8 +71,7 @@ def viewer(recording: Path, home: Path, *, panes: int = 5, height: int = HEIGHT)
     """A viewer without a window that has the recording open; skips where it finds no graphics driver.
 
     `panes` are those that the recording's layout has, hidden ones among them."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = str(free.getsockname()[1])
+    port = str(free_port())
     size = f"{WIDTH}x{height}"
     command: list[str | Path] = [RERUN, "--headless", "--window-size", size, "--bind", "127.0.0.1"]
     log = home / "viewer.log"
@@ -106,12 +106,12 @@ def opened(process: subprocess.Popen[bytes], log: Path, url: str, panes: int) ->
 
 
 def until(ask: Callable[[], T | None]) -> T:
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + HANG
     while time.monotonic() < deadline:
         if (answer := ask()) is not None:
             return answer
         time.sleep(0.05)
-    pytest.fail("the viewer was not ready within a minute")
+    pytest.fail("the viewer was never ready")
 
 
 def settled_picture(client: ViewerClient, path: Path) -> Image.Image:
