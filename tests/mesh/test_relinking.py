@@ -38,6 +38,9 @@ def _cut(ends: set[tuple[int, int]]) -> None:
     """Ends these links below Zenoh: nobody says goodbye."""
     assert ends
     for file in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):
+            if not str(file.readlink()).startswith("socket:"):
+                continue
         with suppress(OSError), socket.socket(fileno=os.dup(int(file.name))) as one:
             if one.family != socket.AF_UNIX and (one.getsockname()[1], one.getpeername()[1]) in ends:
                 one.shutdown(socket.SHUT_RDWR)
@@ -193,8 +196,18 @@ def test_whoever_ends_is_not_looked_for() -> None:
         async with AsyncExitStack() as stack:
             world = _World(stack)
             (first, here, there) = [await world.peer(relinks=True) for _ in range(3)]
+            gone = there.id()
             await there.close()
-            await until(lambda: len(here.peers()) == len(first.peers()) == 1)
+
+            def is_gone() -> bool:
+                # Once in fifty a Zenoh session that is closed makes its own links again, and they last as long as its
+                # process, which would end now.
+                for one in (first, here):
+                    if ends := _ends(one, gone):
+                        _cut(ends)
+                return len(here.peers()) == len(first.peers()) == 1
+
+            await until(is_gone)
             for one in (first, here):
                 assert one._relinking is not None
                 await until(lambda relinking=one._relinking: relinking._thread is None)  # type: ignore[misc]
