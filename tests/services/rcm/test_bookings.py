@@ -850,25 +850,57 @@ def test_a_date_by_pattern_goes_to_another_shared_rc_once_that_has_voted() -> No
     run(story())
 
 
+def forget_how_to_ask(fleet: BookedFleet, host: str) -> None:
+    """The links to a host have come back without what it had declared to be asked by about bookings."""
+    (mesh,) = (mesh for mesh in fleet.meshes if mesh.me.host == host)
+    session = mesh._transport.current
+    assert isinstance(session, MemoryTransport)
+    forgotten = {one for one in session.queryables.all if "/bookings" in str(one)}
+    assert forgotten
+    for other in fleet.network.nodes:
+        fleet.network.between(session, other).hidden |= forgotten
+
+
 def test_a_keeper_that_nobody_asks_joins_the_mesh_anew() -> None:
     async def story() -> None:
         fleet = BookedFleet("x", "y")
         await led(fleet, "x", "y")
         client = fleet.client("one", "x")
         await asyncio.sleep(1)
-        # The link to y has come back without what y had declared to be asked by.
-        (y,) = (mesh for mesh in fleet.meshes if mesh.me.host == "y")
-        session = y._transport.current
-        assert isinstance(session, MemoryTransport)
-        forgotten = {one for one in session.queryables.all if "/bookings" in str(one)}
-        assert forgotten
-        for other in fleet.network.nodes:
-            fleet.network.between(session, other).hidden |= forgotten
+        forget_how_to_ask(fleet, "y")
         with pytest.raises(Refusal, match="not_kept"):
             await do(client, book("b", "robot/a", at=500), BookingView)
         await asyncio.sleep(60)
         await do(client, book("c", "robot/a", at=700), BookingView)
         await asyncio.sleep(1)
         assert [record.id for record in fleet.disks["y"].records][-1] == "c"
+
+    run(story())
+
+
+def test_a_keeper_that_can_not_lead_and_that_nobody_asks_joins_the_mesh_anew() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        await led(fleet, "x", "y")
+        mesh, disk = fleet.mesh("far"), fleet.disks.setdefault("far", Disk())
+        far = BookingKeeper(mesh, disk, candidate=False, wall=fleet.time)
+        far.start(Supervisor("far", lambda error: pytest.fail(str(error))))
+        token = mesh.alive(Token("far", Role.NODE, "node", "1"))
+        session, client = mesh._transport.current, fleet.client("one", "x")
+        await asyncio.sleep(100)
+        await do(client, book("a", "robot/a", at=500), BookingView)
+        await asyncio.sleep(1)
+        assert mesh._transport.current is session, "it joined anew though it was asked"
+        forget_how_to_ask(fleet, "far")
+        await do(client, book("b", "robot/a", at=700), BookingView)
+        await asyncio.sleep(20)
+        assert [record.id for record in disk.records] == ["a"]
+        assert mesh._transport.current is session, "it joined anew though it had been asked lately"
+        await asyncio.sleep(60)
+        assert [record.id for record in disk.records] == ["a", "b"]
+        # Fleet time is for those that may lead.
+        assert far.time is None
+        far.stop()
+        token.close()
 
     run(story())

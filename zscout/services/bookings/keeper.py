@@ -125,7 +125,7 @@ class BookingKeeper:
         """What the disk has."""
         self._saving = asyncio.Lock()
         self._waiting = 0
-        self._served: Declaration | None = None
+        self._declared: list[Declaration] = []
         self.on_shared: Callable[[], None] = lambda: None
         """Called when another leader told of what was not known here."""
         if disk is not None:
@@ -134,12 +134,17 @@ class BookingKeeper:
 
     def start(self, supervisor: Supervisor) -> None:
         """From now on it answers the leader."""
-        self._supervisor, key = supervisor, self.mesh.keys.bookings(self.mesh.me.host)
-        self._served = self.mesh.serve(key, ShareBookings, supervisor.guard(self._on_shared), limit=MAX_STATE)
+        self._supervisor, keys, guard = supervisor, self.mesh.keys, supervisor.guard
+        key = keys.bookings(self.mesh.me.host)
+        self._declared = [self.mesh.serve(key, ShareBookings, guard(self._on_shared), limit=MAX_STATE)]
+        if not self._candidate:
+            # A candidate passes on whom it believes. Here fleet time is of no use, and a leader is heard all the same.
+            watch = guard(lambda _key, grants: self._look_whether_asked(grants))
+            self._declared.append(self.mesh.subscribe(keys.grants, Grants, watch))
 
     def stop(self) -> None:
-        if self._served is not None:
-            self._served.close()
+        for declared in self._declared:
+            declared.close()
 
     # Fleet time
 
@@ -149,11 +154,8 @@ class BookingKeeper:
         tells a younger time than is known here, until it has heard of this one."""
         if grants.time is None:
             return
+        self._look_whether_asked(grants)
         now, (term, at) = self.mesh.now(), self.heard
-        leader, since, last = self._leader
-        self._leader = grants.term, since if leader == grants.term and now - last < LEFT else now, now
-        unasked = now - max(self._asked, self._leader[1]) > UNASKED
-        self.mesh.suspicions.suspect("a leader is heard that asks nothing about bookings", so=unasked)
         offset, since = round(grants.time * SECOND) - now, now - round(grants.time_age * SECOND)
         if self._offset is not None:
             near = abs(offset - self._offset) <= DIFFERS * SECOND
@@ -164,6 +166,15 @@ class BookingKeeper:
                 return
             since = min(since, self.since)
         self._offset, self.heard, self.since = offset, (grants.term, now), since
+
+    def _look_whether_asked(self, grants: Grants) -> None:
+        """A leader that is heard, and that knows bookings, asks each keeper that it sees."""
+        if grants.time is None:
+            return
+        now, (leader, since, last) = self.mesh.now(), self._leader
+        self._leader = grants.term, since if leader == grants.term and now - last < LEFT else now, now
+        unasked = now - max(self._asked, self._leader[1]) > UNASKED
+        self.mesh.suspicions.suspect("a leader is heard that asks nothing about bookings", so=unasked)
 
     @property
     def time(self) -> Ns | None:
