@@ -45,6 +45,8 @@ class Claims:
         """The bookings of which it was told last that they are in danger."""
         self._wanting: dict[str, list[Arc]] = {}
         """By booking: ARCs that would take it up, and can't: it is not there at present, or another has it."""
+        self.certain_from: Ns = 0
+        """Until then dates are not certain: no date has come, and what is over may be to come again."""
 
     def stand_in(self, booking: Booking) -> Arc:
         """What stands for a booking before it is taken up."""
@@ -114,6 +116,7 @@ class Claims:
                 self.take_up(booking.id, arc)
 
     def _wait_until(self, arc: Arc, date: Ns) -> None:
+        date = max(date, self.certain_from)
         if date > self._state.now and arc.id in self._state.queued:
             self._state.hold_back(arc, date, ())
             self._actions.wait(arc, Reason(ReasonCode.NOT_YET))
@@ -156,10 +159,11 @@ class Claims:
         self._state.unclaim(claim)
         self._endangered.pop(claim, None)
         self._emit(BookingChanged(claim.booking.id, state, None if arc is None else arc.id))
-        if arc is not None and at_present:
+        if arc is not None and (at_present or self._state.now < self.certain_from):
             self._wanting[claim.booking.id] = [*self._wanting.get(claim.booking.id, ()), arc]
-        elif arc is not None:
+        if arc is not None and not at_present:
             self._go_on(arc)
+            self._wait_until(arc, 0)
 
     def expire(self) -> None:
         """Ends the bookings whose time is over, or whose owner's to take them up."""

@@ -456,6 +456,7 @@ class Core:
         self.term, self.seq, self._arrivals = lead.term, 0, 0
         if self._state.shares is not None:
             self._state.shares.restore(lead.charged)
+        self._claims.certain_from = lead.dates_from
         # The newest grant is the truth where two claim one exclusive RC.
         for held in sorted(lead.recovered_holds, key=lambda held: held.grant, reverse=True):
             if self._state.arc(held.request.arc) is None:

@@ -425,6 +425,8 @@ class LeadTaken(Struct, frozen=True):
     waiting: tuple[Requested, ...] = ()
     charged: Mapping[str, float] = {}
     """By group: RC-seconds that it had and others waited for, decayed as of now (`fair_shares.py`)."""
+    dates_from: Ns = 0
+    """Until then dates are not certain: who waits for one does not begin."""
 
 
 class Adopted(Struct, frozen=True):

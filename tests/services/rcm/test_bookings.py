@@ -758,7 +758,44 @@ def test_what_ends_by_one_wrong_clock_after_a_restart_of_all_is_not_over() -> No
         fleet.candidate("z")
         await asyncio.sleep(5)
         views = await fleet.bookings()
-        assert {name: states(view) for name, view in views.items()} == {"m": ["open"], "b": ["open"]}
+        assert {name: states(view) for name, view in views.items()} == {"m": ["open"], "b": ["taken"]}
+
+    run(story())
+
+
+@pytest.mark.parametrize("ahead", [NOON + 310, NOON + 2 * 86_400], ids=["its date has come", "it is over"])
+@pytest.mark.parametrize("known", [True, False], ids=["known", "not known"])
+def test_who_waits_for_a_date_does_not_begin_by_one_wrong_clock_after_a_restart_of_all(
+    ahead: float, known: bool
+) -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y", "z")
+        old = await led(fleet, "x", "y", "z")
+        client = fleet.client("one")
+        await do(client, book("b", "robot/b", at=300, patience=Decimal(100)), BookingView)
+        mine = await client.ask("mine", "robot/b", seconds=100, booking="b")
+        await asyncio.sleep(1)
+        client.open = [
+            OpenRequest("mine", "mine", {"robot/b": {}}, 0, Decimal(100), place=mine.place, booking=mine.booking)
+        ]
+        for one in old:
+            fleet.network.kill(one.mesh)
+        await asyncio.sleep(5)
+        fleet.ahead["x"] = ahead - fleet.time()
+        fleet.disks["x"].records *= known
+        first = fleet.candidate("x")
+        await until(lambda: first.rcm)
+        await asyncio.sleep(0.5)
+        assert first.rcm is not None
+        assert not first.rcm.bookings.settled
+        assert first.rcm.bookings.dates.time > NOON + 300
+        fleet.candidate("y")
+        fleet.candidate("z")
+        await asyncio.sleep(5)
+        assert states((await fleet.bookings())["b"]) == ["taken"]
+        assert "running" not in {notice.state for notice in client.notices}
+        await asyncio.sleep(NOON + 301 - fleet.time())
+        assert client.notices[-1].state == "running"
 
     run(story())
 

@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import combinations
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -21,6 +22,7 @@ from zscout.services.bookings.dates import dates, last_end
 from zscout.services.bookings.fleet_clock import DIFFERS, SAME
 from zscout.services.bookings.keeper import BookingKeeper, Disk
 from zscout.services.bookings.records import KEEP, Records
+from zscout.services.rcm.booked_dates import STEPPED
 from zscout.types import SECOND, ArcId, Grant, Ns, Place, Term
 
 if TYPE_CHECKING:
@@ -108,6 +110,8 @@ class BookingPromises:
         """When a leader last took over an older fleet time."""
         self._times: dict[Term, _FleetTime] = {}
         """By term: that of its leader as it was looked at last."""
+        self._dated: dict[Term, Ns] = {}
+        """By term that began without a fleet time for certain: 1970 on its leader's clock, as it was looked at last."""
         self._heard: dict[str, Term] = {}
         """Hosts whose processes knew fleet time as they were looked at last, and of whom they had heard it."""
         self._latest = 0.0
@@ -161,12 +165,16 @@ class BookingPromises:
             where = f"the memory of {sorted(memory)}, and on the disk of {sorted(disk)}"
             self._broken(f"{life.book.name} {what} is acknowledged, and is in {where} alone")
 
-    def news(self, arc: OpenArc) -> None:
-        """A program has news of a request."""
+    def news(self, arc: OpenArc, leaders: Mapping[str, Rcm]) -> None:
+        """A program has news of a request. `leaders`: by host, of processes that do not stand still."""
         booking, _, start = arc.booking.partition("@")
         mine = self.lives.get(booking)
         if mine is not None and start and arc.state == "running" and not (mine.given_up or int(start) in mine.dropped):
-            now = max((self.now() + told.ahead for told in self._times.values()), default=math.inf)
+            # One that has just begun to tell its fleet time was not looked at yet.
+            leading = [self._inside(host, partial(_fleet_time, rcm)) for host, rcm in leaders.items()]
+            told = [time for time in leading if time is not None]
+            told += [self.now() + one.ahead for one in self._times.values()]
+            now = max(told, default=math.inf)
             if now < int(start) - EARLY:
                 self._broken(f"{arc.name} begins {int(start) - now:.1f} s before the date of {mine.book.name}")
         life = self.lives.get((arc.by or "").partition("@")[0])
@@ -277,7 +285,13 @@ class BookingPromises:
         return self._unwanted[rcm.term][1]
 
     def _look_at_time(self, host: str, rcm: Rcm) -> None:
-        now, time = self.now(), self._inside(host, lambda: rcm.bookings.time)
+        now, time = self.now(), self._inside(host, partial(_fleet_time, rcm))
+        dated = rcm.bookings.dates.local(0)
+        if abs(dated - self._dated.get(rcm.term, dated)) > STEPPED:
+            # All its dates were others before: it knows of these since now.
+            self._known[rcm.term] = dict.fromkeys(self._known.get(rcm.term, ()), now)
+        if time is None or rcm.term in self._dated:
+            self._dated[rcm.term] = dated
         if time is None:
             return  # after a restart of all hosts it is found out first
         self._latest = max(self._latest, time)
@@ -456,6 +470,10 @@ class _Listed(NamedTuple):
     def meets(self, other: _Listed) -> bool:
         one, two = self.date, other.date
         return bool(self.rcs & other.rcs) and one.start < two.end and two.start < one.end
+
+
+def _fleet_time(rcm: Rcm) -> float | None:
+    return rcm.bookings.time
 
 
 def _as_record(book: Book) -> BookingRecord:

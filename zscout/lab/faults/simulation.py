@@ -522,7 +522,7 @@ class Simulation:
 
         def told(arc: OpenArc) -> None:
             self.log(f"{arc.name} {arc.state} {arc.outcome or ''} {arc.reason}")
-            self.booked.news(arc)
+            self.booked.news(arc, self._leading_hosts())
             grant, since, rcs = began.get(arc.id, (None, 0.0, []))
             self.promises.told(name, arc, client.term, touched=self._touched(since, name, *rcs, *arc.rcs, *arc.needs))
             if arc.grant is not None and arc.grant != grant:

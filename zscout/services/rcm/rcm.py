@@ -190,7 +190,8 @@ class Rcm:
                 self._recover(request)
         self.requests.believed = recovered.believed
         waiting = (replace(one, request=self.bookings.dates.dated(one.request)) for one in recovered.waiting)
-        lead = LeadTaken(self.term, tuple(recovered.holds), tuple(waiting), recovered.charged)
+        certain = 0 if self.bookings.settled else self.bookings.settles_at
+        lead = LeadTaken(self.term, tuple(recovered.holds), tuple(waiting), recovered.charged, certain)
         booked = self.bookings.recovered({request.booking for request in requests if request.booking})
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
         self._decide([*joined, *booked, lead], named=recovered.rcs)
