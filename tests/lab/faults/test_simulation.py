@@ -28,6 +28,7 @@ FOUND = [
     434963,
     435554,
     440263,
+    550493,
     600943,
     700043,
     892734,
@@ -42,7 +43,8 @@ had no end, as a date that ran was in the way where it had been kept, and not wh
 two placers gave; a date that was in conflict for a while, and lost who had taken it up; a pattern that took what
 another had booked; a keeper that can't lead and that nobody asked; who waited for a date, and began by one wrong clock
 before fleet time was certain. At 892734 the check erred: a leader stood still as it told the time for the first time;
-and at 918193: what began before fleet time was certain was in the way of a date that had been hours away."""
+at 918193: what began before fleet time was certain was in the way of a date that had been hours away; and at 550493: a
+booking was refused, which another host kept, and brought back within milliseconds."""
 MISSED = {
     "order": 15,
     "grant": 1,

@@ -257,13 +257,14 @@ class BookingPromises:
         first = rcm.term not in self._known
         known, kept = self._known.setdefault(rcm.term, {}), self._claims.get(rcm.term, {})
         claims = {booking.id: (booking, arc) for booking, arc in rcm.core.bookings()}
-        # What was in conflict with one that is over is known anew: it was not there, or it is another object. So is
-        # what has other RCs for its patterns.
+        # What was in conflict with one that is over, or was refused and brought back, is known anew: it was not there,
+        # or it is another object, and not one that was put off. So is what has other RCs for its patterns.
         for name in known.keys() - claims.keys():
             del known[name]
         for name in known.keys() & kept.keys():
             (booking, _), (before, _) = claims[name], kept[name]
-            if booking.bound != before.bound or (booking is not before and booking == before):
+            again = booking.since != before.since or (booking is not before and booking == before)
+            if again or booking.bound != before.bound:
                 del known[name]
         for name in claims:
             heard = first and name.partition("@")[0] in self._records.get(host, ())
