@@ -16,13 +16,8 @@ from tests.mesh.kit import run, until
 from zscout.drivers.confirm_server import CommandQuery
 from zscout.drivers.holds import HoldChange
 from zscout.drivers.repeated import MAX_HOSTS, MAX_PER_HOST, MAX_WAITING, CommandMemory
-from zscout.drivers.resource_controller import (
-    COMMANDS_PER_HOST,
-    EARLY_PER_HOST,
-    SAY_AGAIN,
-    ResourceController,
-    WorkQueue,
-)
+from zscout.drivers.resource_controller import SAY_AGAIN, ResourceController
+from zscout.drivers.work_queue import COMMANDS_PER_HOST, EARLY_PER_HOST, WorkQueue
 from zscout.keyexpr import Role, Sender
 from zscout.lab.faults.link import Disturbance
 from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork

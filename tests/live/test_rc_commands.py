@@ -16,7 +16,8 @@ from tests.live.bench import ECHO, Bench, SharedBench, Stand, answer, running, u
 from tests.live.lab import Lab
 from zscout.behaviors.client.arc import Revoked, hold
 from zscout.behaviors.client.client import Client
-from zscout.drivers.resource_controller import COMMANDS_PER_HOST, MAX_TTL
+from zscout.drivers.resource_controller import MAX_TTL
+from zscout.drivers.work_queue import COMMANDS_PER_HOST
 from zscout.mesh import clock
 from zscout.mesh.zenoh_mesh import zenoh_config
 from zscout.messages import Done, EndedHold, Problem, RcState, decode

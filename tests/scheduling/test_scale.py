@@ -41,7 +41,8 @@ from zscout.scheduling.model import (
     VoteOverdue,
 )
 from zscout.scheduling.priority import AdmissionCheck
-from zscout.scheduling.state import QueueIndex, SchedulerState
+from zscout.scheduling.queue_index import QueueIndex
+from zscout.scheduling.state import SchedulerState
 from zscout.types import SECOND, Params
 
 

@@ -7,7 +7,8 @@ from collections import Counter
 from zscout.keyexpr import matcher
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Arc, ArcState
-from zscout.scheduling.state import QueueIndex, SchedulerState
+from zscout.scheduling.queue_index import QueueIndex
+from zscout.scheduling.state import SchedulerState
 from zscout.types import Place
 
 QUEUED = (ArcState.READY, ArcState.VOTING, ArcState.DEFERRED, ArcState.WATCHING, ArcState.PARKED)

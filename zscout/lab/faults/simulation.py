@@ -9,7 +9,6 @@ import asyncio
 import gc
 import hashlib
 import logging
-import math
 import random
 from collections import Counter
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
@@ -35,6 +34,7 @@ from zscout.lab.faults.bookers import Booker, Hosts
 from zscout.lab.faults.booking_promises import BookingPromises
 from zscout.lab.faults.components import DEEDS, KINDS, Deeds, SimulatedComponent, operate, report_load
 from zscout.lab.faults.device import Device, WatchedCapacity, WatchedExclusive
+from zscout.lab.faults.excuses import IMPATIENCE, Excuses
 from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork, MemoryTransport
 from zscout.lab.faults.plan import OPERATIONS, Fault
 from zscout.lab.faults.programs import Work, steal_places
@@ -45,7 +45,6 @@ from zscout.messages import MAX_COUNTER, Grants
 from zscout.scheduling.reason import ReasonCode
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.node.component_host import ComponentHost
-from zscout.services.rcm.absence import AT_ONCE
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.rcm import Rcm
 from zscout.types import SECOND, Grant, Term
@@ -63,10 +62,6 @@ DRIFT: Final = 0.001
 """By which clocks run apart at most."""
 SERVED_WITHIN: Final = 60.0
 """Seconds after the last fault in which all that was asked must have been served."""
-FELT: Final = 5.0
-"""Seconds for which a fault may be felt when it is over: links come back, and holds that were lost are told of."""
-IMPATIENCE: Final = 0.25
-"""Part of the lease before whose end a link may be given up already, as Zenoh does."""
 FORGOTTEN: Final = 0.3
 """Of what was declared, where links come back without all of it."""
 SETTLE: Final = 2.0
@@ -191,10 +186,6 @@ class Simulation:
         """By program: its ARCs that are not over."""
         self.present: list[Fault] = []
         """The faults of now."""
-        self.killed: dict[Fault, tuple[str, float]] = {}
-        """Those that have killed a process, it, and after how many seconds."""
-        self.led_throughout: dict[Fault, set[str]] = {}
-        """By fault that is over: hosts whose leaders led before it began, and as it ended."""
         self.calm_since = START
         """When the last fault ended."""
         self.everybody = [
@@ -240,6 +231,16 @@ class Simulation:
             self.fleet.timing.hold_lease / SECOND,
             strict=self.fleet.strategy == "priority",
             thief=THIEF,
+        )
+        self.excuses = Excuses(
+            hosts=self.hosts,
+            candidates_at=self.candidates_at,
+            where=self.where,
+            faults=self.faults,
+            fleet=self.fleet,
+            leading=lambda: {host: one.rcm.term for host, one in self.candidates.items() if one.rcm is not None},
+            terms=self.promises.terms,
+            now=lambda: loop.now,
         )
         self.equipment = Hosts(self.seed, self.hosts, lambda: loop.now, booked=self.size.bookers > 0)
         self.booked = BookingPromises(
@@ -513,8 +514,6 @@ class Simulation:
             return
         await asyncio.gather(*(self.work.run(client, f"{mesh.me.client}-{number}", busy) for number in range(2)))
 
-    # Faults
-
     def watch(self, name: str, client: Client) -> None:
         """Whatever this client is told is held against the promises."""
         began: dict[str, tuple[Grant | None, float, list[str]]] = {}
@@ -524,77 +523,15 @@ class Simulation:
             self.log(f"{arc.name} {arc.state} {arc.outcome or ''} {arc.reason}")
             self.booked.news(arc, self._leading_hosts())
             grant, since, rcs = began.get(arc.id, (None, 0.0, []))
-            self.promises.told(name, arc, client.term, touched=self._touched(since, name, *rcs, *arc.rcs, *arc.needs))
+            self.promises.told(
+                name, arc, client.term, touched=self.excuses.felt(since, name, *rcs, *arc.rcs, *arc.needs)
+            )
             if arc.grant is not None and arc.grant != grant:
                 began[arc.id] = arc.grant, self.loop.now - START, arc.rcs
 
         client.watch(told)
 
-    def _touched(self, since: float, *whom: str) -> bool:
-        """Whether a fault may be felt by these processes and RCs: one of now, or one that was over lately. What began
-        (`since`) while hosts were apart may be the grant of a leader that does not see all of its RCs yet."""
-        names = {*whom, *(self.where[rc] for rc in whom if rc in self.where)}
-        hosts = {name.split("/")[0] for name in names} & {*self.hosts}
-        lately = self.loop.now - START - FELT
-        faults = [
-            fault
-            for fault in self.faults
-            if fault.at < self.loop.now - START and fault.at + fault.lasts + fault.felt > lately
-        ]
-        failing = {one for fault in faults if fault.kind in ("freeze", "stall") for one in fault.whom}
-        failing |= {self.killed[fault][0] for fault in faults if fault in self.killed}
-        sound = {host for host in self.hosts if f"{host}/node" not in failing}
-        if sound.isdisjoint(self.candidates_at):
-            return True
-        sides = [self._side(fault, hosts) for fault in faults if fault.kind in ("isolate", "part")]
-        beside = {*self.hosts}.intersection(*sides) & sound
-        # A leader that hangs is given up after a silence: where the next candidate fails just then, holds may be over.
-        silence = max(4 * self.fleet.timing.heartbeat / SECOND, self.fleet.mesh.lease)
-        hung = any(fault.kind == "stall" and fault.lasts > silence for fault in faults)
-        if hung and len(beside.intersection(self.candidates_at)) < len(self.candidates_at) - 1:
-            return True
-        return any(self._touches(fault, names, hosts, since, beside) for fault in faults)
-
-    def _side(self, fault: Fault, hosts: set[str]) -> set[str]:
-        """The hosts that a partition leaves with these; none, if it parts them."""
-        one, other = {*fault.whom}, {*self.hosts} - {*fault.whom}
-        return next((side for side in (one, other) if hosts <= side), set())
-
-    def _led_since(self, at: float) -> set[str]:
-        """Hosts whose leaders lead, and did then."""
-        led = ((host, one.rcm.term) for host, one in self.candidates.items() if one.rcm is not None)
-        return {host for host, term in led if self.promises.terms.get(term, self.loop.now) < at + START}
-
-    def _touches(self, fault: Fault, names: set[str], hosts: set[str], since: float, beside: set[str]) -> bool:
-        """`beside`: hosts that no partition parts from these, and whose nodes are touched by no fault of their own."""
-        # Of a leader's links the first was lost as the others came back: nobody can tell that from a host that goes.
-        lasts, timing = self.loop.now - START - fault.at, self.fleet.timing
-        just_over = 0 <= lasts - fault.lasts < 2 * AT_ONCE
-        match fault.kind:
-            case "kill" | "old disk":
-                name, at = self.killed.get(fault, ("", math.inf))
-                # What it said last may have reached some only.
-                return name in names or 0 < since - at < self.fleet.mesh.lease
-            case "stall" | "fail" | "double":
-                return bool(names & {*fault.whom})
-            case "disk" | "clock":
-                return False
-            case "freeze":
-                return just_over or bool(names & {*fault.whom})
-            case "isolate" | "part":
-                there = self._side(fault, hosts)
-                parted = not beside & {*self.candidates_at}
-                # A leader on the other side that goes on has given to others what it did not see for a lease.
-                led = self.led_throughout.get(fault, set()) | self._led_since(fault.at)
-                left = fault.lasts > self.fleet.mesh.lease * (1 - IMPATIENCE) and led - there
-                # A candidate that is left alone waits for as long as a hold lasts: it may be cut off itself.
-                alone = len(beside) == 1 and lasts > (timing.hold_lease - 2 * timing.heartbeat) / SECOND
-                # Nor can one tell it that begins to lead just then.
-                over = START + fault.at + fault.lasts
-                began = any(abs(at - over) < 2 * AT_ONCE for at in self.promises.terms.values())
-                return just_over or began or parted or bool(left) or alone or since > fault.at
-            case _:
-                return True
+    # Faults
 
     def _begin(self, fault: Fault) -> None:
         self.log(f"FAULT {fault}")
@@ -687,7 +624,7 @@ class Simulation:
 
     def _end(self, fault: Fault, end: Callable[[], object]) -> None:
         self.log(f"OVER  {fault.kind} {' '.join(fault.whom)}")
-        self.led_throughout[fault] = self._led_since(fault.at)
+        self.excuses.on_over(fault)
         end()
         self.loop.call_later(fault.felt, self._forget_fault, fault)
 
@@ -701,9 +638,9 @@ class Simulation:
         self.promises.unheard = not lost.isdisjoint(("grants", "alive"))
 
     def _kill(self, name: str, fault: Fault, reached: MemoryTransport | None = None) -> None:
-        if fault in self.killed or self.running[name][0].dead:
+        if fault in self.excuses.killed or self.running[name][0].dead:
             return
-        self.killed[fault] = name, self.loop.now - START
+        self.excuses.killed[fault] = name, self.loop.now - START
         with self.booked.destroying():
             self._take_down(name, reached if fault.message in OPERATIONS else None)
 
@@ -724,8 +661,8 @@ class Simulation:
     def _revive(self, fault: Fault, armed: Iterable[MemoryMesh]) -> None:
         for mesh in armed:
             self.network.after_sending(mesh, "", None)
-        if fault in self.killed:
-            self.start(self.killed[fault][0])
+        if fault in self.excuses.killed:
+            self.start(self.excuses.killed[fault][0])
 
     def _kill_spare(self, name: str, rc: str) -> None:
         self.end_process(name)
