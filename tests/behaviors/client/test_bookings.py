@@ -15,7 +15,7 @@ from msgspec.structs import asdict
 from tests.behaviors.client.small_fleet import RC, SmallFleet, small_fleet
 from tests.behaviors.client.test_open_arc import NOW, RUNS, TAKEN, WAITS, arc
 from tests.mesh.kit import run, until
-from tests.services.rcm.test_bookings import Disk
+from tests.services.rcm.booked_fleet import Disk
 from zscout.behaviors.client.bookings import BookingsClient, RcmSilent
 from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.behaviors.client.request import OpenArc

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.mesh.kit import run, until
-from tests.services.rcm.test_bookings import NOON, BookedFleet, book, do, led
+from tests.services.rcm.booked_fleet import NOON, BookedFleet, book, do, led
 from tests.services.recorder.paper_run import events, rows
 from zscout.keyexpr import Role, Token
 from zscout.messages import BookedDate, BookingsTold, BookingView, Unbook

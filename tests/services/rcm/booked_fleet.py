@@ -1,0 +1,117 @@
+"""A fleet on a mesh in memory whose candidates keep bookings."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from decimal import Decimal
+from typing import Any, TypeVar
+
+from tests.mesh.kit import until
+from tests.services.rcm.kit import FakeClient, FakeFleet, Refusal, request
+from zscout.lab.faults.memory import MemoryMesh
+from zscout.mesh import IncomingQuery
+from zscout.messages import Book, BookingRecord, BookingsAsk, BookingsTold, BookingView, Operation, ShareBookings
+from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.rcm.candidate import Candidate
+
+R = TypeVar("R")
+NOON = 1_800_000_000.0
+"""Seconds since 1970 at the beginning of each story."""
+
+
+class Disk:
+    """What outlives a process, in memory."""
+
+    def __init__(self) -> None:
+        self.records: list[BookingRecord] = []
+        self.broken = False
+
+    def read(self) -> list[BookingRecord]:
+        return list(self.records)
+
+    async def write(self, records: list[BookingRecord]) -> None:
+        if self.broken:
+            raise OSError("no space left")
+        self.records = list(records)
+
+
+class BookedFleet(FakeFleet):
+    """Candidates with disks and clocks of their own."""
+
+    def __init__(self, *candidates: str) -> None:
+        self.meshes: list[MemoryMesh] = []
+        super().__init__(*candidates, strategy="adaptive")
+        self.disks: dict[str, Disk] = {}
+        self.ahead: dict[str, float] = {}
+        """By how many seconds a host's clock is ahead."""
+        loop = asyncio.get_running_loop()
+        begun = loop.time()
+        self.time: Callable[[], float] = lambda: NOON + loop.time() - begun
+
+    def mesh(self, host: str, client: str = "node") -> MemoryMesh:
+        self.meshes.append(super().mesh(host, client))
+        return self.meshes[-1]
+
+    def part(self, host: str) -> None:
+        """Cuts the links between a host and all others."""
+        for one in self.meshes:
+            for other in self.meshes:
+                if (one.me.host == host) is not (other.me.host == host):
+                    self.network.cut(one, other)
+
+    def candidate(self, host: str, *_: Any, **how: Any) -> Candidate:
+        disk = self.disks.setdefault(host, Disk())
+        mesh = self.mesh(host)
+        ahead = self.ahead.get(host, 0.0)
+        keeper = BookingKeeper(mesh, disk, wall=lambda: self.time() + ahead)
+        candidate = Candidate(mesh, self.fleet, keeper=keeper, **how)
+        candidate.start()
+        return candidate
+
+    def silent(self) -> list[IncomingQuery[ShareBookings]]:
+        """A host that answers no question about bookings: those that it was asked."""
+        mesh, asked = self.mesh("silent"), list[IncomingQuery[ShareBookings]]()
+        mesh.serve(mesh.keys.bookings("silent"), ShareBookings, asked.append)
+        return asked
+
+    async def bookings(self, **asked: Any) -> dict[str, BookingView]:
+        key = self.watcher.keys.rcm_bookings
+        reply = await self.watcher.ask_one(key, BookingsAsk(**asked), BookingsTold, timeout=1)
+        assert reply is not None
+        assert reply.message is not None, reply.problem
+        return {view.id: view for view in reply.message.bookings}
+
+
+async def do(client: FakeClient, operation: Operation, kind: type[R]) -> R:
+    reply = await client.mesh.ask_one(client.mesh.keys.schedule(client.mesh.me), operation, kind, timeout=10)
+    assert reply is not None, "the RCM did not answer"
+    if reply.message is None:
+        assert reply.problem is not None
+        raise Refusal(reply.problem)
+    return reply.message
+
+
+def book(name: str, *needs: str, at: float, seconds: float = 100, **more: Any) -> Book:
+    """A booking whose id is its name; `at`: seconds after the beginning of the story."""
+    wanted = request(name, *needs).needs
+    settings = {"priority": 0, "patience": Decimal(20), **more}
+    return Book(id=name, name=name, needs=wanted, start=round(NOON + at), runtime=Decimal(str(seconds)), **settings)
+
+
+async def led(fleet: BookedFleet, *hosts: str) -> list[Candidate]:
+    """Candidates, of which one leads, and two robots that count as there."""
+    candidates = [fleet.candidate(host) for host in hosts]
+    robots = [fleet.rc(f"robot/{name}") for name in "ab"]
+    await until(lambda: any(one.rcm is not None and one.rcm.bookings.settled for one in candidates))
+    await fleet.joined(*robots)
+    return candidates
+
+
+def states(view: BookingView) -> list[str]:
+    return [date.state for date in view.dates]
+
+
+def record(booking: Book, **more: Any) -> BookingRecord:
+    """As a host keeps it."""
+    return BookingRecord(**{name: getattr(booking, name) for name in Book.__struct_fields__}, **more)
