@@ -163,7 +163,7 @@ class Claims:
             self._wanting[claim.booking.id] = [*self._wanting.get(claim.booking.id, ()), arc]
         if arc is not None and not at_present:
             self._go_on(arc)
-            self._wait_until(arc, 0)
+            self._wait_until(arc, self.certain_from)
 
     def expire(self) -> None:
         """Ends the bookings whose time is over, or whose owner's to take them up."""
