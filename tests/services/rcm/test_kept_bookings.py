@@ -16,6 +16,7 @@ from zscout.mesh.supervision import Supervisor
 from zscout.messages import BookingView, Unbook
 from zscout.services.bookings.keeper import MAX_SAVING, BookingKeeper
 from zscout.services.bookings.records import MAX_BYTES
+from zscout.types import Place, Term
 
 
 def test_a_fleet_restarted_whole_reads_its_bookings() -> None:
@@ -146,6 +147,26 @@ def test_a_booking_that_one_leader_could_not_keep_stands_where_another_one_has_i
         fleet.network.heal()
         await asyncio.sleep(10)
         assert states((await fleet.bookings())["b"]) == ["open"]
+
+    run(story())
+
+
+def test_who_took_up_a_booking_that_this_leader_can_not_keep_waits_for_its_date() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x")
+        await led(fleet, "x")
+        fleet.disks["x"].broken = True
+        client = fleet.client("one")
+        # Another leader has made it, and is gone; what its program had asked that one arrives here late.
+        place = Place(Term(0, "elsewhere"), 1)
+        await client.ask("mine", "robot/a", seconds=100, place=place, booking="b@1800000500")
+        with pytest.raises(Refusal, match="not_kept"):
+            await do(client, book("b", "robot/a", at=500), BookingView)
+        await asyncio.sleep(5)
+        assert client.notices[-1].reason == "the time of its booking is still to come"
+        assert {notice.state for notice in client.notices} == {"queued"}
+        await asyncio.sleep(NOON + 501 - fleet.time())
+        assert client.notices[-1].state == "running"
 
     run(story())
 

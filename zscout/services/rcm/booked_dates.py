@@ -198,7 +198,8 @@ class BookedDates:
         """Brings the core's claims to what the records say, and finds which can't be."""
         wanted = {date.id: date for date in self._all()}
         known = {booking.id for booking, _ in self._core.bookings()}
-        gone = [Unbooked(name) for name in known if name not in wanted]
+        # What is only forgotten here, as it could be kept nowhere, another host may have.
+        gone = [Unbooked(name, at_present=not self._has(name)) for name in known if name not in wanted]
         missing = [date for name, date in wanted.items() if name not in known and not self._is_settled(name)]
         found = (self._booked(date) for date in missing if not _unbound(date))
         coming = [replace(one, tentative=self._core.is_wanted(one.booking.id)) for one in found if one is not None]
@@ -214,6 +215,10 @@ class BookedDates:
         self._conflicts = {name: by for name, by in self._conflicts.items() if name in wanted}
         self._judged = {name: found for name, found in self._judged.items() if name in self._conflicts}
         self._danger = {name: why for name, why in self._danger.items() if name in wanted}
+
+    def _has(self, name: str) -> bool:
+        """Whether there is a record of the booking whose date this is."""
+        return self._records.get(name.partition("@")[0]) is not None
 
     def _is_settled(self, name: str) -> bool:
         """Whether a date is in conflict as it was when that was found: to enter it again would only ask RCs again for
