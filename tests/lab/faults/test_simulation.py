@@ -29,7 +29,10 @@ FOUND = [
     435554,
     440263,
     502073,
+    517214,
+    519734,
     550493,
+    567963,
     600943,
     700043,
     892734,
@@ -43,10 +46,11 @@ radio beside a date, maintenance that one wrong clock ended, a conflict with wha
 had no end, as a date that ran was in the way where it had been kept, and not where it was; a number of a component that
 two placers gave; a date that was in conflict for a while, and lost who had taken it up; a pattern that took what
 another had booked; a keeper that can't lead and that nobody asked; who waited for a date, and began by one wrong clock
-before fleet time was certain, or as its leader could keep the booking nowhere. At 892734 the check erred: a leader
-stood still as it told the time for the first time; at 918193: what began before fleet time was certain was in the way
-of a date that had been hours away; and at 550493: a booking was refused, which another host kept, and brought back
-within milliseconds."""
+before fleet time was certain, or as its leader could keep the booking nowhere. Elsewhere the check erred: at 892734 and
+567963 a leader stood still as it told the time for the first time; at 918193 what began before fleet time was certain
+was in the way of a date that had been hours away; at 550493 a booking was refused, which another host kept, and brought
+back within milliseconds; at 517214 the time of a host that was alone went on, which had differed by 2 s; and at 519734
+a candidate was alone with a host that has no RC."""
 MISSED = {
     "order": 15,
     "grant": 1,

@@ -110,6 +110,10 @@ class BookingPromises:
         """When a leader last took over an older fleet time."""
         self._times: dict[Term, _FleetTime] = {}
         """By term: that of its leader as it was looked at last."""
+        self._former: list[_FleetTime] = []
+        """Those that leaders told before they took over an older one."""
+        self._overheard: dict[Term, _FleetTime] = {}
+        """By term of a leader that was gone, or stood still, as it could be looked at: what keepers heard of it."""
         self._dated: dict[Term, Ns] = {}
         """By term that began without a fleet time for certain: 1970 on its leader's clock, as it was looked at last."""
         self._heard: dict[str, Term] = {}
@@ -229,6 +233,9 @@ class BookingPromises:
             for name, (booking, arc) in self._claims[rcm.term].items() if calm else ():
                 if arc is not None and booking.start <= now and self._has_no_excuse(rcm, name, booking, arc, now):
                     yield (name, "is taken up, and its date has come, but", arc, "does not run"), AT_ITS_DATE
+        for host, keeper in self._keepers.items():
+            if (term := keeper.heard[0]) not in self._times and keeper.time is not None:
+                self._overheard.setdefault(term, self._inside(host, partial(_FleetTime.heard_by, keeper, self.now())))
         self._heard = {host: one.heard[0] for host, one in self._keepers.items() if one.time is not None}
         self._records = {host: known for host, known in (self._records | self._news).items() if host in self._keepers}
         self._news = {}
@@ -303,9 +310,11 @@ class BookingPromises:
                 self._broken(f"fleet time jumps by {told.ahead - before.ahead:g} s in term {rcm.term.counter}")
         elif before is not None or self._heard.get(host, rcm.term) != rcm.term:  # itself: it told it, and stood still
             if before is not None:
-                # It began where nobody knew the time of the others, and has met them.
+                # It began where nobody knew the time of the others, and has met them. Hosts that heard it alone may
+                # lead before they hear the older one.
                 self._stepped = now
-            known = self._times.values()
+                self._former.append(before)
+            known = [*self._times.values(), *self._former, *self._overheard.values()]
             if not (any(map(told.agrees, known)) and any(map(told.goes_on, known))):
                 self._broken(f"fleet time is {time:.3f} in term {rcm.term.counter}: none that was told before goes on")
         self._times[rcm.term] = told
@@ -447,6 +456,12 @@ class _FleetTime(NamedTuple):
     """By how much it was ahead of virtual time."""
     since: float
     """Since when it had gone on. There are two where the halves of a fleet began anew."""
+
+    @classmethod
+    def heard_by(cls, keeper: BookingKeeper, now: float) -> _FleetTime:
+        time, age = keeper.time, keeper.mesh.now() - keeper.since
+        assert time is not None  # noqa: S101 - it has heard one
+        return cls(now, time / SECOND - now, now - age / SECOND)
 
     def agrees(self, before: _FleetTime) -> bool:
         return self.differs(before) <= AGREE

@@ -93,8 +93,10 @@ class Excuses:
                 # A leader on the other side that goes on has given to others what it did not see for a lease.
                 led = self.led_throughout.get(fault, set()) | self._led_since(fault.at)
                 left = fault.lasts > self.fleet.mesh.lease * (1 - IMPATIENCE) and led - there
-                # A candidate that is left alone waits for as long as a hold lasts: it may be cut off itself.
-                alone = len(beside) == 1 and lasts > (timing.hold_lease - 2 * timing.heartbeat) / SECOND
+                # A candidate that is left alone, with no RC of another host to ask, waits for as long as a hold lasts:
+                # it may be cut off itself.
+                asked = {*self.candidates_at, *(process.split("/")[0] for process in self.where.values())}
+                alone = len(beside & asked) == 1 and lasts > (timing.hold_lease - 2 * timing.heartbeat) / SECOND
                 # Nor can one tell it that begins to lead just then.
                 over = START + fault.at + fault.lasts
                 began = any(abs(at - over) < 2 * AT_ONCE for at in self.terms.values())
