@@ -33,6 +33,7 @@ FOUND = [
     519734,
     550493,
     567963,
+    579603,
     600943,
     700043,
     892734,
@@ -49,8 +50,9 @@ another had booked; a keeper that can't lead and that nobody asked; who waited f
 before fleet time was certain, or as its leader could keep the booking nowhere. Elsewhere the check erred: at 892734 and
 567963 a leader stood still as it told the time for the first time; at 918193 what began before fleet time was certain
 was in the way of a date that had been hours away; at 550493 a booking was refused, which another host kept, and brought
-back within milliseconds; at 517214 the time of a host that was alone went on, which had differed by 2 s; and at 519734
-a candidate was alone with a host that has no RC."""
+back within milliseconds; at 579603 a date was in conflict for the first milliseconds of a reign; at 517214 the time of
+a host that was alone went on, which had differed by 2 s; and at 519734 a candidate was alone with a host that has no
+RC."""
 MISSED = {
     "order": 15,
     "grant": 1,

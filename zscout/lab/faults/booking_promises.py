@@ -262,6 +262,8 @@ class BookingPromises:
     def _look_at_claims(self, host: str, rcm: Rcm) -> None:
         """Since when its leader knows of each date."""
         first = rcm.term not in self._known
+        # What the last leader had in conflict may be so at first.
+        stood = self._claims[max(self._claims)] if self._claims else {}
         known, kept = self._known.setdefault(rcm.term, {}), self._claims.get(rcm.term, {})
         claims = {booking.id: (booking, arc) for booking, arc in rcm.core.bookings()}
         # What was in conflict with one that is over, or was refused and brought back, is known anew: it was not there,
@@ -274,7 +276,7 @@ class BookingPromises:
             if again or booking.bound != before.bound:
                 del known[name]
         for name in claims:
-            heard = first and name.partition("@")[0] in self._records.get(host, ())
+            heard = first and name in stood and name.partition("@")[0] in self._records.get(host, ())
             known.setdefault(name, 0.0 if heard else self.now())
         self._claims[rcm.term] = claims
 
