@@ -461,6 +461,7 @@ class _FleetTime(NamedTuple):
 
     @classmethod
     def heard_by(cls, keeper: BookingKeeper, now: float) -> _FleetTime:
+        """What a keeper has heard of its leader, who can't be looked at."""
         time, age = keeper.time, keeper.mesh.now() - keeper.since
         assert time is not None  # noqa: S101 - it has heard one
         return cls(now, time / SECOND - now, now - age / SECOND)

@@ -21,6 +21,8 @@ IMPATIENCE: Final = 0.25
 
 @dataclass(slots=True, kw_only=True)
 class Excuses:
+    """Of one run: `felt` says for whom a promise may wait now."""
+
     hosts: Sequence[str]
     candidates_at: Sequence[str]
     """The hosts that may lead."""
