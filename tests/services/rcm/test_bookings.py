@@ -362,12 +362,12 @@ def test_of_all_dates_of_a_booking_a_danger_is_told_once_and_the_next_dates_firs
 def test_a_date_in_conflict_is_not_voted_on_again_and_again() -> None:
     async def story() -> None:
         fleet = BookedFleet("x", "y")
-        await led(fleet, "x", "y")
+        _, y = await led(fleet, "x", "y")
         radio = fleet.rc("radio/rf0")
         await fleet.joined(radio)
         here, there = fleet.client("here", "x"), fleet.client("there", "y")
         fleet.part("y")
-        await asyncio.sleep(4)
+        await until(lambda: y.rcm)
         await do(here, book("beside", "radio/rf0:1", at=500), BookingView)
         await do(here, book("low", "radio/rf0:1", "robot/a", at=500), BookingView)
         await do(there, book("high", "robot/a", at=500, priority=5), BookingView)
@@ -385,12 +385,12 @@ def test_a_date_in_conflict_is_not_voted_on_again_and_again() -> None:
 def test_a_date_by_pattern_goes_to_another_shared_rc_once_that_has_voted() -> None:
     async def story() -> None:
         fleet = BookedFleet("x", "y")
-        await led(fleet, "x", "y")
+        _, y = await led(fleet, "x", "y")
         here, there = fleet.client("here", "x"), fleet.client("there", "y")
         first = fleet.rc("radio/rf0")
         await fleet.joined(first)
         fleet.part("y")
-        await asyncio.sleep(4)
+        await until(lambda: y.rcm)
         await do(here, book("low", "radio/*:1", at=500), BookingView)
         await fleet.joined(fleet.rc("radio/rf1"))
         await do(there, book("high", "radio/rf0:1", at=500, priority=5), BookingView)
