@@ -97,6 +97,39 @@ def test_what_has_changed_in_a_pause_is_no_motion() -> None:
     assert told <= 1.0
 
 
+def test_what_has_come_before_white_in_a_pause_is_no_motion() -> None:
+    """White hardly has noise, as the camera cuts it off: what stands before it now has."""
+    scene = Scene(8, noise=9.0)
+    scene.wall[20:110, 40:120] = 275
+    detector = settled(scene, rate=4.0, seconds=8.0)
+    detector.pause()
+    assert not any(detector.see(time, scene.picture(70, shade=40)).moving for time in times(4.0, 10.0, 60.0))
+    told = told_after(detector, scene, 80.0)
+    assert told is not None
+    assert told <= 1.0
+
+
+def test_lines_that_are_torn_as_a_pause_ends_are_not_learned() -> None:
+    scene = Scene(9)
+    detector = settled(scene, rate=4.0, seconds=8.0)
+    detector.pause()
+    assert detector.see(60.0, scene.picture()).learning
+    torn = scene.picture()
+    torn[60:70] = np.roll(torn[60:70], 24, axis=1)
+    assert not detector.see(60.25, torn).learning
+    assert not any(detector.see(time, scene.picture()).moving for time in times(4.0, 5.0, 60.5))
+
+
+def test_who_walks_as_a_pause_ends_is_told_at_once() -> None:
+    scene = Scene(10)
+    detector = settled(scene, rate=4.0, seconds=8.0)
+    detector.pause()
+    seen = [detector.see(time, scene.picture(20 + 40 * (time - 60))) for time in times(4.0, 1.5, 60.0)]
+    assert [one.moving for one in seen[2:]] == [True] * 4
+    # He leaves nothing behind of which more could be told.
+    assert not any(detector.see(time, scene.picture()).moving for time in times(4.0, 5.0, 63.0))
+
+
 def test_who_was_moved_in_a_pause_learns_anew() -> None:
     detector = settled(Scene(6), rate=4.0, seconds=8.0)
     detector.pause()

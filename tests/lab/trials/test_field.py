@@ -159,7 +159,7 @@ def test_crossings_and_alarms_are_counted_right(text: str, crossings: int, alert
     out, watcher, doing = Outcomes(), Watcher(), ""
     for now, people, word in looks(text):
         step = Step(0, 0, 0, word, "", alert=word == "alert" and doing != "alert")
-        watcher.look(now, people, step, lambda: False, out)
+        watcher.look(now, people, False, step, lambda: False, out)
         doing = word
     assert (out.crossings, out.alerted, out.false_alarms) == (crossings, alerted, false_alarms)
     assert out.robot_alarms == 0
@@ -167,8 +167,17 @@ def test_crossings_and_alarms_are_counted_right(text: str, crossings: int, alert
 
 def test_a_robot_that_drives_is_no_false_alarm() -> None:
     out, watcher = Outcomes(), Watcher()
-    watcher.look(10.0, 0, Step(0, 0, 0, "alert", "", alert=True), lambda: True, out)
+    watcher.look(10.0, 0, False, Step(0, 0, 0, "alert", "", alert=True), lambda: True, out)
     assert (out.robot_alarms, out.false_alarms) == (1, 0)
+
+
+def test_the_shadow_of_somebody_out_of_view_is_no_false_alarm() -> None:
+    out, watcher, alert = Outcomes(), Watcher(), Step(0, 0, 0, "alert", "", alert=True)
+    watcher.look(10.0, 0, True, Step(0, 0, 0, "watch", ""), lambda: False, out)
+    watcher.look(11.0, 0, False, alert, lambda: False, out)
+    assert (out.shadow_alarms, out.false_alarms) == (1, 0)
+    watcher.look(20.0, 0, False, alert, lambda: False, out)
+    assert (out.shadow_alarms, out.false_alarms) == (1, 1)
 
 
 def test_a_walk_counts_when_it_is_over_and_began_when_all_were_placed(room: Plan) -> None:

@@ -58,6 +58,8 @@ CHANGED: Final = 0.2
 """and is another in at most this share: else it is not of the background that is known."""
 AGREE: Final = (0.15, 1.0)
 """Seconds, at least and at most, between two such pictures that go on with it: the last of another robot is alone."""
+STANDS: Final = 0.25
+"""Less than this share of what has become another since differs between them where it does not move."""
 RETURN: Final = 2.0
 """Seconds after a pause in which pictures are waited for that fit what was known before; then all is learned anew."""
 STRONG: Final = 6.5
@@ -137,6 +139,33 @@ class Event(NamedTuple):
     """It was not over when the watch was."""
 
 
+class _Meanwhile:
+    """What pictures after a pause show of what has become another while nobody looked."""
+
+    def __init__(self, since: float, level: _Plane, mask: NDArray[np.uint8]) -> None:
+        self.since, self.pictures = since, 1
+        self.level, self._mask = level.copy(), mask
+        self._differ = np.zeros(level.shape, np.bool_)
+        """Where they differ."""
+
+    def add(self, level: _Plane, mask: NDArray[np.uint8]) -> None:
+        off = level - self.level
+        # Of two that are smoothed 0.6 of their noise is left.
+        self._differ |= np.abs(cv2.GaussianBlur(off, (3, 3), 0)) > 0.6 * WEAK * max(FLOOR, _noise(level))
+        self._mask = self._mask | mask
+        self.pictures += 1
+        self.level += off / self.pictures
+
+    def another(self) -> NDArray[np.bool_]:
+        """Where what is another stands: the rest moves, or was spoiled on the way."""
+        count, labels = cv2.connectedComponents(_with_rim(self._mask))
+        area = np.bincount(labels.ravel(), minlength=count)
+        differ = np.bincount(labels.ravel(), weights=self._differ.ravel(), minlength=count)
+        stands = differ < STANDS * area
+        stands[0] = False
+        return np.asarray(stands[labels], np.bool_)
+
+
 class MotionDetector:
     def __init__(self, *, outlines: bool = False) -> None:
         """With `outlines` it tells the very pixels that move, and boxes close around them."""
@@ -151,8 +180,8 @@ class MotionDetector:
         self._paused = False
         self._back: float | None = None
         """When the first picture after a pause came, with no gap since."""
-        self._fits: float | None = None
-        """Since when all have fitted."""
+        self._meanwhile: _Meanwhile | None = None
+        """What those show that have all fitted."""
         self._presence = Presence()
         self._sightings: deque[tuple[float, NDArray[np.uint8]]] = deque(maxlen=RECENT - 1)
 
@@ -223,7 +252,7 @@ class MotionDetector:
         elif not self._paused:
             self._noise = _noise(self._latest)
             self._paused = True
-        self._back = self._fits = None
+        self._back = self._meanwhile = None
 
     def _return(self, time: float, grey: _Plane, level: _Plane, away: _Plane, passed: float) -> Seen:
         if self._back is None or passed >= AGREE[1]:
@@ -234,15 +263,21 @@ class MotionDetector:
         alike = 1 / ALIKE <= _noise(grey) / max(self._noise, 1e-3) <= ALIKE
         if not alike or middle > ALL_OFF or changed > CHANGED:
             # The camera is warming up, or this is not its picture; or it is not where it was.
-            self._fits = None
+            self._meanwhile = None
             return self._begin(time, grey) if time - self._back > RETURN else Seen(False, learning=True)
-        if self._fits is None or time - self._fits > AGREE[1]:
-            self._fits = time
-        if time - self._fits < AGREE[0]:
+        if self._meanwhile is None or time - self._meanwhile.since > AGREE[1]:
+            self._meanwhile = _Meanwhile(time, level, mask)
+        else:
+            self._meanwhile.add(level, mask)
+        if time - self._meanwhile.since < AGREE[0]:
             return Seen(False, learning=True)
         self._paused = False
-        # What is another now has become so while nobody looked, and moves no more than the rest.
-        self._mean = np.where(mask > 0, level, self._mean)
+        # What is another now has become so while nobody looked, and moves no more than the rest. Nothing is known of
+        # its noise but the picture's own, and its mean is as sure as so few pictures make it.
+        another = self._meanwhile.another()
+        noise = max(FLOOR, _noise(level)) ** 2 * (1 + 1 / self._meanwhile.pictures)
+        self._mean = np.where(another, self._meanwhile.level, self._mean)
+        self._variance = np.where(another, np.maximum(self._variance, np.float32(noise)), self._variance)
         return Seen(False)
 
     def _begin(self, time: float, grey: _Plane) -> Seen:
@@ -269,9 +304,7 @@ class MotionDetector:
         """Follows the picture, by `still` and where something moves by `moved` (shares, 0 to 1)."""
         rate: _Plane | float = min(1.0, still)
         if mask is not None:
-            # Around what moves its shadow and its blur are, too.
-            around = cv2.dilate(mask, np.ones((5, 5), np.uint8))
-            rate = np.where(around > 0, np.float32(min(1.0, moved)), np.float32(min(1.0, still)))
+            rate = np.where(_with_rim(mask) > 0, np.float32(min(1.0, moved)), np.float32(min(1.0, still)))
         self._mean += rate * away
         self._variance += rate * (away * away - self._variance)
 
@@ -307,6 +340,11 @@ class MotionDetector:
         agree = sum(time - at <= MEMORY and bool(np.any(earlier & near)) for at, earlier in self._sightings)
         self._sightings.append((time, mask))
         return bool(np.any(mask)) and 1 + agree >= SURE
+
+
+def _with_rim(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Around what moves its shadow and its blur are, too."""
+    return np.asarray(cv2.dilate(mask, np.ones((5, 5), np.uint8)), np.uint8)
 
 
 def _fitted(box: Box, mask: Mask) -> Box:

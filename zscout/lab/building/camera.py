@@ -48,6 +48,11 @@ _GRAIN_FADE: Final = (1 / (1 + (FLOOR_DEPTH**2 / (EYE * FOCAL) / 0.008) ** 2)).a
 """What is left of the floor's grain, by row: a pixel that covers much of it shows its mean."""
 
 
+def shaded_by(x: float, y: float, heading: float, body: Cylinder) -> slice | None:
+    """The columns in which a body's shadow on the floor may be seen from (x, y) along `heading`; None for none."""
+    return None if body.low > 0.1 else columns_of(x, y, heading, body._replace(radius=_SHADE * body.radius))
+
+
 @dataclass(slots=True)
 class _View:
     """What is seen from one pose of all that stands."""
@@ -140,8 +145,8 @@ class Camera:
         """The shadows on the floor of what moves."""
         floor = view.seen.surface[HORIZON:] == 0
         for body in moving:
-            shaded = columns_of(x, y, heading, body._replace(radius=_SHADE * body.radius))
-            if body.low > 0.1 or shaded is None:
+            shaded = shaded_by(x, y, heading, body)
+            if shaded is None:
                 continue
             square = (view.at_x[:, shaded] - body.x) ** 2 + (view.at_y[:, shaded] - body.y) ** 2
             left = 1 - 0.6 * np.exp(square * (-0.5 / (body.radius * 1.3) ** 2))

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from zscout.lab.building.bodies import RADIUS, WHEEL_BASE, Body, Pose
-from zscout.lab.building.camera import Camera, Picture
+from zscout.lab.building.camera import Camera, Picture, shaded_by
 from zscout.lab.building.casting import Cylinder, columns_of
 from zscout.lab.building.collisions import SLACK, Obstacles
 from zscout.lab.building.light import light_of
@@ -183,6 +183,13 @@ class World:
         people = np.array([shape.person for shape in shapes])
         moving = surface[surface >= caster.first_moving] - caster.first_moving
         return int(np.count_nonzero(people[moving]))
+
+    def shadow_in_view(self, robot: str) -> bool:
+        """Whether somebody who walks stands where his shadow may be seen in the robot's picture, himself or not."""
+        if not any(walker.here for walker in self.walkers):
+            return False
+        pose = self.bodies[robot].pose
+        return any(shape.person and shaded_by(*pose, shape) is not None for shape in self._moving(robot))
 
     def crossing(self, robot: str, least: int = 60) -> bool:
         """Whether people who walk cover `least` pixels or more of the robot's picture now."""

@@ -189,6 +189,8 @@ class FieldFigures:
     """By hour of watching."""
     robot_alarms: float
     """Alerts at another robot that drove, by hour of watching."""
+    shadow_alarms: float
+    """Alerts at somebody's shadow, by hour of watching."""
     preemptions: float
     """By run."""
     blind: float
@@ -257,6 +259,7 @@ def _summed(field: Field, runs: Sequence[Outcomes]) -> FieldFigures:
         watched=hours,
         false_alarms=_share(sum(run.false_alarms for run in runs), hours),
         robot_alarms=_share(sum(run.robot_alarms for run in runs), hours),
+        shadow_alarms=_share(sum(run.shadow_alarms for run in runs), hours),
         preemptions=sum(run.preemptions for run in runs) / len(runs),
         blind=sum(run.blind for run in runs) / len(runs),
         turned_unheld=sum(run.turned_unheld for run in runs) / len(runs),

@@ -58,6 +58,8 @@ class Outcomes:
     """Alerts with nothing in view that moved."""
     robot_alarms: int = 0
     """Alerts with nobody in view, but another robot that drove."""
+    shadow_alarms: int = 0
+    """Alerts with nobody in view, but the shadow of somebody beside or behind the robot."""
     watched: float = 0.0
     """Seconds of watching, all robots together."""
     holds: int = 0
@@ -134,8 +136,9 @@ class Judge:
                     self.outcomes.resumed.append(self._world.time - max(since, body.camera_on_since + WARM_UP))
             self.outcomes.watched += interval
             people = self._world.people_in_view(robot)
+            shadow = self._world.shadow_in_view(robot)
             self._watchers[robot].look(
-                self._world.time, people, step, lambda: self._robot_in_view(robot), self.outcomes
+                self._world.time, people, shadow, step, lambda: self._robot_in_view(robot), self.outcomes
             )
 
     def stepped(self, dt: float, *, alarm: bool) -> None:
@@ -200,13 +203,17 @@ class Watcher:
         """When the person in view came into it."""
         self.open = False
         """It is a crossing of which it is not known yet whether it is alerted in time."""
-        self.last_person = -math.inf
+        self.last_person = self.last_shadow = -math.inf
 
-    def look(self, now: float, people: int, step: Step, bustle: Callable[[], bool], out: Outcomes) -> None:
+    def look(
+        self, now: float, people: int, shadow: bool, step: Step, bustle: Callable[[], bool], out: Outcomes
+    ) -> None:
         if self.began is None:
             self.began = now
         if people:
             self.last_person = now
+        if shadow:
+            self.last_shadow = now
         if people >= PIXELS and self.since is None:
             self.since, self.open = now, now - self.began >= WARMED
         late = self.since is not None and now - self.since > IN_TIME + 1e-6
@@ -218,9 +225,12 @@ class Watcher:
         if now - self.last_person > CLEAR:
             self.since = None
             if step.alert:
-                seen = bustle()
-                out.robot_alarms += seen
-                out.false_alarms += not seen
+                if now - self.last_shadow <= CLEAR:
+                    out.shadow_alarms += 1
+                elif bustle():
+                    out.robot_alarms += 1
+                else:
+                    out.false_alarms += 1
 
 
 def _turns(body: Body) -> bool:
