@@ -130,6 +130,21 @@ def test_who_walks_as_a_pause_ends_is_told_at_once() -> None:
     assert not any(detector.see(time, scene.picture()).moving for time in times(4.0, 5.0, 63.0))
 
 
+@pytest.mark.parametrize("apart", [1.25, 2.5, 10.0])
+def test_after_a_pause_pictures_may_come_slowly(apart: float) -> None:
+    scene = Scene(11)
+    detector = settled(scene, rate=1 / apart, seconds=20 * apart)
+    detector.pause()
+    seen = [detector.see(1000 + apart * number, scene.picture()) for number in range(4)]
+    assert [one.learning for one in seen] == [True, True, False, False]
+    assert detector.see(1000 + apart * 4, scene.picture(70)).moving
+    # And anew, where the robot was moved.
+    detector.pause()
+    moved = Scene(110)
+    assert [detector.see(2000 + apart * number, moved.picture()).learning for number in range(14)][-2:] == [False] * 2
+    assert detector.see(2000 + apart * 14, moved.picture(70)).moving
+
+
 def test_who_was_moved_in_a_pause_learns_anew() -> None:
     detector = settled(Scene(6), rate=4.0, seconds=8.0)
     detector.pause()

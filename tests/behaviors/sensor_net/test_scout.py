@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
+import pytest
+
+from zscout.behaviors.perception.lens import COLUMNS, ROWS
 from zscout.behaviors.sensor_net.place_robot import Slots
 from zscout.behaviors.sensor_net.scout import LATELY, Scout
 
@@ -38,3 +42,29 @@ def test_what_was_kept_before_turns_were_is_taken_up() -> None:
     scout = Scout()
     scout.recall(old)
     assert (scout.alerts.count, scout.saw_somebody) == (3, False)
+
+
+@pytest.mark.parametrize(("goes_on", "phase"), [(True, "hidden"), (False, "check")])
+def test_who_moves_with_his_hold_goes_on_and_who_lost_it_on_the_way_looks_again(goes_on: bool, phase: str) -> None:
+    old, scout = Scout(), Scout()
+    old.held(0.0)
+    old.hider._robot.phase = "hidden"
+    scout.recall(old.memory())
+    scout.held(60.0, goes_on=goes_on)
+    assert scout.hider._robot.phase == phase
+    assert scout.task == "watch"
+
+
+def test_what_moves_after_a_while_of_bad_pictures_is_another_event() -> None:
+    scout = Scout()
+    scout.held(0.0)
+    scout.hider._robot.phase = "hidden"
+    scout.released(0.5)
+    scout.held(1.0)
+    scout.hider._robot.phase = "hidden"
+    assert scout.alerts.see(1.0, True) == "start"
+    snow = np.random.default_rng(0).integers(0, 255, (ROWS, COLUMNS), np.uint8)
+    steps = [scout.see(1 + number / 4, snow, "video/a") for number in range(1, 20)]
+    assert {step.doing for step in steps} == {"blind"}
+    assert [step.quiet for step in steps].count(True) == 1
+    assert scout.alerts.see(6.0, True) == "start"

@@ -60,7 +60,7 @@ def test_who_watches_tells_in_time_late_or_not_at_all(there: int, told_after: fl
 
     found = played(act)
     assert found.fates == {fate: there}
-    assert found.could == there
+    assert (found.could, found.told) == (there, there * (fate == "in time"))
 
 
 def test_a_camera_that_is_always_warming_up(there: int) -> None:

@@ -58,10 +58,14 @@ CHANGED: Final = 0.2
 """and is another in at most this share: else it is not of the background that is known."""
 AGREE: Final = (0.15, 1.0)
 """Seconds, at least and at most, between two such pictures that go on with it: the last of another robot is alone."""
+APART: Final = 3
+"""So many in a row do that come farther apart."""
 STANDS: Final = 0.25
 """Less than this share of what has become another since differs between them where it does not move."""
 RETURN: Final = 2.0
-"""Seconds after a pause in which pictures are waited for that fit what was known before; then all is learned anew."""
+STRANGE: Final = 8
+"""Seconds after a pause in which pictures are waited for that fit what was known before, or so many of them where they
+come farther apart; then all is learned anew."""
 STRONG: Final = 6.5
 """Standard deviations that begin a region."""
 WEAK: Final = 3.2
@@ -142,8 +146,8 @@ class Event(NamedTuple):
 class _Meanwhile:
     """What pictures after a pause show of what has become another while nobody looked."""
 
-    def __init__(self, since: float, level: _Plane, mask: NDArray[np.uint8]) -> None:
-        self.since, self.pictures = since, 1
+    def __init__(self, since: float, level: _Plane, mask: NDArray[np.uint8], row: int) -> None:
+        self.since, self.pictures, self.row = since, 1, row
         self.level, self._mask = level.copy(), mask
         self._differ = np.zeros(level.shape, np.bool_)
         """Where they differ."""
@@ -180,6 +184,8 @@ class MotionDetector:
         self._paused = False
         self._back: float | None = None
         """When the first picture after a pause came, with no gap since."""
+        self._strange = 0
+        """How many pictures after it did not fit."""
         self._meanwhile: _Meanwhile | None = None
         """What those show that have all fitted."""
         self._presence = Presence()
@@ -252,7 +258,7 @@ class MotionDetector:
         elif not self._paused:
             self._noise = _noise(self._latest)
             self._paused = True
-        self._back = self._meanwhile = None
+        self._back, self._strange, self._meanwhile = None, 0, None
 
     def _return(self, time: float, grey: _Plane, level: _Plane, away: _Plane, passed: float) -> Seen:
         if self._back is None or passed >= AGREE[1]:
@@ -263,13 +269,14 @@ class MotionDetector:
         alike = 1 / ALIKE <= _noise(grey) / max(self._noise, 1e-3) <= ALIKE
         if not alike or middle > ALL_OFF or changed > CHANGED:
             # The camera is warming up, or this is not its picture; or it is not where it was.
-            self._meanwhile = None
-            return self._begin(time, grey) if time - self._back > RETURN else Seen(False, learning=True)
+            self._meanwhile, self._strange = None, self._strange + 1
+            anew = time - self._back > RETURN or self._strange >= STRANGE
+            return self._begin(time, grey) if anew else Seen(False, learning=True)
         if self._meanwhile is None or time - self._meanwhile.since > AGREE[1]:
-            self._meanwhile = _Meanwhile(time, level, mask)
+            self._meanwhile = _Meanwhile(time, level, mask, 1 if self._meanwhile is None else self._meanwhile.row + 1)
         else:
             self._meanwhile.add(level, mask)
-        if time - self._meanwhile.since < AGREE[0]:
+        if time - self._meanwhile.since < AGREE[0] and self._meanwhile.row < APART:
             return Seen(False, learning=True)
         self._paused = False
         # What is another now has become so while nobody looked, and moves no more than the rest. Nothing is known of

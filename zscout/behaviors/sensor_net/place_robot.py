@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from zscout.behaviors.client.arc import Held, Revoked, hold, holds
-from zscout.behaviors.client.client import CommandRefused, RequestRefused
+from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
 from zscout.behaviors.client.request import OpenArc
 from zscout.behaviors.perception.lens import COLUMNS, ROWS, grey_picture
 from zscout.behaviors.sensor_net.held_robot import HeldRobot, RobotNeeds
@@ -37,6 +37,8 @@ GIVEN_UP: Final = 60.0
 WARM_AHEAD: Final = 4.0
 """Seconds before a turn to watch, as it is foretold, in which the camera warms up: it takes two, and turns may begin
 earlier than foretold."""
+WARM_SLACK: Final = 4.0
+"""Seconds by which a turn is farther away than that, and the camera is switched off again."""
 SOONER: Final = 0.9
 """Share of its slot that a robot asks for which has seen somebody in one of its last turns."""
 BRIEF: Final = 0.1
@@ -174,7 +176,8 @@ class RobotTask(Behavior):
     async def _warm_up(self, context: BehaviorContext, name: str, turn: OpenArc) -> None:
         client, place = context.client, self.place
         needs = {need: params for need, params in turn.needs.items() if need != place.needs.framegrabber}
-        priority, ahead = place.slots.warm_priority, WARM_AHEAD / context.speed
+        priority = place.slots.warm_priority
+        ahead, slack = WARM_AHEAD / context.speed, WARM_SLACK / context.speed
         while turn.open and turn.grant is None:
             left = None if turn.start is None else (turn.start - client.mesh.now()) / SECOND - ahead
             if left is None or left > 0:
@@ -183,7 +186,9 @@ class RobotTask(Behavior):
             with suppress(Revoked, RequestRefused, CommandRefused):
                 async with hold(client, name, needs, priority=priority, min_runtime=BRIEF) as held:
                     await held.command(place.needs.robot, {"name": "camera", "on": True})
-                    await held.over()
+                    if await _begins(client, turn, ahead + slack):
+                        # It goes on with this one, which is over by that.
+                        await held.over()
                     # What is handed over may come back: then it is given back.
                     await held.resumed()
             await asyncio.sleep(RETRY_AFTER)
@@ -222,3 +227,12 @@ class RobotTask(Behavior):
         boxes = [(round(x * across), round(y * down), round(w * across), round(h * down)) for x, y, w, h in step.boxes]
         self.report(step.doing, step.detail, robot=robot.robot, camera=camera, alert=step.alert, boxes=boxes)
         return not step.over
+
+
+async def _begins(client: Client, turn: OpenArc, within: float) -> bool:
+    """Waits for as long as a turn is foretold to begin within so many seconds, and whether it does."""
+    while turn.open and turn.grant is None:
+        if turn.start is None or turn.start - client.mesh.now() > within * SECOND:
+            return False
+        await client.changed(turn)
+    return turn.open

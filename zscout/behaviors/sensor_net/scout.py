@@ -197,10 +197,13 @@ class Scout:
         """Whether it has lately."""
         return any(self._turns)
 
-    def held(self, now: float) -> None:
-        """A hold begins, or goes on elsewhere after a move. `now` in seconds, by the clock of all calls."""
+    def held(self, now: float, *, goes_on: bool = False) -> None:
+        """A hold begins, or `goes_on` elsewhere after a move. `now` in seconds, by the clock of all calls."""
         if self._held:
-            return
+            if goes_on:
+                return
+            # It was lost on the way, and others may have moved the robot.
+            self.released(now)
         self._held = True
         self._task = self.task
         self._alerts = self.alerts.count
@@ -232,7 +235,9 @@ class Scout:
         if self._task == "hide" or step.over or step.blind:
             return step
         if picture is None or not good:
-            return Step(0, 0, 0, "blind", "no good picture")
+            # Nobody sees whether it goes on: what moves later is another event.
+            edge = self.alerts.see(now, False)
+            return Step(0, 0, 0, "blind", "no good picture", quiet=edge == "end")
         seen = self._detector.see(now, picture)
         edge, count = self.alerts.see(now, seen.moving), self.alerts.count
         if self.alerts.moving:

@@ -41,6 +41,7 @@ SLOT_ROBOTS: Final = 4
 SLOT_CHANNELS: Final = 1
 SECONDS: Final = 180.0
 ENOUGH_BAUD: Final = 9_600
+TURNS: Final = 2
 FEW: Final = 20
 """Crossings of a robot's place from which its share in time is told."""
 
@@ -179,8 +180,14 @@ class FieldFigures:
     """Share of them."""
     best: float
     """Share of them that could have been in time, as the robot was on the air, and its camera warm."""
+    of_best: float
+    """Share in time of those."""
     least: float
-    """Share in time of the robot with the least, as a part of the mean of all robots; over those with FEW or more."""
+    """Share in time of the robot with the least, as a part of the mean of all robots; over those with FEW or more. A
+    robot is its number, over all runs."""
+    least_watch: float
+    """By run, since all were placed: the time for which the robot watched that did so least, as a part of the mean of
+    all. The least of the runs in which each could have had TURNS turns."""
     resumed: Quantiles
     """Seconds from a turn's warm camera until the robot could tell of motion, where it still stood as it had hidden."""
     watched: float
@@ -254,7 +261,9 @@ def _summed(field: Field, runs: Sequence[Outcomes]) -> FieldFigures:
         account={fate: whole.fates[fate] for fate in FATES},
         in_time=whole.in_time,
         best=_share(whole.could, whole.all),
+        of_best=_share(whole.told, whole.could),
         least=min((_share(one.in_time, whole.in_time) for one in of_robots), default=math.nan),
+        least_watch=min((_least_watch(run, field) for run in runs), default=math.nan),
         resumed=quantiles_of([one for run in runs for one in run.resumed]),
         watched=hours,
         false_alarms=_share(sum(run.false_alarms for run in runs), hours),
@@ -276,6 +285,15 @@ def _account(runs: Sequence[Outcomes]) -> tuple[CrossingsOf, list[CrossingsOf]]:
             whole.add(one)
             of_robots.setdefault(number, CrossingsOf()).add(one)
     return whole, [one for one in of_robots.values() if one.all >= FEW]
+
+
+def _least_watch(run: Outcomes, field: Field) -> float:
+    """Infinite where there was no time for TURNS turns of each."""
+    turns = TURNS * field.slots.watch * field.robots / field.receivers
+    if run.seconds - run.all_placed < turns:
+        return math.inf
+    watches = [run.watches.get(robot, 0.0) for robot in run.placed]
+    return min(watches) / float(np.mean(watches)) if any(watches) else math.inf
 
 
 def start_figures(trials: Iterable[RobotsTrial]) -> list[StartFigures]:

@@ -70,7 +70,8 @@ def _print_account(keys: Sequence[str], figures: Sequence[FieldFigures]) -> None
     for one in told:
         whole = sum(one.account.values())
         shares = (percent(one.account[fate] / whole) for fate in fates)
-        cells = [percent(one.best), percent(one.least), spread_text(one.resumed, 1)]
+        least = percent(one.least), "-" if math.isinf(one.least_watch) else percent(one.least_watch)
+        cells = [percent(one.best), percent(one.of_best), *least, spread_text(one.resumed, 1)]
         rows.append([*(f"{getattr(one, key):g}" for key in keys), str(whole), *shares, *cells])
     terminal.print_line("")
     heads = [
@@ -78,7 +79,9 @@ def _print_account(keys: Sequence[str], figures: Sequence[FieldFigures]) -> None
         "crossings",
         *fates,
         "best",
+        "of best",
         "least robot",
+        "least watch",
         "resumes in",
     ]
     terminal.print_table(heads, rows, title="Where the crossings of placed robots went")

@@ -34,6 +34,8 @@ class CrossingsOf:
     fates: Counter[Fate] = field(default_factory=Counter)
     could: int = 0
     """Of these: began while its camera was warm, and it was on the air for as long as there was to tell it in."""
+    told: int = 0
+    """Of those that could: in time."""
 
     @property
     def all(self) -> int:
@@ -48,6 +50,7 @@ class CrossingsOf:
         """Makes it the sum of both."""
         self.fates += other.fates
         self.could += other.could
+        self.told += other.told
 
 
 @dataclass(slots=True)
@@ -126,13 +129,16 @@ class Crossings:
         """The crossing is over, if there is one."""
         if place.since is None:
             return
-        in_time = place.told_at is not None and place.told_at - place.since <= IN_TIME + LOOK / 2
+        # He was in view for half of a look, as a mean, before that was seen here.
+        in_time = place.told_at is not None and place.told_at - place.since <= IN_TIME - LOOK / 2
         if in_time:
             fate: Fate = "in time"
         else:
             fate = place.obstacle or ("not told" if place.told_at is None else "told late")
+        could = place.obstacle not in _AWAY
         self.found[robot].fates[fate] += 1
-        self.found[robot].could += place.obstacle not in _AWAY
+        self.found[robot].could += could
+        self.found[robot].told += could and in_time
         place.since = None
 
     def ended(self, robot: str) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -17,7 +18,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from zscout.behaviors.sensor_net.place_robot import BRIEF, GIVEN_UP, RETRY_AFTER, WARM_AHEAD, Slots
+from zscout.behaviors.sensor_net.place_robot import BRIEF, GIVEN_UP, RETRY_AFTER, WARM_AHEAD, WARM_SLACK, Slots
 from zscout.behaviors.sensor_net.scout import Scout, Step
 from zscout.drivers.airtime import BITS_PER_BYTE, Share, line_rate, objection
 from zscout.drivers.packets import MAX_PACKET, OVERHEAD
@@ -252,22 +253,33 @@ class FieldRun:
         request = ArcRequest(player.warm, player.name, self._needs(player), priority, runtime, keep=True)
         self._handle(Requested(request))
 
-    def _foresee(self, now: Ns) -> None:
-        """When cameras are to begin to warm up: `place_robot` goes by the same forecast."""
-        waiting = [one for one in self.players.values() if one.held is None and one.asked and one.warm is None]
-        waiting = [one for one in waiting if one.asks_at is None and one.scout.task == "watch"]
-        starts = forecast(self._core, now).starts if waiting else {}
+    def _foresee(self) -> list[Event]:
+        """When cameras are to begin to warm up; what ends where their turns have gone away again. `place_robot` goes
+        by such a forecast."""
+        now = self.world.time
+        waiting = [one for one in self.players.values() if one.held is None and one.asked and one.asks_at is None]
+        waiting = [one for one in waiting if one.scout.task == "watch"]
+        starts = forecast(self._core, round(now * SECOND)).starts if waiting else {}
+        over: list[Event] = []
         for player in waiting:
             start = starts.get(player.asked or "")
-            player.warms_at = None if start is None else max(self.world.time, start / SECOND - WARM_AHEAD)
+            ahead = math.inf if start is None else start / SECOND - now
+            if player.warm is None:
+                player.warms_at = None if start is None else now + max(0.0, ahead - WARM_AHEAD)
+            elif ahead > WARM_AHEAD + WARM_SLACK:
+                over.append(Released(player.warm) if player.warmed else Cancelled(player.warm))
+                if player.warmed is None:
+                    del self._by_arc[player.warm]
+                    player.warm = None
+        return over
 
     def _handle(self, *events: Event) -> None:
         """What comes of events at the RCM, and of what follows from them."""
         left = self._instant(*events)
         while left:
             left = self._instant(*left)
-        if self.field.receivers < self.field.channels:
-            self._foresee(round(self.world.time * SECOND))
+        if self.field.receivers < self.field.channels and (over := self._foresee()):
+            self._handle(*over)
 
     def _instant(self, *events: Event) -> list[Event]:
         """One instant at the RCM, with every vote that it takes; and what its clients give up then."""

@@ -62,6 +62,8 @@ class Outcomes:
     """Alerts with nobody in view, but the shadow of somebody beside or behind the robot."""
     watched: float = 0.0
     """Seconds of watching, all robots together."""
+    watches: dict[str, float] = field(default_factory=dict)
+    """By robot: those after all had been placed."""
     holds: int = 0
     preemptions: int = 0
     blind: int = 0
@@ -135,6 +137,8 @@ class Judge:
                 if same_place(pose, body.pose):
                     self.outcomes.resumed.append(self._world.time - max(since, body.camera_on_since + WARM_UP))
             self.outcomes.watched += interval
+            if math.isfinite(self.outcomes.all_placed):
+                self.outcomes.watches[robot] = self.outcomes.watches.get(robot, 0.0) + interval
             people = self._world.people_in_view(robot)
             shadow = self._world.shadow_in_view(robot)
             self._watchers[robot].look(
