@@ -9,12 +9,11 @@ from __future__ import annotations
 import asyncio
 import hashlib
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from typing import Any, Final
 
 from zscout.behaviors.client.client import RequestRefused
-from zscout.behaviors.client.placer_client import PlacerClient
-from zscout.behaviors.sensor_net.net import Effect, SensorNet, StartRobot
+from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
+from zscout.behaviors.sensor_net.net import Effect, SensorNet, StopRobot
 from zscout.behaviors.tree import Behavior, BehaviorContext, CarriedClock
 from zscout.drivers.driver import RcDirectory
 from zscout.mesh import Mesh
@@ -38,7 +37,11 @@ class PlaceSensorNet(Behavior):
         self._components: dict[str, str] = {}
         """Robots by the names of their components, which are unique: they contain the net's own."""
         self._placed: set[str] = set()
-        """Of these components, the ones that this net has had placed: it stops no others."""
+        """Of these components, the ones that this net has asked to have placed: it stops no others."""
+        self._there: set[str] = set()
+        """Of these, the ones of which the placer has said so to this process."""
+        self._busy: set[str] = set()
+        """Components of which the placer is being asked something."""
         self._clock = CarriedClock()
         self._supervisor: Supervisor
         self._mesh: Mesh
@@ -58,14 +61,14 @@ class PlaceSensorNet(Behavior):
                 while True:
                     there = [robot for robot in self.net.members if directory.hosts(robot)]
                     self._apply(self.net.there(self._now(), there))
+                    self._see_to_components()
                     self._report_progress()
                     await context.safe_point()
                     await asyncio.sleep(PERIOD)
         finally:
             for one in declared:
                 one.close()
-            active = [name for name, robot in self._components.items() if self.net.members[robot].standing == "active"]
-            await done_within(STOPPING, asyncio.gather(*(self._stop(name) for name in active)))
+            await done_within(STOPPING, asyncio.gather(*map(self._stop, [*self._placed])))
 
     def _report_progress(self) -> None:
         net = self.net
@@ -86,7 +89,7 @@ class PlaceSensorNet(Behavior):
     def _on_placements(self, placements: Iterable[Placement]) -> None:
         for placement in placements:
             robot = self._components.get(placement.component)
-            ended = placement.component in self._placed and placement.state in ("given_up", "ended")
+            ended = placement.component in self._there and placement.state in ("given_up", "ended")
             if robot is not None and ended:
                 self._apply(self.net.failed(self._now(), robot, placement.reason or "it was stopped"))
 
@@ -94,27 +97,45 @@ class PlaceSensorNet(Behavior):
 
     def _apply(self, effects: Iterable[Effect]) -> None:
         for effect in effects:
-            component = next(name for name, robot in self._components.items() if robot == effect.robot)
-            if isinstance(effect, StartRobot):
-                self._supervisor.spawn(self._start(component, effect.robot))
-            else:
+            if isinstance(effect, StopRobot):
                 self.report(self.doing, f"{effect.robot} is lost: {effect.why}")
-                self._supervisor.spawn(self._stop(component))
+
+    def _see_to_components(self) -> None:
+        """Has those of active robots placed, also after a move, as the answer may not have come any more; and stops all
+        others, until the placer has said that they are."""
+        for component, robot in self._components.items():
+            active = self.net.members[robot].standing == "active"
+            done = component in self._there if active else component not in self._placed
+            if done or component in self._busy:
+                continue
+            self._busy.add(component)
+            self._placed.add(component)
+            self._supervisor.spawn(self._start(component, robot) if active else self._stop(component))
 
     async def _start(self, component: str, robot: str) -> None:
         try:
             placed = await PlacerClient(self._mesh).place(component, self._spec_for(robot, self.path))
         except RequestRefused as refused:
+            if not isinstance(refused, PlacerSilent):
+                self._placed.discard(component)
             self._apply(self.net.failed(self._now(), robot, str(refused)))
         else:
-            self._placed.add(component)
+            self._there.add(component)
             self._on_placements([placed])
+        finally:
+            self._busy.discard(component)
 
     async def _stop(self, component: str) -> None:
-        if component in self._placed:
+        try:
+            await PlacerClient(self._mesh).stop(component)
+        except RequestRefused as refused:
+            if not isinstance(refused, PlacerSilent):
+                self._placed.discard(component)
+        else:
             self._placed.discard(component)
-            with suppress(RequestRefused):
-                await PlacerClient(self._mesh).stop(component)
+        finally:
+            self._there.discard(component)
+            self._busy.discard(component)
 
     def _now(self) -> float:
         return self._clock.read(self._mesh.now())
