@@ -7,6 +7,8 @@ from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from typing import Any
 
+import pytest
+
 from tests.behaviors.client.small_fleet import FLEET, SmallFleet, small_fleet
 from tests.mesh.kit import run, until
 from zscout.behaviors.client.arc import Revoked
@@ -87,6 +89,29 @@ def test_a_camera_that_did_not_come_to_warm_up_is_not_waited_for_any_more() -> N
             assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [["running"], []]
             await over(watching)
             assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [[], []]
+
+    run(test())
+
+
+@pytest.mark.parametrize("why", ["another hides first", "the framegrabber is gone"])
+def test_a_camera_is_switched_off_again_where_its_turn_does_not_come(why: str) -> None:
+    async def test() -> None:
+        async with robot_fleet("robot", "other", "asks") as (fleet, (client, other, _asks)):
+            await other.request("other", {"framegrabber/f": {}}, priority=1, min_runtime=8)
+            watching = watches(client)
+            await asyncio.sleep(5.5)
+            assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [["queued"], ["running"]]
+            if why == "another hides first":
+                await other.request("hides", {"framegrabber/f": {}}, priority=2, min_runtime=60, keep=False)
+            else:
+                next(rc for rc in fleet.rcs if rc.name == "framegrabber/f").fail("unplugged")
+            await asyncio.sleep(5)
+            assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [["queued"], []]
+            if why == "another hides first":
+                # And on again, ahead of when it does.
+                await asyncio.sleep(53)
+                assert await fleet.arcs("z-warm") == ["running"]
+            await over(watching)
 
     run(test())
 

@@ -24,6 +24,7 @@ from zscout.behaviors.perception.lens import COLUMNS, ROWS, grey_picture
 from zscout.behaviors.sensor_net.held_robot import HeldRobot, RobotNeeds
 from zscout.behaviors.sensor_net.scout import NO_PICTURE_TIMEOUT, Scout, Task
 from zscout.behaviors.tree import Behavior, BehaviorContext, CarriedClock
+from zscout.keyexpr import matcher
 from zscout.mesh import FrameWatch
 from zscout.mesh.supervision import Supervisor, done_within, supervised
 from zscout.types import SECOND
@@ -84,7 +85,12 @@ class PlaceRobot(Behavior):
         for task in self._tasks.values():
             self.add(task)
         self._clock = CarriedClock()
-        self.holding = False
+        self.holding = ""
+        """The id of the ARC under which it holds its robot; empty while it does not."""
+        self.video: str | None = None
+        """The channel that its present ARC asks for by name."""
+        self.came: tuple[str, str | None] | None = None
+        """`holding` and `video` of before a move, until it has asked for that ARC."""
 
     async def run(self, context: BehaviorContext) -> None:
         self.now(context)
@@ -100,6 +106,8 @@ class PlaceRobot(Behavior):
                 except (Revoked, CommandRefused, RequestRefused) as error:
                     self.report("wait", str(error), robot=self.needs.robot)
                     await asyncio.sleep(RETRY_AFTER)
+                finally:
+                    self.video = None
 
     async def _offer_safe_points(self, context: BehaviorContext) -> None:
         """While the robot is not held nothing changes here, however long that takes: a time to be moved."""
@@ -112,11 +120,14 @@ class PlaceRobot(Behavior):
         return self._clock.read(context.client.mesh.now(), context.speed)
 
     def memory(self) -> dict[str, Any]:
-        return {"scout": self.scout.memory(), "clock": self._clock.seconds}
+        asked = {"holding": self.holding, "video": self.video}
+        return {"scout": self.scout.memory(), "clock": self._clock.seconds, "asked": asked}
 
     def recall(self, memory: dict[str, Any]) -> None:
         self.scout.recall(memory["scout"])
         self._clock.seconds = float(memory["clock"])
+        if (asked := memory.get("asked")) is not None:
+            self.came = str(asked["holding"]), asked["video"] and str(asked["video"])
 
 
 class RobotTask(Behavior):
@@ -131,10 +142,9 @@ class RobotTask(Behavior):
         it is over or has had its slot. Raises CameraBlind, and what a request raises."""
         place, scout = self.place, self.place.scout
         priority, slot = place.slots.of(self.task, sooner=scout.saw_somebody)
-        state = await context.client.state()
-        rcs = state.rcs if state is not None else []
-        channels = [rc.rc for rc in rcs if rc.present and rc.rc.startswith("video/")]
-        video = scout.blindness.choose(place.now(context), channels)
+        came, place.came = place.came, None
+        # What was handed over is found by its needs.
+        video = place.video = (came and came[1]) or await self._channel(context)
         self.report("wait", "for its turn", robot=place.needs.robot)
         name, needs = f"{place.name}-{self.task}", place.needs.needs(video=video)
         seconds = round(slot / context.speed, 3)
@@ -149,20 +159,33 @@ class RobotTask(Behavior):
             estimate=bool(warm),
             continues=warm,
         ):
-            async with self._warming(context, warm, await attempt.asked()) as warming, attempt as held:
+            turn = await attempt.asked()
+            goes_on, came = came is not None and turn.id == came[0] and turn.grant is not None, None
+            async with self._warming(context, warm, turn) as warming, attempt as held:
                 # What has not begun by now would begin when this is over.
                 warming.cancel()
                 channel = held.rc(video or place.needs.video)
                 # It may be about to be moved: nothing changes before that is over.
                 await context.safe_point()
-                await self._use(context, held, video)
+                await self._use(context, held, video, goes_on=goes_on)
             if held.completed:
+                break
+            if scout.task != self.task:
+                # It was taken away in the very step that was its last.
+                await context.client.end(turn)
                 break
             if scout.no_signal and attempt.arc is not None and attempt.arc.open:
                 # It was taken away because the receiver is dead: the same needs would be given the same one.
                 await context.client.end(attempt.arc)
                 scout.no_signal = False
                 raise CameraBlind(f"{channel} shows nothing at all")
+
+    async def _channel(self, context: BehaviorContext) -> str | None:
+        """One to ask for by name, of those that it may have, because others are to be avoided."""
+        place, state = self.place, await context.client.state()
+        may = matcher(place.needs.video)
+        channels = [rc.rc for rc in state.rcs if rc.present and may(rc.rc)] if state is not None else []
+        return place.scout.blindness.choose(place.now(context), channels)
 
     @asynccontextmanager
     async def _warming(self, context: BehaviorContext, name: str, turn: OpenArc) -> AsyncIterator[Supervisor]:
@@ -193,11 +216,11 @@ class RobotTask(Behavior):
                     await held.resumed()
             await asyncio.sleep(RETRY_AFTER)
 
-    async def _use(self, context: BehaviorContext, held: Held, video: str | None) -> None:
+    async def _use(self, context: BehaviorContext, held: Held, video: str | None, *, goes_on: bool) -> None:
         place, scout = self.place, self.place.scout
         robot = HeldRobot(held, place.needs, video=video)
-        place.holding = True
-        scout.held(place.now(context))
+        place.holding = held.arc.id
+        scout.held(place.now(context), goes_on=goes_on)
         mesh = context.client.mesh
         try:
             with closing(mesh.frames(mesh.keys.frame(robot.framegrabber))) as watch:
@@ -207,7 +230,7 @@ class RobotTask(Behavior):
                     await robot.camera(True, remind=scout.blindness.remind(place.now(context)))
         finally:
             scout.released(place.now(context))
-            place.holding = False
+            place.holding = ""
             self.report("wait", "the hold is over", robot=place.needs.robot)
 
     async def _look(self, context: BehaviorContext, robot: HeldRobot, watch: FrameWatch) -> bool:
