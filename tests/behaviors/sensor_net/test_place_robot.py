@@ -25,8 +25,10 @@ from zscout.messages import Holder
 class Robot:
     """Its behavior, as a program runs it. No picture ever comes, and it waits for one for ever."""
 
-    def __init__(self, client: Client, state: dict[str, Any] | None = None, needs: RobotNeeds = NEEDS) -> None:
-        self.behavior = PlaceRobot("z", needs)
+    def __init__(
+        self, client: Client, state: dict[str, Any] | None = None, needs: RobotNeeds = NEEDS, name: str = "z"
+    ) -> None:
+        self.behavior = PlaceRobot(name, needs)
         if state is not None:
             self.behavior.restore(state)
         self.scout.blindness.timeout = 1e9
@@ -121,6 +123,19 @@ def test_no_channel_is_taken_that_its_parameters_leave_out() -> None:
             state = await fleet.clients[-1].state()
             assert state is not None
             assert "video/1" in state.holds[0].needs
+            await robot.stop()
+
+    run(story())
+
+
+def test_a_robot_may_have_as_long_a_name_as_an_arc() -> None:
+    async def story() -> None:
+        async with robot_fleet("one", "asks") as (fleet, (client, _asks)):
+            robot = Robot(client, name="z" * 64)
+            robot.is_hidden()
+            robot.start()
+            await asyncio.sleep(2)
+            assert await fleet.arcs(f"{'z' * 58}-watch") == ["running"]
             await robot.stop()
 
     run(story())

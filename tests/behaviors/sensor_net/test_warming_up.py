@@ -105,11 +105,11 @@ def test_a_camera_is_switched_off_again_where_its_turn_does_not_come(why: str) -
                 await other.request("hides", {"framegrabber/f": {}}, priority=2, min_runtime=60, keep=False)
             else:
                 next(rc for rc in fleet.rcs if rc.name == "framegrabber/f").fail("unplugged")
-            await asyncio.sleep(5)
+            await asyncio.sleep(8)
             assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [["queued"], []]
             if why == "another hides first":
                 # And on again, ahead of when it does.
-                await asyncio.sleep(53)
+                await asyncio.sleep(50)
                 assert await fleet.arcs("z-warm") == ["running"]
             await over(watching)
 

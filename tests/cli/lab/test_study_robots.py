@@ -21,26 +21,28 @@ def test_json_has_the_figures_and_every_run_and_the_plots_are_written(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     path = tmp_path / "robots.rrd"
-    some = ("--robots", "1-2", "--channels", "1", "--baud", "300", "--json", "--record", path)
+    some = ("--robots", "1-2", "--channels", "1", "--baud", "300", "--framegrabbers", "1", "--json", "--record", path)
     assert zscout_here(*LITTLE, *some, "--svg", tmp_path) == 0
     told: dict[str, Any] = json.loads(capsys.readouterr().out)
     assert [(one["robots"], one["channels"], one["runs"]) for one in told["grid"]] == [(1, 1, 1), (2, 1, 1)]
     assert [(one["baud"], one["command_rate"]) for one in told["radio"]] == [(300, 5.0), (300, 2.5)]
     assert told["starts"] == []
-    assert len(told["runs"]) == 4
+    assert [(one["framegrabbers"], one["channels"]) for one in told["receivers"]] == [(1, 4)]
+    assert len(told["runs"]) == 5
     assert told["runs"][0]["job"]["seed"] == 3
     # Nobody is placed in a second, and infinity is no JSON.
     assert told["grid"][0]["all_placed"] == {"low": None, "median": None, "high": None}
     assert told["grid"][1]["placed"] == 0
     # At 300 baud nobody may begin who wants five packets a second.
-    by_rate = {one["job"]["field"]["command_rate"]: one["outcomes"] for one in told["runs"][2:]}
+    by_rate = {one["job"]["field"]["command_rate"]: one["outcomes"] for one in told["runs"][3:]}
     assert (by_rate[5.0]["holds"], by_rate[2.5]["holds"]) == (0, 1)
     written = sorted(tmp_path.glob("*.svg"))
     assert [one.name for one in written] == ["robots-noticed.svg", "robots-placed.svg", "robots-radio.svg"]
     for picture in written:
         ElementTree.fromstring(picture.read_text())  # noqa: S314 - our own
     entities = {chunk.entity_path for chunk in RrdReader(path).stream()}
-    assert {"/summary", "/grid/placed/1", "/radio/placed/300_baud_2_5_per_second"} <= entities
+    bars = {"/radio/placed/300_baud_2_5_per_second", "/receivers/placed/1_framegrabbers"}
+    assert {"/summary", "/grid/placed/1"} | bars <= entities
 
 
 def test_json_tells_what_became_of_crossings(capsys: pytest.CaptureFixture[str]) -> None:

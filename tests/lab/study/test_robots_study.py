@@ -165,6 +165,12 @@ def test_a_plot_keeps_what_it_draws_within_itself() -> None:
         assert 0 < float(circle.attrib["cy"]) < height
 
 
+def test_a_bar_whose_median_never_came_begins_where_its_first_runs_did() -> None:
+    picture = ElementTree.fromstring(svg(Plot("t", "x", "y", {"a": [("1", Quantiles(160, INF, INF))]})))  # noqa: S314 - our own
+    words = [one.text for one in picture.iter() if one.tag.endswith("text")]
+    assert {"0", "150"} <= set(words)
+
+
 def test_a_building_without_room_is_bad_input(tmp_path: Path) -> None:
     closet = tmp_path / "closet.toml"
     lamp = '[[light]]\nname = "lamp"\nx = 0.8\ny = 0.8\n'

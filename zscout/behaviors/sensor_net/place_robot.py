@@ -9,6 +9,7 @@ free: a third ARC, below all others, without a framegrabber. `Scout` decides wha
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, closing, suppress
 from dataclasses import dataclass
@@ -24,7 +25,7 @@ from zscout.behaviors.perception.lens import COLUMNS, ROWS, grey_picture
 from zscout.behaviors.sensor_net.held_robot import HeldRobot, RobotNeeds
 from zscout.behaviors.sensor_net.scout import NO_PICTURE_TIMEOUT, Scout, Task
 from zscout.behaviors.tree import Behavior, BehaviorContext, CarriedClock
-from zscout.keyexpr import matcher
+from zscout.keyexpr import MAX_NAME, matcher
 from zscout.mesh import FrameWatch
 from zscout.mesh.supervision import Supervisor, done_within, supervised
 from zscout.types import SECOND
@@ -146,12 +147,12 @@ class RobotTask(Behavior):
         # What was handed over is found by its needs.
         video = place.video = (came and came[1]) or await self._channel(context)
         self.report("wait", "for its turn", robot=place.needs.robot)
-        name, needs = f"{place.name}-{self.task}", place.needs.needs(video=video)
+        needs = place.needs.needs(video=video)
         seconds = round(slot / context.speed, 3)
-        warm = f"{place.name}-warm" if self.task == "watch" else ""
+        warm = _arc_name(place.name, "warm") if self.task == "watch" else ""
         async for attempt in holds(
             context.client,
-            name,
+            _arc_name(place.name, self.task),
             needs,
             priority=priority,
             min_runtime=seconds,
@@ -202,14 +203,14 @@ class RobotTask(Behavior):
         priority = place.slots.warm_priority
         ahead, slack = WARM_AHEAD / context.speed, WARM_SLACK / context.speed
         while turn.open and turn.grant is None:
-            left = None if turn.start is None else (turn.start - client.mesh.now()) / SECOND - ahead
-            if left is None or left > 0:
-                await done_within(left, client.changed(turn))
+            left = _left(client, turn, slack) - ahead
+            if left > 0:
+                await done_within(left if math.isfinite(left) else None, client.changed(turn))
                 continue
             with suppress(Revoked, RequestRefused, CommandRefused):
                 async with hold(client, name, needs, priority=priority, min_runtime=BRIEF) as held:
                     await held.command(place.needs.robot, {"name": "camera", "on": True})
-                    if await _begins(client, turn, ahead + slack):
+                    if await _begins(client, turn, ahead + slack, slack):
                         # It goes on with this one, which is over by that.
                         await held.over()
                     # What is handed over may come back: then it is given back.
@@ -252,10 +253,25 @@ class RobotTask(Behavior):
         return not step.over
 
 
-async def _begins(client: Client, turn: OpenArc, within: float) -> bool:
+def _arc_name(robot: str, task: str) -> str:
+    """Names of robots may be as long as those of ARCs, which need not be told apart by them."""
+    return f"{robot[: MAX_NAME - 1 - len(task)]}-{task}"
+
+
+def _left(client: Client, turn: OpenArc, slack: float) -> float:
+    """Seconds until a turn begins, as it was foretold last; infinite where nothing is, or where it is overdue by more
+    than `slack`: nobody is told that a forecast does not hold any more, only another one."""
+    if turn.start is None:
+        return math.inf
+    left = (turn.start - client.mesh.now()) / SECOND
+    return left if left > -slack else math.inf
+
+
+async def _begins(client: Client, turn: OpenArc, within: float, slack: float) -> bool:
     """Waits for as long as a turn is foretold to begin within so many seconds, and whether it does."""
     while turn.open and turn.grant is None:
-        if turn.start is None or turn.start - client.mesh.now() > within * SECOND:
+        left = _left(client, turn, slack)
+        if left > within:
             return False
-        await client.changed(turn)
+        await done_within(left + slack, client.changed(turn))
     return turn.open

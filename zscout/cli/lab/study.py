@@ -337,7 +337,7 @@ def robots(
     if rrd is not None:
         from zscout.lab.plots.robots import record
 
-        record(rrd, found.grid, found.radio, found.turns, found.starts)
+        record(rrd, found)
     if svg is not None:
         from zscout.lab.plots.robots_svg import write
 

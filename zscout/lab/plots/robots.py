@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from zscout.lab.plots.recording import COLOURS, recording, tabs_and_summary
-from zscout.lab.study.robots import FieldFigures, StartFigures
+from zscout.lab.study.robots import FieldFigures, RobotsReport
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -29,24 +29,20 @@ CURVES: Final[tuple[tuple[str, str, Value], ...]] = (
 """Entity, title, value: each is a pane. What is no number, or never came, is left out."""
 
 
-def record(
-    path: Path,
-    grid: Sequence[FieldFigures],
-    radio: Sequence[FieldFigures],
-    turns: Sequence[FieldFigures],
-    starts: Sequence[StartFigures],
-) -> None:
+def record(path: Path, found: RobotsReport) -> None:
     """Writes the recording, replacing what was there. Raises BadInput where the file can't be written."""
     import rerun as rr
 
-    words = _words(grid, radio, turns, starts)
-    with recording(path, APPLICATION, _blueprint(grid, radio), words) as stream:
-        _curves(stream, grid)
-        for name, _, value in CURVES:
-            for number, one in enumerate(radio):
-                if math.isfinite(value(one)):
-                    bar = rr.BarChart([value(one)], abscissa=[number], color=COLOURS[number % len(COLOURS)])
-                    stream.log(f"radio/{name}/{_radio_name(one)}", bar, static=True)
+    with recording(path, APPLICATION, _blueprint(found), _words(found)) as stream:
+        _curves(stream, found.grid)
+        radio = [(_radio_name(one), one) for one in found.radio]
+        receivers = [(f"{one.framegrabbers}_framegrabbers", one) for one in found.receivers]
+        for kind, bars in (("radio", radio), ("receivers", receivers)):
+            for name, _, value in CURVES:
+                for number, (label, one) in enumerate(bars):
+                    if math.isfinite(value(one)):
+                        bar = rr.BarChart([value(one)], abscissa=[number], color=COLOURS[number % len(COLOURS)])
+                        stream.log(f"{kind}/{name}/{label}", bar, static=True)
 
 
 def _curves(stream: rr.RecordingStream, grid: Sequence[FieldFigures]) -> None:
@@ -70,15 +66,15 @@ def _curves(stream: rr.RecordingStream, grid: Sequence[FieldFigures]) -> None:
             )
 
 
-def _blueprint(grid: Sequence[FieldFigures], radio: Sequence[FieldFigures]) -> rrb.Blueprint:
+def _blueprint(found: RobotsReport) -> rrb.Blueprint:
     import rerun as rr
     import rerun.blueprint as rrb
 
     boundary = rr.TimeRangeBoundary
-    most = max((one.robots for one in grid), default=1)
+    most = max((one.robots for one in found.grid), default=1)
     window = rr.TimeRange(start=boundary.absolute(seq=0), end=boundary.absolute(seq=most + 1))
     tabs: list[rrb.Container] = []
-    if grid:
+    if found.grid:
         curves = [
             rrb.TimeSeriesView(
                 origin=f"/grid/{name}",
@@ -89,9 +85,10 @@ def _blueprint(grid: Sequence[FieldFigures], radio: Sequence[FieldFigures]) -> r
             for name, title, _ in CURVES
         ]
         tabs.append(rrb.Grid(*curves, grid_columns=2, name="Robots and channels"))
-    if radio:
-        bars = [rrb.BarChartView(origin=f"/radio/{name}", name=f"{title}, by radio") for name, title, _ in CURVES]
-        tabs.append(rrb.Grid(*bars, grid_columns=2, name="The radio"))
+    for kind, tab, measured in (("radio", "The radio", found.radio), ("receivers", "Framegrabbers", found.receivers)):
+        if measured:
+            bars = [rrb.BarChartView(origin=f"/{kind}/{name}", name=title) for name, title, _ in CURVES]
+            tabs.append(rrb.Grid(*bars, grid_columns=2, name=tab))
     return tabs_and_summary(tabs or [rrb.Grid(name="Starts")], ROBOTS)
 
 
@@ -99,18 +96,14 @@ def _radio_name(one: FieldFigures) -> str:
     return f"{one.baud}_baud_{one.command_rate:g}_per_second".replace(".", "_")
 
 
-def _words(
-    grid: Sequence[FieldFigures],
-    radio: Sequence[FieldFigures],
-    turns: Sequence[FieldFigures],
-    starts: Sequence[StartFigures],
-) -> str:
+def _words(found: RobotsReport) -> str:
     lines = ["# Robots in buildings"]
     head = "all placed | robots placed | walks noticed |"
     for title, figures, columns in (
-        ("Robots and channels", grid, ("robots", "channels")),
-        ("The radio", radio, ("baud", "command_rate")),
-        ("Turns", turns, ("slot", "robots")),
+        ("Robots and channels", found.grid, ("robots", "channels")),
+        ("Framegrabbers", found.receivers, ("framegrabbers", "channels")),
+        ("The radio", found.radio, ("baud", "command_rate")),
+        ("Turns", found.turns, ("slot", "robots")),
     ):
         if figures:
             lines += ["", f"## {title}", f"| {columns[0]} | {columns[1].replace('_', ' ')} | {head}"]
@@ -121,10 +114,12 @@ def _words(
                 f"| {_share(one.noticed)} of {one.walks} |"
                 for one in figures
             ]
-    if starts:
+    if found.starts:
         lines += ["", "## One robot, random starts", "| building | hidden in the dark | and facing the light |"]
         lines += ["|---|---|---|"]
-        lines += [f"| {one.building} | {one.dark} of {one.starts} | {one.good} of {one.starts} |" for one in starts]
+        lines += [
+            f"| {one.building} | {one.dark} of {one.starts} | {one.good} of {one.starts} |" for one in found.starts
+        ]
     return "\n".join(lines)
 
 

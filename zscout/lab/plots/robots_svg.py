@@ -74,7 +74,7 @@ def svg(plot: Plot) -> str:
         value
         for line in plot.lines.values()
         for _, spread in line
-        for value in (spread.median, spread.high)
+        for value in (spread.low, spread.median, spread.high)
         if math.isfinite(value)
     ]
     step, top = _scale(plot.top or max(finite, default=1.0))

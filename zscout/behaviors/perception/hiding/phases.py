@@ -14,7 +14,6 @@ from zscout.behaviors.perception.darkness import DarkPlace, View
 from zscout.behaviors.perception.hiding.state import HidingState, Opening, Sighting, Spot, Step, distance, wrapped
 from zscout.behaviors.perception.lens import COLUMNS
 
-MAX_SIGHTINGS: Final = 120
 HOP: Final = math.radians(36)
 FULL_TURN: Final = math.tau - math.radians(20)
 """Radians of hops that show all sides."""
@@ -81,7 +80,6 @@ def begin_scan(robot: HidingState) -> None:
 def scan(robot: HidingState, view: View) -> Step:
     """A full turn in steps; at its end the best dark place is chosen."""
     robot.sight(view)
-    robot.sightings = robot.sightings[-MAX_SIGHTINGS:]
     if abs(robot.turned) < FULL_TURN and robot.hops < MOST_HOPS:
         degrees, seen = math.degrees(abs(robot.turned)), len(robot.sightings)
         return robot.hop(HOP, f"looks around, {degrees:.0f} degrees, {seen} dark seen")

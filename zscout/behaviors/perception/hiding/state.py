@@ -27,6 +27,7 @@ from zscout.behaviors.perception.lens import COLUMNS, Picture
 MAX_CHECKPOINT: Final = 64_000
 """Bytes; a hider's own is below 20,000."""
 MAX_BAD: Final = 24
+MAX_SIGHTINGS: Final = 120
 FORM: Final = 1
 """Of the checkpoint; one of another form is refused."""
 WHEEL_BASE: Final = 0.11
@@ -361,6 +362,7 @@ class HidingState(msgspec.Struct):
             heading = self.heading + place.bearing
             x, y = self.point(heading, place.distance)
             self.sightings.append(Sighting(heading, place.distance, place.width, place.height, place.darkness, x, y))
+        self.sightings = self.sightings[-MAX_SIGHTINGS:]
         self.openings.append(self.opening(view))
 
     def opening(self, view: View) -> Opening:
