@@ -35,6 +35,12 @@ STORIES = {
         21 there a b       ->
         22 b lost          -> stop b, start a
         """,
+    "nobody is replaced by one that has just gone too": """
+        1 of a b c
+        0 there a b c      -> start a
+        1 there b c        ->
+        12 there c         -> stop a, start c
+        """,
     "with nobody left, the one lost for longest is tried again after a while": """
         1 of a b
         0 there a b        -> start a

@@ -99,7 +99,6 @@ class SensorNet:
     def there(self, now: float, robots: Iterable[str]) -> list[Effect]:
         """Exactly these robots are on the mesh now. Call it now and then: it also sees to what is due."""
         present = set(robots)
-        effects: list[Effect] = []
         for member in self.members.values():
             member.there = member.robot in present
             if member.there:
@@ -108,7 +107,10 @@ class SensorNet:
                     member.standing, member.why = "free", ""
             elif member.away_since is None:
                 member.away_since = now
-            elif member.standing == "active" and now - member.away_since >= ABSENCE_TIMEOUT:
+        # Not before it is known of all: whoever stands in for one may have gone with it.
+        effects: list[Effect] = []
+        for member in self._active:
+            if member.away_since is not None and now - member.away_since >= ABSENCE_TIMEOUT:
                 effects += self._lose(now, member, GONE)
         return effects + self._fill(now)
 
