@@ -306,6 +306,43 @@ def test_maintenance_goes_before_what_is_booked_and_both_are_told() -> None:
     run(story())
 
 
+def test_the_danger_of_maintenance_that_is_given_up_is_over() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        leader, *_ = await led(fleet, "x", "y")
+        assert leader.rcm is not None
+        dangers: list[BookedDanger] = []
+        leader.rcm.bookings.on_danger = dangers.append
+        client = fleet.client("one", "desk")
+        await do(client, book("b", "robot/a", at=500, priority=1), BookingView)
+        await do(client, book("m", "robot/a", at=400, seconds=300, maintenance=True), BookingView)
+        await asyncio.sleep(5)
+        assert states((await fleet.bookings())["b"]) == ["conflict"]
+        await do(client, Unbook("m"), BookingView)
+        await asyncio.sleep(5)
+        (date,) = (await fleet.bookings())["b"].dates
+        assert (date.state, date.danger) == ("open", "")
+        assert [(one.record.id, bool(one.why)) for one in dangers] == [("b", True), ("b", False)]
+
+    run(story())
+
+
+def test_what_is_repeated_is_kept_from_the_instant_that_a_date_is_within_60_days() -> None:
+    async def story() -> None:
+        fleet = BookedFleet("x", "y")
+        await led(fleet, "x", "y")
+        await do(
+            fleet.client("one"), book("b", "robot/a", at=500, every=1, until=round(NOON) + 300 * 86_400), BookingView
+        )
+        await asyncio.sleep(NOON + 499 - fleet.time())
+        assert (await fleet.bookings())["b"].dates[-1].start == NOON + 59 * 86_400 + 500
+        await asyncio.sleep(2)
+        last = (await fleet.bookings())["b"].dates[-1]
+        assert (last.start, last.state, last.danger) == (NOON + 60 * 86_400 + 500, "open", "")
+
+    run(story())
+
+
 def test_a_booking_is_in_danger_while_what_it_needs_is_away() -> None:
     async def story() -> None:
         fleet = BookedFleet("x")

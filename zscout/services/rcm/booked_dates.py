@@ -5,7 +5,9 @@ What of two halves of a fleet can't both be is not in the core: higher priority 
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import suppress
 from functools import partial
 from typing import NamedTuple
 
@@ -162,6 +164,16 @@ class BookedDates:
         left = [Date(record, start) for start in starts if start not in final]
         return [date for date in left if date.id in taken or not self._lapsed(date)]
 
+    def until_another(self, since: float) -> float:
+        """Seconds until what is repeated has one more date within 60 days than it had then (fleet time); infinite where
+        nothing is."""
+        first, coming = since + WINDOW, list[Instant]()
+        for record in self._records:
+            if record.every and not record.unbooked:
+                with suppress(ValueError, OverflowError):  # it is not kept, and that was said
+                    coming += dates(record, first, first + (record.every + 1) * DAY)[:1]
+        return min(coming, default=math.inf) - WINDOW - self.time
+
     def _lapsed(self, date: Date) -> bool:
         """Whether nobody took it up in time: that follows from the time alone, and is not kept."""
         waits = date.record.runtime if date.record.maintenance else min(date.record.patience, date.record.runtime)
@@ -242,6 +254,8 @@ class BookedDates:
         self._conflicts = {name: by for name, by in self._conflicts.items() if self._core.booking(name) is None}
         for name, by in found.losers.items():
             self._emit(Unbooked(name, at_present=True))
+            # The core does not tell of it any more, and begins anew where it is entered again.
+            self._danger.pop(name, None)
             self._bind(wanted[name], by)
 
     def _bind(self, date: Date, by: str) -> None:
@@ -352,7 +366,7 @@ class BookedDates:
             taken = kept.arc if kept is not None else None
             state: DateState = "conflict" if by is not None else "open" if taken is None else "taken"
             danger = self._danger.get(date.id, "") if by is None else self._conflict(by)
-            if kept is None and by is None:
+            if kept is None and by is None and self._waits_for_votes:
                 danger = "an RC that is shared has yet to say whether it would carry it"
             bound = dict(kept.bound) if kept is not None else date.bound
             told.append(BookedDate(date.start, date.start + runtime, state, bound, taken, danger))

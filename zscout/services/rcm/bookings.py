@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
+import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Final, NamedTuple
 
@@ -11,6 +13,7 @@ from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, Mesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import Amounts, BookingRecord, BookingsAsk, BookingsKept, Instant, ProposedHolder, decimals
+from zscout.scheduling.booking import Booked
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Effect, Event, Propose, Vote, VoteOverdue
 from zscout.services.authority import Authority
@@ -25,6 +28,8 @@ log = logging.getLogger(__name__)
 
 SLACK: Final = 0.01
 """Seconds: timers may be a little early."""
+GATHERS: Final = 1.0
+"""Seconds for which bookings are gathered before it is found out when there is one more date of them to keep."""
 LASTS: Final = 3.0
 """Seconds that a danger is waited for to pass: after a change of leader RCs come one after the other."""
 
@@ -86,6 +91,10 @@ class Bookings:
             lambda: self.settled,
         )
         self._reconciling = False
+        self._another: asyncio.TimerHandle | None = None
+        """What is repeated has one more date within 60 days then."""
+        self._booked = False
+        """Since that was found."""
         self._told: dict[str, str] = {}
         """Dangers that were told, by date."""
         self._telling = False
@@ -131,6 +140,9 @@ class Bookings:
         if self.dates.note(events, effects, settled=self.settled):
             self._on_news()
         self._tell_soon()
+        if not self._booked and any(isinstance(event, Booked) for event in events):
+            self._booked = True
+            self._supervisor.call_later(GATHERS, self._await_another, self.dates.time)
         if self.handler.waits_for_votes and any(isinstance(event, (Vote, VoteOverdue)) for event in events):
             self._supervisor.call_later(0, self.handler.try_again)
 
@@ -158,6 +170,15 @@ class Bookings:
         self._reconciling = False
         self.dates.reconcile()
         self._tell_soon()
+        self._await_another(self.dates.time)
+
+    def _await_another(self, since: float) -> None:
+        """What is repeated is to have its dates in time."""
+        if self._another is not None:
+            self._another.cancel()
+        until, self._booked = self.dates.until_another(since), False
+        delay = max(0.0, until) + SLACK
+        self._another = self._supervisor.call_later(delay, self._on_news) if math.isfinite(until) else None
 
     def _tell_soon(self) -> None:
         if not self._telling and self.dates.dangers() != self._told:
