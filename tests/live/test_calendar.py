@@ -104,6 +104,8 @@ def test_a_calendar_in_and_out_and_in_again(tmp_path: Path) -> None:
             # Not free, and not read; the rest is booked.
             other = event("other", SOON + timedelta(minutes=30)), event("odd", SOON, "RRULE:FREQ=SECONDLY")
             later = event("later", SOON + timedelta(hours=2), title="Arm 1 later")
+            seen = await fleet.take(*other, later, options=("--calendar", "others", "--dry-run"), code=1)
+            assert seen == [("Arm 1", "not free"), ("Arm 1 later", "would be booked"), ("Arm 1", "not booked")]
             results = await fleet.take(*other, later, options=("--calendar", "others"), code=1)
             assert results == [("Arm 1", "not free"), ("Arm 1 later", "booked"), ("Arm 1", "not booked")]
 
@@ -126,6 +128,9 @@ def test_a_calendar_in_and_out_and_in_again(tmp_path: Path) -> None:
 
             # What is no more in the calendar is given up where that is said; that of others is left alone.
             assert ("Arm 1", "kept") in await fleet.take(once)
+            # Not where it may be what could not be read.
+            torn = event("weekly", SOON + timedelta(days=1), "RRULE:FREQ=SECONDLY")
+            assert ("Arm 1", "kept") in await fleet.take(once, torn, options=("--sync",), code=1)
             assert ("Arm 1", "given up") in await fleet.take(once, options=("--sync",))
             assert await fleet.dates() == [SOON, SOON + timedelta(hours=2)]
             assert "3 of them changed" in await fleet.zscout("export", "--folder", out)

@@ -80,6 +80,17 @@ def soon(told: BookingsTold | None) -> int:
     )
 
 
+def in_maintenance(told: BookingsTold | None) -> set[str]:
+    """RCs that are kept free now for whom nobody takes it up."""
+    return {
+        rc
+        for booking in (told.bookings if told is not None else ())
+        for date in booking.dates
+        if told is not None and booking.maintenance and date.start <= told.time < date.end
+        for rc in booking.needs
+    }
+
+
 def explained(refused: RequestRefused) -> Exception:
     """What to raise instead: bad input has its own exit code."""
     return BadInput(str(refused)) if refused.code in BAD else refused

@@ -97,6 +97,8 @@ def parse_date(text: str, option: str) -> WrittenDate:
     """What people write for a date. Raises BadInput."""
     words = " ".join(text.lower().split())
     bad = BadInput(f"{option}: {quoted(text)} is no date; write {DATE_FORMS}")
+    if words == "now":
+        return WrittenDate(text, option, after=0.0)
     if words.startswith("in "):
         if (seconds := parse_duration(words.removeprefix("in ").replace(" ", ""))) is None:
             raise bad
@@ -107,7 +109,7 @@ def parse_date(text: str, option: str) -> WrittenDate:
         if (whole := _INSTANT.fullmatch(words)) is not None:
             at = datetime.fromisoformat(words.upper())
             if at.year not in YEARS:
-                raise bad
+                raise _out_of_reach(text, option, at.year)
             if whole["offset"]:
                 return WrittenDate(text, option, instant=at)
             return WrittenDate(text, option, day=at.date(), time=at.time())
@@ -116,10 +118,16 @@ def parse_date(text: str, option: str) -> WrittenDate:
             return WrittenDate(text, option, time=_time(words, bad))
         meant = date.fromisoformat(day["date"]) if day["date"] else _named_day(day["name"], bad)
         if isinstance(meant, date) and meant.year not in YEARS:
-            raise bad
+            raise _out_of_reach(text, option, meant.year)
         return WrittenDate(text, option, day=meant, time=_time(rest, bad) if rest else None)
     except ValueError:  # the 30th of February, 25:00
         raise bad from None
+
+
+def _out_of_reach(text: str, option: str, year: int) -> BadInput:
+    if year < YEARS.start:
+        return BadInput(f"{option}: {quoted(text)} is long past; write a later one")
+    return BadInput(f"{option}: {quoted(text)} is more than a year ahead; write an earlier one")
 
 
 def _named_day(name: str, bad: BadInput) -> int | str:

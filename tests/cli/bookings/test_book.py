@@ -85,6 +85,9 @@ AT = ("--for", "1h", "--at", "tue 14:00")
         (("book", *AT), "Missing argument 'NEED...'"),
         (("book", "robot/a", "--for", "1h", "--at", "tue"), '--at: "tue" has no time of day; write "tue 14:00"'),
         (("book", "robot/a", "--for", "soon", "--at", "9:00"), '--for: "soon" is not a duration'),
+        (("book", "robot/a", "--for", "1h", "--at", "9999-12-31 23:59"), "is more than a year ahead; write an earlier"),
+        (("book", "robot/a", "--for", "1h", "--at", "0001-01-01"), "is long past; write a later one"),
+        (("book", "robot", *AT), 'need "robot": '),
         (("book", "robot/a", *AT, "--until", "2026-12-24"), "--until is the end of what is repeated"),
         (("book", "robot/a", *AT, "--every", "month"), '--every: "month" is not from 1 to 366 days'),
         (("book", "robot/a", *AT, "--patience", "2h"), "--patience: it is over after 1 h"),
@@ -112,4 +115,5 @@ def test_bad_input_is_one_line_and_code_2(
     said = capsys.readouterr()
     assert (code, said.out) == (2, "")
     assert why in said.err
+    assert "after --" not in said.err
     assert said.err.count("\n") == 1

@@ -62,6 +62,10 @@ def test_booked_listed_found_taken_up_and_given_up(fleet: CliFleet) -> None:
     assert (listed["name"], listed["own"], listed["who"]["comment"]) == ("survey", True, "visitors")
     assert [date["state"] for date in listed["dates"]] == ["open"]
     assert told(fleet, "bookings", "--rc", "robot/b")["bookings"] == []
+    found = {
+        rc: len(told(fleet, "bookings", "--rc", rc)["bookings"]) for rc in ("robot/*", "framegrabber/*", "other/*")
+    }
+    assert found == {"robot/*": 1, "framegrabber/*": 1, "other/*": 0}
     columns, row = said(fleet, "bookings", "--zone", "UTC").splitlines()
     assert columns.split()[:3] == ["NAME", "ID", "WHO"]
     assert row.startswith(f"survey  {listed['id'][:8]}  ")
@@ -169,7 +173,20 @@ def test_who_would_run_into_maintenance_is_told_until_when(fleet: CliFleet) -> N
     assert told(fleet, "status")["booked_soon"] == 1
 
 
+def test_status_shows_what_is_in_maintenance(fleet: CliFleet) -> None:
+    said(fleet, "maintain", "robot/b", "--at", "now", "--for", "1h", "--name", "greased")
+    for state in ("maintenance", "free"):
+        row = re.compile(rf"^robot/b +exclusive +{state} ", re.MULTILINE)
+        fleet.shown("status", until=row.search)
+        if state == "maintenance":
+            said(fleet, "unbook", "greased")
+
+
 def test_what_the_rcm_refuses_is_bad_input(fleet: CliFleet) -> None:
+    assert "longer than a year" in said(fleet, "slots", "robot/a", "--for", "370d", code=2)
+    assert "more than a year ahead" in said(
+        fleet, "slots", "robot/a", "--for", "1h", "--from", "2100-01-01 9:00", code=2
+    )
     args = ("--for", "24h", "--at", "9:00", "--every", "day")
     assert "it would overlap its own next date" in said(fleet, "book", "robot/a", *args, code=2)
     assert "speed" in said(fleet, "book", "radio/rf0:speed=1", "--for", "1h", "--at", "9:00", code=2)

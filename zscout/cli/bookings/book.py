@@ -281,7 +281,8 @@ async def _make(
 def _named_after(needs: Needs) -> str:
     """`arm1` for robot/arm1, `framegrabber` where any one will do."""
     kind, _, name = next(iter(needs)).partition("/")
-    return valid_name(kind if is_pattern(name) else name)
+    named = kind if is_pattern(name) else name
+    return "booking" if is_pattern(named) else valid_name(named)
 
 
 async def _instead(client: Client, refused: RequestRefused, needs: Needs, asked: Asked, priority: int) -> str:
@@ -295,7 +296,8 @@ async def _instead(client: Client, refused: RequestRefused, needs: Needs, asked:
     free = [date_words(slot.start, asked.zone) for slot in told.slots if slot.start > start.timestamp()]
     if not free:
         return f"{refused}; within {span(LOOK_AHEAD)} after that they are not free together"
-    return f"{refused}; free together from {' or '.join(free)} on ({asked.zone.key}): write another --at"
+    alone = "that date alone is free" if asked.every else "free together"
+    return f"{refused}; {alone} from {' or '.join(free)} on ({asked.zone.key}): write another --at"
 
 
 def _print(booking: BookingView, asked: Asked, told: BookingsTold) -> None:

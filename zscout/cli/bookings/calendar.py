@@ -7,6 +7,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from decimal import Decimal
 from pathlib import Path
 from typing import Any, Final
@@ -167,7 +168,9 @@ class _Import:
         for view in gone:
             if not view.unbooked and view.owner == self.client.mesh.me.host:
                 words = view.who.comment if view.who is not None and view.who.comment else view.name
-                if sync:
+                if sync and any(one.failed for one in plan.skipped):
+                    self.rows.append(Row(words, "kept", "an event could not be read, and may be this one", view))
+                elif sync:
                     await self._unbook(view, words)
                 else:
                     self.rows.append(Row(words, "kept", "it is not in the calendar any more; --sync gives it up", view))
@@ -182,8 +185,10 @@ class _Import:
         self.rows.append(row)
         if known is None and wanted.book is not None:
             row.result = "would be booked" if self.dry_run else "booked"
-            if self.dry_run or (known := await self._book(wanted.ids, wanted.book, row)) is None:
+            if self.dry_run:
+                await self._foresee(wanted.book, row)
                 return
+            known = await self._book(wanted.ids, wanted.book, row)
         if known is None:
             return
         last = known.start if known.until is None else known.until
@@ -193,6 +198,21 @@ class _Import:
             if not self.dry_run:
                 await self._ask(Unbook(known.id, at, self.client.who), row)
         row.why = row.why or (f"without {many(len(dropped), 'date')} given up in the calendar" if dropped else "")
+
+    async def _foresee(self, book: Book, row: Row) -> None:
+        """Tells in the row why it would not be booked; of what is repeated its first date is tried. Raises
+        NobodyThere."""
+        start = datetime.fromtimestamp(book.start, UTC)
+        try:
+            client = BookingsClient(self.client)
+            told = await client.slots(book.needs, book.runtime, 1.0, start=start, priority=book.priority, limit=1)
+        except RcmSilent as silent:
+            raise NobodyThere(str(silent)) from None
+        except RequestRefused as refused:
+            row.result, row.why, row.failed = "refused", str(refused), True
+            return
+        if not book.maintenance and [one.start for one in told.slots] != [book.start]:
+            row.result, row.why, row.failed = "not free", "zscout slots tells when they are", True
 
     async def _book(self, ids: tuple[str, ...], book: Book, row: Row) -> BookingView | None:
         """None: it is not booked, and the row tells. Raises NobodyThere."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 from zoneinfo import ZoneInfo
@@ -32,6 +32,7 @@ from zscout.cli.bookings.book import DATE
 from zscout.cli.common import Failed
 from zscout.cli.dates import WrittenDate, date_words, every_words, host_zone, in_zone, span_words
 from zscout.config.strict import BadInput
+from zscout.keyexpr import is_pattern, matcher
 from zscout.messages import MAX_AHEAD, WINDOW, BookedDate, BookingRecord, BookingView
 from zscout.services.bookings.dates import dates, zone_of
 from zscout.terminal import Table, clean
@@ -39,7 +40,12 @@ from zscout.terminal import Table, clean
 
 @click.command()
 @click.option("--mine", is_flag=True, help="Only your own.")
-@click.option("--rc", type=journals.RC, shell_complete=completion.needs, help="Only those that may have this RC.")
+@click.option(
+    "--rc",
+    type=journals.RC,
+    shell_complete=completion.needs,
+    help="Only those that may have this RC, or one of a pattern: robot/*.",
+)
 @zone_option
 @common.json_option("Print one JSON object.")
 @common.runs
@@ -47,8 +53,8 @@ async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: b
     """List bookings, the next date first: who has which devices from when to when, and what endangers that.
 
     Of what is repeated the next date is listed, and those of the next 60 days that are in danger; --json has all of
-    these. A state is `open` until somebody has taken the date up, then `taken`; in `conflict` is what was booked in two
-    halves of a fleet, where the other booking stands.
+    these. A state is `open` until somebody has taken the date up, then `taken`; in `conflict` is what another one
+    stands in the way of: maintenance, or what was booked in the other half of a fleet.
 
     \b
     Examples:
@@ -59,10 +65,12 @@ async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: b
     async with common.connected("bookings") as client:
         me = User.of(client)
         try:
-            told = await ask_bookings(client, rc)
+            told = await ask_bookings(client, None if rc is not None and is_pattern(rc) else rc)
         except RequestRefused as refused:
             raise explained(refused) from None
         found = [one for one in told.bookings if not mine or me.owns(one)]
+        if rc is not None and is_pattern(rc):
+            found = [one for one in found if _may_have(one, matcher(rc), rc)]
         if as_json:
             terminal.print_json(
                 {
@@ -79,6 +87,12 @@ async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: b
             terminal.print_line("nothing is booked")
         else:
             _table(found, me, zone).print()
+
+
+def _may_have(booking: BookingView, matches: Callable[[str], bool], pattern: str) -> bool:
+    """Whether it is of an RC that matches, or by that pattern."""
+    bound = {rc for date in booking.dates for rc in date.bound.values()}
+    return any(matches(need) or need.partition("#")[0] == pattern for need in (*booking.needs, *bound))
 
 
 def _table(found: Sequence[BookingView], me: User, zone: ZoneInfo | None) -> Table:

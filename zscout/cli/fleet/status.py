@@ -151,15 +151,18 @@ class Standing:
     def _rcs(self, state: RcmState) -> Table:
         homes = self._homes()
         lost = {device.rc for device in self.devices.known().values() if device.health != "ok"}
+        maintained = booked.in_maintenance(self.booked)
         rows, styles = [], []
         for view in state.rcs:
             holders = [hold for hold in state.holds if view.rc in hold.needs]
-            there = "held" if holders else "free"
+            there = "held" if holders else "maintenance" if view.rc in maintained else "free"
             words = there if view.present else "lost" if view.rc in lost else "absent"
             kind = "shared" if view.sharable else "exclusive"
             names = ", ".join(common.with_amounts(whose(hold), hold.needs[view.rc]) for hold in holders)
             rows.append((view.rc, kind, words, homes.get(view.rc, "-"), names))
-            styles.append({"absent": "red", "lost": "red", "held": "yellow", "free": "green"}[words])
+            styles.append(
+                {"absent": "red", "lost": "red", "held": "yellow", "maintenance": "yellow", "free": "green"}[words]
+            )
         return Table("RCs", ("RC", "USE", "STATE", "HOST", "HELD BY"), rows, styles, cut={"HELD BY"})
 
     def _running(self, state: RcmState) -> Table:

@@ -110,7 +110,7 @@ def parse_need(text: str, _option: str = "") -> tuple[str, dict[str, Decimal]]:
         messages.exact_amounts(params)
     except ValueError as error:
         context = click.get_current_context(silent=True)
-        no_dashes = "/" not in text and context is not None and not context.meta.get("command")
+        no_dashes = "/" not in text and context is not None and context.meta.get("command") == ()
         raise BadInput(f"need {quoted(text)}: {error}{'; a command goes after --' if no_dashes else ''}") from None
     return rc, params
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from typing import Final, TypeAlias
 
 from zscout.config.fleet import Fleet
@@ -139,8 +140,7 @@ class BookingHandler:
             raise Refused("bad_request", str(error)) from None
         if not -MAX_PRIORITY <= wanted.priority <= MAX_PRIORITY:
             raise Refused("bad_request", f"priority must lie between -{MAX_PRIORITY} and {MAX_PRIORITY}")
-        if wanted.runtime > MAX_AHEAD:
-            raise Refused("bad_date", "nothing is booked for longer than a year")
+        self._check_length(wanted.runtime)
         over = wanted.start + min(patience, runtime) / SECOND
         if over <= time:
             date, now = told(wanted.start, wanted.zone), told(time, wanted.zone)
@@ -160,6 +160,10 @@ class BookingHandler:
         if wanted.maintenance:
             fields["priority"] = max(wanted.priority, self._fleet.operator_priority)
         return BookingRecord(**fields, owner=sender.host, since=int(time), made=made, changed=made)
+
+    def _check_length(self, runtime: Decimal) -> None:
+        if runtime > MAX_AHEAD:
+            raise Refused("bad_date", "nothing is booked for longer than a year; ask for less")
 
     def _check_allowed(self, wanted: Book | FindSlots, sender: Sender) -> None:
         if isinstance(wanted, Book) and wanted.maintenance:
@@ -271,11 +275,14 @@ class BookingHandler:
             runtime = duration(asked.runtime, "runtime")
         except (BadName, ValueError) as error:
             raise Refused("bad_request", str(error)) from None
+        self._check_length(asked.runtime)
         self._check_allowed(asked, sender)
         self._check_door(asked.needs)
         now = self._now()
         start = self._dates.local(max(asked.start or 0, -(-self._dates.to_fleet(now) // SECOND)))
-        within = min(asked.within, MAX_AHEAD)
+        within = min(asked.within, MAX_AHEAD - (start - now) / SECOND)
+        if within < 0:
+            raise Refused("bad_date", "nothing is booked more than a year ahead; ask for earlier times")
         wanted = Booking(asked.id, needs, asked.priority, start, runtime, runtime, now, owner=sender.host)
         self._try(_Undecided(query, lambda: self._answer_slots(query, asked, wanted, start + round(within * SECOND))))
 
