@@ -128,6 +128,10 @@ def test_a_calendar_in_and_out_and_in_again(tmp_path: Path) -> None:
 
             # What is no more in the calendar is given up where that is said; that of others is left alone.
             assert ("Arm 1", "kept") in await fleet.take(once)
+            # What was moved would be in its own way, if it were not given up first.
+            later = event("once", SOON + timedelta(minutes=20))
+            seen = await fleet.take(later, options=("--sync", "--dry-run"))
+            assert ("Arm 1", "would be booked") in seen
             # Not where it may be what could not be read.
             torn = event("weekly", SOON + timedelta(days=1), "RRULE:FREQ=SECONDLY")
             assert ("Arm 1", "kept") in await fleet.take(once, torn, options=("--sync",), code=1)

@@ -161,6 +161,8 @@ class _Import:
     dry_run: bool
     again: bool
     rows: list[Row] = field(default_factory=list)
+    makes_room: bool = False
+    """Whether something is given up, or would be, before the rest is booked."""
 
     async def run(self, plan: ImportPlan, *, sync: bool) -> None:
         """Raises NobodyThere."""
@@ -194,6 +196,7 @@ class _Import:
         last = known.start if known.until is None else known.until
         given_up = {*known.dropped, *(one.start for one in known.dates if one.state == "unbooked")}
         dropped = [at for at in wanted.dropped if known.start <= at <= last and at not in given_up]
+        self.makes_room |= bool(dropped)
         for at in dropped:
             if not self.dry_run:
                 await self._ask(Unbook(known.id, at, self.client.who), row)
@@ -211,7 +214,11 @@ class _Import:
         except RequestRefused as refused:
             row.result, row.why, row.failed = "refused", str(refused), True
             return
-        if not book.maintenance and [one.start for one in told.slots] != [book.start]:
+        if book.maintenance or [one.start for one in told.slots] == [book.start]:
+            return
+        if self.makes_room:
+            row.why = "if what is given up makes room for it"
+        else:
             row.result, row.why, row.failed = "not free", "zscout slots tells when they are", True
 
     async def _book(self, ids: tuple[str, ...], book: Book, row: Row) -> BookingView | None:
@@ -229,6 +236,7 @@ class _Import:
             words, "would be given up" if self.dry_run else "given up", "it is not in the calendar any more", view
         )
         self.rows.append(row)
+        self.makes_room = True
         if not self.dry_run:
             await self._ask(Unbook(view.id, who=self.client.who), row)
 
