@@ -11,7 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from benchmarks import commands, crowd, frames, hosts, latency, process, programs, reporter
+from benchmarks import commands, crowd, latency, process, programs, reporter
 from benchmarks.loop import run
 from benchmarks.stats import Row, table
 
@@ -41,13 +41,8 @@ async def measure(rounds: int, crowds: int, members: int, before: str | None) ->
             rows += await crowd.crowd(lab, folder / "empty", crowds, 3.0, progress, members)
             rows += process.memory_after(lab)
             rows += reporter.costs(lab.nodes["lead"].pid)
-        progress("1,000 hosts")
-        (folder / "hosts").mkdir()
-        rows += await hosts.rows_of_thousand(folder / "hosts")
     progress("commands")
-    rows += await commands.measure(15)
-    rows += await frames.measure(15.0, progress)
-    return rows
+    return rows + await commands.measure(15)
 
 
 def main() -> None:

@@ -15,8 +15,8 @@ from pathlib import Path
 
 from formal.tlc import ENTERING, GUARDS, SETTLING, Instance, NoTlc, Outcome, check, check_entering, check_settling, jar
 from formal.traces import Behaviour, accept
+from studies.faults.simulation import simulate
 from zscout import terminal
-from zscout.lab.faults.simulation import simulate
 
 INSTANCES = (
     Instance("safety", terms=3, steps=3, joins=3),

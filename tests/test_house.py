@@ -15,9 +15,9 @@ import zscout
 ROOT = Path(__file__).parents[1]
 MODULES = {path.relative_to(ROOT): ast.parse(path.read_text()) for path in sorted((ROOT / "zscout").rglob("*.py"))}
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
-SOURCES = {path.name for tree in ("zscout", "tests", "benchmarks") for path in (ROOT / tree).rglob("*.py")}
+SOURCES = {path.name for tree in ("zscout", "tests", "studies", "benchmarks") for path in (ROOT / tree).rglob("*.py")}
 WROTE = re.compile(r"`([\w./]+)`")
-TREES = {"zscout", "tests", "benchmarks", "examples"} | {path.parts[1] for path in MODULES}
+TREES = {"zscout", "tests", "studies", "benchmarks", "examples"} | {path.parts[1] for path in MODULES}
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
 
 
@@ -40,16 +40,14 @@ def test_a_public_class_name_stands_in_one_module() -> None:
     assert {name: paths for name, paths in homes.items() if len(paths) > 1} == {}
 
 
-def test_nothing_but_the_command_line_imports_the_lab() -> None:
+def test_nothing_but_the_command_line_imports_the_simulation() -> None:
     outside = {
         path: found
         for path, tree in MODULES.items()
-        if path.parts[1] not in ("lab", "cli")
-        and (found := [name for name in imports(tree) if f"{name}.".startswith("zscout.lab.")])
+        if path.parts[1] not in ("simulation", "cli")
+        and (found := [name for name in imports(tree) if f"{name}.".startswith("zscout.simulation.")])
     }
     assert outside == {}
-    users = {path.parts[1] for path, tree in MODULES.items() if any("zscout.lab." in name for name in imports(tree))}
-    assert users == {"lab", "cli"}
 
 
 @pytest.mark.parametrize("name", zscout.__all__)

@@ -8,7 +8,7 @@ import pytest
 from formal.__main__ import WITHOUT
 from formal.tlc import ENTERING, SETTLING, Instance, NoTlc, check, check_entering, check_settling, jar
 from formal.traces import Behaviour, accept
-from zscout.lab.faults.simulation import simulate
+from studies.faults.simulation import simulate
 
 try:
     jar()

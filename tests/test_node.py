@@ -19,10 +19,10 @@ from zscout.config.node import Node, load_node
 from zscout.drivers.driver import RcHandle
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.keyexpr import Role, Sender, Token
-from zscout.lab.faults.memory import MemoryNetwork
 from zscout.mesh import MeshError
 from zscout.node import NodeFailed, run_services
 from zscout.services.node.component_host import ComponentHost
+from zscout.testing.memory import MemoryNetwork
 
 
 class Faulty(ExclusiveDriver):

@@ -18,11 +18,11 @@ from typing import Any, Final, TypeAlias
 
 import psutil
 
+from studies.faults import simulation
+from studies.faults.simulation import Result, Simulation, Size, simulate
 from tests.chaos import net
 from tests.chaos.run import Fleet, NotServed
 from tests.chaos.work import NODES, OWN_CLIENTS
-from zscout.lab.faults import simulation
-from zscout.lab.faults.simulation import Result, Simulation, Size, simulate
 from zscout.services.rcm.registry import MAX_LINES
 
 Figures: TypeAlias = dict[str, float]
@@ -111,7 +111,9 @@ def product_objects() -> int:
 def _is_product(one: object) -> bool:
     module = type(one).__module__
     # The checker's memory is of grants and places, which are tuples.
-    return module.startswith("zscout.") and not module.startswith("zscout.lab.") and not isinstance(one, type | tuple)
+    return (
+        module.startswith("zscout.") and not module.startswith("zscout.testing.") and not isinstance(one, type | tuple)
+    )
 
 
 def virtual(hours: float) -> tuple[list[dict[str, Figures]], Result]:

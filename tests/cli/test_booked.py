@@ -26,8 +26,8 @@ from zscout.cli.booked import (
 from zscout.cli.common import Failed
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Sender
-from zscout.lab.faults.memory import MemoryNetwork
 from zscout.messages import BookedDate, BookingsAsk, BookingsTold, BookingView, Who
+from zscout.testing.memory import MemoryNetwork
 
 FLEET = default_fleet()
 ALICE = User("alice", "ws1", person=False)

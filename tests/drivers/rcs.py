@@ -11,10 +11,10 @@ from typing import Any, Final
 from zscout.drivers.driver import Driver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token
-from zscout.lab.faults.memory import MemoryNetwork
 from zscout.mesh import IncomingQuery, Mesh
 from zscout.mesh.supervision import StallWatch
 from zscout.messages import Command, Done, Grants, Holder, HoldView, RcmState, StateAsk
+from zscout.testing.memory import MemoryNetwork
 from zscout.types import Grant, Place, Term
 
 TERM = Term(3, "test")

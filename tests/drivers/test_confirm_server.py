@@ -7,9 +7,9 @@ import asyncio
 from tests.mesh.kit import run
 from zscout.drivers.confirm_server import CommandQuery, ConfirmServer
 from zscout.keyexpr import Sender
-from zscout.lab.faults.memory import MemoryNetwork
 from zscout.mesh import Refused
 from zscout.messages import Confirm, Confirmed, Done, Problem
+from zscout.testing.memory import MemoryNetwork
 from zscout.types import Grant, Term
 
 GRANT = Grant(Term(1, "a"), 2)

@@ -12,9 +12,9 @@ from tests.services.rcm.kit import FakeClient, FakeFleet, grant_of
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.instances import InstanceState
 from zscout.drivers.resource_controller import ResourceController
-from zscout.lab.faults.memory import MemoryMesh
 from zscout.mesh.supervision import StallWatch
 from zscout.messages import Command, Done, Grants, Holder, OpenRequest
+from zscout.testing.memory import MemoryMesh
 from zscout.types import SECOND, Grant, Place, Term
 
 RC = "robot/a"

@@ -19,10 +19,10 @@ from zscout.drivers.repeated import MAX_HOSTS, MAX_PER_HOST, MAX_WAITING, Comman
 from zscout.drivers.resource_controller import SAY_AGAIN, ResourceController
 from zscout.drivers.work_queue import COMMANDS_PER_HOST, EARLY_PER_HOST, WorkQueue
 from zscout.keyexpr import Role, Sender
-from zscout.lab.faults.link import Disturbance
-from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
 from zscout.mesh import IncomingQuery, Mesh, Refused
 from zscout.messages import Command, Done, Grants, Holder, Malformed, RcAsk, RcmState, RcState
+from zscout.testing.link import Disturbance
+from zscout.testing.memory import MemoryMesh, MemoryNetwork
 from zscout.types import SECOND, Grant
 
 Story = Callable[[Rcm, ResourceController, Device, Mesh], Awaitable[None]]

@@ -15,9 +15,9 @@ from tests.mesh.kit import run, until
 from zscout.drivers.last_holder import LastHolder, LastHolderFile, UnknownLastHolder
 from zscout.drivers.resource_controller import SETTLE, ResourceController
 from zscout.keyexpr import Sender
-from zscout.lab.faults.memory import MemoryNetwork
 from zscout.mesh import Mesh
 from zscout.messages import Command, Done, Grants, Holder, Problem, RcAsk, RcState, Revocation
+from zscout.testing.memory import MemoryNetwork
 from zscout.types import SECOND, Grant
 
 CONFIRM: Mapping[str, Any] = {"name": "confirm"}

@@ -18,6 +18,7 @@ from typing import Any, Final, TypeVar
 
 import msgspec
 
+from studies.faults.components import SimulatedComponent, report_load
 from tests.fuzz.hostile import Hostile, Names, is_one
 from tests.fuzz.key_table import PROTOCOL, Row, read_rows
 from zscout import messages
@@ -30,9 +31,6 @@ from zscout.config.node import ComponentsConfig, JournalConfig
 from zscout.drivers.generic import CapacityDriver, ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
-from zscout.lab.faults.components import SimulatedComponent, report_load
-from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork, MemoryTransport
-from zscout.lab.faults.virtual_time import Process, VirtualTimeLoop
 from zscout.mesh.supervision import StallWatch
 from zscout.mesh.transport import Collector, Quality, TransportQuery
 from zscout.messages import ComponentSpec, Problem, Recorded
@@ -41,6 +39,8 @@ from zscout.services.node.component_host import ComponentHost
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.recorder.recorder import Recorder
 from zscout.services.recorder.timeline import Timeline
+from zscout.testing.memory import MemoryMesh, MemoryNetwork, MemoryTransport
+from zscout.testing.virtual_time import Process, VirtualTimeLoop
 from zscout.types import SECOND
 
 T = TypeVar("T")

@@ -20,13 +20,13 @@ from zscout.config.node import load_node
 from zscout.config.strict import BadInput, read_text
 from zscout.drivers.last_holder import LastHolderFile
 from zscout.keyexpr import Sender
-from zscout.lab.building.plan_file import load_plan, shipped_plans
-from zscout.lab.faults.memory import MemoryNetwork
-from zscout.lab.workload import MAX_BYTES, parse_workload
 from zscout.messages import encode
 from zscout.services.rcm.devices import SeenHome
 from zscout.services.rcm.inventory import FILE, Inventory, _DeviceFile
 from zscout.services.recorder.process import decode_job, new_recording, prune
+from zscout.simulation.building.plan_file import load_plan, shipped_plans
+from zscout.simulation.workload import MAX_BYTES, parse_workload
+from zscout.testing.memory import MemoryNetwork
 
 EXAMPLES: Final = Path(__file__).parents[2] / "examples"
 MOST_IN_A_LINE: Final = 1_500

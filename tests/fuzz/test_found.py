@@ -18,10 +18,10 @@ from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeFleet
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
-from zscout.lab.faults.memory import MemoryNetwork
 from zscout.messages import RcState, RcView
 from zscout.services.rcm.devices import ExpectedDevices, SeenHome, homes_in
 from zscout.services.rcm.inventory import FILE, Inventory
+from zscout.testing.memory import MemoryNetwork
 from zscout.types import SECOND
 
 

@@ -19,8 +19,8 @@ from tests.thorough import FACTOR, times
 from zscout import messages
 from zscout.behaviors.client.rcm_link import _TermOnly
 from zscout.keyexpr import Keys, Sender, Token
-from zscout.lab.faults.memory import intersects
 from zscout.messages import Grants
+from zscout.testing.memory import intersects
 
 Deed = tuple[Row, int, int]
 """On which row, with how many faults, and of which seed."""

@@ -20,8 +20,8 @@ import pytest
 
 from tests.hang import HANG
 from tests.services.recorder.paper_run import RCS, TABLE2, colours, events, lanes, rows
-from zscout.lab.demo.tables import ArcBody, Observed, differences, paper
 from zscout.services.recorder.timeline import OPERATOR_MARK
+from zscout.simulation.demo.tables import ArcBody, Observed, differences, paper
 from zscout.types import SECOND, Ns
 
 pytestmark = pytest.mark.live

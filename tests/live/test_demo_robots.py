@@ -15,7 +15,7 @@ import pytest
 
 from tests.hang import HANG
 from tests.services.recorder.paper_run import lanes
-from zscout.lab.building.plan_file import shipped_plans
+from zscout.simulation.building.plan_file import shipped_plans
 
 pytestmark = pytest.mark.live
 

@@ -17,11 +17,11 @@ from tests.mesh.kit import until
 from zscout import messages
 from zscout.config.fleet import MeshConfig, default_fleet
 from zscout.keyexpr import Role, Sender, Token, new_instance
-from zscout.lab.faults.memory import MemoryNetwork
-from zscout.lab.faults.virtual_time import VirtualTimeLoop
 from zscout.mesh import IncomingQuery, Mesh, MeshError, ZenohMesh
 from zscout.mesh.transport import Collector
 from zscout.messages import Message
+from zscout.testing.memory import MemoryNetwork
+from zscout.testing.virtual_time import VirtualTimeLoop
 from zscout.types import SECOND
 
 LONG = HANG

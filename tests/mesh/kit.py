@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable
 
 from tests.hang import HANG
-from zscout.lab.faults.virtual_time import run
+from zscout.testing.virtual_time import run
 
 __all__ = ["run", "until"]
 

@@ -11,8 +11,8 @@ import pytest
 from tests.mesh.both_meshes import ASK, LONG, NEWS, Ping, Play, Pong, World, token
 from tests.mesh.kit import run, until
 from zscout.keyexpr import Role, Sender
-from zscout.lab.faults.memory import MemoryNetwork
 from zscout.mesh.renewal import LASTS, LONGEST, PATIENCE, SHORTEST, Suspicions
+from zscout.testing.memory import MemoryNetwork
 from zscout.types import SECOND
 
 

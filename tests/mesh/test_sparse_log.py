@@ -9,10 +9,10 @@ import pytest
 
 from tests.mesh.kit import run, until
 from zscout.keyexpr import Sender
-from zscout.lab.faults.memory import MemoryNetwork
 from zscout.mesh.sparse_log import MAX_KEYS, SparseLog
 from zscout.mesh.transport import Quality
 from zscout.messages import Grants, RcmState, StateAsk
+from zscout.testing.memory import MemoryNetwork
 from zscout.types import SECOND, Ns
 
 log = logging.getLogger("zscout.test")

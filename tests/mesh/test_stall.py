@@ -7,8 +7,8 @@ import asyncio
 import pytest
 
 from tests.mesh.kit import run
-from zscout.lab.faults.virtual_time import VirtualTimeLoop
 from zscout.mesh.supervision import AFTERMATH, StallWatch
+from zscout.testing.virtual_time import VirtualTimeLoop
 from zscout.types import SECOND, Ns
 
 

@@ -10,8 +10,8 @@ from random import Random
 import pytest
 from msgspec.structs import replace
 
+from studies.placement.simulation import Machine, SimulatedJob, _Host, _Running
 from zscout.config.fleet import PlacementPolicy
-from zscout.lab.study.placement.simulation import Machine, SimulatedJob, _Host, _Running
 from zscout.messages import ComponentSpec, ComponentView, DrainHost, MoveComponent, StartComponent, StopComponent
 from zscout.placement.balancer import LOAD_TIME, Balancer
 from zscout.placement.events import (

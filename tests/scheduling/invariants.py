@@ -11,10 +11,10 @@ from msgspec.structs import replace
 from tests.scheduling.oracle import Contender, Oracle
 from tests.scheduling.validate import validate
 from zscout.keyexpr import is_pattern, matcher
-from zscout.lab.workload import WorkloadRc
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Arc, ArcRequest, Effect, Granted, HoldEnded, Outcome, Queued
+from zscout.simulation.workload import WorkloadRc
 from zscout.types import NO_TERM, ArcId, ClientId, Grant, Ns, Params, RcName
 
 

@@ -12,11 +12,11 @@ from itertools import product
 
 from zscout.config.scheduling_policy import FairShares
 from zscout.keyexpr import is_pattern, matcher
-from zscout.lab.replay import HoldRecord, Replay
-from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.fair_shares import LITTLE, NEAR
 from zscout.scheduling.model import QUANTUM, ArcRequest, Outcome
+from zscout.simulation.replay import HoldRecord, Replay
+from zscout.simulation.workload import Arrival, Workload, WorkloadRc
 from zscout.types import SECOND, Ns, Params, RcName
 
 

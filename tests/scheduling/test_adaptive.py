@@ -16,8 +16,6 @@ from tests.scheduling.workloads import workloads
 from tests.services.recorder.paper_run import RCS, TABLE1
 from tests.thorough import times
 from zscout.config.scheduling_policy import StrategyName
-from zscout.lab.replay import replay
-from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.adaptive import MAX_SLICES, SLICE, Adaptive, steps_for
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
@@ -40,6 +38,8 @@ from zscout.scheduling.model import (
 )
 from zscout.scheduling.priority import Priority
 from zscout.scheduling.strategies import STRATEGIES
+from zscout.simulation.replay import replay
+from zscout.simulation.workload import Arrival, Workload, WorkloadRc
 from zscout.types import SECOND, Ns
 
 MANY_PASSES = 500

@@ -11,13 +11,13 @@ from tests.scheduling.test_patterns import workload as with_patterns
 from tests.scheduling.test_waiting import workload as with_one_priority
 from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy, StrategyName
-from zscout.lab.replay import replay
-from zscout.lab.workload import Arrival, Workload
 from zscout.scheduling.conflict_groups import undecided_arcs
 from zscout.scheduling.model import Arc, ArcRequest
 from zscout.scheduling.state import Actions, SchedulerState, Strategy
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.votes import Votes
+from zscout.simulation.replay import replay
+from zscout.simulation.workload import Arrival, Workload
 from zscout.types import SECOND, Ns
 
 

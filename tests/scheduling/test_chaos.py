@@ -13,7 +13,6 @@ from tests.scheduling.invariants import Ledger
 from tests.scheduling.workloads import capacity, rcs, requests
 from tests.thorough import times
 from zscout.config.scheduling_policy import StrategyName
-from zscout.lab.workload import WorkloadRc
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
@@ -36,6 +35,7 @@ from zscout.scheduling.model import (
     WakeAt,
 )
 from zscout.scheduling.strategies import STRATEGIES
+from zscout.simulation.workload import WorkloadRc
 from zscout.types import NO_TERM, SECOND, ArcId, ClientId, Ns, RcName, Term
 
 OPS = (

@@ -15,8 +15,6 @@ from tests.scheduling.validate import validate
 from tests.scheduling.workloads import workloads
 from tests.thorough import times
 from zscout.config.scheduling_policy import FairShares, SchedulingPolicy
-from zscout.lab.replay import replay
-from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling import fair_shares
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.core import Core
@@ -33,6 +31,8 @@ from zscout.scheduling.model import (
     Requested,
     Tick,
 )
+from zscout.simulation.replay import replay
+from zscout.simulation.workload import Arrival, Workload, WorkloadRc
 from zscout.types import SECOND, Ns, Params, Term
 
 HOUR: Ns = 3_600 * SECOND

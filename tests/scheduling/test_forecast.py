@@ -6,7 +6,6 @@ from hypothesis import given, settings
 
 from tests.scheduling.workloads import workloads
 from tests.thorough import times
-from zscout.lab.workload import Workload
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.booking import Booked, Booking
 from zscout.scheduling.capacity import excess
@@ -25,6 +24,7 @@ from zscout.scheduling.model import (
     Tick,
     Vote,
 )
+from zscout.simulation.workload import Workload
 from zscout.types import SECOND, ArcId, Ns
 
 

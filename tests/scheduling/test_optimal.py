@@ -10,8 +10,6 @@ from tests.scheduling.exhaustive import best_set
 from tests.scheduling.invariants import Ledger
 from tests.scheduling.workloads import workloads
 from tests.thorough import times
-from zscout.lab.replay import replay
-from zscout.lab.workload import Workload, WorkloadRc
 from zscout.scheduling import optimal
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
@@ -30,6 +28,8 @@ from zscout.scheduling.model import (
     VoteOverdue,
 )
 from zscout.scheduling.packing import PackingItem
+from zscout.simulation.replay import replay
+from zscout.simulation.workload import Workload, WorkloadRc
 from zscout.types import SECOND, ArcId
 
 

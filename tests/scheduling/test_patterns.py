@@ -13,8 +13,6 @@ from tests.scheduling.oracle import Contender, Oracle, bindings
 from tests.scheduling.validate import validate
 from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy, StrategyName
-from zscout.lab.replay import replay
-from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     Arc,
@@ -36,6 +34,8 @@ from zscout.scheduling.model import (
 )
 from zscout.scheduling.needs import check_patterns
 from zscout.scheduling.strategies import STRATEGIES
+from zscout.simulation.replay import replay
+from zscout.simulation.workload import Arrival, Workload, WorkloadRc
 from zscout.types import SECOND, Grant, Ns, Params, Place, Term
 
 ALL: tuple[StrategyName, ...] = ("priority", "optimal", "adaptive")

@@ -15,8 +15,6 @@ from tests.scheduling.test_waiting import workload
 from tests.scheduling.validate import validate
 from tests.thorough import times
 from zscout.config.scheduling_policy import RcQuota, SchedulingPolicy, StrategyName
-from zscout.lab.replay import replay
-from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import play_instant
@@ -39,6 +37,8 @@ from zscout.scheduling.model import (
     WakeAt,
 )
 from zscout.scheduling.strategies import STRATEGIES
+from zscout.simulation.replay import replay
+from zscout.simulation.workload import Arrival, Workload, WorkloadRc
 from zscout.types import SECOND, Grant, Ns, Place, Term
 
 ALL: tuple[StrategyName, ...] = ("priority", "optimal", "adaptive")

@@ -11,8 +11,6 @@ from tests.scheduling import oracle
 from tests.scheduling.invariants import Ledger, check_settled
 from tests.scheduling.workloads import workloads
 from tests.thorough import times
-from zscout.lab.replay import HoldRecord, Replay, replay
-from zscout.lab.workload import Workload
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
@@ -27,6 +25,8 @@ from zscout.scheduling.model import (
     Tick,
     Vote,
 )
+from zscout.simulation.replay import HoldRecord, Replay, replay
+from zscout.simulation.workload import Workload
 from zscout.types import ArcId, Ns
 
 

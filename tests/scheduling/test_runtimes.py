@@ -8,11 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from studies.scheduling.forecasts import overestimated
 from tests.scheduling.workloads import workloads
 from tests.thorough import times
-from zscout.lab.replay import SERVED, replay
-from zscout.lab.study.scheduling.forecasts import overestimated
-from zscout.lab.workload import Workload
 from zscout.messages import Who
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.booking import Booking
@@ -20,6 +18,8 @@ from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcRequest, Effect, Granted, HoldEnded, RcJoined, Released, Requested, Tick
 from zscout.scheduling.runtimes import MAX_KEPT, RuntimeEstimator, Wish
+from zscout.simulation.replay import SERVED, replay
+from zscout.simulation.workload import Workload
 from zscout.types import SECOND, ArcId, Ns
 
 MINUTE = 60 * SECOND

@@ -12,12 +12,12 @@ from msgspec import structs
 from tests.scheduling.invariants import Ledger
 from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy
-from zscout.lab.replay import Replay, replay
-from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, Effect, LeadTaken, RcJoined, Requested, Tick
 from zscout.scheduling.reservations import MAX_STARVING
+from zscout.simulation.replay import Replay, replay
+from zscout.simulation.workload import Arrival, Workload, WorkloadRc
 from zscout.types import NO_TERM, SECOND, Ns, Params, Place, RcName, Term
 
 RUNS = times(1_000)

@@ -6,8 +6,8 @@ from fractions import Fraction
 
 from hypothesis import strategies as st
 
-from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.model import ArcRequest
+from zscout.simulation.workload import Arrival, Workload, WorkloadRc
 from zscout.types import SECOND, Params, RcName
 
 PARAMETERS = ("rate", "width")

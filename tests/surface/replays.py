@@ -30,9 +30,9 @@ from tests.surface.commands import scripts
 from tests.surface.record import text as as_text
 from tests.surface.tree import find
 from tests.surface.workloads import SEEDS, workload
-from zscout.lab.replay import replay
-from zscout.lab.workload import parse_workload
 from zscout.scheduling.strategies import STRATEGIES
+from zscout.simulation.replay import replay
+from zscout.simulation.workload import parse_workload
 
 StrategyName: TypeAlias = Literal["priority", "optimal", "adaptive"]
 

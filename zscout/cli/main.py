@@ -13,7 +13,7 @@ import difflib
 import errno
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
@@ -52,10 +52,9 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "doctor": ("fleet.doctor", "Find out why there is no link, no leader or no device."),
     "cert": ("fleet.cert", "Make, renew and show the certificates of a secured fleet."),
     "view": ("fleet.view", "Watch the fleet live on a timeline, or open a recording."),
-    "replay": ("lab.replay", "Schedule a workload file under virtual time."),
-    "study": ("lab.study", "Compare scheduling strategies on random workloads."),
-    "simulate": ("lab.simulate", "Serve a simulated building with robots, radio and cameras."),
-    "demo": ("lab.demo", "Show what zscout does, on a live mesh on this machine."),
+    "replay": ("simulation.replay", "Schedule a workload file under virtual time."),
+    "simulate": ("simulation.simulate", "Serve a simulated building with robots, radio and cameras."),
+    "demo": ("simulation.demo", "Show what zscout does, on a live mesh on this machine."),
     "completion": ("completion", "Print the completion script for bash, zsh or fish."),
 }
 """Name: the module below zscout.cli that has the click command of that name, and its line in the help."""
@@ -105,22 +104,29 @@ class LazyGroup(click.Group):
         for name in ("stdout", "stderr"):
             if getattr(sys, name) is None:  # closed by whoever started it (`>&-`)
                 setattr(sys, name, open(os.devnull, "w"))  # noqa: PTH123, SIM115 - open to the end
-        try:
-            code = super().main(args, "zscout", complete_var, standalone_mode=False, **extra)
-            sys.stdout.flush()
-        except (Exception, KeyboardInterrupt) as error:
-            known = explain(error)
-            if known is None:
-                raise
-            code, line = known
-            if line:
-                # Where nobody reads it, the code still tells.
-                with suppress(OSError):
-                    click.echo(line, err=True)
-        _drop_unwritten()
+        own = super().main
+        code = run_command(lambda: own(args, "zscout", complete_var, standalone_mode=False, **extra))
         if not standalone_mode:
             return code
         sys.exit(code if isinstance(code, int) else OK)
+
+
+def run_command(call: Callable[[], Any]) -> Any:
+    """Return what `call` returns; print an error that people can mend as one line, and return its exit code."""
+    try:
+        code = call()
+        sys.stdout.flush()
+    except (Exception, KeyboardInterrupt) as error:
+        known = explain(error)
+        if known is None:
+            raise
+        code, line = known
+        if line:
+            # Where nobody reads it, the code still tells.
+            with suppress(OSError):
+                click.echo(line, err=True)
+    _drop_unwritten()
+    return code
 
 
 def explain(error: BaseException) -> tuple[int, str] | None:
@@ -152,9 +158,9 @@ def explain(error: BaseException) -> tuple[int, str] | None:
     from zscout.cli.common import Failed, Interrupted
     from zscout.config.strict import BadInput
     from zscout.keyexpr import BadName
-    from zscout.lab import LabError
     from zscout.mesh import MeshError
     from zscout.messages import DOOR_CODES
+    from zscout.simulation import DemoFailed
 
     words = f"zscout: {_line(str(error))}"
     match error:
@@ -168,7 +174,7 @@ def explain(error: BaseException) -> tuple[int, str] | None:
             return NOBODY, words
         case RequestRefused(code=code) if code in DOOR_CODES:
             return BAD_INPUT, words
-        case RequestRefused() | CommandRefused() | MeshError() | LabError():
+        case RequestRefused() | CommandRefused() | MeshError() | DemoFailed():
             return COULD_NOT, words
     return None
 

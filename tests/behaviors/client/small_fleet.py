@@ -11,9 +11,9 @@ from zscout.config.fleet import Fleet, default_fleet
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
-from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
 from zscout.mesh.supervision import StallWatch
 from zscout.services.rcm.candidate import Candidate
+from zscout.testing.memory import MemoryMesh, MemoryNetwork
 from zscout.types import SECOND
 
 RC, OTHER = "robot/x", "robot/y"

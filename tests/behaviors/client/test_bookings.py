@@ -21,11 +21,11 @@ from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.behaviors.client.request import OpenArc
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Sender
-from zscout.lab.faults.memory import MemoryNetwork
 from zscout.mesh import IncomingQuery, Refused
 from zscout.messages import Book, BookingView, OpenRequest, Operation, Who
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.rcm.candidate import Candidate
+from zscout.testing.memory import MemoryNetwork
 from zscout.types import SECOND
 
 FLEET = default_fleet()

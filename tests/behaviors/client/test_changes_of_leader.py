@@ -14,12 +14,12 @@ from zscout.behaviors.client.arc import hold
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import OpenArc
 from zscout.keyexpr import Role, Token
-from zscout.lab.faults.link import Disturbance
-from zscout.lab.faults.memory import MemoryMesh, MemoryTransport
 from zscout.mesh import Declaration, IncomingQuery
 from zscout.messages import Ask, Notice
 from zscout.services.rcm import request_handler
 from zscout.services.rcm.candidate import Candidate
+from zscout.testing.link import Disturbance
+from zscout.testing.memory import MemoryMesh, MemoryTransport
 from zscout.types import SECOND, Place, Term
 
 

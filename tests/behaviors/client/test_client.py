@@ -15,10 +15,10 @@ from zscout.behaviors.components.component import ComponentContext, SafePointGat
 from zscout.behaviors.components.shipped import Counter
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Sender
-from zscout.lab.faults.link import Disturbance
-from zscout.lab.faults.memory import MemoryMesh
-from zscout.lab.faults.virtual_time import START
 from zscout.mesh import ZenohMesh
+from zscout.testing.link import Disturbance
+from zscout.testing.memory import MemoryMesh
+from zscout.testing.virtual_time import START
 from zscout.types import SECOND
 
 

@@ -14,8 +14,8 @@ from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.direct import DirectHold
 from zscout.behaviors.client.request import CommandRefused, OpenArc, amounts
 from zscout.drivers.resource_controller import SETTLE
-from zscout.lab.faults.link import Disturbance
 from zscout.messages import Done, Problem, Release
+from zscout.testing.link import Disturbance
 from zscout.types import NO_TERM, SECOND, Grant, Ns
 
 LEASE = FLEET.timing.hold_lease / SECOND

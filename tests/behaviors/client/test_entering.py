@@ -11,7 +11,7 @@ from tests.behaviors.client.small_fleet import ECHO, OTHER, RC, small_fleet
 from tests.mesh.kit import run, until
 from zscout.behaviors.client.arc import Revoked, hold, holds
 from zscout.behaviors.client.client import CommandRefused
-from zscout.lab.faults.link import kind_of
+from zscout.testing.link import kind_of
 from zscout.types import SECOND
 
 

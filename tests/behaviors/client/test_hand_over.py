@@ -11,10 +11,10 @@ from tests.behaviors.client.small_fleet import ECHO, RC, SmallFleet, small_fleet
 from tests.mesh.kit import run, until
 from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.behaviors.client.request import OpenArc
-from zscout.lab.faults.link import Disturbance
-from zscout.lab.faults.memory import MemoryMesh
 from zscout.mesh.renewal import Suspicions
 from zscout.messages import ClientRequests, Grants, Notice, RcAsk
+from zscout.testing.link import Disturbance
+from zscout.testing.memory import MemoryMesh
 from zscout.types import Grant, Place, Term
 
 

@@ -11,9 +11,9 @@ from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, small_fleet
 from tests.mesh.kit import run, until
 from zscout.behaviors.client.confirmation import CONFIRM_TIMEOUT
 from zscout.behaviors.client.request import CommandRefused
-from zscout.lab.faults.link import Disturbance
-from zscout.lab.faults.memory import MemoryMesh, MemoryTransport
 from zscout.scheduling.model import HOLD_BACK
+from zscout.testing.link import Disturbance
+from zscout.testing.memory import MemoryMesh, MemoryTransport
 from zscout.types import SECOND
 
 

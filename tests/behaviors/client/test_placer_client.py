@@ -11,9 +11,9 @@ from tests.mesh.kit import run, until
 from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
 from zscout.behaviors.client.request import RequestRefused
 from zscout.keyexpr import Sender
-from zscout.lab.faults.memory import MemoryNetwork
 from zscout.mesh import IncomingQuery, Refused
 from zscout.messages import ComponentSpec, ListPlacements, PlaceComponent, Placement, Placements, PlacerOperation
+from zscout.testing.memory import MemoryNetwork
 from zscout.types import Term
 
 JOB = ComponentSpec("job")

@@ -15,7 +15,6 @@ from zscout.behaviors.components.migration import RESTORE_TIMEOUT, NotMoved, Out
 from zscout.behaviors.components.shipped import Counter
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
-from zscout.lab.faults.memory import MemoryNetwork
 from zscout.mesh import IncomingQuery
 from zscout.messages import (
     ComponentList,
@@ -27,6 +26,7 @@ from zscout.messages import (
     Phase,
     StopComponent,
 )
+from zscout.testing.memory import MemoryNetwork
 from zscout.types import SECOND
 
 STANDS_BY = ComponentView("c", 2, "b", ComponentSpec("counter"), "standby")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from zscout.behaviors.perception.lens import Picture
-from zscout.lab.building.bodies import Pose
-from zscout.lab.building.plan import Furniture, Light, Plan, Robot, Rug
-from zscout.lab.building.world import World
+from zscout.simulation.building.bodies import Pose
+from zscout.simulation.building.plan import Furniture, Light, Plan, Robot, Rug
+from zscout.simulation.building.world import World
 
 
 def room(*furniture: Furniture, rugs: tuple[Rug, ...] = ()) -> Plan:

@@ -10,7 +10,7 @@ import pytest
 from tests.behaviors.perception.rooms import carton, room, seen_from, sofa
 from zscout.behaviors.perception.darkness import analyse
 from zscout.behaviors.perception.lens import FIELD, GAMMA, bearing, linear
-from zscout.lab.building.plan import Rug
+from zscout.simulation.building.plan import Rug
 
 
 @pytest.mark.parametrize("distance", [0.5, 0.8, 1.2, 1.8])

@@ -8,16 +8,16 @@ import msgspec
 import numpy as np
 import pytest
 
+from studies.robots.watch import hide_at_random
 from tests.behaviors.perception.rooms import room, sofa
 from zscout.behaviors.perception.garble import garbled
 from zscout.behaviors.perception.lens import Picture
 from zscout.behaviors.sensor_net.scout import NO_PICTURE_TIMEOUT, Scout
-from zscout.lab.building.air import Air, tear
-from zscout.lab.building.bodies import Pose
-from zscout.lab.building.plan import Robot
-from zscout.lab.building.plan_file import load_plan, shipped_plans
-from zscout.lab.building.world import World
-from zscout.lab.trials.watch import hide_at_random
+from zscout.simulation.building.air import Air, tear
+from zscout.simulation.building.bodies import Pose
+from zscout.simulation.building.plan import Robot
+from zscout.simulation.building.plan_file import load_plan, shipped_plans
+from zscout.simulation.building.world import World
 
 CHANNEL = 1
 

@@ -10,17 +10,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from studies.robots.hide import HideJob, LinkConditions, run, trial
 from tests.behaviors.perception.rooms import room, sofa
 from tests.thorough import times
 from zscout.behaviors.perception.hiding.hider import BadCheckpoint, Hider
 from zscout.behaviors.perception.hiding.state import MAX_CHECKPOINT, WheelCommand
 from zscout.behaviors.perception.lens import Picture
-from zscout.lab.building.bodies import Pose
-from zscout.lab.building.drawn import drawn_plan
-from zscout.lab.building.plan import Plan, Rug
-from zscout.lab.building.plan_file import load_plan, shipped_plans
-from zscout.lab.building.world import World
-from zscout.lab.trials.hide import HideJob, LinkConditions, run, trial
+from zscout.simulation.building.bodies import Pose
+from zscout.simulation.building.drawn import drawn_plan
+from zscout.simulation.building.plan import Plan, Rug
+from zscout.simulation.building.plan_file import load_plan, shipped_plans
+from zscout.simulation.building.world import World
 
 STATES = {"search", "approach", "unstick", "enter", "turn", "hidden"}
 

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from studies.robots.watch import Case, Watched, cases, plan_of, watch
 from tests.behaviors.perception.recordings import EMPTY_LAWN, GARDEN, HAND, PASSERS_BY, PEOPLE, covered, pictures
 from tests.behaviors.perception.scenes import Scene, box_of, overlap
 from zscout.behaviors.perception.motion import MAX_SIDE, MotionDetector
-from zscout.lab.building.plan_file import load_plan, shipped_plans
-from zscout.lab.trials.watch import Case, Watched, cases, plan_of, watch
+from zscout.simulation.building.plan_file import load_plan, shipped_plans
 
 MISSING = "needs Debian's package opencv-doc (apt-get install opencv-doc)"
 
@@ -344,7 +344,7 @@ def test_leaves_in_the_wind_hardly_count_and_a_hand_does() -> None:
 
 
 def test_hidden_in_a_building_it_alerts_to_who_walks_by() -> None:
-    """Far from the figures of docs/watching.md, which `python -m benchmarks.watching` measures."""
+    """Far from the figures of docs/watching.md, which `python -m studies.watching` measures."""
     sight = Watched()
     for seed in (3, 4):
         case = Case("living_room", 1.0, seed)

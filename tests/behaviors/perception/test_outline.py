@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from benchmarks import cdnet
+from studies import cdnet
 from zscout.behaviors.perception.motion import MotionDetector, Seen
 
 WIDTH, HEIGHT = 640, 480

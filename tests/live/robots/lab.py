@@ -16,11 +16,11 @@ from tests.live.lab import Lab
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.tree import BehaviorContext
 from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket, Packet
-from zscout.lab.building.node_file import node_file
-from zscout.lab.building.plan import Furniture, Light, Noise, Plan, Robot
-from zscout.lab.building.serve import Served
 from zscout.mesh import clock
 from zscout.messages import BehaviorSaid
+from zscout.simulation.building.node_file import node_file
+from zscout.simulation.building.plan import Furniture, Light, Noise, Plan, Robot
+from zscout.simulation.building.serve import Served
 from zscout.types import Ns
 
 P = TypeVar("P", bound=Packet)

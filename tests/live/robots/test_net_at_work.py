@@ -16,8 +16,8 @@ from zscout.behaviors.sensor_net.held_robot import RobotNeeds
 from zscout.behaviors.sensor_net.place_sensor_net import PlaceSensorNet
 from zscout.behaviors.teleop import Pilot, Teleop
 from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket
-from zscout.lab.building.plan import Furniture, Light, Noise, Plan, Robot
 from zscout.messages import BehaviorSaid, ComponentList, ListComponents, MigrateComponent, Placement
+from zscout.simulation.building.plan import Furniture, Light, Noise, Plan, Robot
 
 pytestmark = pytest.mark.live
 

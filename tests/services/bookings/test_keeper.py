@@ -12,9 +12,9 @@ import pytest
 
 from tests.mesh.kit import run
 from zscout.keyexpr import Sender
-from zscout.lab.faults.memory import MemoryNetwork
 from zscout.messages import BookingRecord, Grants
 from zscout.services.bookings.keeper import ASIDE, FILE, BookingFile, BookingKeeper
+from zscout.testing.memory import MemoryNetwork
 from zscout.types import SECOND, Term
 
 NOON = 1_800_000_000.0

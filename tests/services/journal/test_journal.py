@@ -18,7 +18,6 @@ from zscout.config.node import JournalConfig
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
-from zscout.lab.faults.memory import MemoryMesh
 from zscout.mesh.supervision import StallWatch
 from zscout.messages import UNHEARD, Command, Done, History, HistoryAsk, HoldUse, RcState, Release, Who
 from zscout.services.journal import journal as journal_module
@@ -27,6 +26,7 @@ from zscout.services.journal.journal import Journal
 from zscout.services.journal.merging import Span
 from zscout.services.journal.store import FILE
 from zscout.services.rcm.candidate import Candidate
+from zscout.testing.memory import MemoryMesh
 from zscout.types import SECOND, Grant
 
 START = 1_700_000_000.0

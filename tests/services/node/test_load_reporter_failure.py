@@ -6,10 +6,10 @@ import pytest
 
 from tests.mesh.kit import run, until
 from zscout.keyexpr import Role, Sender, Token
-from zscout.lab.faults.memory import MemoryNetwork
 from zscout.messages import LoadReport
 from zscout.services.node import load_reporter
 from zscout.services.node.load_reporter import LoadReporter
+from zscout.testing.memory import MemoryNetwork
 
 
 def test_a_reporter_that_fails_is_seen_to_and_reports_again(

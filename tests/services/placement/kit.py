@@ -11,7 +11,6 @@ import msgspec
 from tests.mesh.kit import until
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
-from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
 from zscout.mesh import Declaration, IncomingQuery, Refused
 from zscout.messages import (
     ComponentList,
@@ -34,6 +33,7 @@ from zscout.messages import (
 from zscout.placement.events import Inherited
 from zscout.services.placement.component_placer import ComponentPlacer
 from zscout.services.placement.load_balancer import LoadBalancer
+from zscout.testing.memory import MemoryMesh, MemoryNetwork
 from zscout.types import Term
 
 JOB = ComponentSpec("job")

@@ -9,11 +9,11 @@ from typing import Any, TypeVar
 
 from tests.mesh.kit import until
 from tests.services.rcm.kit import FakeClient, FakeFleet, Refusal, request
-from zscout.lab.faults.memory import MemoryMesh
 from zscout.mesh import IncomingQuery
 from zscout.messages import Book, BookingRecord, BookingsAsk, BookingsTold, BookingView, Operation, ShareBookings
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.rcm.candidate import Candidate
+from zscout.testing.memory import MemoryMesh
 
 R = TypeVar("R")
 NOON = 1_800_000_000.0

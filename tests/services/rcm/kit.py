@@ -12,7 +12,6 @@ import msgspec
 
 from zscout.config.fleet import Fleet, default_fleet
 from zscout.keyexpr import Role, Sender, Token
-from zscout.lab.faults.memory import MemoryMesh, MemoryNetwork
 from zscout.mesh import IncomingQuery, Refused
 from zscout.messages import (
     Ask,
@@ -34,6 +33,7 @@ from zscout.messages import (
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.recovery import RecoveredState
+from zscout.testing.memory import MemoryMesh, MemoryNetwork
 from zscout.types import NO_TERM, Grant, Place, Term
 
 DELAY = 0.0002

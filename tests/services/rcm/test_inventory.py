@@ -13,11 +13,11 @@ from tests.services.rcm.kit import FakeFleet
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.instances import InstanceState
 from zscout.drivers.resource_controller import ResourceController
-from zscout.lab.faults.memory import MemoryMesh
 from zscout.mesh.supervision import StallWatch
 from zscout.messages import RcmState, RcView, StateAsk
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.inventory import FILE
+from zscout.testing.memory import MemoryMesh
 from zscout.types import SECOND
 
 RC = "robot/a"

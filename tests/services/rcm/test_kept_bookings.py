@@ -11,11 +11,11 @@ from tests.mesh.kit import run, until
 from tests.services.rcm.booked_fleet import NOON, BookedFleet, Disk, book, do, led, record, states
 from tests.services.rcm.kit import Refusal
 from zscout.keyexpr import Role, Token
-from zscout.lab.faults.memory import MemoryTransport
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import BookingView, Unbook
 from zscout.services.bookings.keeper import MAX_SAVING, BookingKeeper
 from zscout.services.bookings.records import MAX_BYTES
+from zscout.testing.memory import MemoryTransport
 from zscout.types import Place, Term
 
 

@@ -14,8 +14,6 @@ from msgspec.structs import replace
 from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeFleet, FakeRc
 from zscout.config.fleet import default_fleet
-from zscout.lab.faults.link import Disturbance
-from zscout.lab.faults.virtual_time import VirtualTimeLoop
 from zscout.mesh import IncomingQuery
 from zscout.messages import Holder, OpenRequest, RcAsk, RcmState, RcState, StateAsk
 from zscout.scheduling.core import Core
@@ -24,6 +22,8 @@ from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.rcm.membership import discrepancies
 from zscout.services.rcm.rcm import holders_of
 from zscout.services.rcm.recovery import RecoveredState
+from zscout.testing.link import Disturbance
+from zscout.testing.virtual_time import VirtualTimeLoop
 from zscout.types import SECOND, Grant, Place, Term
 
 RC = "robot/x"

@@ -9,12 +9,12 @@ from typing import Any
 
 from rerun.chunk import RrdReader
 
-from zscout.lab.replay import Replay, replay
-from zscout.lab.workload import Arrival, Workload, WorkloadRc
 from zscout.scheduling.model import ArcRequest, Effect, Granted, HoldEnded, Outcome, Queued
 from zscout.services.recorder.blueprint import TIME, WALL_TIME
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import OPERATOR_MARK, Timeline
+from zscout.simulation.replay import Replay, replay
+from zscout.simulation.workload import Arrival, Workload, WorkloadRc
 from zscout.types import SECOND, Ns
 
 _spec = find_spec("rerun_cli")

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from studies.placement.plots import record
+from studies.placement.study import SCENARIOS, study
+from studies.recording import COLOURS
 from tests.services.recorder.placed_hour import play
 from tests.services.recorder.test_viewer_picture import DIMMED, WIDTH, Rgb, rgb, settled_picture, viewer
-from zscout.lab.plots.placement import record
-from zscout.lab.plots.recording import COLOURS
-from zscout.lab.study.placement.study import SCENARIOS, study
 from zscout.messages import Placements
 from zscout.services.recorder.blueprint import MARK_WORDS
 from zscout.services.recorder.colours import FAILED, LINES, MARKS, PALETTE

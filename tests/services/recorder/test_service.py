@@ -14,10 +14,10 @@ from tests.mesh.kit import run, until
 from tests.services.recorder.paper_run import SCOUT33, events, lanes, rows
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
-from zscout.lab.faults.memory import MemoryNetwork
 from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, ReasonInfo, ReasonParty, StateAsk, WaitView, Who
 from zscout.services.recorder.recorder import Recorder, RecorderFailed
 from zscout.services.recorder.timeline import Timeline
+from zscout.testing.memory import MemoryNetwork
 from zscout.types import Grant, Place, Term
 
 TERM = Term(1, "anvil")

@@ -1,0 +1,499 @@
+"""What zscout promises of bookings under every fault: the second part of the list of docs/promises.md.
+
+What an RCM has acknowledged is a fact: that a booking was made, that it or one of its dates was given up. Facts outlive
+all faults but those that destroy every copy: in the memory of a process that keeps bookings, or on a host's disk."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import combinations
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from zscout.behaviors.client.request import OpenArc
+from zscout.keyexpr import is_pattern
+from zscout.messages import WINDOW, Book, BookedDate, BookingRecord, BookingView, Instant
+from zscout.scheduling.booking import Booking
+from zscout.services.bookings.dates import dates, last_end
+from zscout.services.bookings.fleet_clock import DIFFERS, SAME
+from zscout.services.bookings.keeper import BookingKeeper, Disk
+from zscout.services.bookings.records import KEEP, Records
+from zscout.services.rcm.booked_dates import STEPPED
+from zscout.types import SECOND, ArcId, Grant, Ns, Place, Term
+
+if TYPE_CHECKING:
+    from zscout.services.rcm.rcm import Rcm
+
+RUNS_APART: Final = 0.012
+"""Of the time: by which fleet time may be faster or slower than virtual time, slewed on a clock that is not true."""
+AGREE: Final = 0.5
+"""Seconds by which the fleet time of a leader may differ, as it begins, from one that it goes on."""
+AT_ITS_DATE: Final = 1.5
+"""Seconds after its date, or after it was taken up if that was later, within which a booking is held."""
+NOT_EXACT: Final[Ns] = SECOND // 4
+"""By how much a date may be put off, as fleet time is slewed."""
+EARLY: Final = 0.5
+"""By which who has taken up a booking may begin before its date: fleet time is slewed."""
+GIVEN_UP: Final = 0.1
+"""Seconds within which a leader that has heard that a booking is given up keeps nothing for it."""
+
+
+@dataclass(slots=True)
+class Life:
+    """A booking as the program knows it that made it."""
+
+    book: Book
+    made: bool = False
+    """Whether an RCM has acknowledged it."""
+    given_up: bool = False
+    """Whether the program has asked to unbook it, whatever became of that."""
+    dropped: set[Instant] = field(default_factory=set)
+    """The dates that it has asked to give up."""
+
+    def dates(self) -> list[Instant]:
+        return dates(_as_record(self.book), 0, last_end(_as_record(self.book)))
+
+    def give_up(self, start: Instant | None) -> None:
+        if start is None:
+            self.given_up = True
+        else:
+            self.dropped.add(start)
+
+
+@dataclass(slots=True, eq=False)
+class Fact:
+    booking: str
+    what: Instant | str
+    """`made`, `unbooked`, or the date that was given up."""
+    destroyed: bool = False
+    """Whether faults have destroyed every copy of it."""
+
+    def __str__(self) -> str:
+        return f"{self.booking} {self.what}"
+
+    def known_by(self, record: BookingRecord | None) -> bool:
+        if record is None:
+            return False
+        if self.what == "made":
+            return True
+        return record.unbooked or self.what in record.dropped
+
+
+class BookingPromises:
+    """`broken(text)` is told of a promise that was not kept. `keepers`: of processes that live, by host; `disks`: of
+    all hosts; `calm`: there is no fault now; `inside`
+    calls something as code of the process of a host's node."""
+
+    def __init__(
+        self,
+        broken: Callable[[str], None],
+        now: Callable[[], float],
+        keepers: Mapping[str, BookingKeeper],
+        disks: Mapping[str, Disk],
+        candidates: list[str],
+        calm: Callable[[], bool],
+        inside: Callable[[str, Callable[[], Any]], Any],
+    ) -> None:
+        self._broken, self.now, self._calm, self._inside = broken, now, calm, inside
+        self._keepers, self._disks, self._candidates = keepers, disks, candidates
+        self.lives: dict[str, Life] = {}
+        self.facts: dict[tuple[str, Instant | str], Fact] = {}
+        self._destroyed = 0.0
+        """When copies were last destroyed."""
+        self._final: dict[BookingKeeper, tuple[str, dict[str, BookingRecord]]] = {}
+        """What each process knew of bookings as it was looked at last, and its digest."""
+        self._stepped = -1.0
+        """When a leader last took over an older fleet time."""
+        self._times: dict[Term, _FleetTime] = {}
+        """By term: that of its leader as it was looked at last."""
+        self._former: list[_FleetTime] = []
+        """Those that leaders told before they took over an older one."""
+        self._overheard: dict[Term, _FleetTime] = {}
+        """By term of a leader that was gone, or stood still, as it could be looked at: what keepers heard of it."""
+        self._dated: dict[Term, Ns] = {}
+        """By term that began without a fleet time for certain: 1970 on its leader's clock, as it was looked at last."""
+        self._heard: dict[str, Term] = {}
+        """Hosts whose processes knew fleet time as they were looked at last, and of whom they had heard it."""
+        self._latest = 0.0
+        """The latest fleet time that any leader has told."""
+        self._known: dict[Term, dict[str, float]] = {}
+        """By term and date: since when its leader knows of it."""
+        self._claims: dict[Term, dict[str, tuple[Booking, ArcId | None]]] = {}
+        """By term and date: as it was looked at last, with the ARC that has taken it up."""
+        self._unwanted: dict[Term, tuple[tuple[str, int], list[str]]] = {}
+        """By term: dates that are kept though they were given up, and for which records and batch that is."""
+        self._begun: dict[Term, float] = {}
+        """When each was seen first, or a little before: what is held for longer may be handed over in it."""
+        self._looked: dict[Term, int] = {}
+        self._running: dict[Term, set[tuple[Place, Ns]]] = {}
+        """By term: places and beginnings of holds; who hands one over gives both away."""
+        self._present: dict[Term, dict[str, float]] = {}
+        """By term and RC that is present: since when."""
+        self._records: dict[str, set[str]] = {}
+        """By host: the bookings that it knew as it was looked at last."""
+        self._news: dict[str, set[str]] = {}
+        """Likewise, while it is looked at."""
+
+    # What programs are told
+
+    def asked(self, book: Book) -> Life:
+        return self.lives.setdefault(book.id, Life(book))
+
+    def booked(self, life: Life, view: BookingView, asked: float) -> None:
+        """An RCM has acknowledged it, as it was `asked` to then."""
+        if view.unbooked:
+            if not life.given_up:
+                self._broken(f"booking {life.book.name} is unbooked though nobody gave it up")
+            return
+        life.made = True
+        self._establish(life, "made", asked)
+
+    def unbooked(self, life: Life, start: Instant | None, view: BookingView, asked: float) -> None:
+        """An RCM has acknowledged that it, or its date `start`, is given up, as it was `asked` to then."""
+        if start is None and not view.unbooked:
+            self._broken(f"{life.book.name} is told as booked in the answer to its unbooking")
+        self._establish(life, "unbooked" if start is None else start, asked)
+
+    def _establish(self, life: Life, what: Instant | str, asked: float) -> None:
+        fact = self.facts.setdefault((life.book.id, what), Fact(life.book.id, what))
+        memory, disk = self._copies(fact)
+        enough = len({*memory, *disk} & {*self._candidates}) > 1
+        # Of a leader that sees no other candidate its own disk has to do.
+        # Who has said that it keeps it may be gone as the last are still asked.
+        kept = enough or fact.destroyed or self._is_over(fact) or self._destroyed > asked
+        if not kept and (self._calm() or not disk):
+            where = f"the memory of {sorted(memory)}, and on the disk of {sorted(disk)}"
+            self._broken(f"{life.book.name} {what} is acknowledged, and is in {where} alone")
+
+    def news(self, arc: OpenArc, leaders: Mapping[str, Rcm]) -> None:
+        """A program has news of a request. `leaders`: by host, of processes that do not stand still."""
+        booking, _, start = arc.booking.partition("@")
+        mine = self.lives.get(booking)
+        if mine is not None and start and arc.state == "running" and not (mine.given_up or int(start) in mine.dropped):
+            # One that has just begun to tell its fleet time was not looked at yet.
+            leading = [self._inside(host, partial(_fleet_time, rcm)) for host, rcm in leaders.items()]
+            told = [time for time in leading if time is not None]
+            told += [self.now() + one.ahead for one in self._times.values()]
+            now = max(told, default=math.inf)
+            if now < int(start) - EARLY:
+                self._broken(f"{arc.name} begins {int(start) - now:.1f} s before the date of {mine.book.name}")
+        life = self.lives.get((arc.by or "").partition("@")[0])
+        if life is not None and arc.outcome == "preempted" and not life.book.maintenance:
+            self._broken(f"{arc.name} is preempted for {life.book.name}, which nobody has taken up")
+
+    # What is destroyed
+
+    def _copies(self, fact: Fact) -> tuple[set[str], set[str]]:
+        """The hosts that have it in memory, and on disk."""
+        memory = {host for host, one in self._keepers.items() if fact.known_by(one.records.get(fact.booking))}
+        return memory, {
+            host
+            for host, disk in self._disks.items()
+            if any(fact.known_by(record) for record in disk.read() if record.id == fact.booking)
+        }
+
+    @contextmanager
+    def destroying(self) -> Iterator[None]:
+        """Processes die within, or disks are exchanged."""
+        facts = [fact for fact in self.facts.values() if not fact.destroyed and not self._is_over(fact)]
+        for fact in facts:
+            if not any(self._copies(fact)):
+                self._broken(f"{fact} was acknowledged, and nobody knows of it any more")
+        yield
+        self._destroyed = self.now()
+        for fact in facts:
+            fact.destroyed = not any(self._copies(fact))
+
+    def _is_over(self, fact: Fact) -> bool:
+        """Whether it may be forgotten."""
+        book = self.lives[fact.booking].book
+        return last_end(_as_record(book)) + KEEP < self._latest + 1
+
+    # What is so at any time
+
+    def look(self, leaders: Mapping[str, Rcm], *, calm: bool) -> Iterator[tuple[tuple[object, ...], float]]:
+        """What may not last, each with for how long it may. `leaders`: by host, of processes that do not stand
+        still."""
+        for host, keeper in self._keepers.items():
+            self._look_at_records(host, keeper)
+        for host, rcm in leaders.items():
+            self._look_at_time(host, rcm)
+            self._begun.setdefault(rcm.term, self.now() - GIVEN_UP)
+            if self._looked.get(rcm.term) != rcm.core.batches:
+                self._looked[rcm.term] = rcm.core.batches
+                self._look_at_claims(host, rcm)
+                self._look_at_grants(host, rcm)
+            for name in self._given_up(host, rcm):
+                yield (host, "keeps", name, "for nobody: it was given up"), GIVEN_UP
+            now = self._inside(host, rcm.mesh.now)
+            for name, (booking, arc) in self._claims[rcm.term].items() if calm else ():
+                if arc is not None and booking.start <= now and self._has_no_excuse(rcm, name, booking, arc, now):
+                    yield (name, "is taken up, and its date has come, but", arc, "does not run"), AT_ITS_DATE
+        for host, keeper in self._keepers.items():
+            if (term := keeper.heard[0]) not in self._times and keeper.time is not None:
+                self._overheard.setdefault(term, self._inside(host, partial(_FleetTime.heard_by, keeper, self.now())))
+        self._heard = {host: one.heard[0] for host, one in self._keepers.items() if one.time is not None}
+        self._records = {host: known for host, known in (self._records | self._news).items() if host in self._keepers}
+        self._news = {}
+
+    def _look_at_records(self, host: str, keeper: BookingKeeper) -> None:
+        """What is final of a booking stays, wherever it has been heard."""
+        digest, before_it = self._final.get(keeper, ("", {}))
+        if keeper.records.digest() == digest and host in self._records:
+            return
+        # What was over long ago may be forgotten, and may be heard once more of a host that was away.
+        self._final[keeper] = keeper.records.digest(), {record.id: record for record in keeper.records}
+        self._news[host] = {record.id for record in keeper.records}
+        for record in keeper.records:
+            before = before_it.get(record.id)
+            if before is record:
+                continue
+            if before is not None and (
+                before.unbooked > record.unbooked
+                or not {*before.dropped} <= {*record.dropped}
+                or not {*before.over} <= {*record.over}
+            ):
+                self._broken(f"{record.name} was given up or over on {keeper.mesh.me}, and is not any more")
+
+    def _look_at_claims(self, host: str, rcm: Rcm) -> None:
+        """Since when its leader knows of each date."""
+        first = rcm.term not in self._known
+        # What the last leader had in conflict may be so at first.
+        stood = self._claims[max(self._claims)] if self._claims else {}
+        known, kept = self._known.setdefault(rcm.term, {}), self._claims.get(rcm.term, {})
+        claims = {booking.id: (booking, arc) for booking, arc in rcm.core.bookings()}
+        # What was in conflict with one that is over, or was refused and brought back, is known anew: it was not there,
+        # or it is another object, and not one that was put off. So is what has other RCs for its patterns.
+        for name in known.keys() - claims.keys():
+            del known[name]
+        for name in known.keys() & kept.keys():
+            (booking, _), (before, _) = claims[name], kept[name]
+            again = booking.since != before.since or (booking is not before and booking == before)
+            if again or booking.bound != before.bound:
+                del known[name]
+        for name in claims:
+            heard = first and name in stood and name.partition("@")[0] in self._records.get(host, ())
+            known.setdefault(name, 0.0 if heard else self.now())
+        self._claims[rcm.term] = claims
+
+    def _given_up(self, host: str, rcm: Rcm) -> list[str]:
+        """What a leader keeps of which it knows that it was given up."""
+        records = self._keepers[host].records
+        of = records.digest(), rcm.core.batches
+        if self._unwanted.get(rcm.term, ((), ()))[0] != of:
+            found = []
+            for name in self._claims[rcm.term]:
+                id_, _, start = name.partition("@")
+                record = records.get(id_)
+                if record is None or record.unbooked or int(start) in record.dropped:
+                    found.append(name)
+            self._unwanted[rcm.term] = of, found
+        return self._unwanted[rcm.term][1]
+
+    def _look_at_time(self, host: str, rcm: Rcm) -> None:
+        now, time = self.now(), self._inside(host, partial(_fleet_time, rcm))
+        dated = rcm.bookings.dates.local(0)
+        if abs(dated - self._dated.get(rcm.term, dated)) > STEPPED:
+            # All its dates were others before: it knows of these since now.
+            self._known[rcm.term] = dict.fromkeys(self._known.get(rcm.term, ()), now)
+        if time is None or rcm.term in self._dated:
+            self._dated[rcm.term] = dated
+        if time is None:
+            return  # after a restart of all hosts it is found out first
+        self._latest = max(self._latest, time)
+        age = self._inside(host, lambda: rcm.mesh.now() - rcm.bookings.clock.since) / SECOND
+        told, before = _FleetTime(now, time - now, now - age), self._times.get(rcm.term)
+        if before is not None and told.since >= before.since - SAME:
+            if abs(told.ahead - before.ahead) > RUNS_APART * (now - before.at) + 1e-6:
+                self._broken(f"fleet time jumps by {told.ahead - before.ahead:g} s in term {rcm.term.counter}")
+        elif before is not None or self._heard.get(host, rcm.term) != rcm.term:  # itself: it told it, and stood still
+            if before is not None:
+                # It began where nobody knew the time of the others, and has met them. Hosts that heard it alone may
+                # lead before they hear the older one.
+                self._stepped = now
+                self._former.append(before)
+            known = [*self._times.values(), *self._former, *self._overheard.values()]
+            if not (any(map(told.agrees, known)) and any(map(told.goes_on, known))):
+                self._broken(f"fleet time is {time:.3f} in term {rcm.term.counter}: none that was told before goes on")
+        self._times[rcm.term] = told
+
+    def _look_at_grants(self, host: str, rcm: Rcm) -> None:
+        """Nobody starts what would not be over by the date of a booking of its rank that its leader knew of."""
+        status, local = rcm.core.status(), self._inside(host, rcm.mesh.now)
+        present = self._present.get(rcm.term, {})
+        there = {rc.name for rc in status.rcs if rc.present and rc.name in present}
+        self._present[rcm.term] = {rc.name: present.get(rc.name, self.now()) for rc in status.rcs if rc.present}
+        for arc in (*status.running, *status.queued):
+            if self._claims[rcm.term].get(arc.request.booking, (None, arc.id))[1] is None:
+                self._broken(f"{arc.name} would take up {arc.request.booking}, which is open, and has not")
+        running = {(one.place, one.hold.start): one for one in status.running if one.hold}
+        before, self._running[rcm.term] = self._running.get(rcm.term, set()), set(running)
+        if self.now() - self._stepped < 1.0:
+            return  # its dates came just now
+        exclusive = {rc.name for rc in status.rcs if rc.present and not rc.sharable}
+        has_it = {one.id for one in status.running}
+        # For patterns others may be kept at any time.
+        waiting = {
+            name: (booking, by)
+            for name, (booking, by) in self._claims[rcm.term].items()
+            if by not in has_it and not any(map(is_pattern, booking.needs))
+        }
+        for arc in (running[hold] for hold in running.keys() - before):
+            assert arc.hold is not None
+            if arc.hold.grant.term != rcm.term:
+                continue
+            began = self.now() - (local - arc.hold.start) / SECOND
+            for name, (booking, by) in waiting.items():
+                over = booking.lapses if by is None else booking.end
+                meet = booking.start + NOT_EXACT < arc.hold.end and arc.hold.start + NOT_EXACT < over
+                rcs = booking.needs.keys()
+                if (
+                    meet
+                    and arc.request.priority <= booking.priority
+                    # What has begun is kept as long only as all of it is there.
+                    and (booking.start > arc.hold.start + NOT_EXACT or rcs <= there)
+                    and rcs & arc.needs.keys() & exclusive
+                    and max(self._known[rcm.term][name], self._begun[rcm.term]) < began
+                ):
+                    booked = self.lives[name.partition("@")[0]].book.name
+                    self._broken(f"{arc.name} begins what is not over by the date of {booked}: {name}")
+
+    def _has_no_excuse(self, rcm: Rcm, name: str, booking: Booking, arc: ArcId, now: Ns) -> bool:
+        """Whether a booking whose date has come should be held now, and is not: nobody is in its way of higher
+        priority, or who held before its leader knew of it and had all of it."""
+        status = rcm.core.arc(arc)
+        if status is None or status.hold is not None:
+            return False
+        present = self._present[rcm.term]
+        # Those that are kept for its patterns.
+        rcs = {booking.bound.get(need, need) for need in booking.needs}
+        if not rcs <= present.keys():
+            return False
+        # While some of it was away the rest was not kept.
+        since = max(self._known[rcm.term][name], self._begun[rcm.term], *(present[rc] for rc in rcs))
+        known = self.now() - since
+        for rc in rcs:
+            for holder in rcm.core.holders(rc):
+                hold = holder.hold
+                if hold is None or holder.request.priority > booking.priority or hold.grant.term != rcm.term:
+                    return False
+                # Who keeps what he has beyond his minimum runtime yields.
+                if hold.end > now and known < (now - hold.start) / SECOND + GIVEN_UP:
+                    return False
+        return True
+
+    # What is so at the end
+
+    def unsettled(self, leaders: Mapping[str, Rcm]) -> str:
+        """Why not all keepers know the same, in words; empty: they do."""
+        if len(leaders) != 1:
+            return f"{len(leaders)} lead"
+        own = self._keepers[next(iter(leaders))].records.digest()
+        others = [host for host, keeper in self._keepers.items() if keeper.records.digest() != own]
+        return f"{', '.join(others)} know other bookings than the leader" if others else ""
+
+    def at_end(self, leaders: Mapping[str, Rcm], *, jumped: bool) -> Counter[str]:
+        """All is healed, and `unsettled` is empty. `jumped`: all processes were gone at once, and fleet time with
+        them. Returns what there was of what."""
+        ((host, rcm),) = leaders.items()
+        time = self._inside(host, lambda: rcm.bookings.dates.time)
+        views = {view.id: view for view in self._inside(host, rcm.bookings.handler.views)}
+        records = self._keepers[host].records
+        for fact in self.facts.values():
+            life = self.lives[fact.booking]
+            if fact.destroyed or self._is_over(fact):
+                continue
+            record = records.get(fact.booking)
+            if record is None or not fact.known_by(record):
+                self._broken(f"{life.book.name} {fact.what} was acknowledged, and is lost")
+            elif fact.what == "made" and not life.given_up:
+                # By a fleet time that did not go on, of one half, it may have been held.
+                over = {start for start in record.over if start < self._latest}
+                self._is_listed(life, views.get(fact.booking), over, max(time, self._latest) if jumped else time)
+            view = views.get(fact.booking)
+            if view is not None and (fact.what == "unbooked" or fact.what in {date.start for date in view.dates}):
+                self._broken(f"{life.book.name} {fact.what} is listed, though it was given up")
+        self._look_at_conflicts(rcm, records, views)
+        states = Counter(f"dates {date.state} at the end" for view in views.values() for date in view.dates)
+        destroyed = sum(fact.destroyed for fact in self.facts.values())
+        return states + Counter({"acknowledged, and destroyed": destroyed})
+
+    def _is_listed(self, life: Life, view: BookingView | None, over: set[Instant], time: float) -> None:
+        told = {} if view is None else {date.start: date.state for date in view.dates}
+        for start in dates(_as_record(life.book), time + 1, time + WINDOW - 1):
+            if start not in life.dropped | over and told.get(start) not in ("open", "taken", "conflict"):
+                self._broken(f"{life.book.name} at {start} is lost: it is {told.get(start, 'not listed')}")
+
+    def _look_at_conflicts(self, rcm: Rcm, records: Records, views: Mapping[str, BookingView]) -> None:
+        """Of two that can't both be the one of better rank stands; that is told here of RCs that are not sharable."""
+        sharable = {rc.name for rc in rcm.core.status().rcs if rc.sharable or not rc.present}
+        stands, not_held = list[_Listed](), list[_Listed]()
+        for view in views.values():
+            record = records.get(view.id)
+            assert record is not None
+            for date in view.dates:
+                rcs = {date.bound.get(need, need) for need in view.needs} - sharable
+                listed = _Listed((-view.priority, record.made, view.id), date, rcs, view)
+                (not_held if date.state == "conflict" else stands).append(listed)
+        for one, other in combinations(stands, 2):
+            both = one.view.maintenance and other.view.maintenance
+            if not both and one.view.id != other.view.id and one.meets(other):
+                self._broken(f"{one.view.name} and {other.view.name} both stand: {one.date} {other.date}")
+        for one in not_held:
+            exact = not any(map(is_pattern, one.view.needs)) and sharable.isdisjoint(one.view.needs)
+            if exact and not any(other.rank < one.rank and one.meets(other) for other in stands):
+                self._broken(f"{one.view.name} at {one.date.start} is in conflict with none: {one.date.danger}")
+
+
+class _FleetTime(NamedTuple):
+    """As a leader told it."""
+
+    at: float
+    """When, in virtual time."""
+    ahead: float
+    """By how much it was ahead of virtual time."""
+    since: float
+    """Since when it had gone on. There are two where the halves of a fleet began anew."""
+
+    @classmethod
+    def heard_by(cls, keeper: BookingKeeper, now: float) -> _FleetTime:
+        """What a keeper has heard of its leader, who can't be looked at."""
+        time, age = keeper.time, keeper.mesh.now() - keeper.since
+        assert time is not None
+        return cls(now, time / SECOND - now, now - age / SECOND)
+
+    def agrees(self, before: _FleetTime) -> bool:
+        return self.differs(before) <= AGREE
+
+    def goes_on(self, before: _FleetTime) -> bool:
+        """Whether it has gone on for as long, and is the same or one that differs too little to be another."""
+        return abs(self.since - before.since) <= SAME and self.differs(before) <= DIFFERS
+
+    def differs(self, before: _FleetTime) -> float:
+        """By how many seconds more than it may have been slewed."""
+        return abs(self.ahead - before.ahead) - 2 * RUNS_APART * (self.at - before.at)
+
+
+class _Listed(NamedTuple):
+    """A date, as the leader lists it."""
+
+    rank: tuple[int, Grant, str]
+    date: BookedDate
+    rcs: set[str]
+    view: BookingView
+
+    def meets(self, other: _Listed) -> bool:
+        one, two = self.date, other.date
+        return bool(self.rcs & other.rcs) and one.start < two.end and two.start < one.end
+
+
+def _fleet_time(rcm: Rcm) -> float | None:
+    return rcm.bookings.time
+
+
+def _as_record(book: Book) -> BookingRecord:
+    return BookingRecord(**{name: getattr(book, name) for name in Book.__struct_fields__})

@@ -1,0 +1,142 @@
+"""A device as the simulation knows it, which no fault touches: it sees who drives it, and what it is told to do.
+
+The promises about a device are checked here, where they count, and not by what services believe."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any, Final
+
+from zscout.drivers.generic import CapacityDriver, ExclusiveDriver
+from zscout.messages import Holder, exact_amounts
+from zscout.testing.virtual_time import PROCESS, Process
+from zscout.types import NO_TERM, Grant
+
+NO_GRANT: Final = Grant(NO_TERM, 0)
+
+
+@dataclass(slots=True)
+class Device:
+    """One device; `broken(text)` is told of a promise that was not kept."""
+
+    name: str
+    capacity: Mapping[str, Fraction] | None
+    """None: it is exclusive."""
+    broken: Callable[[str], None]
+    log: Callable[[str], None]
+    holders: dict[Grant, tuple[Process, Holder]] = field(default_factory=dict)
+    """Who drives it, and in which process the driver is that let them."""
+    programs: dict[Grant, str] = field(default_factory=dict)
+    """Programs that touch it past its driver, by grant: whose they are."""
+    done: set[str] = field(default_factory=set)
+    """The commands of programs that it has carried out."""
+    newest: tuple[Process, Grant] | None = None
+    """Of all commands that it has carried out; and the process that its driver was in. One that starts anew knows of
+    none, and obeys the RCM that it finds."""
+
+    def begin(self, process: Process, holder: Holder) -> None:
+        self.log(f"{self.name} begins for {holder.client} {holder.arc} {number(holder.grant)}")
+        self._forget_dead()
+        # The same ARC, in another client: it was handed over.
+        arc = holder.id, holder.place
+        self.holders = {grant: held for grant, held in self.holders.items() if (held[1].id, held[1].place) != arc}
+        if self.capacity is None and self.holders:
+            other = next(one for _, one in self.holders.values())
+            self.broken(f"two holders of {self.name}: {other.client} and {holder.client}")
+        self._is_alone(holder.grant, holder.client)
+        self.holders[holder.grant] = process, holder
+        if self.capacity is not None:
+            for parameter, most in self.capacity.items():
+                total = sum(exact_amounts(one.params).get(parameter, Fraction()) for _, one in self.holders.values())
+                if total > most:
+                    self.broken(f"{self.name} carries {float(total):g} of {parameter}, and can carry {float(most):g}")
+
+    def end(self, holder: Holder) -> None:
+        self.log(f"{self.name} ends for {holder.client} {holder.arc} {number(holder.grant)}")
+        self.holders.pop(holder.grant, None)
+
+    def safe(self, process: Process) -> None:
+        """All that this driver let in have gone."""
+        self.log(f"{self.name} is safe")
+        self.holders = {grant: held for grant, held in self.holders.items() if held[0] is not process}
+
+    def command(self, process: Process, holder: Holder, value: object) -> None:
+        """A program gives each of its commands a value of its own; a component may command the same again."""
+        if isinstance(value, str):
+            if value in self.done:
+                self.broken(f"{self.name} carries out a command of {holder.client} twice")
+            self.done.add(value)
+        self._forget_dead()
+        newest = self.newest[1] if self.newest is not None else NO_GRANT
+        if self.capacity is None and holder.grant < newest:
+            self.broken(f"{self.name} obeyed {number(holder.grant)} after {number(newest)}")
+        if holder.grant not in self.holders:
+            self.broken(f"{self.name} obeyed {holder.client}, who does not hold it")
+        if holder.grant >= newest:
+            self.newest = process, holder.grant
+
+    def touch(self, grant: Grant, client: str) -> None:
+        """A program begins to touch it past its driver."""
+        self.log(f"{self.name} is touched by a program of {client} {number(grant)}")
+        self._is_alone(grant, client)
+        self.programs[grant] = client
+
+    def leave(self, grant: Grant) -> None:
+        """Such a program is gone."""
+        if self.programs.pop(grant, None) is not None:
+            self.log(f"{self.name} is left by a program {number(grant)}")
+
+    def _is_alone(self, grant: Grant, client: str) -> None:
+        if self.capacity is None:
+            for other, of in self.programs.items():
+                if other != grant:
+                    self.broken(f"two programs at {self.name}: that of {of} {number(other)}, and {client}'s")
+
+    def _forget_dead(self) -> None:
+        # What a driver let in that was killed drives nothing any more: commands went through it.
+        self.holders = {grant: held for grant, held in self.holders.items() if not held[0].dead}
+        if self.newest is not None and self.newest[0].dead:
+            self.newest = None
+
+
+def number(grant: Grant) -> str:
+    return f"{grant.term.counter}.{grant.seq}"
+
+
+class _Watched:
+    """A driver's part that tells its device."""
+
+    device: Device
+
+    async def begin(self, holder: Holder) -> None:
+        self.device.begin(_here(), holder)
+
+    async def end(self, holder: Holder) -> None:
+        self.device.end(holder)
+
+    async def safe(self) -> None:
+        self.device.safe(_here())
+
+    async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
+        self.device.command(_here(), holder, do["value"])
+        return await super().command(holder, do)  # type: ignore[misc]
+
+
+class WatchedExclusive(_Watched, ExclusiveDriver):
+    def __init__(self, device: Device) -> None:
+        super().__init__()
+        self.device = device
+
+
+class WatchedCapacity(_Watched, CapacityDriver):
+    def __init__(self, device: Device) -> None:
+        super().__init__(device.capacity or {})
+        self.device = device
+
+
+def _here() -> Process:
+    process = PROCESS.get()
+    assert process is not None
+    return process

@@ -1,0 +1,164 @@
+"""What the programs of a simulated fleet do: they ask for devices, at random, and command what they hold."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Callable, Mapping
+from contextvars import Context
+from dataclasses import dataclass
+from typing import Any, Final
+
+from msgspec.structs import replace
+
+from studies.faults.device import Device
+from zscout.behaviors.client.arc import Held, Revoked, hold, holds
+from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
+from zscout.behaviors.client.direct import DirectHold
+from zscout.keyexpr import RANDOM, Role, Token, new_instance
+from zscout.mesh import Mesh
+from zscout.messages import Ask, ClientRequests, Notice, OpenRequest, RcAsk, RcmState, StateAsk
+from zscout.testing.virtual_time import PROCESS
+from zscout.types import SECOND, Place
+
+LONG: Final = 4
+STEALS_EVERY: Final = 0.5
+ASKED: Final = ("id", "arc", "needs", "priority", "min_runtime", "seal", "was")
+CLEARS_UP: Final = (0.0, 0.0, 0.2, 1.0, 60.0)
+"""Seconds that a program takes to end when it is told to; the last is killed before."""
+
+
+class Program:
+    """A program that touches devices past their RCs, with a guardian that keeps its deadline. It is a process of its
+    own, which neither stands still nor dies with its client."""
+
+    def __init__(self, devices: Mapping[str, Device], direct: DirectHold, client: str, now: Callable[[], int]) -> None:
+        self._devices = [devices[rc] for rc in direct.rcs]
+        self._grant, self._now = direct.grant, now
+        self._timer: asyncio.TimerHandle | None = None
+        for device in self._devices:
+            device.touch(direct.grant, client)
+        direct.watch(self.keep)
+        self.keep(direct)
+
+    def keep(self, direct: DirectHold) -> None:
+        """Its guardian is given the deadline anew."""
+        if self._timer is not None:
+            self._timer.cancel()
+        left = max(0.0, (direct.gone_by - self._now()) / SECOND)
+        # The guardian is no part of the client's process, and its clock is its own.
+        self._timer = Context().run(asyncio.get_running_loop().call_later, left, self.end)
+
+    def end(self) -> None:
+        """Nothing of it is left."""
+        if self._timer is not None:
+            self._timer.cancel()
+        for device in self._devices:
+            device.leave(self._grant)
+
+
+async def steal_places(mesh: Mesh, over: Callable[[], bool]) -> None:
+    """Asks at the places of others that wait, and says to new leaders that they are its own. Leaves when it is over."""
+    rng, listed, seals = RANDOM.get(), list[OpenRequest](), dict[Place | None, str | None]()
+    hear = lambda _, notice: seals.update({notice.place: notice.seal})  # noqa: E731
+    answer = lambda query: query.answer(ClientRequests(str(mesh.me), listed))  # noqa: E731
+    declared = [
+        mesh.subscribe(mesh.keys.notice_any, Notice, hear),
+        mesh.serve(mesh.keys.requests(mesh.me), RcAsk, answer),
+        mesh.alive(Token(mesh.me.host, Role.CLIENT, mesh.me.client, new_instance())),
+    ]
+    while not over():
+        await asyncio.sleep(rng.uniform(0, 2 * STEALS_EVERY))
+        state = await mesh.ask_one(mesh.keys.rcm_state, StateAsk(), RcmState, timeout=STEALS_EVERY)
+        others = [one for one in state.message.queue if one.client != str(mesh.me)] if state and state.message else []
+        if others:
+            one = rng.choice(others)
+            id_ = rng.choice((new_instance(), one.id))
+            stolen = OpenRequest(id_, "stolen", one.needs, one.priority, one.min_runtime, seal=seals.get(one.place))
+            listed[:] = [replace(stolen, place=one.place, was=rng.choice((None, one.id)))]
+            ask = Ask(place=one.place, **{name: getattr(listed[0], name) for name in ASKED})
+            await mesh.ask_one(mesh.keys.schedule(mesh.me), ask, Notice, timeout=STEALS_EVERY)
+    for left in declared:
+        left.close()
+    await mesh.close()
+
+
+@dataclass(slots=True)
+class Work:
+    """What all programs have to do: to ask for `devices` until `over`, with up to `pause` seconds in between."""
+
+    devices: Mapping[str, Mapping[str, object] | None]
+    """By RC: its capacity, where it is sharable."""
+    pause: float
+    counts: Counter[str]
+    log: Callable[[str], None]
+    broken: Callable[[str], None]
+    touched: Mapping[str, Device] | None = None
+    """By RC: its device, where programs touch it past the RC."""
+    over: bool = False
+    commanded: int = 0
+
+    async def run(self, client: Client, arc: str, busy: set[str]) -> None:
+        """One ARC after the other, under one name, which is in `busy` while one is open."""
+        rng = RANDOM.get()
+        await asyncio.sleep(rng.uniform(0, 3))
+        while not self.over:
+            rcs = rng.sample(sorted(self.devices), rng.choice((1, 1, 2, 2, 3)))
+            needs = {rc: {"rate": rng.choice((2, 4, 6))} if self.devices[rc] else {} for rc in rcs}
+            # Some go on through any fault, and its end.
+            times = LONG if rng.random() < 0.15 else 1
+            how: dict[str, Any] = {
+                "priority": rng.choice((0, 0, 0, 1, 5)),
+                "min_runtime": round(rng.uniform(0.3, 3) * times, 3),
+                "keep": rng.random() < 0.1,
+            }
+            if self.touched is not None:
+                how["direct"] = rng.random() < 0.6
+            self.counts["requests"] += 1
+            self.log(f"{arc} asks for {' '.join(rcs)} {how}")
+            busy.add(arc)
+            try:
+                if rng.random() < 0.5:
+                    async with hold(client, arc, needs, **how) as held:
+                        await self._use(client, held, times)
+                else:
+                    async for attempt in holds(client, arc, needs, **how):
+                        async with attempt as held:
+                            await self._use(client, held, times)
+            except Revoked as revoked:
+                self.counts[f"revoked {revoked.outcome}"] += 1
+            except (RequestRefused, CommandRefused) as refused:
+                self.broken(f"{arc} was thrown away: {refused.code}: {refused}")
+            busy.discard(arc)
+            await asyncio.sleep(rng.uniform(0.05, self.pause))
+
+    async def _use(self, client: Client, held: Held, times: int) -> None:
+        direct = client.direct_hold(held.grant)
+        if direct is None or self.touched is None:
+            await self._body(held, times)
+            return
+        self.counts["programs"] += 1
+        program, process = Program(self.touched, direct, str(client.mesh.me), client.mesh.now), PROCESS.get()
+        try:
+            await self._body(held, times)
+        finally:
+            # One that is killed sees to nothing: its guardian does.
+            if process is not None and not process.dead:
+                try:
+                    # What ends of its own accord has nobody to wait for it.
+                    await asyncio.sleep(RANDOM.get().choice(CLEARS_UP) if direct.over else 0)
+                finally:
+                    if not process.dead:
+                        program.end()
+
+    async def _body(self, held: Held, times: int) -> None:
+        rng = RANDOM.get()
+        self.counts["grants"] += 1
+        for _ in range(rng.randrange(1, 12) * times):
+            try:
+                self.commanded += 1
+                await held.command(rng.choice(held.rcs), {"name": "echo", "value": f"command {self.commanded}"})
+                self.counts["commands"] += 1
+            except CommandRefused as refused:
+                self.counts[f"refused {refused.code}"] += 1
+            await asyncio.sleep(rng.uniform(0.02, 0.3))

@@ -1,0 +1,709 @@
+"""A fleet under faults, in virtual time: the services and clients as they are, each process on a mesh in memory.
+
+One seed is one run, to the byte: the work, the faults, the network's delays, and every process's clock and randomness
+come from it. Afterwards all faults are mended, and what was asked must be served."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import hashlib
+import logging
+import random
+from collections import Counter
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from functools import partial
+from typing import Any, Final, TypeVar
+
+import msgspec
+from msgspec.structs import replace
+
+from studies.faults import plan
+from studies.faults.bookers import Booker, Hosts
+from studies.faults.booking_promises import BookingPromises
+from studies.faults.components import DEEDS, KINDS, Deeds, SimulatedComponent, operate, report_load
+from studies.faults.device import Device, WatchedCapacity, WatchedExclusive
+from studies.faults.excuses import IMPATIENCE, Excuses
+from studies.faults.plan import OPERATIONS, Fault
+from studies.faults.programs import Work, steal_places
+from studies.faults.promises import LEFT_OVER, Promises
+from zscout import trace
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.request import OpenArc
+from zscout.config.fleet import default_fleet
+from zscout.config.node import ComponentsConfig
+from zscout.drivers.confirm_server import ConfirmServer
+from zscout.drivers.last_holder import LastHolder
+from zscout.drivers.resource_controller import ResourceController
+from zscout.keyexpr import Role, Sender, Token, new_instance
+from zscout.mesh.supervision import StallWatch, Supervisor
+from zscout.messages import MAX_COUNTER, Grants
+from zscout.scheduling.reason import ReasonCode
+from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.node.component_host import ComponentHost
+from zscout.services.rcm.candidate import Candidate
+from zscout.services.rcm.rcm import Rcm
+from zscout.testing.memory import MemoryMesh, MemoryNetwork, MemoryTransport
+from zscout.testing.virtual_time import PROCESS, START, Process, VirtualTimeLoop
+from zscout.types import SECOND, Grant, Term
+
+T = TypeVar("T")
+
+DEVICES: Final[Mapping[str, Mapping[str, Fraction] | None]] = {
+    "robot/a": None,
+    "robot/b": None,
+    "robot/c": None,
+    "framegrabber/f": None,
+    "radio/r": {"rate": Fraction(10)},
+}
+DRIFT: Final = 0.001
+"""By which clocks run apart at most."""
+SERVED_WITHIN: Final = 60.0
+"""Seconds after the last fault in which all that was asked must have been served."""
+FORGOTTEN: Final = 0.3
+"""Of what was declared, where links come back without all of it."""
+SETTLE: Final = 2.0
+"""Seconds that RCs settle."""
+SETTLED_WITHIN: Final = 60.0
+"""Seconds after all was served in which all keepers know the same bookings: all are asked every 30 s, and one that is
+not for 40 s joins the mesh anew."""
+COPIED_AT: Final = 10.0
+"""Seconds after the beginning at which disks are copied."""
+LOOK_EVERY: Final = 0.05
+FORGED_EVERY: Final = 0.25
+OPERATOR: Final = "h0/operator"
+THIEF: Final = "h0/thief"
+PLACES_KEY: Final = bytes(32)
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """How much happens in a run."""
+
+    hosts: int = 3
+    """With a candidate each. Half of the runs have one more, without."""
+    clients: int = 4
+    components: int = 2
+    faults: int = 6
+    span: float = 30.0
+    """Seconds with faults and new requests."""
+    pause: float = 3.0
+    """Seconds from one request of a program to its next, at most."""
+    direct: bool = False
+    """Many programs touch devices past their RCs."""
+    thief: bool = False
+    """Managers share a key, and a program asks at the places of others. Commands arrive twice."""
+    moves_only: bool = False
+    """Nothing fails but nodes, in the steps of a component's move: no other fault excuses what breaks."""
+    bookers: int = 0
+    """Programs that book, give up and take up."""
+
+    @classmethod
+    def of(cls, seed: int) -> Size:
+        """Every tenth run is a long one of many, every tenth one of moves that fail, every tenth one of programs that
+        touch devices past their RCs, every tenth one with a thief, and every fifth one of bookings."""
+        match seed % 10:
+            case 3 | 4:
+                return cls(bookers=2, clients=3, faults=4, span=40.0)
+            case 8:
+                return cls(direct=True, span=40.0)
+            case 9:
+                return cls(hosts=4, clients=20, faults=30, span=300.0, pause=60.0)
+            case 7:
+                return cls(moves_only=True)
+            case 0:
+                return cls(thief=True)
+        return cls()
+
+
+@dataclass(slots=True)
+class Result:
+    seed: int
+    faults: list[Fault]
+    broken: list[str] = field(default_factory=list)
+    """Promises that were not kept, each with the time."""
+    lines: list[str] = field(default_factory=list)
+    trace: list[str] = field(default_factory=list)
+    """What became of holds, in the order in which it came about (`zscout.trace`)."""
+    digest: str = ""
+    """Of everything that arrived anywhere, in order."""
+    counts: Counter[str] = field(default_factory=Counter)
+    served_after: float = 0.0
+    """Seconds from the end of the last fault until all was served."""
+
+
+def simulate(
+    seed: int, size: Size | None = None, faults: Sequence[Fault] | None = None, *, traced: bool = False
+) -> Result:
+    """One run. `faults` in place of those that the seed draws; `traced`: with the trace of what became of holds."""
+    fleet = Simulation(seed, size or Size.of(seed), faults, traced=traced)
+    logger, handler = logging.getLogger("zscout"), _Lines(fleet)
+    before = logger.level, logger.propagate
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    trace.log.setLevel(logging.DEBUG)
+    logger.propagate = False
+    collecting = gc.isenabled()
+    gc.disable()  # what dies is to die at its place in the run
+    try:
+        with asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
+            runner.get_loop().set_exception_handler(fleet.on_exception)
+            return runner.run(fleet.run())
+    finally:
+        logger.removeHandler(handler)
+        logger.level, logger.propagate = before
+        trace.log.setLevel(logging.NOTSET)
+        if collecting:
+            gc.enable()
+
+
+class Simulation:
+    def __init__(self, seed: int, size: Size, faults: Sequence[Fault] | None, *, traced: bool = False) -> None:
+        self.seed, self.size, self._traced = seed, size, traced
+        self.random = random.Random(f"fleet {seed}")  # noqa: S311 - what failed once must fail again
+        self.hosts = [f"h{number}" for number in range(size.hosts + (self.random.random() < 0.5))]
+        self.candidates_at = self.hosts[: size.hosts]
+        self.clients = {f"{self.random.choice(self.hosts)}/c{number}": None for number in range(size.clients)}
+        fleet = default_fleet()
+        self.fleet = replace(fleet, strategy=self.random.choice(("priority", "adaptive")))
+        if size.bookers:
+            self.fleet = replace(self.fleet, strategy="adaptive")
+        self.where = {rc: f"{self.random.choice(self.hosts)}/{self._program(rc)}" for rc in DEVICES}
+        """In which process each RC is: in its host's node, or in one of its own, without a candidate beside it."""
+        bookers = [f"{self.random.choice(self.hosts)}/b{number}" for number in range(size.bookers)]
+        self.clients |= dict.fromkeys(bookers)
+        self.running: dict[str, tuple[Process, MemoryMesh]] = {}
+        self.candidates: dict[str, Candidate] = {}
+        self.excused: set[str] = set()
+        """Clients that need not be served at the end."""
+        self.keepers: dict[str, BookingKeeper] = {}
+        """By host: those of processes that live."""
+        self.rcs: dict[str, ResourceController] = {}
+        self.programs: dict[str, Client] = {}
+        self.busy: dict[str, set[str]] = {}
+        """By program: its ARCs that are not over."""
+        self.present: list[Fault] = []
+        """The faults of now."""
+        self.calm_since = START
+        """When the last fault ended."""
+        self.everybody = [
+            *dict.fromkeys((*(f"{host}/node" for host in self.hosts), *self.where.values(), *self.clients))
+        ]
+        if size.moves_only:
+            drawn = plan.draw_moves(seed, self.everybody, count=size.faults, span=size.span)
+        else:
+            drawn = plan.draw(seed, self.everybody, self.hosts, sorted(DEVICES), count=size.faults, span=size.span)
+        if size.bookers:
+            drawn = plan.draw_for_bookings(seed, self.hosts, size.span, drawn)
+        if size.direct:
+            # A second instance has a device of its own, which no program of the first touches.
+            drawn = [fault for fault in drawn if fault.kind != "double"]
+        self.last_holders = {rc: LastHolder() for rc in DEVICES}
+        """What RCs keep on disk."""
+        self.faults = drawn if faults is None else list(faults)
+        self.cuts: Counter[tuple[str, str]] = Counter()
+        self.result = Result(seed, self.faults)
+        self.idle, self.failed = asyncio.Event(), asyncio.Event()
+
+    def _program(self, rc: str) -> str:
+        return "node" if self.random.random() < 0.6 else f"rc-{rc.replace('/', '-')}"
+
+    async def run(self) -> Result:
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, VirtualTimeLoop)
+        self.loop, loop.isolated = loop, True
+        self.network = MemoryNetwork(
+            lease=self.fleet.mesh.lease, impatience=IMPATIENCE, relink=plan.RELINK, seed=self.seed
+        )
+        self._digest = hashlib.blake2b(digest_size=16)
+        self.network.trace = self._trace
+        self.devices = {rc: self._device(rc) for rc in DEVICES}
+        calm = lambda: 0.0 if self.present else loop.now - self.calm_since  # noqa: E731
+        DEEDS.set(Deeds(self.broken, calm, lambda: self.work.over, self.busy))
+        self.component = type("Component", (SimulatedComponent,), {"processes": self})
+        touched = self.devices if self.size.direct else None
+        self.work = Work(DEVICES, self.size.pause, self.result.counts, self.log, self.broken, touched)
+        self.promises = Promises(
+            self.broken,
+            lambda: loop.now,
+            self.fleet.timing.hold_lease / SECOND,
+            strict=self.fleet.strategy == "priority",
+            thief=THIEF,
+        )
+        self.excuses = Excuses(
+            hosts=self.hosts,
+            candidates_at=self.candidates_at,
+            where=self.where,
+            faults=self.faults,
+            fleet=self.fleet,
+            leading=lambda: {host: one.rcm.term for host, one in self.candidates.items() if one.rcm is not None},
+            terms=self.promises.terms,
+            now=lambda: loop.now,
+        )
+        self.equipment = Hosts(self.seed, self.hosts, lambda: loop.now, booked=self.size.bookers > 0)
+        self.booked = BookingPromises(
+            self.broken,
+            lambda: loop.now,
+            self.keepers,
+            self.equipment.disks,
+            self.candidates_at,
+            lambda: not self.present,
+            lambda host, call: self.running[f"{host}/node"][0].run(call),
+        )
+        bookers = [name for name in self.clients if name.split("/")[1].startswith("b")]
+        self.bookers = {name: Booker(name, self.work, self.booked) for name in bookers}
+        for name in (*self.everybody, OPERATOR):
+            self.start(name)
+        loop.call_later(COPIED_AT, self.equipment.copy_disks)
+        if self.size.thief:
+            self.network.twice = ("command",)
+            process, mesh = self.open_process(THIEF)
+            process.main = process.run(asyncio.create_task, self._guard(steal_places(mesh, lambda: self.work.over)))
+        look = asyncio.create_task(self._look())
+        timers = [loop.call_later(fault.at, self._begin, fault) for fault in self.faults]
+        done = asyncio.create_task(self._served())
+        failed = asyncio.create_task(self.failed.wait())
+        await asyncio.wait({done, failed}, return_when=asyncio.FIRST_COMPLETED)
+        for timer in timers:
+            timer.cancel()
+        for task in (look, done, failed):
+            task.cancel()
+        self.result.digest = self._digest.hexdigest()
+        for process, mesh in tuple(self.running.values()):
+            process.kill()
+            self.network.kill(mesh)
+        return self.result
+
+    def _goes_round_dates(self) -> set[str]:
+        """Clients whose ARCs would run into what is booked: the dates of days to come may be near after a month."""
+        leaders = [one.rcm for one in self.candidates.values() if one.rcm is not None]
+        return {
+            arc.request.client
+            for rcm in leaders
+            for arc in rcm.core.status().queued
+            if arc.reason is not None and arc.reason.code in (ReasonCode.MAINTENANCE, ReasonCode.BOOKED)
+        }
+
+    async def _served(self) -> None:
+        """All faults are mended, and then all that was asked for is served."""
+        await asyncio.sleep(self.size.span)
+        self.work.over = True
+        end = max([self.size.span, *(fault.at + fault.lasts for fault in self.faults)])
+        await asyncio.sleep(max(0.0, START + end - self.loop.now))
+        self.log("all faults are mended")
+        mended = self.loop.now
+        try:
+            async with asyncio.timeout(SERVED_WITHIN):
+                await self.idle.wait()
+        except TimeoutError:
+            self.excused = self._goes_round_dates()
+            late = [
+                f"{name} {arc}" for name, arcs in self.busy.items() for arc in sorted(arcs) if name not in self.excused
+            ]
+            if late:
+                self.broken(f"not served within {SERVED_WITHIN:g} s: {', '.join(late)}")
+        self.result.served_after = self.loop.now - mended
+        await asyncio.sleep(LEFT_OVER)
+        if self.bookers:
+            await self._bookings_settled()
+        faults = [(START + fault.at, START + fault.at + fault.lasts + plan.RELINK) for fault in self.faults]
+        self.promises.at_end(self._alive(self.programs), self._leaders(), faults, self.excused)
+        self.result.counts["terms"] += len(self.promises.terms)
+
+    async def _bookings_settled(self) -> None:
+        """All who keep bookings know the same, and that is what was acknowledged."""
+        try:
+            async with asyncio.timeout(SETTLED_WITHIN):
+                while self.booked.unsettled(self._leading_hosts()):  # noqa: ASYNC110 - nobody tells it
+                    await asyncio.sleep(LOOK_EVERY)
+        except TimeoutError:
+            why = self.booked.unsettled(self._leading_hosts())
+            self.broken(f"bookings are not the same everywhere within {SETTLED_WITHIN:g} s: {why}")
+            return
+        restarted = any(fault.kind == "restart" for fault in self.faults)
+        self.result.counts += self.booked.at_end(self._leading_hosts(), jumped=restarted)
+
+    # What is seen
+
+    def log(self, text: str) -> None:
+        process = PROCESS.get()
+        who = "" if process is None else process.name
+        self.result.lines.append(f"{self.loop.now - START:8.3f}  {who:8}  {text}")
+
+    def broken(self, text: str) -> None:
+        """A promise was not kept."""
+        process = PROCESS.get()
+        if process is not None and process.dead:
+            return
+        self.log(f"BROKEN: {text}")
+        self.result.broken.append(f"{self.loop.now - START:.3f} {text}")
+        self.failed.set()
+
+    def on_exception(self, _loop: object, context: dict[str, Any]) -> None:
+        self.broken(f"an error that nobody saw: {context.get('exception') or context['message']!r}")
+
+    def _trace(self, source: str, target: str, kind: str, args: tuple[Any, ...]) -> None:
+        self.result.counts["messages"] += 1
+        payload = next((arg for arg in args if isinstance(arg, bytes)), b"")
+        self._digest.update(f"{self.loop.now:.9f} {source} {target} {kind} ".encode() + payload)
+
+    def on_trace(self, line: str) -> None:
+        if self._traced:
+            self.result.trace.append(line)
+        self.promises.event(msgspec.json.decode(line))
+
+    async def _look(self) -> None:
+        while True:
+            await asyncio.sleep(LOOK_EVERY)
+            silence = {
+                key: process.run(rc.mesh.now) - rc.holds.last_contact
+                for key, rc in self.rcs.items()
+                if not (process := self.running[key.split()[0]][0]).stopped
+            }
+            clients = self._alive(self.programs)
+            # Two instances of an RC on one mesh are settled while there are two.
+            calm = all(fault.kind == "double" for fault in self.present)
+            lasting = dict(self.booked.look(self._leading_hosts(), calm=not self.present)) if self.bookers else {}
+            self.promises.look(clients, self.rcs, self._leaders(), silence, calm=calm, lasting=lasting)
+            if self.work.over and not any(self.busy.values()):
+                self.idle.set()
+
+    def _alive(self, of: dict[str, T]) -> dict[str, T]:
+        """Without those that stand still."""
+        return {name: one for name, one in of.items() if not self.running[name][0].stopped}
+
+    def _leaders(self) -> dict[str, Rcm]:
+        candidates = {f"{host}/node": one for host, one in self.candidates.items()}
+        return {name: one.rcm for name, one in self._alive(candidates).items() if one.rcm is not None}
+
+    def _leading_hosts(self) -> dict[str, Rcm]:
+        return {name.split("/")[0]: rcm for name, rcm in self._leaders().items()}
+
+    # Processes
+
+    def start(self, name: str) -> None:
+        process, mesh = self.open_process(name)
+        process.run(self._start, process, name, mesh)
+
+    def _start_all(self, names: Iterable[str]) -> None:
+        for name in names:
+            if self.running[name][0].dead:
+                self.start(name)
+
+    def open_process(self, name: str) -> tuple[Process, MemoryMesh]:
+        rng = self.random
+        process = Process(
+            name,
+            seed=(self.seed, rng.random()),
+            rate=1 + rng.uniform(-DRIFT, DRIFT) / 2,
+            boot=rng.uniform(100, 1_000_000),
+        )
+        self.running[name] = process, process.run(self.network.open, self.fleet.name, Sender(*name.split("/")))
+        self._cut()
+        return self.running[name]
+
+    def end_process(self, name: str, reached: MemoryTransport | None = None) -> None:
+        """Nothing of it runs any more, and of what it has just said nothing arrives but at `reached`, or some."""
+        process, mesh = self.running.get(name, (None, None))
+        self.busy.pop(name, None)
+        if process is not None and mesh is not None and not process.dead:
+            # In this order: nothing that would clean up says anything.
+            self.network.kill(mesh, reached)
+            process.kill()
+        if "." in name:  # a component's: no other that lives has its name
+            self.running.pop(name, None)
+
+    def _start(self, process: Process, name: str, mesh: MemoryMesh) -> None:
+        host, program = name.split("/")
+        main: Coroutine[Any, Any, None]
+        if name not in self.clients:
+            mesh.watch_links()
+        if program == "node":
+            main = self._node(host, mesh)
+        elif name in self.where.values():
+            main = self._offer_all(mesh, StallWatch(mesh.now).start())
+        elif name == OPERATOR:
+            main = operate(mesh, self.work, self.size.components)
+        else:
+            main = self._client(name, mesh)
+        process.main = asyncio.create_task(self._guard(main))
+
+    async def _guard(self, main: Coroutine[Any, Any, None]) -> None:
+        try:
+            await main
+        except BaseException as error:
+            self.broken(f"it ended with {error!r}")
+            raise
+
+    async def _node(self, host: str, mesh: MemoryMesh) -> None:
+        stall = StallWatch(mesh.now).start()
+        mesh_token = mesh.alive(Token(host, Role.NODE, "node", new_instance()))
+        await self._offer_all(mesh, stall)
+        leads = host in self.candidates_at
+        keeper = BookingKeeper(
+            mesh, self.equipment.disks[host], candidate=leads, wall=partial(self.equipment.wall, host)
+        )
+        if leads:
+            self.keepers[host] = keeper
+            key = PLACES_KEY if self.size.thief else None
+            candidate = self.candidates[host] = Candidate(mesh, self.fleet, places_key=key, keeper=keeper)
+            candidate.start()
+        elif self.size.bookers and str(mesh.me) in self.where.values():
+            self.keepers[host] = keeper
+            keeper.start(Supervisor("what keeps bookings", self._on_failure))
+        component_host = ComponentHost(
+            mesh, self.fleet, ComponentsConfig(), self._on_failure, kinds=lambda: KINDS, process=self.component
+        )
+        await component_host.start()
+        await report_load(mesh)
+        mesh_token.close()
+
+    def _device(self, rc: str) -> Device:
+        return Device(rc, DEVICES[rc], self.broken, self.log)
+
+    async def _offer(
+        self, name: str, device: Device, mesh: MemoryMesh, stall: StallWatch, confirmations: ConfirmServer | None = None
+    ) -> ResourceController:
+        driver = WatchedExclusive(device) if device.capacity is None else WatchedCapacity(device)
+        lease = self.fleet.timing.hold_lease / SECOND
+        last = self.last_holders[name] if device is self.devices[name] else LastHolder()
+        how: dict[str, Any] = {"settle": SETTLE, "last_holder": last, "on_failure": self._on_failure}
+        how["confirmations"] = confirmations
+        rc = ResourceController(mesh, name, driver, hold_lease=lease, stall=stall, **how)
+        await rc.start()
+        self.rcs[f"{mesh.me} {name}"] = rc
+        return rc
+
+    async def _offer_all(self, mesh: MemoryMesh, stall: StallWatch) -> None:
+        """The RCs of this process."""
+        confirmations = ConfirmServer(mesh)
+        for rc in [rc for rc, at in self.where.items() if at == str(mesh.me)]:
+            await self._offer(rc, self.devices[rc], mesh, stall, confirmations)
+
+    async def _spare(self, name: str, mesh: MemoryMesh, leaves: asyncio.Event) -> None:
+        """Another device of this name on another host, until it `leaves`."""
+        rc = await self._offer(name, self._device(name), mesh, StallWatch(mesh.now).start())
+        await leaves.wait()
+        await rc.stop()
+        self.rcs.pop(f"{mesh.me} {name}", None)
+
+    async def _forge(self, mesh: MemoryMesh, jump: int) -> None:
+        """Publishes as an RCM, of which nobody sees a token."""
+        highest = max((term.counter for term in self.promises.terms), default=0)
+        term = Term(min(highest + jump, MAX_COUNTER), new_instance())
+        while True:
+            mesh.put(mesh.keys.grants, Grants(term, 1, 1, FORGED_EVERY, {}, []))
+            await asyncio.sleep(FORGED_EVERY)
+
+    def _on_failure(self, error: Exception) -> None:
+        self.broken(f"a service failed: {error!r}")
+
+    async def _client(self, name: str, mesh: MemoryMesh) -> None:
+        client = self.programs[name] = Client(mesh, self.fleet).start()
+        # A leader that has just begun may know nothing of an RC that is down.
+        client.waits_for_devices = True
+        busy = self.busy[name] = set()
+        self.watch(name, client)
+        if name in self.bookers:
+            await self.bookers[name].run(client, busy)
+            await client.close()
+            # What it gave up where nobody led is told by its token.
+            del self.programs[name]
+            return
+        await asyncio.gather(*(self.work.run(client, f"{mesh.me.client}-{number}", busy) for number in range(2)))
+
+    def watch(self, name: str, client: Client) -> None:
+        """Whatever this client is told is held against the promises."""
+        began: dict[str, tuple[Grant | None, float, list[str]]] = {}
+        """By ARC: its last grant, since when it was known here, and of which RCs it was."""
+
+        def told(arc: OpenArc) -> None:
+            self.log(f"{arc.name} {arc.state} {arc.outcome or ''} {arc.reason}")
+            self.booked.news(arc, self._leading_hosts())
+            grant, since, rcs = began.get(arc.id, (None, 0.0, []))
+            self.promises.told(
+                name, arc, client.term, touched=self.excuses.felt(since, name, *rcs, *arc.rcs, *arc.needs)
+            )
+            if arc.grant is not None and arc.grant != grant:
+                began[arc.id] = arc.grant, self.loop.now - START, arc.rcs
+
+        client.watch(told)
+
+    # Faults
+
+    def _begin(self, fault: Fault) -> None:
+        self.log(f"FAULT {fault}")
+        self.result.counts["faults"] += 1
+        end: Callable[[], object]
+        match fault.kind:
+            case "freeze" | "stall":
+                (name,) = fault.whom
+                process, mesh = self.running[name]
+                if process.stopped or process.dead:
+                    return
+                if fault.kind == "freeze":
+                    self.network.freeze(mesh)
+                    end = lambda: self.network.thaw(mesh)  # noqa: E731
+                else:
+                    process.stop()
+                    end = process.go_on
+            case "kill":
+                armed = {name: self.running[name][1] for name in fault.whom if not self.running[name][0].dead}
+                if not armed:
+                    return
+                for name, mesh in armed.items():
+                    if fault.both:
+                        self._kill(name, fault)
+                    else:
+                        self.network.after_sending(mesh, fault.message, partial(self._kill, name, fault))
+                end = partial(self._revive, fault, armed.values())
+            case "cut" | "isolate" | "part":
+                pairs = self._pairs(fault)
+                self.cuts.update(pairs)
+                self._cut()
+                end = lambda: self._mend(pairs)  # noqa: E731
+            case "disturb":
+                self.network.disturb({fault.message: fault.how})
+                end = lambda: self.network.disturb({})  # noqa: E731
+            case "double":
+                rc, host = fault.whom
+                if self.where[rc].startswith(f"{host}/"):
+                    return
+                name, leaves = f"{host}/spare{self.result.counts['faults']}", asyncio.Event()
+                process, mesh = self.open_process(name)
+                process.main = process.run(asyncio.create_task, self._guard(self._spare(rc, mesh, leaves)))
+                end = leaves.set if fault.both else lambda: self._kill_spare(name, rc)
+            case "forge":
+                name = f"{fault.whom[0]}/stranger{self.result.counts['faults']}"
+                process, mesh = self.open_process(name)
+                process.main = process.run(asyncio.create_task, self._forge(mesh, fault.jump))
+                end = lambda: self.end_process(name)  # noqa: E731
+            case "fail":
+                failing = {key: rc for key, rc in self.rcs.items() if rc.name == fault.whom[0]}
+                self._each(failing, lambda rc: rc.fail("its device failed"))
+                end = lambda: self._each(failing, ResourceController.recover)  # noqa: E731
+            case "forget":
+                pairs = self._pairs(fault)
+                self.cuts.update(pairs)
+                self._cut()
+                end = lambda: self._come_back(pairs)  # noqa: E731
+            case "old disk":
+                (host,) = fault.whom
+                if self.running[f"{host}/node"][0].dead:
+                    return
+                self._kill(f"{host}/node", fault)
+                with self.booked.destroying():
+                    self.equipment.restore_disk(host)
+                end = partial(self._start_all, [f"{host}/node"])
+            case "restart":
+                names = [name for name in self.everybody if not self.running[name][0].dead]
+                with self.booked.destroying():
+                    for name in names:
+                        self._take_down(name)
+                DEEDS.get().done.clear()  # nothing goes on from what was done before
+                self.equipment.pass_by(fault.jump)
+                end = partial(self._start_all, names)
+            case "disk":
+                self.equipment.fail(fault.whom)
+                end = partial(self.equipment.fail, fault.whom, fails=False)
+            case "clock":
+                self.equipment.ahead[fault.whom[0]] += fault.jump
+                end = lambda: None  # noqa: E731
+        self.present.append(fault)
+        self._look_who_is_heard()
+        self.loop.call_later(fault.lasts, self._end, fault, end)
+
+    def _each(self, rcs: Mapping[str, ResourceController], call: Callable[[ResourceController], None]) -> None:
+        """Has the processes of these RCs do something when they go on, as far as they live."""
+        for key, rc in rcs.items():
+            process, _ = self.running[key.split()[0]]
+            if self.rcs.get(key) is rc and not process.dead:
+                process.run(self.loop.call_soon, call, rc)
+
+    def _end(self, fault: Fault, end: Callable[[], object]) -> None:
+        self.log(f"OVER  {fault.kind} {' '.join(fault.whom)}")
+        self.excuses.on_over(fault)
+        end()
+        self.loop.call_later(fault.felt, self._forget_fault, fault)
+
+    def _forget_fault(self, fault: Fault) -> None:
+        self.present.remove(fault)
+        self._look_who_is_heard()
+        self.calm_since = self.loop.now
+
+    def _look_who_is_heard(self) -> None:
+        lost = {fault.message for fault in self.present if fault.kind == "disturb" and fault.how.lost == 1}
+        self.promises.unheard = not lost.isdisjoint(("grants", "alive"))
+
+    def _kill(self, name: str, fault: Fault, reached: MemoryTransport | None = None) -> None:
+        if fault in self.excuses.killed or self.running[name][0].dead:
+            return
+        self.excuses.killed[fault] = name, self.loop.now - START
+        with self.booked.destroying():
+            self._take_down(name, reached if fault.message in OPERATIONS else None)
+
+    def _take_down(self, name: str, reached: MemoryTransport | None = None) -> None:
+        self.end_process(name, reached)
+        host, program = name.split("/")
+        if program == "node":
+            self.keepers.pop(host, None)
+            for other in [other for other in self.running if other.startswith(f"{host}/") and "." in other]:
+                self.end_process(other)
+            self.candidates.pop(host, None)
+        for rc in [key for key in self.rcs if key.startswith(f"{name} ")]:
+            del self.rcs[rc]
+        if name in self.clients:
+            self.programs.pop(name, None)
+            self.promises.forget_client(name)
+
+    def _revive(self, fault: Fault, armed: Iterable[MemoryMesh]) -> None:
+        for mesh in armed:
+            self.network.after_sending(mesh, "", None)
+        if fault in self.excuses.killed:
+            self.start(self.excuses.killed[fault][0])
+
+    def _kill_spare(self, name: str, rc: str) -> None:
+        self.end_process(name)
+        self.rcs.pop(f"{name} {rc}", None)
+
+    def _pairs(self, fault: Fault) -> list[tuple[str, str]]:
+        if fault.kind == "cut":
+            one, other = fault.whom
+            return [(one, other), (other, one)] if fault.both else [(one, other)]
+        side = set(fault.whom)
+        return [(one, other) for one in self.hosts for other in self.hosts if (one in side) != (other in side)]
+
+    def _mend(self, pairs: list[tuple[str, str]]) -> None:
+        self.cuts.subtract(pairs)
+        self._cut()
+
+    def _come_back(self, pairs: list[tuple[str, str]]) -> None:
+        self.network.forgetful = FORGOTTEN
+        self._mend(pairs)
+        self.network.forgetful = 0.0
+
+    def _cut(self) -> None:
+        cuts = +self.cuts
+        self.network.cut_where(lambda one, other: (one.split("/")[0], other.split("/")[0]) in cuts)
+
+
+class _Lines(logging.Handler):
+    """What services log becomes part of the transcript; an error among it is a promise that was not kept."""
+
+    def __init__(self, fleet: Simulation) -> None:
+        super().__init__()
+        self._fleet = fleet
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage()
+        if record.name == trace.log.name:
+            self._fleet.on_trace(text)
+            return
+        if record.exc_info and record.exc_info[1] is not None:
+            text += f" ({record.exc_info[1]!r})"
+        if record.levelno >= logging.ERROR:
+            self._fleet.broken(text)
+        else:
+            self._fleet.log(text)

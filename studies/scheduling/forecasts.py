@@ -1,0 +1,153 @@
+"""How good forecasts are where people ask for more time than they need: with what was asked for, with what was learned
+(`runtimes.py`), and with the true runtimes.
+
+Each ARC of a workload is a run of one of a few programs, and asks for so many times what it takes: always about as many
+for one program. When it is first queued it is foretold its start, in each of the ways; what is told changes nothing of
+the run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from random import Random
+from statistics import median
+from typing import Final
+
+from msgspec.structs import replace
+
+from studies.scheduling.families import FAMILIES, MILLISECOND
+from studies.scheduling.trial import STRATEGIES
+from zscout.scheduling.core import Core
+from zscout.scheduling.forecast import forecast
+from zscout.scheduling.model import ArcRequest, Effect, Granted, Hold, HoldEnded, Propose, Queued
+from zscout.scheduling.runtimes import RuntimeEstimator, Wish
+from zscout.simulation.replay import SERVED, replay
+from zscout.simulation.workload import Arrival, Workload
+from zscout.types import SECOND, ArcId, Ns
+
+PROGRAMS: Final = 12
+FACTORS: Final = (2.0, 10.0)
+"""Between these is by how many times a program asks for too much."""
+NOISE: Final = 0.2
+"""By this share a single request differs from its program's factor at most."""
+NEAR: Final = 0.2
+"""What starts within this share of the wait that was told counts as foretold right."""
+WAYS: Final = ("asked", "learned", "true")
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class ForecastJob:
+    family: str
+    seed: int
+    strategy: str
+    exact: bool = False
+    """Whether all ask for exactly what they take."""
+
+
+@dataclass(frozen=True, slots=True)
+class ForetoldStart:
+    """What an ARC was told when it was first queued, and what came: waits in ns. None: that it never starts."""
+
+    waits: tuple[Ns | None, ...]
+    """In the order of `WAYS`."""
+    waited: Ns
+
+
+@dataclass(frozen=True, slots=True)
+class ForecastTrial:
+    job: ForecastJob
+    told: tuple[ForetoldStart, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Accuracy:
+    near: float
+    """Share of the ARCs that were queued: those that started within `NEAR` of the wait that they were told."""
+    error: float
+    """The median, in seconds, of those that were told one."""
+
+
+@dataclass(frozen=True, slots=True)
+class FamilyForecasts:
+    family: str
+    queued: int
+    ways: Mapping[str, Accuracy]
+
+
+class _TrueRuntimes(RuntimeEstimator):
+    def __init__(self, lasting: Mapping[ArcId, Ns]) -> None:
+        super().__init__()
+        self._lasting = lasting
+
+    def end(self, request: ArcRequest, hold: Hold, now: Ns) -> Ns | None:
+        return max(now + 1, hold.start + self._lasting[request.arc])
+
+
+def overestimated(workload: Workload, random: Random, *, exact: bool = False) -> tuple[Workload, Mapping[ArcId, Ns]]:
+    """The same as runs of programs that ask for too much time, unless `exact`; and what each ARC takes, in ns."""
+    factors = [random.uniform(*FACTORS) for _ in range(PROGRAMS)]
+    arrivals = []
+    for arrival in workload.arrivals:
+        program = random.randrange(PROGRAMS)
+        factor = 1.0 if exact else factors[program] * random.uniform(1 - NOISE, 1 + NOISE)
+        asked = round(arrival.request.min_runtime * factor / MILLISECOND) * MILLISECOND
+        arrivals.append(Arrival(arrival.at, replace(arrival.request, label=f"program{program}", min_runtime=asked)))
+    lasting = {arrival.request.arc: arrival.request.min_runtime for arrival in workload.arrivals}
+    return Workload(workload.rcs, tuple(arrivals)), lasting
+
+
+def run(job: ForecastJob) -> ForecastTrial:
+    """Raises KeyError for a family or strategy that does not exist."""
+    random = Random(f"{job.family}/{job.seed}/asked")  # noqa: S311 - workloads, not secrets
+    workload, lasting = overestimated(FAMILIES[job.family].workload(job.seed), random, exact=job.exact)
+    requests = {arrival.request.arc: arrival.request for arrival in workload.arrivals}
+    learned, true = RuntimeEstimator(), _TrueRuntimes(lasting)
+    queued: dict[ArcId, Ns] = {}
+    told: dict[ArcId, tuple[Ns | None, ...]] = {}
+    started: dict[ArcId, Ns] = {}
+    since: dict[ArcId, Ns] = {}
+
+    def watch(now: Ns, core: Core, effects: list[Effect]) -> None:
+        for effect in effects:
+            match effect:
+                case Granted(arc=arc):
+                    started.setdefault(arc, now)
+                    since[arc] = now
+                case HoldEnded(arc=arc, outcome=outcome):
+                    learned.observe(Wish.of(requests[arc]), now - since[arc], whole=outcome in SERVED)
+                case Queued(arc=arc) if arc not in started:
+                    queued.setdefault(arc, now)
+        if any(isinstance(effect, Propose) for effect in effects):
+            return
+        new = [arc for arc in queued if arc not in told and arc not in started]
+        if not new:
+            return
+        found = [forecast(core, now, runtimes=runtimes).starts for runtimes in (None, learned, true)]
+        for arc in new:
+            told[arc] = tuple(starts[arc] - now if arc in starts else None for starts in found)
+
+    replay(workload, watch, strategy=STRATEGIES[job.strategy](), lasting=lasting)
+    found = (ForetoldStart(waits, started[arc] - queued[arc]) for arc, waits in told.items() if arc in started)
+    return ForecastTrial(job, tuple(found))
+
+
+def accuracy(told: Sequence[tuple[Ns | None, Ns]]) -> Accuracy:
+    """Of pairs of the wait that was told and that which came."""
+    errors = [abs(waited - wait) for wait, waited in told if wait is not None]
+    near = sum(wait is not None and abs(waited - wait) <= NEAR * wait for wait, waited in told)
+    return Accuracy(near / len(told) if told else 0.0, median(errors) / SECOND if errors else 0.0)
+
+
+def report(trials: Iterable[ForecastTrial]) -> list[FamilyForecasts]:
+    """By family, in the order of the trials."""
+    families: dict[str, list[ForetoldStart]] = {}
+    for trial in trials:
+        families.setdefault(trial.job.family, []).extend(trial.told)
+    return [
+        FamilyForecasts(
+            family,
+            len(told),
+            {name: accuracy([(one.waits[way], one.waited) for one in told]) for way, name in enumerate(WAYS)},
+        )
+        for family, told in families.items()
+    ]

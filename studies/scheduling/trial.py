@@ -1,0 +1,96 @@
+"""One trial: one workload under one strategy."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from studies.scheduling.families import FAMILIES
+from studies.scheduling.measures import Curve, Measures, curve, measure
+from studies.scheduling.situations import Observer, Situation
+from zscout.scheduling import strategies
+from zscout.scheduling.state import Actions, SchedulerState, Strategy
+from zscout.simulation.replay import replay
+from zscout.simulation.workload import Workload
+from zscout.types import Ns
+
+STRATEGIES: Final[Mapping[str, Callable[[], Strategy]]] = {
+    str(name): make for name, make in strategies.STRATEGIES.items()
+}
+"""Each makes a strategy for one run."""
+JUDGED = "priority"
+"""The strategy whose situations are judged against the best: the paper's heuristic."""
+BEST = "optimal"
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class SchedulingJob:
+    """What to run. `drawn` asks for the run's curve as well."""
+
+    family: str
+    seed: int
+    strategy: str
+    drawn: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SchedulingTrial:
+    job: SchedulingJob
+    measures: Measures
+    situations: tuple[Situation, ...]
+    """Empty unless the strategy is `JUDGED`."""
+    decisions: tuple[Ns, ...]
+    """How long each pass took on the caller's clock: the only part that is not the same every time."""
+    curve: Curve | None = None
+
+
+class _Watched:
+    """A strategy with a stop watch, and perhaps an observer."""
+
+    def __init__(self, strategy: Strategy, clock: Callable[[], Ns], observer: Observer | None) -> None:
+        self.name = strategy.name
+        self.strategy, self.clock, self.observer = strategy, clock, observer
+        self.took: list[Ns] = []
+
+    def log_line(self) -> str:
+        return self.strategy.log_line()
+
+    def run_pass(self, state: SchedulerState, actions: Actions) -> None:
+        if self.observer is not None:
+            self.observer.before(state, state.now)
+        begin = self.clock()
+        self.strategy.run_pass(state, actions)
+        self.took.append(self.clock() - begin)
+        if self.observer is not None:
+            self.observer.after(state)
+
+
+def run(job: SchedulingJob, clock: Callable[[], Ns]) -> SchedulingTrial:
+    """Runs a job to its end. `clock` gives ns and only serves to time the passes.
+
+    Raises KeyError for a family or strategy that does not exist."""
+    return play(job, FAMILIES[job.family].workload(job.seed), clock)
+
+
+def run_timed(job: SchedulingJob) -> SchedulingTrial:
+    """The same with passes timed in processor time, as a study keeps all processors busy; of all threads,
+    since a solver may have some."""
+    return run(job, time.process_time_ns)
+
+
+def play(job: SchedulingJob, workload: Workload, clock: Callable[[], Ns]) -> SchedulingTrial:
+    """The same with a workload of the caller's own."""
+    observer = Observer(workload.rcs, STRATEGIES[BEST]()) if job.strategy == JUDGED else None
+    watched = _Watched(STRATEGIES[job.strategy](), clock, observer)
+    played = replay(workload, strategy=watched)
+    if observer is not None:
+        observer.close()
+    return SchedulingTrial(
+        job,
+        measure(workload, played),
+        tuple(observer.found) if observer is not None else (),
+        tuple(watched.took),
+        curve(workload, played) if job.drawn else None,
+    )

@@ -1,0 +1,155 @@
+"""Whole fleets under faults: every promise of docs/promises.md, and that one that is not kept would be noticed."""
+
+from __future__ import annotations
+
+import gc
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from studies.faults.guards import GUARDS, without
+from studies.faults.runs import shrink
+from studies.faults.simulation import Simulation, simulate
+from tests.hang import HANG
+
+SEEDS = [seed for seed in range(1, 200) if seed % 10 != 9]
+"""Small runs; every tenth is one of many programs."""
+BLOCK = 20
+FOUND = [
+    1923,
+    302274,
+    302324,
+    302513,
+    400894,
+    407164,
+    434963,
+    435554,
+    440263,
+    502073,
+    517214,
+    519734,
+    550493,
+    567963,
+    579603,
+    600943,
+    700043,
+    892734,
+    900973,
+    918193,
+    965924,
+    967464,
+]
+"""Runs that once broke a promise: a keeper that nobody asked, an old publication read after a standstill, a silent
+radio beside a date, maintenance that one wrong clock ended, a conflict with what was kept elsewhere by then; one that
+had no end, as a date that ran was in the way where it had been kept, and not where it was; a number of a component that
+two placers gave; a date that was in conflict for a while, and lost who had taken it up; a pattern that took what
+another had booked; a keeper that can't lead and that nobody asked; who waited for a date, and began by one wrong clock
+before fleet time was certain, or as its leader could keep the booking nowhere. Elsewhere the check erred: at 892734 and
+567963 a leader stood still as it told the time for the first time; at 918193 what began before fleet time was certain
+was in the way of a date that had been hours away; at 550493 a booking was refused, which another host kept, and brought
+back within milliseconds; at 579603 a date was in conflict for the first milliseconds of a reign; at 517214 the time of
+a host that was alone went on, which had differed by 2 s; and at 519734 a candidate was alone with a host that has no
+RC."""
+MISSED = {
+    "order": 15,
+    "grant": 1,
+    "safe first": 1,
+    "snapshots": 1,
+    "step down": 1,
+    "reopen": 2,
+    "places": 2,
+    "withdrawn": 55,
+    "believed": 47,
+    "settling": 8,
+    "deadline": 8,
+    "once": 10,
+    "sealed": 10,
+    "copied": 3,
+    "dates": 103,
+    "merged": 3,
+    "caught up": 4,
+    "one stands": 33,
+    "awaited": 103,
+    "had again": 13,
+    "dates first": 94,
+    "fleet time": 4,
+    "late": 173,
+    "slewed": 3,
+}
+"""Guards without which some promise breaks within a few runs, and the seed of docs/promises.md, which is tried first;
+`python -m studies faults --without` tries the others."""
+
+
+@pytest.mark.parametrize("first", range(0, len(SEEDS) + len(FOUND), BLOCK))
+def test_promises_are_kept_under_faults(first: int) -> None:
+    broken = {seed: simulate(seed).broken for seed in [*SEEDS, *FOUND][first : first + BLOCK]}
+    assert {seed: texts for seed, texts in broken.items() if texts} == {}, "python -m studies faults --seed SEED"
+
+
+def test_a_seed_is_one_run_to_the_byte_whatever_the_order_of_sets() -> None:
+    program = (
+        "from studies.faults.simulation import simulate\n"
+        "result = simulate(7, traced=True)\n"
+        "print(result.digest, *result.lines, *result.trace, sep='\\n')\n"
+    )
+    said = []
+    for hash_seed in ("1", "2"):
+        environment = os.environ | {"PYTHONHASHSEED": hash_seed}
+        command = [sys.executable, "-c", program]
+        said.append(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
+    assert len(said[0].splitlines()) > 1_000
+    assert said[0] == said[1]
+
+
+def test_a_run_leaves_nothing_in_memory() -> None:
+    def left() -> int:
+        gc.collect()
+        return sum(type(one) is Simulation for one in gc.get_objects())
+
+    before = left()
+    simulate(1)
+    assert left() == before
+
+
+@pytest.mark.parametrize("guard", MISSED)
+def test_without_a_guard_a_promise_breaks(guard: str) -> None:
+    with without(guard):
+        assert any(simulate(seed).broken for seed in (MISSED[guard], *SEEDS[:60])), GUARDS[guard].what
+
+
+def test_what_is_left_of_the_faults_of_a_failing_run_fails_alike() -> None:
+    with without("reopen"):
+        failed = next(result for seed in SEEDS if (result := simulate(seed)).broken)
+        less = shrink(failed)
+        assert less.broken
+        assert 0 < len(less.faults) < len(failed.faults)
+
+
+def test_runs_are_added_up_as_json() -> None:
+    done = study("1-2")
+    told = json.loads(done.stdout)
+    assert (told["runs"], told["broken"], sum(told["faults"].values()) > 0) == (2, {}, True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_a_run_that_breaks_a_promise_is_told_with_its_seed() -> None:
+    done = study("1-2", "--without", "safe first")
+    assert done.returncode == 1
+    assert 1 in {seed for seeds in json.loads(done.stdout)["broken"].values() for seed in seeds}
+    assert done.stderr.startswith("seed 1 BROKEN ")
+
+
+def study(seeds: str, *more: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "studies", "faults", "--seed", seeds, "--json", *more]
+    return subprocess.run(command, capture_output=True, text=True, timeout=3 * HANG)
+
+
+def test_only_runs_of_bookings_are_counted_where_those_are_wanted() -> None:
+    told = json.loads(study("2", "--runs", "1", "--bookings").stdout)
+    assert (told["seed"], told["counts"]["booked"] > 5) == (3, True)
+    done = study("5-7", "--bookings")
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "in none of these runs programs book" in done.stderr

@@ -1,0 +1,220 @@
+"""`zscout demo`: what zscout does, on a live mesh on this machine."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Coroutine
+from contextlib import AsyncExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+from urllib.parse import urlsplit
+
+import click
+
+from zscout import terminal
+from zscout.cli import common
+from zscout.cli.simulation.options import DefaultGroup
+from zscout.cli.simulation.simulate import BUILDING, buildings
+from zscout.config.strict import BadInput
+from zscout.types import POLICIES, Policy
+
+if TYPE_CHECKING:
+    from zscout.cli.fleet.view import Child
+    from zscout.simulation.demo.screen import LiveView
+
+SCENARIOS: Final = ("at-once", "staggered")
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+@click.group(cls=DefaultGroup, default="robots")
+def demo() -> None:
+    """Show what zscout does on a live mesh on this machine; `robots` unless another one is named.
+
+    \b
+    Examples:
+      zscout demo
+      zscout demo --web
+      zscout demo table1 --out demo.rrd
+      zscout demo placement
+    """
+
+
+class _Live:
+    """The Rerun viewer beside a demo: a window, or the server of a page for a browser. The page has one address for the
+    demo and its recording."""
+
+    def __init__(self, stack: AsyncExitStack, *, web: bool) -> None:
+        self._stack, self._web = stack, web
+        self._port = self._stream = 0
+        self._window: Child | None = None
+
+    async def open(self, url: str) -> str:
+        from zscout.cli.fleet.view import WEB_PORT, free_port, open_viewer
+        from zscout.services.recorder.process import Recording
+
+        self._stream = urlsplit(url).port or 0
+        self._port = free_port("127.0.0.1", WEB_PORT, 0)
+        shown = open_viewer(Recording("", url), web=self._web, port=self._port)
+        self._window, address = await self._stack.enter_async_context(shown)
+        return f"Live: open {address}" if address is not None else "Live in the viewer's window"
+
+    async def finished(self, recording: Path) -> None:
+        from zscout.cli.fleet.view import open_viewer
+        from zscout.services.recorder.process import Recording
+
+        if self._web:
+            await self._stack.aclose()
+            shown = open_viewer(Recording(str(recording), None), web=True, port=self._port, stream=self._stream)
+            self._window, address = await self._stack.enter_async_context(shown)
+            terminal.print_line(f"The page stays at {address}; Ctrl-C ends", sys.stderr)
+        if self._window is not None:
+            await self._window.process.wait()
+
+
+def live_options(command: F) -> F:
+    """`--web` and `--view`."""
+    command = click.option("--view", is_flag=True, help="Show it live in the Rerun viewer's window.")(command)
+    return click.option("--web", is_flag=True, help="Show it live in a browser: prints the address to open.")(command)
+
+
+async def _played(web: bool, view: bool, play: Callable[[LiveView | None], Coroutine[Any, Any, int]]) -> int:
+    async with AsyncExitStack() as stack:
+        return await play(_Live(stack, web=web) if web or view else None)
+
+
+def _check_live(web: bool, view: bool) -> None:
+    from zscout.cli.fleet.view import has_display
+
+    if web and view:
+        raise BadInput("--web and --view: one of them shows it; leave one out")
+    if view and not has_display():
+        raise common.Failed("no display is here (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web, and a browser")
+
+
+def recording_option(command: F) -> F:
+    """`--out FILE`."""
+    return click.option(
+        "--out", metavar="FILE", type=click.Path(path_type=Path), help="The recording. Default: runs/demo-….rrd"
+    )(command)
+
+
+@demo.command()
+@click.option(
+    "--building",
+    type=BUILDING,
+    shell_complete=buildings,
+    metavar="BUILDING",
+    default="living_room",
+    help="As in zscout simulate: a name, a TOML file, or random:SEED.",
+)
+@click.option("--seed", type=click.IntRange(0), default=1, help="Of noise, slip and people.")
+@click.option(
+    "--speed",
+    type=click.FloatRange(0.2, 4.0),
+    default=1.5,
+    help="How many of the building's seconds pass in one of ours.",
+)
+@recording_option
+@live_options
+@common.json_option("Print the summary as one JSON object.")
+def robots(building: str, seed: int, speed: float, out: Path | None, web: bool, view: bool, as_json: bool) -> int:
+    """Hide the robots of a building in the dark, and have them watch.
+
+    There are four of them, two framegrabbers and one radio. It serves a simulated building, starts three
+    nodes with its devices on this machine, apart from every other fleet, and has the component placer place
+    a sensor net. In the middle an operator takes one robot, drives it and gives it back. It ends when all
+    robots are hidden and somebody has walked by, or a minute of the building later, at the latest after two
+    and a half minutes of ours. It leaves nothing but a recording; so does Ctrl-C.
+
+    Exit code: 0 all robots came to be hidden; 1 not all of them did.
+
+    \b
+    Examples:
+      zscout demo robots
+      zscout demo robots --web
+      zscout demo robots --building office --speed 1 --out office.rrd
+    """
+    common.check_recording("--out", out)
+    _check_live(web, view)
+    # Zenoh is loaded here: the help needs none of it.
+    from zscout.simulation.demo.robots_screen import play
+
+    return common.run(_played(web, view, lambda live: play(building, seed, speed, out, as_json=as_json, live=live)))
+
+
+@demo.command()
+@recording_option
+@live_options
+@common.json_option("Print the tables as JSON.")
+def table1(out: Path | None, web: bool, view: bool, as_json: bool) -> int:
+    """Play Table 1 of the paper on a live mesh, and compare what happens with Table 2.
+
+    It starts three nodes with four devices and five programs on this machine, apart from every other fleet,
+    for about 25 seconds, and records them. Nothing is left but the recording. Exit code 1: not all came in
+    the order of Table 2; cells that are only late, on a busy machine, are named.
+
+    \b
+    Examples:
+      zscout demo table1
+      zscout demo table1 --out demo.rrd --json
+    """
+    common.check_recording("--out", out)
+    _check_live(web, view)
+    from zscout.simulation.demo.table1_screen import play
+
+    return common.run(_played(web, view, lambda live: play(out, as_json=as_json, live=live)))
+
+
+@demo.command()
+@click.option(
+    "--policy",
+    "policies",
+    multiple=True,
+    type=click.Choice(POLICIES),
+    help="A policy; repeat it for several. Default: all.",
+)
+@click.option(
+    "--when",
+    "scenarios",
+    multiple=True,
+    type=click.Choice(SCENARIOS),
+    help="All components at once, or net by net. Default: both.",
+)
+@click.option(
+    "--out",
+    metavar="FOLDER",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Keep a Rerun recording of each trial there.",
+)
+@common.json_option("Print one JSON object.")
+def placement(policies: tuple[Policy, ...], scenarios: tuple[str, ...], out: Path | None, as_json: bool) -> int:
+    """Place three Place Sensor Nets on three live nodes under each policy (Figure 3 of the paper).
+
+    Each trial starts three nodes on this machine, apart from every other fleet; each reports the load of what
+    it started itself. Twelve components, which really use the processor, are started all at once or net by
+    net. A trial takes about 12 seconds. Exit code 1: `pending` did not come within one component of even, or
+    a policy that was given time did not use all hosts.
+
+    \b
+    Examples:
+      zscout demo placement
+      zscout demo placement --policy least_loaded --policy pending --when at-once
+      zscout demo placement --out runs/figure3 --json
+    """
+    if out is not None:
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise BadInput(f"--out {out}: can't be made ({error.strerror}); give another folder") from None
+    from zscout.simulation.demo.placement_run import play
+
+    # In the order in which the options list them.
+    chosen = [
+        (scenario, policy)
+        for scenario in SCENARIOS
+        if scenario in (scenarios or SCENARIOS)
+        for policy in POLICIES
+        if policy in (policies or POLICIES)
+    ]
+    return common.run(play(chosen, out, as_json=as_json))

@@ -1,0 +1,115 @@
+"""`zscout simulate`: a building with robots, served so that drivers cannot tell it from a real one."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any, Final
+
+import click
+from click.shell_completion import CompletionItem
+
+from zscout.cli import common
+from zscout.cli.requests.options import SECONDS
+from zscout.config.strict import BadInput, quoted
+from zscout.simulation.building.plan_file import MAX_SEED, RANDOM, known_buildings, plan_named, shipped_plans
+
+BUILDING: Final = common.Parsed("building", lambda text, _: text)
+MAX_FRAMEGRABBERS: Final = 16
+_ADDRESS: Final = re.compile(r"(?:(?P<host>\[[0-9a-fA-F:.]+\]|[^:\[\]]+):)?(?P<port>[0-9]{1,5})")
+
+
+def buildings(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """What serves as a building at Tab: names of those that are shipped, and files."""
+    names = [name for name in (*shipped_plans(), f"{RANDOM}:1") if name.startswith(incomplete)]
+    return [CompletionItem(name) for name in names] or [CompletionItem(incomplete, type="file")]
+
+
+def parse_address(text: str, option: str) -> tuple[str, int]:
+    """Host and port of `HOST:PORT` or `PORT`. Raises BadInput."""
+    found = _ADDRESS.fullmatch(text)
+    if found is None or int(found["port"]) > 65_535:
+        raise BadInput(f"{option} {quoted(text)}: write HOST:PORT, as in 127.0.0.1:8080")
+    return (found["host"] or "127.0.0.1").strip("[]"), int(found["port"])
+
+
+@click.command()
+@click.argument("building", type=BUILDING, required=False, shell_complete=buildings)
+@click.option("--list", "listing", is_flag=True, help="List the buildings that are shipped, and end.")
+@click.option(
+    "--seed",
+    type=click.IntRange(0, MAX_SEED),
+    default=0,
+    help="Of all that is random in it: the same seed, the same building and noise.",
+)
+@click.option(
+    "--speed", type=click.FloatRange(0, 100, min_open=True), default=1.0, help="The building's seconds in one of ours."
+)
+@click.option(
+    "--frames",
+    "frame_rate",
+    type=click.FloatRange(0.1, 60),
+    default=10.0,
+    help="Pictures of each channel in a second of the building.",
+)
+@click.option(
+    "--http",
+    metavar="HOST:PORT",
+    type=common.Parsed("text", parse_address),
+    default="127.0.0.1:0",
+    help="Where cameras are served; port 0 is any free one.",
+)
+@click.option("--channels", type=click.IntRange(1, 15), default=4, help="Video channels served.")
+@click.option(
+    "--baud",
+    type=click.IntRange(300, 1_000_000),
+    default=9600,
+    help="Rate of the radio's line; the line is as much faster as the building is.",
+)
+@click.option(
+    "--loss", type=click.FloatRange(0, 1), default=0.0, help="Share of the radio's packets that no robot hears."
+)
+@click.option(
+    "--radio",
+    "radio_link",
+    metavar="LINK",
+    type=click.Path(path_type=Path),
+    help="A name for the radio's port: a symlink, removed at the end.",
+)
+@click.option(
+    "--node",
+    metavar="FILE",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Write a node file with all the devices: zscout-node FILE serves them.",
+)
+@click.option(
+    "--framegrabbers", type=click.IntRange(1, MAX_FRAMEGRABBERS), default=2, help="How many the node file has."
+)
+@click.option("--mesh", is_flag=True, help="Show recorders and operators on the mesh who is where.")
+@click.option("--for", "seconds", type=SECONDS, help="End after so long in the building: 90s, 5m. Default: at Ctrl-C.")
+@common.json_option("Print how to reach everything as one JSON object.")
+def simulate(building: str | None, listing: bool, mesh: bool, as_json: bool, **options: Any) -> None:
+    """Serves a simulated building: a radio on a serial port, cameras as MJPEG over HTTP, in real time.
+
+    BUILDING is the name of one that is shipped (--list), a TOML file, or random:SEED for one that is drawn.
+    Robots move and see as packets over the radio tell them to; docs/simulation.md says what is true to life
+    in it, and how a building is written.
+
+    \b
+    Examples:
+      zscout simulate --list
+      zscout simulate living_room --node lab.toml --radio radio0 --mesh
+      zscout simulate random:7 --speed 2 --http 127.0.0.1:8080 --loss 0.05
+    """
+    if listing:
+        from zscout.simulation.building.simulate import print_shipped
+
+        print_shipped(as_json=as_json)
+        return
+    if building is None:
+        raise BadInput(f"which building? name one of {known_buildings()}, or a file")
+    plan = plan_named(building)
+    from zscout.simulation.building.simulate import simulate as serve
+
+    fleet = common.the_fleet() if mesh else None
+    common.run(serve(plan, mesh_of=fleet, fleet_file=common.fleet_file(), as_json=as_json, **options))

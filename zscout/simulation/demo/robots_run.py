@@ -1,0 +1,286 @@
+"""`zscout demo robots`: a building, three nodes with its devices, and a net that is placed.
+
+What happens is followed as anybody on the mesh may: what the RCM publishes, what behaviors publish, and,
+because the building is a simulated one, where its robots truly stand.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.placer_client import PlacerClient
+from zscout.behaviors.sensor_net.held_robot import RobotNeeds
+from zscout.behaviors.sensor_net.net import HIDDEN, WATCHING
+from zscout.behaviors.teleop import Pilot, Teleop, Way
+from zscout.mesh import clock
+from zscout.messages import BehaviorSaid, BuildingPoses, ComponentSpec, Grants
+from zscout.simulation.building.bodies import WARM_UP
+from zscout.simulation.building.node_file import RADIO, device_tables, framegrabber_name
+from zscout.simulation.demo.runner import BUILDING, HOSTS, DemoRunner, free_ports
+from zscout.types import SECOND, Ns
+
+NET: Final = "place_sensor_net"
+BAUD: Final = 1_200
+"""Of the demo's radio: room for the commands of two robots, not for those of three."""
+BOUND: Final = 0.5
+"""Seconds that a packet may wait."""
+FRAME_RATE: Final = 10.0
+"""Of the framegrabbers, frames in a second of the building."""
+FRAMEGRABBERS: Final = 2
+START: Final = 40.0
+"""Seconds within which everything must be there."""
+TAKEOVER: Final = 37.5
+"""Seconds of the building from the beginning of the net to the operator's takeover."""
+DRIVES: Final = 9.0
+"""Seconds of the building that the operator drives."""
+GUARDS: Final = (15.0, 60.0)
+"""Seconds of the building that the net is watched once all are hidden: at least, and at most if nobody walks by."""
+WORST: Final = 150.0
+"""Seconds of ours after which the demo ends, placed or not."""
+PATROL: Final[tuple[tuple[Way, float], ...]] = (("forward", 2.25), ("left", 1.5), ("forward", 2.25), ("right", 1.5))
+"""What the operator does, in seconds of the building."""
+
+
+@dataclass(slots=True)
+class RobotsObserved:
+    """What the demo saw."""
+
+    robots: list[str]
+    hidden: set[str] = field(default_factory=set)
+    """That report so."""
+    truly: set[str] = field(default_factory=set)
+    """That truly stand in the dark, as the building knows."""
+    watching: set[str] = field(default_factory=set)
+    placed_at: float | None = None
+    """When all were hidden for the first time, in seconds of the demo."""
+    alerts: int = 0
+    grants: int = 0
+    preemptions: int = 0
+    turns: int = 0
+    """Holds that ended because another of the same rank had its turn."""
+    waits: list[float] = field(default_factory=list)
+    """Seconds from a behavior's "wait" to its next report."""
+    takeover: float | None = None
+    """Seconds from the operator's key to the robot's first own command."""
+    taken: str = ""
+    resumed_after: float | None = None
+    """Seconds from the operator's release to the robot's behavior going on."""
+    doing: dict[str, str] = field(default_factory=dict)
+    """By robot: what it reports that it does."""
+    simulated: float = 0.0
+    """Seconds of the building."""
+
+    def summary(self) -> dict[str, Any]:
+        """What came of it, for programs."""
+        waits = sorted(self.waits)
+        return {
+            "robots": len(self.robots),
+            "hidden": sorted(self.hidden),
+            "truly_dark": sorted(self.truly),
+            "placed_after": self.placed_at,
+            "alerts": self.alerts,
+            "grants": self.grants,
+            "turns": self.turns,
+            "preemptions": self.preemptions,
+            "waits": len(waits),
+            "longest_wait": waits[-1] if waits else 0.0,
+            "median_wait": waits[len(waits) // 2] if waits else 0.0,
+            "takeover": self.takeover,
+            "taken": self.taken,
+            "resumed_after": self.resumed_after,
+            "simulated": self.simulated,
+        }
+
+
+class RobotsDemo(DemoRunner):
+    """The whole demo; `zero` is the beginning of the net."""
+
+    def __init__(
+        self,
+        folder: Path,
+        building: str,
+        ids: Mapping[str, int],
+        *,
+        seed: int,
+        speed: float,
+        show: Callable[[float, str], None],
+    ) -> None:
+        """`building` as `zscout simulate` knows it, `ids` of the robots in it, on the air, by RC."""
+        super().__init__(folder, show)
+        self._ids = ids
+        self.robots = list(ids)
+        self.seen = RobotsObserved(self.robots)
+        self.building, self.seed, self.speed = building, seed, speed
+        self.driven: str | None = None
+        """The robot that the operator has now."""
+        self._client: Client | None = None
+        self._waiting: dict[str, Ns] = {}
+        self._news = asyncio.Event()
+        self._returned_at: Ns | None = None
+
+    async def play(self) -> None:
+        """Has the net placed, one robot taken over, and the net watched."""
+        client = await self._start()
+        spec = ComponentSpec("place_sensor_net", {"robots": self.robots, "speed": self.speed})
+        self.zero = clock.now()
+        placer = PlacerClient(client.mesh)
+        await placer.place(NET, spec)
+        operator = asyncio.create_task(self._operator(client))
+        try:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(WORST):
+                    await self._all_hidden()
+                    await operator
+                    await self._all_hidden()
+                    await self._guard()
+        finally:
+            operator.cancel()
+            await asyncio.gather(operator, return_exceptions=True)
+        self.event("the net is ended, and all nodes with it")
+        await placer.stop(NET, wait=5.0)
+
+    async def _all_hidden(self) -> None:
+        while len(self.seen.hidden) < len(self.robots):
+            self._news.clear()
+            await self._news.wait()
+
+    async def _guard(self) -> None:
+        """For a while, and until something was alerted."""
+        alerts = self.seen.alerts
+        least, most = (seconds / self.speed for seconds in GUARDS)
+        await asyncio.sleep(least)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(most - least):
+                while self.seen.alerts == alerts:
+                    self._news.clear()
+                    await self._news.wait()
+
+    async def _operator(self, client: Client) -> None:
+        """In the middle of it, a human takes one robot, drives it about and gives it back."""
+        await asyncio.sleep(TAKEOVER / self.speed)
+        robot = next((one for one in self.robots if self.seen.doing.get(one) not in (None, "wait")), self.robots[0])
+        pilot = Pilot(0.5)
+        teleop = Teleop(client, RobotNeeds(robot), pilot, priority=client.fleet.operator_priority)
+        driving = asyncio.create_task(teleop.run())
+        self.seen.taken = self.driven = robot
+        self.event(f"an operator takes {robot}")
+        try:
+            end = clock.now() + round(DRIVES / self.speed * SECOND)
+            while clock.now() < end:
+                for way, seconds in PATROL:
+                    until = clock.now() + round(seconds / self.speed * SECOND)
+                    while clock.now() < min(until, end):
+                        # As a terminal repeats a key that is held down.
+                        pilot.press(clock.now() / SECOND, way)
+                        teleop.take()
+                        await asyncio.sleep(0.05)
+            self.seen.takeover = teleop.takeover
+        finally:
+            teleop.give_back()
+            self.driven = None
+            self._returned_at = clock.now()
+            self.event(f"the operator gives {robot} back")
+            driving.cancel()
+            await asyncio.gather(driving, return_exceptions=True)
+
+    # Starting
+
+    async def _start(self) -> Client:
+        """Starts the building and the nodes, and waits until all are there."""
+        self.write_fleet()
+        (port,) = free_ports(1)
+        line = self.folder / "radio0"
+        await self.start(
+            BUILDING,
+            [
+                *("-m", "zscout.cli.main", "simulate", self.building, "--mesh", "--json"),
+                *("--seed", str(self.seed), "--speed", f"{self.speed:g}", "--baud", str(BAUD)),
+                *("--http", f"127.0.0.1:{port}", "--radio", str(line), "--loss", "0.02"),
+            ],
+        )
+        await self.start_nodes(self._devices(port, line))
+        client = self._client = await Client.connect("demo", fleet=self.fleet(), host="operator")
+        mesh, keys = client.mesh, client.mesh.keys
+        mesh.subscribe(keys.behavior_any, BehaviorSaid, self._on_behavior)
+        mesh.subscribe(keys.grants, Grants, self._on_grants)
+        mesh.subscribe(keys.building_poses_any, BuildingPoses, self._on_poses)
+        grabbers = [framegrabber_name(number) for number in range(1, FRAMEGRABBERS + 1)]
+        there = self.all_there(mesh, *HOSTS, *self.robots, RADIO, *grabbers)
+        await self.within(START, there, "the nodes, robots and cameras were not all there")
+        return client
+
+    def _devices(self, port: int, line: Path) -> dict[str, str]:
+        """The devices' part of the node files, by host: radio and channels on the first, robots on the
+        second, framegrabbers on first and third."""
+        tables = device_tables(
+            port=str(line),
+            baud=BAUD,
+            bound=BOUND,
+            robots=self._ids,
+            urls=[f"http://127.0.0.1:{port}/ch{number}" for number in range(1, FRAMEGRABBERS + 1)],
+            warm_up=WARM_UP / self.speed,
+            rate=FRAME_RATE * self.speed,
+            framegrabbers=FRAMEGRABBERS,
+        )
+        first, second, third = HOSTS
+        return {
+            first: "".join([tables.radio, *tables.videos, tables.framegrabbers[0]]),
+            second: "".join(tables.robots),
+            third: "".join(tables.framegrabbers[1:]),
+        }
+
+    async def close(self) -> None:
+        if self._client is not None:
+            await self._client.close()
+
+    # What is seen
+
+    def _on_behavior(self, _key: str, status: BehaviorSaid) -> None:
+        if status.robot not in self.robots or not status.path.startswith(f"{NET}/"):
+            return
+        now, seen, robot = clock.now(), self.seen, status.robot
+        before = seen.doing.get(robot)
+        if status.doing == "wait":
+            self._waiting.setdefault(robot, now)
+        elif robot in self._waiting:
+            seen.waits.append((now - self._waiting.pop(robot)) / SECOND)
+            if robot == seen.taken and self._returned_at is not None and seen.resumed_after is None:
+                seen.resumed_after = (now - self._returned_at) / SECOND
+                self.event(f"{robot} goes on: {status.doing}")
+        if status.doing:
+            seen.doing[robot] = status.doing
+        (seen.watching.add if status.doing in WATCHING else seen.watching.discard)(robot)
+        if status.doing in WATCHING | {"hidden"} and robot not in seen.hidden:
+            seen.hidden.add(robot)
+            found = status.detail.removeprefix("hidden: ") if status.doing == "hidden" else ""
+            self.event(f"{robot} is hidden" + (f": {found}" if found else ""))
+        elif status.doing not in HIDDEN | {"wait", ""} and robot in seen.hidden:
+            seen.hidden.discard(robot)
+            self.event(f"{robot} is not hidden any more")
+        if len(seen.hidden) == len(self.robots) and seen.placed_at is None:
+            seen.placed_at = self.elapsed()
+            self.event("all robots are hidden")
+        if status.alert:
+            seen.alerts += 1
+            self.event(f"ALERT: {robot} sees {status.detail}")
+        elif status.doing != before and status.doing not in WATCHING | {"", "wait", "hidden"}:
+            self.event(f"{robot} {status.doing}" + (f": {status.detail}" if status.detail else ""))
+        self._news.set()
+
+    def _on_grants(self, _key: str, grants: Grants) -> None:
+        for revoked in grants.revoked:
+            if revoked.outcome == "preempted":
+                self.seen.preemptions += 1
+                self.event(f"{revoked.arc} is {revoked.reason}")
+            self.seen.turns += revoked.outcome == "completed"
+        self.seen.grants += len({holder.grant for holders in grants.rcs.values() for holder in holders})
+
+    def _on_poses(self, _key: str, poses: BuildingPoses) -> None:
+        self.seen.simulated = poses.time
+        self.seen.truly = {f"robot/{one.name}" for one in poses.robots if one.hidden} & set(self.robots)

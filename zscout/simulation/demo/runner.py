@@ -1,0 +1,244 @@
+"""What all demos share: nodes in a fleet of their own, watched, recorded, and ended with whoever started them."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+from zscout.behaviors.launch import LAUNCH
+from zscout.config.fleet import Fleet, load_fleet
+from zscout.keyexpr import Role, Token, new_instance
+from zscout.mesh import Mesh, Supervisor, clock
+from zscout.simulation import DemoFailed
+from zscout.types import SECOND, Ns
+
+HOSTS: Final = ("anvil", "bellows", "crucible")
+RECORDS: Final = "crucible"
+"""The host whose node records."""
+RECORDINGS: Final = "recordings"
+"""The folder of its recording, below the demo's."""
+BUILDING: Final = "building"
+"""The process that simulates one, where there is one."""
+GRACE: Final = 45.0
+"""Seconds for the processes to end in order, the recording finished."""
+LIVE: Final = 40.0
+"""Seconds within which the recorder has begun."""
+MAX_LINE: Final = 65_536
+SHOWN: Final = 600
+"""Characters of a log that explain a failure."""
+
+
+class DemoRunner(ABC):
+    """One run of a demo, whose `play` says what happens. Use as an async context manager: no process is left
+    afterwards.
+
+    `show(at, text)` gets each event in words, `at` in seconds since `zero`."""
+
+    def __init__(self, folder: Path, show: Callable[[float, str], None]) -> None:
+        self.folder = folder
+        self.zero: Ns | None = None
+        """When what is shown began."""
+        self._fleet_file = folder / "fleet.toml"
+        self._show = show
+        self._failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        """Has an exception once a process ended that should not have."""
+        self._processes: dict[str, asyncio.subprocess.Process] = {}
+        self._supervisor = Supervisor("the demo", self._fail)
+        self._ending = False
+        self._ends: dict[str, str] = {}
+        """Where each host's node listens."""
+        self._live = 0
+        """The port of the recorder's live view."""
+        self.on_live: Callable[[str], Awaitable[None]] | None = None
+        """Gets the address of the live view before anything is shown."""
+
+    @abstractmethod
+    async def play(self) -> None:
+        """Starts what the demo needs, and plays it to its end. Raises DemoFailed, MeshError, BadInput."""
+
+    @abstractmethod
+    async def close(self) -> None:
+        """Leaves the mesh, before the processes end."""
+
+    async def run(self) -> None:
+        """Plays the demo. Raises what `play` raises, and DemoFailed as soon as a process ends that should not."""
+        task = asyncio.ensure_future(self.play())
+        try:
+            await asyncio.wait({task, self._failed}, return_when=asyncio.FIRST_COMPLETED)
+            if self._failed.done():
+                self._failed.result()
+            await task
+        finally:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+    def event(self, text: str, at: Ns | None = None) -> None:
+        """Shows what happened `at` (default: now)."""
+        self._show(self.elapsed(at), text)
+
+    def elapsed(self, at: Ns | None = None) -> float:
+        """Seconds since `zero`, 0 before."""
+        return ((clock.now() if at is None else at) - self.zero) / SECOND if self.zero is not None else 0.0
+
+    def fleet(self) -> Fleet:
+        """The fleet of the demo's nodes."""
+        return load_fleet(self._fleet_file)
+
+    def write_fleet(self) -> None:
+        """Writes the fleet file, for those who begin before the nodes."""
+        *ports, self._live = free_ports(len(HOSTS) + 1)
+        self._ends = {host: f"tcp/127.0.0.1:{port}" for host, port in zip(HOSTS, ports, strict=True)}
+        self._fleet_file.write_text(
+            f'[fleet]\nname = "demo-{new_instance()}"\ncandidates = {_list(HOSTS)}\n'
+            '[mesh]\nmulticast = false\nlease = 5\nlisten = ["tcp/127.0.0.1:0"]\n'
+            f"connect = {_list(list(self._ends.values()))}\n"
+            # Nobody fails here unnoticed, and a process of a busy machine may not run for a second.
+            "[timing]\nhold_lease = 10\n"
+        )
+
+    async def start_nodes(self, extra: Mapping[str, str], node_table: str = "") -> None:
+        """Starts a node on each of HOSTS, in a fleet of their own on this machine's loopback: `extra` is more
+        text for the node file of a host, `node_table` more lines of its [node] table."""
+        if not self._ends:
+            self.write_fleet()
+        for host, end in self._ends.items():
+            others = [other for other in self._ends.values() if other != end]
+            text = f'[node]\nhost = "{host}"\nfleet = "fleet.toml"\n{node_table}'
+            text += f'[mesh]\nlisten = ["{end}"]\nconnect = {_list(others)}\n'
+            if host == RECORDS:
+                text += f'[recorder]\npath = "{RECORDINGS}"\nport = {self._live}\n'
+            file = self.folder / f"{host}.toml"
+            file.write_text(text + extra.get(host, ""))
+            # The launcher has the kernel end the node with this process, however that may end.
+            node = [*LAUNCH[1:], str(os.getpid()), sys.executable, "-m", "zscout.node", str(file)]
+            await self.start(f"node {host}", node)
+        if self.on_live is not None:
+            await self.within(LIVE, self._served(), "the recorder did not begin")
+            await self.on_live(f"rerun+http://127.0.0.1:{self._live}/proxy")
+
+    async def _served(self) -> None:
+        """Returns once the live view answers."""
+        while True:
+            with suppress(OSError):
+                _, writer = await asyncio.open_connection("127.0.0.1", self._live)
+                writer.close()
+                return
+            await asyncio.sleep(0.1)
+
+    async def start(self, name: str, arguments: Sequence[str], *, piped: bool = False) -> asyncio.subprocess.Process:
+        """Starts a Python process; one that is `piped` talks through pipes, else its output is logged."""
+        with self._log(name).open("wb") as log:
+            process = await asyncio.create_subprocess_exec(
+                sys.executable,
+                *arguments,
+                stdin=asyncio.subprocess.PIPE if piped else asyncio.subprocess.DEVNULL,
+                stdout=asyncio.subprocess.PIPE if piped else log,
+                stderr=log,
+                env=os.environ | {"ZSCOUT_FLEET": str(self._fleet_file)},
+                # Ctrl-C is for this process alone, which then ends the others in their order.
+                start_new_session=True,
+                limit=MAX_LINE,
+            )
+        self._processes[name] = process
+        self._supervisor.spawn(self._watch_end(name, process))
+        return process
+
+    def spawn(self, work: Coroutine[Any, Any, None]) -> None:
+        """Runs `work` beside the demo, which fails with it."""
+        self._supervisor.spawn(work)
+
+    async def all_there(self, mesh: Mesh, *others: str) -> None:
+        """Waits for the tokens of an RCM, the recorder, and `others`: hosts of nodes, names of RCs."""
+        missing, complete = {Role.RCM, Role.RECORDER, *others}, asyncio.Event()
+
+        def seen(token: Token, alive: bool) -> None:
+            if alive:
+                # By role: the session of a recorder that has read nothing yet is named like one.
+                missing.difference_update((token.role, {Role.NODE: token.host, Role.RC: token.name}.get(token.role)))
+            if not missing:
+                complete.set()
+
+        watch = mesh.watch(mesh.keys.alive_any(), seen)
+        await complete.wait()
+        watch.close()
+
+    async def within(self, seconds: float, what: Awaitable[object], otherwise: str) -> None:
+        """Waits for `what`. Raises DemoFailed with what the logs say, if it takes longer than `seconds`."""
+        try:
+            async with asyncio.timeout(seconds):
+                await what
+        except TimeoutError:
+            logs = (self._log(name).read_text(errors="replace").strip() for name in self._processes)
+            words = next((log for log in logs if "ERROR" in log or "WARN" in log), "")[-SHOWN:]
+            raise DemoFailed(f"{otherwise} in time; {words or 'is this machine very busy? try again'}") from None
+
+    async def _watch_end(self, name: str, process: asyncio.subprocess.Process) -> None:
+        code = await process.wait()
+        early = bool(code) or name.startswith("node ")
+        if early and not self._ending:
+            words = self._log(name).read_text(errors="replace").strip()[-SHOWN:]
+            self._fail(DemoFailed(f"{name} ended with code {code}: {words or 'it printed nothing'}"))
+
+    def _fail(self, error: Exception) -> None:
+        if not self._failed.done():
+            self._failed.set_exception(error)
+
+    def _log(self, name: str) -> Path:
+        return self.folder / f"{name.replace(' ', '-')}.log"
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._ending = True
+        try:
+            await self.close()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(GRACE):
+                    await self._end()
+        finally:
+            for process in self._processes.values():
+                if process.returncode is None:
+                    process.kill()
+        await asyncio.gather(*(process.wait() for process in self._processes.values()))
+        await self._supervisor.close()
+        self._failed.cancel()
+
+    async def _end(self) -> None:
+        """The node that records goes first, so that the end of the others is not recorded. The building of
+        their devices, which does not end with its input, goes last."""
+        for process in self._processes.values():
+            if process.stdin is not None:
+                process.stdin.close()
+        nodes = [process for name, process in self._processes.items() if name.startswith("node ")]
+        recording = self._processes.get(f"node {RECORDS}")
+        for process in sorted(nodes, key=lambda process: process is not recording):
+            if process.returncode is None:
+                process.terminate()
+            if process is recording:
+                await process.wait()
+        building = self._processes.get(BUILDING)
+        if building is not None and building.returncode is None:
+            building.terminate()
+        await asyncio.gather(*(process.wait() for process in self._processes.values()))
+
+
+def _list(texts: Sequence[str]) -> str:
+    return "[" + ", ".join(f'"{text}"' for text in texts) + "]"
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports that nobody has at this moment, all different."""
+    with ExitStack() as stack:
+        servers = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
+        return [int(server.getsockname()[1]) for server in servers]
