@@ -10,6 +10,8 @@ import tempfile
 import pytest
 from hypothesis import settings
 
+pytest_plugins = ["tests.tiers"]
+
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
 
