@@ -1,8 +1,8 @@
 """The tiers of the suite, as a pytest plugin: what a test costs, and which tier it belongs to.
 
-`slow`: over 1 s of processor time, or over 5 s of waiting (a live test: 3 s). `make test` leaves these out, but for those
-that are `essential`, which may take 3 s of processor time. A test that starts a process is `live`. A run names each
-test above the bound of its tier, and counts what it left out.
+`slow`: over 1 s of processor time, or over 5 s of waiting (a live test: 3 s); `make test` leaves these out. An
+`essential` test is not left out, and may take 3 s of processor time. A test that starts a process is `live`. A run
+names each test above the bound of its tier, and counts what it left out.
 """
 
 from __future__ import annotations
