@@ -6,11 +6,12 @@ READY := $(VENV)/.ready
 PEERS := .venv-peers
 PEERS_READY := $(PEERS)/.ready
 
-.PHONY: help setup demo test docs lint bench bench-peers model install-check chaos soak lock clean
+.PHONY: help setup demo test test-all docs lint bench bench-peers model install-check chaos soak lock clean
 
 help:
 	@echo "make demo   four robots in a simulated building hide and watch, on a live mesh"
-	@echo "make test   all tests"
+	@echo "make test   the quick tests, under four minutes on two cores"
+	@echo "make test-all   all tests, some 15 minutes"
 	@echo "make docs   the documentation as a site, in site/"
 	@echo "make lint   formatting, linting, strict types, the rooms' contracts, links of the docs"
 	@echo "make install-check   the wheel in clean environments, by pip, pipx and uv, and the light installation"
@@ -32,8 +33,12 @@ setup: $(READY)
 demo: $(READY)
 	$(BIN)/zscout demo
 
+PYTEST := $(BIN)/python -m pytest -q -n 3 --dist worksteal
 test: $(READY)
-	$(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder
+	$(PYTEST) -m "not slow"
+
+test-all: $(READY)
+	$(PYTEST)
 
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet

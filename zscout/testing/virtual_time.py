@@ -9,6 +9,7 @@ and a source of randomness of its own. It can stand still, and die without runni
 from __future__ import annotations
 
 import asyncio
+import functools
 import heapq
 import random
 import selectors
@@ -16,10 +17,11 @@ import weakref
 from collections.abc import Callable, Coroutine
 from contextlib import suppress
 from contextvars import Context, ContextVar, copy_context
-from typing import Any, Final, TypeVar
+from typing import Any, Final, ParamSpec, TypeVar
 
 from zscout.keyexpr import RANDOM
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 MANY_TIMERS: Final = 100
@@ -272,3 +274,13 @@ def run(coro: Coroutine[Any, Any, T]) -> T:
     """`asyncio.run` in virtual time."""
     with asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
         return runner.run(coro)
+
+
+def in_virtual_time(test: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
+    """Make an ordinary function of an async one, such as a test: each call runs it in virtual time."""
+
+    @functools.wraps(test)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        return run(test(*args, **kwargs))
+
+    return call
