@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -30,13 +31,14 @@ def test_an_example_of_the_how_to(number: int, tmp_path: Path) -> None:
     assert run(blocks("how-to/test-your-code.md")[number], {}, tmp_path) == 1
 
 
-def test_the_lamp_of_the_tutorial(tmp_path: Path) -> None:
+def test_the_lamp_of_the_tutorial(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     driver, test = (
         next(code for code in blocks("tutorial-device.md") if code.startswith(f"# {name}"))
         for name in ("lamp/lamp.py", "test_lamp.py")
     )
-    names: dict[str, Any] = {"__name__": "lamp"}
-    assert run(driver, names, tmp_path) == 0
-    assert run(test.replace("from lamp import Lamp\n", ""), names, tmp_path) == 1
-    lines = test.partition("@in_virtual_time")[2].split("async def")[1].strip().splitlines()
-    assert len(lines) <= 10
+    (tmp_path / "lamp.py").write_text(driver)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert run(test, {}, tmp_path) == 1
+    monkeypatch.delitem(sys.modules, "lamp")
+    body = test.partition("@in_virtual_time")[2].split("(tmp_path):\n")[1]
+    assert len(body.strip().splitlines()) <= 10
