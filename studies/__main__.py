@@ -32,6 +32,8 @@ STUDIES: Final[dict[str, Study]] = {
     "watching": Study("watching:main", "How many passers-by does the motion detector report?", "20 min"),
     "cdnet": Study("cdnet:main", "How does the motion detector compare with MOG2 and KNN on CDnet 2014?", "1 min"),
     "faults": Study("faults.commands:faults", "Are all promises kept under faults, in virtual time?", "3 min"),
+    "guards": Study("suite:guards", "Which guards of the protocol does the quick tier of tests notice?", "30 min"),
+    "coverage": Study("suite:coverage", "What do slow tests alone reach?", "40 min"),
     "booking-cost": Study("booking_cost:main", "What does a booking cost beside a bare query?", "1 min"),
     "building": Study("building:main", "What does serving a simulated building cost?", "1 min"),
     "doors": Study("doors:main", "What do certificates cost, and what does a stranger do to an open fleet?", "5 min"),
