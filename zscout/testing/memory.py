@@ -1,8 +1,8 @@
-"""A mesh in memory: many processes' places on one event loop, on a network that fails to order.
+"""A mesh in memory: the sessions of many processes on one event loop, on a network that fails on request.
 
-What it does like Zenoh is what `tests/mesh/both_meshes.py` lets tests try on both. Where a link is blocked for `lease`
-seconds both sides give it up, and see each other's tokens die, until it works again; it may come back without some of
-what was declared (`MemoryNetwork.forgetful`). What happens on the way is `link.py`'s."""
+`tests/mesh/both_meshes.py` tests that it behaves as Zenoh does. When a link was blocked for `lease` seconds, both sides
+drop it and see each other's tokens disappear until it works again; it may come back without some declarations
+(`MemoryNetwork.forgetful`). `link.py` carries the messages."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def intersects(one: str, other: str) -> bool:
 
 
 MAX_KNOWN_KEYS: Final = 1_000
-"""That a session knows its handlers for."""
+"""Keys for which a session caches its handlers."""
 
 
 class MemoryMesh(Mesh):
-    """One process's place on a MemoryNetwork; `network.open(...)` makes it."""
+    """The mesh of one process on a MemoryNetwork; `network.open(...)` makes it."""
 
     _transport: RenewableTransport
 
@@ -50,14 +50,14 @@ def _memory(mesh: Mesh) -> MemoryMesh:
 
 
 def _node(mesh: Mesh) -> MemoryTransport:
-    """Its session of now."""
+    """Return its current session."""
     node = _memory(mesh)._transport.current
     assert isinstance(node, MemoryTransport)  # noqa: S101
     return node
 
 
 class Neighbour(NamedTuple):
-    """A session that another one is linked to, and the link in both directions."""
+    """A linked session, and the link in both directions."""
 
     node: MemoryTransport
     to: MemoryLink
@@ -67,8 +67,8 @@ class Neighbour(NamedTuple):
 class MemoryNetwork:
     """The processes of a fleet, and the links between them.
 
-    All times are seconds. `delay` is that of every link, and `lease` how long a process waits for a silent peer, less
-    up to `impatience` of it. A link that was lost stands again up to `relink` after it could."""
+    All times are in seconds. `delay`: of every link. `lease`: how long a process waits for a silent peer, less a random
+    part of it, `impatience` at most. `relink`: the longest time from when a lost link could work until it does."""
 
     def __init__(
         self, *, delay: float = 0.0002, lease: float = 1.0, impatience: float = 0.0, relink: float = 0.0, seed: int = 0
@@ -78,13 +78,14 @@ class MemoryNetwork:
         self.nodes: list[MemoryTransport] = []
         self.trace: Trace | None = None
         self.forgetful = 0.0
-        """How likely each declaration stays unknown to a peer whose link comes back, until it is lost again."""
+        """Probability that a declaration stays unknown to a peer whose link comes back, until the link is lost
+        again."""
         self.twice: Collection[str] = ()
         """Kinds of queries that arrive twice, as over two relays."""
         self.links: dict[tuple[MemoryTransport, MemoryTransport], MemoryLink] = {}
-        """Of all that live, those with themselves included; a new one is made when it is first needed."""
+        """Links of all living sessions, each with itself included; made on first use."""
         self._linked: dict[MemoryTransport, list[Neighbour]] = {}
-        """As `linked` tells it, until any link changes."""
+        """Cache of `linked`, cleared when any link changes."""
         self._ids = itertools.count(1)
         self._is_cut: Callable[[str, str], bool] = lambda _one, _other: False
         self._disturbed: Mapping[str, Disturbance] = {}
@@ -102,7 +103,7 @@ class MemoryNetwork:
         return node
 
     def _sessions(self, mesh: Mesh) -> list[MemoryTransport]:
-        """Of its process: two, while it joins anew."""
+        """Return the sessions of its process: two while it reopens its session."""
         now = _node(mesh)
         mine = [node for node in self.nodes if node.process is now.process]
         return [now] if now.process is None else mine
@@ -111,7 +112,7 @@ class MemoryNetwork:
         return self._session()
 
     def cut_where(self, is_cut: Callable[[str, str], bool]) -> None:
-        """Of all links, those of sessions to come included, those are cut for which that is true of the names of both
+        """Cut each link, also of later sessions, for which `is_cut(source, target)` is true of the names of its
         processes."""
         self._is_cut = is_cut
         for link in self.links.values():
@@ -119,23 +120,23 @@ class MemoryNetwork:
         self._changed()
 
     def disturb(self, disturbed: Mapping[str, Disturbance]) -> None:
-        """From now on, on all links but those of a session with itself."""
+        """Disturb kinds of messages from now on, on all links but those of a session with itself."""
         self._disturbed = disturbed
         for link in self.links.values():
             link.disturbed = {} if link.source is link.target else disturbed
             link.answers.clear()
 
     def link(self, source: Mesh, target: Mesh) -> MemoryLink:
-        """What carries messages from `source` to `target`: its delays and losses may be set."""
+        """Return the link from `source` to `target`; its delay, jitter and loss may be set."""
         return self.between(_node(source), _node(target))
 
     def cut(self, source: Mesh, target: Mesh) -> None:
-        """Nothing passes from `source` to `target` any more, until `heal`."""
+        """Block the link from `source` to `target` until `heal`."""
         self.link(source, target).cut = True
         self._changed()
 
     def isolate(self, mesh: Mesh) -> None:
-        """Cuts all links of `mesh`, in both directions."""
+        """Cut all links of `mesh` in both directions."""
         node = _node(mesh)
         for link in self.links.values():
             if node in (link.source, link.target) and link.source is not link.target:
@@ -143,14 +144,14 @@ class MemoryNetwork:
         self._changed()
 
     def heal(self) -> None:
-        """All links work again."""
+        """Unblock all links."""
         self._is_cut = lambda _one, _other: False
         for link in self.links.values():
             link.cut = False
         self._changed()
 
     def freeze(self, mesh: Mesh) -> None:
-        """Nothing reaches or leaves `mesh` until `thaw`: what arrives waits. Its process stands still."""
+        """Freeze the process of `mesh` until `thaw`: nothing reaches or leaves it, messages wait."""
         for node in self._sessions(mesh):
             node.frozen = True
             if node.process is not None:
@@ -165,8 +166,8 @@ class MemoryNetwork:
         self._changed()
 
     def kill(self, mesh: Mesh, reached: MemoryTransport | None = None) -> None:
-        """As though its process was killed: of what is under way on each of its links some may not have left it, and
-        the rest arrives, then its tokens die. `reached`: all that is under way to that one arrives, and no more."""
+        """Kill the process of `mesh`. On each of its links a random number of the messages under way still arrives,
+        then its tokens disappear. `reached`: all messages to that session arrive, and none to others."""
         self.thaw(mesh)
         _memory(mesh)._inbox.close()
         for node in self._sessions(mesh):
@@ -176,12 +177,12 @@ class MemoryNetwork:
             node.leave()
 
     def after_sending(self, mesh: Mesh, kind: str, then: Callable[[MemoryTransport], None] | None) -> None:
-        """Calls `then` once, as soon as `mesh` has sent a message of that kind, an operation or its answer, to another
-        process: with that one's session."""
+        """Call `then` once with the receiving session, as soon as `mesh` has sent a message of that kind, an operation
+        or its answer to another process."""
         _node(mesh).after = None if then is None else (kind, then)
 
     def remove(self, node: MemoryTransport) -> None:
-        # What is under way is kept by the timers of its links; over one that is blocked nothing comes any more.
+        # Timers of the links keep the messages under way; a blocked link delivers nothing more.
         for link in self.links.values():
             if link.source is node and link.blocked:
                 link.call_in(self.lease, link.target.call, link.target.disconnected, node)
@@ -201,14 +202,14 @@ class MemoryNetwork:
         return link
 
     def linked(self, node: MemoryTransport) -> list[Neighbour]:
-        """The sessions that one is linked to, itself included."""
+        """Return the sessions that `node` is linked to, itself included."""
         if (linked := self._linked.get(node)) is None:
             everybody = [Neighbour(one, self.between(node, one), self.between(one, node)) for one in self.nodes]
             linked = self._linked[node] = [one for one in everybody if not one.to.lost]
         return linked
 
     def match(self) -> None:
-        """Tells publishers that follow their subscribers of changes."""
+        """Notify publishers that follow their subscribers of changes."""
         for node in self.nodes:
             for publisher in node.followed:
                 publisher.update()
@@ -285,13 +286,13 @@ class MemoryTransport(Transport):
         self._watchers: _Declared[Callable[[str, bool], None]] = _Declared()
         self._gets: dict[_Get, None] = {}
         self._alive: dict[MemoryTransport, list[str]] = {}
-        """Tokens that are known here, by the process that declared them."""
+        """Tokens known here, by the session that declared them."""
         self._lives: Counter[str] = Counter()
-        """How often each of them is known."""
+        """Number of declarations of each token."""
         self._id = f"{number:x}"
 
     def call(self, f: Callable[..., None], *args: Any) -> None:
-        """Calls `f` as code of this process."""
+        """Call `f` as code of this process."""
         if self.process is None:
             f(*args)
         elif not self.process.dead:
@@ -375,7 +376,7 @@ class MemoryTransport(Transport):
                 one[1](key, payload, attachment)
 
     def subscribes(self, key: str, to: MemoryLink) -> bool:
-        """Whether the process that this link leads to knows that."""
+        """Return True if the process at the end of this link knows of a subscriber to `key` here."""
         return any(one not in to.hidden for one in self.subscribers.matching(key))
 
     def subscriber(self, key: str, on_sample: OnSample) -> Undeclare:
@@ -587,7 +588,7 @@ class _Declared(Generic[H]):
         return remove
 
     def matching(self, key: str) -> list[tuple[str, H]]:
-        """Those whose key expression intersects `key`: a list that does not change."""
+        """Return the handlers whose key expression intersects `key`; the list does not change."""
         if (found := self._matching.get(key)) is None:
             if len(self._matching) >= MAX_KNOWN_KEYS:  # of programs that are gone, most of them
                 self._matching.clear()

@@ -1,10 +1,10 @@
 """An asyncio event loop whose time jumps to the next timer when nothing is left to do, and processes on it.
 
-The idea is that of trio's MockClock. For what runs in one process without sockets and subprocesses, such as
-services on a mesh in memory: an hour of theirs passes in milliseconds, always in the same order.
+After trio's MockClock. For code that runs in one process without sockets and subprocesses, such as services on a mesh
+in memory: it waits for nothing, and runs in the same order every time.
 
-A `Process` stands for a process of the operating system: whatever is begun in its context belongs to it, with a clock
-and a source of randomness of its own. It can stand still, and die without running another line."""
+A `Process` represents a process of the operating system: tasks started in its context belong to it, with a clock and a
+source of randomness of its own. It can freeze, and die without running another line."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 MANY_TIMERS: Final = 100
-"""Above so many, those that are cancelled are looked for when they are half of them."""
+"""Number of timers above which cancelled ones are removed as soon as they are half of them."""
 
 START = 1_000.0
 """The time at which a loop starts, in seconds: not zero, which often stands for "never"."""
 
 PROCESS: Final[ContextVar[Process | None]] = ContextVar("PROCESS", default=None)
-"""Whose code runs; None: that of the simulation itself, or there are no processes."""
+"""The process whose code runs; None: the simulation itself, or there are no processes."""
 
 
 class Deadlock(RuntimeError):
-    """No task can go on, and no timer is left that would wake one."""
+    """No task can continue, and no timer is left that would wake a task."""
 
 
 class Process:
@@ -44,7 +44,7 @@ class Process:
     def __init__(self, name: str, *, seed: object = 0, rate: float = 1.0, boot: float = 0.0) -> None:
         self.name, self.rate, self.boot = name, rate, boot
         self.stopped = False
-        """Whether it stands still: what falls due waits until it goes on."""
+        """True while it is frozen: callbacks that fall due wait until `go_on`."""
         self.dead = False
         self.main: asyncio.Task[None] | None = None
         self._parked: list[asyncio.Handle] = []
@@ -59,7 +59,7 @@ class Process:
         return self._context.copy().run(f, *args)
 
     def local(self, time: float) -> float:
-        """What this process's clock shows at a virtual time."""
+        """Return the reading of this process's clock at a virtual time."""
         return self.boot + (time - START) * self.rate
 
     def virtual(self, local: float) -> float:
@@ -69,14 +69,14 @@ class Process:
         self.stopped = True
 
     def go_on(self) -> None:
-        """What fell due meanwhile is done now, in its order."""
+        """Unfreeze: run the callbacks that fell due meanwhile, in their order."""
         self.stopped = False
         parked, self._parked = self._parked, []
         for handle in parked:
             handle._loop._ready.append(handle)  # type: ignore[attr-defined]
 
     def kill(self) -> None:
-        """Nothing of it runs any more, not even what would clean up."""
+        """Kill it: none of its code runs any more, not even clean-up."""
         self.dead = True
         self._parked.clear()
         for _, task in sorted(self._tasks.items()):
