@@ -26,7 +26,7 @@ import zenoh
 from benchmarks import bare
 from benchmarks.child import Child, child
 from benchmarks.loop import run
-from benchmarks.stats import Row, Samples
+from benchmarks.stats import Samples
 from tests.hang import HANG
 from tests.live.lab import Lab
 from zscout import messages
@@ -172,31 +172,6 @@ async def measure(folder: Path, hosts: int, quiet: float = QUIET, asked: float =
         sent=sent,
         missed=sent - heard,
     )
-
-
-async def rows_of_thousand(folder: Path) -> list[Row]:
-    """Rows for 1,000 hosts."""
-    return rows(await measure(folder, 1_000, quiet=3.0, asked=5.0))
-
-
-def rows(found: Figures) -> list[Row]:
-    name = f"{found.hosts:,} hosts"
-    against = "bare query"
-    return [
-        Row(
-            f"{name}: balancer's answer",
-            found.answer * 1e6,
-            "us",
-            found.answer_p99 * 1e6,
-            found.ratio,
-            against,
-            END,
-            rounds=found.rounds,
-        ),
-        Row(f"{name}: CPU of the node that leads", found.cpu * 100, "% of a core"),
-        Row(f"{name}: its RSS", found.memory / MEGA, "MB", aim=80.0),
-        Row(f"{name}: reports missed of {found.sent:,}", found.missed, "", aim=0.0),
-    ]
 
 
 def table(all_found: list[Figures]) -> str:

@@ -26,7 +26,6 @@ from zscout.config.strict import BadInput
 
 ENDING: Final = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 MAX_PROCESSES: Final = 256
-REMEDY: Final = "use fewer with --jobs 1"
 
 J = TypeVar("J")
 A = TypeVar("A")
