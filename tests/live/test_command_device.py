@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from pathlib import Path
 
 import pytest
@@ -22,25 +21,21 @@ timeout = 100
 """
 
 
-def test_a_slow_start_is_waited_for_and_told_of(tmp_path: Path) -> None:
+async def test_a_slow_start_is_waited_for_and_told_of(tmp_path: Path) -> None:
     told = tmp_path / "told"
-
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("small", extra=TABLE % {"told": told})
-            await lab.ready(await lab.client("crew"), "psu/bench")
-            program = ("--", "sh", "-c", f"echo enter >> {told}")
-            held = await lab.zscout("request", "psu/bench:voltage=12", *program)
-            assert held.returncode == 0, held.stderr
-            assert told.read_text().splitlines()[:2] == ['{"voltage": 12.0}', "enter"]
-            assert "and waits: psu/bench is being started, for " in held.stderr
-            for asked, why in (
-                ("psu/bench:voltage=31", "can never start: voltage 31 of 30 at psu/bench"),
-                ("psu/bench:current=1", "psu/bench knows no parameter current; it knows voltage"),
-            ):
-                refused = await lab.zscout("request", asked, *program)
-                assert refused.returncode == 2
-                assert why in refused.stderr
-            assert told.read_text().split().count("enter") == 1
-
-    asyncio.run(story())
+    async with Lab(tmp_path) as lab:
+        lab.node("small", extra=TABLE % {"told": told})
+        await lab.ready(await lab.client("crew"), "psu/bench")
+        program = ("--", "sh", "-c", f"echo enter >> {told}")
+        held = await lab.zscout("request", "psu/bench:voltage=12", *program)
+        assert held.returncode == 0, held.stderr
+        assert told.read_text().splitlines()[:2] == ['{"voltage": 12.0}', "enter"]
+        assert "and waits: psu/bench is being started, for " in held.stderr
+        for asked, why in (
+            ("psu/bench:voltage=31", "can never start: voltage 31 of 30 at psu/bench"),
+            ("psu/bench:current=1", "psu/bench knows no parameter current; it knows voltage"),
+        ):
+            refused = await lab.zscout("request", asked, *program)
+            assert refused.returncode == 2
+            assert why in refused.stderr
+        assert told.read_text().split().count("enter") == 1

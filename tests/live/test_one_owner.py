@@ -41,46 +41,41 @@ async def answers(client: Client, grant: Grant) -> list[Any]:
     return [reply.message.result if reply.message is not None else reply.problem for reply in replies]
 
 
-def test_the_one_that_is_not_named_obeys_nothing_and_says_so(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path, candidates=("boss", "heir")) as lab:
-            lab.node("boss")
-            lab.node("heir")
-            # Not the lesser name: it is meant because it came first, not by its host.
-            lab.node("ws2", RC, extra="candidate = false")
-            client = await lab.client()
-            await lab.ready(client, RC)
-            lab.node("ws1", RC, extra="candidate = false")
-            await lab.logged("ws1", "robot/arm stands by: duplicate of robot/arm at ws2")
-            arc = await client.request("work", {RC: {}}, min_runtime=600)
-            grant = await client.granted(arc, confirmed=True)
-            assert grant is not None
-            assert [await answers(client, grant) for _ in range(20)] == [[1]] * 20
+async def test_the_one_that_is_not_named_obeys_nothing_and_says_so(tmp_path: Path) -> None:
+    async with Lab(tmp_path, candidates=("boss", "heir")) as lab:
+        lab.node("boss")
+        lab.node("heir")
+        # Not the lesser name: it is meant because it came first, not by its host.
+        lab.node("ws2", RC, extra="candidate = false")
+        client = await lab.client()
+        await lab.ready(client, RC)
+        lab.node("ws1", RC, extra="candidate = false")
+        await lab.logged("ws1", "robot/arm stands by: duplicate of robot/arm at ws2")
+        arc = await client.request("work", {RC: {}}, min_runtime=600)
+        grant = await client.granted(arc, confirmed=True)
+        assert grant is not None
+        assert [await answers(client, grant) for _ in range(20)] == [[1]] * 20
 
-            await lab.state(client, lambda state: [view.duplicates for view in state.rcs] == [["ws1"]])
-            plain = await lab.zscout("status")
-            (row,) = section(plain.stdout, "RCs")
-            assert row[:4] == [RC, "exclusive", "held", "ws2"]
-            assert [row[:2] for row in section(plain.stdout, "Devices")] == [
-                [RC, "at ws1: duplicate of robot/arm at ws2"]
-            ]
+        await lab.state(client, lambda state: [view.duplicates for view in state.rcs] == [["ws1"]])
+        plain = await lab.zscout("status")
+        (row,) = section(plain.stdout, "RCs")
+        assert row[:4] == [RC, "exclusive", "held", "ws2"]
+        assert [row[:2] for row in section(plain.stdout, "Devices")] == [[RC, "at ws1: duplicate of robot/arm at ws2"]]
 
-            # Who leads next has a link to both.
-            await lab.candidates(client, "boss", "heir")
-            before = await lab.state(client, lambda _: True)
-            lab.nodes[before.host].kill()
-            owners = [("ws2", ["ws1"])]
-            await lab.state(
-                client,
-                lambda state: (
-                    state.term > before.term
-                    and bool(state.holds)
-                    and [(view.host, view.duplicates) for view in state.rcs] == owners
-                ),
-            )
-            assert await answers(client, grant) == [1]
-
-    asyncio.run(story())
+        # Who leads next has a link to both.
+        await lab.candidates(client, "boss", "heir")
+        before = await lab.state(client, lambda _: True)
+        lab.nodes[before.host].kill()
+        owners = [("ws2", ["ws1"])]
+        await lab.state(
+            client,
+            lambda state: (
+                state.term > before.term
+                and bool(state.holds)
+                and [(view.host, view.duplicates) for view in state.rcs] == owners
+            ),
+        )
+        assert await answers(client, grant) == [1]
 
 
 class Halves:

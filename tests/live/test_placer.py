@@ -56,11 +56,7 @@ async def host_dies(lab: Lab, host: str) -> int:
     return at
 
 
-def test_placing_is_idempotent_and_stopping_is_for_good(tmp_path: Path) -> None:
-    asyncio.run(_idempotent(tmp_path))
-
-
-async def _idempotent(tmp_path: Path) -> None:
+async def test_placing_is_idempotent_and_stopping_is_for_good(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path) as lab:
         placing = await three(lab)
         first = await placing.place("one", "counter")
@@ -82,11 +78,7 @@ async def _idempotent(tmp_path: Path) -> None:
         assert unknown.code == "unknown_component"
 
 
-def test_what_does_not_start_there_starts_elsewhere_or_is_given_up(tmp_path: Path) -> None:
-    asyncio.run(_elsewhere(tmp_path))
-
-
-async def _elsewhere(tmp_path: Path) -> None:
+async def test_what_does_not_start_there_starts_elsewhere_or_is_given_up(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path, rules="restarts = 2\nback_off = 0.05\n") as lab:
         lab.node("h0", extra="[components]\nallow = false")
         lab.node("h1", extra='[components]\nkinds = ["counter"]')
@@ -117,11 +109,7 @@ async def _elsewhere(tmp_path: Path) -> None:
         assert "period" in badly.reason
 
 
-def test_what_ran_on_a_host_that_dies_runs_elsewhere(tmp_path: Path) -> None:
-    asyncio.run(_host_dies(tmp_path))
-
-
-async def _host_dies(tmp_path: Path) -> None:
+async def test_what_ran_on_a_host_that_dies_runs_elsewhere(tmp_path: Path) -> None:
     # The leader is not the one that dies.
     async with ComponentLab(tmp_path, candidates=["h0"]) as lab, WitnessRc(lab, RC) as rc:
         register(lab)
@@ -149,11 +137,7 @@ async def _host_dies(tmp_path: Path) -> None:
         assert (await placing.until("mortal", lambda one: one.state == "ended")).reason
 
 
-def test_the_leader_dies_with_a_component_and_the_next_placer_knows(tmp_path: Path) -> None:
-    asyncio.run(_leader_dies(tmp_path))
-
-
-async def _leader_dies(tmp_path: Path) -> None:
+async def test_the_leader_dies_with_a_component_and_the_next_placer_knows(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path) as lab:
         placing = await three(lab)
         leader = (await lab.state(placing.client, lambda state: bool(state.host))).host
@@ -174,11 +158,7 @@ async def _leader_dies(tmp_path: Path) -> None:
         assert ended.state == "ended"
 
 
-def test_a_component_that_is_killed_starts_again(tmp_path: Path) -> None:
-    asyncio.run(_restarts(tmp_path))
-
-
-async def _restarts(tmp_path: Path) -> None:
+async def test_a_component_that_is_killed_starts_again(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path, rules="back_off = 0.05\n") as lab:
         placing = await three(lab)
         first = await placing.place("one", "counter")

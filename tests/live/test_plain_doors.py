@@ -92,21 +92,17 @@ async def mad_leader(lab: Lab) -> AsyncIterator[None]:
         beating.cancel()
 
 
-def test_a_fleet_that_began_beside_a_mad_leader_goes_on_once_that_has_left(tmp_path: Path) -> None:
+async def test_a_fleet_that_began_beside_a_mad_leader_goes_on_once_that_has_left(tmp_path: Path) -> None:
     """RCs and RCMs that start then know no better than to believe it."""
-
-    async def story() -> None:
-        async with Lab(tmp_path, lease=1.0) as lab:
-            async with mad_leader(lab):
-                lab.node("a", "robot/a")
-                lab.node("b", "robot/b")
-                client = await lab.client()
-                await lab.candidates(client, "a", "b")
-                await lab.living(client, "rc", lambda found: {"a", "b"} <= set(found))
-                lab.nodes["a"].kill()
-                lab.node("a", "robot/a")
-                await lab.candidates(client, "a", "b")
-            arc = await client.request("survey", {"robot/a": {}, "robot/b": {}}, wait_for_device=True)
-            assert await client.granted(arc)
-
-    asyncio.run(story())
+    async with Lab(tmp_path, lease=1.0) as lab:
+        async with mad_leader(lab):
+            lab.node("a", "robot/a")
+            lab.node("b", "robot/b")
+            client = await lab.client()
+            await lab.candidates(client, "a", "b")
+            await lab.living(client, "rc", lambda found: {"a", "b"} <= set(found))
+            lab.nodes["a"].kill()
+            lab.node("a", "robot/a")
+            await lab.candidates(client, "a", "b")
+        arc = await client.request("survey", {"robot/a": {}, "robot/b": {}}, wait_for_device=True)
+        assert await client.granted(arc)
