@@ -14,7 +14,7 @@ from zscout.behaviors.client.client import Client
 from zscout.keyexpr import Role
 from zscout.messages import HostRanking, RankAsk
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 HOSTS = {"h1", "h2", "h3"}
 

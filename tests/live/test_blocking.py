@@ -60,6 +60,7 @@ def take(fleet: CliFleet, rc: str, *options: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_a_direct_body_clears_up_before_the_next_program_begins(fleet: CliFleet, tmp_path: Path) -> None:
     told = tmp_path / "told"
     text = f"""
@@ -83,6 +84,7 @@ def test_a_direct_body_clears_up_before_the_next_program_begins(fleet: CliFleet,
     assert told.read_text().split() == ["left", "next"]
 
 
+@pytest.mark.slow
 def test_a_direct_body_that_clears_up_for_too_long_is_interrupted_once_more(fleet: CliFleet) -> None:
     text = """
         with zscout.connect() as lab:
@@ -144,6 +146,7 @@ def test_a_body_whose_time_is_over_is_interrupted(fleet: CliFleet, how: str, *, 
     assert (by("true") in told) == waits
 
 
+@pytest.mark.slow
 def test_a_hold_that_had_its_time_by_this_host_s_clock_is_completed_though_no_rcm_says_so_yet(fleet: CliFleet) -> None:
     text = """
         with zscout.connect() as lab:
@@ -322,6 +325,7 @@ def test_who_was_not_told_is_told_at_the_end(fleet: CliFleet) -> None:
     assert rest_of(survey) == ["told preempted"]
 
 
+@pytest.mark.slow
 def test_a_wait_for_the_grant_ends_with_its_timeout_and_says_why(fleet: CliFleet) -> None:
     text = """
         with zscout.connect() as lab:
@@ -339,6 +343,7 @@ def test_a_wait_for_the_grant_ends_with_its_timeout_and_says_why(fleet: CliFleet
     end(blocker)
 
 
+@pytest.mark.slow
 def test_without_an_rcm_it_says_so_and_what_to_do(tmp_path: Path) -> None:
     text = """
         with zscout.connect() as lab:

@@ -19,7 +19,7 @@ from zscout.behaviors.client.client import Client
 from zscout.keyexpr import Role
 from zscout.messages import BookingView
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 BOTH = ("anvil", "bellows")
 SOON = 8.0

@@ -79,6 +79,7 @@ def events(text: bytes) -> list[Event]:
     return calendar.events
 
 
+@pytest.mark.slow
 async def test_a_calendar_in_and_out_and_in_again(tmp_path: Path) -> None:
     async with Lab(tmp_path) as lab:
         port = free_port()

@@ -25,6 +25,7 @@ pytestmark = pytest.mark.live
 SECOND = timedelta(seconds=1)
 
 
+@pytest.mark.essential
 async def test_two_persons_and_a_node_on_one_machine(tmp_path: Path) -> None:
     """Each is known by its own name, whatever its user is called there, and a person's machine by a field."""
     async with ClosedLab(tmp_path) as lab:
@@ -108,6 +109,7 @@ async def test_a_certificate_of_another_name_is_told_before_joining(tmp_path: Pa
             await ZenohMesh.open(lab.fleet_of("mallory"), Sender("mallory", "c1"))
 
 
+@pytest.mark.slow
 async def test_certificates_that_are_renewed_in_place_end_no_hold(tmp_path: Path) -> None:
     """Past the end of those by which all links were made, the hold goes on and a newcomer is let in."""
     async with ClosedLab(tmp_path) as lab:

@@ -8,6 +8,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from tests.behaviors.components.kit import ComponentLab, Hosts, counts, counts_on, gone
 from tests.hang import HANG
 from tests.live.bench import until
@@ -33,6 +35,8 @@ from zscout.messages import (
     ReadOutput,
 )
 
+pytestmark = pytest.mark.live
+
 QUICK: dict[str, Any] = {"period": 0.02}
 
 
@@ -56,6 +60,7 @@ async def move(hosts: Hosts, source: str, target: str, incarnation: int, kind: s
     return moved
 
 
+@pytest.mark.slow
 async def test_a_component_without_arcs_moves_there_and_back_and_counts_on(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path) as lab:
         lab.node("a")
@@ -85,6 +90,7 @@ async def test_a_component_without_arcs_moves_there_and_back_and_counts_on(tmp_p
         print(f"dead for {there.dead * 1000:.1f} and {back.dead * 1000:.1f} ms")
 
 
+@pytest.mark.essential
 async def test_a_component_takes_its_hold_along_and_a_rival_gets_nothing(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path) as lab:
         register(lab)
@@ -101,8 +107,7 @@ async def test_a_component_takes_its_hold_along_and_a_rival_gets_nothing(tmp_pat
         said: list[Grants] = []
         client.mesh.subscribe(client.mesh.keys.grants, Grants, lambda _, grants: said.append(grants))
         dead = []
-        hosts_by_turn = ["a", "b", "a", "b"]
-        for incarnation, (source, target) in enumerate(pairwise(hosts_by_turn), 1):
+        for incarnation, (source, target) in enumerate(pairwise("aba"), 1):
             dead.append((await move(hosts, source, target, incarnation, "tally", params)).dead)
             await counts_on(hosts, target)
             await went_on(hosts, source, target)
@@ -114,15 +119,16 @@ async def test_a_component_takes_its_hold_along_and_a_rival_gets_nothing(tmp_pat
         await until(lambda: sum(len(grants.revoked) for grants in said) >= len(dead))
         told = [[(one.arc, one.client) for one in grants.rcs["robot/x"]] for grants in said if grants.rcs]
         told = told[1:] if told[0] == [("c", "a/c.1")] else told
-        assert told == [[("c", f"{host}/c.{number}")] for number, host in enumerate("bab", 2)]
+        assert told == [[("c", f"{host}/c.{number}")] for number, host in enumerate("ba", 2)]
         ends = [(one.outcome, one.client) for grants in said for one in grants.revoked]
-        assert ends == [("handed_over", f"{host}/c.{number}") for number, host in enumerate("aba", 1)]
+        assert ends == [("handed_over", f"{host}/c.{number}") for number, host in enumerate("ab", 1)]
         assert rival.state == "queued"
         print("dead for", *(f"{1000 * seconds:.1f}" for seconds in dead), "ms")
         await hosts.stop("b", "c")
         await lab.held_by(client, "robot/x", "rival")
 
 
+@pytest.mark.slow
 async def test_what_waits_for_its_arc_moves_with_its_place(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path) as lab:
         register(lab)
@@ -147,6 +153,7 @@ async def test_what_waits_for_its_arc_moves_with_its_place(tmp_path: Path) -> No
         await counts_on(hosts, "b")
 
 
+@pytest.mark.slow
 async def test_a_move_that_fails_before_the_commit_changes_nothing(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path, candidates=["a"]) as lab:
         register(lab)
@@ -185,6 +192,7 @@ async def test_a_move_that_fails_before_the_commit_changes_nothing(tmp_path: Pat
         assert (await lab.rc(client, "robot/x")).holders[0].grant == holder.grant
 
 
+@pytest.mark.slow
 async def test_a_target_that_is_killed_while_it_is_moved_to_leaves_one_that_counts(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path, candidates=["r"]) as lab:
         register(lab)

@@ -7,6 +7,8 @@ import json
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
+import pytest
+
 from tests.behaviors.components.kit import ComponentLab, Hosts, counts, counts_on
 from tests.hang import HANG
 from tests.live.placing import register
@@ -27,6 +29,8 @@ from zscout.messages import (
     RestoreComponent,
     StopComponent,
 )
+
+pytestmark = pytest.mark.live
 
 QUICK = {"period": 0.02, "rc": "robot/x"}
 
@@ -93,6 +97,7 @@ class Target:
                 await client.leave()
 
 
+@pytest.mark.slow
 async def test_who_handed_over_takes_back_what_the_new_one_does_not_take_on(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path) as lab:
         register(lab)

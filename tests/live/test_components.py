@@ -9,6 +9,7 @@ from decimal import Decimal
 from pathlib import Path
 
 import psutil
+import pytest
 
 from tests.behaviors.components.kit import ComponentLab, Hosts, gone, lives
 from tests.behaviors.components.odd import TOO_LARGE
@@ -34,6 +35,8 @@ from zscout.messages import (
     StopComponent,
 )
 from zscout.types import Grant, Term
+
+pytestmark = pytest.mark.live
 
 COUNTER = ComponentSpec("counter", {"period": 0.02}, restart="never")
 
@@ -95,6 +98,7 @@ async def test_a_component_is_started_once_listed_read_checkpointed_and_stopped(
         assert (anew.incarnation, anew.ended) in ((8, None), (8, "stopped"))
 
 
+@pytest.mark.slow
 async def test_what_a_node_does_not_do_it_refuses_with_the_reason(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path) as lab:
         lab.node("a", extra="[components]\nmax = 2\n")
@@ -136,6 +140,7 @@ async def test_what_a_node_does_not_do_it_refuses_with_the_reason(tmp_path: Path
         assert (await hosts.get("a", ListComponents("x"), ComponentList)).components[0].pid == big.pid
 
 
+@pytest.mark.slow
 async def test_one_that_does_not_get_ready_is_killed(tmp_path: Path) -> None:
     # Alone: what else begins at that moment has the same limit, and may need longer beside other work.
     async with ComponentLab(tmp_path, start_timeout=20) as lab:
@@ -145,6 +150,7 @@ async def test_one_that_does_not_get_ready_is_killed(tmp_path: Path) -> None:
         assert never.reason == "it was killed: it did not get ready within 20 s"
 
 
+@pytest.mark.slow
 async def test_how_one_ended_is_told_as_it_was(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path) as lab:
         lab.node("a")
@@ -189,6 +195,7 @@ async def test_how_one_ended_is_told_as_it_was(tmp_path: Path) -> None:
         assert (await hosts.start("a", "calm", "still")).phase == "running"
 
 
+@pytest.mark.slow
 async def test_limits_hold_for_the_component_alone(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path) as lab:
         lab.node("a")
@@ -245,6 +252,7 @@ async def test_nothing_outlives_a_node_that_is_killed(tmp_path: Path) -> None:
         await gone(*pids)
 
 
+@pytest.mark.slow
 async def test_a_node_that_stops_ends_its_components_and_what_they_started(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path) as lab:
         node = lab.node("a", "robot/x")
@@ -266,6 +274,7 @@ async def test_a_node_that_stops_ends_its_components_and_what_they_started(tmp_p
         assert "Traceback" not in lab.log("a")
 
 
+@pytest.mark.slow
 async def test_who_sees_a_higher_incarnation_ends_itself(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path) as lab:
         lab.node("a")

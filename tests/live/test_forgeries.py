@@ -76,6 +76,7 @@ def test_an_exclusive_rc_obeys_one_of_two_forged_holders(stranger: Stranger) -> 
     stranger.serves()
 
 
+@pytest.mark.slow
 def test_a_forged_term_that_can_be_believed_costs_one_election(stranger: Stranger) -> None:
     counter = stranger.state()["term"][0] + 7
     stranger.put("rcm/grants", json.dumps(grants(term=[counter, "~"], seq=3, rcs={})).encode())
@@ -84,6 +85,7 @@ def test_a_forged_term_that_can_be_believed_costs_one_election(stranger: Strange
     stranger.serves()
 
 
+@pytest.mark.slow
 def test_a_token_of_an_rc_that_never_answers_is_asked_now_and_then(stranger: Stranger) -> None:
     asked: list[float] = []
 
@@ -134,6 +136,7 @@ async def test_a_client_does_not_fall_for_forged_notices(tmp_path: Path) -> None
             await asyncio.to_thread(stranger.close)
 
 
+@pytest.mark.slow
 async def test_a_token_that_only_claims_to_lead_stops_no_takeover(tmp_path: Path) -> None:
     async with Lab(tmp_path, lease=1.0, candidates=("a", "b")) as lab:
         lab.node("c", "robot/a", "radio/a:rate=10", extra="candidate = false")

@@ -13,7 +13,7 @@ from tests.live.lab import Lab
 from zscout.behaviors.client.client import CommandRefused
 from zscout.types import SECOND
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 ECHO = {"name": "echo", "value": 1}
 

@@ -106,6 +106,7 @@ class Record:
         self.held.add((state.rc, tuple(holder.arc for holder in state.holders)))
 
 
+@pytest.mark.essential
 async def test_all_goes_over_in_one_step_and_nobody_gets_in_between(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -22,6 +22,7 @@ pytestmark = pytest.mark.live
 ENCODER = msgspec.json.Encoder(decimal_format="number")
 
 
+@pytest.mark.slow
 async def test_the_leader_dies_around_a_hand_over(tmp_path: Path) -> None:
     async with Lab(tmp_path, candidates=("a", "b", "c")) as lab:
         lab.node("rcs", "robot/x", "radio/f:rate=5", extra="candidate = false")
@@ -61,7 +62,7 @@ async def test_the_leader_dies_around_a_hand_over(tmp_path: Path) -> None:
         assert [arc.place for arc in back.values()] == [arc.place for arc in before.values()]
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.001, 0.003])
+@pytest.mark.parametrize("delay", [0.003, *(pytest.param(delay, marks=pytest.mark.slow) for delay in (0.0, 0.001))])
 async def test_the_leader_dies_in_a_hand_over(tmp_path: Path, delay: float) -> None:
     """Whenever that is: all is at one of both, once, and the other knows."""
     async with Lab(tmp_path, candidates=("a", "b")) as lab:

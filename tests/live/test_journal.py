@@ -57,6 +57,7 @@ async def committed(lab: Lab, host: str, *holds: tuple[str, str]) -> None:
         raise AssertionError(f"{host} has {found}") from None
 
 
+@pytest.mark.slow
 async def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> None:
     async with Lab(tmp_path, candidates=("anvil", "bellows")) as lab:
         lab.node("anvil", "robot/a")
@@ -175,6 +176,7 @@ async def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> 
         assert unknown.returncode == 1
 
 
+@pytest.mark.slow
 async def test_journals_answer_while_nobody_leads(tmp_path: Path) -> None:
     # Who is deposed leads again after a lease at the earliest, about.
     async with Lab(tmp_path, lease=3 * PATIENT) as lab:

@@ -15,12 +15,16 @@ from zscout.types import SECOND
 
 pytestmark = pytest.mark.live
 
-BATCHES = times(3)
-ROUNDS = 10
-"""Kills in one batch; all of its processes wait in the queue before the first one dies."""
 
-
-async def test_the_next_in_the_queue_follows_a_holder_killed_with_9(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("batches", "rounds"),
+    [
+        pytest.param(1, 3, marks=pytest.mark.essential, id="few"),
+        pytest.param(times(3), 10, marks=pytest.mark.slow, id="many"),
+    ],
+)
+async def test_the_next_in_the_queue_follows_a_holder_killed_with_9(tmp_path: Path, batches: int, rounds: int) -> None:
+    """All processes of a batch wait in the queue before the first one dies."""
     async with Lab(tmp_path) as lab:
         lab.node("a")
         lab.node("b", "robot/x", extra="candidate = false")
@@ -30,8 +34,8 @@ async def test_the_next_in_the_queue_follows_a_holder_killed_with_9(tmp_path: Pa
         entered: list[float] = []
         first = await _queued(lab, "first")
         await first.event("entered")
-        for batch in range(BATCHES):
-            names = [f"h{batch}-{number}" for number in range(ROUNDS)]
+        for batch in range(batches):
+            names = [f"h{batch}-{number}" for number in range(rounds)]
             queue = [first, *await asyncio.gather(*(lab.holder(name) for name in names))]
             for holder in queue[1:]:
                 await _ask(holder)
@@ -48,7 +52,7 @@ async def test_the_next_in_the_queue_follows_a_holder_killed_with_9(tmp_path: Pa
                 f"kill -9 of a holder -> the next one {what}: median {median(times) * 1000:.1f} ms, "
                 f"p99 {p99 * 1000:.1f} ms, {len(times)} rounds"
             )
-        assert len(took) == BATCHES * ROUNDS
+        assert len(took) == batches * rounds
         assert min(took) > 0
         # A leader that stood still itself leaves who is gone a lease to come back.
         late = sum(seconds >= PATIENT for seconds in took)

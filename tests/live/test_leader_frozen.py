@@ -22,7 +22,7 @@ from zscout.mesh.zenoh_mesh import zenoh_config
 from zscout.messages import Ask, Grants, Notice, RcState, Revocation, encode
 from zscout.types import SECOND, Grant, Term
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 ROBOTS = [f"robot/r{number}" for number in range(RUNNING)]
 

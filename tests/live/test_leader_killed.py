@@ -33,6 +33,7 @@ async def grant_of(client: Client, rc: str) -> Ns:
     return granted
 
 
+@pytest.mark.essential
 async def test_a_successor_carries_everything_on(tmp_path: Path) -> None:
     async with Lab(tmp_path, candidates=("a", "b")) as lab:
         lab.node("c", *ROBOTS, "robot/free", extra=APART)
@@ -68,12 +69,14 @@ async def test_a_successor_carries_everything_on(tmp_path: Path) -> None:
         await asyncio.gather(*(body.finish() for body in crew.bodies if body is not crew.bodies[1]))
 
 
-def test_a_leader_killed_between_answer_and_publication_has_granted_nothing(tmp_path: Path) -> None:
-    found = asyncio.run(deaths(tmp_path, 3, lambda _: None))
+@pytest.mark.slow
+async def test_a_leader_killed_between_answer_and_publication_has_granted_nothing(tmp_path: Path) -> None:
+    found = await deaths(tmp_path, 3, lambda _: None)
     assert [one.trouble for one in found] == [""] * 3
     assert any(one.answered for one in found)
 
 
+@pytest.mark.slow
 async def test_the_only_rcm_killed_and_started_again_finds_everything(tmp_path: Path) -> None:
     # A process takes its time to start on a busy machine; holds must last that long.
     async with Lab(tmp_path, lease=PATIENT, extra="[timing]\nhold_lease = 60\n") as lab:

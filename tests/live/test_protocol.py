@@ -154,6 +154,7 @@ def holds(request_id: str, grant: Any = None) -> Callable[[RcmState], bool]:
     return lambda state: any(view.id == request_id and wanted in (None, json.dumps(view.grant)) for view in state.holds)
 
 
+@pytest.mark.essential
 @pytest.mark.live
 async def test_a_client_written_from_the_document_lives_a_whole_life(tmp_path: Path) -> None:
     async def live(lab: Lab, plain: PlainProcess) -> None:

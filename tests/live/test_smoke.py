@@ -17,6 +17,7 @@ from zscout.messages import LoadReport
 pytestmark = pytest.mark.live
 
 
+@pytest.mark.essential
 async def test_a_gang_over_two_nodes_is_granted_commanded_and_preempted(tmp_path: Path) -> None:
     async with Lab(tmp_path) as lab:
         lab.node("a", "robot/a", "radio/a:rate=10")

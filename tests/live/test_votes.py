@@ -37,12 +37,13 @@ async def ask(client: Client, name: str, rate: str, *, priority: int = 0, runtim
     return await client.request(name, needs, priority=priority, min_runtime=runtime)
 
 
+@pytest.mark.essential
 async def test_a_capacity_is_filled_and_never_exceeded(tmp_path: Path) -> None:
     async with Lab(tmp_path) as lab:
-        lab.node("a")
+        lab.node("a", "video/v:lines=1")
         lab.node("c", "radio/rf:rate=0.3", extra="candidate = false")
         client = await lab.client()
-        await lab.ready(client, "radio/rf")
+        await lab.ready(client, "radio/rf", "video/v")
 
         one, two = await ask(client, "one", "0.1"), await ask(client, "two", "0.2")
         # One tenth and two tenths are three tenths, and not a bit more.
@@ -68,6 +69,18 @@ async def test_a_capacity_is_filled_and_never_exceeded(tmp_path: Path) -> None:
         await comes_to(three, "running")
         assert two.state == "queued"
         await lab.held_by(client, "radio/rf", "idle", "operator", "three")
+
+        # Where two vote, both must agree: nothing is held of the one that does.
+        needs = {"radio/rf": {"rate": "0.1"}, "video/v": {"lines": 1}}
+        both = await client.request("both", needs, min_runtime=600)
+        await comes_to(both, "queued", ": radio/rf refuses more")
+        await lab.held_by(client, "video/v")
+        await client.end(three)
+        await comes_to(both, "running")
+        more = await client.request("more", {"video/v": {"lines": 1}}, min_runtime=600)
+        await comes_to(more, "queued", ": video/v refuses more: lines would be 2 of 1")
+        await lab.held_by(client, "radio/rf", "both", "idle", "operator")
+        await lab.held_by(client, "video/v", "both")
 
 
 async def test_answers_stand_until_the_rules_change(tmp_path: Path) -> None:

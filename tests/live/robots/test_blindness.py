@@ -21,7 +21,7 @@ from zscout.mesh import clock
 from zscout.messages import BehaviorSaid
 from zscout.types import SECOND
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 ALL = ("robot/scout33", "robot/scout35", "radio/rf0", "video/ch1", "video/ch2", "framegrabber/fgrab1")
 

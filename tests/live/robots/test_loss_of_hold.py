@@ -22,7 +22,7 @@ from zscout.mesh import clock
 from zscout.messages import RcState
 from zscout.types import SECOND
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 ROBOT = "robot/scout33"
 NEEDS = RobotNeeds(ROBOT)

@@ -19,7 +19,7 @@ from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket
 from zscout.messages import BehaviorSaid, ComponentList, ListComponents, MigrateComponent, Placement
 from zscout.simulation.building.plan import Furniture, Light, Noise, Plan, Robot
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 DEN = Plan(
     name="den",

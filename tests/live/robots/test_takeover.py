@@ -75,6 +75,7 @@ class Shift:
         return max(0.0, halted.time - lost)
 
 
+@pytest.mark.slow
 async def test_takeover(tmp_path: Path) -> None:
     async with RobotLab(tmp_path, frame_rate=2, channels=1) as lab:
         lab.devices("mast", "radio", "video", "framegrabber", "robot")

@@ -42,6 +42,7 @@ class Operator:
                 await self.told.wait()
 
 
+@pytest.mark.slow
 async def test_the_later_operator_keeps_it_and_the_earlier_is_told(tmp_path: Path) -> None:
     async with Lab(tmp_path) as lab:
         lab.node("a", *OFFERED)

@@ -14,7 +14,7 @@ from zscout.behaviors.sensor_net.place_robot import PlaceRobot, RobotTask, Slots
 from zscout.drivers.packets import CameraPacket, HaltPacket, Packet
 from zscout.messages import Grants, RcState
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 ROBOTS = ["scout33", "scout35"]
 SLOT = 8.0
