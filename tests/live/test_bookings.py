@@ -44,8 +44,7 @@ async def listed(bookings: BookingsClient, until: Callable[[dict[str, BookingVie
 async def fleet_of_two(lab: Lab) -> tuple[Client, BookingsClient]:
     """The first leads: the other comes when it does."""
     lab.node(BOTH[0], "robot/a")
-    client = await lab.client("program")
-    await lab.ready(client, "robot/a")
+    client = await lab.begun("program")
     lab.node(BOTH[1], "robot/b")
     await lab.ready(client, "robot/a", "robot/b")
     await lab.candidates(client, *BOTH)

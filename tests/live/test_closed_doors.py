@@ -99,21 +99,20 @@ def has_seen(session: zenoh.Session) -> list[str]:
 
 
 @pytest.mark.parametrize("name", ["plain TCP", "no certificate", "another CA's", "expired"])
-async def test_an_intruder_has_no_link_no_token_and_no_key(tmp_path: Path, name: str) -> None:
-    async with ClosedLab(tmp_path) as lab:
-        inside = Inside(lab)
-        try:
-            # Whoever joins makes the links: one member joins before the intruder, one after.
-            await inside.join("anvil")
-            with bare(lab, **intruders(lab)[name]) as intruder:
-                mesh = await inside.join("bench")
-                assert not await asyncio.to_thread(has_seen, intruder)
-                assert not linked(intruder)
-                # Either end may tell later than the other.
-                await until(lambda: {one.links() for one in inside.meshes} == {1}, within=HANG)
-                assert mesh.links() == 1
-        finally:
-            await inside.close()
+async def test_an_intruder_has_no_link_no_token_and_no_key(lab: ClosedLab, name: str) -> None:
+    inside = Inside(lab)
+    try:
+        # Whoever joins makes the links: one member joins before the intruder, one after.
+        await inside.join("anvil")
+        with bare(lab, **intruders(lab)[name]) as intruder:
+            mesh = await inside.join("bench")
+            assert not await asyncio.to_thread(has_seen, intruder)
+            assert not linked(intruder)
+            # Either end may tell later than the other.
+            await until(lambda: {one.links() for one in inside.meshes} == {1}, within=HANG)
+            assert mesh.links() == 1
+    finally:
+        await inside.close()
 
 
 def without(settings: dict[str, Any], path: str) -> dict[str, Any]:
@@ -137,19 +136,18 @@ def without(settings: dict[str, Any], path: str) -> dict[str, Any]:
     ],
 )
 async def test_each_setting_keeps_somebody_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, setting: str, name: str
+    lab: ClosedLab, monkeypatch: pytest.MonkeyPatch, setting: str, name: str
 ) -> None:
     closed = zenoh_mesh._closed
     monkeypatch.setattr(zenoh_mesh, "_closed", lambda security: without(closed(security), setting))
-    async with ClosedLab(tmp_path) as lab:
-        inside = Inside(lab)
-        try:
-            await inside.join("anvil")
-            with bare(lab, **intruders(lab)[name]) as intruder:
-                await inside.join("bench")
-                await until(lambda: linked(intruder), within=HANG)
-        finally:
-            await inside.close()
+    inside = Inside(lab)
+    try:
+        await inside.join("anvil")
+        with bare(lab, **intruders(lab)[name]) as intruder:
+            await inside.join("bench")
+            await until(lambda: linked(intruder), within=HANG)
+    finally:
+        await inside.close()
 
 
 # Roles

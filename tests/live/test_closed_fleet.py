@@ -26,19 +26,18 @@ SECOND = timedelta(seconds=1)
 
 
 @pytest.mark.essential
-async def test_two_persons_and_a_node_on_one_machine(tmp_path: Path) -> None:
+async def test_two_persons_and_a_node_on_one_machine(lab: ClosedLab) -> None:
     """Each is known by its own name, whatever its user is called there, and a person's machine by a field."""
-    async with ClosedLab(tmp_path) as lab:
-        lab.node("anvil", "robot/a", "robot/b")
-        ada, bob = await lab.person("ada", "arm"), await lab.person("bob", "arm")
-        await lab.ready(ada, "robot/a", "robot/b")
-        await lab.ready(bob, "robot/a", "robot/b")
-        async with hold(ada, "survey", {"robot/a": {}}), hold(bob, "survey", {"robot/b": {}}):
-            state = await lab.state(ada, lambda state: len(state.holds) == 2)
-            assert {view.client for view in state.holds} == {"ada/arm", "bob/arm"}
-            machine = valid_name(socket.gethostname())
-            whose = sorted((view.who.user, view.who.host) for view in state.holds if view.who is not None)
-            assert whose == [("ada", machine), ("bob", machine)]
+    lab.node("anvil", "robot/a", "robot/b")
+    ada, bob = await lab.person("ada", "arm"), await lab.person("bob", "arm")
+    await lab.ready(ada, "robot/a", "robot/b")
+    await lab.ready(bob, "robot/a", "robot/b")
+    async with hold(ada, "survey", {"robot/a": {}}), hold(bob, "survey", {"robot/b": {}}):
+        state = await lab.state(ada, lambda state: len(state.holds) == 2)
+        assert {view.client for view in state.holds} == {"ada/arm", "bob/arm"}
+        machine = valid_name(socket.gethostname())
+        whose = sorted((view.who.user, view.who.host) for view in state.holds if view.who is not None)
+        assert whose == [("ada", machine), ("bob", machine)]
 
 
 async def test_a_secured_fleet_and_an_open_one_never_mix(tmp_path: Path) -> None:
@@ -62,81 +61,77 @@ async def test_a_secured_fleet_and_an_open_one_never_mix(tmp_path: Path) -> None
             assert {token.host for token in tokens} == hosts
 
 
-async def test_a_viewer_is_refused_by_name_and_sees(tmp_path: Path) -> None:
-    async with ClosedLab(tmp_path) as lab:
-        lab.node("anvil", "robot/a")
-        wall = await lab.person("wall")
-        await lab.state(wall, lambda state: any(view.rc == "robot/a" and view.present for view in state.rcs))
-        with pytest.raises(RequestRefused, match=r"wall \(viewer\) may not ask for an ARC; ada, anvil, .* may"):
-            async with hold(wall, "survey", {"robot/a": {}}):
-                pass
-
-
-async def test_what_roles_say_is_enforced_and_taken_anew_at_sighup(tmp_path: Path) -> None:
-    async with ClosedLab(tmp_path) as lab:
-        lab.node("anvil", "robot/a", "robot/b")
-        bob, ada = await lab.person("bob"), await lab.person("ada")
-        await lab.ready(bob, "robot/a", "robot/b")
-        with pytest.raises(RequestRefused, match=r"bob \(client\) may not ask for priority 10; at most 9; ada may"):
-            async with hold(bob, "survey", {"robot/a": {}}, priority=10):
-                pass
-
-        async def survey() -> None:
-            async with hold(bob, "survey", {"robot/a": {}}, min_runtime=600):
-                async with hold(ada, "operator", {"robot/b": {}}, priority=10):
-                    pass
-                fleet = lab.fleet_file.read_text()
-                lab.fleet_file.write_text(fleet.replace('client = ["bob", "eve"]', 'client = ["eve"]'))
-                lab.signal("anvil", signal.SIGHUP)
-                await asyncio.sleep(HANG)
-
-        with pytest.raises(Revoked, match="the fleet file, which names its owner under no role"):
-            await survey()
-        with pytest.raises(RequestRefused, match="bob, who has no role here, may not ask for an ARC"):
-            async with hold(bob, "survey", {"robot/a": {}}):
-                pass
-        # Who was not touched, and who is named from now on, goes on.
-        async with hold(ada, "operator", {"robot/a": {}}, priority=10):
+async def test_a_viewer_is_refused_by_name_and_sees(lab: ClosedLab) -> None:
+    lab.node("anvil", "robot/a")
+    wall = await lab.person("wall")
+    await lab.state(wall, lambda state: any(view.rc == "robot/a" and view.present for view in state.rcs))
+    with pytest.raises(RequestRefused, match=r"wall \(viewer\) may not ask for an ARC; ada, anvil, .* may"):
+        async with hold(wall, "survey", {"robot/a": {}}):
             pass
 
 
-async def test_a_certificate_of_another_name_is_told_before_joining(tmp_path: Path) -> None:
-    async with ClosedLab(tmp_path) as lab:
-        with pytest.raises(BadInput, match=r"is the certificate of .*bob.*, and this is .*ada"):
-            await ZenohMesh.open(lab.fleet_of("bob"), Sender("ada", "c1"))
-        lab.authority.issue("mallory", tmp_path / "keys" / "mallory", DAY, datetime.now(UTC))
-        with pytest.raises(BadInput, match=r"mallory has no role in fleet .*; name it under"):
-            await ZenohMesh.open(lab.fleet_of("mallory"), Sender("mallory", "c1"))
+async def test_what_roles_say_is_enforced_and_taken_anew_at_sighup(lab: ClosedLab) -> None:
+    lab.node("anvil", "robot/a", "robot/b")
+    bob, ada = await lab.person("bob"), await lab.person("ada")
+    await lab.ready(bob, "robot/a", "robot/b")
+    with pytest.raises(RequestRefused, match=r"bob \(client\) may not ask for priority 10; at most 9; ada may"):
+        async with hold(bob, "survey", {"robot/a": {}}, priority=10):
+            pass
+
+    async def survey() -> None:
+        async with hold(bob, "survey", {"robot/a": {}}, min_runtime=600):
+            async with hold(ada, "operator", {"robot/b": {}}, priority=10):
+                pass
+            fleet = lab.fleet_file.read_text()
+            lab.fleet_file.write_text(fleet.replace('client = ["bob", "eve"]', 'client = ["eve"]'))
+            lab.signal("anvil", signal.SIGHUP)
+            await asyncio.sleep(HANG)
+
+    with pytest.raises(Revoked, match="the fleet file, which names its owner under no role"):
+        await survey()
+    with pytest.raises(RequestRefused, match="bob, who has no role here, may not ask for an ARC"):
+        async with hold(bob, "survey", {"robot/a": {}}):
+            pass
+    # Who was not touched, and who is named from now on, goes on.
+    async with hold(ada, "operator", {"robot/a": {}}, priority=10):
+        pass
+
+
+async def test_a_certificate_of_another_name_is_told_before_joining(tmp_path: Path, lab: ClosedLab) -> None:
+    with pytest.raises(BadInput, match=r"is the certificate of .*bob.*, and this is .*ada"):
+        await ZenohMesh.open(lab.fleet_of("bob"), Sender("ada", "c1"))
+    lab.authority.issue("mallory", tmp_path / "keys" / "mallory", DAY, datetime.now(UTC))
+    with pytest.raises(BadInput, match=r"mallory has no role in fleet .*; name it under"):
+        await ZenohMesh.open(lab.fleet_of("mallory"), Sender("mallory", "c1"))
 
 
 @pytest.mark.slow
-async def test_certificates_that_are_renewed_in_place_end_no_hold(tmp_path: Path) -> None:
+async def test_certificates_that_are_renewed_in_place_end_no_hold(tmp_path: Path, lab: ClosedLab) -> None:
     """Past the end of those by which all links were made, the hold goes on and a newcomer is let in."""
-    async with ClosedLab(tmp_path) as lab:
-        # So short a life that it ends in this test, and longer than this machine takes to start all.
-        began = time.monotonic()
-        lab.node("cart", "radio/r")
-        lab.node("anvil", "robot/a")
-        await lab.ready(await lab.person("ada"), "robot/a", "radio/r")
-        life = timedelta(seconds=max(20.0, 8 * (time.monotonic() - began)))
-        await lab.stop()
+    # So short a life that it ends in this test, and longer than this machine takes to start all.
+    began = time.monotonic()
+    lab.node("cart", "radio/r")
+    lab.node("anvil", "robot/a")
+    await lab.ready(await lab.person("ada"), "robot/a", "radio/r")
+    life = timedelta(seconds=max(20.0, 8 * (time.monotonic() - began)))
+    await lab.stop()
+    for name in ("anvil", "cart", "bob", "eve"):
+        lab.authority.renew(tmp_path / "keys" / name, life, datetime.now(UTC))
+    ends = datetime.now(UTC) + life
+    lab.node("cart", "radio/r")
+    lab.node("anvil", "robot/a")
+    bob = await lab.person("bob")
+    await lab.ready(bob, "robot/a", "radio/r")
+    needs: dict[str, dict[str, float]] = {"robot/a": {}, "radio/r": {}}
+    async with hold(bob, "survey", needs, min_runtime=600) as held:
+        assert datetime.now(UTC) < ends
         for name in ("anvil", "cart", "bob", "eve"):
-            lab.authority.renew(tmp_path / "keys" / name, life, datetime.now(UTC))
-        ends = datetime.now(UTC) + life
-        lab.node("cart", "radio/r")
-        lab.node("anvil", "robot/a")
-        bob = await lab.person("bob")
-        await lab.ready(bob, "robot/a", "radio/r")
-        needs: dict[str, dict[str, float]] = {"robot/a": {}, "radio/r": {}}
-        async with hold(bob, "survey", needs, min_runtime=600) as held:
-            assert datetime.now(UTC) < ends
-            for name in ("anvil", "cart", "bob", "eve"):
-                lab.authority.renew(tmp_path / "keys" / name, DAY, datetime.now(UTC))
-            while datetime.now(UTC) < ends + 4 * SECOND:  # noqa: ASYNC110 - a time of day
-                await asyncio.sleep(0.1)
-            state = await lab.state(bob, lambda state: bool(state.holds))
-            assert [(view.arc, view.grant) for view in state.holds] == [("survey", held.grant)]
-        eve = await lab.person("eve")
-        await lab.ready(eve, "robot/a", "radio/r")
-        async with hold(eve, "newcomer", needs):
-            pass
+            lab.authority.renew(tmp_path / "keys" / name, DAY, datetime.now(UTC))
+        while datetime.now(UTC) < ends + 4 * SECOND:  # noqa: ASYNC110 - a time of day
+            await asyncio.sleep(0.1)
+        state = await lab.state(bob, lambda state: bool(state.holds))
+        assert [(view.arc, view.grant) for view in state.holds] == [("survey", held.grant)]
+    eve = await lab.person("eve")
+    await lab.ready(eve, "robot/a", "radio/r")
+    async with hold(eve, "newcomer", needs):
+        pass

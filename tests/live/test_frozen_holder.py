@@ -22,8 +22,7 @@ async def test_a_holder_stopped_is_followed_and_refused_when_it_goes_on(tmp_path
     async with Lab(tmp_path, lease=4.0) as lab:
         lab.node("a")
         lab.node("b", "robot/x", extra="candidate = false")
-        client = await lab.client()
-        await lab.ready(client, "robot/x")
+        client = await lab.begun()
         frozen, following = await asyncio.gather(lab.holder("frozen"), lab.holder("following"))
         await frozen.order("ask", arc="frozen", needs={"robot/x": {}}, min_runtime=600)
         grant = (await frozen.event("entered"))["grant"]
@@ -55,8 +54,7 @@ async def test_a_holder_stopped_is_followed_and_refused_when_it_goes_on(tmp_path
 async def test_a_holder_that_wakes_is_granted_anew_and_its_old_grant_is_never_revived(tmp_path: Path) -> None:
     async with Lab(tmp_path, lease=4.0) as lab:
         lab.node("a", "robot/x")
-        client = await lab.client()
-        await lab.ready(client, "robot/x")
+        client = await lab.begun()
         frozen = await lab.holder("frozen")
         await frozen.order("ask", arc="frozen", needs={"robot/x": {}}, min_runtime=600)
         entered = await frozen.event("entered")

@@ -91,38 +91,36 @@ async def test_the_leader_dies_in_a_hand_over(tmp_path: Path, delay: float) -> N
         assert [view.place for view in state.queue] == [before["later"].place]
 
 
-async def test_the_old_process_dies_right_after_it(tmp_path: Path) -> None:
-    async with Lab(tmp_path) as lab:
-        lab.node("a", "robot/x", "radio/f:rate=5")
-        old = await lab.client("old")
-        await lab.ready(old, "robot/x", "radio/f")
-        await claimed(old, list(NEEDS))
-        grants = holding(await lab.state(old, lambda state: len(state.holds) == 2))
-        heir = await asyncio.create_subprocess_exec(
-            sys.executable,
-            *("-m", "tests.live.heir", "new"),
-            env=lab.env,
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-        )
-        try:
-            assert heir.stdin is not None
-            assert heir.stdout is not None
-            old.pause()
-            heir.stdin.write(ENCODER.encode(old.open_requests()) + b"\n")
-            assert await asyncio.wait_for(heir.stdout.readline(), HANG) == b"ready\n"
-            await old.hand_over_all(Sender("test", "new"))
-            await old.leave()
-            line = await asyncio.wait_for(heir.stdout.readline(), HANG)
-            told = msgspec.json.decode(line, type=dict[str, Grant])
-            watcher = await lab.client("watcher")
-            await lab.living(watcher, "client", lambda hosts: len(hosts) == 2)
-            state = await lab.state(watcher, lambda state: len(state.holds) == 2)
-            assert {client for client, _ in holding(state).values()} == {"test/new"}
-            for name, (_, grant) in holding(state).items():
-                assert grant > grants[name][1]
-                assert grant == told[name]
-            assert [view.arc for view in state.queue] == ["later"]
-        finally:
-            heir.kill()
-            await heir.wait()
+async def test_the_old_process_dies_right_after_it(lab: Lab) -> None:
+    lab.node("a", "robot/x", "radio/f:rate=5")
+    old = await lab.begun("old")
+    await claimed(old, list(NEEDS))
+    grants = holding(await lab.state(old, lambda state: len(state.holds) == 2))
+    heir = await asyncio.create_subprocess_exec(
+        sys.executable,
+        *("-m", "tests.live.heir", "new"),
+        env=lab.env,
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+    )
+    try:
+        assert heir.stdin is not None
+        assert heir.stdout is not None
+        old.pause()
+        heir.stdin.write(ENCODER.encode(old.open_requests()) + b"\n")
+        assert await asyncio.wait_for(heir.stdout.readline(), HANG) == b"ready\n"
+        await old.hand_over_all(Sender("test", "new"))
+        await old.leave()
+        line = await asyncio.wait_for(heir.stdout.readline(), HANG)
+        told = msgspec.json.decode(line, type=dict[str, Grant])
+        watcher = await lab.client("watcher")
+        await lab.living(watcher, "client", lambda hosts: len(hosts) == 2)
+        state = await lab.state(watcher, lambda state: len(state.holds) == 2)
+        assert {client for client, _ in holding(state).values()} == {"test/new"}
+        for name, (_, grant) in holding(state).items():
+            assert grant > grants[name][1]
+            assert grant == told[name]
+        assert [view.arc for view in state.queue] == ["later"]
+    finally:
+        heir.kill()
+        await heir.wait()

@@ -61,8 +61,7 @@ async def committed(lab: Lab, host: str, *holds: tuple[str, str]) -> None:
 async def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> None:
     async with Lab(tmp_path, candidates=("anvil", "bellows")) as lab:
         lab.node("anvil", "robot/a")
-        client = await lab.client("program")
-        await lab.ready(client, "robot/a")  # it leads before the other could
+        client = await lab.begun("program")
         lab.node("bellows", "robot/b")
         await lab.ready(client, "robot/b")
         await lab.candidates(client, "anvil", "bellows")
@@ -181,8 +180,7 @@ async def test_journals_answer_while_nobody_leads(tmp_path: Path) -> None:
     # Who is deposed leads again after a lease at the earliest, about.
     async with Lab(tmp_path, lease=3 * PATIENT) as lab:
         lab.node("anvil", "robot/a")
-        client = await lab.client("program")
-        await lab.ready(client, "robot/a")
+        client = await lab.begun("program")
         await client.end(await client.request("survey", {"robot/a": {}}, min_runtime=600))
         await told(lab, lambda found: [hold["outcome"] for hold in found["holds"]] == ["released"])
         above = Grants(Term((await lab.state(client, lambda _: True)).term.counter + 1, "stranger"), 1, 0, 0.5)
@@ -194,36 +192,31 @@ async def test_journals_answer_while_nobody_leads(tmp_path: Path) -> None:
             assert len(json.loads(done.stdout)[found]) == 1
 
 
-async def test_where_nobody_is_there_nobody_answers(tmp_path: Path) -> None:
-    async with Lab(tmp_path) as lab:
-        done = await zscout_soon("history", env=lab.env)
-        assert done.returncode == 3
-        assert done.stderr.startswith(f"zscout: no RCM is on the mesh of fleet {lab.fleet.name} (no other program")
+async def test_where_nobody_is_there_nobody_answers(lab: Lab) -> None:
+    done = await zscout_soon("history", env=lab.env)
+    assert done.returncode == 3
+    assert done.stderr.startswith(f"zscout: no RCM is on the mesh of fleet {lab.fleet.name} (no other program")
 
 
-async def test_a_journal_that_is_damaged_is_set_aside_and_the_node_runs(tmp_path: Path) -> None:
-    async with Lab(tmp_path) as lab:
-        file = file_of(lab, "anvil")
-        file.parent.mkdir(parents=True)
-        file.write_bytes(b"this is no journal\n" * 1_000)
-        lab.node("anvil", "robot/a")
-        client = await lab.client("program")
-        await lab.ready(client, "robot/a")
-        request = await client.request("survey", {"robot/a": {}}, min_runtime=600)
-        await client.end(request)
-        await told(lab, lambda found: [hold["outcome"] for hold in found["holds"]] == ["released"])
-        assert lab.log("anvil").count("is damaged") == 1
-        assert file.with_name(ASIDE).exists()
+async def test_a_journal_that_is_damaged_is_set_aside_and_the_node_runs(lab: Lab) -> None:
+    file = file_of(lab, "anvil")
+    file.parent.mkdir(parents=True)
+    file.write_bytes(b"this is no journal\n" * 1_000)
+    lab.node("anvil", "robot/a")
+    client = await lab.begun("program")
+    request = await client.request("survey", {"robot/a": {}}, min_runtime=600)
+    await client.end(request)
+    await told(lab, lambda found: [hold["outcome"] for hold in found["holds"]] == ["released"])
+    assert lab.log("anvil").count("is damaged") == 1
+    assert file.with_name(ASIDE).exists()
 
 
-async def test_a_fleet_without_a_journal_says_so(tmp_path: Path) -> None:
-    async with Lab(tmp_path) as lab:
-        lab.node("anvil", "robot/a", extra="[journal]\noff = true")
-        client = await lab.client("program")
-        await lab.ready(client, "robot/a")
-        for command in ("history", "usage"):
-            done = await lab.zscout(command)
-            assert done.returncode == 1
-            assert "has no journal that could be asked" in done.stderr
-            assert done.stderr.count("\n") == 1
-        assert not file_of(lab, "anvil").exists()
+async def test_a_fleet_without_a_journal_says_so(lab: Lab) -> None:
+    lab.node("anvil", "robot/a", extra="[journal]\noff = true")
+    await lab.begun("program")
+    for command in ("history", "usage"):
+        done = await lab.zscout(command)
+        assert done.returncode == 1
+        assert "has no journal that could be asked" in done.stderr
+        assert done.stderr.count("\n") == 1
+    assert not file_of(lab, "anvil").exists()

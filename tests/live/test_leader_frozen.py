@@ -32,8 +32,7 @@ async def test_a_frozen_leader_is_followed_and_steps_down_when_it_wakes(tmp_path
     async with Lab(tmp_path, lease=4.0, candidates=("a", "b"), extra=timing) as lab:
         lab.node("c", *ROBOTS, "robot/free", "robot/short", extra=APART)
         lab.node("a")
-        client = await lab.client("asker")
-        await lab.ready(client, *ROBOTS, "robot/free", "robot/short")
+        client = await lab.begun("asker")
         lab.node("b")
         leaders = LeaderWatch(client)
         crew = Crew()

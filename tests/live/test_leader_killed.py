@@ -38,8 +38,7 @@ async def test_a_successor_carries_everything_on(tmp_path: Path) -> None:
     async with Lab(tmp_path, candidates=("a", "b")) as lab:
         lab.node("c", *ROBOTS, "robot/free", extra=APART)
         lab.node("a")
-        client = await lab.client("asker")
-        await lab.ready(client, *ROBOTS, "robot/free")
+        client = await lab.begun("asker")
         lab.node("b")
         leaders = LeaderWatch(client)
         crew = Crew()
@@ -82,8 +81,7 @@ async def test_the_only_rcm_killed_and_started_again_finds_everything(tmp_path: 
     async with Lab(tmp_path, lease=PATIENT, extra="[timing]\nhold_lease = 60\n") as lab:
         lab.node("c", *ROBOTS, extra=APART)
         lab.node("a")
-        client = await lab.client("asker")
-        await lab.ready(client, *ROBOTS)
+        client = await lab.begun("asker")
         leaders = LeaderWatch(client)
         crew = Crew()
         await crew.assemble(lab, ROBOTS, waiting=WAITING)
@@ -104,8 +102,7 @@ async def test_what_is_given_up_while_nobody_leads_is_free_under_the_next_rcm(tm
     async with Lab(tmp_path, lease=PATIENT, extra="[timing]\nhold_lease = 60\n") as lab:
         lab.node("c", "robot/x", "robot/y", extra=APART)
         lab.node("a")
-        client = await lab.client("asker")
-        await lab.ready(client, "robot/x", "robot/y")
+        client = await lab.begun("asker")
         _, stays = await running(client, "stays", "robot/y", min_runtime=0.1, keep=True)
         arc, _ = await running(client, "kept", "robot/x", min_runtime=0.1, keep=True)
         lab.signal("a", signal.SIGKILL)

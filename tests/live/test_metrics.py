@@ -102,8 +102,7 @@ async def measured(folder: Path) -> AsyncIterator[tuple[Lab, Client, int]]:
     async with Lab(folder, extra=groups) as lab:
         port = free_port()
         lab.node("anvil", "robot/a", extra=f"[metrics]\nport = {port}")
-        client = await lab.client("worker")
-        await lab.ready(client, "robot/a")
+        client = await lab.begun("worker")
         first, second = [
             await client.request(name, {"robot/a": {}}, min_runtime=60, estimate=True) for name in ("first", "second")
         ]
@@ -189,12 +188,11 @@ async def test_prometheus_understands_all_that_the_dashboard_asks(tmp_path: Path
         prometheus.stop()
 
 
-async def test_a_port_that_is_taken_ends_the_node_with_a_line(tmp_path: Path) -> None:
-    async with Lab(tmp_path) as lab:
-        with socket.socket() as one:
-            one.bind(("127.0.0.1", 0))
-            one.listen()
-            port = one.getsockname()[1]
-            node = lab.node("anvil", extra=f"[metrics]\nport = {port}")
-            assert await asyncio.to_thread(node.wait, HANG) == 1
-        assert f"zscout-node: [metrics] can't be served at 127.0.0.1:{port}: " in lab.log("anvil")
+async def test_a_port_that_is_taken_ends_the_node_with_a_line(lab: Lab) -> None:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        one.listen()
+        port = one.getsockname()[1]
+        node = lab.node("anvil", extra=f"[metrics]\nport = {port}")
+        assert await asyncio.to_thread(node.wait, HANG) == 1
+    assert f"zscout-node: [metrics] can't be served at 127.0.0.1:{port}: " in lab.log("anvil")

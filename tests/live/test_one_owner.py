@@ -47,8 +47,7 @@ async def test_the_one_that_is_not_named_obeys_nothing_and_says_so(tmp_path: Pat
         lab.node("heir")
         # Not the lesser name: it is meant because it came first, not by its host.
         lab.node("ws2", RC, extra="candidate = false")
-        client = await lab.client()
-        await lab.ready(client, RC)
+        client = await lab.begun()
         lab.node("ws1", RC, extra="candidate = false")
         await lab.logged("ws1", "robot/arm stands by: duplicate of robot/arm at ws2")
         arc = await client.request("work", {RC: {}}, min_runtime=600)

@@ -36,49 +36,47 @@ def waits_for(state: RcmState) -> list[tuple[str, list[str]]]:
     return [(view.arc, sorted(view.needs)) for view in state.queue]
 
 
-async def test_each_gets_a_free_one_and_who_waits_the_first_that_is_given_back(tmp_path: Path) -> None:
-    async with Lab(tmp_path) as lab:
-        lab.node("a", *BOTH, "robot/x")
-        client, other, third = [await lab.client(name) for name in ("one", "two", "three")]
-        await lab.ready(client, *BOTH, "robot/x")
-        async with hold(client, "one", {ANY: {}, "robot/x": {}}, min_runtime=600) as one:
-            (mine,) = set(BOTH) & set(one.rcs)
-            assert (one.rc(ANY), one.rcs) == (mine, [mine, "robot/x"])
-            assert [await echo(one, need) for need in (ANY, mine, "robot/x")] == [ANY, mine, "robot/x"]
-            with pytest.raises(KeyError, match="is no need of one; it asked for framegrabber/"):
-                await one.command(MORE, {"name": "echo", "value": 1})
-            (told,) = (await lab.rc(client, mine)).holders
-            assert (told.rcs, told.bound) == (one.rcs, {ANY: mine})
+async def test_each_gets_a_free_one_and_who_waits_the_first_that_is_given_back(lab: Lab) -> None:
+    lab.node("a", *BOTH, "robot/x")
+    client, other, third = [await lab.client(name) for name in ("one", "two", "three")]
+    await lab.ready(client, *BOTH, "robot/x")
+    async with hold(client, "one", {ANY: {}, "robot/x": {}}, min_runtime=600) as one:
+        (mine,) = set(BOTH) & set(one.rcs)
+        assert (one.rc(ANY), one.rcs) == (mine, [mine, "robot/x"])
+        assert [await echo(one, need) for need in (ANY, mine, "robot/x")] == [ANY, mine, "robot/x"]
+        with pytest.raises(KeyError, match="is no need of one; it asked for framegrabber/"):
+            await one.command(MORE, {"name": "echo", "value": 1})
+        (told,) = (await lab.rc(client, mine)).holders
+        assert (told.rcs, told.bound) == (one.rcs, {ANY: mine})
 
-            second, grant = await running(other, "two", ANY)
-            two = Held(other, second, grant)
-            assert {one.rc(ANY), two.rc(ANY)} == set(BOTH)
-            assert await echo(two, ANY) == ANY
-            with pytest.raises(CommandRefused, match=mine):
-                await two.command(mine, {"name": "echo", "value": 1})
+        second, grant = await running(other, "two", ANY)
+        two = Held(other, second, grant)
+        assert {one.rc(ANY), two.rc(ANY)} == set(BOTH)
+        assert await echo(two, ANY) == ANY
+        with pytest.raises(CommandRefused, match=mine):
+            await two.command(mine, {"name": "echo", "value": 1})
 
-            late = await third.request("three", {ANY: {}}, min_runtime=600)
-            await comes_to(late, "queued", "waits for one of framegrabber/")
-            state = await lab.state(client, lambda state: waits_for(state) == [("three", [ANY])])
-            assert {view.arc: (sorted(view.needs), view.bound) for view in state.holds} == {
-                "one": (one.rcs, {ANY: mine}),
-                "two": (two.rcs, {ANY: two.rc(ANY)}),
-            }
-            await other.end(second)
-            given = await third.granted(late)
-            assert given is not None
-            three = Held(third, late, given)
-            assert three.rc(ANY) == two.rc(ANY)
-            assert await echo(three, ANY) == ANY
-            assert await echo(one, ANY) == ANY
+        late = await third.request("three", {ANY: {}}, min_runtime=600)
+        await comes_to(late, "queued", "waits for one of framegrabber/")
+        state = await lab.state(client, lambda state: waits_for(state) == [("three", [ANY])])
+        assert {view.arc: (sorted(view.needs), view.bound) for view in state.holds} == {
+            "one": (one.rcs, {ANY: mine}),
+            "two": (two.rcs, {ANY: two.rc(ANY)}),
+        }
+        await other.end(second)
+        given = await third.granted(late)
+        assert given is not None
+        three = Held(third, late, given)
+        assert three.rc(ANY) == two.rc(ANY)
+        assert await echo(three, ANY) == ANY
+        assert await echo(one, ANY) == ANY
 
 
 async def test_a_hold_keeps_its_rcs_over_a_change_of_rcm_and_gets_another_after_a_loss(tmp_path: Path) -> None:
     async with Lab(tmp_path, candidates=("a", "b")) as lab:
         lab.node("c", *BOTH, extra=APART)
         lab.node("a")
-        client = await lab.client("asker")
-        await lab.ready(client, *BOTH)
+        client = await lab.begun("asker")
         lab.node("b")
         async with Stand(lab) as stand:
             rc = await stand.rc("framegrabber/f3", Bench())
@@ -128,8 +126,7 @@ async def test_the_one_that_was_given_is_asked_whether_it_knows(tmp_path: Path) 
     async with Lab(tmp_path, lease=30, extra="[timing]\nhold_lease = 60\n") as lab:
         lab.node("a")
         lab.node("v", BOTH[0], extra=APART)
-        client = await lab.client()
-        await lab.ready(client, BOTH[0])
+        client = await lab.begun()
         lab.signal("v", signal.SIGSTOP)
         arc = await client.request("any", {ANY: {}}, min_runtime=600)
         entered = asyncio.create_task(client.granted(arc, confirmed=True))
@@ -144,7 +141,7 @@ async def test_the_one_that_was_given_is_asked_whether_it_knows(tmp_path: Path) 
         assert arc.bound == {ANY: BOTH[0]}
 
 
-async def test_a_plain_script_commands_by_need(tmp_path: Path) -> None:
+async def test_a_plain_script_commands_by_need(lab: Lab) -> None:
     def script(lab: Lab) -> None:
         with (
             blocking.connect("plain", fleet=lab.fleet, host="test") as mesh,
@@ -154,35 +151,31 @@ async def test_a_plain_script_commands_by_need(tmp_path: Path) -> None:
             for need in (ANY, MORE, *BOTH):
                 assert held.command(need, {"name": "echo", "value": need}) == need
 
-    async with Lab(tmp_path) as lab:
-        lab.node("a", *BOTH)
-        client = await lab.client("eye")
-        await lab.ready(client, *BOTH)
-        await asyncio.to_thread(script, lab)
+    lab.node("a", *BOTH)
+    await lab.begun("eye")
+    await asyncio.to_thread(script, lab)
 
 
-async def test_what_no_request_may_ask_is_refused_with_the_remedy(tmp_path: Path) -> None:
-    async with Lab(tmp_path) as lab:
-        lab.node("a", "radio/f:rate=5")
-        client = await lab.client()
-        await lab.ready(client, "radio/f")
-        refusals: list[tuple[dict[str, dict[str, Any]], str]] = [
-            ({"radio/**": {}}, "write kind/name with"),
-            ({"radio/*": {"rate": 1}, "radio/*#2": {"rate": 2}}, "give all the same"),
-            ({"radio/*": {"rate": 1}, "*/f": {}}, "name its kind"),
-        ]
-        for needs, remedy in refusals:
-            with pytest.raises(RequestRefused, match=remedy) as refused:
-                await client.request("bad", needs)
-            assert refused.value.code == "bad_request"
-            with pytest.raises(RequestRefused, match=remedy):
-                await client.foresee("bad", needs, priority=0, min_runtime=Decimal(1))
-        foretold = await client.foresee("good", {"radio/*": {"rate": 1}}, priority=0, min_runtime=Decimal(1))
-        assert foretold is not None
-        assert foretold.starts_in == 0
+async def test_what_no_request_may_ask_is_refused_with_the_remedy(lab: Lab) -> None:
+    lab.node("a", "radio/f:rate=5")
+    client = await lab.begun()
+    refusals: list[tuple[dict[str, dict[str, Any]], str]] = [
+        ({"radio/**": {}}, "write kind/name with"),
+        ({"radio/*": {"rate": 1}, "radio/*#2": {"rate": 2}}, "give all the same"),
+        ({"radio/*": {"rate": 1}, "*/f": {}}, "name its kind"),
+    ]
+    for needs, remedy in refusals:
+        with pytest.raises(RequestRefused, match=remedy) as refused:
+            await client.request("bad", needs)
+        assert refused.value.code == "bad_request"
+        with pytest.raises(RequestRefused, match=remedy):
+            await client.foresee("bad", needs, priority=0, min_runtime=Decimal(1))
+    foretold = await client.foresee("good", {"radio/*": {"rate": 1}}, priority=0, min_runtime=Decimal(1))
+    assert foretold is not None
+    assert foretold.starts_in == 0
 
 
-async def test_a_client_written_from_the_document_asks_by_pattern(tmp_path: Path) -> None:
+async def test_a_client_written_from_the_document_asks_by_pattern(lab: Lab) -> None:
     async def live(lab: Lab, plain: PlainProcess) -> None:
         assert (await plain.told_of("ready"))["imported"] == []
         client = lab.clients[0]
@@ -203,15 +196,13 @@ async def test_a_client_written_from_the_document_asks_by_pattern(tmp_path: Path
         assert await plain.command("q1", ANY, {"name": "echo", "value": 1}) == {"result": 1}
         assert await plain.end() == 0
 
-    async with Lab(tmp_path) as lab:
-        lab.node("a", *BOTH, "robot/r")
-        client = await lab.client("rival")
-        await lab.ready(client, *BOTH, "robot/r")
-        plain = await PlainProcess.start(lab, "plain")
-        try:
-            await live(lab, plain)
-        finally:
-            plain.kill()
+    lab.node("a", *BOTH, "robot/r")
+    await lab.begun("rival")
+    plain = await PlainProcess.start(lab, "plain")
+    try:
+        await live(lab, plain)
+    finally:
+        plain.kill()
 
 
 @pytest.fixture

@@ -217,8 +217,7 @@ async def test_a_client_written_from_the_document_lives_a_whole_life(tmp_path: P
         lab.node("c", "robot/r", "radio/f:rate=5", extra="candidate = false")
         lab.node("a")
         lab.node("b")
-        client = await lab.client("rival")
-        await lab.ready(client, "robot/r", "radio/f")
+        await lab.begun("rival")
         plain = await PlainProcess.start(lab, "plain")
         try:
             await live(lab, plain)

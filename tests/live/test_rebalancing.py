@@ -23,8 +23,7 @@ async def test_what_is_on_one_host_spreads_and_then_stays(tmp_path: Path) -> Non
     rules = f"[placement]\nstart_timeout = {HANG}\nrebalance = true\ngain = 0.1\nsteady = 1\nrest = 2\n"
     async with Lab(tmp_path, candidates=["h1"], extra=rules) as lab:
         lab.node("h1", extra='load = "tree"')
-        client = await lab.client()
-        await lab.ready(client)
+        client = await lab.begun()
         placing = Placing(client)
         await placing.hosts(1)
         # More than this machine carries, if it has two processors.

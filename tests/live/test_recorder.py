@@ -110,8 +110,7 @@ async def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
     async with Lab(tmp_path) as lab:
         lab.node("a", "robot/a", "radio/a:rate=10", extra=recorder())
         lab.node("b", "robot/b")
-        client = await lab.client("crew")
-        await lab.ready(client, "robot/a", "radio/a", "robot/b")
+        client = await lab.begun("crew")
         await recording(lab)
         told_why = asyncio.Event()
 
@@ -186,8 +185,7 @@ async def test_a_recorder_starts_in_the_middle_and_outlives_the_leader(tmp_path:
     runs = tmp_path / "runs"
     async with Lab(tmp_path, candidates=["a", "b"]) as lab:
         lab.node("a")
-        client = await lab.client("crew")
-        await lab.ready(client)
+        client = await lab.begun("crew")
         lab.node("b", "robot/b", "robot/c")
         await lab.ready(client, "robot/b", "robot/c")
         first = await client.request("twin", {"robot/b": {}}, min_runtime=60)
@@ -239,8 +237,7 @@ async def test_what_ends_while_no_rcm_is_there_is_seen_from_the_devices(tmp_path
     async with Lab(tmp_path, lease=4.0, candidates=["a"]) as lab:
         lab.node("a")
         lab.node("b", "robot/b", extra="candidate = false\n" + recorder())
-        client = await lab.client("crew")
-        await lab.ready(client, "robot/b")
+        client = await lab.begun("crew")
         await recording(lab)
         survey = await client.request("survey", {"robot/b": {}}, min_runtime=60)
         assert await client.granted(survey, confirmed=True)
@@ -259,32 +256,31 @@ async def test_what_ends_while_no_rcm_is_there_is_seen_from_the_devices(tmp_path
         await ended(lab, "b")
 
 
-async def test_a_recorder_that_dies_is_started_again(tmp_path: Path) -> None:
-    async with Lab(tmp_path) as lab:
-        node = lab.node("a", "robot/a", extra=recorder())
-        client = await lab.client("crew")
-        await recording(lab)
-        (child,) = psutil.Process(node.pid).children()
-        tokens, again = 0, asyncio.Event()
+async def test_a_recorder_that_dies_is_started_again(tmp_path: Path, lab: Lab) -> None:
+    node = lab.node("a", "robot/a", extra=recorder())
+    client = await lab.client("crew")
+    await recording(lab)
+    (child,) = psutil.Process(node.pid).children()
+    tokens, again = 0, asyncio.Event()
 
-        def seen(_token: Token, alive: bool) -> None:
-            nonlocal tokens
-            tokens += alive
-            if tokens == 2:
-                again.set()
+    def seen(_token: Token, alive: bool) -> None:
+        nonlocal tokens
+        tokens += alive
+        if tokens == 2:
+            again.set()
 
-        watch = client.mesh.watch(client.mesh.keys.alive_any(Role.RECORDER), seen)
-        child.kill()
-        async with asyncio.timeout(HANG):
-            await again.wait()
-        watch.close()
-        assert len(list((tmp_path / "runs").iterdir())) == 2
-        (child,) = psutil.Process(node.pid).children()
-        # Ended on purpose, it stays ended, and the node goes on.
-        child.terminate()
-        await until(lambda: "the recorder was ended" in lab.log("a"))
-        await lab.ready(client, "robot/a")
-        assert psutil.Process(node.pid).children() == []
+    watch = client.mesh.watch(client.mesh.keys.alive_any(Role.RECORDER), seen)
+    child.kill()
+    async with asyncio.timeout(HANG):
+        await again.wait()
+    watch.close()
+    assert len(list((tmp_path / "runs").iterdir())) == 2
+    (child,) = psutil.Process(node.pid).children()
+    # Ended on purpose, it stays ended, and the node goes on.
+    child.terminate()
+    await until(lambda: "the recorder was ended" in lab.log("a"))
+    await lab.ready(client, "robot/a")
+    assert psutil.Process(node.pid).children() == []
 
 
 def run_recorder(lab: Lab, job: bytes, *program: str) -> subprocess.Popen[bytes]:
@@ -304,24 +300,23 @@ def run_recorder(lab: Lab, job: bytes, *program: str) -> subprocess.Popen[bytes]
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, None])
 async def test_the_program_says_where_it_records_and_ends_in_order(
-    tmp_path: Path, number: signal.Signals | None
+    tmp_path: Path, lab: Lab, number: signal.Signals | None
 ) -> None:
-    async with Lab(tmp_path) as lab:
-        job = RecorderJob(RecorderConfig(tmp_path / "new" / "runs", "127.0.0.1", 0), lab.fleet, "a")
-        process = run_recorder(lab, encode_job(job))
-        assert process.stdout is not None
-        assert process.stdin is not None
-        told = msgspec.json.decode(await asyncio.to_thread(process.stdout.readline), type=Recording)
-        assert told.url is not None
-        socket.create_connection(("127.0.0.1", int(told.url.split(":")[2].split("/")[0])), 5).close()
-        name = Path(told.file).name
-        assert name.startswith(f"{lab.fleet.name}-{time.strftime('%Y')}")
-        if number is None:
-            process.stdin.close()
-        else:
-            process.send_signal(number)
-        assert await asyncio.to_thread(process.wait, HANG) == 0
-        assert Path(told.file) == the_file(tmp_path / "new" / "runs")
+    job = RecorderJob(RecorderConfig(tmp_path / "new" / "runs", "127.0.0.1", 0), lab.fleet, "a")
+    process = run_recorder(lab, encode_job(job))
+    assert process.stdout is not None
+    assert process.stdin is not None
+    told = msgspec.json.decode(await asyncio.to_thread(process.stdout.readline), type=Recording)
+    assert told.url is not None
+    socket.create_connection(("127.0.0.1", int(told.url.split(":")[2].split("/")[0])), 5).close()
+    name = Path(told.file).name
+    assert name.startswith(f"{lab.fleet.name}-{time.strftime('%Y')}")
+    if number is None:
+        process.stdin.close()
+    else:
+        process.send_signal(number)
+    assert await asyncio.to_thread(process.wait, HANG) == 0
+    assert Path(told.file) == the_file(tmp_path / "new" / "runs")
 
 
 async def test_bad_settings_are_one_line_and_code_2(tmp_path: Path) -> None:
@@ -352,8 +347,7 @@ async def test_a_recorder_that_comes_late_has_what_a_journal_kept(tmp_path: Path
     runs = tmp_path / "runs"
     async with Lab(tmp_path) as lab:
         lab.node("a", "robot/a")
-        client = await lab.client("crew")
-        await lab.ready(client, "robot/a")
+        client = await lab.begun("crew")
         async with hold(client, "survey", {"robot/a": {}}, min_runtime=60):
             pass
         film = await client.request("film", {"robot/a": {}}, min_runtime=60)
@@ -398,8 +392,7 @@ async def test_parts_follow_one_another_and_the_oldest_make_room(tmp_path: Path)
         # Far more than the parts come to, whatever time this takes; and no room on the disk.
         old = [before(number, 20_000_000) for number in (1, 2, 3)]
         lab.node("a", "robot/a")
-        client = await lab.client("crew")
-        await lab.ready(client, "robot/a")
+        client = await lab.begun("crew")
         job = RecorderJob(RecorderConfig(runs, "127.0.0.1", 0, limit=50), lab.fleet, "b")
         process = run_recorder(lab, encode_job(job), "-c", IN_A_HURRY)
         await recording(lab)

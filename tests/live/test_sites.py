@@ -24,7 +24,7 @@ from zscout.config.certificate_authority import CertificateAuthority
 from zscout.messages import RcmState
 from zscout.types import SECOND, Grant
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 SHOWN = "import ssl; print(ssl.get_server_certificate(('127.0.0.1', 7447), timeout=5))"
 """The certificate that a relay shows who links to it."""
 LEASE = 5.0

@@ -119,8 +119,7 @@ async def test_a_leader_is_killed_and_one_of_the_other_version_goes_on(
             lab.node("d", "robot/d", "robot/free", extra=apart)
         with lab.at(leads):
             lab.node("a")
-        client = await lab.client("asker")
-        await lab.ready(client, "robot/c", "robot/d", "robot/old", "robot/free")
+        client = await lab.begun("asker")
         with lab.at(OTHER[leads]):
             lab.node("b")
         crew = Crew()
@@ -190,8 +189,7 @@ async def test_a_component_is_started_by_either_versions_program(tmp_path: Path,
             lab.node("a", extra="[components]\nallow = false\n")
         with lab.at(OTHER[leads]):
             lab.node("b")
-        client = await lab.client()
-        await lab.ready(client)
+        client = await lab.begun()
         # Before the balancer knows the other host, the one that takes no components would be asked, and refuse.
         await Placing(client).hosts(2)
         for version in ("old", "new"):
@@ -229,8 +227,7 @@ async def test_what_the_other_side_does_not_know_is_refused_naming_both_versions
     async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
         with lab.at(leads):
             lab.node("a", "robot/a")
-        client = await lab.client()
-        await lab.ready(client, "robot/a")
+        client = await lab.begun()
         link, operation = client._rcm, cast("Any", Book("b"))
         # What this version should not have sent is its own fault.
         assert ("upgrade" in (await refusal(lambda: link.query(operation))).message) == (leads == "old")
@@ -253,8 +250,7 @@ async def test_what_the_other_side_does_not_know_is_refused_naming_both_versions
 async def test_status_names_who_runs_which_version_where_they_differ(tmp_path: Path, former: Path) -> None:
     async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
         lab.node("a", "robot/a")
-        client = await lab.client()
-        await lab.ready(client, "robot/a")
+        client = await lab.begun()
         alone = await lab.zscout("status")
         assert "they differ" not in alone.stdout
         with lab.at("old"):
