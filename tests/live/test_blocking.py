@@ -146,38 +146,6 @@ def test_a_body_whose_time_is_over_is_interrupted(fleet: CliFleet, how: str, *, 
     assert (by("true") in told) == waits
 
 
-@pytest.mark.slow
-def test_a_hold_that_had_its_time_by_this_host_s_clock_is_completed_though_no_rcm_says_so_yet(fleet: CliFleet) -> None:
-    text = """
-        with zscout.connect() as lab:
-            try:
-                with lab.hold("survey", {"robot/a": {}}, min_runtime=10, keep=False, confirmed=True) as held:
-                    say("entered")
-                    time.sleep(LONGER)
-            except zscout.Revoked as revoked:
-                say(revoked.outcome, held.completed)
-    """
-    survey, node = script(fleet.lab, text), fleet.lab.nodes["anvil"]
-    read_until(survey, "entered")
-    node.send_signal(signal.SIGSTOP)
-    try:
-        told = read_until(survey, "completed")[-1]
-    finally:
-        node.send_signal(signal.SIGCONT)
-    assert told == "completed True"
-    assert rest_of(survey) == []
-
-
-def test_what_is_kept_goes_on_past_its_minimum_runtime(fleet: CliFleet) -> None:
-    text = """
-        with zscout.connect() as lab, lab.hold("survey", {"robot/a": {}}, min_runtime=0.1) as held:
-            while held.remaining > -1:
-                assert not held.wait(0.1)
-            say("still", held.active, held.command("robot/a", {"name": "echo", "value": 5}, ttl=60))
-    """
-    assert rest_of(script(fleet.lab, text)) == ["still True 5"]
-
-
 def test_the_end_of_an_inner_hold_leaves_the_outer_one(fleet: CliFleet) -> None:
     text = """
         with zscout.connect() as lab, lab.hold("outer", {"robot/a": {}}) as outer:
@@ -400,10 +368,3 @@ def test_who_waits_in_another_thread_as_a_lab_is_closed_is_told(fleet: CliFleet)
         thread.join()
     """
     assert rest_of(script(fleet.lab, text)) == ["this lab is closed; zscout.connect() gives a new one"]
-
-
-def test_all_names_are_listed_and_there() -> None:
-    import zscout
-
-    assert set(zscout.__all__) <= set(dir(zscout))
-    assert all(getattr(zscout, name) is not None for name in zscout.__all__)

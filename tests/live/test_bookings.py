@@ -59,20 +59,6 @@ async def taken_up(client: Client, booking: BookingView) -> float:
     return began.timestamp() - booking.start
 
 
-async def test_a_booking_outlives_its_leader(tmp_path: Path) -> None:
-    async with Lab(tmp_path, candidates=BOTH) as lab:
-        client, bookings = await fleet_of_two(lab)
-        booked = await bookings.book({"robot/b": {}}, in_seconds(SOON), 120, name="survey")
-        leader = (await lab.state(client, lambda _: True)).host
-        assert leader == "anvil"
-        lab.signal(leader, signal.SIGKILL)
-        lab.nodes[leader].wait()
-        await lab.living(client, Role.RCM, lambda hosts: hosts == ["bellows"])
-        assert [*await listed(bookings, lambda found: bool(found))] == ["survey"]
-        # Not before its date, by the time of the fleet, which is this host's.
-        assert await taken_up(client, booked) > -0.5
-
-
 async def test_bookings_outlive_a_restart_of_every_node_one_after_the_other(tmp_path: Path) -> None:
     async with Lab(tmp_path, candidates=BOTH) as lab:
         client, bookings = await fleet_of_two(lab)

@@ -61,15 +61,6 @@ async def test_a_secured_fleet_and_an_open_one_never_mix(tmp_path: Path) -> None
             assert {token.host for token in tokens} == hosts
 
 
-async def test_a_viewer_is_refused_by_name_and_sees(lab: ClosedLab) -> None:
-    lab.node("anvil", "robot/a")
-    wall = await lab.person("wall")
-    await lab.state(wall, lambda state: any(view.rc == "robot/a" and view.present for view in state.rcs))
-    with pytest.raises(RequestRefused, match=r"wall \(viewer\) may not ask for an ARC; ada, anvil, .* may"):
-        async with hold(wall, "survey", {"robot/a": {}}):
-            pass
-
-
 async def test_what_roles_say_is_enforced_and_taken_anew_at_sighup(lab: ClosedLab) -> None:
     lab.node("anvil", "robot/a", "robot/b")
     bob, ada = await lab.person("bob"), await lab.person("ada")

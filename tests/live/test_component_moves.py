@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import signal
 from itertools import pairwise
 from pathlib import Path
@@ -11,27 +10,19 @@ from typing import Any
 import pytest
 
 from tests.behaviors.components.kit import ComponentLab, Hosts, counts, counts_on, gone
-from tests.hang import HANG
 from tests.live.bench import until
-from tests.live.placing import LONGEST, register
-from zscout.behaviors.client.client import Client
+from tests.live.placing import register
 from zscout.messages import (
     MAX_CHECKPOINT,
     Checkpoint,
     CheckpointComponent,
     ComponentList,
-    ComponentSpec,
     Grants,
-    HostRanking,
     ListComponents,
-    MigrateComponent,
     MoveComponent,
     Moved,
     Output,
-    PlaceComponent,
-    Placement,
     Problem,
-    RankAsk,
     ReadOutput,
 )
 
@@ -187,56 +178,3 @@ async def test_a_move_that_fails_before_the_commit_changes_nothing(tmp_path: Pat
         numbers = await counts(hosts, "a")
         assert numbers == list(range(numbers[0], numbers[-1] + 1))
         assert (await lab.rc(client, "robot/x")).holders[0].grant == holder.grant
-
-
-@pytest.mark.slow
-async def test_a_target_that_is_killed_while_it_is_moved_to_leaves_one_that_counts(tmp_path: Path) -> None:
-    async with ComponentLab(tmp_path, candidates=["r"]) as lab:
-        register(lab)
-        for host in ("a", "b"):
-            lab.node(host)
-        lab.node("r", "robot/x", extra="[components]\nallow = false\n")
-        client = await lab.client()
-        hosts = Hosts(client)
-        await lab.ready(client, "robot/x")
-        await ranked(client, "a", "b")
-        spec = ComponentSpec("tally", QUICK | {"rc": "robot/x"}, hosts=["a", "b"])
-        placed = await placer(client, PlaceComponent("c", spec))
-        async with asyncio.timeout(HANG):
-            # It may be seen to run before its node has told what it can.
-            while not (isinstance(placed, Placement) and placed.state == "running" and placed.movable):
-                await asyncio.sleep(0.05)
-                placed = await placer(client, PlaceComponent("c", spec))
-        source = placed.host
-        assert source is not None
-        target = "b" if source == "a" else "a"
-        await counts_on(hosts, source)
-        # Wherever in the move the other node dies: it goes on where it was, or is started there again.
-        moving = asyncio.create_task(placer(client, MigrateComponent("c", target, wait=LONGEST)))
-        await lab.state(
-            client, lambda state: moving.done() or any(hold.client.startswith(target) for hold in state.holds)
-        )
-        lab.signal(target, signal.SIGKILL)
-        answer = await moving
-        assert isinstance(answer, Placement) or answer.code == "move_failed"
-        await lab.state(client, lambda state: any(hold.client.startswith(source) for hold in state.holds))
-        await counts_on(hosts, source)
-
-
-async def ranked(client: Client, *hosts: str) -> None:
-    """Waits until the balancer ranks these hosts: something can be placed there."""
-    async with asyncio.timeout(HANG):
-        while True:
-            ask = RankAsk(hosts=list(hosts))
-            reply = await client.mesh.ask_one(client.mesh.keys.rank, ask, HostRanking, timeout=1)
-            if reply is not None and reply.message is not None and len(reply.message.hosts) == len(hosts):
-                return
-            await asyncio.sleep(0.05)
-
-
-async def placer(client: Client, operation: PlaceComponent | MigrateComponent) -> Placement | Problem:
-    reply = await client.mesh.ask_one(client.mesh.keys.placer(client.mesh.me), operation, Placement, timeout=2 * HANG)
-    assert reply is not None
-    answer = reply.message or reply.problem
-    assert answer is not None
-    return answer

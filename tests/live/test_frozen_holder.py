@@ -49,20 +49,3 @@ async def test_a_holder_stopped_is_followed_and_refused_when_it_goes_on(tmp_path
         assert (await following.event("command"))["code"] == "done"
         state = await lab.rc(client, "robot/x")
         assert [holder.arc for holder in state.holders] == ["following"]
-
-
-async def test_a_holder_that_wakes_is_granted_anew_and_its_old_grant_is_never_revived(tmp_path: Path) -> None:
-    async with Lab(tmp_path, lease=4.0) as lab:
-        lab.node("a", "robot/x")
-        client = await lab.begun()
-        frozen = await lab.holder("frozen")
-        await frozen.order("ask", arc="frozen", needs={"robot/x": {}}, min_runtime=600)
-        entered = await frozen.event("entered")
-        frozen.signal(signal.SIGSTOP)
-        await lab.state(client, lambda state: not state.holds)
-        frozen.signal(signal.SIGCONT)
-        again = await frozen.event("entered")
-        assert again["grant"] > entered["grant"]
-        with pytest.raises(CommandRefused) as refused:
-            await client.command("robot/x", entered["grant"], ECHO)
-        assert refused.value.code == "ended"

@@ -21,7 +21,7 @@ from tests.hang import HANG
 from tests.live.lab import PATIENT, Lab
 from zscout.keyexpr import Role
 from zscout.messages import Grants
-from zscout.services.journal.store import ASIDE, FILE
+from zscout.services.journal.store import FILE
 from zscout.types import Term
 
 pytestmark = pytest.mark.live
@@ -196,19 +196,6 @@ async def test_where_nobody_is_there_nobody_answers(lab: Lab) -> None:
     done = await zscout_soon("history", env=lab.env)
     assert done.returncode == 3
     assert done.stderr.startswith(f"zscout: no RCM is on the mesh of fleet {lab.fleet.name} (no other program")
-
-
-async def test_a_journal_that_is_damaged_is_set_aside_and_the_node_runs(lab: Lab) -> None:
-    file = file_of(lab, "anvil")
-    file.parent.mkdir(parents=True)
-    file.write_bytes(b"this is no journal\n" * 1_000)
-    lab.node("anvil", "robot/a")
-    client = await lab.begun("program")
-    request = await client.request("survey", {"robot/a": {}}, min_runtime=600)
-    await client.end(request)
-    await told(lab, lambda found: [hold["outcome"] for hold in found["holds"]] == ["released"])
-    assert lab.log("anvil").count("is damaged") == 1
-    assert file.with_name(ASIDE).exists()
 
 
 async def test_a_fleet_without_a_journal_says_so(lab: Lab) -> None:

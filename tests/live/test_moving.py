@@ -21,7 +21,7 @@ from zscout.behaviors.client.request import OpenArc
 from zscout.messages import DrainHost, EndComponent, Grants, MigrateComponent, Placement, Placements, RcState
 from zscout.types import Grant
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 RC = "robot/scout33"
 MOVES = times(20)

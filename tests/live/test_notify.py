@@ -14,7 +14,7 @@ from tests.live.lab import Lab
 from tests.services.notify.receiver import Receiver
 from zscout.behaviors.client.client import Client
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 
 def node(lab: Lab, host: str, receiver: Receiver, *rcs: str) -> None:

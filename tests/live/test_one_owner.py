@@ -29,7 +29,7 @@ from zscout.mesh import clock
 from zscout.messages import Command, Done
 from zscout.types import Grant, Ns
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 RC = "robot/arm"
 
 

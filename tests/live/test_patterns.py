@@ -5,9 +5,7 @@ from __future__ import annotations
 import asyncio
 import signal
 from collections.abc import Iterator
-from decimal import Decimal
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,7 +16,7 @@ from tests.live.stranger import Stranger, beside_a_node, command, good_ask
 from tests.live.test_protocol import PlainProcess
 from zscout.behaviors.client import blocking
 from zscout.behaviors.client.arc import Held, hold
-from zscout.behaviors.client.client import CommandRefused, RequestRefused
+from zscout.behaviors.client.client import CommandRefused
 from zscout.messages import RcmState
 
 pytestmark = pytest.mark.live
@@ -72,6 +70,7 @@ async def test_each_gets_a_free_one_and_who_waits_the_first_that_is_given_back(l
         assert await echo(one, ANY) == ANY
 
 
+@pytest.mark.slow
 async def test_a_hold_keeps_its_rcs_over_a_change_of_rcm_and_gets_another_after_a_loss(tmp_path: Path) -> None:
     async with Lab(tmp_path, candidates=("a", "b")) as lab:
         lab.node("c", *BOTH, extra=APART)
@@ -121,6 +120,7 @@ async def test_a_hold_keeps_its_rcs_over_a_change_of_rcm_and_gets_another_after_
             assert sorted(waiting.bound.values()) == waiting.rcs == BOTH
 
 
+@pytest.mark.slow
 async def test_the_one_that_was_given_is_asked_whether_it_knows(tmp_path: Path) -> None:
     # With so long a lease nobody takes the frozen node for gone while this lasts.
     async with Lab(tmp_path, lease=30, extra="[timing]\nhold_lease = 60\n") as lab:
@@ -154,25 +154,6 @@ async def test_a_plain_script_commands_by_need(lab: Lab) -> None:
     lab.node("a", *BOTH)
     await lab.begun("eye")
     await asyncio.to_thread(script, lab)
-
-
-async def test_what_no_request_may_ask_is_refused_with_the_remedy(lab: Lab) -> None:
-    lab.node("a", "radio/f:rate=5")
-    client = await lab.begun()
-    refusals: list[tuple[dict[str, dict[str, Any]], str]] = [
-        ({"radio/**": {}}, "write kind/name with"),
-        ({"radio/*": {"rate": 1}, "radio/*#2": {"rate": 2}}, "give all the same"),
-        ({"radio/*": {"rate": 1}, "*/f": {}}, "name its kind"),
-    ]
-    for needs, remedy in refusals:
-        with pytest.raises(RequestRefused, match=remedy) as refused:
-            await client.request("bad", needs)
-        assert refused.value.code == "bad_request"
-        with pytest.raises(RequestRefused, match=remedy):
-            await client.foresee("bad", needs, priority=0, min_runtime=Decimal(1))
-    foretold = await client.foresee("good", {"radio/*": {"rate": 1}}, priority=0, min_runtime=Decimal(1))
-    assert foretold is not None
-    assert foretold.starts_in == 0
 
 
 async def test_a_client_written_from_the_document_asks_by_pattern(lab: Lab) -> None:

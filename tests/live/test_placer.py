@@ -26,7 +26,7 @@ from zscout.messages import (
 )
 from zscout.types import SECOND
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 RC = "robot/scout33"
 

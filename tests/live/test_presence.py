@@ -15,7 +15,7 @@ from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.recovery import RecoveredState
 from zscout.types import Term
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 
 async def test_an_rc_that_died_while_the_lead_was_taken_is_lost_within_a_lease(tmp_path: Path) -> None:

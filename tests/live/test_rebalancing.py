@@ -12,7 +12,7 @@ from tests.live.lab import Lab
 from tests.live.placing import Placing
 from zscout.messages import ListPlacements, Placement, Placements
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 QUIET = 4.0
 """Seconds: more than the fleet of this test needs for a move."""

@@ -8,10 +8,8 @@ from decimal import Decimal
 
 import pytest
 
-from tests.hang import HANG
 from tests.live.lab import TTL, Lab
 from zscout.behaviors.client.arc import Revoked, hold
-from zscout.messages import LoadReport
 
 pytestmark = pytest.mark.live
 
@@ -71,25 +69,3 @@ async def test_what_would_come_is_foretold_and_nothing_is_changed_by_asking(lab:
     assert [view.arc for view in after.holds] == ["mine"]
     assert [view.arc for view in after.queue] == ["next"]
     assert (running.state, waiting.state) == ("running", "queued")
-
-
-async def test_a_node_tells_its_load_once_a_second_with_its_labels(lab: Lab) -> None:
-    client = await lab.client()
-    heard: asyncio.Queue[tuple[float, LoadReport]] = asyncio.Queue()
-    loop = asyncio.get_running_loop()
-    keys = client.mesh.keys
-
-    def on_load(key: str, report: LoadReport) -> None:
-        assert keys.host_of(key) == report.host
-        heard.put_nowait((loop.time(), report))
-
-    client.mesh.subscribe(keys.load_any, LoadReport, on_load)
-    lab.node("a", extra='labels = ["gpu", "lab-3"]')
-    async with asyncio.timeout(HANG):
-        told = [await heard.get() for _ in range(4)]
-    reports = [report for _, report in told]
-    first = reports[0].number
-    assert [report.number for report in reports] == list(range(first, first + 4))
-    assert {report.labels for report in reports} == {("gpu", "lab-3")}
-    assert all(report.speed > 0.01 and report.components == () for report in reports)
-    assert told[-1][0] - told[0][0] > 2.5

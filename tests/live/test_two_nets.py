@@ -12,6 +12,7 @@ from zscout.messages import MAX_COMPONENT_NAME, EndComponent, Placement
 pytestmark = pytest.mark.live
 
 
+@pytest.mark.slow
 async def test_a_component_that_others_placed_under_its_name_is_left_alone(lab: ComponentLab) -> None:
     lab.node("a", "robot/r1", "robot/r2")
     client = await lab.begun()

@@ -107,6 +107,7 @@ async def test_a_gang_over_nodes_of_both_versions(tmp_path: Path, former: Path, 
         await lab.held_by(client, "radio/b", "second")
 
 
+@pytest.mark.slow
 @leaders
 async def test_a_leader_is_killed_and_one_of_the_other_version_goes_on(
     tmp_path: Path, former: Path, leads: str
@@ -146,6 +147,7 @@ async def test_a_leader_is_killed_and_one_of_the_other_version_goes_on(
         await asyncio.gather(*(body.finish() for body in crew.bodies))
 
 
+@pytest.mark.slow
 @leaders
 async def test_a_component_moves_between_the_versions_with_its_hold(tmp_path: Path, former: Path, leads: str) -> None:
     async with MixedLab(tmp_path, former, candidates=("r",)) as lab:
@@ -182,6 +184,7 @@ async def test_a_component_moves_between_the_versions_with_its_hold(tmp_path: Pa
         assert (holder.arc, holder.client.partition("/")[0]) == ("c", at)
 
 
+@pytest.mark.slow
 @leaders
 async def test_a_component_is_started_by_either_versions_program(tmp_path: Path, former: Path, leads: str) -> None:
     async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
@@ -247,6 +250,7 @@ async def test_what_the_other_side_does_not_know_is_refused_naming_both_versions
         assert f"the node {says}" in problem.message
 
 
+@pytest.mark.slow
 async def test_status_names_who_runs_which_version_where_they_differ(tmp_path: Path, former: Path) -> None:
     async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
         lab.node("a", "robot/a")
@@ -267,6 +271,7 @@ async def test_status_names_who_runs_which_version_where_they_differ(tmp_path: P
         assert shown["versions"] == [{"version": None, "hosts": ["b"]}, {"version": VERSION, "hosts": ["a"]}]
 
 
+@pytest.mark.slow
 @leaders
 async def test_a_command_is_told_that_nobody_waits_for_it(tmp_path: Path, former: Path, leads: str) -> None:
     who = [f"the RCM at a (older than 0.2.0, this is {VERSION})"] * (leads == "old") + ["robot/old"]
