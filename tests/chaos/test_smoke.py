@@ -24,6 +24,7 @@ NEVER = range(1, 7)
 pytestmark = pytest.mark.live
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(bool(why_not), reason=why_not)
 def test_a_leader_is_killed_and_nothing_is_left() -> None:
     command = [sys.executable, "-m", "tests.chaos", "--count", "1", "--only", "leader killed", "--json"]

@@ -92,6 +92,8 @@ class Lab:
         )
         self.fleet: Fleet = load_fleet(self.fleet_file)
         self.env = os.environ | {"ZSCOUT_FLEET": str(self.fleet_file), "XDG_STATE_HOME": str(folder / "state")}
+        self._rcs: set[str] = set()
+        """Of its nodes."""
         self.cwd: Path | None = None
         """Of what is started. `python -m` looks there first."""
         self._confirm_timeout = confirmation.CONFIRM_TIMEOUT
@@ -101,6 +103,7 @@ class Lab:
         text = f'[node]\nhost = "{host}"\nfleet = "fleet.toml"\n{extra}\n'
         for rc in rcs:
             name, _, bounds = rc.partition(":")
+            self._rcs.add(name)
             text += f'[[rc]]\nname = "{name}"\ndriver = "{"capacity" if bounds else "exclusive"}"\n'
             if bounds:
                 text += f"capacity = {{ {bounds} }}\n"
@@ -135,6 +138,12 @@ class Lab:
     async def client(self, name: str | None = None) -> Client:
         client = await PatientClient.connect(name, fleet=self.fleet, host="test")
         self.clients.append(client)
+        return client
+
+    async def begun(self, name: str | None = None) -> Client:
+        """A client, once somebody leads and all RCs of all nodes are there for it."""
+        client = await self.client(name)
+        await self.ready(client, *self._rcs)
         return client
 
     def signal(self, host: str, number: signal.Signals) -> Ns:

@@ -14,7 +14,7 @@ from zscout.behaviors.client.client import Client
 from zscout.keyexpr import Role
 from zscout.messages import HostRanking, RankAsk
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 HOSTS = {"h1", "h2", "h3"}
 
@@ -30,11 +30,7 @@ async def ranked(client: Client, asked: RankAsk, hosts: set[str]) -> HostRanking
     return answer
 
 
-def test_the_balancer_ranks_whom_it_hears(tmp_path: Path) -> None:
-    asyncio.run(_ranks(tmp_path))
-
-
-async def _ranks(tmp_path: Path) -> None:
+async def test_the_balancer_ranks_whom_it_hears(tmp_path: Path) -> None:
     async with Lab(tmp_path, candidates=["h1", "h2"]) as lab:
         for host in sorted(HOSTS):
             lab.node(host, f"robot/{host}")

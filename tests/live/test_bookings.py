@@ -19,7 +19,7 @@ from zscout.behaviors.client.client import Client
 from zscout.keyexpr import Role
 from zscout.messages import BookingView
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 BOTH = ("anvil", "bellows")
 SOON = 8.0
@@ -44,8 +44,7 @@ async def listed(bookings: BookingsClient, until: Callable[[dict[str, BookingVie
 async def fleet_of_two(lab: Lab) -> tuple[Client, BookingsClient]:
     """The first leads: the other comes when it does."""
     lab.node(BOTH[0], "robot/a")
-    client = await lab.client("program")
-    await lab.ready(client, "robot/a")
+    client = await lab.begun("program")
     lab.node(BOTH[1], "robot/b")
     await lab.ready(client, "robot/a", "robot/b")
     await lab.candidates(client, *BOTH)
@@ -60,67 +59,44 @@ async def taken_up(client: Client, booking: BookingView) -> float:
     return began.timestamp() - booking.start
 
 
-def test_a_booking_outlives_its_leader(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path, candidates=BOTH) as lab:
-            client, bookings = await fleet_of_two(lab)
-            booked = await bookings.book({"robot/b": {}}, in_seconds(SOON), 120, name="survey")
-            leader = (await lab.state(client, lambda _: True)).host
-            assert leader == "anvil"
-            lab.signal(leader, signal.SIGKILL)
-            lab.nodes[leader].wait()
-            await lab.living(client, Role.RCM, lambda hosts: hosts == ["bellows"])
-            assert [*await listed(bookings, lambda found: bool(found))] == ["survey"]
-            # Not before its date, by the time of the fleet, which is this host's.
-            assert await taken_up(client, booked) > -0.5
-
-    asyncio.run(story())
-
-
-def test_bookings_outlive_a_restart_of_every_node_one_after_the_other(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path, candidates=BOTH) as lab:
-            client, bookings = await fleet_of_two(lab)
-            weekly = await bookings.book(
-                {"robot/*": {}}, in_seconds(3600), 600, name="weekly", every=7, until=in_seconds(30 * 86_400)
-            )
-            gone = await bookings.book({"robot/a": {}}, in_seconds(7200), 600, name="gone")
-            await bookings.unbook(gone.id)
-            await bookings.unbook(weekly.id, weekly.dates[1].start)
-            for host, rc in zip(BOTH, ("robot/a", "robot/b"), strict=True):
-                other = "bellows" if host == "anvil" else "anvil"
-                lab.signal(host, signal.SIGTERM)
-                assert lab.nodes[host].wait(timeout=HANG) == 0
-                await lab.living(client, Role.RCM, lambda hosts, other=other: hosts == [other])  # type: ignore[misc]
-                lab.node(host, rc)
-                await lab.candidates(client, *BOTH)
-            await lab.ready(client, "robot/a", "robot/b")
-            found = await listed(bookings, lambda found: bool(found) and not found["weekly"].dates[0].danger)
-            assert [*found] == ["weekly"]
-            dates = [date.start for date in weekly.dates]
-            assert [date.start for date in found["weekly"].dates] == [dates[0], *dates[2:]]
-            # While one robot was away the other was kept.
-            assert found["weekly"].dates[0].bound["robot/*"] in ("robot/a", "robot/b")
-
-    asyncio.run(story())
+async def test_bookings_outlive_a_restart_of_every_node_one_after_the_other(tmp_path: Path) -> None:
+    async with Lab(tmp_path, candidates=BOTH) as lab:
+        client, bookings = await fleet_of_two(lab)
+        weekly = await bookings.book(
+            {"robot/*": {}}, in_seconds(3600), 600, name="weekly", every=7, until=in_seconds(30 * 86_400)
+        )
+        gone = await bookings.book({"robot/a": {}}, in_seconds(7200), 600, name="gone")
+        await bookings.unbook(gone.id)
+        await bookings.unbook(weekly.id, weekly.dates[1].start)
+        for host, rc in zip(BOTH, ("robot/a", "robot/b"), strict=True):
+            other = "bellows" if host == "anvil" else "anvil"
+            lab.signal(host, signal.SIGTERM)
+            assert lab.nodes[host].wait(timeout=HANG) == 0
+            await lab.living(client, Role.RCM, lambda hosts, other=other: hosts == [other])  # type: ignore[misc]
+            lab.node(host, rc)
+            await lab.candidates(client, *BOTH)
+        await lab.ready(client, "robot/a", "robot/b")
+        found = await listed(bookings, lambda found: bool(found) and not found["weekly"].dates[0].danger)
+        assert [*found] == ["weekly"]
+        dates = [date.start for date in weekly.dates]
+        assert [date.start for date in found["weekly"].dates] == [dates[0], *dates[2:]]
+        # While one robot was away the other was kept.
+        assert found["weekly"].dates[0].bound["robot/*"] in ("robot/a", "robot/b")
 
 
-def test_a_fleet_that_was_killed_whole_keeps_what_was_booked(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path, candidates=BOTH) as lab:
-            client, bookings = await fleet_of_two(lab)
-            booked = await bookings.book({"robot/a": {}, "robot/b": {}}, in_seconds(SOON), 120, name="survey")
-            gone = await bookings.book({"robot/a": {}}, in_seconds(7200), 600, name="gone")
-            await bookings.unbook(gone.id)
-            for host in BOTH:
-                lab.signal(host, signal.SIGKILL)
-            for host in BOTH:
-                lab.nodes[host].wait()
-            for host, rc in zip(BOTH, ("robot/a", "robot/b"), strict=True):
-                lab.node(host, rc)
-            await lab.ready(client, "robot/a", "robot/b")
-            assert [*await listed(bookings, lambda found: bool(found))] == ["survey"]
-            assert await taken_up(client, booked) > -0.5
-            assert not await listed(bookings, lambda found: not found)
-
-    asyncio.run(story())
+async def test_a_fleet_that_was_killed_whole_keeps_what_was_booked(tmp_path: Path) -> None:
+    async with Lab(tmp_path, candidates=BOTH) as lab:
+        client, bookings = await fleet_of_two(lab)
+        booked = await bookings.book({"robot/a": {}, "robot/b": {}}, in_seconds(SOON), 120, name="survey")
+        gone = await bookings.book({"robot/a": {}}, in_seconds(7200), 600, name="gone")
+        await bookings.unbook(gone.id)
+        for host in BOTH:
+            lab.signal(host, signal.SIGKILL)
+        for host in BOTH:
+            lab.nodes[host].wait()
+        for host, rc in zip(BOTH, ("robot/a", "robot/b"), strict=True):
+            lab.node(host, rc)
+        await lab.ready(client, "robot/a", "robot/b")
+        assert [*await listed(bookings, lambda found: bool(found))] == ["survey"]
+        assert await taken_up(client, booked) > -0.5
+        assert not await listed(bookings, lambda found: not found)

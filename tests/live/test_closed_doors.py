@@ -99,24 +99,20 @@ def has_seen(session: zenoh.Session) -> list[str]:
 
 
 @pytest.mark.parametrize("name", ["plain TCP", "no certificate", "another CA's", "expired"])
-def test_an_intruder_has_no_link_no_token_and_no_key(tmp_path: Path, name: str) -> None:
-    async def story() -> None:
-        async with ClosedLab(tmp_path) as lab:
-            inside = Inside(lab)
-            try:
-                # Whoever joins makes the links: one member joins before the intruder, one after.
-                await inside.join("anvil")
-                with bare(lab, **intruders(lab)[name]) as intruder:
-                    mesh = await inside.join("bench")
-                    assert not await asyncio.to_thread(has_seen, intruder)
-                    assert not linked(intruder)
-                    # Either end may tell later than the other.
-                    await until(lambda: {one.links() for one in inside.meshes} == {1}, within=HANG)
-                    assert mesh.links() == 1
-            finally:
-                await inside.close()
-
-    asyncio.run(story())
+async def test_an_intruder_has_no_link_no_token_and_no_key(lab: ClosedLab, name: str) -> None:
+    inside = Inside(lab)
+    try:
+        # Whoever joins makes the links: one member joins before the intruder, one after.
+        await inside.join("anvil")
+        with bare(lab, **intruders(lab)[name]) as intruder:
+            mesh = await inside.join("bench")
+            assert not await asyncio.to_thread(has_seen, intruder)
+            assert not linked(intruder)
+            # Either end may tell later than the other.
+            await until(lambda: {one.links() for one in inside.meshes} == {1}, within=HANG)
+            assert mesh.links() == 1
+    finally:
+        await inside.close()
 
 
 def without(settings: dict[str, Any], path: str) -> dict[str, Any]:
@@ -139,24 +135,19 @@ def without(settings: dict[str, Any], path: str) -> dict[str, Any]:
         ("transport/link/tls#enable_mtls", "expired"),
     ],
 )
-def test_each_setting_keeps_somebody_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, setting: str, name: str
+async def test_each_setting_keeps_somebody_out(
+    lab: ClosedLab, monkeypatch: pytest.MonkeyPatch, setting: str, name: str
 ) -> None:
     closed = zenoh_mesh._closed
     monkeypatch.setattr(zenoh_mesh, "_closed", lambda security: without(closed(security), setting))
-
-    async def story() -> None:
-        async with ClosedLab(tmp_path) as lab:
-            inside = Inside(lab)
-            try:
-                await inside.join("anvil")
-                with bare(lab, **intruders(lab)[name]) as intruder:
-                    await inside.join("bench")
-                    await until(lambda: linked(intruder), within=HANG)
-            finally:
-                await inside.close()
-
-    asyncio.run(story())
+    inside = Inside(lab)
+    try:
+        await inside.join("anvil")
+        with bare(lab, **intruders(lab)[name]) as intruder:
+            await inside.join("bench")
+            await until(lambda: linked(intruder), within=HANG)
+    finally:
+        await inside.close()
 
 
 # Roles

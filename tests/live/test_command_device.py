@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 from pathlib import Path
 
 import pytest
 
 from tests.live.lab import Lab
+from zscout.behaviors.client.client import RequestRefused
 
 pytestmark = pytest.mark.live
 
@@ -15,32 +15,27 @@ TABLE = """
 [[rc]]
 name = "psu/bench"
 driver = "command"
-start = ["sh", "-c", 'sleep 3; echo "$ZSCOUT_PARAMETERS" >> "%(told)s"']
+start = ["sh", "-c", 'sleep 2; echo "$ZSCOUT_PARAMETERS" >> "%(told)s"']
 stop = ["sh", "-c", 'echo stop >> "%(told)s"']
 parameters = { voltage = 30.0 }
 timeout = 100
 """
 
 
-def test_a_slow_start_is_waited_for_and_told_of(tmp_path: Path) -> None:
+async def test_a_slow_start_is_waited_for_and_told_of(tmp_path: Path, lab: Lab) -> None:
     told = tmp_path / "told"
-
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("small", extra=TABLE % {"told": told})
-            await lab.ready(await lab.client("crew"), "psu/bench")
-            program = ("--", "sh", "-c", f"echo enter >> {told}")
-            held = await lab.zscout("request", "psu/bench:voltage=12", *program)
-            assert held.returncode == 0, held.stderr
-            assert told.read_text().splitlines()[:2] == ['{"voltage": 12.0}', "enter"]
-            assert "and waits: psu/bench is being started, for " in held.stderr
-            for asked, why in (
-                ("psu/bench:voltage=31", "can never start: voltage 31 of 30 at psu/bench"),
-                ("psu/bench:current=1", "psu/bench knows no parameter current; it knows voltage"),
-            ):
-                refused = await lab.zscout("request", asked, *program)
-                assert refused.returncode == 2
-                assert why in refused.stderr
-            assert told.read_text().split().count("enter") == 1
-
-    asyncio.run(story())
+    lab.node("small", extra=TABLE % {"told": told})
+    client = await lab.client("crew")
+    await lab.ready(client, "psu/bench")
+    program = ("--", "sh", "-c", f"echo enter >> {told}")
+    held = await lab.zscout("request", "psu/bench:voltage=12", *program)
+    assert held.returncode == 0, held.stderr
+    assert told.read_text().splitlines()[:2] == ['{"voltage": 12.0}', "enter"]
+    assert "and waits: psu/bench is being started, for " in held.stderr
+    for asked, why in (
+        ({"voltage": 31}, "can never start: voltage 31 of 30 at psu/bench"),
+        ({"current": 1}, "psu/bench knows no parameter current; it knows voltage"),
+    ):
+        with pytest.raises(RequestRefused, match=why):
+            await client.request("bench", {"psu/bench": asked}, min_runtime=1)
+    assert told.read_text().split().count("enter") == 1

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Awaitable, Callable
-from pathlib import Path
+
+import pytest
 
 from tests.behaviors.components.kit import ComponentLab, Hosts, counts, counts_on
 from tests.hang import HANG
@@ -27,6 +28,8 @@ from zscout.messages import (
     RestoreComponent,
     StopComponent,
 )
+
+pytestmark = pytest.mark.live
 
 QUICK = {"period": 0.02, "rc": "robot/x"}
 
@@ -93,89 +96,82 @@ class Target:
                 await client.leave()
 
 
-def test_who_handed_over_takes_back_what_the_new_one_does_not_take_on(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with ComponentLab(tmp_path) as lab:
-            register(lab)
-            lab.node("a", "robot/x")
-            client = await lab.client()
-            hosts = Hosts(client)
-            await lab.ready(client, "robot/x")
-            await hosts.start("a", "c", "tally", QUICK)
-            await counts_on(hosts, "a")
+@pytest.mark.slow
+async def test_who_handed_over_takes_back_what_the_new_one_does_not_take_on(lab: ComponentLab) -> None:
+    register(lab)
+    lab.node("a", "robot/x")
+    client = await lab.client()
+    hosts = Hosts(client)
+    await lab.ready(client, "robot/x")
+    await hosts.start("a", "c", "tally", QUICK)
+    await counts_on(hosts, "a")
 
-            async def fails(target: Target) -> str:
-                problem = await hosts.ask("a", MoveComponent("c", 1, "b", target.incarnation), Moved)
-                assert isinstance(problem, Problem), problem
-                assert problem.code == "move_failed"
-                await counts_on(hosts, "a")
-                numbers = await counts(hosts, "a")
-                assert numbers == list(range(numbers[0], numbers[-1] + 1))
-                (holder,) = (await lab.rc(client, "robot/x")).holders
-                assert (holder.arc, holder.client) == ("c", "a/c.1")
-                grants.append(holder.grant)
-                await target.leave()
-                return problem.message
+    async def fails(target: Target) -> str:
+        problem = await hosts.ask("a", MoveComponent("c", 1, "b", target.incarnation), Moved)
+        assert isinstance(problem, Problem), problem
+        assert problem.code == "move_failed"
+        await counts_on(hosts, "a")
+        numbers = await counts(hosts, "a")
+        assert numbers == list(range(numbers[0], numbers[-1] + 1))
+        (holder,) = (await lab.rc(client, "robot/x")).holders
+        assert (holder.arc, holder.client) == ("c", "a/c.1")
+        grants.append(holder.grant)
+        await target.leave()
+        return problem.message
 
-            grants = [(await lab.rc(client, "robot/x")).holders[0].grant]
-            # Refused at the commit: nothing has changed.
-            target = await Target.there(lab.fleet, 2, component=False)
-            assert "refused the hand-over" in await fails(target)
-            assert not target.activated.is_set()
-            assert grants[1] == grants[0]
+    grants = [(await lab.rc(client, "robot/x")).holders[0].grant]
+    # Refused at the commit: nothing has changed.
+    target = await Target.there(lab.fleet, 2, component=False)
+    assert "refused the hand-over" in await fails(target)
+    assert not target.activated.is_set()
+    assert grants[1] == grants[0]
 
-            failed = await Target.there(lab.fleet, 3)
-            failed.answer = lambda request: request.answer(failed.view("ended", "failed"))
-            failed.at_last = failed.gives_back
-            assert "asked anew here" in await fails(failed)
-            unknown = await Target.there(lab.fleet, 4)
-            unknown.answer = lambda request: request.refuse(Problem("unknown_component", "what?"))
-            unknown.at_last = unknown.gives_back
-            assert "asked anew here" in await fails(unknown)
-            # This one dies with all that it holds, and says nothing.
-            silent = await Target.there(lab.fleet, 5)
-            silent.answer = lambda _: silent.token.close()
-            silent.at_last = silent.leave
-            assert "asked anew here" in await fails(silent)
-            assert sorted(set(grants)) == grants[1:]
-
-    asyncio.run(story())
+    failed = await Target.there(lab.fleet, 3)
+    failed.answer = lambda request: request.answer(failed.view("ended", "failed"))
+    failed.at_last = failed.gives_back
+    assert "asked anew here" in await fails(failed)
+    unknown = await Target.there(lab.fleet, 4)
+    unknown.answer = lambda request: request.refuse(Problem("unknown_component", "what?"))
+    unknown.at_last = unknown.gives_back
+    assert "asked anew here" in await fails(unknown)
+    # This one dies with all that it holds, and says nothing.
+    silent = await Target.there(lab.fleet, 5)
+    silent.answer = lambda _: silent.token.close()
+    silent.at_last = silent.leave
+    assert "asked anew here" in await fails(silent)
+    assert sorted(set(grants)) == grants[1:]
 
 
-def test_who_handed_over_does_nothing_until_it_is_known_that_the_new_one_runs(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with ComponentLab(tmp_path) as lab:
-            register(lab)
-            lab.node("a", "robot/x")
-            client = await lab.client()
-            hosts = Hosts(client)
-            await lab.ready(client, "robot/x")
-            await hosts.start("a", "c", "tally", QUICK)
-            await counts_on(hosts, "a")
-            target = await Target.there(lab.fleet, 2)
-            answers: list[ComponentView | None] = [target.view("running"), target.view("standby"), None]
-            moving = asyncio.create_task(hosts.get("a", MoveComponent("c", 1, "b", 2), Moved))
+async def test_who_handed_over_does_nothing_until_it_is_known_that_the_new_one_runs(lab: ComponentLab) -> None:
+    register(lab)
+    lab.node("a", "robot/x")
+    client = await lab.client()
+    hosts = Hosts(client)
+    await lab.ready(client, "robot/x")
+    await hosts.start("a", "c", "tally", QUICK)
+    await counts_on(hosts, "a")
+    target = await Target.there(lab.fleet, 2)
+    answers: list[ComponentView | None] = [target.view("running"), target.view("standby"), None]
+    moving = asyncio.create_task(hosts.get("a", MoveComponent("c", 1, "b", 2), Moved))
 
-            def answer(request: IncomingQuery[ComponentOperation]) -> None:
-                # At first none, then one that says: not yet.
-                view = answers.pop()
-                if view is not None:
-                    request.answer(view)
+    def answer(request: IncomingQuery[ComponentOperation]) -> None:
+        # At first none, then one that says: not yet.
+        view = answers.pop()
+        if view is not None:
+            request.answer(view)
 
-            target.answer = answer
-            await target.activated.wait()
-            async with asyncio.timeout(HANG):  # the RC may hear of it later
-                while [one.client for one in (await lab.rc(client, "robot/x")).holders] != ["b/c.2"]:
-                    pass
-            moved = await moving
-            assert answers == []
-            assert (await hosts.ended("a", "c")).ended == "moved"
-            # When it has ended all that it wrote is read: it has not counted on.
-            assert (await counts(hosts, "a"))[-1] == target.count
-            assert moved.dead > 0
-            # It gave up nothing when it left.
-            (holder,) = (await lab.rc(client, "robot/x")).holders
-            assert holder.client == "b/c.2"
-            await target.leave()
-
-    asyncio.run(story())
+    target.answer = answer
+    await target.activated.wait()
+    async with asyncio.timeout(HANG):  # the RC may hear of it later
+        while [one.client for one in (await lab.rc(client, "robot/x")).holders] != ["b/c.2"]:
+            pass
+    moved = await moving
+    assert answers == []
+    assert (await hosts.ended("a", "c")).ended == "moved"
+    # When it has ended all that it wrote is read: it has not counted on.
+    assert (await counts(hosts, "a"))[-1] == target.count
+    assert moved.dead > 0
+    # It gave up nothing when it left.
+    (holder,) = (await lab.rc(client, "robot/x")).holders
+    assert holder.client == "b/c.2"
+    await target.leave()

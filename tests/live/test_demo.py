@@ -64,6 +64,7 @@ def gone(processes: list[psutil.Process]) -> bool:
     return not alive
 
 
+@pytest.mark.slow
 def test_table_1_live_gives_table_2(tmp_path: Path) -> None:
     demo = start(tmp_path, "--json")
     out, error = demo.communicate(timeout=HANG)
@@ -99,6 +100,7 @@ def test_table_1_live_gives_table_2(tmp_path: Path) -> None:
     assert any(map(told.fullmatch, events(path)))
 
 
+@pytest.mark.slow
 def test_it_is_shown_live_from_its_first_second_and_finished_on_the_same_page(tmp_path: Path) -> None:
     demo = start(tmp_path, "--web")
     assert demo.stdout is not None
@@ -129,6 +131,7 @@ def test_it_is_shown_live_from_its_first_second_and_finished_on_the_same_page(tm
     assert gone(others)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP, signal.SIGKILL])
 def test_nothing_runs_on_when_it_is_stopped(tmp_path: Path, number: signal.Signals) -> None:
     demo = start(tmp_path, "--out", "mine/demo.rrd")
@@ -148,6 +151,7 @@ def test_nothing_runs_on_when_it_is_stopped(tmp_path: Path, number: signal.Signa
     assert list((tmp_path / "tmp").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_node_that_dies_ends_it_with_one_line(tmp_path: Path) -> None:
     demo = start(tmp_path)
     read_until(demo, "arc0 runs on")

@@ -65,6 +65,7 @@ def left_of(folder: Path) -> list[psutil.Process]:
     return found
 
 
+@pytest.mark.slow
 def test_robots_hide_on_a_live_mesh_and_nothing_is_left(tmp_path: Path) -> None:
     building(tmp_path)
     demo = start(tmp_path, "--json", "--building", "den.toml", "--speed", "3", "--out", "mine/demo.rrd")

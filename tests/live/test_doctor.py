@@ -95,243 +95,197 @@ def plain_file(lab: Lab) -> Path:
     return file
 
 
-def test_a_fleet_that_is_well_is_told_to_be_and_a_device_on_two_hosts(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path, candidates=("anvil",), extra='[devices]\nanvil = ["robot/a"]') as lab:
-            lab.node("anvil", "robot/a")
-            client = await lab.client()
-            await lab.ready(client, "robot/a")
-            told = await mends(lab, [])
-            assert told.code == 0
-            assert told.of("leader") == [("ok", "anvil leads, term 1")]
-            assert told.of("devices") == [("ok", "1 RC there and well")]
-            assert [state for state, _ in told.of("open")] == ["note"]
-            lab.node("bellows", "robot/a")
-            await lab.state(client, lambda state: [view.duplicates for view in state.rcs] == [["bellows"]])
-            both = "robot/a is offered by anvil, bellows, and anvil is meant"
-            told = await told_of(lab, "devices", both)
-            assert told.of("devices")[0] == ("note", both)
-            lab.nodes["anvil"].terminate()
-            await asyncio.to_thread(lab.nodes["anvil"].wait, HANG)
-            told = await told_of(lab, "leader", "nobody leads: of the candidates anvil none is seen")
-            assert told.code == 1
-
-    asyncio.run(story())
+async def test_a_fleet_that_is_well_is_told_to_be_and_a_device_on_two_hosts(tmp_path: Path) -> None:
+    async with Lab(tmp_path, candidates=("anvil",), extra='[devices]\nanvil = ["robot/a"]') as lab:
+        lab.node("anvil", "robot/a")
+        client = await lab.begun()
+        told = await mends(lab, [])
+        assert told.code == 0
+        assert told.of("leader") == [("ok", "anvil leads, term 1")]
+        assert told.of("devices") == [("ok", "1 RC there and well")]
+        assert [state for state, _ in told.of("open")] == ["note"]
+        lab.node("bellows", "robot/a")
+        await lab.state(client, lambda state: [view.duplicates for view in state.rcs] == [["bellows"]])
+        both = "robot/a is offered by anvil, bellows, and anvil is meant"
+        told = await told_of(lab, "devices", both)
+        assert told.of("devices")[0] == ("note", both)
+        lab.nodes["anvil"].terminate()
+        await asyncio.to_thread(lab.nodes["anvil"].wait, HANG)
+        told = await told_of(lab, "leader", "nobody leads: of the candidates anvil none is seen")
+        assert told.code == 1
 
 
-def test_why_nobody_leads_is_told_and_what_a_node_should_offer_is_missed(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path, candidates=("forge",)) as lab:
-            lab.node("anvil", "robot/a")
-            client = await lab.client()
-            await lab.living(client, Role.RC, lambda found: found == ["anvil"])
-            nobody = "nobody leads: of the candidates forge none is seen"
-            await mends(lab, [nobody])
-            file = lab.folder / "cart.toml"
-            file.write_text(
-                '[node]\nhost = "cart"\nfleet = "fleet.toml"\n[[rc]]\nname = "robot/c"\ndriver = "exclusive"'
-            )
-            told = await mends(lab, [nobody, "not there: robot/c of cart (that host is not seen either)"], file)
-            assert told.host == "cart"
-            file.write_text(file.read_text().replace("exclusive", "none-such"))
-            missing, nobody, *_ = (await doctor(lab, file)).mends()
-            assert missing == f'{file}: rc[0].driver (robot/c): no driver "none-such" is installed here'
-            assert nobody.startswith("nobody leads")  # it joins all the same
-
-    asyncio.run(story())
+async def test_why_nobody_leads_is_told_and_what_a_node_should_offer_is_missed(tmp_path: Path) -> None:
+    async with Lab(tmp_path, candidates=("forge",)) as lab:
+        lab.node("anvil", "robot/a")
+        client = await lab.client()
+        await lab.living(client, Role.RC, lambda found: found == ["anvil"])
+        nobody = "nobody leads: of the candidates forge none is seen"
+        await mends(lab, [nobody])
+        file = lab.folder / "cart.toml"
+        file.write_text('[node]\nhost = "cart"\nfleet = "fleet.toml"\n[[rc]]\nname = "robot/c"\ndriver = "exclusive"')
+        told = await mends(lab, [nobody, "not there: robot/c of cart (that host is not seen either)"], file)
+        assert told.host == "cart"
+        file.write_text(file.read_text().replace("exclusive", "none-such"))
+        missing, nobody, *_ = (await doctor(lab, file)).mends()
+        assert missing == f'{file}: rc[0].driver (robot/c): no driver "none-such" is installed here'
+        assert nobody.startswith("nobody leads")  # it joins all the same
 
 
-def test_beside_a_node_that_listens_where_the_file_says_commands_listen_elsewhere(tmp_path: Path) -> None:
-    async def story() -> None:
-        address = f"tcp/127.0.0.1:{free_port()}"
-        async with Lab(tmp_path) as lab:
-            text = lab.fleet_file.read_text()
-            lab.fleet_file.write_text(
-                text.replace(
-                    "[mesh]\n", f'[mesh]\nlisten = ["{address}"]\nconnect = ["{address}"]\nmulticast = false\n'
-                )
-            )
-            says = f"this host's node does not run ({address}: Connection refused)"
-            assert (await doctor(lab)).of("connect") == [("mend", says)]
-            lab.node("anvil", "robot/a")
-            await lab.logged("anvil", "is on the mesh")
-            told = await told_of(lab, "leader", "anvil leads, term 1", lab.folder / "anvil.toml")
-            assert told.code == 0
-            assert told.of("multicast") == [("note", "it is off: only the hosts under `connect` are found")]
-            done = await lab.zscout("status")
-            assert (done.returncode, done.stderr) == (0, "")
-
-    asyncio.run(story())
+async def test_beside_a_node_that_listens_where_the_file_says_commands_listen_elsewhere(lab: Lab) -> None:
+    address = f"tcp/127.0.0.1:{free_port()}"
+    text = lab.fleet_file.read_text()
+    lab.fleet_file.write_text(
+        text.replace("[mesh]\n", f'[mesh]\nlisten = ["{address}"]\nconnect = ["{address}"]\nmulticast = false\n')
+    )
+    says = f"this host's node does not run ({address}: Connection refused)"
+    assert (await doctor(lab)).of("connect") == [("mend", says)]
+    lab.node("anvil", "robot/a")
+    await lab.logged("anvil", "is on the mesh")
+    told = await told_of(lab, "leader", "anvil leads, term 1", lab.folder / "anvil.toml")
+    assert told.code == 0
+    assert told.of("multicast") == [("note", "it is off: only the hosts under `connect` are found")]
+    done = await lab.zscout("status")
+    assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_relay_that_is_not_linked_is_told(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            plain = lab.fleet_file.read_text()
-            lab.fleet_file.write_text(plain.replace("[mesh]\n", '[mesh]\nsite = "north"\n'))
-            lab.node("anvil", "robot/a")
-            await lab.logged("anvil", "is on the mesh")
-            alone = r"no relay is linked: this host sees its own site only \(north\)"
-            assert (await told_of(lab, "site", alone)).code == 1
-            with zenoh.open(zenoh_config(replace(lab.fleet.mesh, relay=("north", "south")))):
-                assert (await told_of(lab, "site", "site north, linked to 1 relay")).code == 0
-                file = lab.folder / "nowhere.toml"
-                file.write_text(plain)
-                lost = r"no `site` is set, so no link to the relay \(tcp/.*\): if it is this fleet's, .*"
-                assert (await told_of(lab, "site", lost, ZSCOUT_FLEET=file)).code == 0
-
-    asyncio.run(story())
+async def test_a_relay_that_is_not_linked_is_told(lab: Lab) -> None:
+    plain = lab.fleet_file.read_text()
+    lab.fleet_file.write_text(plain.replace("[mesh]\n", '[mesh]\nsite = "north"\n'))
+    lab.node("anvil", "robot/a")
+    await lab.logged("anvil", "is on the mesh")
+    alone = r"no relay is linked: this host sees its own site only \(north\)"
+    assert (await told_of(lab, "site", alone)).code == 1
+    with zenoh.open(zenoh_config(replace(lab.fleet.mesh, relay=("north", "south")))):
+        assert (await told_of(lab, "site", "site north, linked to 1 relay")).code == 0
+        file = lab.folder / "nowhere.toml"
+        file.write_text(plain)
+        lost = r"no `site` is set, so no link to the relay \(tcp/.*\): if it is this fleet's, .*"
+        assert (await told_of(lab, "site", lost, ZSCOUT_FLEET=file)).code == 0
 
 
-def test_whose_role_is_taken_away_is_told_first(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with ClosedLab(tmp_path) as lab:
-            before = lab.folder / "before.toml"
-            before.write_text(lab.fleet_file.read_text())
-            lab.fleet_file.write_text(before.read_text().replace('"ada"', ""))
-            lab.node("anvil")
-            await shown(lab, "bob", "anvil")
-            keys = tmp_path / "keys" / "ada"
-            unseen = f"1 link, and nobody of fleet {lab.fleet.name} is seen by ada"
-            told = await told_of(lab, "certificate", unseen, ZSCOUT_KEYS=keys, ZSCOUT_FLEET=before)
-            assert told.mends() == [unseen]
-            told = await doctor(lab, ZSCOUT_KEYS=keys)
-            assert told.mends() == [f"{keys}/cert.pem: ada has no role in fleet {lab.fleet.name}"]
-
-    asyncio.run(story())
+async def test_whose_role_is_taken_away_is_told_first(tmp_path: Path, lab: ClosedLab) -> None:
+    before = lab.folder / "before.toml"
+    before.write_text(lab.fleet_file.read_text())
+    lab.fleet_file.write_text(before.read_text().replace('"ada"', ""))
+    lab.node("anvil")
+    await shown(lab, "bob", "anvil")
+    keys = tmp_path / "keys" / "ada"
+    unseen = f"1 link, and nobody of fleet {lab.fleet.name} is seen by ada"
+    told = await told_of(lab, "certificate", unseen, ZSCOUT_KEYS=keys, ZSCOUT_FLEET=before)
+    assert told.mends() == [unseen]
+    told = await doctor(lab, ZSCOUT_KEYS=keys)
+    assert told.mends() == [f"{keys}/cert.pem: ada has no role in fleet {lab.fleet.name}"]
 
 
-def test_another_name_of_the_fleet_is_told(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("anvil", "robot/a")
-            await lab.ready(await lab.client(), "robot/a")
-            other = lab.folder / "other.toml"
-            other.write_text(lab.fleet_file.read_text().replace(lab.fleet.name, "typo"))
-            others = rf"nobody is seen of fleet typo, and of others: {lab.fleet.name} \(anvil\)"
-            assert (await told_of(lab, "links", others, ZSCOUT_FLEET=other)).code == 1
-
-    asyncio.run(story())
+async def test_another_name_of_the_fleet_is_told(lab: Lab) -> None:
+    lab.node("anvil", "robot/a")
+    await lab.ready(await lab.client(), "robot/a")
+    other = lab.folder / "other.toml"
+    other.write_text(lab.fleet_file.read_text().replace(lab.fleet.name, "typo"))
+    others = rf"nobody is seen of fleet typo, and of others: {lab.fleet.name} \(anvil\)"
+    assert (await told_of(lab, "links", others, ZSCOUT_FLEET=other)).code == 1
 
 
-def test_a_plain_host_and_a_secured_fleet_are_told_of_each_other(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with ClosedLab(tmp_path) as lab:
-            lab.node("anvil", "robot/a")
-            await shown(lab, "ada", "anvil")
-            well = await mends(lab, [], ZSCOUT_KEYS=tmp_path / "keys" / "ada")
-            assert (well.code, well.host) == (0, "ada")
-            plain = plain_file(lab)
-            told = await told_of(lab, "security", "anvil takes TLS only, .* have no .security.", ZSCOUT_FLEET=plain)
-            assert told.of("links")[0][0] == "mend"
+async def test_a_plain_host_and_a_secured_fleet_are_told_of_each_other(tmp_path: Path, lab: ClosedLab) -> None:
+    lab.node("anvil", "robot/a")
+    await shown(lab, "ada", "anvil")
+    well = await mends(lab, [], ZSCOUT_KEYS=tmp_path / "keys" / "ada")
+    assert (well.code, well.host) == (0, "ada")
+    plain = plain_file(lab)
+    told = await told_of(lab, "security", "anvil takes TLS only, .* have no .security.", ZSCOUT_FLEET=plain)
+    assert told.of("links")[0][0] == "mend"
 
-            cart = lab.folder / "cart.toml"
-            cart.write_text(f'[node]\nhost = "cart"\nfleet = "{plain.name}"')
-            lab.spawn([sys.executable, "-m", "zscout.node", str(cart)], log="cart.log")
-            await lab.logged("cart", "is on the mesh")
-            mixed = f"cart runs fleet {lab.fleet.name} without certificates"
-            told = await told_of(lab, "security", mixed, ZSCOUT_KEYS=tmp_path / "keys" / "ada")
-            assert told.mends() == [mixed]
-            # Each is well by itself.
-            assert told.of("leader")[0][0] == "ok"
-
-    asyncio.run(story())
+    cart = lab.folder / "cart.toml"
+    cart.write_text(f'[node]\nhost = "cart"\nfleet = "{plain.name}"')
+    lab.spawn([sys.executable, "-m", "zscout.node", str(cart)], log="cart.log")
+    await lab.logged("cart", "is on the mesh")
+    mixed = f"cart runs fleet {lab.fleet.name} without certificates"
+    told = await told_of(lab, "security", mixed, ZSCOUT_KEYS=tmp_path / "keys" / "ada")
+    assert told.mends() == [mixed]
+    # Each is well by itself.
+    assert told.of("leader")[0][0] == "ok"
 
 
-def test_certificates_of_another_ca_are_told_by_both_sides_and_expired_ones(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with ClosedLab(tmp_path) as lab:
-            keys, now = tmp_path / "keys", datetime.now(UTC)
-            lab.node("anvil")
-            await shown(lab, "ada", "anvil")
-            (ours,) = (one.name for one in read_cas(keys / "ca" / "ca.pem"))
-            make_authority(tmp_path / "other").issue("bob", tmp_path / "bob", DAY, now)
-            foreign = rf"anvil \(tls/.*\) shows a certificate of {ours}, and ca.pem trusts zscout CA \w+"
-            await told_of(lab, "security", foreign, ZSCOUT_KEYS=tmp_path / "bob")
-            # Who trusts both still is refused.
-            with (tmp_path / "bob" / "ca.pem").open("a") as file:
-                file.write((keys / "ada" / "ca.pem").read_text())
-            refused = r"anvil \(tls/.*\) refuses this certificate: unknown ca"
-            told = await told_of(lab, "security", refused, ZSCOUT_KEYS=tmp_path / "bob")
-            assert told.of("links") == [("mend", "no link to anybody")]
+async def test_certificates_of_another_ca_are_told_by_both_sides_and_expired_ones(
+    tmp_path: Path, lab: ClosedLab
+) -> None:
+    keys, now = tmp_path / "keys", datetime.now(UTC)
+    lab.node("anvil")
+    await shown(lab, "ada", "anvil")
+    (ours,) = (one.name for one in read_cas(keys / "ca" / "ca.pem"))
+    make_authority(tmp_path / "other").issue("bob", tmp_path / "bob", DAY, now)
+    foreign = rf"anvil \(tls/.*\) shows a certificate of {ours}, and ca.pem trusts zscout CA \w+"
+    await told_of(lab, "security", foreign, ZSCOUT_KEYS=tmp_path / "bob")
+    # Who trusts both still is refused.
+    with (tmp_path / "bob" / "ca.pem").open("a") as file:
+        file.write((keys / "ada" / "ca.pem").read_text())
+    refused = r"anvil \(tls/.*\) refuses this certificate: unknown ca"
+    told = await told_of(lab, "security", refused, ZSCOUT_KEYS=tmp_path / "bob")
+    assert told.of("links") == [("mend", "no link to anybody")]
 
-            lab.authority.issue("eve", keys / "late", timedelta(seconds=1), now - DAY)
-            told = await doctor(lab, ZSCOUT_KEYS=keys / "late")
-            assert len(told.mends()) == 1
-            assert told.of("certificate")[0][1].startswith(f"{keys}/late/cert.pem: has ended on ")
-            assert not told.of("links")
+    lab.authority.issue("eve", keys / "late", timedelta(seconds=1), now - DAY)
+    told = await doctor(lab, ZSCOUT_KEYS=keys / "late")
+    assert len(told.mends()) == 1
+    assert told.of("certificate")[0][1].startswith(f"{keys}/late/cert.pem: has ended on ")
+    assert not told.of("links")
 
-            lab.authority.issue("bench", keys / "early", DAY, now - 2 * DAY)
-            with bare(lab, tls=tls(keys / "early")):
-                ended = r"the certificate of bench \(tls/.*\) has ended on .*"
-                told = await told_of(lab, "security", ended, ZSCOUT_KEYS=keys / "ada")
-            assert len(told.mends()) == 1
-
-    asyncio.run(story())
+    lab.authority.issue("bench", keys / "early", DAY, now - 2 * DAY)
+    with bare(lab, tls=tls(keys / "early")):
+        ended = r"the certificate of bench \(tls/.*\) has ended on .*"
+        told = await told_of(lab, "security", ended, ZSCOUT_KEYS=keys / "ada")
+    assert len(told.mends()) == 1
 
 
-def test_a_name_that_is_not_the_certificates_is_told_before_joining(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with ClosedLab(tmp_path) as lab:
-            file = lab.folder / "bench.toml"
-            file.write_text('[node]\nhost = "bench"\nfleet = "fleet.toml"\n[security]\nfolder = "keys/anvil"')
-            told = await doctor(lab, file)
-            keys = tmp_path / "keys" / "anvil"
-            assert told.of("certificate") == [
-                ("mend", f'{keys}/cert.pem: is the certificate of "anvil", and this is "bench"')
-            ]
-            assert not told.of("links")
-            lab.node("cart")
-            await lab.logged("cart", "is on the mesh")
-            (keys / "key.pem").chmod(0o644)
-            await mends(lab, [f"{keys}/key.pem: may be read by others (mode 644)"], file)
-            (keys / "ca.pem").chmod(0o666)
-            await mends(lab, [f"{keys}/ca.pem: may be written by others (mode 666)"], file)
-
-    asyncio.run(story())
+async def test_a_name_that_is_not_the_certificates_is_told_before_joining(tmp_path: Path, lab: ClosedLab) -> None:
+    file = lab.folder / "bench.toml"
+    file.write_text('[node]\nhost = "bench"\nfleet = "fleet.toml"\n[security]\nfolder = "keys/anvil"')
+    told = await doctor(lab, file)
+    keys = tmp_path / "keys" / "anvil"
+    assert told.of("certificate") == [("mend", f'{keys}/cert.pem: is the certificate of "anvil", and this is "bench"')]
+    assert not told.of("links")
+    lab.node("cart")
+    await lab.logged("cart", "is on the mesh")
+    (keys / "key.pem").chmod(0o644)
+    await mends(lab, [f"{keys}/key.pem: may be read by others (mode 644)"], file)
+    (keys / "ca.pem").chmod(0o666)
+    await mends(lab, [f"{keys}/ca.pem: may be written by others (mode 666)"], file)
 
 
-def test_status_and_doctor_warn_of_every_certificate_that_ends_soon(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with ClosedLab(tmp_path) as lab:
-            for name in ("anvil", "ada"):  # of ten hours one is left
-                lab.authority.issue(name, tmp_path / "keys" / name, DAY * 10 / 24, datetime.now(UTC) - DAY * 9 / 24)
-            lab.node("anvil")
-            lab.node("cart")
-            await shown(lab, "bob", "anvil", "cart")
-            env = lab.env | {KEYS_VARIABLE: str(tmp_path / "keys" / "ada")}
-            done = await lab.zscout("status", env=env)
-            _, warnings = done.stdout.split("\nWarnings\n")
-            said = [line.split("  ") for line in warnings.split("\n\n")[0].splitlines()[1:]]
-            assert [(about, words.partition(" ends in ")[0]) for about, words in said] == [
-                ("certificate", "the certificate of anvil"),
-                ("certificate", "the certificate of ada"),
-            ]
-            state = json.loads((await lab.zscout("status", "--json", env=env)).stdout)
-            assert [one["name"] for one in state["ending"]] == ["anvil", "ada"]
-            assert all(3000 < one["ends_in"] <= 3600 for one in state["ending"])
-            assert state["advisory"] is False
-            ending = ["the certificate of ada", "the certificate of anvil"]
-            await told_that(
-                lab,
-                lambda told: [says.partition(" ends in ")[0] for says in told.mends()] == ending,
-                **{KEYS_VARIABLE: env[KEYS_VARIABLE]},
-            )
-            await lab.logged("anvil", "renew it (zscout cert renew)")
-
-    asyncio.run(story())
+async def test_status_and_doctor_warn_of_every_certificate_that_ends_soon(tmp_path: Path, lab: ClosedLab) -> None:
+    for name in ("anvil", "ada"):  # of ten hours one is left
+        lab.authority.issue(name, tmp_path / "keys" / name, DAY * 10 / 24, datetime.now(UTC) - DAY * 9 / 24)
+    lab.node("anvil")
+    lab.node("cart")
+    await shown(lab, "bob", "anvil", "cart")
+    env = lab.env | {KEYS_VARIABLE: str(tmp_path / "keys" / "ada")}
+    done = await lab.zscout("status", env=env)
+    _, warnings = done.stdout.split("\nWarnings\n")
+    said = [line.split("  ") for line in warnings.split("\n\n")[0].splitlines()[1:]]
+    assert [(about, words.partition(" ends in ")[0]) for about, words in said] == [
+        ("certificate", "the certificate of anvil"),
+        ("certificate", "the certificate of ada"),
+    ]
+    state = json.loads((await lab.zscout("status", "--json", env=env)).stdout)
+    assert [one["name"] for one in state["ending"]] == ["anvil", "ada"]
+    assert all(3000 < one["ends_in"] <= 3600 for one in state["ending"])
+    assert state["advisory"] is False
+    ending = ["the certificate of ada", "the certificate of anvil"]
+    await told_that(
+        lab,
+        lambda told: [says.partition(" ends in ")[0] for says in told.mends()] == ending,
+        **{KEYS_VARIABLE: env[KEYS_VARIABLE]},
+    )
+    await lab.logged("anvil", "renew it (zscout cert renew)")
 
 
-def test_status_says_that_roles_are_advisory_where_nothing_proves_a_name(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path, extra='[roles]\nmanager = ["anvil"]\nclient = ["bob"]') as lab:
-            lab.node("anvil")
-            await lab.ready(await lab.client())
-            done = await lab.zscout("status")
-            assert "roles  they are advisory: nobody proves a name where [security] is not set" in done.stdout
-            assert json.loads((await lab.zscout("status", "--json")).stdout)["advisory"] is True
-
-    asyncio.run(story())
+async def test_status_says_that_roles_are_advisory_where_nothing_proves_a_name(tmp_path: Path) -> None:
+    async with Lab(tmp_path, extra='[roles]\nmanager = ["anvil"]\nclient = ["bob"]') as lab:
+        lab.node("anvil")
+        await lab.ready(await lab.client())
+        done = await lab.zscout("status")
+        assert "roles  they are advisory: nobody proves a name where [security] is not set" in done.stdout
+        assert json.loads((await lab.zscout("status", "--json")).stdout)["advisory"] is True
 
 
 @pytest.fixture
@@ -367,21 +321,18 @@ def doctoring(lab: Lab) -> Iterator[subprocess.Popen[bytes]]:
         process.wait()
 
 
-def test_interrupted_it_leaves_nothing(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path, candidates=("forge",)) as lab:
-            lab.node("anvil")
-            client = await lab.client()
-            seen = asyncio.Event()
-            client.mesh.watch(
-                client.mesh.keys.alive_any(Role.CLIENT), lambda token, _: seen.set() if "doctor" in token.name else None
-            )
-            with doctoring(lab) as process:
-                async with asyncio.timeout(HANG):
-                    await seen.wait()
-                process.send_signal(signal.SIGINT)
-                out, _ = await asyncio.to_thread(process.communicate, timeout=HANG)
-                assert (process.returncode, out) == (130, b"")
-            await lab.living(client, Role.CLIENT, lambda found: len(found) == 1)
-
-    asyncio.run(story())
+async def test_interrupted_it_leaves_nothing(tmp_path: Path) -> None:
+    async with Lab(tmp_path, candidates=("forge",)) as lab:
+        lab.node("anvil")
+        client = await lab.client()
+        seen = asyncio.Event()
+        client.mesh.watch(
+            client.mesh.keys.alive_any(Role.CLIENT), lambda token, _: seen.set() if "doctor" in token.name else None
+        )
+        with doctoring(lab) as process:
+            async with asyncio.timeout(HANG):
+                await seen.wait()
+            process.send_signal(signal.SIGINT)
+            out, _ = await asyncio.to_thread(process.communicate, timeout=HANG)
+            assert (process.returncode, out) == (130, b"")
+        await lab.living(client, Role.CLIENT, lambda found: len(found) == 1)

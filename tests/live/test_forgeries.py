@@ -76,6 +76,7 @@ def test_an_exclusive_rc_obeys_one_of_two_forged_holders(stranger: Stranger) -> 
     stranger.serves()
 
 
+@pytest.mark.slow
 def test_a_forged_term_that_can_be_believed_costs_one_election(stranger: Stranger) -> None:
     counter = stranger.state()["term"][0] + 7
     stranger.put("rcm/grants", json.dumps(grants(term=[counter, "~"], seq=3, rcs={})).encode())
@@ -84,6 +85,7 @@ def test_a_forged_term_that_can_be_believed_costs_one_election(stranger: Strange
     stranger.serves()
 
 
+@pytest.mark.slow
 def test_a_token_of_an_rc_that_never_answers_is_asked_now_and_then(stranger: Stranger) -> None:
     asked: list[float] = []
 
@@ -101,58 +103,51 @@ def test_a_token_of_an_rc_that_never_answers_is_asked_now_and_then(stranger: Str
     stranger.serves()
 
 
-def test_a_client_does_not_fall_for_forged_notices(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("n", "robot/a", "radio/a:rate=10")
-            client = await lab.client("victim")
-            await lab.ready(client, "robot/a", "radio/a")
-            stranger = await asyncio.to_thread(Stranger, lab)
-            try:
-                async with hold(client, "victim", {"robot/a": {}}, min_runtime=60) as held:
-                    notice = {
-                        "id": held.arc.id, "arc": "victim", "client": "test/victim", "state": "ended",
-                        "term": [HIGH, "f"], "step": 1, "outcome": "preempted",
-                    }  # fmt: skip
-                    said = [b"", b"\xff", b"[]", json.dumps(notice).encode(), b"{" * 1_000_000]
-                    said.append(json.dumps(notice | {"term": [0, ""]}).encode())
-                    said.append(json.dumps(notice | {"remaining": 1e300, "term": [2, ""]}).encode())
-                    said.append(json.dumps(notice | {"state": "stolen", "term": [2, ""]}).encode())
-                    for payload in said:
-                        await asyncio.to_thread(stranger.put, "client/test/victim/notice", payload)
-                    requests = "client/test/victim/requests"
-                    for promise in (b'{"promise":[%d,"f"]}' % HIGH, b'{"promise":[0,"f"]}'):
-                        [(kind, answer)] = await asyncio.to_thread(stranger.get, requests, promise)
-                        assert (kind, answer["code"]) == ("err", "old_term")
-                    [(kind, answer)] = await asyncio.to_thread(stranger.get, requests, b"?")
-                    assert (kind, answer["code"]) == ("err", "malformed")
-                    answer = await asyncio.to_thread(stranger.ask, requests, {})
-                    assert [told["id"] for told in answer["requests"]] == [held.arc.id]
-                    assert client.term.counter < 100
-                    assert held.active
-                    assert (await held.command("robot/a", {"name": "echo", "value": 1}, ttl=TTL)).result == 1
-            finally:
-                await asyncio.to_thread(stranger.close)
-
-    asyncio.run(story())
+async def test_a_client_does_not_fall_for_forged_notices(lab: Lab) -> None:
+    lab.node("n", "robot/a", "radio/a:rate=10")
+    client = await lab.begun("victim")
+    stranger = await asyncio.to_thread(Stranger, lab)
+    try:
+        async with hold(client, "victim", {"robot/a": {}}, min_runtime=60) as held:
+            notice = {
+                "id": held.arc.id, "arc": "victim", "client": "test/victim", "state": "ended",
+                "term": [HIGH, "f"], "step": 1, "outcome": "preempted",
+            }  # fmt: skip
+            said = [b"", b"\xff", b"[]", json.dumps(notice).encode(), b"{" * 1_000_000]
+            said.append(json.dumps(notice | {"term": [0, ""]}).encode())
+            said.append(json.dumps(notice | {"remaining": 1e300, "term": [2, ""]}).encode())
+            said.append(json.dumps(notice | {"state": "stolen", "term": [2, ""]}).encode())
+            for payload in said:
+                await asyncio.to_thread(stranger.put, "client/test/victim/notice", payload)
+            requests = "client/test/victim/requests"
+            for promise in (b'{"promise":[%d,"f"]}' % HIGH, b'{"promise":[0,"f"]}'):
+                [(kind, answer)] = await asyncio.to_thread(stranger.get, requests, promise)
+                assert (kind, answer["code"]) == ("err", "old_term")
+            [(kind, answer)] = await asyncio.to_thread(stranger.get, requests, b"?")
+            assert (kind, answer["code"]) == ("err", "malformed")
+            answer = await asyncio.to_thread(stranger.ask, requests, {})
+            assert [told["id"] for told in answer["requests"]] == [held.arc.id]
+            assert client.term.counter < 100
+            assert held.active
+            assert (await held.command("robot/a", {"name": "echo", "value": 1}, ttl=TTL)).result == 1
+    finally:
+        await asyncio.to_thread(stranger.close)
 
 
-def test_a_token_that_only_claims_to_lead_stops_no_takeover(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path, lease=1.0, candidates=("a", "b")) as lab:
-            lab.node("c", "robot/a", "radio/a:rate=10", extra="candidate = false")
-            lab.node("a")
-            lab.node("b")
-            client = await lab.client()
-            before = await lab.ready(client, "robot/a", "radio/a")
-            stranger = await asyncio.to_thread(Stranger, lab)
-            token = await asyncio.to_thread(stranger.token, "t/rcm/node/forged")
-            try:
-                lab.nodes[before.host].send_signal(signal.SIGKILL)
-                after = await lab.state(client, lambda state: state.term > before.term)
-                assert after.host != before.host
-            finally:
-                token.undeclare()
-                await asyncio.to_thread(stranger.close)
-
-    asyncio.run(story())
+@pytest.mark.slow
+async def test_a_token_that_only_claims_to_lead_stops_no_takeover(tmp_path: Path) -> None:
+    async with Lab(tmp_path, lease=1.0, candidates=("a", "b")) as lab:
+        lab.node("c", "robot/a", "radio/a:rate=10", extra="candidate = false")
+        lab.node("a")
+        lab.node("b")
+        client = await lab.client()
+        before = await lab.ready(client, "robot/a", "radio/a")
+        stranger = await asyncio.to_thread(Stranger, lab)
+        token = await asyncio.to_thread(stranger.token, "t/rcm/node/forged")
+        try:
+            lab.nodes[before.host].send_signal(signal.SIGKILL)
+            after = await lab.state(client, lambda state: state.term > before.term)
+            assert after.host != before.host
+        finally:
+            token.undeclare()
+            await asyncio.to_thread(stranger.close)

@@ -91,83 +91,80 @@ async def until_there(put: Callable[[], None], there: Callable[[], bool]) -> Non
                 await asyncio.sleep(0.01)
 
 
-def test_who_looks_has_the_newest_frame_and_whoever_publishes_knows(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with AsyncExitStack() as stack:
-            lab = Lab(tmp_path)
-            here, there = [
-                await stack.enter_async_context(await ZenohMesh.open(lab.fleet, Sender(name, "node")))
-                for name in ("here", "there")
-            ]
-            key = here.keys.frame(GRABBER)
-            publisher = here.frame_publisher(key)
-            told: list[bool] = []
-            publisher.follow(told.append)
-            assert not publisher.watched
-            assert told == []
-            publisher.put(head(1), b"for nobody")
+async def test_who_looks_has_the_newest_frame_and_whoever_publishes_knows(tmp_path: Path) -> None:
+    async with AsyncExitStack() as stack:
+        lab = Lab(tmp_path)
+        here, there = [
+            await stack.enter_async_context(await ZenohMesh.open(lab.fleet, Sender(name, "node")))
+            for name in ("here", "there")
+        ]
+        key = here.keys.frame(GRABBER)
+        publisher = here.frame_publisher(key)
+        told: list[bool] = []
+        publisher.follow(told.append)
+        assert not publisher.watched
+        assert told == []
+        publisher.put(head(1), b"for nobody")
 
-            watch = there.frames(there.keys.frame_any)
-            await until(lambda: publisher.watched)
+        watch = there.frames(there.keys.frame_any)
+        await until(lambda: publisher.watched)
 
-            async def arrives(number: int, jpeg: bytes) -> Frame:
-                got: list[Frame | None] = [None]
+        async def arrives(number: int, jpeg: bytes) -> Frame:
+            got: list[Frame | None] = [None]
 
-                def there() -> bool:
-                    got[0] = watch.take()
-                    return got[0] is not None
+            def there() -> bool:
+                got[0] = watch.take()
+                return got[0] is not None
 
-                await until_there(lambda: publisher.put(head(number), jpeg), there)
-                assert got[0] is not None
-                return got[0]
+            await until_there(lambda: publisher.put(head(number), jpeg), there)
+            assert got[0] is not None
+            return got[0]
 
+        frame = await arrives(2, b"two")
+        # A session that has just joined may be sent what came before it subscribed.
+        while frame.head.number < 2:
             frame = await arrives(2, b"two")
-            # A session that has just joined may be sent what came before it subscribed.
-            while frame.head.number < 2:
-                frame = await arrives(2, b"two")
-            assert (frame.key, frame.head, frame.jpeg) == (key, head(2), b"two")
-            assert await watch.next(0.01) is None
+        assert (frame.key, frame.head, frame.jpeg) == (key, head(2), b"two")
+        assert await watch.next(0.01) is None
 
-            # Who is slow gets the newest of what came meanwhile, and knows how many it has missed.
-            for number in range(3, 9):
-                await until_there(
-                    functools.partial(publisher.put, head(number), b"x" * number),
-                    functools.partial(missed_or_new, watch, number - 3),
-                )
+        # Who is slow gets the newest of what came meanwhile, and knows how many it has missed.
+        for number in range(3, 9):
+            await until_there(
+                functools.partial(publisher.put, head(number), b"x" * number),
+                functools.partial(missed_or_new, watch, number - 3),
+            )
+        frame = await frame_of(watch)
+        while frame.head.number < 8:
             frame = await frame_of(watch)
-            while frame.head.number < 8:
-                frame = await frame_of(watch)
-            assert len(frame.jpeg) == 8
-            assert await watch.next(0.01) is None
+        assert len(frame.jpeg) == 8
+        assert await watch.next(0.01) is None
 
-            with pytest.raises(ValueError, match="too large"):
-                publisher.put(head(9), b"x" * (MAX_FRAME + 1))
-            assert len((await arrives(10, b"x" * MAX_FRAME)).jpeg) == MAX_FRAME
+        with pytest.raises(ValueError, match="too large"):
+            publisher.put(head(9), b"x" * (MAX_FRAME + 1))
+        assert len((await arrives(10, b"x" * MAX_FRAME)).jpeg) == MAX_FRAME
 
-            # What is no frame is passed over; the watch goes on.
-            bad: list[tuple[bytes, bytes | None]] = [
-                (b"no head", None),
-                (b"no JSON", b"{"),
-                (b"a field of the wrong type", b'{"number": "1", "time": 0, "width": 1, "height": 1}'),
-                (b"a head without end", b" " * 100_000),
-                (b"x" * (MAX_FRAME + 1), b'{"number": 1, "time": 0, "width": 1, "height": 1}'),
-            ]
-            raw = here._transport.publisher(key, None, Quality.FRAME)
-            for payload, attachment in bad:
-                before = watch.malformed
-                await until_there(
-                    functools.partial(raw.put, payload, attachment), functools.partial(refused, watch, before)
-                )
-            assert (await arrives(11, b"good")).head.number == 11
+        # What is no frame is passed over; the watch goes on.
+        bad: list[tuple[bytes, bytes | None]] = [
+            (b"no head", None),
+            (b"no JSON", b"{"),
+            (b"a field of the wrong type", b'{"number": "1", "time": 0, "width": 1, "height": 1}'),
+            (b"a head without end", b" " * 100_000),
+            (b"x" * (MAX_FRAME + 1), b'{"number": 1, "time": 0, "width": 1, "height": 1}'),
+        ]
+        raw = here._transport.publisher(key, None, Quality.FRAME)
+        for payload, attachment in bad:
+            before = watch.malformed
+            await until_there(
+                functools.partial(raw.put, payload, attachment), functools.partial(refused, watch, before)
+            )
+        assert (await arrives(11, b"good")).head.number == 11
 
-            watch.close()
-            await until(lambda: not publisher.watched)
-            assert told == [True, False]
-            with closing(there.frames(key)):
-                await until(lambda: publisher.watched)
-            publisher.close()
-
-    asyncio.run(story())
+        watch.close()
+        await until(lambda: not publisher.watched)
+        assert told == [True, False]
+        with closing(there.frames(key)):
+            await until(lambda: publisher.watched)
+        publisher.close()
 
 
 @dataclass
@@ -218,7 +215,7 @@ async def scene(folder: Path, *, rate: float = 60) -> AsyncIterator[Scene]:
         yield Scene(lab, client, rc, driver, one, two)
 
 
-def test_frames_are_published_while_somebody_holds_and_somebody_looks(
+async def test_frames_are_published_while_somebody_holds_and_somebody_looks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     encoded: list[bytes] = []
@@ -229,200 +226,189 @@ def test_frames_are_published_while_somebody_holds_and_somebody_looks(
         return encoded[-1]
 
     monkeypatch.setattr(framegrabber, "encode", counted)
+    async with scene(tmp_path) as at:
+        # Free: somebody looks, and nothing is opened.
+        tried = at.one.accepted, at.two.accepted
+        watch = at.watch()
+        await until(lambda: at.driver._publisher.watched)
+        assert (at.one.accepted, at.two.accepted) == tried == (1, 0)
 
-    async def story() -> None:
-        async with scene(tmp_path) as at:
-            # Free: somebody looks, and nothing is opened.
-            tried = at.one.accepted, at.two.accepted
-            watch = at.watch()
-            await until(lambda: at.driver._publisher.watched)
-            assert (at.one.accepted, at.two.accepted) == tried == (1, 0)
+        first, grant = await running(at.client, "first", GRABBER, "video/ch1")
+        frames = [await frame_of(watch) for _ in range(6)]
+        assert {(frame.head.grant, frame.head.source) for frame in frames} == {(grant, "video/ch1")}
+        numbers = [frame.head.number for frame in frames]
+        assert numbers == sorted(set(numbers))
+        times = [frame.head.time for frame in frames]
+        assert times == sorted(times)
+        for frame in frames:
+            picture = picture_in(frame)
+            # It came in three colours, and had none.
+            assert picture.shape == (frame.head.height, frame.head.width) == (120, 160)
+            assert 0 < number_of(picture) <= at.one.sent
+        drawn = [number_of(picture_in(frame)) for frame in frames]
+        # Numbers count the source's pictures, those included that were not published.
+        assert len({here - there for here, there in zip(drawn, numbers, strict=True)}) == 1
 
-            first, grant = await running(at.client, "first", GRABBER, "video/ch1")
-            frames = [await frame_of(watch) for _ in range(6)]
-            assert {(frame.head.grant, frame.head.source) for frame in frames} == {(grant, "video/ch1")}
-            numbers = [frame.head.number for frame in frames]
-            assert numbers == sorted(set(numbers))
-            times = [frame.head.time for frame in frames]
-            assert times == sorted(times)
-            for frame in frames:
-                picture = picture_in(frame)
-                # It came in three colours, and had none.
-                assert picture.shape == (frame.head.height, frame.head.width) == (120, 160)
-                assert 0 < number_of(picture) <= at.one.sent
-            drawn = [number_of(picture_in(frame)) for frame in frames]
-            # Numbers count the source's pictures, those included that were not published.
-            assert len({here - there for here, there in zip(drawn, numbers, strict=True)}) == 1
+        told = await at.ask(grant, "snapshot")
+        assert told["source"] == "video/ch1"
+        assert (told["health"], told["width"], told["height"]) == ("ok", 160, 120)
+        assert told["number"] >= numbers[-1]
+        # A frame may arrive before the thread that published it has counted it.
+        await until(lambda: at.driver.figures()["latency_ms"] > 0 and at.driver.figures()["published"] >= 6)
+        figures = (await at.lab.rc(at.client, GRABBER)).figures
+        assert (figures["opened"], figures["stalls"], figures["width"]) == (1, 0, 160)
+        assert 0 < figures["frames_per_second"] <= 60
+        assert figures["published"] >= 6
 
-            told = await at.ask(grant, "snapshot")
-            assert told["source"] == "video/ch1"
-            assert (told["health"], told["width"], told["height"]) == ("ok", 160, 120)
-            assert told["number"] >= numbers[-1]
-            # A frame may arrive before the thread that published it has counted it.
-            await until(lambda: at.driver.figures()["latency_ms"] > 0 and at.driver.figures()["published"] >= 6)
-            figures = (await at.lab.rc(at.client, GRABBER)).figures
-            assert (figures["opened"], figures["stalls"], figures["width"]) == (1, 0, 160)
-            assert 0 < figures["frames_per_second"] <= 60
-            assert figures["published"] >= 6
-
-            # A gang on another channel, with more weight: from its first frame on nothing is of the old hold.
-            second, newer = await running(at.client, "second", GRABBER, "video/ch2", priority=5)
-            seen = [await frame_of(watch)]
-            while seen[-1].head.grant != newer:
-                assert (seen[-1].head.grant, seen[-1].head.source) == (grant, "video/ch1")
-                seen.append(await frame_of(watch))
-            for _ in range(4):
-                frame = await frame_of(watch)
-                assert (frame.head.grant, frame.head.source) == (newer, "video/ch2")
-                picture = picture_in(frame)
-                assert picture.shape == (120, 160, 3)
-                assert BLUE < number_of(picture) <= BLUE + at.two.sent
-                assert frame.head.number > numbers[-1]
-            await until(lambda: at.one.connected == 0)
-
-            # Nobody looks: it stays open, and encodes nothing.
-            watch.close()
-            await until(lambda: not at.driver._publisher.watched)
-            done = len(encoded)
-            await look_at(at.driver, 10)
-            assert len(encoded) <= done + 1
-            assert at.two.connected == 1
-            # Somebody looks again: at once there are frames, and not of those that gathered.
-            before = looked_at(at.driver)
-            with closing(at.watch()) as watch:
-                assert (await frame_of(watch)).head.number >= before
-
-                # Free again: it stays open for the next while somebody looks, and publishes nothing.
-                await at.client.end(first)
-                await at.client.end(second)
-                await until(lambda: at.driver._holder is None)
-                # Nothing was commanded under it: from its first frame to its last it was used.
-                keys = at.client.mesh.keys
-                reply = await at.client.mesh.ask_one(keys.rc_state(GRABBER), RcAsk(), RcState, timeout=HANG)
-                assert reply is not None
-                assert reply.message is not None
-                assert {use.grant: use.seconds for use in reply.message.used}[newer] > 0
-                # One that was under way is counted.
-                await look_at(at.driver, 3)
-                published = at.driver.figures()["published"]
-                await look_at(at.driver, 10)
-                assert at.driver.figures()["published"] == published
-                assert (at.two.connected, at.driver.figures()["opened"]) == (1, 2)
-
-                # The next holder has it at once, but nothing that was there before its hold.
-                assert at.driver._capture is not None
-                before = at.driver._before["number"] + at.driver._capture.number
-                third, newest = await running(at.client, "third", GRABBER, "video/ch2")
-                frame = await frame_of(watch)
-                while frame.head.grant == newer:  # it was under way
-                    frame = await frame_of(watch)
-                assert frame.head.grant == newest
-                assert frame.head.number > before
-                assert at.driver.figures()["opened"] == 2
-
-                # What is too old or too large is not sent.
-                for limit, value in (("MAX_AGE", -1.0), ("MAX_FRAME", 100)):
-                    with monkeypatch.context() as patch:
-                        patch.setattr(framegrabber, limit, value)
-                        await look_at(at.driver, 3)
-                        published = at.driver.figures()["published"]
-                        await look_at(at.driver, 10)
-                        assert at.driver.figures()["published"] == published
-                assert at.driver.figures()["too_large"] > 0
-                await at.client.end(third)
-                await until(lambda: at.driver._holder is None)
-            await until(lambda: at.two.connected == 0)
-            assert at.driver._capture is None
-
-    asyncio.run(story())
-
-
-def test_tuning_by_hand(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with scene(tmp_path, rate=10) as at:
-            watch = at.watch()
-            arc, grant = await running(at.client, "free", GRABBER, "robot/a")
-            told = await at.ask(grant, "snapshot")
-            assert told["source"] is None
-            assert told["health"] == "no video RC is in its gang; tune it to one of video/ch1, video/ch2"
-            assert (at.one.accepted, at.two.accepted) == (1, 0)
-
-            def tune(**how: Any) -> Any:
-                return answer(at.client.command(GRABBER, at_grant, {"name": "tune"} | how))
-
-            at_grant = grant
-            for wrong in ({}, {"to": 1}, {"to": "video/ch9"}, {"to": ["video/ch1"]}):
-                assert await tune(**wrong) == "bad_command"
-            assert await at.ask(grant, "tune", to="video/ch2") == {"source": "video/ch2"}
-            times = []
-            for _ in range(5):
-                frame = await frame_of(watch)
-                times.append(frame.head.time)
-                assert frame.head.source == "video/ch2"
-            # Of 40 a second 10 are published; one may be half an interval early.
-            assert times[-1] - times[0] > 0.34
-            assert await tune(to="video/ch1") == "done"
+        # A gang on another channel, with more weight: from its first frame on nothing is of the old hold.
+        second, newer = await running(at.client, "second", GRABBER, "video/ch2", priority=5)
+        seen = [await frame_of(watch)]
+        while seen[-1].head.grant != newer:
+            assert (seen[-1].head.grant, seen[-1].head.source) == (grant, "video/ch1")
+            seen.append(await frame_of(watch))
+        for _ in range(4):
             frame = await frame_of(watch)
-            while frame.head.source != "video/ch1":
+            assert (frame.head.grant, frame.head.source) == (newer, "video/ch2")
+            picture = picture_in(frame)
+            assert picture.shape == (120, 160, 3)
+            assert BLUE < number_of(picture) <= BLUE + at.two.sent
+            assert frame.head.number > numbers[-1]
+        await until(lambda: at.one.connected == 0)
+
+        # Nobody looks: it stays open, and encodes nothing.
+        watch.close()
+        await until(lambda: not at.driver._publisher.watched)
+        done = len(encoded)
+        await look_at(at.driver, 10)
+        assert len(encoded) <= done + 1
+        assert at.two.connected == 1
+        # Somebody looks again: at once there are frames, and not of those that gathered.
+        before = looked_at(at.driver)
+        with closing(at.watch()) as watch:
+            assert (await frame_of(watch)).head.number >= before
+
+            # Free again: it stays open for the next while somebody looks, and publishes nothing.
+            await at.client.end(first)
+            await at.client.end(second)
+            await until(lambda: at.driver._holder is None)
+            # Nothing was commanded under it: from its first frame to its last it was used.
+            keys = at.client.mesh.keys
+            reply = await at.client.mesh.ask_one(keys.rc_state(GRABBER), RcAsk(), RcState, timeout=HANG)
+            assert reply is not None
+            assert reply.message is not None
+            assert {use.grant: use.seconds for use in reply.message.used}[newer] > 0
+            # One that was under way is counted.
+            await look_at(at.driver, 3)
+            published = at.driver.figures()["published"]
+            await look_at(at.driver, 10)
+            assert at.driver.figures()["published"] == published
+            assert (at.two.connected, at.driver.figures()["opened"]) == (1, 2)
+
+            # The next holder has it at once, but nothing that was there before its hold.
+            assert at.driver._capture is not None
+            before = at.driver._before["number"] + at.driver._capture.number
+            third, newest = await running(at.client, "third", GRABBER, "video/ch2")
+            frame = await frame_of(watch)
+            while frame.head.grant == newer:  # it was under way
                 frame = await frame_of(watch)
-            assert frame.head.grant == grant
-            assert await answer(at.client.command(GRABBER, grant, {"name": "zoom"})) == "unknown_command"
-            await at.client.end(arc)
+            assert frame.head.grant == newest
+            assert frame.head.number > before
+            assert at.driver.figures()["opened"] == 2
 
-            # A gang that has a channel is not shown another one's.
-            arc, at_grant = await running(at.client, "mine", GRABBER, "video/ch1")
-            assert await tune(to="video/ch2") == "bad_command"
-            await at.client.end(arc)
-            arc, at_grant = await running(at.client, "deaf", GRABBER, "video/ch9")
-            assert "does not receive video/ch9" in (await at.ask(at_grant, "snapshot"))["health"]
-            assert at.rc.health == "ok"
-            await at.client.end(arc)
+            # What is too old or too large is not sent.
+            for limit, value in (("MAX_AGE", -1.0), ("MAX_FRAME", 100)):
+                with monkeypatch.context() as patch:
+                    patch.setattr(framegrabber, limit, value)
+                    await look_at(at.driver, 3)
+                    published = at.driver.figures()["published"]
+                    await look_at(at.driver, 10)
+                    assert at.driver.figures()["published"] == published
+            assert at.driver.figures()["too_large"] > 0
+            await at.client.end(third)
+            await until(lambda: at.driver._holder is None)
+        await until(lambda: at.two.connected == 0)
+        assert at.driver._capture is None
 
-    asyncio.run(story())
+
+async def test_tuning_by_hand(tmp_path: Path) -> None:
+    async with scene(tmp_path, rate=10) as at:
+        watch = at.watch()
+        arc, grant = await running(at.client, "free", GRABBER, "robot/a")
+        told = await at.ask(grant, "snapshot")
+        assert told["source"] is None
+        assert told["health"] == "no video RC is in its gang; tune it to one of video/ch1, video/ch2"
+        assert (at.one.accepted, at.two.accepted) == (1, 0)
+
+        def tune(**how: Any) -> Any:
+            return answer(at.client.command(GRABBER, at_grant, {"name": "tune"} | how))
+
+        at_grant = grant
+        for wrong in ({}, {"to": 1}, {"to": "video/ch9"}, {"to": ["video/ch1"]}):
+            assert await tune(**wrong) == "bad_command"
+        assert await at.ask(grant, "tune", to="video/ch2") == {"source": "video/ch2"}
+        times = []
+        for _ in range(5):
+            frame = await frame_of(watch)
+            times.append(frame.head.time)
+            assert frame.head.source == "video/ch2"
+        # Of 40 a second 10 are published; one may be half an interval early.
+        assert times[-1] - times[0] > 0.34
+        assert await tune(to="video/ch1") == "done"
+        frame = await frame_of(watch)
+        while frame.head.source != "video/ch1":
+            frame = await frame_of(watch)
+        assert frame.head.grant == grant
+        assert await answer(at.client.command(GRABBER, grant, {"name": "zoom"})) == "unknown_command"
+        await at.client.end(arc)
+
+        # A gang that has a channel is not shown another one's.
+        arc, at_grant = await running(at.client, "mine", GRABBER, "video/ch1")
+        assert await tune(to="video/ch2") == "bad_command"
+        await at.client.end(arc)
+        arc, at_grant = await running(at.client, "deaf", GRABBER, "video/ch9")
+        assert "does not receive video/ch9" in (await at.ask(at_grant, "snapshot"))["health"]
+        assert at.rc.health == "ok"
+        await at.client.end(arc)
 
 
-def test_a_source_that_falls_silent_loses_the_framegrabber_until_it_is_back(
+async def test_a_source_that_falls_silent_loses_the_framegrabber_until_it_is_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(framegrabber, "LOST_AFTER", 2.0)
-
-    async def story() -> None:
-        async with scene(tmp_path) as at:
-            monkeypatch.setattr(framegrabber, "TRY_NEXT", 600)
-            arc, grant = await running(at.client, "hide", GRABBER, "video/ch1")
-            # Whether or not somebody looks: whoever holds it may be about to.
-            await until(lambda: at.driver._capture is not None and at.driver._capture.number > 0)
-            at.one.close()
-            await until(lambda: arc.state == "queued")
-            assert arc.ending is not None
-            assert arc.ending.outcome == "lost"
-            assert "no picture of video/ch1 for 2 s: http://127.0.0.1" in arc.ending.reason
-            assert "can't be opened" in arc.ending.reason
-            assert "no picture of video/ch1" in (await at.lab.rc(at.client, GRABBER)).health
-            await until(lambda: at.driver._holder is None)
-            at.one.open()
-            async with asyncio.timeout(HANG):
-                again = await at.client.granted(arc)
-            assert again is not None
-            assert again > grant
-            watch = at.watch()
+    async with scene(tmp_path) as at:
+        monkeypatch.setattr(framegrabber, "TRY_NEXT", 600)
+        arc, grant = await running(at.client, "hide", GRABBER, "video/ch1")
+        # Whether or not somebody looks: whoever holds it may be about to.
+        await until(lambda: at.driver._capture is not None and at.driver._capture.number > 0)
+        at.one.close()
+        await until(lambda: arc.state == "queued")
+        assert arc.ending is not None
+        assert arc.ending.outcome == "lost"
+        assert "no picture of video/ch1 for 2 s: http://127.0.0.1" in arc.ending.reason
+        assert "can't be opened" in arc.ending.reason
+        assert "no picture of video/ch1" in (await at.lab.rc(at.client, GRABBER)).health
+        await until(lambda: at.driver._holder is None)
+        at.one.open()
+        async with asyncio.timeout(HANG):
+            again = await at.client.granted(arc)
+        assert again is not None
+        assert again > grant
+        watch = at.watch()
+        frame = await frame_of(watch)
+        while frame.head.grant != again:
             frame = await frame_of(watch)
-            while frame.head.grant != again:
-                frame = await frame_of(watch)
-            assert at.rc.health == "ok"
+        assert at.rc.health == "ok"
 
-            # With several sources it is there for others as soon as any of them works.
-            monkeypatch.setattr(framegrabber, "TRY_NEXT", 0.3)
-            at.one.close()
-            await until(lambda: arc.state == "queued")
-            await at.client.end(arc)
-            await until(lambda: at.rc.health == "ok")
-            arc, grant = await running(at.client, "other", GRABBER, "video/ch2")
+        # With several sources it is there for others as soon as any of them works.
+        monkeypatch.setattr(framegrabber, "TRY_NEXT", 0.3)
+        at.one.close()
+        await until(lambda: arc.state == "queued")
+        await at.client.end(arc)
+        await until(lambda: at.rc.health == "ok")
+        arc, grant = await running(at.client, "other", GRABBER, "video/ch2")
+        frame = await frame_of(watch)
+        while frame.head.grant != grant:
             frame = await frame_of(watch)
-            while frame.head.grant != grant:
-                frame = await frame_of(watch)
-            assert frame.head.source == "video/ch2"
-            watch.close()
-            await at.client.end(arc)
-
-    asyncio.run(story())
+        assert frame.head.source == "video/ch2"
+        watch.close()
+        await at.client.end(arc)

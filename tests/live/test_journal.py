@@ -21,7 +21,7 @@ from tests.hang import HANG
 from tests.live.lab import PATIENT, Lab
 from zscout.keyexpr import Role
 from zscout.messages import Grants
-from zscout.services.journal.store import ASIDE, FILE
+from zscout.services.journal.store import FILE
 from zscout.types import Term
 
 pytestmark = pytest.mark.live
@@ -57,186 +57,153 @@ async def committed(lab: Lab, host: str, *holds: tuple[str, str]) -> None:
         raise AssertionError(f"{host} has {found}") from None
 
 
-def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path, candidates=("anvil", "bellows")) as lab:
-            lab.node("anvil", "robot/a")
-            client = await lab.client("program")
-            await lab.ready(client, "robot/a")  # it leads before the other could
-            lab.node("bellows", "robot/b")
-            await lab.ready(client, "robot/b")
-            await lab.candidates(client, "anvil", "bellows")
-            survey = await client.request("survey", {"robot/b": {}}, min_runtime=600)
-            await lab.held_by(client, "robot/b", "survey")
-            take = await client.request("take", {"robot/b": {}}, priority=10, min_runtime=600)
-            await lab.held_by(client, "robot/b", "take")
-            granted = await client.granted(take)
-            assert granted is not None
-            for _ in range(20):
-                await client.command("robot/b", granted, {"name": "echo"})
-            both = {"anvil", "bellows"}
-            first = await told(
-                lab,
-                lambda found: (
-                    [hold["outcome"] for hold in found["holds"]] == ["preempted", ""]
-                    and {one["host"] for one in found["candidates"] if one["gaps"] is not None} == both
-                ),
-            )
-            assert first["holds"][0]["by"]["arc"] == "take"
+@pytest.mark.slow
+async def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> None:
+    async with Lab(tmp_path, candidates=("anvil", "bellows")) as lab:
+        lab.node("anvil", "robot/a")
+        client = await lab.begun("program")
+        lab.node("bellows", "robot/b")
+        await lab.ready(client, "robot/b")
+        await lab.candidates(client, "anvil", "bellows")
+        survey = await client.request("survey", {"robot/b": {}}, min_runtime=600)
+        await lab.held_by(client, "robot/b", "survey")
+        take = await client.request("take", {"robot/b": {}}, priority=10, min_runtime=600)
+        await lab.held_by(client, "robot/b", "take")
+        granted = await client.granted(take)
+        assert granted is not None
+        for _ in range(20):
+            await client.command("robot/b", granted, {"name": "echo"})
+        both = {"anvil", "bellows"}
+        first = await told(
+            lab,
+            lambda found: (
+                [hold["outcome"] for hold in found["holds"]] == ["preempted", ""]
+                and {one["host"] for one in found["candidates"] if one["gaps"] is not None} == both
+            ),
+        )
+        assert first["holds"][0]["by"]["arc"] == "take"
 
-            # The leader is killed, with what it has committed; the other goes on, with its own journal.
-            for host in both:
-                await committed(lab, host, ("survey", "preempted"), ("take", ""))
-            await lab.candidates(client, "bellows")
-            lab.signal("anvil", signal.SIGKILL)
-            lab.nodes["anvil"].wait()
-            await lab.living(client, Role.RCM, lambda hosts: hosts == ["bellows"])
-            await client.end(take)
-            await lab.held_by(client, "robot/b", "survey")
-            (last,) = [use.seconds for use in (await lab.rc(client, "robot/b")).used if use.grant == granted]
-            # What it said while they stood may have been less.
-            later = await told(
-                lab,
-                lambda found: (
-                    [one["outcome"] for one in found["holds"]] == ["preempted", "released", ""]
-                    and [one["used_rc_seconds"] for one in found["holds"][:2]] == [0.0, last]
-                ),
-            )
-            used = [one["used"]["robot/b"] for one in later["holds"][:2]]
-            assert used == [0.0, last]
-            # By the clock of another candidate, which heard it a moment sooner or later.
-            assert 0 < last <= later["holds"][1]["held"] + PATIENT
-            assert later["holds"][0]["grant"] == first["holds"][0]["grant"]
-            assert later["holds"][0]["held"] == pytest.approx(first["holds"][0]["held"], abs=PATIENT)
+        # The leader is killed, with what it has committed; the other goes on, with its own journal.
+        for host in both:
+            await committed(lab, host, ("survey", "preempted"), ("take", ""))
+        await lab.candidates(client, "bellows")
+        lab.signal("anvil", signal.SIGKILL)
+        lab.nodes["anvil"].wait()
+        await lab.living(client, Role.RCM, lambda hosts: hosts == ["bellows"])
+        await client.end(take)
+        await lab.held_by(client, "robot/b", "survey")
+        (last,) = [use.seconds for use in (await lab.rc(client, "robot/b")).used if use.grant == granted]
+        # What it said while they stood may have been less.
+        later = await told(
+            lab,
+            lambda found: (
+                [one["outcome"] for one in found["holds"]] == ["preempted", "released", ""]
+                and [one["used_rc_seconds"] for one in found["holds"][:2]] == [0.0, last]
+            ),
+        )
+        used = [one["used"]["robot/b"] for one in later["holds"][:2]]
+        assert used == [0.0, last]
+        # By the clock of another candidate, which heard it a moment sooner or later.
+        assert 0 < last <= later["holds"][1]["held"] + PATIENT
+        assert later["holds"][0]["grant"] == first["holds"][0]["grant"]
+        assert later["holds"][0]["held"] == pytest.approx(first["holds"][0]["held"], abs=PATIENT)
 
-            # Its file opens again with all that was committed, and it knows since when it was away.
-            with sqlite3.connect(file_of(lab, "anvil")) as db:
-                assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
-                assert db.execute("SELECT arc, outcome FROM holds ORDER BY id").fetchall()[0] == ("survey", "preempted")
-            lab.node("anvil", "robot/a")
-            again = await told(
-                lab,
-                lambda found: any(
-                    gap["cause"] == "off"
-                    for one in found["candidates"]
-                    if one["host"] == "anvil"
-                    for gap in one["gaps"] or ()
-                ),
-            )
-            assert [hold["outcome"] for hold in again["holds"]] == ["preempted", "released", ""]
-            # No time is unknown: one of the two always ran.
-            assert again["gaps"] == []
+        # Its file opens again with all that was committed, and it knows since when it was away.
+        with sqlite3.connect(file_of(lab, "anvil")) as db:
+            assert db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+            assert db.execute("SELECT arc, outcome FROM holds ORDER BY id").fetchall()[0] == ("survey", "preempted")
+        lab.node("anvil", "robot/a")
+        again = await told(
+            lab,
+            lambda found: any(
+                gap["cause"] == "off"
+                for one in found["candidates"]
+                if one["host"] == "anvil"
+                for gap in one["gaps"] or ()
+            ),
+        )
+        assert [hold["outcome"] for hold in again["holds"]] == ["preempted", "released", ""]
+        # No time is unknown: one of the two always ran.
+        assert again["gaps"] == []
 
-            # In a pipe: a line for each hold, newest last.
-            plain = (await lab.zscout("history", "--rc", "robot/*")).stdout.splitlines()
-            assert plain[0].startswith("Holds since ")
-            assert plain[1].split() == ["BEGAN", "HELD", "ARC", "WHO", "PRIORITY", "WAITED", "END", "RCS"]
-            assert [line.split()[-1] for line in plain[2:5]] == ["robot/b"] * 3
-            assert "preempted by take" in plain[2]
-            assert "stands" in plain[4]
-            rows = [*csv.DictReader(io.StringIO((await lab.zscout("history", "--csv")).stdout))]
-            assert [(row["arc"], row["outcome"], row["rcs"]) for row in rows] == [
-                ("survey", "preempted", "robot/b"),
-                ("take", "released", "robot/b"),
-                ("survey", "", "robot/b"),
-            ]
-            assert (rows[1]["used"], rows[1]["used_rc_seconds"]) == (f"robot/b={used[1]}", str(used[1]))
-            assert (await lab.zscout("history", "--rc", "robot/a")).stdout.startswith("no holds since ")
+        # In a pipe: a line for each hold, newest last.
+        plain = (await lab.zscout("history", "--rc", "robot/*")).stdout.splitlines()
+        assert plain[0].startswith("Holds since ")
+        assert plain[1].split() == ["BEGAN", "HELD", "ARC", "WHO", "PRIORITY", "WAITED", "END", "RCS"]
+        assert [line.split()[-1] for line in plain[2:5]] == ["robot/b"] * 3
+        assert "preempted by take" in plain[2]
+        assert "stands" in plain[4]
+        rows = [*csv.DictReader(io.StringIO((await lab.zscout("history", "--csv")).stdout))]
+        assert [(row["arc"], row["outcome"], row["rcs"]) for row in rows] == [
+            ("survey", "preempted", "robot/b"),
+            ("take", "released", "robot/b"),
+            ("survey", "", "robot/b"),
+        ]
+        assert (rows[1]["used"], rows[1]["used_rc_seconds"]) == (f"robot/b={used[1]}", str(used[1]))
+        assert (await lab.zscout("history", "--rc", "robot/a")).stdout.startswith("no holds since ")
 
-            by_rc = json.loads((await lab.zscout("usage", "--by", "rc", "--json")).stdout)
-            (account,) = by_rc["accounts"]
-            assert (account["key"], account["holds"], account["preempted"]) == ("robot/b", 3, 1)
-            assert account["used"] >= used[1]
-            assert (
-                account["thrown_away"]
-                == account["preempted_seconds"]
-                == pytest.approx(again["holds"][0]["held"], abs=PATIENT)
-            )
-            by_user = (await lab.zscout("usage")).stdout.splitlines()
-            assert by_user[1].split()[:2] == ["USER", "HOLDS"]
-            assert by_user[2].split()[1] == "3"
-            assert by_user[1].split()[5:7] == ["USED", "WAITED"]
+        by_rc = json.loads((await lab.zscout("usage", "--by", "rc", "--json")).stdout)
+        (account,) = by_rc["accounts"]
+        assert (account["key"], account["holds"], account["preempted"]) == ("robot/b", 3, 1)
+        assert account["used"] >= used[1]
+        assert (
+            account["thrown_away"]
+            == account["preempted_seconds"]
+            == pytest.approx(again["holds"][0]["held"], abs=PATIENT)
+        )
+        by_user = (await lab.zscout("usage")).stdout.splitlines()
+        assert by_user[1].split()[:2] == ["USER", "HOLDS"]
+        assert by_user[2].split()[1] == "3"
+        assert by_user[1].split()[5:7] == ["USED", "WAITED"]
 
-            # A leader that begins anew remembers nothing of it; the journals do.
-            await client.end(survey)
-            await told(lab, lambda found: [one["outcome"] for one in found["holds"]][2:] == ["released"])
-            await committed(lab, "anvil", ("survey", "preempted"), ("survey", "released"))
-            await lab.candidates(client, "anvil")
-            lab.signal("bellows", signal.SIGKILL)
-            lab.nodes["bellows"].wait()
-            await lab.living(client, Role.RCM, lambda hosts: hosts == ["anvil"])
-            why = await lab.zscout("why", "take")
-            assert why.returncode == 0
-            assert why.stdout.startswith("take is not open any more\nHolds, as the candidates' journals have them\n")
-            assert "priority 10, held robot/b\n" in why.stdout
-            as_json = json.loads((await lab.zscout("why", survey.id, "--json")).stdout)
-            (arc,) = as_json["arcs"]
-            assert (arc["state"], [hold["outcome"] for hold in arc["holds"]]) == ("ended", ["preempted", "released"])
-            unknown = await lab.zscout("why", "nobody")
-            assert unknown.returncode == 1
-
-    asyncio.run(story())
+        # A leader that begins anew remembers nothing of it; the journals do.
+        await client.end(survey)
+        await told(lab, lambda found: [one["outcome"] for one in found["holds"]][2:] == ["released"])
+        await committed(lab, "anvil", ("survey", "preempted"), ("survey", "released"))
+        await lab.candidates(client, "anvil")
+        lab.signal("bellows", signal.SIGKILL)
+        lab.nodes["bellows"].wait()
+        await lab.living(client, Role.RCM, lambda hosts: hosts == ["anvil"])
+        why = await lab.zscout("why", "take")
+        assert why.returncode == 0
+        assert why.stdout.startswith("take is not open any more\nHolds, as the candidates' journals have them\n")
+        assert "priority 10, held robot/b\n" in why.stdout
+        as_json = json.loads((await lab.zscout("why", survey.id, "--json")).stdout)
+        (arc,) = as_json["arcs"]
+        assert (arc["state"], [hold["outcome"] for hold in arc["holds"]]) == ("ended", ["preempted", "released"])
+        unknown = await lab.zscout("why", "nobody")
+        assert unknown.returncode == 1
 
 
-def test_journals_answer_while_nobody_leads(tmp_path: Path) -> None:
-    async def story() -> None:
-        # Who is deposed leads again after a lease at the earliest, about.
-        async with Lab(tmp_path, lease=3 * PATIENT) as lab:
-            lab.node("anvil", "robot/a")
-            client = await lab.client("program")
-            await lab.ready(client, "robot/a")
-            await client.end(await client.request("survey", {"robot/a": {}}, min_runtime=600))
-            await told(lab, lambda found: [hold["outcome"] for hold in found["holds"]] == ["released"])
-            above = Grants(Term((await lab.state(client, lambda _: True)).term.counter + 1, "stranger"), 1, 0, 0.5)
-            client.mesh.publisher(client.mesh.keys.grants, Grants).put(above)
-            await lab.living(client, Role.RCM, lambda hosts: not hosts)
-            for command, found in (("history", "holds"), ("usage", "accounts")):
-                done = await lab.zscout(command, "--json")
-                assert (done.returncode, done.stderr) == (0, "")
-                assert len(json.loads(done.stdout)[found]) == 1
-
-    asyncio.run(story())
+@pytest.mark.slow
+async def test_journals_answer_while_nobody_leads(tmp_path: Path) -> None:
+    # Who is deposed leads again after a lease at the earliest, about.
+    async with Lab(tmp_path, lease=3 * PATIENT) as lab:
+        lab.node("anvil", "robot/a")
+        client = await lab.begun("program")
+        await client.end(await client.request("survey", {"robot/a": {}}, min_runtime=600))
+        await told(lab, lambda found: [hold["outcome"] for hold in found["holds"]] == ["released"])
+        above = Grants(Term((await lab.state(client, lambda _: True)).term.counter + 1, "stranger"), 1, 0, 0.5)
+        client.mesh.publisher(client.mesh.keys.grants, Grants).put(above)
+        await lab.living(client, Role.RCM, lambda hosts: not hosts)
+        for command, found in (("history", "holds"), ("usage", "accounts")):
+            done = await lab.zscout(command, "--json")
+            assert (done.returncode, done.stderr) == (0, "")
+            assert len(json.loads(done.stdout)[found]) == 1
 
 
-def test_where_nobody_is_there_nobody_answers(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            done = await zscout_soon("history", env=lab.env)
-            assert done.returncode == 3
-            assert done.stderr.startswith(f"zscout: no RCM is on the mesh of fleet {lab.fleet.name} (no other program")
-
-    asyncio.run(story())
+async def test_where_nobody_is_there_nobody_answers(lab: Lab) -> None:
+    done = await zscout_soon("history", env=lab.env)
+    assert done.returncode == 3
+    assert done.stderr.startswith(f"zscout: no RCM is on the mesh of fleet {lab.fleet.name} (no other program")
 
 
-def test_a_journal_that_is_damaged_is_set_aside_and_the_node_runs(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            file = file_of(lab, "anvil")
-            file.parent.mkdir(parents=True)
-            file.write_bytes(b"this is no journal\n" * 1_000)
-            lab.node("anvil", "robot/a")
-            client = await lab.client("program")
-            await lab.ready(client, "robot/a")
-            request = await client.request("survey", {"robot/a": {}}, min_runtime=600)
-            await client.end(request)
-            await told(lab, lambda found: [hold["outcome"] for hold in found["holds"]] == ["released"])
-            assert lab.log("anvil").count("is damaged") == 1
-            assert file.with_name(ASIDE).exists()
-
-    asyncio.run(story())
-
-
-def test_a_fleet_without_a_journal_says_so(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("anvil", "robot/a", extra="[journal]\noff = true")
-            client = await lab.client("program")
-            await lab.ready(client, "robot/a")
-            for command in ("history", "usage"):
-                done = await lab.zscout(command)
-                assert done.returncode == 1
-                assert "has no journal that could be asked" in done.stderr
-                assert done.stderr.count("\n") == 1
-            assert not file_of(lab, "anvil").exists()
-
-    asyncio.run(story())
+async def test_a_fleet_without_a_journal_says_so(lab: Lab) -> None:
+    lab.node("anvil", "robot/a", extra="[journal]\noff = true")
+    await lab.begun("program")
+    for command in ("history", "usage"):
+        done = await lab.zscout(command)
+        assert done.returncode == 1
+        assert "has no journal that could be asked" in done.stderr
+        assert done.stderr.count("\n") == 1
+    assert not file_of(lab, "anvil").exists()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from itertools import pairwise
-from pathlib import Path
 from statistics import median, quantiles
 
 import pytest
@@ -15,47 +14,46 @@ from zscout.types import SECOND
 
 pytestmark = pytest.mark.live
 
-BATCHES = times(3)
-ROUNDS = 10
-"""Kills in one batch; all of its processes wait in the queue before the first one dies."""
 
-
-def test_the_next_in_the_queue_follows_a_holder_killed_with_9(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("a")
-            lab.node("b", "robot/x", extra="candidate = false")
-            client = await lab.client()
-            await lab.ready(client, "robot/x")
-            took: list[float] = []
-            entered: list[float] = []
-            first = await _queued(lab, "first")
-            await first.event("entered")
-            for batch in range(BATCHES):
-                names = [f"h{batch}-{number}" for number in range(ROUNDS)]
-                queue = [first, *await asyncio.gather(*(lab.holder(name) for name in names))]
-                for holder in queue[1:]:
-                    await _ask(holder)
-                    await holder.event("queued")
-                for holder, following in pairwise(queue):
-                    killed = holder.kill()
-                    told = await following.event("running")
-                    took.append((told["at"] - killed) / SECOND)
-                    entered.append(((await following.event("entered"))["at"] - killed) / SECOND)
-                first = queue[-1]
-            for what, times in (("granted", took), ("entered", entered)):
-                p99 = quantiles(times, n=100, method="inclusive")[98]
-                print(
-                    f"kill -9 of a holder -> the next one {what}: median {median(times) * 1000:.1f} ms, "
-                    f"p99 {p99 * 1000:.1f} ms, {len(times)} rounds"
-                )
-            assert len(took) == BATCHES * ROUNDS
-            assert min(took) > 0
-            # A leader that stood still itself leaves who is gone a lease to come back.
-            late = sum(seconds >= PATIENT for seconds in took)
-            assert late <= lab.log("a").count("stood still"), "it was noticed by the lease, not by the death"
-
-    asyncio.run(story())
+@pytest.mark.parametrize(
+    ("batches", "rounds"),
+    [
+        pytest.param(1, 3, marks=pytest.mark.essential, id="few"),
+        pytest.param(times(3), 10, marks=pytest.mark.slow, id="many"),
+    ],
+)
+async def test_the_next_in_the_queue_follows_a_holder_killed_with_9(lab: Lab, batches: int, rounds: int) -> None:
+    """All processes of a batch wait in the queue before the first one dies."""
+    lab.node("a")
+    lab.node("b", "robot/x", extra="candidate = false")
+    await lab.begun()
+    took: list[float] = []
+    entered: list[float] = []
+    first = await _queued(lab, "first")
+    await first.event("entered")
+    for batch in range(batches):
+        names = [f"h{batch}-{number}" for number in range(rounds)]
+        queue = [first, *await asyncio.gather(*(lab.holder(name) for name in names))]
+        for holder in queue[1:]:
+            await _ask(holder)
+            await holder.event("queued")
+        for holder, following in pairwise(queue):
+            killed = holder.kill()
+            told = await following.event("running")
+            took.append((told["at"] - killed) / SECOND)
+            entered.append(((await following.event("entered"))["at"] - killed) / SECOND)
+        first = queue[-1]
+    for what, found in (("granted", took), ("entered", entered)):
+        p99 = quantiles(found, n=100, method="inclusive")[98]
+        print(
+            f"kill -9 of a holder -> the next one {what}: median {median(found) * 1000:.1f} ms, "
+            f"p99 {p99 * 1000:.1f} ms, {len(found)} rounds"
+        )
+    assert len(took) == batches * rounds
+    assert min(took) > 0
+    # A leader that stood still itself leaves who is gone a lease to come back.
+    late = sum(seconds >= PATIENT for seconds in took)
+    assert late <= lab.log("a").count("stood still"), "it was noticed by the lease, not by the death"
 
 
 async def _queued(lab: Lab, name: str) -> HolderProcess:

@@ -102,8 +102,7 @@ async def measured(folder: Path) -> AsyncIterator[tuple[Lab, Client, int]]:
     async with Lab(folder, extra=groups) as lab:
         port = free_port()
         lab.node("anvil", "robot/a", extra=f"[metrics]\nport = {port}")
-        client = await lab.client("worker")
-        await lab.ready(client, "robot/a")
+        client = await lab.begun("worker")
         first, second = [
             await client.request(name, {"robot/a": {}}, min_runtime=60, estimate=True) for name in ("first", "second")
         ]
@@ -127,58 +126,52 @@ async def measured(folder: Path) -> AsyncIterator[tuple[Lab, Client, int]]:
         yield lab, client, port
 
 
-def test_a_node_shows_what_it_knows(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with measured(tmp_path) as (lab, _, _):
-            text = await shown(lab, "anvil")
-        for line in (
-            r'zscout_info\{fleet="test-\w+",host="anvil",version="[\d.]+"\} 1\.0',
-            r"zscout_links [1-9]\.0",
-            r"zscout_leading 1\.0",
-            r"zscout_terms_led_total 1\.0",
-            r"zscout_queue_length 0\.0",
-            r'zscout_wait_seconds_count\{group="arms",priority="0"\} 3\.0',
-            r'zscout_wait_seconds_count\{group="arms",priority="5"\} 1\.0',
-            # It was foretold to start when the first one's minimum runtime would be over.
-            r'zscout_forecast_error_seconds_bucket\{le="-15\.0"\} [1-9]\.0',
-            r'zscout_preemptions_total\{group="arms",priority="0"\} 1\.0',
-            r'zscout_refusals_total\{code="unknown_parameter"\} 1\.0',
-            r'zscout_holds\{rc="robot/a"\} 0\.0',
-            r'zscout_held_seconds_total\{rc="robot/a"\} [\d.e-]+',
-            r'zscout_commands_total\{rc="robot/a"\} 1\.0',
-            r'zscout_commands_refused_total\{code="\w+",rc="robot/a"\} 1\.0',
-        ):
-            assert re.search(f"^{line}$", text, re.MULTILINE), f"{line}\n{text}"
-
-    asyncio.run(story())
+async def test_a_node_shows_what_it_knows(tmp_path: Path) -> None:
+    async with measured(tmp_path) as (lab, _, _):
+        text = await shown(lab, "anvil")
+    for line in (
+        r'zscout_info\{fleet="test-\w+",host="anvil",version="[\d.]+"\} 1\.0',
+        r"zscout_links [1-9]\.0",
+        r"zscout_leading 1\.0",
+        r"zscout_terms_led_total 1\.0",
+        r"zscout_queue_length 0\.0",
+        r'zscout_wait_seconds_count\{group="arms",priority="0"\} 3\.0',
+        r'zscout_wait_seconds_count\{group="arms",priority="5"\} 1\.0',
+        # It was foretold to start when the first one's minimum runtime would be over.
+        r'zscout_forecast_error_seconds_bucket\{le="-15\.0"\} [1-9]\.0',
+        r'zscout_preemptions_total\{group="arms",priority="0"\} 1\.0',
+        r'zscout_refusals_total\{code="unknown_parameter"\} 1\.0',
+        r'zscout_holds\{rc="robot/a"\} 0\.0',
+        r'zscout_held_seconds_total\{rc="robot/a"\} [\d.e-]+',
+        r'zscout_commands_total\{rc="robot/a"\} 1\.0',
+        r'zscout_commands_refused_total\{code="\w+",rc="robot/a"\} 1\.0',
+    ):
+        assert re.search(f"^{line}$", text, re.MULTILINE), f"{line}\n{text}"
 
 
 @without
-def test_prometheus_scrapes_it_and_answers_from_that(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with measured(tmp_path) as (_, client, port):
-            prometheus = PrometheusServer(tmp_path, port)
-            try:
-                rc, leads = {"rc": "robot/a"}, {"host": "anvil"}
-                await client.granted(await client.request("third", {"robot/a": {}}, min_runtime=600))
-                assert await prometheus.until("zscout_holds", rc, 1) == 1
-                # It grows while it is held.
-                await prometheus.until("sum by (rc) (zscout_held_seconds_total)", rc, 3)
-                await prometheus.until("sum by (rc) (rate(zscout_held_seconds_total[1m]))", rc, 0.01)
-                waits = 'zscout_wait_seconds_count{group="arms"}'
-                assert await prometheus.until(waits, {"priority": "0"}, 4) == 4
-                dashboard = "(zscout_leading == 1) * on(instance) group_left(host, fleet) zscout_info"
-                assert await prometheus.until(dashboard, leads, 1) == 1
-                (up,) = await prometheus.ask('up{job="zscout"}')
-                assert up["value"][1] == "1"
-            finally:
-                prometheus.stop()
-
-    asyncio.run(story())
+async def test_prometheus_scrapes_it_and_answers_from_that(tmp_path: Path) -> None:
+    async with measured(tmp_path) as (_, client, port):
+        prometheus = PrometheusServer(tmp_path, port)
+        try:
+            rc, leads = {"rc": "robot/a"}, {"host": "anvil"}
+            await client.granted(await client.request("third", {"robot/a": {}}, min_runtime=600))
+            assert await prometheus.until("zscout_holds", rc, 1) == 1
+            # It grows while it is held.
+            await prometheus.until("sum by (rc) (zscout_held_seconds_total)", rc, 3)
+            await prometheus.until("sum by (rc) (rate(zscout_held_seconds_total[1m]))", rc, 0.01)
+            waits = 'zscout_wait_seconds_count{group="arms"}'
+            assert await prometheus.until(waits, {"priority": "0"}, 4) == 4
+            dashboard = "(zscout_leading == 1) * on(instance) group_left(host, fleet) zscout_info"
+            assert await prometheus.until(dashboard, leads, 1) == 1
+            (up,) = await prometheus.ask('up{job="zscout"}')
+            assert up["value"][1] == "1"
+        finally:
+            prometheus.stop()
 
 
 @without
-def test_prometheus_understands_all_that_the_dashboard_asks(tmp_path: Path) -> None:
+async def test_prometheus_understands_all_that_the_dashboard_asks(tmp_path: Path) -> None:
     from tests.docs.test_metrics_reference import DASHBOARD, expressions
 
     asked = [one for one in expressions(json.loads(DASHBOARD.read_text())) if "zscout_" in one or "process_" in one]
@@ -186,28 +179,20 @@ def test_prometheus_understands_all_that_the_dashboard_asks(tmp_path: Path) -> N
         one.replace("$__rate_interval", "1m").replace("$fleet", ".*") for one in asked if "label_values" not in one
     ]
     assert len(asked) > 10
-
-    async def story() -> None:
-        prometheus = PrometheusServer(tmp_path, 1)
-        try:
-            await prometheus.until("vector(1)", {}, 1)
-            for query in asked:
-                assert await prometheus.ask(query) == []
-        finally:
-            prometheus.stop()
-
-    asyncio.run(story())
+    prometheus = PrometheusServer(tmp_path, 1)
+    try:
+        await prometheus.until("vector(1)", {}, 1)
+        for query in asked:
+            assert await prometheus.ask(query) == []
+    finally:
+        prometheus.stop()
 
 
-def test_a_port_that_is_taken_ends_the_node_with_a_line(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            with socket.socket() as one:
-                one.bind(("127.0.0.1", 0))
-                one.listen()
-                port = one.getsockname()[1]
-                node = lab.node("anvil", extra=f"[metrics]\nport = {port}")
-                assert await asyncio.to_thread(node.wait, HANG) == 1
-            assert f"zscout-node: [metrics] can't be served at 127.0.0.1:{port}: " in lab.log("anvil")
-
-    asyncio.run(story())
+async def test_a_port_that_is_taken_ends_the_node_with_a_line(lab: Lab) -> None:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        one.listen()
+        port = one.getsockname()[1]
+        node = lab.node("anvil", extra=f"[metrics]\nport = {port}")
+        assert await asyncio.to_thread(node.wait, HANG) == 1
+    assert f"zscout-node: [metrics] can't be served at 127.0.0.1:{port}: " in lab.log("anvil")

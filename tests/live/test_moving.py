@@ -21,7 +21,7 @@ from zscout.behaviors.client.request import OpenArc
 from zscout.messages import DrainHost, EndComponent, Grants, MigrateComponent, Placement, Placements, RcState
 from zscout.types import Grant
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 RC = "robot/scout33"
 MOVES = times(20)
@@ -57,11 +57,7 @@ async def rival_of(lab: Lab) -> Rival:
     return Rival(client, await client.request("rival", {RC: {}}, min_runtime=1))
 
 
-def test_a_component_that_moves_keeps_its_count_and_its_hold(tmp_path: Path) -> None:
-    asyncio.run(_moves(tmp_path))
-
-
-async def _moves(tmp_path: Path) -> None:
+async def test_a_component_that_moves_keeps_its_count_and_its_hold(tmp_path: Path) -> None:
     async with Lab(tmp_path, candidates=["h0"]) as lab, WitnessRc(lab, RC) as rc:
         register(lab)
         for host in ("h0", "h1", "h2"):
@@ -253,11 +249,7 @@ MOVE_TO: dict[str, Callable[[Lab, Placing, Path, str], Awaitable[None]]] = {
 }
 
 
-def test_drain_empties_a_host_without_a_lost_grant(tmp_path: Path) -> None:
-    asyncio.run(_drains(tmp_path))
-
-
-async def _drains(tmp_path: Path) -> None:
+async def test_drain_empties_a_host_without_a_lost_grant(tmp_path: Path) -> None:
     names = [f"part-{number}" for number in range(4)]
     async with Lab(tmp_path, candidates=["h0"]) as lab:
         register(lab)

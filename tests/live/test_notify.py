@@ -14,7 +14,7 @@ from tests.live.lab import Lab
 from tests.services.notify.receiver import Receiver
 from zscout.behaviors.client.client import Client
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 
 def node(lab: Lab, host: str, receiver: Receiver, *rcs: str) -> None:
@@ -33,35 +33,32 @@ async def take_turns(client: Client, name: str) -> None:
     await client.end(first)
 
 
-def test_who_leads_tells_each_thing_once_and_the_next_leader_goes_on(tmp_path: Path) -> None:
-    async def story() -> None:
-        with Receiver() as receiver:
-            async with Lab(tmp_path, candidates=("a", "b")) as lab:
-                node(lab, "a", receiver)
-                client = await lab.client("worker")
-                await lab.state(client, lambda state: state.host == "a")
-                node(lab, "b", receiver, "robot/a")
-                await lab.ready(client, "robot/a")
-                await lab.candidates(client, "a", "b")
-                await take_turns(client, "one")
-                await asyncio.to_thread(receiver.until, lambda: len(receiver.heard) == 2)
-                lab.signal("a", signal.SIGKILL)
-                await lab.state(client, lambda state: state.host == "b")
-                await lab.ready(client, "robot/a")
-                await take_turns(client, "two")
-                await asyncio.to_thread(receiver.until, lambda: len(receiver.heard) == 4)
-                logs = lab.log("a") + lab.log("b")
-            fleet = lab.fleet.name
-            assert receiver.titles == [
-                f"zscout {fleet}: one-first was preempted",
-                f"zscout {fleet}: one-first is yours now",
-                f"zscout {fleet}: two-first was preempted",
-                f"zscout {fleet}: two-first is yours now",
-            ]
-            assert re.fullmatch(
-                r"\S+ \(.*\) held robot/a for [\d.]+ s: preempted by \S+ \(.*\), priority 5; it waits again",
-                receiver.heard[0]["message"],
-            )
-            assert Receiver.SECRET not in logs
-
-    asyncio.run(story())
+async def test_who_leads_tells_each_thing_once_and_the_next_leader_goes_on(tmp_path: Path) -> None:
+    with Receiver() as receiver:
+        async with Lab(tmp_path, candidates=("a", "b")) as lab:
+            node(lab, "a", receiver)
+            client = await lab.client("worker")
+            await lab.state(client, lambda state: state.host == "a")
+            node(lab, "b", receiver, "robot/a")
+            await lab.ready(client, "robot/a")
+            await lab.candidates(client, "a", "b")
+            await take_turns(client, "one")
+            await asyncio.to_thread(receiver.until, lambda: len(receiver.heard) == 2)
+            lab.signal("a", signal.SIGKILL)
+            await lab.state(client, lambda state: state.host == "b")
+            await lab.ready(client, "robot/a")
+            await take_turns(client, "two")
+            await asyncio.to_thread(receiver.until, lambda: len(receiver.heard) == 4)
+            logs = lab.log("a") + lab.log("b")
+        fleet = lab.fleet.name
+        assert receiver.titles == [
+            f"zscout {fleet}: one-first was preempted",
+            f"zscout {fleet}: one-first is yours now",
+            f"zscout {fleet}: two-first was preempted",
+            f"zscout {fleet}: two-first is yours now",
+        ]
+        assert re.fullmatch(
+            r"\S+ \(.*\) held robot/a for [\d.]+ s: preempted by \S+ \(.*\), priority 5; it waits again",
+            receiver.heard[0]["message"],
+        )
+        assert Receiver.SECRET not in logs

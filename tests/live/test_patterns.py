@@ -5,9 +5,7 @@ from __future__ import annotations
 import asyncio
 import signal
 from collections.abc import Iterator
-from decimal import Decimal
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,7 +16,7 @@ from tests.live.stranger import Stranger, beside_a_node, command, good_ask
 from tests.live.test_protocol import PlainProcess
 from zscout.behaviors.client import blocking
 from zscout.behaviors.client.arc import Held, hold
-from zscout.behaviors.client.client import CommandRefused, RequestRefused
+from zscout.behaviors.client.client import CommandRefused
 from zscout.messages import RcmState
 
 pytestmark = pytest.mark.live
@@ -36,131 +34,114 @@ def waits_for(state: RcmState) -> list[tuple[str, list[str]]]:
     return [(view.arc, sorted(view.needs)) for view in state.queue]
 
 
-def test_each_gets_a_free_one_and_who_waits_the_first_that_is_given_back(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("a", *BOTH, "robot/x")
-            client, other, third = [await lab.client(name) for name in ("one", "two", "three")]
-            await lab.ready(client, *BOTH, "robot/x")
-            async with hold(client, "one", {ANY: {}, "robot/x": {}}, min_runtime=600) as one:
-                (mine,) = set(BOTH) & set(one.rcs)
-                assert (one.rc(ANY), one.rcs) == (mine, [mine, "robot/x"])
-                assert [await echo(one, need) for need in (ANY, mine, "robot/x")] == [ANY, mine, "robot/x"]
-                with pytest.raises(KeyError, match="is no need of one; it asked for framegrabber/"):
-                    await one.command(MORE, {"name": "echo", "value": 1})
-                (told,) = (await lab.rc(client, mine)).holders
-                assert (told.rcs, told.bound) == (one.rcs, {ANY: mine})
+async def test_each_gets_a_free_one_and_who_waits_the_first_that_is_given_back(lab: Lab) -> None:
+    lab.node("a", *BOTH, "robot/x")
+    client, other, third = [await lab.client(name) for name in ("one", "two", "three")]
+    await lab.ready(client, *BOTH, "robot/x")
+    async with hold(client, "one", {ANY: {}, "robot/x": {}}, min_runtime=600) as one:
+        (mine,) = set(BOTH) & set(one.rcs)
+        assert (one.rc(ANY), one.rcs) == (mine, [mine, "robot/x"])
+        assert [await echo(one, need) for need in (ANY, mine, "robot/x")] == [ANY, mine, "robot/x"]
+        with pytest.raises(KeyError, match="is no need of one; it asked for framegrabber/"):
+            await one.command(MORE, {"name": "echo", "value": 1})
+        (told,) = (await lab.rc(client, mine)).holders
+        assert (told.rcs, told.bound) == (one.rcs, {ANY: mine})
 
-                second, grant = await running(other, "two", ANY)
-                two = Held(other, second, grant)
-                assert {one.rc(ANY), two.rc(ANY)} == set(BOTH)
-                assert await echo(two, ANY) == ANY
-                with pytest.raises(CommandRefused, match=mine):
-                    await two.command(mine, {"name": "echo", "value": 1})
+        second, grant = await running(other, "two", ANY)
+        two = Held(other, second, grant)
+        assert {one.rc(ANY), two.rc(ANY)} == set(BOTH)
+        assert await echo(two, ANY) == ANY
+        with pytest.raises(CommandRefused, match=mine):
+            await two.command(mine, {"name": "echo", "value": 1})
 
-                late = await third.request("three", {ANY: {}}, min_runtime=600)
-                await comes_to(late, "queued", "waits for one of framegrabber/")
-                state = await lab.state(client, lambda state: waits_for(state) == [("three", [ANY])])
-                assert {view.arc: (sorted(view.needs), view.bound) for view in state.holds} == {
-                    "one": (one.rcs, {ANY: mine}),
-                    "two": (two.rcs, {ANY: two.rc(ANY)}),
-                }
-                await other.end(second)
-                given = await third.granted(late)
-                assert given is not None
-                three = Held(third, late, given)
-                assert three.rc(ANY) == two.rc(ANY)
-                assert await echo(three, ANY) == ANY
-                assert await echo(one, ANY) == ANY
-
-    asyncio.run(story())
+        late = await third.request("three", {ANY: {}}, min_runtime=600)
+        await comes_to(late, "queued", "waits for one of framegrabber/")
+        state = await lab.state(client, lambda state: waits_for(state) == [("three", [ANY])])
+        assert {view.arc: (sorted(view.needs), view.bound) for view in state.holds} == {
+            "one": (one.rcs, {ANY: mine}),
+            "two": (two.rcs, {ANY: two.rc(ANY)}),
+        }
+        await other.end(second)
+        given = await third.granted(late)
+        assert given is not None
+        three = Held(third, late, given)
+        assert three.rc(ANY) == two.rc(ANY)
+        assert await echo(three, ANY) == ANY
+        assert await echo(one, ANY) == ANY
 
 
-def test_a_hold_keeps_its_rcs_over_a_change_of_rcm_and_gets_another_after_a_loss(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path, candidates=("a", "b")) as lab:
-            lab.node("c", *BOTH, extra=APART)
-            lab.node("a")
-            client = await lab.client("asker")
-            await lab.ready(client, *BOTH)
-            lab.node("b")
-            async with Stand(lab) as stand:
-                rc = await stand.rc("framegrabber/f3", Bench())
-                blockers = [(await running(client, f"block-{name[-1]}", name))[0] for name in BOTH]
-                await lab.ready(client, "framegrabber/f3")
-                arc, grant = await running(client, "any", ANY)
-                assert arc.bound == {ANY: "framegrabber/f3"}
-                waiting = await client.request("waits", {ANY: {}, MORE: {}}, min_runtime=600)
-                # Both free ones match, but the hold keeps its own.
-                await client.end(blockers[0])
-                before = await lab.state(client, lambda state: bool(state.queue))
-                await lab.candidates(client, "a", "b")
+@pytest.mark.slow
+async def test_a_hold_keeps_its_rcs_over_a_change_of_rcm_and_gets_another_after_a_loss(tmp_path: Path) -> None:
+    async with Lab(tmp_path, candidates=("a", "b")) as lab:
+        lab.node("c", *BOTH, extra=APART)
+        lab.node("a")
+        client = await lab.begun("asker")
+        lab.node("b")
+        async with Stand(lab) as stand:
+            rc = await stand.rc("framegrabber/f3", Bench())
+            blockers = [(await running(client, f"block-{name[-1]}", name))[0] for name in BOTH]
+            await lab.ready(client, "framegrabber/f3")
+            arc, grant = await running(client, "any", ANY)
+            assert arc.bound == {ANY: "framegrabber/f3"}
+            waiting = await client.request("waits", {ANY: {}, MORE: {}}, min_runtime=600)
+            # Both free ones match, but the hold keeps its own.
+            await client.end(blockers[0])
+            before = await lab.state(client, lambda state: bool(state.queue))
+            await lab.candidates(client, "a", "b")
 
-                lab.signal(before.host, signal.SIGKILL)
-                after = await lab.state(client, lambda state: state.term > before.term and bool(state.queue))
-                assert waits_for(after) == [("waits", [ANY, MORE])]
-                (view,) = [view for view in after.holds if view.arc == "any"]
-                assert (view.grant, view.bound, list(view.needs)) == (grant, arc.bound, ["framegrabber/f3"])
-                held = Held(client, arc, grant)
-                assert held.active
-                assert await echo(held, ANY) == ANY
+            lab.signal(before.host, signal.SIGKILL)
+            after = await lab.state(client, lambda state: state.term > before.term and bool(state.queue))
+            assert waits_for(after) == [("waits", [ANY, MORE])]
+            (view,) = [view for view in after.holds if view.arc == "any"]
+            assert (view.grant, view.bound, list(view.needs)) == (grant, arc.bound, ["framegrabber/f3"])
+            held = Held(client, arc, grant)
+            assert held.active
+            assert await echo(held, ANY) == ANY
 
-                # What it lost is made up for by another that matches: it ranks first.
-                await rc.stop()
-                stand.rcs.remove(rc)
-                async with asyncio.timeout(HANG):
-                    while arc.grant in (None, grant):
-                        await client.changed(arc)
-                again = await client.granted(arc)
-                assert again is not None
-                found = Held(client, arc, again)
-                assert (found.rc(ANY), held.rc(ANY)) == ("framegrabber/f1", "framegrabber/f3")
-                assert await echo(found, ANY) == ANY
-                assert arc.ending is not None
-                assert arc.ending.outcome == "lost"
-
-                await client.end(blockers[1])
-                await client.end(arc)
-                both = await client.granted(waiting)
-                assert both is not None
-                assert sorted(waiting.bound) == [ANY, MORE]
-                assert sorted(waiting.bound.values()) == waiting.rcs == BOTH
-
-    asyncio.run(story())
-
-
-def test_the_one_that_was_given_is_asked_whether_it_knows(tmp_path: Path) -> None:
-    async def story() -> None:
-        # With so long a lease nobody takes the frozen node for gone while this lasts.
-        async with Lab(tmp_path, lease=30, extra="[timing]\nhold_lease = 60\n") as lab:
-            lab.node("a")
-            lab.node("v", BOTH[0], extra=APART)
-            client = await lab.client()
-            await lab.ready(client, BOTH[0])
-            lab.signal("v", signal.SIGSTOP)
-            arc = await client.request("any", {ANY: {}}, min_runtime=600)
-            entered = asyncio.create_task(client.granted(arc, confirmed=True))
-            why = f"{BOTH[0]} did not confirm"
-            await lab.state(
-                client, lambda state: not state.holds and [one.reason[: len(why)] for one in state.queue] == [why]
-            )
-            assert not entered.done()
-            lab.signal("v", signal.SIGCONT)
+            # What it lost is made up for by another that matches: it ranks first.
+            await rc.stop()
+            stand.rcs.remove(rc)
             async with asyncio.timeout(HANG):
-                assert await entered is not None
-            assert arc.bound == {ANY: BOTH[0]}
+                while arc.grant in (None, grant):
+                    await client.changed(arc)
+            again = await client.granted(arc)
+            assert again is not None
+            found = Held(client, arc, again)
+            assert (found.rc(ANY), held.rc(ANY)) == ("framegrabber/f1", "framegrabber/f3")
+            assert await echo(found, ANY) == ANY
+            assert arc.ending is not None
+            assert arc.ending.outcome == "lost"
 
-    asyncio.run(story())
+            await client.end(blockers[1])
+            await client.end(arc)
+            both = await client.granted(waiting)
+            assert both is not None
+            assert sorted(waiting.bound) == [ANY, MORE]
+            assert sorted(waiting.bound.values()) == waiting.rcs == BOTH
 
 
-def test_a_plain_script_commands_by_need(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("a", *BOTH)
-            client = await lab.client("eye")
-            await lab.ready(client, *BOTH)
-            await asyncio.to_thread(script, lab)
+@pytest.mark.slow
+async def test_the_one_that_was_given_is_asked_whether_it_knows(tmp_path: Path) -> None:
+    # With so long a lease nobody takes the frozen node for gone while this lasts.
+    async with Lab(tmp_path, lease=30, extra="[timing]\nhold_lease = 60\n") as lab:
+        lab.node("a")
+        lab.node("v", BOTH[0], extra=APART)
+        client = await lab.begun()
+        lab.signal("v", signal.SIGSTOP)
+        arc = await client.request("any", {ANY: {}}, min_runtime=600)
+        entered = asyncio.create_task(client.granted(arc, confirmed=True))
+        why = f"{BOTH[0]} did not confirm"
+        await lab.state(
+            client, lambda state: not state.holds and [one.reason[: len(why)] for one in state.queue] == [why]
+        )
+        assert not entered.done()
+        lab.signal("v", signal.SIGCONT)
+        async with asyncio.timeout(HANG):
+            assert await entered is not None
+        assert arc.bound == {ANY: BOTH[0]}
 
+
+async def test_a_plain_script_commands_by_need(lab: Lab) -> None:
     def script(lab: Lab) -> None:
         with (
             blocking.connect("plain", fleet=lab.fleet, host="test") as mesh,
@@ -170,45 +151,12 @@ def test_a_plain_script_commands_by_need(tmp_path: Path) -> None:
             for need in (ANY, MORE, *BOTH):
                 assert held.command(need, {"name": "echo", "value": need}) == need
 
-    asyncio.run(story())
+    lab.node("a", *BOTH)
+    await lab.begun("eye")
+    await asyncio.to_thread(script, lab)
 
 
-def test_what_no_request_may_ask_is_refused_with_the_remedy(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("a", "radio/f:rate=5")
-            client = await lab.client()
-            await lab.ready(client, "radio/f")
-            refusals: list[tuple[dict[str, dict[str, Any]], str]] = [
-                ({"radio/**": {}}, "write kind/name with"),
-                ({"radio/*": {"rate": 1}, "radio/*#2": {"rate": 2}}, "give all the same"),
-                ({"radio/*": {"rate": 1}, "*/f": {}}, "name its kind"),
-            ]
-            for needs, remedy in refusals:
-                with pytest.raises(RequestRefused, match=remedy) as refused:
-                    await client.request("bad", needs)
-                assert refused.value.code == "bad_request"
-                with pytest.raises(RequestRefused, match=remedy):
-                    await client.foresee("bad", needs, priority=0, min_runtime=Decimal(1))
-            foretold = await client.foresee("good", {"radio/*": {"rate": 1}}, priority=0, min_runtime=Decimal(1))
-            assert foretold is not None
-            assert foretold.starts_in == 0
-
-    asyncio.run(story())
-
-
-def test_a_client_written_from_the_document_asks_by_pattern(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("a", *BOTH, "robot/r")
-            client = await lab.client("rival")
-            await lab.ready(client, *BOTH, "robot/r")
-            plain = await PlainProcess.start(lab, "plain")
-            try:
-                await live(lab, plain)
-            finally:
-                plain.kill()
-
+async def test_a_client_written_from_the_document_asks_by_pattern(lab: Lab) -> None:
     async def live(lab: Lab, plain: PlainProcess) -> None:
         assert (await plain.told_of("ready"))["imported"] == []
         client = lab.clients[0]
@@ -229,7 +177,13 @@ def test_a_client_written_from_the_document_asks_by_pattern(tmp_path: Path) -> N
         assert await plain.command("q1", ANY, {"name": "echo", "value": 1}) == {"result": 1}
         assert await plain.end() == 0
 
-    asyncio.run(story())
+    lab.node("a", *BOTH, "robot/r")
+    await lab.begun("rival")
+    plain = await PlainProcess.start(lab, "plain")
+    try:
+        await live(lab, plain)
+    finally:
+        plain.kill()
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ from zscout.messages import (
 )
 from zscout.types import SECOND
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 RC = "robot/scout33"
 
@@ -35,8 +35,7 @@ async def three(lab: Lab) -> Placing:
     """Three nodes that report, of which h0 and h1 may lead."""
     for host in ("h0", "h1", "h2"):
         lab.node(host)
-    client = await lab.client()
-    await lab.ready(client)
+    client = await lab.begun()
     placing = Placing(client)
     await placing.hosts(3)
     return placing
@@ -56,43 +55,33 @@ async def host_dies(lab: Lab, host: str) -> int:
     return at
 
 
-def test_placing_is_idempotent_and_stopping_is_for_good(tmp_path: Path) -> None:
-    asyncio.run(_idempotent(tmp_path))
+async def test_placing_is_idempotent_and_stopping_is_for_good(lab: ComponentLab) -> None:
+    placing = await three(lab)
+    first = await placing.place("one", "counter")
+    assert (first.state, first.wanted) == ("running", True)
+    again = await placing.place("one", "counter")
+    assert (again.incarnation, again.host) == (first.incarnation, first.host)
+    other = await placing.ask(PlaceComponent("one", ComponentSpec("spin")), Placement)
+    assert isinstance(other, Problem)
+    assert other.code == "exists"
+    ended = await placing.get(EndComponent("one"), Placement)
+    assert (ended.state, ended.wanted) == ("ended", False)
+    assert first.host is not None
+    (view,) = await placing.views("one", first.host)
+    assert (view.phase, view.ended) == ("ended", "stopped")
+    anew = await placing.place("one", "counter")
+    assert anew.incarnation > first.incarnation
+    unknown = await placing.ask(EndComponent("nothing"), Placement)
+    assert isinstance(unknown, Problem)
+    assert unknown.code == "unknown_component"
 
 
-async def _idempotent(tmp_path: Path) -> None:
-    async with ComponentLab(tmp_path) as lab:
-        placing = await three(lab)
-        first = await placing.place("one", "counter")
-        assert (first.state, first.wanted) == ("running", True)
-        again = await placing.place("one", "counter")
-        assert (again.incarnation, again.host) == (first.incarnation, first.host)
-        other = await placing.ask(PlaceComponent("one", ComponentSpec("spin")), Placement)
-        assert isinstance(other, Problem)
-        assert other.code == "exists"
-        ended = await placing.get(EndComponent("one"), Placement)
-        assert (ended.state, ended.wanted) == ("ended", False)
-        assert first.host is not None
-        (view,) = await placing.views("one", first.host)
-        assert (view.phase, view.ended) == ("ended", "stopped")
-        anew = await placing.place("one", "counter")
-        assert anew.incarnation > first.incarnation
-        unknown = await placing.ask(EndComponent("nothing"), Placement)
-        assert isinstance(unknown, Problem)
-        assert unknown.code == "unknown_component"
-
-
-def test_what_does_not_start_there_starts_elsewhere_or_is_given_up(tmp_path: Path) -> None:
-    asyncio.run(_elsewhere(tmp_path))
-
-
-async def _elsewhere(tmp_path: Path) -> None:
+async def test_what_does_not_start_there_starts_elsewhere_or_is_given_up(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path, rules="restarts = 2\nback_off = 0.05\n") as lab:
         lab.node("h0", extra="[components]\nallow = false")
         lab.node("h1", extra='[components]\nkinds = ["counter"]')
         lab.node("h2", extra='labels = ["gpu"]')
-        client = await lab.client()
-        await lab.ready(client)
+        client = await lab.begun()
         placing = Placing(client)
         await placing.hosts(3)
         # The first two will not, whichever is the best.
@@ -117,11 +106,7 @@ async def _elsewhere(tmp_path: Path) -> None:
         assert "period" in badly.reason
 
 
-def test_what_ran_on_a_host_that_dies_runs_elsewhere(tmp_path: Path) -> None:
-    asyncio.run(_host_dies(tmp_path))
-
-
-async def _host_dies(tmp_path: Path) -> None:
+async def test_what_ran_on_a_host_that_dies_runs_elsewhere(tmp_path: Path) -> None:
     # The leader is not the one that dies.
     async with ComponentLab(tmp_path, candidates=["h0"]) as lab, WitnessRc(lab, RC) as rc:
         register(lab)
@@ -149,36 +134,27 @@ async def _host_dies(tmp_path: Path) -> None:
         assert (await placing.until("mortal", lambda one: one.state == "ended")).reason
 
 
-def test_the_leader_dies_with_a_component_and_the_next_placer_knows(tmp_path: Path) -> None:
-    asyncio.run(_leader_dies(tmp_path))
+async def test_the_leader_dies_with_a_component_and_the_next_placer_knows(lab: ComponentLab) -> None:
+    placing = await three(lab)
+    leader = (await lab.state(placing.client, lambda state: bool(state.host))).host
+    others = sorted({"h0", "h1", "h2"} - {leader})
+    lost = await placing.place("lost", "counter", hosts=[leader, others[0]])
+    kept = await placing.place("kept", "counter", hosts=[others[1]])
+    doomed = [leader] if lost.host == leader else []
+    # Who leads next sees the other, and what runs there.
+    await lab.candidates(placing.client, *others)
+    await host_dies(lab, leader)
+    moved = await placing.until("lost", lambda one: one.state == "running" and one.host == others[0])
+    assert (moved.incarnation > lost.incarnation) is bool(doomed)
+    still = await placing.until("kept", lambda one: one.state == "running")
+    assert (still.host, still.incarnation) == (kept.host, kept.incarnation)
+    listed = await placing.get(ListPlacements(), Placements)
+    assert {one.component for one in listed.components} == {"lost", "kept"}
+    ended = await placing.get(EndComponent("kept"), Placement)
+    assert ended.state == "ended"
 
 
-async def _leader_dies(tmp_path: Path) -> None:
-    async with ComponentLab(tmp_path) as lab:
-        placing = await three(lab)
-        leader = (await lab.state(placing.client, lambda state: bool(state.host))).host
-        others = sorted({"h0", "h1", "h2"} - {leader})
-        lost = await placing.place("lost", "counter", hosts=[leader, others[0]])
-        kept = await placing.place("kept", "counter", hosts=[others[1]])
-        doomed = [leader] if lost.host == leader else []
-        # Who leads next sees the other, and what runs there.
-        await lab.candidates(placing.client, *others)
-        await host_dies(lab, leader)
-        moved = await placing.until("lost", lambda one: one.state == "running" and one.host == others[0])
-        assert (moved.incarnation > lost.incarnation) is bool(doomed)
-        still = await placing.until("kept", lambda one: one.state == "running")
-        assert (still.host, still.incarnation) == (kept.host, kept.incarnation)
-        listed = await placing.get(ListPlacements(), Placements)
-        assert {one.component for one in listed.components} == {"lost", "kept"}
-        ended = await placing.get(EndComponent("kept"), Placement)
-        assert ended.state == "ended"
-
-
-def test_a_component_that_is_killed_starts_again(tmp_path: Path) -> None:
-    asyncio.run(_restarts(tmp_path))
-
-
-async def _restarts(tmp_path: Path) -> None:
+async def test_a_component_that_is_killed_starts_again(tmp_path: Path) -> None:
     async with ComponentLab(tmp_path, rules="back_off = 0.05\n") as lab:
         placing = await three(lab)
         first = await placing.place("one", "counter")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from pathlib import Path
 
 import pytest
@@ -16,29 +15,26 @@ from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.recovery import RecoveredState
 from zscout.types import Term
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 
-def test_an_rc_that_died_while_the_lead_was_taken_is_lost_within_a_lease(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path, lease=4) as lab, Stand(lab) as stand:
-            rc = await stand.rc("robot/real", Bench())
-            client = await lab.client()
-            leader = await ZenohMesh.open(lab.fleet, Sender("leader", "node"))
-            rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _term, _rc: None, lambda _: None)
-            try:
-                # Both answered when they were asked; then one of them died, and nobody saw its token go.
-                ghost = RcState(rc="robot/ghost", host="h", instance="gone", sharable=False)
-                real = await lab.rc(client, "robot/real")
-                rcm.start(RecoveredState(rcs={"robot/real": real, "robot/ghost": ghost}))
-                _, grant = await running(client, "real", "robot/real")
-                lost = await client.request("ghost", {"robot/ghost": {}}, min_runtime=600, wait_for_device=True)
-                await until(lambda: lost.reason == "robot/ghost is lost: h is gone")
-                assert lost.state == "queued"
-                assert await answer(client.command("robot/real", grant, ECHO)) == "done"
-                assert set(rc.holds.held) == {grant}
-            finally:
-                rcm.stop()
-                await leader.close()
-
-    asyncio.run(story())
+async def test_an_rc_that_died_while_the_lead_was_taken_is_lost_within_a_lease(tmp_path: Path) -> None:
+    async with Lab(tmp_path, lease=4) as lab, Stand(lab) as stand:
+        rc = await stand.rc("robot/real", Bench())
+        client = await lab.client()
+        leader = await ZenohMesh.open(lab.fleet, Sender("leader", "node"))
+        rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _term, _rc: None, lambda _: None)
+        try:
+            # Both answered when they were asked; then one of them died, and nobody saw its token go.
+            ghost = RcState(rc="robot/ghost", host="h", instance="gone", sharable=False)
+            real = await lab.rc(client, "robot/real")
+            rcm.start(RecoveredState(rcs={"robot/real": real, "robot/ghost": ghost}))
+            _, grant = await running(client, "real", "robot/real")
+            lost = await client.request("ghost", {"robot/ghost": {}}, min_runtime=600, wait_for_device=True)
+            await until(lambda: lost.reason == "robot/ghost is lost: h is gone")
+            assert lost.state == "queued"
+            assert await answer(client.command("robot/real", grant, ECHO)) == "done"
+            assert set(rc.holds.held) == {grant}
+        finally:
+            rcm.stop()
+            await leader.close()

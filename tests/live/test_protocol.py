@@ -154,21 +154,9 @@ def holds(request_id: str, grant: Any = None) -> Callable[[RcmState], bool]:
     return lambda state: any(view.id == request_id and wanted in (None, json.dumps(view.grant)) for view in state.holds)
 
 
+@pytest.mark.essential
 @pytest.mark.live
-def test_a_client_written_from_the_document_lives_a_whole_life(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path, candidates=("a", "b")) as lab:
-            lab.node("c", "robot/r", "radio/f:rate=5", extra="candidate = false")
-            lab.node("a")
-            lab.node("b")
-            client = await lab.client("rival")
-            await lab.ready(client, "robot/r", "radio/f")
-            plain = await PlainProcess.start(lab, "plain")
-            try:
-                await live(lab, plain)
-            finally:
-                plain.kill()
-
+async def test_a_client_written_from_the_document_lives_a_whole_life(tmp_path: Path) -> None:
     async def live(lab: Lab, plain: PlainProcess) -> None:
         client = lab.clients[0]
         assert (await plain.told_of("ready"))["imported"] == []
@@ -225,4 +213,13 @@ def test_a_client_written_from_the_document_lives_a_whole_life(tmp_path: Path) -
         assert (await plain.told_of("refused", id="q3"))["code"] == "bad_request"
         assert await plain.end() == 0
 
-    asyncio.run(story())
+    async with Lab(tmp_path, candidates=("a", "b")) as lab:
+        lab.node("c", "robot/r", "radio/f:rate=5", extra="candidate = false")
+        lab.node("a")
+        lab.node("b")
+        await lab.begun("rival")
+        plain = await PlainProcess.start(lab, "plain")
+        try:
+            await live(lab, plain)
+        finally:
+            plain.kill()

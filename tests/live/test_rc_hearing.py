@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 from decimal import Decimal
-from pathlib import Path
 
 import pytest
 
@@ -44,103 +43,34 @@ def said(seq: int, prev: int) -> Grants:
     return Grants(term=TERM, seq=seq, prev=prev, every=0.5, rcs={"robot/other": []})
 
 
-def test_a_snapshot_that_was_overtaken_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_snapshot_that_was_overtaken_is_read_again(
+    lab: Lab, stand: Stand, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(resource_controller, "REREAD_TIMEOUT", HANG)
+    client = await lab.client()
+    mesh, keys = client.mesh, client.mesh.keys
+    waiting: list[IncomingQuery[StateAsk]] = []
+    seq = 3
 
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            client = await lab.client()
-            mesh, keys = client.mesh, client.mesh.keys
-            waiting: list[IncomingQuery[StateAsk]] = []
-            seq = 3
+    def on_asked(request: IncomingQuery[StateAsk]) -> None:
+        if not waiting:
+            # The first answer is held back until more has been published.
+            waiting.append(request)
+        else:
+            request.answer(RcmState(TERM, seq, "test", [view(str(mesh.me), 5)]))
 
-            def on_asked(request: IncomingQuery[StateAsk]) -> None:
-                if not waiting:
-                    # The first answer is held back until more has been published.
-                    waiting.append(request)
-                else:
-                    request.answer(RcmState(TERM, seq, "test", [view(str(mesh.me), 5)]))
-
-            async with Stand(lab) as stand:
-                rc = await stand.rc("robot/x", Bench())
-                mesh.serve(keys.rcm_state, StateAsk, on_asked)
-                publisher = mesh.publisher(keys.grants, Grants)
-                mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, TERM.rcm))
-                while rc.holds.seq != 3:
-                    publisher.put(said(3, 0))
-                    await asyncio.sleep(0.02)
-                await until(lambda: bool(waiting))
-                # Its new term made it read; the grant with number 5 is published and gets lost, 7 arrives.
-                seq = 7
-                publisher.put(said(7, 6))
-                await until(lambda: rc.holds.seq == 7)
-                waiting[0].answer(RcmState(TERM, 3, "test"))
-                await until(lambda: set(rc.holds.held) == {Grant(TERM, 5)})
-                assert await answer(client.command("robot/x", Grant(TERM, 5), ECHO)) == "done"
-
-    asyncio.run(story())
-
-
-def test_a_question_that_nobody_answered_is_asked_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resource_controller, "REREAD_TIMEOUT", 0.1)
-
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            client = await lab.client()
-            mesh, keys = client.mesh, client.mesh.keys
-            waiting: list[IncomingQuery[StateAsk]] = []
-            answers = False
-
-            def on_asked(request: IncomingQuery[StateAsk]) -> None:
-                if answers:
-                    request.answer(RcmState(TERM, 7, "test", [view(str(mesh.me), 5)]))
-                else:
-                    waiting.append(request)
-
-            async with Stand(lab) as stand:
-                rc = await stand.rc("robot/x", Bench())
-                mesh.serve(keys.rcm_state, StateAsk, on_asked)
-                publisher = mesh.publisher(keys.grants, Grants)
-                mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, TERM.rcm))
-                while len(waiting) < 2:
-                    # A gap, and then a heartbeat: what was missed is still not known.
-                    publisher.put(said(7, 6 if rc.holds.seq < 7 else 7))
-                    await asyncio.sleep(0.02)
-                assert not rc.holds.held
-                answers = True
-                while not rc.holds.held:
-                    publisher.put(said(7, 7))
-                    await asyncio.sleep(0.02)
-                assert set(rc.holds.held) == {Grant(TERM, 5)}
-
-    asyncio.run(story())
-
-
-def test_a_command_newer_than_the_rc_knows_makes_it_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(resource_controller, "REREAD_TIMEOUT", HANG)
-
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            client = await lab.client()
-            mesh, keys = client.mesh, client.mesh.keys
-            asked: list[StateAsk] = []
-
-            def on_asked(request: IncomingQuery[StateAsk]) -> None:
-                asked.append(request.message)
-                holds = [view(str(mesh.me), 5)] if len(asked) > 1 else []
-                request.answer(RcmState(TERM, 5 if holds else 4, "test", holds))
-
-            async with Stand(lab) as stand:
-                rc = await stand.rc("robot/x", Bench())
-                mesh.serve(keys.rcm_state, StateAsk, on_asked)
-                publisher = mesh.publisher(keys.grants, Grants)
-                while rc.holds.seq != 4:
-                    publisher.put(said(4, 3))
-                    await asyncio.sleep(0.02)
-                await until(lambda: len(asked) == 1)
-                # Two commands at once: both wait for what is read, and both are obeyed.
-                commands = [answer(client.command("robot/x", Grant(TERM, 5), ECHO)) for _ in range(2)]
-                assert await asyncio.gather(*commands) == ["done", "done"]
-                assert await answer(client.command("robot/x", Grant(TERM, 6), ECHO)) == "not_yet"
-
-    asyncio.run(story())
+    rc = await stand.rc("robot/x", Bench())
+    mesh.serve(keys.rcm_state, StateAsk, on_asked)
+    publisher = mesh.publisher(keys.grants, Grants)
+    mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, TERM.rcm))
+    while rc.holds.seq != 3:
+        publisher.put(said(3, 0))
+        await asyncio.sleep(0.02)
+    await until(lambda: bool(waiting))
+    # Its new term made it read; the grant with number 5 is published and gets lost, 7 arrives.
+    seq = 7
+    publisher.put(said(7, 6))
+    await until(lambda: rc.holds.seq == 7)
+    waiting[0].answer(RcmState(TERM, 3, "test"))
+    await until(lambda: set(rc.holds.held) == {Grant(TERM, 5)})
+    assert await answer(client.command("robot/x", Grant(TERM, 5), ECHO)) == "done"

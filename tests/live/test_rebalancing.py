@@ -12,23 +12,18 @@ from tests.live.lab import Lab
 from tests.live.placing import Placing
 from zscout.messages import ListPlacements, Placement, Placements
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 QUIET = 4.0
 """Seconds: more than the fleet of this test needs for a move."""
 NAMES = [f"part-{number}" for number in range(4)]
 
 
-def test_what_is_on_one_host_spreads_and_then_stays(tmp_path: Path) -> None:
-    asyncio.run(_spreads(tmp_path))
-
-
-async def _spreads(tmp_path: Path) -> None:
+async def test_what_is_on_one_host_spreads_and_then_stays(tmp_path: Path) -> None:
     rules = f"[placement]\nstart_timeout = {HANG}\nrebalance = true\ngain = 0.1\nsteady = 1\nrest = 2\n"
     async with Lab(tmp_path, candidates=["h1"], extra=rules) as lab:
         lab.node("h1", extra='load = "tree"')
-        client = await lab.client()
-        await lab.ready(client)
+        client = await lab.begun()
         placing = Placing(client)
         await placing.hosts(1)
         # More than this machine carries, if it has two processors.

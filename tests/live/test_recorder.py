@@ -105,45 +105,40 @@ def words(path: Path, arc: str) -> list[str]:
     return [state for state, _ in groupby(text.split(" · ")[0] for (text,) in lane(path, f"/arc/{arc}"))]
 
 
-def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
+async def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
+    async with Lab(tmp_path) as lab:
+        lab.node("a", "robot/a", "radio/a:rate=10", extra=recorder())
+        lab.node("b", "robot/b")
+        client = await lab.begun("crew")
+        await recording(lab)
+        told_why = asyncio.Event()
 
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("a", "robot/a", "radio/a:rate=10", extra=recorder())
-            lab.node("b", "robot/b")
-            client = await lab.client("crew")
-            await lab.ready(client, "robot/a", "radio/a", "robot/b")
-            await recording(lab)
-            told_why = asyncio.Event()
+        def heard(_key: str, notice: Notice) -> None:
+            if (notice.arc, notice.state) == ("later", "queued"):
+                told_why.set()
 
-            def heard(_key: str, notice: Notice) -> None:
-                if (notice.arc, notice.state) == ("later", "queued"):
-                    told_why.set()
-
-            notices = client.mesh.subscribe(client.mesh.keys.notice_any, Notice, heard)
-            both = {"robot/a": {}, "robot/b": {}, "radio/a": {"rate": 4}}
-            survey = await client.request("survey", both, min_runtime=60)
-            listen = await client.request("listen", {"radio/a": {"rate": 5}}, min_runtime=60)
-            later = await client.request("later", {"robot/b": {}}, min_runtime=2, keep=False)
-            # On a busy machine a vote may be overdue at first.
-            await until(lambda: (survey.state, listen.state, later.state) == ("running", "running", "queued"))
-            await told_why.wait()
-            async with hold(client, "operator", {"robot/a": {}}, priority=10, min_runtime=8, keep=False):
-                await lab.state(client, lambda state: {wait.arc for wait in state.queue} == {"survey"})
-                await asyncio.Event().wait()
-            await lab.state(client, lambda state: "survey" in {held.arc for held in state.holds})
-            await recorded(runs, lambda path: {entity for entity, _, _ in loads_in(path)} == {"/load/a", "/load/b"})
-            await client.end(survey)
-            await client.end(listen)
-            await lab.state(client, lambda state: not state.holds and not state.queue)
-            await ended(lab, "b")
-            await lab.state(client, lambda state: "robot/b" not in {rc.rc for rc in state.rcs if rc.present})
-            notices.close()
-            await recorded(runs, lambda path: {"node b is gone", "robot/b is gone from b"} <= {*presence(path)})
-            await ended(lab, "a")
-
-    asyncio.run(story())
+        notices = client.mesh.subscribe(client.mesh.keys.notice_any, Notice, heard)
+        both = {"robot/a": {}, "robot/b": {}, "radio/a": {"rate": 4}}
+        survey = await client.request("survey", both, min_runtime=60)
+        listen = await client.request("listen", {"radio/a": {"rate": 5}}, min_runtime=60)
+        later = await client.request("later", {"robot/b": {}}, min_runtime=2, keep=False)
+        # On a busy machine a vote may be overdue at first.
+        await until(lambda: (survey.state, listen.state, later.state) == ("running", "running", "queued"))
+        await told_why.wait()
+        async with hold(client, "operator", {"robot/a": {}}, priority=10, min_runtime=8, keep=False):
+            await lab.state(client, lambda state: {wait.arc for wait in state.queue} == {"survey"})
+            await asyncio.Event().wait()
+        await lab.state(client, lambda state: "survey" in {held.arc for held in state.holds})
+        await recorded(runs, lambda path: {entity for entity, _, _ in loads_in(path)} == {"/load/a", "/load/b"})
+        await client.end(survey)
+        await client.end(listen)
+        await lab.state(client, lambda state: not state.holds and not state.queue)
+        await ended(lab, "b")
+        await lab.state(client, lambda state: "robot/b" not in {rc.rc for rc in state.rcs if rc.present})
+        notices.close()
+        await recorded(runs, lambda path: {"node b is gone", "robot/b is gone from b"} <= {*presence(path)})
+        await ended(lab, "a")
     path = the_file(tmp_path / "runs")
     robot = lane(path, "/rc/robot/a")
     # Between two holders it may be free for a moment: votes of the radio may be asked again.
@@ -186,36 +181,31 @@ def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
     assert all(0 <= cpu <= 1 for _, _, (cpu,) in rows(path, "/cpu/**", "Scalars:scalars"))
 
 
-def test_a_recorder_starts_in_the_middle_and_outlives_the_leader(tmp_path: Path) -> None:
+async def test_a_recorder_starts_in_the_middle_and_outlives_the_leader(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
-
-    async def story() -> None:
-        async with Lab(tmp_path, candidates=["a", "b"]) as lab:
-            lab.node("a")
-            client = await lab.client("crew")
-            await lab.ready(client)
-            lab.node("b", "robot/b", "robot/c")
-            await lab.ready(client, "robot/b", "robot/c")
-            first = await client.request("twin", {"robot/b": {}}, min_runtime=60)
-            second = await client.request("twin", {"robot/c": {}}, priority=5, min_runtime=60)
-            waiter = await client.request("waiter", {"robot/b": {}}, min_runtime=60)
-            lab.node("c", extra="candidate = false\n" + recorder())
-            await recording(lab)
-            await lab.candidates(client, "b")
-            lab.nodes["a"].kill()
-            await lab.state(client, lambda state: state.host == "b" and len(state.holds) == 2)
-            await client.end(first)
-            await lab.state(client, lambda state: "waiter" in {held.arc for held in state.holds})
-            await client.end(waiter)
-            await client.end(second)
-            await lab.state(client, lambda state: not state.holds)
-            ends = [["waiter"], [""]], [[""]]
-            await recorded(runs, lambda path: (lane(path, "/rc/robot/b")[-2:], lane(path, "/rc/robot/c")[-1:]) == ends)
-            # The node is shot: its recorder finishes the file all the same, as its input closes.
-            lab.nodes["c"].kill()
-            await until(lambda: finished(the_file(tmp_path / "runs")))
-
-    asyncio.run(story())
+    async with Lab(tmp_path, candidates=["a", "b"]) as lab:
+        lab.node("a")
+        client = await lab.begun("crew")
+        lab.node("b", "robot/b", "robot/c")
+        await lab.ready(client, "robot/b", "robot/c")
+        first = await client.request("twin", {"robot/b": {}}, min_runtime=60)
+        second = await client.request("twin", {"robot/c": {}}, priority=5, min_runtime=60)
+        waiter = await client.request("waiter", {"robot/b": {}}, min_runtime=60)
+        lab.node("c", extra="candidate = false\n" + recorder())
+        await recording(lab)
+        await lab.candidates(client, "b")
+        lab.nodes["a"].kill()
+        await lab.state(client, lambda state: state.host == "b" and len(state.holds) == 2)
+        await client.end(first)
+        await lab.state(client, lambda state: "waiter" in {held.arc for held in state.holds})
+        await client.end(waiter)
+        await client.end(second)
+        await lab.state(client, lambda state: not state.holds)
+        ends = [["waiter"], [""]], [[""]]
+        await recorded(runs, lambda path: (lane(path, "/rc/robot/b")[-2:], lane(path, "/rc/robot/c")[-1:]) == ends)
+        # The node is shot: its recorder finishes the file all the same, as its input closes.
+        lab.nodes["c"].kill()
+        await until(lambda: finished(the_file(tmp_path / "runs")))
     path = the_file(tmp_path / "runs")
     twins = {lane(path, f"/rc/robot/{rc}")[0][0]: rc for rc in "bc"}
     assert set(twins) == {"twin", "twin.2"}
@@ -242,64 +232,55 @@ def finished(path: Path) -> bool:
     return False
 
 
-def test_what_ends_while_no_rcm_is_there_is_seen_from_the_devices(tmp_path: Path) -> None:
+async def test_what_ends_while_no_rcm_is_there_is_seen_from_the_devices(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
+    async with Lab(tmp_path, lease=4.0, candidates=["a"]) as lab:
+        lab.node("a")
+        lab.node("b", "robot/b", extra="candidate = false\n" + recorder())
+        client = await lab.begun("crew")
+        await recording(lab)
+        survey = await client.request("survey", {"robot/b": {}}, min_runtime=60)
+        assert await client.granted(survey, confirmed=True)
+        over = asyncio.Event()
 
-    async def story() -> None:
-        async with Lab(tmp_path, lease=4.0, candidates=["a"]) as lab:
-            lab.node("a")
-            lab.node("b", "robot/b", extra="candidate = false\n" + recorder())
-            client = await lab.client("crew")
-            await lab.ready(client, "robot/b")
-            await recording(lab)
-            survey = await client.request("survey", {"robot/b": {}}, min_runtime=60)
-            assert await client.granted(survey, confirmed=True)
-            over = asyncio.Event()
+        def heard(_key: str, state: RcState) -> None:
+            if [hold.why for hold in state.ended] == ["lease"]:
+                over.set()
 
-            def heard(_key: str, state: RcState) -> None:
-                if [hold.why for hold in state.ended] == ["lease"]:
-                    over.set()
-
-            subscription = client.mesh.subscribe(client.mesh.keys.rc_state("robot/b"), RcState, heard)
-            lab.nodes["a"].kill()
-            async with asyncio.timeout(HANG):
-                await over.wait()
-            subscription.close()
-            await recorded(runs, lambda path: lane(path, "/rc/robot/b")[:3] == [[""], ["survey"], [""]])
-            await ended(lab, "b")
-
-    asyncio.run(story())
+        subscription = client.mesh.subscribe(client.mesh.keys.rc_state("robot/b"), RcState, heard)
+        lab.nodes["a"].kill()
+        async with asyncio.timeout(HANG):
+            await over.wait()
+        subscription.close()
+        await recorded(runs, lambda path: lane(path, "/rc/robot/b")[:3] == [[""], ["survey"], [""]])
+        await ended(lab, "b")
 
 
-def test_a_recorder_that_dies_is_started_again(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            node = lab.node("a", "robot/a", extra=recorder())
-            client = await lab.client("crew")
-            await recording(lab)
-            (child,) = psutil.Process(node.pid).children()
-            tokens, again = 0, asyncio.Event()
+async def test_a_recorder_that_dies_is_started_again(tmp_path: Path, lab: Lab) -> None:
+    node = lab.node("a", "robot/a", extra=recorder())
+    client = await lab.client("crew")
+    await recording(lab)
+    (child,) = psutil.Process(node.pid).children()
+    tokens, again = 0, asyncio.Event()
 
-            def seen(_token: Token, alive: bool) -> None:
-                nonlocal tokens
-                tokens += alive
-                if tokens == 2:
-                    again.set()
+    def seen(_token: Token, alive: bool) -> None:
+        nonlocal tokens
+        tokens += alive
+        if tokens == 2:
+            again.set()
 
-            watch = client.mesh.watch(client.mesh.keys.alive_any(Role.RECORDER), seen)
-            child.kill()
-            async with asyncio.timeout(HANG):
-                await again.wait()
-            watch.close()
-            assert len(list((tmp_path / "runs").iterdir())) == 2
-            (child,) = psutil.Process(node.pid).children()
-            # Ended on purpose, it stays ended, and the node goes on.
-            child.terminate()
-            await until(lambda: "the recorder was ended" in lab.log("a"))
-            await lab.ready(client, "robot/a")
-            assert psutil.Process(node.pid).children() == []
-
-    asyncio.run(story())
+    watch = client.mesh.watch(client.mesh.keys.alive_any(Role.RECORDER), seen)
+    child.kill()
+    async with asyncio.timeout(HANG):
+        await again.wait()
+    watch.close()
+    assert len(list((tmp_path / "runs").iterdir())) == 2
+    (child,) = psutil.Process(node.pid).children()
+    # Ended on purpose, it stays ended, and the node goes on.
+    child.terminate()
+    await until(lambda: "the recorder was ended" in lab.log("a"))
+    await lab.ready(client, "robot/a")
+    assert psutil.Process(node.pid).children() == []
 
 
 def run_recorder(lab: Lab, job: bytes, *program: str) -> subprocess.Popen[bytes]:
@@ -318,80 +299,69 @@ def run_recorder(lab: Lab, job: bytes, *program: str) -> subprocess.Popen[bytes]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, None])
-def test_the_program_says_where_it_records_and_ends_in_order(tmp_path: Path, number: signal.Signals | None) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            job = RecorderJob(RecorderConfig(tmp_path / "new" / "runs", "127.0.0.1", 0), lab.fleet, "a")
-            process = run_recorder(lab, encode_job(job))
-            assert process.stdout is not None
-            assert process.stdin is not None
-            told = msgspec.json.decode(await asyncio.to_thread(process.stdout.readline), type=Recording)
-            assert told.url is not None
-            socket.create_connection(("127.0.0.1", int(told.url.split(":")[2].split("/")[0])), 5).close()
-            name = Path(told.file).name
-            assert name.startswith(f"{lab.fleet.name}-{time.strftime('%Y')}")
-            if number is None:
-                process.stdin.close()
-            else:
-                process.send_signal(number)
-            assert await asyncio.to_thread(process.wait, HANG) == 0
-            assert Path(told.file) == the_file(tmp_path / "new" / "runs")
-
-    asyncio.run(story())
+async def test_the_program_says_where_it_records_and_ends_in_order(
+    tmp_path: Path, lab: Lab, number: signal.Signals | None
+) -> None:
+    job = RecorderJob(RecorderConfig(tmp_path / "new" / "runs", "127.0.0.1", 0), lab.fleet, "a")
+    process = run_recorder(lab, encode_job(job))
+    assert process.stdout is not None
+    assert process.stdin is not None
+    told = msgspec.json.decode(await asyncio.to_thread(process.stdout.readline), type=Recording)
+    assert told.url is not None
+    socket.create_connection(("127.0.0.1", int(told.url.split(":")[2].split("/")[0])), 5).close()
+    name = Path(told.file).name
+    assert name.startswith(f"{lab.fleet.name}-{time.strftime('%Y')}")
+    if number is None:
+        process.stdin.close()
+    else:
+        process.send_signal(number)
+    assert await asyncio.to_thread(process.wait, HANG) == 0
+    assert Path(told.file) == the_file(tmp_path / "new" / "runs")
 
 
-def test_bad_settings_are_one_line_and_code_2(tmp_path: Path) -> None:
+async def test_bad_settings_are_one_line_and_code_2(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            with socket.create_server(("127.0.0.1", 0)) as other:
-                port = other.getsockname()[1]
-                jobs = {
-                    f"can't listen on 127.0.0.1, port {port}": encode_job(
-                        RecorderJob(RecorderConfig(tmp_path / "runs", "127.0.0.1", port), lab.fleet, "a")
-                    ),
-                    "recordings can't be written to": encode_job(
-                        RecorderJob(RecorderConfig(tmp_path / "file" / "runs", "127.0.0.1", 0), lab.fleet, "a")
-                    ),
-                    "no job for a recorder": b'{"recorder": 1}\n',
-                }
-                for line, job in jobs.items():
-                    process = run_recorder(lab, job)
-                    _, error = await asyncio.to_thread(process.communicate, None, HANG)
-                    assert process.returncode == 2
-                    assert line in error.decode()
-                    assert len(error.decode().strip().splitlines()) == 1
-        assert list((tmp_path / "runs").iterdir()) == []
-
-    asyncio.run(story())
+    async with Lab(tmp_path) as lab:
+        with socket.create_server(("127.0.0.1", 0)) as other:
+            port = other.getsockname()[1]
+            jobs = {
+                f"can't listen on 127.0.0.1, port {port}": encode_job(
+                    RecorderJob(RecorderConfig(tmp_path / "runs", "127.0.0.1", port), lab.fleet, "a")
+                ),
+                "recordings can't be written to": encode_job(
+                    RecorderJob(RecorderConfig(tmp_path / "file" / "runs", "127.0.0.1", 0), lab.fleet, "a")
+                ),
+                "no job for a recorder": b'{"recorder": 1}\n',
+            }
+            for line, job in jobs.items():
+                process = run_recorder(lab, job)
+                _, error = await asyncio.to_thread(process.communicate, None, HANG)
+                assert process.returncode == 2
+                assert line in error.decode()
+                assert len(error.decode().strip().splitlines()) == 1
+    assert list((tmp_path / "runs").iterdir()) == []
 
 
 @pytest.mark.parametrize("past", [3_600 * SECOND, 0])
-def test_a_recorder_that_comes_late_has_what_a_journal_kept(tmp_path: Path, past: int) -> None:
+async def test_a_recorder_that_comes_late_has_what_a_journal_kept(tmp_path: Path, past: int) -> None:
     runs = tmp_path / "runs"
-
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("a", "robot/a")
-            client = await lab.client("crew")
-            await lab.ready(client, "robot/a")
-            async with hold(client, "survey", {"robot/a": {}}, min_runtime=60):
-                pass
-            film = await client.request("film", {"robot/a": {}}, min_runtime=60)
-            await lab.state(client, lambda state: {held.arc for held in state.holds} == {"film"})
-            job = RecorderJob(RecorderConfig(runs, "127.0.0.1", 0, past=past), lab.fleet, "b")
-            process = run_recorder(lab, encode_job(job))
-            await recording(lab)
-            if past:
-                await recorded(runs, lambda path: any("before this recording" in text for text in events(path)))
-            await client.end(film)
-            await lab.state(client, lambda state: not state.holds)
-            assert process.stdin is not None
-            process.stdin.close()
-            assert await asyncio.to_thread(process.wait, HANG) == 0
-
-    asyncio.run(story())
+    async with Lab(tmp_path) as lab:
+        lab.node("a", "robot/a")
+        client = await lab.begun("crew")
+        async with hold(client, "survey", {"robot/a": {}}, min_runtime=60):
+            pass
+        film = await client.request("film", {"robot/a": {}}, min_runtime=60)
+        await lab.state(client, lambda state: {held.arc for held in state.holds} == {"film"})
+        job = RecorderJob(RecorderConfig(runs, "127.0.0.1", 0, past=past), lab.fleet, "b")
+        process = run_recorder(lab, encode_job(job))
+        await recording(lab)
+        if past:
+            await recorded(runs, lambda path: any("before this recording" in text for text in events(path)))
+        await client.end(film)
+        await lab.state(client, lambda state: not state.holds)
+        assert process.stdin is not None
+        process.stdin.close()
+        assert await asyncio.to_thread(process.wait, HANG) == 0
     shown = [state for (state,) in lane(the_file(runs), "/rc/robot/a") if state]
     assert shown == (["survey (journal)", "film (journal)"] if past else []) + ["film"]
     RrdReader(the_file(runs)).store()
@@ -403,58 +373,53 @@ IN_A_HURRY = (
 """The recorder, with parts of seconds."""
 
 
-def test_parts_follow_one_another_and_the_oldest_make_room(tmp_path: Path) -> None:
+async def test_parts_follow_one_another_and_the_oldest_make_room(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     runs.mkdir()
+    async with Lab(tmp_path) as lab:
 
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
+        def before(number: int, size: int) -> Path:
+            path = runs / f"{lab.fleet.name}-20200101-00000{number}.rrd"
+            path.touch()
+            os.truncate(path, size)
+            os.utime(path, (number, number))
+            return path
 
-            def before(number: int, size: int) -> Path:
-                path = runs / f"{lab.fleet.name}-20200101-00000{number}.rrd"
-                path.touch()
-                os.truncate(path, size)
-                os.utime(path, (number, number))
-                return path
+        def parts() -> list[Path]:
+            made = [path for path in runs.glob("*.rrd") if "-20200101-" not in path.name]
+            return sorted(made)
 
-            def parts() -> list[Path]:
-                made = [path for path in runs.glob("*.rrd") if "-20200101-" not in path.name]
-                return sorted(made)
+        # Far more than the parts come to, whatever time this takes; and no room on the disk.
+        old = [before(number, 20_000_000) for number in (1, 2, 3)]
+        lab.node("a", "robot/a")
+        client = await lab.begun("crew")
+        job = RecorderJob(RecorderConfig(runs, "127.0.0.1", 0, limit=50), lab.fleet, "b")
+        process = run_recorder(lab, encode_job(job), "-c", IN_A_HURRY)
+        await recording(lab)
+        assert [path.exists() for path in old] == [False, True, True]
+        arc = await client.request("survey", {"robot/a": {}}, min_runtime=600)
+        await lab.state(client, lambda state: len(state.holds) == 1)
+        first = len(parts())
+        await until(lambda: len(parts()) >= first + 2)
+        # What comes besides makes the oldest go, whenever it comes.
+        newer = before(4, 15_000_000)
+        await until(lambda: not old[1].exists())
+        await client.end(arc)
+        await lab.state(client, lambda state: not state.holds)
+        written = parts()
+        assert process.stdin is not None
+        process.stdin.close()
+        assert await asyncio.to_thread(process.wait, HANG) == 0
+        assert [path.exists() for path in (*old, newer)] == [False, False, True, True]
+        assert set(written) <= set(parts())
 
-            # Far more than the parts come to, whatever time this takes; and no room on the disk.
-            old = [before(number, 20_000_000) for number in (1, 2, 3)]
-            lab.node("a", "robot/a")
-            client = await lab.client("crew")
-            await lab.ready(client, "robot/a")
-            job = RecorderJob(RecorderConfig(runs, "127.0.0.1", 0, limit=50), lab.fleet, "b")
-            process = run_recorder(lab, encode_job(job), "-c", IN_A_HURRY)
-            await recording(lab)
-            assert [path.exists() for path in old] == [False, True, True]
-            arc = await client.request("survey", {"robot/a": {}}, min_runtime=600)
-            await lab.state(client, lambda state: len(state.holds) == 1)
-            first = len(parts())
-            await until(lambda: len(parts()) >= first + 2)
-            # What comes besides makes the oldest go, whenever it comes.
-            newer = before(4, 15_000_000)
-            await until(lambda: not old[1].exists())
-            await client.end(arc)
-            await lab.state(client, lambda state: not state.holds)
-            written = parts()
-            assert process.stdin is not None
-            process.stdin.close()
-            assert await asyncio.to_thread(process.wait, HANG) == 0
-            assert [path.exists() for path in (*old, newer)] == [False, False, True, True]
-            assert set(written) <= set(parts())
-
-        told: list[str] = []
-        for number, path in enumerate(parts()):
-            RrdReader(path).store()  # it has its footer: it was written anew
-            states = [held for (held,) in lane(path, "/rc/robot/a")]
-            assert number == 0 or states[0] == told[-1]
-            told += states
-        assert [held for held, _ in groupby(told)] == ["", "survey", ""]
-
-    asyncio.run(story())
+    told: list[str] = []
+    for number, path in enumerate(parts()):
+        RrdReader(path).store()  # it has its footer: it was written anew
+        states = [held for (held,) in lane(path, "/rc/robot/a")]
+        assert number == 0 or states[0] == told[-1]
+        told += states
+    assert [held for held, _ in groupby(told)] == ["", "survey", ""]
 
 
 def test_only_the_newest_recordings_are_kept(tmp_path: Path) -> None:

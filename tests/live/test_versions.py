@@ -71,145 +71,136 @@ async def commands(holder: HolderProcess, *rcs: str) -> None:
 
 
 @leaders
-def test_a_gang_over_nodes_of_both_versions(tmp_path: Path, former: Path, leads: str) -> None:
-    async def story() -> None:
-        async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
-            with lab.at(leads):
-                lab.node("a", "robot/a")
-            with lab.at(OTHER[leads]):
-                lab.node("b", "robot/b", "camera/b", "radio/b:rate=10")
-            client = await lab.client()
-            rcs = "robot/a", "robot/b", "camera/b", "radio/b"
-            state = await lab.ready(client, *rcs)
-            assert (state.host, state.version) == ("a", TELLS[leads])
-            assert (await lab.rc(client, "robot/b")).version == TELLS[OTHER[leads]]
-            with lab.at("old"):
-                old = await lab.holder("old")
-            needs: dict[str, Any] = {"robot/a": {}, "robot/b": {}, "camera/*": {}, "radio/b": {"rate": 6}}
-            await enters(old, "first", needs)
-            await commands(old, *rcs)
+async def test_a_gang_over_nodes_of_both_versions(tmp_path: Path, former: Path, leads: str) -> None:
+    async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
+        with lab.at(leads):
+            lab.node("a", "robot/a")
+        with lab.at(OTHER[leads]):
+            lab.node("b", "robot/b", "camera/b", "radio/b:rate=10")
+        client = await lab.client()
+        rcs = "robot/a", "robot/b", "camera/b", "radio/b"
+        state = await lab.ready(client, *rcs)
+        assert (state.host, state.version) == ("a", TELLS[leads])
+        assert (await lab.rc(client, "robot/b")).version == TELLS[OTHER[leads]]
+        with lab.at("old"):
+            old = await lab.holder("old")
+        needs: dict[str, Any] = {"robot/a": {}, "robot/b": {}, "camera/*": {}, "radio/b": {"rate": 6}}
+        await enters(old, "first", needs)
+        await commands(old, *rcs)
 
-            second = await client.request("second", needs, min_runtime=600)
-            assert (second.state, second.ahead) == ("queued", 0)
-            await old.order("end")
-            grant = await client.granted(second, confirmed=True)
-            assert grant is not None
-            for rc in rcs:
-                assert (await client.command(rc, grant, ECHO)).result == ECHO["value"]
+        second = await client.request("second", needs, min_runtime=600)
+        assert (second.state, second.ahead) == ("queued", 0)
+        await old.order("end")
+        grant = await client.granted(second, confirmed=True)
+        assert grant is not None
+        for rc in rcs:
+            assert (await client.command(rc, grant, ECHO)).result == ECHO["value"]
 
-            # A higher priority takes it, from either version; and what was taken comes back at its place.
-            await enters(old, "boss", {"robot/a": {}}, priority=9)
-            await lab.state(client, lambda state: [one.arc for one in state.queue] == ["second"])
-            await comes_to(second, "queued")
-            assert second.ending is not None
-            assert second.ending.outcome == "preempted"
-            old.kill()
-            assert await client.granted(second) is not None
-            await lab.held_by(client, "radio/b", "second")
-
-    asyncio.run(story())
+        # A higher priority takes it, from either version; and what was taken comes back at its place.
+        await enters(old, "boss", {"robot/a": {}}, priority=9)
+        await lab.state(client, lambda state: [one.arc for one in state.queue] == ["second"])
+        await comes_to(second, "queued")
+        assert second.ending is not None
+        assert second.ending.outcome == "preempted"
+        old.kill()
+        assert await client.granted(second) is not None
+        await lab.held_by(client, "radio/b", "second")
 
 
+@pytest.mark.slow
 @leaders
-def test_a_leader_is_killed_and_one_of_the_other_version_goes_on(tmp_path: Path, former: Path, leads: str) -> None:
-    async def story() -> None:
-        async with MixedLab(tmp_path, former, candidates=("a", "b")) as lab:
-            apart = "candidate = false"
-            with lab.at("old"):
-                lab.node("c", "robot/c", "robot/old", extra=apart)
-            with lab.at("new"):
-                lab.node("d", "robot/d", "robot/free", extra=apart)
-            with lab.at(leads):
-                lab.node("a")
-            client = await lab.client("asker")
-            await lab.ready(client, "robot/c", "robot/d", "robot/old", "robot/free")
-            with lab.at(OTHER[leads]):
-                lab.node("b")
-            crew = Crew()
-            await crew.assemble(lab, ["robot/c", "robot/d"], waiting=4)
-            with lab.at("old"):
-                holds, waits = await asyncio.gather(lab.holder("holds"), lab.holder("waits"))
-            await enters(holds, "holds", {"robot/old": {}})
-            await waits.order("ask", arc="waits", needs={"robot/old": {}}, min_runtime=600)
-            before = await lab.state(client, lambda state: len(state.queue) == 5)
-            stood = Stand(before)
-            assert (before.host, len(stood.holds)) == ("a", 3)
-            await lab.candidates(client, "b")
+async def test_a_leader_is_killed_and_one_of_the_other_version_goes_on(
+    tmp_path: Path, former: Path, leads: str
+) -> None:
+    async with MixedLab(tmp_path, former, candidates=("a", "b")) as lab:
+        apart = "candidate = false"
+        with lab.at("old"):
+            lab.node("c", "robot/c", "robot/old", extra=apart)
+        with lab.at("new"):
+            lab.node("d", "robot/d", "robot/free", extra=apart)
+        with lab.at(leads):
+            lab.node("a")
+        client = await lab.begun("asker")
+        with lab.at(OTHER[leads]):
+            lab.node("b")
+        crew = Crew()
+        await crew.assemble(lab, ["robot/c", "robot/d"], waiting=4)
+        with lab.at("old"):
+            holds, waits = await asyncio.gather(lab.holder("holds"), lab.holder("waits"))
+        await enters(holds, "holds", {"robot/old": {}})
+        await waits.order("ask", arc="waits", needs={"robot/old": {}}, min_runtime=600)
+        before = await lab.state(client, lambda state: len(state.queue) == 5)
+        stood = Stand(before)
+        assert (before.host, len(stood.holds)) == ("a", 3)
+        await lab.candidates(client, "b")
 
-            lab.signal("a", signal.SIGKILL)
-            _, free = await running(client, "free", "robot/free")
-            assert free.term > stood.term
-            stood.went_on(await lab.state(client, lambda state: len(state.holds) == 4), "free")
-            after = await crew.checked(lab, client, stood, since=clock.now())
-            assert after.host == "b"
-            await commands(holds, "robot/old")
-            await holds.order("end")
-            await waits.event("entered")
-            await commands(waits, "robot/old")
-            await asyncio.gather(*(body.finish() for body in crew.bodies))
-
-    asyncio.run(story())
+        lab.signal("a", signal.SIGKILL)
+        _, free = await running(client, "free", "robot/free")
+        assert free.term > stood.term
+        stood.went_on(await lab.state(client, lambda state: len(state.holds) == 4), "free")
+        after = await crew.checked(lab, client, stood, since=clock.now())
+        assert after.host == "b"
+        await commands(holds, "robot/old")
+        await holds.order("end")
+        await waits.event("entered")
+        await commands(waits, "robot/old")
+        await asyncio.gather(*(body.finish() for body in crew.bodies))
 
 
+@pytest.mark.slow
 @leaders
-def test_a_component_moves_between_the_versions_with_its_hold(tmp_path: Path, former: Path, leads: str) -> None:
-    async def story() -> None:
-        async with MixedLab(tmp_path, former, candidates=("r",)) as lab:
-            for version in ("old", "new"):
-                with lab.at(version):
-                    lab.node(version)
-            with lab.at(leads):
-                lab.node("r", "robot/x", extra="[components]\nallow = false\n")
-            client = await lab.client()
-            placing, hosts = Placing(client), Hosts(client)
-            await lab.ready(client, "robot/x")
-            await placing.hosts(3)
-            said: list[Grants] = []
-            client.mesh.subscribe(client.mesh.keys.grants, Grants, lambda _, grants: said.append(grants))
-            spec = ComponentSpec("counter", {"period": 0.02, "rc": "robot/x"}, hosts=["old", "new"])
-            await placing.get(PlaceComponent("c", spec), Placement)
-            placed = await placing.until("c", lambda one: one.state == "running" and one.movable)
-            at = placed.host
-            assert at is not None
-            for _ in range(2):
-                await counts_on(hosts, at)
-                moved = await placing.get(MigrateComponent("c", OTHER[at], wait=LONGEST), Placement)
-                assert (moved.state, moved.host) == ("running", OTHER[at]), moved
-                await counts_on(hosts, OTHER[at])
-                # When it has ended there, all that it counted has been read.
-                await hosts.ended(at, "c")
-                assert (await counts(hosts, OTHER[at]))[0] == (await counts(hosts, at))[-1] + 1
-                assert "lost" not in (await hosts.get(OTHER[at], ReadOutput("c"), Output)).text
-                at = OTHER[at]
-            # All that is published comes to this client later than to the RC.
-            await until(lambda: sum(len(grants.revoked) for grants in said) >= 2)
-            assert {one.outcome for grants in said for one in grants.revoked} == {"handed_over"}
-            (holder,) = (await lab.rc(client, "robot/x")).holders
-            assert (holder.arc, holder.client.partition("/")[0]) == ("c", at)
-
-    asyncio.run(story())
+async def test_a_component_moves_between_the_versions_with_its_hold(tmp_path: Path, former: Path, leads: str) -> None:
+    async with MixedLab(tmp_path, former, candidates=("r",)) as lab:
+        for version in ("old", "new"):
+            with lab.at(version):
+                lab.node(version)
+        with lab.at(leads):
+            lab.node("r", "robot/x", extra="[components]\nallow = false\n")
+        client = await lab.client()
+        placing, hosts = Placing(client), Hosts(client)
+        await lab.ready(client, "robot/x")
+        await placing.hosts(3)
+        said: list[Grants] = []
+        client.mesh.subscribe(client.mesh.keys.grants, Grants, lambda _, grants: said.append(grants))
+        spec = ComponentSpec("counter", {"period": 0.02, "rc": "robot/x"}, hosts=["old", "new"])
+        await placing.get(PlaceComponent("c", spec), Placement)
+        placed = await placing.until("c", lambda one: one.state == "running" and one.movable)
+        at = placed.host
+        assert at is not None
+        for _ in range(2):
+            await counts_on(hosts, at)
+            moved = await placing.get(MigrateComponent("c", OTHER[at], wait=LONGEST), Placement)
+            assert (moved.state, moved.host) == ("running", OTHER[at]), moved
+            await counts_on(hosts, OTHER[at])
+            # When it has ended there, all that it counted has been read.
+            await hosts.ended(at, "c")
+            assert (await counts(hosts, OTHER[at]))[0] == (await counts(hosts, at))[-1] + 1
+            assert "lost" not in (await hosts.get(OTHER[at], ReadOutput("c"), Output)).text
+            at = OTHER[at]
+        # All that is published comes to this client later than to the RC.
+        await until(lambda: sum(len(grants.revoked) for grants in said) >= 2)
+        assert {one.outcome for grants in said for one in grants.revoked} == {"handed_over"}
+        (holder,) = (await lab.rc(client, "robot/x")).holders
+        assert (holder.arc, holder.client.partition("/")[0]) == ("c", at)
 
 
+@pytest.mark.slow
 @leaders
-def test_a_component_is_started_by_either_versions_program(tmp_path: Path, former: Path, leads: str) -> None:
-    async def story() -> None:
-        async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
-            with lab.at(leads):
-                lab.node("a", extra="[components]\nallow = false\n")
-            with lab.at(OTHER[leads]):
-                lab.node("b")
-            client = await lab.client()
-            await lab.ready(client)
-            # Before the balancer knows the other host, the one that takes no components would be asked, and refuse.
-            await Placing(client).hosts(2)
-            for version in ("old", "new"):
-                with lab.at(version):
-                    start = "start", "spin", "--name", version, "--set", "cpu=0.01"
-                    program = lab.spawn([*COMMAND, *start], log=f"start-{version}.log")
-                assert await asyncio.to_thread(program.wait, HANG) == 0, lab.log(f"start-{version}")
-                assert (await Placing(client).placement(version)).host == "b"
-
-    asyncio.run(story())
+async def test_a_component_is_started_by_either_versions_program(tmp_path: Path, former: Path, leads: str) -> None:
+    async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
+        with lab.at(leads):
+            lab.node("a", extra="[components]\nallow = false\n")
+        with lab.at(OTHER[leads]):
+            lab.node("b")
+        client = await lab.begun()
+        # Before the balancer knows the other host, the one that takes no components would be asked, and refuse.
+        await Placing(client).hosts(2)
+        for version in ("old", "new"):
+            with lab.at(version):
+                start = "start", "spin", "--name", version, "--set", "cpu=0.01"
+                program = lab.spawn([*COMMAND, *start], log=f"start-{version}.log")
+            assert await asyncio.to_thread(program.wait, HANG) == 0, lab.log(f"start-{version}")
+            assert (await Placing(client).placement(version)).host == "b"
 
 
 def of_the_next_version(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -233,81 +224,72 @@ class Book(messages.Message, frozen=True, tag_field="op", tag="book"):
 
 
 @leaders
-def test_what_the_other_side_does_not_know_is_refused_naming_both_versions(
+async def test_what_the_other_side_does_not_know_is_refused_naming_both_versions(
     tmp_path: Path, former: Path, leads: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def story() -> None:
-        async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
-            with lab.at(leads):
-                lab.node("a", "robot/a")
-            client = await lab.client()
-            await lab.ready(client, "robot/a")
-            link, operation = client._rcm, cast("Any", Book("b"))
-            # What this version should not have sent is its own fault.
-            assert ("upgrade" in (await refusal(lambda: link.query(operation))).message) == (leads == "old")
-
-            of_the_next_version(monkeypatch)
-            theirs = "older than 0.2.0" if leads == "old" else f"version {VERSION}"
-            says = f"at a is {theirs}, this is 0.4.0: upgrade the older one"
-            ask = Ask("x", "x", {"robot/{a,b}": {}}, 0, Decimal(1))
-            for sent, code in ((operation, "malformed"), (ask, "bad_request")):
-                problem = await refusal(functools.partial(link.query, sent))
-                assert problem.code == code
-                assert f"the RCM {says}" in problem.message
-            with pytest.raises(RequestRefused, match=f"the component placer {re.escape(says)}"):
-                await PlacerClient(client.mesh).request(operation, Placement)
-            node = NodeClient(client.mesh, round(HANG * SECOND))
-            problem = await refusal(lambda: node._ask("a", operation, Placement, HANG))
-            assert f"the node {says}" in problem.message
-
-    asyncio.run(story())
-
-
-def test_status_names_who_runs_which_version_where_they_differ(tmp_path: Path, former: Path) -> None:
-    async def story() -> None:
-        async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
+    async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
+        with lab.at(leads):
             lab.node("a", "robot/a")
-            client = await lab.client()
-            await lab.ready(client, "robot/a")
-            alone = await lab.zscout("status")
-            assert "they differ" not in alone.stdout
-            with lab.at("old"):
-                lab.node("b", "robot/b")
-            await lab.ready(client, "robot/a", "robot/b")
-            words = f"they differ: older than 0.2.0 on b; version {VERSION} on a; this zscout is {VERSION}"
-            # The link of a command that has just come to one of the nodes may be too young for what that one tells.
-            async with asyncio.timeout(HANG):
-                while words not in (mixed := await lab.zscout("status")).stdout:
-                    pass
-            assert section(mixed.stdout, "Warnings") == [["versions", words]]
-            shown = json.loads((await lab.zscout("status", "--json")).stdout)
-            assert shown["version"] == VERSION
-            assert shown["versions"] == [{"version": None, "hosts": ["b"]}, {"version": VERSION, "hosts": ["a"]}]
+        client = await lab.begun()
+        link, operation = client._rcm, cast("Any", Book("b"))
+        # What this version should not have sent is its own fault.
+        assert ("upgrade" in (await refusal(lambda: link.query(operation))).message) == (leads == "old")
 
-    asyncio.run(story())
+        of_the_next_version(monkeypatch)
+        theirs = "older than 0.2.0" if leads == "old" else f"version {VERSION}"
+        says = f"at a is {theirs}, this is 0.4.0: upgrade the older one"
+        ask = Ask("x", "x", {"robot/{a,b}": {}}, 0, Decimal(1))
+        for sent, code in ((operation, "malformed"), (ask, "bad_request")):
+            problem = await refusal(functools.partial(link.query, sent))
+            assert problem.code == code
+            assert f"the RCM {says}" in problem.message
+        with pytest.raises(RequestRefused, match=f"the component placer {re.escape(says)}"):
+            await PlacerClient(client.mesh).request(operation, Placement)
+        node = NodeClient(client.mesh, round(HANG * SECOND))
+        problem = await refusal(lambda: node._ask("a", operation, Placement, HANG))
+        assert f"the node {says}" in problem.message
 
 
+@pytest.mark.slow
+async def test_status_names_who_runs_which_version_where_they_differ(tmp_path: Path, former: Path) -> None:
+    async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
+        lab.node("a", "robot/a")
+        client = await lab.begun()
+        alone = await lab.zscout("status")
+        assert "they differ" not in alone.stdout
+        with lab.at("old"):
+            lab.node("b", "robot/b")
+        await lab.ready(client, "robot/a", "robot/b")
+        words = f"they differ: older than 0.2.0 on b; version {VERSION} on a; this zscout is {VERSION}"
+        # The link of a command that has just come to one of the nodes may be too young for what that one tells.
+        async with asyncio.timeout(HANG):
+            while words not in (mixed := await lab.zscout("status")).stdout:
+                pass
+        assert section(mixed.stdout, "Warnings") == [["versions", words]]
+        shown = json.loads((await lab.zscout("status", "--json")).stdout)
+        assert shown["version"] == VERSION
+        assert shown["versions"] == [{"version": None, "hosts": ["b"]}, {"version": VERSION, "hosts": ["a"]}]
+
+
+@pytest.mark.slow
 @leaders
-def test_a_command_is_told_that_nobody_waits_for_it(tmp_path: Path, former: Path, leads: str) -> None:
-    async def story() -> None:
-        async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
-            with lab.at(leads):
-                lab.node("a")
-            for version in ("old", "new"):
-                with lab.at(version):
-                    lab.node(version, f"robot/{version}")
-            client = await lab.client()
-            await lab.ready(client, "robot/old", "robot/new")
-            request = "request", "robot/old", "robot/new", "--json", "--", "sleep", "600"
-            lab.spawn([*COMMAND, *request], log="request.log")
-            await lab.logged("request", "not_settling")
-            # The line may be half written yet.
-            await until(lambda: lab.log("request").partition("not_settling")[2].find("\n") >= 0)
-            told = map(json.loads, lab.log("request").rpartition("\n")[0].splitlines())
-            assert [one["who"] for one in told if one["event"] == "not_settling"] == [who]
-
+async def test_a_command_is_told_that_nobody_waits_for_it(tmp_path: Path, former: Path, leads: str) -> None:
     who = [f"the RCM at a (older than 0.2.0, this is {VERSION})"] * (leads == "old") + ["robot/old"]
-    asyncio.run(story())
+    async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
+        with lab.at(leads):
+            lab.node("a")
+        for version in ("old", "new"):
+            with lab.at(version):
+                lab.node(version, f"robot/{version}")
+        client = await lab.client()
+        await lab.ready(client, "robot/old", "robot/new")
+        request = "request", "robot/old", "robot/new", "--json", "--", "sleep", "600"
+        lab.spawn([*COMMAND, *request], log="request.log")
+        await lab.logged("request", "not_settling")
+        # The line may be half written yet.
+        await until(lambda: lab.log("request").partition("not_settling")[2].find("\n") >= 0)
+        told = map(json.loads, lab.log("request").rpartition("\n")[0].splitlines())
+        assert [one["who"] for one in told if one["event"] == "not_settling"] == [who]
 
 
 def test_each_version_takes_every_message_of_the_other(former: Path) -> None:

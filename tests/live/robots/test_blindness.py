@@ -21,7 +21,7 @@ from zscout.mesh import clock
 from zscout.messages import BehaviorSaid
 from zscout.types import SECOND
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 ALL = ("robot/scout33", "robot/scout35", "radio/rf0", "video/ch1", "video/ch2", "framegrabber/fgrab1")
 
@@ -65,70 +65,67 @@ class Placed:
         await asyncio.gather(self.task, return_exceptions=True)
 
 
-def test_jammed_and_silent_channels_are_left_and_a_dead_robot_is_lost(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with RobotLab(tmp_path, speed=4, frame_rate=3, channels=2) as lab:
-            lab.devices("mast", "radio", "video", "framegrabber", "robot")
-            client = await lab.client()
-            await lab.ready(client, *ALL)
-            placed, building = Placed(lab, client), lab.building
-            channel = await placed.drives()
+async def test_jammed_and_silent_channels_are_left_and_a_dead_robot_is_lost(tmp_path: Path) -> None:
+    async with RobotLab(tmp_path, speed=4, frame_rate=3, channels=2) as lab:
+        lab.devices("mast", "radio", "video", "framegrabber", "robot")
+        client = await lab.client()
+        await lab.ready(client, *ALL)
+        placed, building = Placed(lab, client), lab.building
+        channel = await placed.drives()
 
-            # Asked for in the regular way, the channel is refused to a second robot.
-            video = f"video/ch{channel}"
-            second = {"robot/scout35": {}, "radio/rf0": {"command_rate": 2}, video: {"transmitters": 1}}
-            arc = await client.request("second", second, min_runtime=600)
-            await comes_to(arc, "queued", "spoil each other")
-            assert "scout33-hide transmits on it already" in arc.reason
-            await client.end(arc)
+        # Asked for in the regular way, the channel is refused to a second robot.
+        video = f"video/ch{channel}"
+        second = {"robot/scout35": {}, "radio/rf0": {"command_rate": 2}, video: {"transmitters": 1}}
+        arc = await client.request("second", second, min_runtime=600)
+        await comes_to(arc, "queued", "spoil each other")
+        assert "scout33-hide transmits on it already" in arc.reason
+        await client.end(arc)
 
-            # Its transmitter goes off unasked: it is told again, within the same hold.
-            body, since = building.world.bodies["scout33"], len(placed.said)
-            await building.in_world(lambda: body.transmit(None, building.world.time))
-            await placed.drives()
-            assert not any(one.doing == "wait" for one in placed.said[since:])
+        # Its transmitter goes off unasked: it is told again, within the same hold.
+        body, since = building.world.bodies["scout33"], len(placed.said)
+        await building.in_world(lambda: body.transmit(None, building.world.time))
+        await placed.drives()
+        assert not any(one.doing == "wait" for one in placed.said[since:])
 
-            # By force: somebody switches the other robot's camera on, around all votes.
-            since = len(placed.said)
-            other = building.world.bodies["scout35"]
-            await building.in_world(lambda: other.transmit(channel, building.world.time))
-            jammed = building.time
-            await placed.says("search", "pictures are jammed: waits", since=since)
-            told, stood = building.time, await building.stands("scout33")
-            await placed.says("wait", f"no picture on {video} for {NO_PICTURE_TIMEOUT:g} s", since=since)
-            left = building.time
-            assert stood == await building.stands("scout33"), "it moved on in the dark"
-            await placed.drives(left=channel)
-            await building.in_world(lambda: other.transmit(None, building.world.time))
-            print(
-                f"jammed: stands after {max(0, stood - jammed):.1f} s of the building, says so after "
-                f"{told - jammed:.1f} s, leaves the channel after {left - jammed:.1f} s"
-            )
-            await placed.end()
+        # By force: somebody switches the other robot's camera on, around all votes.
+        since = len(placed.said)
+        other = building.world.bodies["scout35"]
+        await building.in_world(lambda: other.transmit(channel, building.world.time))
+        jammed = building.time
+        await placed.says("search", "pictures are jammed: waits", since=since)
+        told, stood = building.time, await building.stands("scout33")
+        await placed.says("wait", f"no picture on {video} for {NO_PICTURE_TIMEOUT:g} s", since=since)
+        left = building.time
+        assert stood == await building.stands("scout33"), "it moved on in the dark"
+        await placed.drives(left=channel)
+        await building.in_world(lambda: other.transmit(None, building.world.time))
+        print(
+            f"jammed: stands after {max(0, stood - jammed):.1f} s of the building, says so after "
+            f"{told - jammed:.1f} s, leaves the channel after {left - jammed:.1f} s"
+        )
+        await placed.end()
 
-            # A receiver that falls silent: the framegrabber is lost before the behavior's patience is, which
-            # takes its time as in a real building; then it goes on through the other channel.
-            placed = Placed(lab, client, speed=1)
-            channel, stalled = await placed.drives(), clock.now()
-            building.stall(channel)
-            await placed.says("wait", f"video/ch{channel} shows nothing at all")
-            await placed.drives(left=channel)
-            print(f"stalled: drives on through the other channel after {(clock.now() - stalled) / SECOND:.1f} s")
-            building.stall(channel, stalled=False)
-            await placed.end()
+        # A receiver that falls silent: the framegrabber is lost before the behavior's patience is, which
+        # takes its time as in a real building; then it goes on through the other channel.
+        placed = Placed(lab, client, speed=1)
+        channel, stalled = await placed.drives(), clock.now()
+        building.stall(channel)
+        await placed.says("wait", f"video/ch{channel} shows nothing at all")
+        await placed.drives(left=channel)
+        print(f"stalled: drives on through the other channel after {(clock.now() - stalled) / SECOND:.1f} s")
+        building.stall(channel, stalled=False)
+        await placed.end()
 
-            # Its battery is gone: it is seen on no channel.
-            placed = Placed(lab, client)
-            await placed.drives()
-            since = len(placed.said)
-            building.kill("scout33")
-            killed = building.time
-            await placed.says("lost", since=since)
-            print(f"dead: lost after {building.time - killed:.1f} s")
-            assert sum(one.detail.startswith("no picture on") for one in placed.said[since:]) == 2
-            await placed.end()
-
-    asyncio.run(story())
+        # Its battery is gone: it is seen on no channel.
+        placed = Placed(lab, client)
+        await placed.drives()
+        since = len(placed.said)
+        building.kill("scout33")
+        killed = building.time
+        await placed.says("lost", since=since)
+        print(f"dead: lost after {building.time - killed:.1f} s")
+        assert sum(one.detail.startswith("no picture on") for one in placed.said[since:]) == 2
+        await placed.end()
 
 
 def test_a_channel_without_any_picture_is_left_and_the_robot_not_blamed() -> None:

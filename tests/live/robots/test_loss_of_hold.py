@@ -22,7 +22,7 @@ from zscout.mesh import clock
 from zscout.messages import RcState
 from zscout.types import SECOND
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 ROBOT = "robot/scout33"
 NEEDS = RobotNeeds(ROBOT)
@@ -150,24 +150,21 @@ def at_once(act: Callable[[], object]) -> Callable[[], Awaitable[None]]:
     return do
 
 
-def test_none_drives_on_after_losing_its_hold(tmp_path: Path) -> None:
-    async def story() -> None:
-        # The lease ends in this test, and for nobody whose process only stands still for a while.
-        lease = "[timing]\nhold_lease = 8\n"
-        async with RobotLab(tmp_path, lease=4, candidates=["lead"], extra=lease, frame_rate=1) as lab:
-            lab.node("lead")
-            lab.devices("mast", "radio", "video", "framegrabber")
-            lab.devices("cart", "robot")
-            losses = Losses(lab, await lab.client())
-            await losses.released()
-            await losses.preempted()
-            await losses.time_over()
-            await losses.client_killed()
-            await losses.radio_unplugged()
-            await losses.node_killed()
-            await losses.no_rcm()
-            ways = ", ".join(f"{way} {took:.2f} s" for way, took in losses.took.items())
-            print(f"building's seconds from the loss of the hold until the wheels stand: {ways}")
-            print(f"worst {max(losses.took.values()):.2f} s; a drive command lasts {LASTS} s")
-
-    asyncio.run(story())
+async def test_none_drives_on_after_losing_its_hold(tmp_path: Path) -> None:
+    # The lease ends in this test, and for nobody whose process only stands still for a while.
+    lease = "[timing]\nhold_lease = 8\n"
+    async with RobotLab(tmp_path, lease=4, candidates=["lead"], extra=lease, frame_rate=1) as lab:
+        lab.node("lead")
+        lab.devices("mast", "radio", "video", "framegrabber")
+        lab.devices("cart", "robot")
+        losses = Losses(lab, await lab.client())
+        await losses.released()
+        await losses.preempted()
+        await losses.time_over()
+        await losses.client_killed()
+        await losses.radio_unplugged()
+        await losses.node_killed()
+        await losses.no_rcm()
+        ways = ", ".join(f"{way} {took:.2f} s" for way, took in losses.took.items())
+        print(f"building's seconds from the loss of the hold until the wheels stand: {ways}")
+        print(f"worst {max(losses.took.values()):.2f} s; a drive command lasts {LASTS} s")

@@ -75,64 +75,62 @@ class Shift:
         return max(0.0, halted.time - lost)
 
 
-def test_takeover(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with RobotLab(tmp_path, frame_rate=2, channels=1) as lab:
-            lab.devices("mast", "radio", "video", "framegrabber", "robot")
-            drive = ("drive", "scout33", "--stand-by", "--json")
-            with ExitStack() as stack:
-                client = await lab.client()
-                await lab.ready(client, *ALL)
+@pytest.mark.slow
+async def test_takeover(tmp_path: Path) -> None:
+    async with RobotLab(tmp_path, frame_rate=2, channels=1) as lab:
+        lab.devices("mast", "radio", "video", "framegrabber", "robot")
+        drive = ("drive", "scout33", "--stand-by", "--json")
+        with ExitStack() as stack:
+            client = await lab.client()
+            await lab.ready(client, *ALL)
 
-                def terminal(*command: str) -> Terminal:
-                    return stack.enter_context(Terminal(*command, env=lab.env))
+            def terminal(*command: str) -> Terminal:
+                return stack.enter_context(Terminal(*command, env=lab.env))
 
-                looking = terminal(*drive, "--no-view")
-                broken, killed, both = (terminal(*drive, "--no-picture") for _ in range(3))
-                hung_up = stack.enter_context(Terminal(*drive[:3], "--no-picture", env=lab.env, shown=True))
-                unknown = terminal("drive", "scout99")
-                await all_read_keys(looking, broken, killed, hung_up, both)
-                shift, turning = Shift(lab), Turning(client, RobotNeeds(ROBOT))
+            looking = terminal(*drive, "--no-view")
+            broken, killed, both = (terminal(*drive, "--no-picture") for _ in range(3))
+            hung_up = stack.enter_context(Terminal(*drive[:3], "--no-picture", env=lab.env, shown=True))
+            unknown = terminal("drive", "scout99")
+            await all_read_keys(looking, broken, killed, hung_up, both)
+            shift, turning = Shift(lab), Turning(client, RobotNeeds(ROBOT))
+            await shift.goes_on()
+            await looking.says("picture")
+
+            took = []
+            for _ in range(ROUNDS):
+                said = len(looking.events)
+                took.append(await shift.taken(looking))
+                # The robot obeys before its operator knows.
+                await looking.says("driving", since=said)
+                looking.type(b"g")
                 await shift.goes_on()
-                await looking.says("picture")
+            p50, worst = 1000 * statistics.median(took), 1000 * max(took)
+            print(f"from key to own command: p50 {p50:.0f} ms, worst {worst:.0f} ms of {ROUNDS}")
 
-                took = []
-                for _ in range(ROUNDS):
-                    said = len(looking.events)
-                    took.append(await shift.taken(looking))
-                    # The robot obeys before its operator knows.
-                    await looking.says("driving", since=said)
-                    looking.type(b"g")
-                    await shift.goes_on()
-                p50, worst = 1000 * statistics.median(took), 1000 * max(took)
-                print(f"from key to own command: p50 {p50:.0f} ms, worst {worst:.0f} ms of {ROUNDS}")
-
-                stops = {
-                    "zscout drive killed -9": await shift.lost(killed, killed.process.kill),
-                    "its terminal killed -9": await shift.lost(hung_up, hung_up.kill),
-                    "both": await shift.lost(both, both.kill_all),
-                    "Ctrl-C": await shift.lost(broken, lambda: broken.type(b"\x03")),
-                    "q": await shift.lost(looking, lambda: looking.type(b"q")),
-                }
-                print("halted after, in s:", ", ".join(f"{way} {s:.2f}" for way, s in stops.items()))
-                assert await looking.ended() == 0
-                assert await broken.ended() == 130
-                assert looking.as_before()
-                assert broken.as_before()
-                # 1: where SIGHUP is ignored, as by nohup: nobody reads its last word.
-                assert await hung_up.ended() in (1, 129), hung_up.text
-                assert "Traceback" not in hung_up.text
-                events = [one["event"] for one in looking.events]
-                assert events[0] == "picture"
-                for event, count in (("taken", ROUNDS + 1), ("free", ROUNDS)):
-                    assert events.count(event) == count, event
-                # The last one ended it perhaps before that was known.
-                assert events.count("driving") in (ROUNDS, ROUNDS + 1)
-                assert events[-1] == "ended"
-                assert all(one["takeover"] > 0 for one in looking.events if one["event"] == "driving")
-                assert await unknown.ended() == 2
-                there = 'there is no "robot/scout99" on the mesh; there are: robot/scout33, robot/scout35'
-                assert there in unknown.text
-                await turning.end()
-
-    asyncio.run(story())
+            stops = {
+                "zscout drive killed -9": await shift.lost(killed, killed.process.kill),
+                "its terminal killed -9": await shift.lost(hung_up, hung_up.kill),
+                "both": await shift.lost(both, both.kill_all),
+                "Ctrl-C": await shift.lost(broken, lambda: broken.type(b"\x03")),
+                "q": await shift.lost(looking, lambda: looking.type(b"q")),
+            }
+            print("halted after, in s:", ", ".join(f"{way} {s:.2f}" for way, s in stops.items()))
+            assert await looking.ended() == 0
+            assert await broken.ended() == 130
+            assert looking.as_before()
+            assert broken.as_before()
+            # 1: where SIGHUP is ignored, as by nohup: nobody reads its last word.
+            assert await hung_up.ended() in (1, 129), hung_up.text
+            assert "Traceback" not in hung_up.text
+            events = [one["event"] for one in looking.events]
+            assert events[0] == "picture"
+            for event, count in (("taken", ROUNDS + 1), ("free", ROUNDS)):
+                assert events.count(event) == count, event
+            # The last one ended it perhaps before that was known.
+            assert events.count("driving") in (ROUNDS, ROUNDS + 1)
+            assert events[-1] == "ended"
+            assert all(one["takeover"] > 0 for one in looking.events if one["event"] == "driving")
+            assert await unknown.ended() == 2
+            there = 'there is no "robot/scout99" on the mesh; there are: robot/scout33, robot/scout35'
+            assert there in unknown.text
+            await turning.end()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from pathlib import Path
 
 import pytest
 
@@ -42,42 +41,35 @@ class Operator:
                 await self.told.wait()
 
 
-def test_the_later_operator_keeps_it_and_the_earlier_is_told(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("a", *OFFERED)
-            one, two = Operator(lab), Operator(lab)
-            async with one as first, two as second:
-                first.take()
-                await one.comes_to("driving")
-                second.take()
-                # Equals wait until the other has had its second, and say for what.
-                await two.comes_to("driving")
-                await one.comes_to("free", "taken by")
-                await asyncio.sleep(AFTER_A_SLOT)
-                assert (first.state, second.state) == ("free", "driving")
-                # Who wants it again only has to say so.
-                first.take()
-                await one.comes_to("driving")
-                await two.comes_to("free", "taken by")
-
-    asyncio.run(story())
+@pytest.mark.slow
+async def test_the_later_operator_keeps_it_and_the_earlier_is_told(lab: Lab) -> None:
+    lab.node("a", *OFFERED)
+    one, two = Operator(lab), Operator(lab)
+    async with one as first, two as second:
+        first.take()
+        await one.comes_to("driving")
+        second.take()
+        # Equals wait until the other has had its second, and say for what.
+        await two.comes_to("driving")
+        await one.comes_to("free", "taken by")
+        await asyncio.sleep(AFTER_A_SLOT)
+        assert (first.state, second.state) == ("free", "driving")
+        # Who wants it again only has to say so.
+        first.take()
+        await one.comes_to("driving")
+        await two.comes_to("free", "taken by")
 
 
-def test_who_waits_is_told_for_what(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("a", *OFFERED[:3])
-            operator = Operator(lab)
-            operator_rcs = RCS[:3]
-            client = await lab.client()
-            await lab.ready(client, *operator_rcs)
-            teleop = Teleop(client, RobotNeeds(RCS[0]), Pilot(), priority=10, changed=operator.told.set)
-            operator.teleop, operator.running = teleop, asyncio.create_task(teleop.run())
-            teleop.take()
-            await operator.comes_to("waiting", "framegrabber")
-            teleop.give_back()
-            await operator.comes_to("free")
-            await operator.__aexit__()
-
-    asyncio.run(story())
+async def test_who_waits_is_told_for_what(lab: Lab) -> None:
+    lab.node("a", *OFFERED[:3])
+    operator = Operator(lab)
+    operator_rcs = RCS[:3]
+    client = await lab.client()
+    await lab.ready(client, *operator_rcs)
+    teleop = Teleop(client, RobotNeeds(RCS[0]), Pilot(), priority=10, changed=operator.told.set)
+    operator.teleop, operator.running = teleop, asyncio.create_task(teleop.run())
+    teleop.take()
+    await operator.comes_to("waiting", "framegrabber")
+    teleop.give_back()
+    await operator.comes_to("free")
+    await operator.__aexit__()
