@@ -1,7 +1,9 @@
-"""Coroutine tests run in virtual time: an hour on a mesh in memory takes milliseconds."""
+"""Coroutine tests run in virtual time: an hour on a mesh in memory takes milliseconds. In a module with `REAL_TIME`,
+such as one with sockets, they run in that of the clock."""
 
 from __future__ import annotations
 
+import asyncio
 import inspect
 
 import pytest
@@ -13,5 +15,6 @@ from zscout.testing.virtual_time import run
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     if not inspect.iscoroutinefunction(pyfuncitem.obj):
         return None
-    run(pyfuncitem.obj(**{name: pyfuncitem.funcargs[name] for name in inspect.signature(pyfuncitem.obj).parameters}))
+    args = {name: pyfuncitem.funcargs[name] for name in inspect.signature(pyfuncitem.obj).parameters}
+    (asyncio.run if getattr(pyfuncitem.module, "REAL_TIME", False) else run)(pyfuncitem.obj(**args))
     return True

@@ -61,17 +61,11 @@ async def test_a_publication_that_comes_late_turns_no_clock_back() -> None:
     assert hear(0.0, term=6, ahead=-61, age=900) == pytest.approx(0, abs=1e-3)
 
 
-def test_a_file_is_read_as_it_was_written(tmp_path: Path) -> None:
-    async def story() -> None:
-        records = [
-            record("one", unbooked=True),
-            record("two", every=1, until=round(NOON) + 86_400, dropped=[round(NOON)]),
-        ]
-        await BookingFile(tmp_path, "zscout").write(records)
-        assert BookingFile(tmp_path, "zscout").read() == records
-        assert (tmp_path / FILE).stat().st_mode & 0o777 == 0o600
-
-    asyncio.run(story())
+async def test_a_file_is_read_as_it_was_written(tmp_path: Path) -> None:
+    records = [record("one", unbooked=True), record("two", every=1, until=round(NOON) + 86_400, dropped=[round(NOON)])]
+    await BookingFile(tmp_path, "zscout").write(records)
+    assert BookingFile(tmp_path, "zscout").read() == records
+    assert (tmp_path / FILE).stat().st_mode & 0o777 == 0o600
 
 
 def test_a_file_of_another_fleet_is_not_used(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from tests.mesh.kit import until
-from tests.services.placement.kit import JOB, PlacerFleet, Refusal
+from tests.services.kit import Refusal
+from tests.services.placement.kit import JOB, PlacerFleet
 from zscout.messages import (
     ComponentSpec,
     DrainHost,

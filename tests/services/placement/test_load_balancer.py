@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 
 from tests.mesh.kit import until
-from tests.services.placement.kit import PlacerFleet, Refusal
+from tests.services.kit import Refusal
+from tests.services.placement.kit import PlacerFleet
 from tests.services.rcm.kit import FakeFleet
 from zscout.keyexpr import Role, Token
 from zscout.messages import HostRanking, RankAsk

@@ -9,16 +9,14 @@ import pytest
 from msgspec.structs import replace
 
 from tests.mesh.kit import until
-from tests.services.rcm.booked_fleet import NOON, BookedFleet, book, do, led, states
+from tests.services.rcm.booked_fleet import NOON, BookedFleet, book, booked, dangers_at, do, led, states
 from tests.services.rcm.kit import Refusal, request
 from zscout.messages import BookingView, FindSlots, Release, SlotsTold, Unbook
-from zscout.services.rcm.bookings import BookedDanger
 from zscout.types import Place, Term
 
 
 async def test_a_booking_is_kept_by_another_candidate_and_taken_up_at_its_date() -> None:
-    fleet = BookedFleet("x", "y")
-    await led(fleet, "x", "y")
+    fleet, *_ = await booked("x", "y")
     client, other = fleet.client("one"), fleet.client("two")
     made = await do(client, book("b", "robot/a", "robot/*", at=50), BookingView)
     assert states(made) == ["open"]
@@ -40,8 +38,7 @@ async def test_a_booking_is_kept_by_another_candidate_and_taken_up_at_its_date()
 
 
 async def test_slots_are_the_times_between_bookings() -> None:
-    fleet = BookedFleet("x")
-    await led(fleet, "x")
+    fleet, *_ = await booked("x")
     client = fleet.client("one")
     await do(client, book("b", "robot/a", at=50), BookingView)
     await do(client, book("c", "robot/b", at=250), BookingView)
@@ -63,8 +60,7 @@ async def test_slots_are_the_times_between_bookings() -> None:
 
 
 async def test_a_date_that_is_not_repeated_is_kept_free_however_far_ahead() -> None:
-    fleet = BookedFleet("x")
-    await led(fleet, "x")
+    fleet, *_ = await booked("x")
     client = fleet.client("one")
     far = 300 * 86_400
     await do(client, book("b", "robot/a", at=far), BookingView)
@@ -77,8 +73,7 @@ async def test_a_date_that_is_not_repeated_is_kept_free_however_far_ahead() -> N
 
 
 async def test_slots_go_by_what_was_asked_for_and_tell_what_is_likely() -> None:
-    fleet = BookedFleet("x")
-    await led(fleet, "x")
+    fleet, *_ = await booked("x")
     client, other = fleet.client("one"), fleet.client("two")
     asked = FindSlots("s", request("s", "robot/a").needs, 0, Decimal(60), within=1_000)
     for number in range(4):
@@ -92,8 +87,7 @@ async def test_slots_go_by_what_was_asked_for_and_tell_what_is_likely() -> None:
 
 
 async def test_votes_decide_about_a_sharable_rc() -> None:
-    fleet = BookedFleet("x")
-    await led(fleet, "x")
+    fleet, *_ = await booked("x")
     radio = fleet.rc("radio/rf0", accept=True)
     await fleet.joined(radio)
     client = fleet.client("one")
@@ -109,8 +103,7 @@ async def test_votes_decide_about_a_sharable_rc() -> None:
 
 
 async def test_a_booking_outlives_its_leader_and_its_taker_goes_on() -> None:
-    fleet = BookedFleet("x", "y")
-    leader, heir = await led(fleet, "x", "y")
+    fleet, leader, heir = await booked("x", "y")
     client = fleet.client("one")
     await do(client, book("b", "robot/a", at=50, every=1, until=round(NOON + 86_400 * 3 + 50)), BookingView)
     waits = await client.ask("mine", "robot/a", seconds=100, booking="b")
@@ -130,8 +123,7 @@ async def test_a_booking_outlives_its_leader_and_its_taker_goes_on() -> None:
 
 
 async def test_two_halves_book_the_same_and_the_earlier_of_the_higher_priority_stands() -> None:
-    fleet = BookedFleet("x", "y")
-    x, y = await led(fleet, "x", "y")
+    fleet, x, y = await booked("x", "y")
     assert x.rcm is not None
     here, there = fleet.client("here", "x"), fleet.client("there", "y")
     await do(here, book("both", "robot/b", at=900), BookingView)
@@ -166,8 +158,7 @@ async def test_two_halves_book_the_same_and_the_earlier_of_the_higher_priority_s
 
 
 async def test_who_took_up_a_date_that_is_in_conflict_waits_for_it_and_has_it_once_it_stands() -> None:
-    fleet = BookedFleet("x", "y")
-    _, y = await led(fleet, "x", "y")
+    fleet, _, y = await booked("x", "y")
     here, there = fleet.client("here", "x"), fleet.client("there", "y")
     fleet.part("y")
     await until(lambda: y.rcm)
@@ -209,8 +200,7 @@ async def test_who_took_up_a_date_that_its_leader_does_not_know_yet_waits_for_it
 
 
 async def test_what_is_no_booking_is_refused_in_one_line() -> None:
-    fleet = BookedFleet("x")
-    await led(fleet, "x")
+    fleet, *_ = await booked("x")
     client = fleet.client("one")
     good = book("b", "robot/a", at=50)
     for wrong, code in [
@@ -248,8 +238,7 @@ async def test_other_strategies_keep_no_bookings() -> None:
 
 
 async def test_maintenance_goes_before_what_is_booked_and_both_are_told() -> None:
-    fleet = BookedFleet("x")
-    await led(fleet, "x")
+    fleet, *_ = await booked("x")
     client = fleet.client("one")
     await do(client, book("b", "robot/a", at=300), BookingView)
     drain = await do(client, book("m", "robot/a", "robot/b", at=200, seconds=200, maintenance=True), BookingView)
@@ -271,11 +260,8 @@ async def test_maintenance_goes_before_what_is_booked_and_both_are_told() -> Non
 
 
 async def test_the_danger_of_maintenance_that_is_given_up_is_over() -> None:
-    fleet = BookedFleet("x", "y")
-    leader, *_ = await led(fleet, "x", "y")
-    assert leader.rcm is not None
-    dangers: list[BookedDanger] = []
-    leader.rcm.bookings.on_danger = dangers.append
+    fleet, leader, *_ = await booked("x", "y")
+    dangers = dangers_at(leader)
     client = fleet.client("one", "desk")
     await do(client, book("b", "robot/a", at=500, priority=1), BookingView)
     await do(client, book("m", "robot/a", at=400, seconds=300, maintenance=True), BookingView)
@@ -289,8 +275,7 @@ async def test_the_danger_of_maintenance_that_is_given_up_is_over() -> None:
 
 
 async def test_what_is_repeated_is_kept_from_the_instant_that_a_date_is_within_60_days() -> None:
-    fleet = BookedFleet("x", "y")
-    await led(fleet, "x", "y")
+    fleet, *_ = await booked("x", "y")
     await do(fleet.client("one"), book("b", "robot/a", at=500, every=1, until=round(NOON) + 300 * 86_400), BookingView)
     await asyncio.sleep(NOON + 499 - fleet.time())
     assert (await fleet.bookings())["b"].dates[-1].start == NOON + 59 * 86_400 + 500
@@ -300,11 +285,8 @@ async def test_what_is_repeated_is_kept_from_the_instant_that_a_date_is_within_6
 
 
 async def test_a_booking_is_in_danger_while_what_it_needs_is_away() -> None:
-    fleet = BookedFleet("x")
-    (leader,) = await led(fleet, "x")
-    assert leader.rcm is not None
-    dangers: list[BookedDanger] = []
-    leader.rcm.bookings.on_danger = dangers.append
+    fleet, leader = await booked("x")
+    dangers = dangers_at(leader)
     far = fleet.rc("robot/far")
     await fleet.joined(far)
     client = fleet.client("one")
@@ -325,11 +307,8 @@ async def test_a_booking_is_in_danger_while_what_it_needs_is_away() -> None:
 
 
 async def test_of_all_dates_of_a_booking_a_danger_is_told_once_and_the_next_dates_first() -> None:
-    fleet = BookedFleet("x")
-    (leader,) = await led(fleet, "x")
-    assert leader.rcm is not None
-    dangers: list[BookedDanger] = []
-    leader.rcm.bookings.on_danger = dangers.append
+    fleet, leader = await booked("x")
+    dangers = dangers_at(leader)
     far = fleet.rc("robot/far")
     await fleet.joined(far)
     client = fleet.client("one")
@@ -347,8 +326,7 @@ async def test_of_all_dates_of_a_booking_a_danger_is_told_once_and_the_next_date
 
 
 async def test_a_date_in_conflict_is_not_voted_on_again_and_again() -> None:
-    fleet = BookedFleet("x", "y")
-    _, y = await led(fleet, "x", "y")
+    fleet, _, y = await booked("x", "y")
     radio = fleet.rc("radio/rf0")
     await fleet.joined(radio)
     here, there = fleet.client("here", "x"), fleet.client("there", "y")
@@ -367,8 +345,7 @@ async def test_a_date_in_conflict_is_not_voted_on_again_and_again() -> None:
 
 
 async def test_a_date_by_pattern_goes_to_another_shared_rc_once_that_has_voted() -> None:
-    fleet = BookedFleet("x", "y")
-    _, y = await led(fleet, "x", "y")
+    fleet, _, y = await booked("x", "y")
     here, there = fleet.client("here", "x"), fleet.client("there", "y")
     first = fleet.rc("radio/rf0")
     await fleet.joined(first)

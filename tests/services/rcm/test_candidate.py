@@ -202,7 +202,7 @@ def test_a_leader_in_which_something_fails_steps_down_and_stands_again(
     assert "never retrieved" not in caplog.text
 
 
-def test_a_candidate_that_always_fails_tries_less_and_less(
+async def test_a_candidate_that_always_fails_tries_less_and_less(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     stood: list[float] = []
@@ -212,17 +212,13 @@ def test_a_candidate_that_always_fails_tries_less_and_less(
         raise ZeroDivisionError
 
     monkeypatch.setattr(Candidate, "_run", fails)
-
-    async def story() -> None:
-        fleet = FakeFleet()
-        candidate = fleet.candidate("x")
-        await asyncio.sleep(120)
-        await candidate.stop()
-        count = len(stood)
-        await asyncio.sleep(120)
-        assert len(stood) == count
-
-    run(story())
+    fleet = FakeFleet()
+    candidate = fleet.candidate("x")
+    await asyncio.sleep(120)
+    await candidate.stop()
+    count = len(stood)
+    await asyncio.sleep(120)
+    assert len(stood) == count
     gaps = [round(later - earlier) for earlier, later in pairwise(stood)]
     assert gaps[:6] == [BACKOFF, 2, 4, 8, 16, MAX_BACKOFF]
     assert set(gaps[6:]) == {MAX_BACKOFF}

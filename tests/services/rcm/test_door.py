@@ -8,7 +8,8 @@ from decimal import Decimal
 
 import pytest
 
-from tests.services.rcm.kit import FakeFleet, Refusal, grant_of, request
+from tests.services.rcm.booked_fleet import do
+from tests.services.rcm.kit import FakeFleet, Refusal, fleet_of, grant_of, request
 from zscout.mesh import Refused
 from zscout.messages import Amounts, Foresee, Foresight, Parameter, Parameters
 from zscout.services.rcm.door import check_door
@@ -125,19 +126,12 @@ async def test_the_leader_refuses_what_it_knows_only_to_who_asks_for_that() -> N
     assert (await client.do(placed)).state == "queued"
     assert grant_of(await client.ask("arm", "robot/arm1", check=True)).seq
 
-    asked = Foresee("f", "dry", {"robot/arn2": {}}, 0, Decimal(1), check=True)
-    key, mesh = client.mesh.keys.schedule(client.mesh.me), client.mesh
-    reply = await mesh.ask_one(key, asked, Foresight, timeout=1)
-    assert reply is not None
-    assert reply.problem is not None
-    assert reply.problem.code == "unknown_device"
+    with pytest.raises(Refusal, match="unknown_device"):
+        await do(client, Foresee("f", "dry", {"robot/arn2": {}}, 0, Decimal(1), check=True), Foresight)
 
 
 async def test_a_device_that_went_is_waited_for() -> None:
-    fleet = FakeFleet()
-    fleet.rcm()
-    rc = fleet.rc("robot/arm1")
-    await fleet.joined(rc)
+    fleet, rc = await fleet_of("robot/arm1")
     client = fleet.client("one")
     await asyncio.sleep(fleet.fleet.timing.hold_lease / SECOND)
     fleet.network.kill(rc.mesh)

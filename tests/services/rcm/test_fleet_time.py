@@ -8,9 +8,9 @@ from decimal import Decimal
 import pytest
 
 from tests.mesh.kit import until
-from tests.services.rcm.booked_fleet import NOON, BookedFleet, Disk, book, do, led, record, states
+from tests.services.rcm.booked_fleet import NOON, BookedFleet, Disk, book, booked, do, led, record, states
 from tests.services.rcm.kit import Refusal
-from zscout.messages import BookingsAsk, BookingsTold, BookingView, OpenRequest
+from zscout.messages import BookingView, OpenRequest
 from zscout.services.rcm.candidate import Candidate
 from zscout.types import Grant, Term
 
@@ -46,10 +46,7 @@ async def test_a_leader_whose_clock_is_an_hour_off_goes_on_in_the_time_of_the_fl
     assert [notice.state for notice in client.notices].count("running") == 0
     await asyncio.sleep(2)
     assert client.notices[-1].state == "running"
-    reply = await fleet.watcher.ask_one(fleet.watcher.keys.rcm_bookings, BookingsAsk(), BookingsTold, timeout=1)
-    assert reply is not None
-    assert reply.message is not None
-    assert reply.message.clocks == {"y": pytest.approx(ahead, abs=2)}
+    assert (await fleet.told()).clocks == {"y": pytest.approx(ahead, abs=2)}
 
 
 async def test_fleet_time_does_not_jump_in_a_reign() -> None:
@@ -110,8 +107,7 @@ async def test_a_booking_right_after_another_stands_though_fleet_time_is_slewed(
 
 
 async def test_after_a_restart_of_all_hosts_nothing_is_decided_by_one_wrong_clock() -> None:
-    fleet = BookedFleet("x", "y", "z")
-    old = await led(fleet, "x", "y", "z")
+    fleet, *old = await booked("x", "y", "z")
     client = fleet.client("one")
     await do(client, book("b", "robot/a", at=300, patience=Decimal(30)), BookingView)
     await do(client, book("c", "robot/b", at=400), BookingView)
@@ -132,8 +128,7 @@ async def test_after_a_restart_of_all_hosts_nothing_is_decided_by_one_wrong_cloc
 
 
 async def test_what_ends_by_one_wrong_clock_after_a_restart_of_all_is_not_over() -> None:
-    fleet = BookedFleet("x", "y", "z")
-    old = await led(fleet, "x", "y", "z")
+    fleet, *old = await booked("x", "y", "z")
     client = fleet.client("one")
     await do(client, book("m", "robot/a", at=300, maintenance=True), BookingView)
     await do(client, book("b", "robot/b", at=300, patience=Decimal(100)), BookingView)
@@ -159,8 +154,7 @@ async def test_what_ends_by_one_wrong_clock_after_a_restart_of_all_is_not_over()
 async def test_who_waits_for_a_date_does_not_begin_by_one_wrong_clock_after_a_restart_of_all(
     ahead: float, known: bool
 ) -> None:
-    fleet = BookedFleet("x", "y", "z")
-    old = await led(fleet, "x", "y", "z")
+    fleet, *old = await booked("x", "y", "z")
     client = fleet.client("one")
     await do(client, book("b", "robot/b", at=300, patience=Decimal(100)), BookingView)
     mine = await client.ask("mine", "robot/b", seconds=100, booking="b")
@@ -210,8 +204,7 @@ async def test_the_older_of_two_fleet_times_goes_on() -> None:
 
 async def test_a_host_that_does_not_answer_turns_no_clock_back() -> None:
     """What others have answered is older by as long as it was waited for."""
-    fleet = BookedFleet("x", "y", "z")
-    x, *_ = await led(fleet, "x", "y", "z")
+    fleet, x, *_ = await booked("x", "y", "z")
     asked = fleet.silent()
     await asyncio.sleep(120)
     assert asked

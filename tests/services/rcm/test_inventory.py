@@ -82,16 +82,15 @@ async def test_it_is_kept_over_a_restart_of_the_only_candidate(tmp_path: Path) -
     await anew.stop()
 
 
-def test_a_file_that_is_none_is_not_used_and_written_anew(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    async def story() -> None:
-        (tmp_path / FILE).write_text('{"written": "now"')
-        fleet = FakeFleet()
-        candidate = fleet.candidate("x", tmp_path)
-        await until(lambda: candidate.rcm)
-        await until(lambda: "homes" not in (tmp_path / FILE).read_text() or "now" not in (tmp_path / FILE).read_text())
-        await candidate.stop()
-
-    run(story())
+async def test_a_file_that_is_none_is_not_used_and_written_anew(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / FILE).write_text('{"written": "now"')
+    fleet = FakeFleet()
+    candidate = fleet.candidate("x", tmp_path)
+    await until(lambda: candidate.rcm)
+    await until(lambda: "homes" not in (tmp_path / FILE).read_text() or "now" not in (tmp_path / FILE).read_text())
+    await candidate.stop()
     assert "can't be read, and is not used" in caplog.text
 
 

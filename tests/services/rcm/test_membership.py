@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from decimal import Decimal
 from typing import Any
 from unittest.mock import ANY
@@ -236,25 +235,20 @@ async def test_what_its_client_gave_up_with_another_leader_ends_once_the_client_
     assert [(one.grant, one.outcome) for one in fleet.published[-1].revoked] == [(HELD.grant, "released")]
 
 
-def test_a_client_that_is_seen_and_does_not_say_what_it_asks_for_is_a_contradiction(
+async def test_a_client_that_is_seen_and_does_not_say_what_it_asks_for_is_a_contradiction(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Its link came back without its queryable: what it gave up would be held for as long as it lives."""
-
-    async def story() -> None:
-        fleet = FakeFleet()
-        fleet.network.disturb({"requests": Disturbance(lost=1.0)})
-        fleet.rcm(5)
-        robots = [holding(fleet, name) for name in HELD.rcs]
-        await fleet.joined(*robots)
-        fleet.client("one")
-        said = "desk/one is seen and does not answer: this process joins the mesh anew"
-        await until(lambda: said in caplog.messages)
-        fleet.network.disturb({})
-        await until(lambda: not any(robot.holders for robot in robots))
-
-    with caplog.at_level(logging.WARNING):
-        run(story())
+    fleet = FakeFleet()
+    fleet.network.disturb({"requests": Disturbance(lost=1.0)})
+    fleet.rcm(5)
+    robots = [holding(fleet, name) for name in HELD.rcs]
+    await fleet.joined(*robots)
+    fleet.client("one")
+    said = "desk/one is seen and does not answer: this process joins the mesh anew"
+    await until(lambda: said in caplog.messages)
+    fleet.network.disturb({})
+    await until(lambda: not any(robot.holders for robot in robots))
 
 
 async def test_what_was_queued_by_the_word_of_an_rc_alone_ends_once_its_client_does_not_ask_for_it() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.mesh.kit import run, until
+from tests.mesh.kit import until
 from tests.services.journal.kit import past
 from tests.services.journal.test_journal import START, Told
 from tests.services.recorder.paper_run import colours, events, lanes
@@ -106,8 +106,8 @@ def test_what_is_not_known_is_told_in_words() -> None:
     assert len(latest.gaps) == 1
 
 
-def test_the_past_is_drawn_paler_and_makes_the_run_no_longer(tmp_path: Path) -> None:
-    path, drive = tmp_path / "run.rrd", PastBar("drive", operator=True)
+def test_the_past_is_drawn_paler_and_makes_the_run_no_longer(path: Path) -> None:
+    drive = PastBar("drive", operator=True)
     with Timeline("lab", path=path) as timeline:
         timeline.holders(0.5, "robot/a", [HolderRow("survey")])
         timeline.past(
@@ -152,37 +152,32 @@ def test_only_the_first_file_has_the_past(tmp_path: Path) -> None:
     assert [states for _, states in lanes(second, "/rc/**")["/rc/robot/a"]] == [[""]]
 
 
-def test_a_recorder_that_comes_late_shows_what_journals_tell(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
-
-    async def story() -> None:
-        told, stop = Told(tmp_path, "x", "y"), asyncio.Event()
-        fleet = told.fleet
-        robots = [fleet.rc(f"robot/{name}") for name in "ab"]
-        await until(lambda: told.candidates["x"].rcm)
-        await fleet.joined(*robots)
-        one, two = fleet.client("one"), fleet.client("two")
-        await one.ask("survey", "robot/a", seconds=6_000)
-        await two.ask("film", "robot/b", seconds=600)
-        await asyncio.sleep(100)
-        await two.do(Release("film"))
-        await asyncio.sleep(50)
-        here = fleet.mesh("basil", "recorder")
-        with Timeline("lab", path=path, wall=True) as timeline:
-            recorder = Recorder(here, fleet.fleet, timeline, past=3_600, wall=lambda: START + here.now() / 10**9)
-            recording = asyncio.create_task(recorder.run(stop))
-            seen: list[Token] = []
-            fleet.watcher.watch(fleet.watcher.keys.alive_any(Role.RECORDER), lambda token, _: seen.append(token))
-            await until(lambda: seen)
-            await until(lambda: timeline.layout(live=True).past)
-            # What happens now is not the past, though the journals have it too.
-            await two.ask("again", "robot/b", seconds=600)
-            await asyncio.sleep(10)
-            stop.set()
-            await recording
-        await told.close()
-
-    run(story())
+async def test_a_recorder_that_comes_late_shows_what_journals_tell(path: Path, tmp_path: Path) -> None:
+    told, stop = Told(tmp_path, "x", "y"), asyncio.Event()
+    fleet = told.fleet
+    robots = [fleet.rc(f"robot/{name}") for name in "ab"]
+    await until(lambda: told.candidates["x"].rcm)
+    await fleet.joined(*robots)
+    one, two = fleet.client("one"), fleet.client("two")
+    await one.ask("survey", "robot/a", seconds=6_000)
+    await two.ask("film", "robot/b", seconds=600)
+    await asyncio.sleep(100)
+    await two.do(Release("film"))
+    await asyncio.sleep(50)
+    here = fleet.mesh("basil", "recorder")
+    with Timeline("lab", path=path, wall=True) as timeline:
+        recorder = Recorder(here, fleet.fleet, timeline, past=3_600, wall=lambda: START + here.now() / 10**9)
+        recording = asyncio.create_task(recorder.run(stop))
+        seen: list[Token] = []
+        fleet.watcher.watch(fleet.watcher.keys.alive_any(Role.RECORDER), lambda token, _: seen.append(token))
+        await until(lambda: seen)
+        await until(lambda: timeline.layout(live=True).past)
+        # What happens now is not the past, though the journals have it too.
+        await two.ask("again", "robot/b", seconds=600)
+        await asyncio.sleep(10)
+        stop.set()
+        await recording
+    await told.close()
     found = lanes(path, "/rc/**")
     assert [states for _, states in found["/rc/robot/a"]] == [["survey (journal)"], [""], ["survey"]]
     assert [states for _, states in found["/rc/robot/b"]] == [["film (journal)"], [""], [""], ["again"]]
