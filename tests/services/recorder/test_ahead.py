@@ -13,16 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.mesh.kit import until
-from tests.services.rcm.booked_fleet import NOON, BookedFleet, book, do, led
+from tests.services.rcm.booked_fleet import NOON, book, do
+from tests.services.rcm.booked_fleet import booked as booked_fleet
+from tests.services.recorder.kit import recording
 from tests.services.recorder.paper_run import events, rows
-from zscout.keyexpr import Role, Token
 from zscout.messages import BookedDate, BookingsTold, BookingView, Unbook
 from zscout.services.recorder.ahead import LEFT, MARGIN, MAX_BARS, Bar, ChartLayer, rows_of
 from zscout.services.recorder.ahead import chart as chart_of_rows
 from zscout.services.recorder.blueprint import AHEAD, CHART_HEAD, CHART_WIDTH, MAX_CHART_ROWS, Ahead, chart_row
 from zscout.services.recorder.bookings import AGAIN, MAX_TOLD, STALE
 from zscout.services.recorder.colours import ALERT, FAILED, MAINTENANCE, PALETTE
-from zscout.services.recorder.recorder import Recorder
 from zscout.services.recorder.timeline import Timeline
 
 HOUR, DAY = 3_600, 86_400
@@ -261,22 +261,11 @@ def test_outlines_have_the_colour_of_what_they_are_and_go_on_with_time(path: Pat
 # On the mesh
 
 
-async def recorder_sees(fleet: BookedFleet, timeline: Timeline, stop: asyncio.Event) -> asyncio.Task[None]:
-    recorder = Recorder(fleet.mesh("basil", "recorder"), fleet.fleet, timeline, wall=fleet.time)
-    recording = asyncio.create_task(recorder.run(stop))
-    seen: list[Token] = []
-    fleet.watcher.watch(fleet.watcher.keys.alive_any(Role.RECORDER), lambda token, _: seen.append(token))
-    await until(lambda: seen)
-    return recording
-
-
 @pytest.mark.parametrize("maintenance", [False, True])
 async def test_a_booking_appears_and_vanishes(path: Path, maintenance: bool) -> None:
-    fleet, stop = BookedFleet("x"), asyncio.Event()
-    await led(fleet, "x")
-    client = fleet.client("one")
-    with Timeline("lab", path=path, wall=True) as timeline:
-        recording = await recorder_sees(fleet, timeline, stop)
+    fleet, *_ = await booked_fleet("x")
+    client, here = fleet.client("one"), fleet.mesh("basil", "recorder")
+    async with recording(path, here, fleet.watcher, fleet.fleet, clock=True, wall=fleet.time) as timeline:
         await asyncio.sleep(1)
         needs = ["robot/a", "robot/b" if maintenance else "robot/*"]
         what = book("crew", *needs, at=2 * HOUR, seconds=HOUR, maintenance=maintenance)
@@ -285,8 +274,6 @@ async def test_a_booking_appears_and_vanishes(path: Path, maintenance: bool) -> 
         await do(client, Unbook("crew"), BookingView)
         await until(lambda: timeline.bookings.rows == 0)
         assert timeline.layout(live=True).ahead == 0
-        stop.set()
-        await recording
     name = "maintenance: crew" if maintenance else "crew"
     # Erased, not left where it was.
     assert [names for _, names in drawn(path)] == [[name, name]]

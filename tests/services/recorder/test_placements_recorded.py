@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
-from tests.hang import HANG
-from tests.live.lab import Lab
+from tests.services.recorder.kit import ears, recording
 from tests.services.recorder.paper_run import colours, events, lanes, rows
 from tests.services.recorder.placed_hour import TERM, placement, play
-from zscout.behaviors.client.client import Client
-from zscout.keyexpr import Sender
-from zscout.mesh import IncomingQuery, ZenohMesh
+from tests.services.recorder.test_service import Leader
+from zscout.mesh import IncomingQuery
 from zscout.messages import ComponentUse, ListPlacements, Placement, Placements, PlacerOperation
 from zscout.services.recorder import hosts as module
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.hosts import HostTracker
-from zscout.services.recorder.recorder import Recorder
 from zscout.services.recorder.timeline import Timeline
+from zscout.testing.memory import MemoryNetwork
 from zscout.types import Term
-
-REAL_TIME = True
 
 SCALARS = "Scalars:scalars"
 
@@ -199,43 +194,21 @@ def test_marks_of_one_moment_stand_above_each_other(path: Path) -> None:
     assert heights[0] < heights[1] < heights[2]
 
 
-@pytest.mark.live
-async def test_a_recorder_hears_a_placer_and_asks_for_what_it_missed(path: Path, tmp_path: Path) -> None:
-    """The words are a placer's, the mesh is real."""
-    async with Lab(tmp_path) as lab:
-        speaker: Client = await lab.client("speaker")
-        mesh, asked = speaker.mesh, asyncio.Event()
+async def test_a_recorder_hears_a_placer_and_asks_for_what_it_missed(path: Path) -> None:
+    network = MemoryNetwork()
+    mesh = Leader(network).mesh
 
-        def answer(request: IncomingQuery[PlacerOperation]) -> None:
-            assert isinstance(request.message, ListPlacements)
-            request.answer(Placements(TERM, [placement("counter", "running", "anvil", 1)]))
-            asked.set()
+    def list_all(query: IncomingQuery[PlacerOperation]) -> None:
+        assert isinstance(query.message, ListPlacements)
+        query.answer(Placements(TERM, [placement("counter", "running", "anvil", 1)]))
 
-        served = mesh.serve(mesh.keys.placer(mesh.me), PlacerOperation, answer)
-        fleet = lab.fleet
-        async with await ZenohMesh.open(fleet, Sender("here", "recorder")) as ears:
-            with Timeline("lab", path=path) as timeline:
-                there, stop = asyncio.Event(), asyncio.Event()
-                show = timeline.hosts.lanes.show
-
-                def seen(at: float, name: str, shown: Mapping[str, tuple[str, int]]) -> None:
-                    show(at, name, shown)
-                    there.set()
-
-                timeline.hosts.lanes.show = seen  # type: ignore[method-assign]
-                recording = asyncio.create_task(Recorder(ears, fleet, timeline).run(stop))
-                async with asyncio.timeout(HANG):
-                    await asked.wait()
-                    await there.wait()
-                    there.clear()
-                    mesh.put(
-                        mesh.keys.placements,
-                        Placements(TERM, [placement("counter", "running", "basil", 2, moves=1, dead=0.5)]),
-                    )
-                    await there.wait()
-                stop.set()
-                await recording
-        served.close()
+    served = mesh.serve(mesh.keys.placer(mesh.me), PlacerOperation, list_all)
+    async with recording(path, ears(network), mesh):
+        await asyncio.sleep(1)
+        moved = placement("counter", "running", "basil", 2, moves=1, dead=0.5)
+        mesh.put(mesh.keys.placements, Placements(TERM, [moved]))
+        await asyncio.sleep(1)
+    served.close()
     assert [text for text in events(path) if text.startswith("counter")] == [
         "counter (counter) runs on anvil already",
         "counter moved anvil -> basil, dead 500 ms",
