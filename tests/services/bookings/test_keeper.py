@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from tests.mesh.kit import run
 from zscout.keyexpr import Sender
 from zscout.messages import BookingRecord, Grants
 from zscout.services.bookings.keeper import ASIDE, FILE, BookingFile, BookingKeeper
@@ -24,58 +23,49 @@ def record(name: str, **more: Any) -> BookingRecord:
     return BookingRecord(name, name, {"robot/a": {}}, 0, round(NOON), Decimal(60), Decimal(60), **more)
 
 
-def test_a_publication_that_comes_late_turns_no_clock_back() -> None:
-    async def story() -> None:
-        keeper = BookingKeeper(MemoryNetwork().open("zscout", Sender("x", "node")))
-        assert keeper.time is None
-        begun = asyncio.get_running_loop().time()
+async def test_a_publication_that_comes_late_turns_no_clock_back() -> None:
+    keeper = BookingKeeper(MemoryNetwork().open("zscout", Sender("x", "node")))
+    assert keeper.time is None
+    begun = asyncio.get_running_loop().time()
 
-        def hear(late: float, term: int = 1, ahead: float = 0.0, age: float = 100.0) -> float:
-            """By how much fleet time here is behind what the leader means. `age`: of its time at the beginning."""
-            gone = asyncio.get_running_loop().time() - begun
-            true = NOON + ahead + gone
-            held = max(0.0, age + gone - late)
-            keeper.hear(Grants(Term(term, "x"), 1, 1, 0.5, {}, [], time=true - late, time_age=held))
-            assert keeper.time is not None
-            return true - keeper.time / SECOND
+    def hear(late: float, term: int = 1, ahead: float = 0.0, age: float = 100.0) -> float:
+        """By how much fleet time here is behind what the leader means. `age`: of its time at the beginning."""
+        gone = asyncio.get_running_loop().time() - begun
+        true = NOON + ahead + gone
+        held = max(0.0, age + gone - late)
+        keeper.hear(Grants(Term(term, "x"), 1, 1, 0.5, {}, [], time=true - late, time_age=held))
+        assert keeper.time is not None
+        return true - keeper.time / SECOND
 
-        assert hear(0.0) == pytest.approx(0, abs=1e-3)
-        await asyncio.sleep(0.5)
-        assert hear(2.0) == pytest.approx(0, abs=0.02)
-        await asyncio.sleep(0.5)
-        assert hear(5.0) == pytest.approx(0, abs=0.03)
-        await asyncio.sleep(0.5)
-        assert hear(0.0) == pytest.approx(0, abs=1e-3)
-        # What is slewed is followed. A leader of another half is believed if its time has gone on for longer.
-        await asyncio.sleep(10)
-        assert hear(0.0, ahead=-0.1) == pytest.approx(0, abs=1e-3)
-        assert hear(0.0, term=2, ahead=-60, age=1) == pytest.approx(-60, abs=0.2)
-        assert hear(0.0, term=3, ahead=-60, age=900) == pytest.approx(0, abs=1e-3)
-        # What another leader said first may have waited here while this process stood still: in seed 523 for 1.1 s.
-        await asyncio.sleep(1)
-        assert hear(1.4, term=4, ahead=-60, age=900) == pytest.approx(0, abs=0.03)
-        await asyncio.sleep(0.5)
-        assert hear(0.8, term=5, ahead=-60, age=900) == pytest.approx(0, abs=0.04)
-        # It is gone towards where that leader is behind in truth.
-        await asyncio.sleep(0.5)
-        assert hear(0.0, term=6, ahead=-61, age=900) == pytest.approx(-1, abs=0.05)
-        await asyncio.sleep(60)
-        assert hear(0.0, term=6, ahead=-61, age=900) == pytest.approx(0, abs=1e-3)
-
-    run(story())
+    assert hear(0.0) == pytest.approx(0, abs=1e-3)
+    await asyncio.sleep(0.5)
+    assert hear(2.0) == pytest.approx(0, abs=0.02)
+    await asyncio.sleep(0.5)
+    assert hear(5.0) == pytest.approx(0, abs=0.03)
+    await asyncio.sleep(0.5)
+    assert hear(0.0) == pytest.approx(0, abs=1e-3)
+    # What is slewed is followed. A leader of another half is believed if its time has gone on for longer.
+    await asyncio.sleep(10)
+    assert hear(0.0, ahead=-0.1) == pytest.approx(0, abs=1e-3)
+    assert hear(0.0, term=2, ahead=-60, age=1) == pytest.approx(-60, abs=0.2)
+    assert hear(0.0, term=3, ahead=-60, age=900) == pytest.approx(0, abs=1e-3)
+    # What another leader said first may have waited here while this process stood still: in seed 523 for 1.1 s.
+    await asyncio.sleep(1)
+    assert hear(1.4, term=4, ahead=-60, age=900) == pytest.approx(0, abs=0.03)
+    await asyncio.sleep(0.5)
+    assert hear(0.8, term=5, ahead=-60, age=900) == pytest.approx(0, abs=0.04)
+    # It is gone towards where that leader is behind in truth.
+    await asyncio.sleep(0.5)
+    assert hear(0.0, term=6, ahead=-61, age=900) == pytest.approx(-1, abs=0.05)
+    await asyncio.sleep(60)
+    assert hear(0.0, term=6, ahead=-61, age=900) == pytest.approx(0, abs=1e-3)
 
 
-def test_a_file_is_read_as_it_was_written(tmp_path: Path) -> None:
-    async def story() -> None:
-        records = [
-            record("one", unbooked=True),
-            record("two", every=1, until=round(NOON) + 86_400, dropped=[round(NOON)]),
-        ]
-        await BookingFile(tmp_path, "zscout").write(records)
-        assert BookingFile(tmp_path, "zscout").read() == records
-        assert (tmp_path / FILE).stat().st_mode & 0o777 == 0o600
-
-    asyncio.run(story())
+async def test_a_file_is_read_as_it_was_written(tmp_path: Path) -> None:
+    records = [record("one", unbooked=True), record("two", every=1, until=round(NOON) + 86_400, dropped=[round(NOON)])]
+    await BookingFile(tmp_path, "zscout").write(records)
+    assert BookingFile(tmp_path, "zscout").read() == records
+    assert (tmp_path / FILE).stat().st_mode & 0o777 == 0o600
 
 
 def test_a_file_of_another_fleet_is_not_used(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -16,6 +16,8 @@ from zscout.services.metrics.figures import FAMILIES, Histogram, Samples
 from zscout.services.metrics.server import MetricsServer
 from zscout.services.plain_http import MAX_CONNECTIONS, MAX_HEAD
 
+REAL_TIME = True
+
 
 def everything() -> Samples:
     """Each metric once."""
@@ -49,24 +51,21 @@ async def say(server: MetricsServer, request: bytes) -> bytes:
         writer.close()
 
 
-def test_each_metric_is_written_as_its_family_says() -> None:
-    async def story() -> None:
-        async with served() as server:
-            head, _, text = (await say(server, b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n")).partition(b"\r\n\r\n")
-        assert head.splitlines()[0] == b"HTTP/1.1 200 OK"
-        assert f"Content-Length: {len(text)}".encode() in head
-        found = {family.name: family for family in text_string_to_metric_families(text.decode())}
-        assert "process_cpu_seconds" in found
-        for name, family in FAMILIES.items():
-            written = found[name.removesuffix("_total")]
-            assert (written.type, written.documentation) == (family.kind, family.help)
-            for sample in written.samples:
-                assert {*sample.labels} - {"le"} == {*family.labels}
-                assert all(sample.labels[label] == f'a "{label}"\n' for label in family.labels)
-        buckets = [(one.labels["le"], one.value) for one in found["zscout_forecast_error_seconds"].samples]
-        assert buckets == [("-1.0", 0), ("0.0", 0), ("2.5", 1), ("+Inf", 1)]
-
-    asyncio.run(story())
+async def test_each_metric_is_written_as_its_family_says() -> None:
+    async with served() as server:
+        head, _, text = (await say(server, b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n")).partition(b"\r\n\r\n")
+    assert head.splitlines()[0] == b"HTTP/1.1 200 OK"
+    assert f"Content-Length: {len(text)}".encode() in head
+    found = {family.name: family for family in text_string_to_metric_families(text.decode())}
+    assert "process_cpu_seconds" in found
+    for name, family in FAMILIES.items():
+        written = found[name.removesuffix("_total")]
+        assert (written.type, written.documentation) == (family.kind, family.help)
+        for sample in written.samples:
+            assert {*sample.labels} - {"le"} == {*family.labels}
+            assert all(sample.labels[label] == f'a "{label}"\n' for label in family.labels)
+    buckets = [(one.labels["le"], one.value) for one in found["zscout_forecast_error_seconds"].samples]
+    assert buckets == [("-1.0", 0), ("0.0", 0), ("2.5", 1), ("+Inf", 1)]
 
 
 @pytest.mark.parametrize(
@@ -79,43 +78,33 @@ def test_each_metric_is_written_as_its_family_says() -> None:
         (b"\x16\x03\x01\r\n\r\n", b"HTTP/1.1 404 Not Found\r\n"),
     ],
 )
-def test_other_requests_are_answered_in_a_line(request_: bytes, answer: bytes) -> None:
-    async def story() -> None:
-        async with served() as server:
-            assert (await say(server, request_)).startswith(answer)
-
-    asyncio.run(story())
+async def test_other_requests_are_answered_in_a_line(request_: bytes, answer: bytes) -> None:
+    async with served() as server:
+        assert (await say(server, request_)).startswith(answer)
 
 
-def test_who_sends_too_much_or_nothing_is_shut_out(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_who_sends_too_much_or_nothing_is_shut_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(plain_http, "TIMEOUT", 0.2)
-
-    async def story() -> None:
-        async with served() as server:
-            assert await say(server, b"x" * 10 * MAX_HEAD) in (b"", b"reset")
-            assert await say(server, b"GET /metrics HTTP/1.1\r\n") in (b"", b"reset")
-
-    asyncio.run(story())
+    async with served() as server:
+        assert await say(server, b"x" * 10 * MAX_HEAD) in (b"", b"reset")
+        assert await say(server, b"GET /metrics HTTP/1.1\r\n") in (b"", b"reset")
 
 
-def test_so_many_are_served_at_one_time_and_then_there_is_room_again() -> None:
-    async def story() -> None:
-        async with served() as server:
-            waiting = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(MAX_CONNECTIONS)]
-            # The last one that was let in has been seen once one more is turned away.
-            assert await say(server, b"") in (b"", b"reset")
-            for _, writer in waiting:
-                writer.write(b"GET /metrics HTTP/1.1\r\n\r\n")
-            answers = await asyncio.gather(*(reader.read() for reader, _ in waiting))
-            assert all(b" 200 OK" in answer for answer in answers)
-            for _, writer in waiting:
-                writer.close()
-            assert b" 200 OK" in await say(server, b"GET /metrics HTTP/1.1\r\n\r\n")
-
-    asyncio.run(story())
+async def test_so_many_are_served_at_one_time_and_then_there_is_room_again() -> None:
+    async with served() as server:
+        waiting = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(MAX_CONNECTIONS)]
+        # The last one that was let in has been seen once one more is turned away.
+        assert await say(server, b"") in (b"", b"reset")
+        for _, writer in waiting:
+            writer.write(b"GET /metrics HTTP/1.1\r\n\r\n")
+        answers = await asyncio.gather(*(reader.read() for reader, _ in waiting))
+        assert all(b" 200 OK" in answer for answer in answers)
+        for _, writer in waiting:
+            writer.close()
+        assert b" 200 OK" in await say(server, b"GET /metrics HTTP/1.1\r\n\r\n")
 
 
-def test_figures_are_read_once_a_second_however_many_ask(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_figures_are_read_once_a_second_however_many_ask(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(figures_server, "FRESH", HANG)  # or once in whatever this takes
     read = 0
 
@@ -124,24 +113,18 @@ def test_figures_are_read_once_a_second_however_many_ask(monkeypatch: pytest.Mon
         read += 1
         return everything()
 
-    async def story() -> None:
-        async with served(samples) as server:
-            asks = (say(server, b"GET /metrics HTTP/1.1\r\n\r\n") for _ in range(MAX_CONNECTIONS))
-            answers = {*await asyncio.gather(*asks)}
-            assert len(answers) == 1
-        assert read == 1
-
-    asyncio.run(story())
+    async with served(samples) as server:
+        asks = (say(server, b"GET /metrics HTTP/1.1\r\n\r\n") for _ in range(MAX_CONNECTIONS))
+        answers = {*await asyncio.gather(*asks)}
+        assert len(answers) == 1
+    assert read == 1
 
 
-def test_a_fault_of_the_figures_is_logged_and_ends_nothing(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_fault_of_the_figures_is_logged_and_ends_nothing(caplog: pytest.LogCaptureFixture) -> None:
     def samples() -> Samples:
         raise KeyError("a fault")
 
-    async def story() -> None:
-        async with served(samples) as server:
-            for _ in range(3):
-                assert await say(server, b"GET /metrics HTTP/1.1\r\n\r\n") in (b"", b"reset")
-
-    asyncio.run(story())
+    async with served(samples) as server:
+        for _ in range(3):
+            assert await say(server, b"GET /metrics HTTP/1.1\r\n\r\n") in (b"", b"reset")
     assert [record.message for record in caplog.records] == ["figures can't be served: KeyError('a fault')"]

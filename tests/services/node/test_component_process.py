@@ -26,6 +26,9 @@ from zscout.services.node.component_process import ComponentProcess
 from zscout.services.node.limits import ControlGroups
 from zscout.types import SECOND
 
+REAL_TIME = True
+pytestmark = pytest.mark.live
+
 
 def play(
     folder: Path,
@@ -111,56 +114,50 @@ def test_who_ends_before_it_has_answered_is_not_waited_for(tmp_path: Path) -> No
     assert (process.ended, process.reason) == ("stopped", "")
 
 
-def test_who_is_stopped_before_it_is_ready_ends(tmp_path: Path) -> None:
-    async def story() -> None:
-        fleet = default_fleet()
-        start = StartComponent("c", 1, ComponentSpec("Never"))
-        process = ComponentProcess(
-            "h",
-            fleet,
-            time.monotonic_ns,
-            ControlGroups(tmp_path),
-            start,
-            "tests.behaviors.components.odd:Never",
-            lambda _: None,
-        )
-        failures: list[Exception] = []
-        process.begin(Supervisor("test", failures.append))
-        began = asyncio.get_running_loop().time()
-        await process.stop(0.5)
-        assert asyncio.get_running_loop().time() - began < fleet.placement.start_timeout / SECOND
-        assert (process.phase, process.ended) == ("ended", "stopped")
-        assert process.settled.is_set()
-
-    asyncio.run(story())
+async def test_who_is_stopped_before_it_is_ready_ends(tmp_path: Path) -> None:
+    fleet = default_fleet()
+    start = StartComponent("c", 1, ComponentSpec("Never"))
+    process = ComponentProcess(
+        "h",
+        fleet,
+        time.monotonic_ns,
+        ControlGroups(tmp_path),
+        start,
+        "tests.behaviors.components.odd:Never",
+        lambda _: None,
+    )
+    failures: list[Exception] = []
+    process.begin(Supervisor("test", failures.append))
+    began = asyncio.get_running_loop().time()
+    await process.stop(0.5)
+    assert asyncio.get_running_loop().time() - began < fleet.placement.start_timeout / SECOND
+    assert (process.phase, process.ended) == ("ended", "stopped")
+    assert process.settled.is_set()
 
 
-def test_the_last_word_of_who_has_left_counts_though_an_order_to_it_fails(tmp_path: Path) -> None:
-    async def story() -> None:
-        start, last = StartComponent("c", 1, ComponentSpec("counter")), EndReport("moved")
-        process = ComponentProcess(
-            "h", default_fleet(), time.monotonic_ns, ControlGroups(tmp_path), start, "x:y", lambda _: None
-        )
-        process._supervisor = Supervisor("test", lambda _: None)
-        ours, theirs = socket.socketpair()
-        code = (
-            "import os, socket, sys\n"
-            "node = socket.socket(fileno=int(sys.argv[1]))\n"
-            "node.makefile('rb').readline()\n"
-            "sys.stdin.readline()\n"
-            "node.sendall(bytes.fromhex(sys.argv[2]))\n"
-            "os._exit(0)\n"
-        )
-        command = [sys.executable, "-c", code, str(theirs.fileno()), channel.pack(last).hex()]
-        with theirs:
-            child = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdin=subprocess.PIPE)  # noqa: ASYNC220
-        serving = asyncio.create_task(process._serve_connection(ours, child))
-        while process._orders is None or not process._orders.empty():  # noqa: ASYNC110 - a test waits for any state
-            await asyncio.sleep(0.001)
-        # Nothing is read before it has left.
-        child.communicate(b"\n")
-        process._send(Order(0, StopComponent("c")))
-        await serving
-        assert process._end_report == last
-
-    asyncio.run(story())
+async def test_the_last_word_of_who_has_left_counts_though_an_order_to_it_fails(tmp_path: Path) -> None:
+    start, last = StartComponent("c", 1, ComponentSpec("counter")), EndReport("moved")
+    process = ComponentProcess(
+        "h", default_fleet(), time.monotonic_ns, ControlGroups(tmp_path), start, "x:y", lambda _: None
+    )
+    process._supervisor = Supervisor("test", lambda _: None)
+    ours, theirs = socket.socketpair()
+    code = (
+        "import os, socket, sys\n"
+        "node = socket.socket(fileno=int(sys.argv[1]))\n"
+        "node.makefile('rb').readline()\n"
+        "sys.stdin.readline()\n"
+        "node.sendall(bytes.fromhex(sys.argv[2]))\n"
+        "os._exit(0)\n"
+    )
+    command = [sys.executable, "-c", code, str(theirs.fileno()), channel.pack(last).hex()]
+    with theirs:
+        child = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdin=subprocess.PIPE)  # noqa: ASYNC220
+    serving = asyncio.create_task(process._serve_connection(ours, child))
+    while process._orders is None or not process._orders.empty():  # noqa: ASYNC110 - a test waits for any state
+        await asyncio.sleep(0.001)
+    # Nothing is read before it has left.
+    child.communicate(b"\n")
+    process._send(Order(0, StopComponent("c")))
+    await serving
+    assert process._end_report == last

@@ -22,6 +22,8 @@ from zscout.services.notify.notices import Notification
 from zscout.services.notify.notifier import QUEUE, Notifier
 from zscout.types import SECOND
 
+REAL_TIME = True
+
 WHERE = Where("anvil.toml", ("notify",))
 NEWS = Notification("preempted", "ada", "a title", "a body")
 
@@ -35,37 +37,30 @@ def started(made: Notifier) -> Notifier:
     return made
 
 
-def test_it_arrives_as_text_at_the_urls_and_at_the_user_concerned() -> None:
-    async def story() -> None:
-        with Receiver() as lab, Receiver() as ada, Receiver() as bob:
-            table = NotifyTable((lab.url,), ("yours_now",), {"ada": (ada.url,), "bob": (bob.url,)}, after=SECOND)
-            telling = started(notifier(table))
-            telling.tell(NEWS)  # of what the lab's URL does not hear
-            telling.holds.on_began(of(ADA, 100))
-            await asyncio.to_thread(lab.until, lambda: len(lab.heard) == 1)
-            await asyncio.to_thread(ada.until, lambda: len(ada.heard) == 2)
-            telling.stop()
-            assert lab.titles == ["zscout lab: survey is yours now"]
-            assert ada.titles == ["a title", *lab.titles]
-            assert lab.heard[0]["message"] == "ada@ws1 (survey.py) holds robot/a after a wait of 1 min 40 s"
-            assert bob.heard == []
-
-    asyncio.run(story())
+async def test_it_arrives_as_text_at_the_urls_and_at_the_user_concerned() -> None:
+    with Receiver() as lab, Receiver() as ada, Receiver() as bob:
+        table = NotifyTable((lab.url,), ("yours_now",), {"ada": (ada.url,), "bob": (bob.url,)}, after=SECOND)
+        telling = started(notifier(table))
+        telling.tell(NEWS)  # of what the lab's URL does not hear
+        telling.holds.on_began(of(ADA, 100))
+        await asyncio.to_thread(lab.until, lambda: len(lab.heard) == 1)
+        await asyncio.to_thread(ada.until, lambda: len(ada.heard) == 2)
+        telling.stop()
+        assert lab.titles == ["zscout lab: survey is yours now"]
+        assert ada.titles == ["a title", *lab.titles]
+        assert lab.heard[0]["message"] == "ada@ws1 (survey.py) holds robot/a after a wait of 1 min 40 s"
+        assert bob.heard == []
     # A node does without the 28 MB of all the services that Apprise knows.
     assert "apprise" not in sys.modules
 
 
-def test_apprise_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+async def test_apprise_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     telling = notifier(NotifyTable(("json://localhost",)))
     monkeypatch.setattr(apprise_process, "TIMEOUT", 0.001)
     telling.tell(NEWS)
-
-    async def story() -> None:
-        telling.start()
-        await asyncio.to_thread(telling._waiting.join)
-        telling.stop()
-
-    asyncio.run(story())
+    telling.start()
+    await asyncio.to_thread(telling._waiting.join)
+    telling.stop()
     assert [record.getMessage() for record in caplog.records] == [
         "notify.urls[0] was not told, in 3 attempts: Apprise has not ended within 0.001 s"
     ]
@@ -73,34 +68,27 @@ def test_apprise_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch, caplog: py
         notifier(NotifyTable(("json://localhost",)))
 
 
-def test_what_is_refused_is_tried_again() -> None:
-    async def story() -> None:
-        with Receiver(refuses=2) as lab:
-            telling = started(notifier(NotifyTable((lab.url,))))
-            telling.tell(NEWS)
-            await asyncio.to_thread(lab.until, lambda: len(lab.heard) == 1)
-            telling.stop()
-            assert lab.asked == 3
-
-    asyncio.run(story())
+async def test_what_is_refused_is_tried_again() -> None:
+    with Receiver(refuses=2) as lab:
+        telling = started(notifier(NotifyTable((lab.url,))))
+        telling.tell(NEWS)
+        await asyncio.to_thread(lab.until, lambda: len(lab.heard) == 1)
+        telling.stop()
+        assert lab.asked == 3
 
 
-def test_who_can_not_be_reached_is_logged_once_without_its_url_and_holds_up_nobody(
+async def test_who_can_not_be_reached_is_logged_once_without_its_url_and_holds_up_nobody(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.DEBUG)
-
-    async def story() -> None:
-        with Receiver(refuses=1_000) as broken, Receiver() as lab:
-            telling = started(notifier(NotifyTable((broken.url, lab.url), per_minute=600)))
-            for number in range(2):
-                telling.tell(NEWS._replace(title=f"{number}"))
-            await asyncio.to_thread(lab.until, lambda: len(lab.heard) == 2)
-            telling.stop()
-            # Once it has failed it is left alone for a while.
-            assert broken.asked == 3
-
-    asyncio.run(story())
+    with Receiver(refuses=1_000) as broken, Receiver() as lab:
+        telling = started(notifier(NotifyTable((broken.url, lab.url), per_minute=600)))
+        for number in range(2):
+            telling.tell(NEWS._replace(title=f"{number}"))
+        await asyncio.to_thread(lab.until, lambda: len(lab.heard) == 2)
+        telling.stop()
+        # Once it has failed it is left alone for a while.
+        assert broken.asked == 3
     lines = [record.getMessage() for record in caplog.records if record.name.startswith("zscout")]
     assert lines == [
         "notify.urls[0] was not told, in 3 attempts: it did not take it",
@@ -109,37 +97,31 @@ def test_who_can_not_be_reached_is_logged_once_without_its_url_and_holds_up_nobo
     assert Receiver.SECRET not in caplog.text
 
 
-def test_what_is_too_much_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
-    async def story() -> None:
-        with Receiver() as lab:
-            # It has not begun to send.
-            telling = notifier(NotifyTable((lab.url,), per_minute=1))
-            for _ in range(QUEUE + 5):
-                telling.tell(NEWS)
-            telling.start()
-            await asyncio.to_thread(lab.until, lambda: len(lab.heard) == 1)
-            await asyncio.to_thread(telling._waiting.join)
-            telling.stop()
-            assert len(lab.heard) == 1
-
-    asyncio.run(story())
+async def test_what_is_too_much_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
+    with Receiver() as lab:
+        # It has not begun to send.
+        telling = notifier(NotifyTable((lab.url,), per_minute=1))
+        for _ in range(QUEUE + 5):
+            telling.tell(NEWS)
+        telling.start()
+        await asyncio.to_thread(lab.until, lambda: len(lab.heard) == 1)
+        await asyncio.to_thread(telling._waiting.join)
+        telling.stop()
+        assert len(lab.heard) == 1
     assert [record.getMessage() for record in caplog.records] == [
         f"{QUEUE} notifications wait to be sent: one is left out",
         "notify.urls[0]: more than 1 a minute, the rest is left out",
     ]
 
 
-def test_certificates_are_looked_at_while_this_node_leads() -> None:
-    async def story() -> None:
-        with Receiver() as lab:
-            reports: list[LoadReport] = []
-            telling = started(notifier(NotifyTable((lab.url,)), lambda: reports, look=0.01))
-            reports.append(report("anvil", 86_400, renew=True))
-            await asyncio.to_thread(lab.until, lambda: len(lab.heard) == 1)
-            telling.stop()
-            assert lab.titles == ["zscout lab: the certificate of anvil ends in 1.0 days"]
-
-    asyncio.run(story())
+async def test_certificates_are_looked_at_while_this_node_leads() -> None:
+    with Receiver() as lab:
+        reports: list[LoadReport] = []
+        telling = started(notifier(NotifyTable((lab.url,)), lambda: reports, look=0.01))
+        reports.append(report("anvil", 86_400, renew=True))
+        await asyncio.to_thread(lab.until, lambda: len(lab.heard) == 1)
+        telling.stop()
+        assert lab.titles == ["zscout lab: the certificate of anvil ends in 1.0 days"]
 
 
 def test_a_url_is_in_no_repr() -> None:

@@ -9,8 +9,9 @@ from typing import Any, TypeVar
 import msgspec
 
 from tests.mesh.kit import until
+from tests.services.kit import MemoryFleet, answer
 from zscout.config.fleet import default_fleet
-from zscout.keyexpr import Role, Sender, Token
+from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Refused
 from zscout.messages import (
     ComponentList,
@@ -25,7 +26,6 @@ from zscout.messages import (
     Placement,
     Placements,
     PlacerOperation,
-    Problem,
     RankAsk,
     StartComponent,
     StopComponent,
@@ -33,17 +33,11 @@ from zscout.messages import (
 from zscout.placement.events import Inherited
 from zscout.services.placement.component_placer import ComponentPlacer
 from zscout.services.placement.load_balancer import LoadBalancer
-from zscout.testing.memory import MemoryMesh, MemoryNetwork
+from zscout.testing.memory import MemoryMesh
 from zscout.types import Term
 
 JOB = ComponentSpec("job")
 R = TypeVar("R")
-
-
-class Refusal(Exception):
-    def __init__(self, problem: Problem) -> None:
-        super().__init__(f"{problem.code}: {problem.message}")
-        self.code = problem.code
 
 
 @dataclass
@@ -125,22 +119,17 @@ class FakeNode:
                 raise AssertionError(operation)
 
 
-class PlacerFleet:
-    """Processes on one network; `published` are the placements that were published, the newest last."""
+class PlacerFleet(MemoryFleet):
+    """`published` are the placements that were published, the newest last."""
 
     def __init__(self, *hosts: str) -> None:
-        self.network = MemoryNetwork()
-        self.watcher = self.mesh("watcher", "all")
+        super().__init__()
         self.published: list[Placement] = []
-        self.failures: list[Exception] = []
         self.watcher.subscribe(self.watcher.keys.placements, Placements, self._on_placements)
         self.leader = self.mesh("leader")
         self.nodes: dict[str, FakeNode] = {}
         for host in hosts:
             self.node(host)
-
-    def mesh(self, host: str, client: str = "node") -> MemoryMesh:
-        return self.network.open("test", Sender(host, client))
 
     def node(self, host: str, **how: Any) -> FakeNode:
         node = self.nodes[host] = FakeNode(self.mesh(host), others=self.nodes, **how)
@@ -179,9 +168,4 @@ class PlacerFleet:
         """The answer of placer or balancer. Raises Refusal."""
         keys = self.watcher.keys
         key = keys.rank if isinstance(operation, RankAsk) else keys.placer(self.watcher.me)
-        reply = await self.watcher.ask_one(key, operation, kind, timeout=timeout)
-        assert reply is not None, "no answer"
-        if reply.message is None:
-            assert reply.problem is not None
-            raise Refusal(reply.problem)
-        return reply.message
+        return await answer(self.watcher, key, operation, kind, timeout)

@@ -8,10 +8,12 @@ from decimal import Decimal
 from typing import Any, TypeVar
 
 from tests.mesh.kit import until
-from tests.services.rcm.kit import FakeClient, FakeFleet, Refusal, request
+from tests.services.kit import answer
+from tests.services.rcm.kit import FakeClient, FakeFleet, request
 from zscout.mesh import IncomingQuery
 from zscout.messages import Book, BookingRecord, BookingsAsk, BookingsTold, BookingView, Operation, ShareBookings
 from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.rcm.bookings import BookedDanger
 from zscout.services.rcm.candidate import Candidate
 from zscout.testing.memory import MemoryMesh
 
@@ -76,20 +78,14 @@ class BookedFleet(FakeFleet):
         return asked
 
     async def bookings(self, **asked: Any) -> dict[str, BookingView]:
-        key = self.watcher.keys.rcm_bookings
-        reply = await self.watcher.ask_one(key, BookingsAsk(**asked), BookingsTold, timeout=1)
-        assert reply is not None
-        assert reply.message is not None, reply.problem
-        return {view.id: view for view in reply.message.bookings}
+        return {view.id: view for view in (await self.told(**asked)).bookings}
+
+    async def told(self, **asked: Any) -> BookingsTold:
+        return await answer(self.watcher, self.watcher.keys.rcm_bookings, BookingsAsk(**asked), BookingsTold, timeout=1)
 
 
 async def do(client: FakeClient, operation: Operation, kind: type[R]) -> R:
-    reply = await client.mesh.ask_one(client.mesh.keys.schedule(client.mesh.me), operation, kind, timeout=10)
-    assert reply is not None, "the RCM did not answer"
-    if reply.message is None:
-        assert reply.problem is not None
-        raise Refusal(reply.problem)
-    return reply.message
+    return await answer(client.mesh, client.mesh.keys.schedule(client.mesh.me), operation, kind, timeout=10)
 
 
 def book(name: str, *needs: str, at: float, seconds: float = 100, **more: Any) -> Book:
@@ -106,6 +102,20 @@ async def led(fleet: BookedFleet, *hosts: str) -> list[Candidate]:
     await until(lambda: any(one.rcm is not None and one.rcm.bookings.settled for one in candidates))
     await fleet.joined(*robots)
     return candidates
+
+
+async def booked(*hosts: str) -> tuple[BookedFleet, *tuple[Candidate, ...]]:
+    """A fleet that all these hosts may lead, and one does."""
+    fleet = BookedFleet(*hosts)
+    return fleet, *await led(fleet, *hosts)
+
+
+def dangers_at(candidate: Candidate) -> list[BookedDanger]:
+    """What this leader tells of dangers from now on."""
+    dangers: list[BookedDanger] = []
+    assert candidate.rcm is not None
+    candidate.rcm.bookings.on_danger = dangers.append
+    return dangers
 
 
 def states(view: BookingView) -> list[str]:

@@ -10,8 +10,10 @@ from typing import Any
 
 import msgspec
 
+from tests.services.kit import MemoryFleet, answer
+from tests.services.kit import Refusal as Refusal
 from zscout.config.fleet import Fleet, default_fleet
-from zscout.keyexpr import Role, Sender, Token
+from zscout.keyexpr import Role, Token
 from zscout.mesh import IncomingQuery, Refused
 from zscout.messages import (
     Ask,
@@ -23,7 +25,6 @@ from zscout.messages import (
     OpenRequest,
     Operation,
     Parameter,
-    Problem,
     Proposal,
     RcAsk,
     RcmState,
@@ -33,11 +34,8 @@ from zscout.messages import (
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.recovery import RecoveredState
-from zscout.testing.memory import MemoryMesh, MemoryNetwork
+from zscout.testing.memory import MemoryMesh
 from zscout.types import NO_TERM, Grant, Place, Term
-
-DELAY = 0.0002
-"""Seconds that a message takes from one process to another."""
 
 
 @dataclass
@@ -151,23 +149,12 @@ class FakeClient:
 
     async def do(self, operation: Operation) -> Notice:
         """The answer to an operation. Raises Refusal."""
-        key = self.mesh.keys.schedule(self.mesh.me)
-        reply = await self.mesh.ask_one(key, operation, Notice, timeout=5)
-        assert reply is not None, "the RCM did not answer"
-        if reply.message is None:
-            assert reply.problem is not None
-            raise Refusal(reply.problem)
-        self.log.append((self.mesh.me.client, "answer", f"{reply.message.arc} {reply.message.state}"))
-        return reply.message
+        notice = await answer(self.mesh, self.mesh.keys.schedule(self.mesh.me), operation, Notice)
+        self.log.append((self.mesh.me.client, "answer", f"{notice.arc} {notice.state}"))
+        return notice
 
     async def ask(self, arc: str, *needs: str, **more: Any) -> Notice:
         return await self.do(request(arc, *needs, **more))
-
-
-class Refusal(Exception):
-    def __init__(self, problem: Problem) -> None:
-        super().__init__(f"{problem.code}: {problem.message}")
-        self.code = problem.code
 
 
 def request(
@@ -181,22 +168,16 @@ def request(
     return Ask(arc, arc, rates, priority, Decimal(str(seconds)), place=place, **more)
 
 
-class FakeFleet:
-    """Processes on one network. `published`: what was published on `rcm/grants`, without heartbeats."""
+class FakeFleet(MemoryFleet):
+    """`published`: what was published on `rcm/grants`, without heartbeats."""
 
     def __init__(self, *candidates: str, strategy: str = "priority") -> None:
-        self.network = MemoryNetwork(delay=DELAY)
-        base = default_fleet()
-        self.fleet: Fleet = msgspec.structs.replace(base, candidates=candidates, strategy=strategy)
+        super().__init__()
+        self.fleet: Fleet = msgspec.structs.replace(default_fleet(), candidates=candidates, strategy=strategy)
         self.log: list[tuple[str, str, str]] = []
         self.published: list[Grants] = []
-        self.failures: list[Exception] = []
         self.newer: list[Term] = []
-        self.watcher = self.mesh("watcher", "all")
         self.watcher.subscribe(self.watcher.keys.grants, Grants, self._on_grants)
-
-    def mesh(self, host: str, client: str = "node") -> MemoryMesh:
-        return self.network.open("test", Sender(host, client))
 
     def _on_grants(self, _key: str, grants: Grants) -> None:
         if grants.rcs or grants.revoked:
@@ -227,18 +208,23 @@ class FakeFleet:
         return client
 
     async def state(self, **asked: Any) -> RcmState:
-        mesh = self.watcher
-        reply = await mesh.ask_one(mesh.keys.rcm_state, StateAsk(**asked), RcmState, timeout=1)
-        assert reply is not None
-        assert reply.message is not None
-        return reply.message
+        return await answer(self.watcher, self.watcher.keys.rcm_state, StateAsk(**asked), RcmState, timeout=1)
 
     async def joined(self, *rcs: FakeRc) -> None:
         """Waits until the leader counts these RCs as there."""
         names = {rc.name for rc in rcs}
         async with asyncio.timeout(10):
             while not names <= {view.rc for view in (await self.state()).rcs if view.present}:  # noqa: ASYNC110
-                await asyncio.sleep(DELAY)
+                await asyncio.sleep(0.001)
+
+
+async def fleet_of(*rcs: str) -> tuple[FakeFleet, *tuple[FakeRc, ...]]:
+    """A fleet whose leader counts these RCs as there."""
+    fleet = FakeFleet()
+    fleet.rcm()
+    found = [fleet.rc(rc) for rc in rcs]
+    await fleet.joined(*found)
+    return fleet, *found
 
 
 def grant_of(notice: Notice) -> Grant:

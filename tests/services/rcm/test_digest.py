@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from tests.mesh.kit import run, until
+from tests.mesh.kit import until
 from tests.services.rcm.kit import FakeFleet
 from zscout.messages import HandOver, Release
 from zscout.scheduling.core import Core
@@ -166,45 +166,39 @@ def test_a_listener_that_fails_ends_the_telling_and_nothing_else(caplog: pytest.
     ]
 
 
-def test_an_rcm_tells_its_listeners_once_all_others_have_their_answers() -> None:
-    async def story() -> None:
-        fleet, heard = FakeFleet(), Heard()
-        candidate = fleet.candidate("anvil", listeners=[heard])
-        await until(lambda: candidate.rcm is not None)
-        robot = fleet.rc("robot/a")
-        await fleet.joined(robot)
-        one, two = fleet.client("one"), fleet.client("two")
-        await one.ask("first", "robot/a")
-        queued = await two.ask("second", "robot/a", estimate=True)
-        assert queued.starts_in is not None
-        await asyncio.sleep(3)
-        await one.do(HandOver("first", "desk/two"))
-        await two.do(Release("first"))
-        await until(lambda: len(heard.began) == 3)
-        assert [name for name, _ in heard.waits] == ["first", "first", "second"]
-        late = heard.began[-1].late
-        assert late is not None
-        assert queued.starts_in + late / SECOND == pytest.approx(3, abs=0.1)
-        await candidate.stop()
-        assert heard.ends[-1][:2] == ("second", None)
-        assert (candidate.terms_led, candidate.tally.refused()) == (1, {})
-
-    run(story())
+async def test_an_rcm_tells_its_listeners_once_all_others_have_their_answers() -> None:
+    fleet, heard = FakeFleet(), Heard()
+    candidate = fleet.candidate("anvil", listeners=[heard])
+    await until(lambda: candidate.rcm is not None)
+    robot = fleet.rc("robot/a")
+    await fleet.joined(robot)
+    one, two = fleet.client("one"), fleet.client("two")
+    await one.ask("first", "robot/a")
+    queued = await two.ask("second", "robot/a", estimate=True)
+    assert queued.starts_in is not None
+    await asyncio.sleep(3)
+    await one.do(HandOver("first", "desk/two"))
+    await two.do(Release("first"))
+    await until(lambda: len(heard.began) == 3)
+    assert [name for name, _ in heard.waits] == ["first", "first", "second"]
+    late = heard.began[-1].late
+    assert late is not None
+    assert queued.starts_in + late / SECOND == pytest.approx(3, abs=0.1)
+    await candidate.stop()
+    assert heard.ends[-1][:2] == ("second", None)
+    assert (candidate.terms_led, candidate.tally.refused()) == (1, {})
 
 
-def test_refusals_are_counted_by_code() -> None:
-    async def story() -> None:
-        fleet = FakeFleet()
-        candidate = fleet.candidate("anvil")
-        await until(lambda: candidate.rcm is not None)
-        client = fleet.client("one")
-        for number in range(3):
-            with pytest.raises(Exception, match="needs is empty"):
-                await client.ask(f"arc{number}")
-        await client.ask("first", "robot/a", wait_for_device=True)
-        with pytest.raises(Exception, match="unknown_client"):
-            await client.do(HandOver("first", "desk/nobody"))
-        assert candidate.tally.refused() == {"bad_request": 3, "unknown_client": 1}
-        await candidate.stop()
-
-    run(story())
+async def test_refusals_are_counted_by_code() -> None:
+    fleet = FakeFleet()
+    candidate = fleet.candidate("anvil")
+    await until(lambda: candidate.rcm is not None)
+    client = fleet.client("one")
+    for number in range(3):
+        with pytest.raises(Exception, match="needs is empty"):
+            await client.ask(f"arc{number}")
+    await client.ask("first", "robot/a", wait_for_device=True)
+    with pytest.raises(Exception, match="unknown_client"):
+        await client.do(HandOver("first", "desk/nobody"))
+    assert candidate.tally.refused() == {"bad_request": 3, "unknown_client": 1}
+    await candidate.stop()

@@ -7,10 +7,10 @@ from decimal import Decimal
 
 import pytest
 
-from tests.mesh.kit import run, until
-from tests.services.rcm.booked_fleet import NOON, BookedFleet, Disk, book, do, led, record, states
+from tests.mesh.kit import until
+from tests.services.rcm.booked_fleet import NOON, BookedFleet, Disk, book, booked, do, led, record, states
 from tests.services.rcm.kit import Refusal
-from zscout.messages import BookingsAsk, BookingsTold, BookingView, OpenRequest
+from zscout.messages import BookingView, OpenRequest
 from zscout.services.rcm.candidate import Candidate
 from zscout.types import Grant, Term
 
@@ -33,215 +33,180 @@ async def first_back(fleet: BookedFleet, wall: float) -> Candidate:
 
 
 @pytest.mark.parametrize("ahead", [3_600, -3_600])
-def test_a_leader_whose_clock_is_an_hour_off_goes_on_in_the_time_of_the_fleet(ahead: float) -> None:
-    async def story() -> None:
-        fleet = BookedFleet("x", "y", "z")
-        fleet.ahead["y"] = ahead
-        x, y, _ = await led(fleet, "x", "y", "z")
-        client = fleet.client("one")
-        await do(client, book("b", "robot/a", at=200), BookingView)
-        fleet.network.kill(x.mesh)
-        await until(lambda: y.rcm)
-        await client.ask("mine", "robot/a", seconds=100, booking="b")
-        await asyncio.sleep(NOON + 199 - fleet.time())
-        assert [notice.state for notice in client.notices].count("running") == 0
-        await asyncio.sleep(2)
-        assert client.notices[-1].state == "running"
-        reply = await fleet.watcher.ask_one(fleet.watcher.keys.rcm_bookings, BookingsAsk(), BookingsTold, timeout=1)
-        assert reply is not None
-        assert reply.message is not None
-        assert reply.message.clocks == {"y": pytest.approx(ahead, abs=2)}
-
-    run(story())
+async def test_a_leader_whose_clock_is_an_hour_off_goes_on_in_the_time_of_the_fleet(ahead: float) -> None:
+    fleet = BookedFleet("x", "y", "z")
+    fleet.ahead["y"] = ahead
+    x, y, _ = await led(fleet, "x", "y", "z")
+    client = fleet.client("one")
+    await do(client, book("b", "robot/a", at=200), BookingView)
+    fleet.network.kill(x.mesh)
+    await until(lambda: y.rcm)
+    await client.ask("mine", "robot/a", seconds=100, booking="b")
+    await asyncio.sleep(NOON + 199 - fleet.time())
+    assert [notice.state for notice in client.notices].count("running") == 0
+    await asyncio.sleep(2)
+    assert client.notices[-1].state == "running"
+    assert (await fleet.told()).clocks == {"y": pytest.approx(ahead, abs=2)}
 
 
-def test_fleet_time_does_not_jump_in_a_reign() -> None:
-    async def story() -> None:
-        fleet = BookedFleet("x", "y", "z")
-        fleet.ahead |= {"y": 10.0, "z": 10.0}
-        x = fleet.candidate("x")
-        await until(lambda: x.rcm)
-        assert x.rcm is not None
-        await until(lambda: x.rcm and x.rcm.bookings.settled)
-        dates = x.rcm.bookings.dates
-        assert dates.time == pytest.approx(fleet.time(), abs=0.1)
-        fleet.candidate("y"), fleet.candidate("z")
+async def test_fleet_time_does_not_jump_in_a_reign() -> None:
+    fleet = BookedFleet("x", "y", "z")
+    fleet.ahead |= {"y": 10.0, "z": 10.0}
+    x = fleet.candidate("x")
+    await until(lambda: x.rcm)
+    assert x.rcm is not None
+    await until(lambda: x.rcm and x.rcm.bookings.settled)
+    dates = x.rcm.bookings.dates
+    assert dates.time == pytest.approx(fleet.time(), abs=0.1)
+    fleet.candidate("y"), fleet.candidate("z")
+    last, at = dates.time, fleet.time()
+    for _ in range(1_500):
+        await asyncio.sleep(1)
+        gone = dates.time - last
+        assert 0.989 < gone / (fleet.time() - at) < 1.011
         last, at = dates.time, fleet.time()
-        for _ in range(1_500):
-            await asyncio.sleep(1)
-            gone = dates.time - last
-            assert 0.989 < gone / (fleet.time() - at) < 1.011
-            last, at = dates.time, fleet.time()
-        assert dates.time == pytest.approx(fleet.time() + 10, abs=0.1)
-
-    run(story())
+    assert dates.time == pytest.approx(fleet.time() + 10, abs=0.1)
 
 
-def test_what_changes_after_a_restart_of_all_counts_though_terms_begin_anew() -> None:
-    async def story() -> None:
-        fleet = BookedFleet("x", "y")
-        before = Grant(Term(9, "old"), 50)
-        asked = book("b", "robot/*", at=500, every=1, until=round(NOON) + 200_000)
-        old = record(asked, owner="desk", made=before, changed=before)
-        fleet.disks["y"] = Disk()
-        fleet.disks["y"].records = [old]
-        await led(fleet, "x")
-        fleet.candidate("y")
-        await asyncio.sleep(1)
-        client = fleet.client("one", "desk")
-        assert [date.bound for date in (await fleet.bookings())["b"].dates] == [{"robot/*": "robot/a"}] * 3
-        for disk in fleet.disks.values():
-            assert [len(one.kept) for one in disk.records] == [3]
-            assert disk.records[0].changed > before
-        # What is made later goes behind, in whatever half.
-        await do(client, book("c", "robot/b", at=500), BookingView)
-        assert {one.id: one.made > before for one in fleet.disks["y"].records} == {"b": False, "c": True}
-
-    run(story())
+async def test_what_changes_after_a_restart_of_all_counts_though_terms_begin_anew() -> None:
+    fleet = BookedFleet("x", "y")
+    before = Grant(Term(9, "old"), 50)
+    asked = book("b", "robot/*", at=500, every=1, until=round(NOON) + 200_000)
+    old = record(asked, owner="desk", made=before, changed=before)
+    fleet.disks["y"] = Disk()
+    fleet.disks["y"].records = [old]
+    await led(fleet, "x")
+    fleet.candidate("y")
+    await asyncio.sleep(1)
+    client = fleet.client("one", "desk")
+    assert [date.bound for date in (await fleet.bookings())["b"].dates] == [{"robot/*": "robot/a"}] * 3
+    for disk in fleet.disks.values():
+        assert [len(one.kept) for one in disk.records] == [3]
+        assert disk.records[0].changed > before
+    # What is made later goes behind, in whatever half.
+    await do(client, book("c", "robot/b", at=500), BookingView)
+    assert {one.id: one.made > before for one in fleet.disks["y"].records} == {"b": False, "c": True}
 
 
-def test_a_booking_right_after_another_stands_though_fleet_time_is_slewed() -> None:
-    async def story() -> None:
-        fleet = BookedFleet("x", "y", "z")
-        fleet.ahead |= {"y": 10.0, "z": 10.0}
-        await led(fleet, "x")
-        client = fleet.client("one")
-        await do(client, book("first", "robot/a", at=20, seconds=100), BookingView)
-        await do(client, book("next", "robot/a", at=120, seconds=100), BookingView)
-        await asyncio.sleep(2)
-        await client.ask("mine", "robot/a", seconds=100, booking="first")
-        fleet.candidate("y"), fleet.candidate("z")
-        for number in range(18):
-            await asyncio.sleep(5)
-            await do(client, book(f"other{number}", "robot/b", at=1_000 + 200 * number), BookingView)
-            views = await fleet.bookings()
-            assert states(views["next"]) == ["open"], f"at {fleet.time() - NOON:g}: {views['next'].dates}"
-        assert states(views["first"]) == ["taken"]
-
-    run(story())
-
-
-def test_after_a_restart_of_all_hosts_nothing_is_decided_by_one_wrong_clock() -> None:
-    async def story() -> None:
-        fleet = BookedFleet("x", "y", "z")
-        old = await led(fleet, "x", "y", "z")
-        client = fleet.client("one")
-        await do(client, book("b", "robot/a", at=300, patience=Decimal(30)), BookingView)
-        await do(client, book("c", "robot/b", at=400), BookingView)
-        await asyncio.sleep(1)
-        await kill_all(fleet, old)
-        # The first to be back is two days ahead, by which both would be over, and long forgotten.
-        first = await first_back(fleet, fleet.time() + 2 * 86_400)
-        with pytest.raises(Refusal, match="busy"):
-            await do(client, book("d", "robot/a", at=900), BookingView)
-        others = [fleet.candidate("y"), fleet.candidate("z")]
+async def test_a_booking_right_after_another_stands_though_fleet_time_is_slewed() -> None:
+    fleet = BookedFleet("x", "y", "z")
+    fleet.ahead |= {"y": 10.0, "z": 10.0}
+    await led(fleet, "x")
+    client = fleet.client("one")
+    await do(client, book("first", "robot/a", at=20, seconds=100), BookingView)
+    await do(client, book("next", "robot/a", at=120, seconds=100), BookingView)
+    await asyncio.sleep(2)
+    await client.ask("mine", "robot/a", seconds=100, booking="first")
+    fleet.candidate("y"), fleet.candidate("z")
+    for number in range(18):
         await asyncio.sleep(5)
-        assert len([one for one in (first, *others) if one.rcm]) == 1
-        assert {name: states(view) for name, view in (await fleet.bookings()).items()} == {"b": ["open"], "c": ["open"]}
-        waits = await client.ask("mine", "robot/a", seconds=100, booking="b")
-        assert waits.state == "queued"
-        await asyncio.sleep(NOON + 301 - fleet.time())
-        assert client.notices[-1].state == "running"
-
-    run(story())
-
-
-def test_what_ends_by_one_wrong_clock_after_a_restart_of_all_is_not_over() -> None:
-    async def story() -> None:
-        fleet = BookedFleet("x", "y", "z")
-        old = await led(fleet, "x", "y", "z")
-        client = fleet.client("one")
-        await do(client, book("m", "robot/a", at=300, maintenance=True), BookingView)
-        await do(client, book("b", "robot/b", at=300, patience=Decimal(100)), BookingView)
-        mine = await client.ask("mine", "robot/b", seconds=100, booking="b")
-        client.open = [
-            OpenRequest("mine", "mine", {"robot/b": {}}, 0, Decimal(100), place=mine.place, booking="b@1800000300")
-        ]
-        await kill_all(fleet, old)
-        # By the clock of the first to be back both end as it has just begun to lead.
-        first = await first_back(fleet, NOON + 399.2)
-        await asyncio.sleep(0.5)
-        assert first.rcm is not None
-        assert first.rcm.bookings.dates.time > NOON + 400
-        fleet.candidate("y")
-        fleet.candidate("z")
-        await asyncio.sleep(5)
+        await do(client, book(f"other{number}", "robot/b", at=1_000 + 200 * number), BookingView)
         views = await fleet.bookings()
-        assert {name: states(view) for name, view in views.items()} == {"m": ["open"], "b": ["taken"]}
+        assert states(views["next"]) == ["open"], f"at {fleet.time() - NOON:g}: {views['next'].dates}"
+    assert states(views["first"]) == ["taken"]
 
-    run(story())
+
+async def test_after_a_restart_of_all_hosts_nothing_is_decided_by_one_wrong_clock() -> None:
+    fleet, *old = await booked("x", "y", "z")
+    client = fleet.client("one")
+    await do(client, book("b", "robot/a", at=300, patience=Decimal(30)), BookingView)
+    await do(client, book("c", "robot/b", at=400), BookingView)
+    await asyncio.sleep(1)
+    await kill_all(fleet, old)
+    # The first to be back is two days ahead, by which both would be over, and long forgotten.
+    first = await first_back(fleet, fleet.time() + 2 * 86_400)
+    with pytest.raises(Refusal, match="busy"):
+        await do(client, book("d", "robot/a", at=900), BookingView)
+    others = [fleet.candidate("y"), fleet.candidate("z")]
+    await asyncio.sleep(5)
+    assert len([one for one in (first, *others) if one.rcm]) == 1
+    assert {name: states(view) for name, view in (await fleet.bookings()).items()} == {"b": ["open"], "c": ["open"]}
+    waits = await client.ask("mine", "robot/a", seconds=100, booking="b")
+    assert waits.state == "queued"
+    await asyncio.sleep(NOON + 301 - fleet.time())
+    assert client.notices[-1].state == "running"
+
+
+async def test_what_ends_by_one_wrong_clock_after_a_restart_of_all_is_not_over() -> None:
+    fleet, *old = await booked("x", "y", "z")
+    client = fleet.client("one")
+    await do(client, book("m", "robot/a", at=300, maintenance=True), BookingView)
+    await do(client, book("b", "robot/b", at=300, patience=Decimal(100)), BookingView)
+    mine = await client.ask("mine", "robot/b", seconds=100, booking="b")
+    client.open = [
+        OpenRequest("mine", "mine", {"robot/b": {}}, 0, Decimal(100), place=mine.place, booking="b@1800000300")
+    ]
+    await kill_all(fleet, old)
+    # By the clock of the first to be back both end as it has just begun to lead.
+    first = await first_back(fleet, NOON + 399.2)
+    await asyncio.sleep(0.5)
+    assert first.rcm is not None
+    assert first.rcm.bookings.dates.time > NOON + 400
+    fleet.candidate("y")
+    fleet.candidate("z")
+    await asyncio.sleep(5)
+    views = await fleet.bookings()
+    assert {name: states(view) for name, view in views.items()} == {"m": ["open"], "b": ["taken"]}
 
 
 @pytest.mark.parametrize("ahead", [NOON + 310, NOON + 2 * 86_400], ids=["its date has come", "it is over"])
 @pytest.mark.parametrize("known", [True, False], ids=["known", "not known"])
-def test_who_waits_for_a_date_does_not_begin_by_one_wrong_clock_after_a_restart_of_all(
+async def test_who_waits_for_a_date_does_not_begin_by_one_wrong_clock_after_a_restart_of_all(
     ahead: float, known: bool
 ) -> None:
-    async def story() -> None:
-        fleet = BookedFleet("x", "y", "z")
-        old = await led(fleet, "x", "y", "z")
-        client = fleet.client("one")
-        await do(client, book("b", "robot/b", at=300, patience=Decimal(100)), BookingView)
-        mine = await client.ask("mine", "robot/b", seconds=100, booking="b")
-        await asyncio.sleep(1)
-        client.open = [
-            OpenRequest("mine", "mine", {"robot/b": {}}, 0, Decimal(100), place=mine.place, booking=mine.booking)
-        ]
-        await kill_all(fleet, old)
-        fleet.disks["x"].records *= known
-        first = await first_back(fleet, ahead)
-        await asyncio.sleep(0.5)
-        assert first.rcm is not None
-        assert not first.rcm.bookings.settled
-        assert first.rcm.bookings.dates.time > NOON + 300
-        fleet.candidate("y")
-        fleet.candidate("z")
-        await asyncio.sleep(5)
-        assert states((await fleet.bookings())["b"]) == ["taken"]
-        assert "running" not in {notice.state for notice in client.notices}
-        await asyncio.sleep(NOON + 301 - fleet.time())
-        assert client.notices[-1].state == "running"
-
-    run(story())
+    fleet, *old = await booked("x", "y", "z")
+    client = fleet.client("one")
+    await do(client, book("b", "robot/b", at=300, patience=Decimal(100)), BookingView)
+    mine = await client.ask("mine", "robot/b", seconds=100, booking="b")
+    await asyncio.sleep(1)
+    client.open = [
+        OpenRequest("mine", "mine", {"robot/b": {}}, 0, Decimal(100), place=mine.place, booking=mine.booking)
+    ]
+    await kill_all(fleet, old)
+    fleet.disks["x"].records *= known
+    first = await first_back(fleet, ahead)
+    await asyncio.sleep(0.5)
+    assert first.rcm is not None
+    assert not first.rcm.bookings.settled
+    assert first.rcm.bookings.dates.time > NOON + 300
+    fleet.candidate("y")
+    fleet.candidate("z")
+    await asyncio.sleep(5)
+    assert states((await fleet.bookings())["b"]) == ["taken"]
+    assert "running" not in {notice.state for notice in client.notices}
+    await asyncio.sleep(NOON + 301 - fleet.time())
+    assert client.notices[-1].state == "running"
 
 
-def test_the_older_of_two_fleet_times_goes_on() -> None:
-    async def story() -> None:
-        fleet = BookedFleet("x", "y", "z")
-        fleet.ahead["y"] = 7_200
-        x, y, z = await led(fleet, "x", "y", "z")
-        client = fleet.client("one")
-        await do(client, book("b", "robot/a", at=200, patience=Decimal(30)), BookingView)
-        # One that starts anew while it is cut off knows nothing but its own clock, by which that is over.
-        fleet.network.kill(y.mesh)
-        await asyncio.sleep(2)
-        again = fleet.candidate("y")
-        fleet.part("y")
-        await until(lambda: again.rcm and again.rcm.bookings.settled)
-        assert again.rcm is not None
-        assert again.rcm.bookings.dates.time == pytest.approx(fleet.time() + 7_200, abs=1)
-        fleet.network.kill(x.mesh)
-        # All that others answer is as old as the question to this one.
-        fleet.silent()
-        fleet.network.heal()
-        await asyncio.sleep(70)
-        leaders = [one.rcm for one in (again, z) if one.rcm is not None]
-        assert [one.bookings.time for one in leaders] == [pytest.approx(fleet.time(), abs=0.1)]
-        assert states((await fleet.bookings())["b"]) == ["open"]
-
-    run(story())
+async def test_the_older_of_two_fleet_times_goes_on() -> None:
+    fleet = BookedFleet("x", "y", "z")
+    fleet.ahead["y"] = 7_200
+    x, y, z = await led(fleet, "x", "y", "z")
+    client = fleet.client("one")
+    await do(client, book("b", "robot/a", at=200, patience=Decimal(30)), BookingView)
+    # One that starts anew while it is cut off knows nothing but its own clock, by which that is over.
+    fleet.network.kill(y.mesh)
+    await asyncio.sleep(2)
+    again = fleet.candidate("y")
+    fleet.part("y")
+    await until(lambda: again.rcm and again.rcm.bookings.settled)
+    assert again.rcm is not None
+    assert again.rcm.bookings.dates.time == pytest.approx(fleet.time() + 7_200, abs=1)
+    fleet.network.kill(x.mesh)
+    # All that others answer is as old as the question to this one.
+    fleet.silent()
+    fleet.network.heal()
+    await asyncio.sleep(70)
+    leaders = [one.rcm for one in (again, z) if one.rcm is not None]
+    assert [one.bookings.time for one in leaders] == [pytest.approx(fleet.time(), abs=0.1)]
+    assert states((await fleet.bookings())["b"]) == ["open"]
 
 
-def test_a_host_that_does_not_answer_turns_no_clock_back() -> None:
+async def test_a_host_that_does_not_answer_turns_no_clock_back() -> None:
     """What others have answered is older by as long as it was waited for."""
-
-    async def story() -> None:
-        fleet = BookedFleet("x", "y", "z")
-        x, *_ = await led(fleet, "x", "y", "z")
-        asked = fleet.silent()
-        await asyncio.sleep(120)
-        assert asked
-        assert x.rcm is not None
-        assert x.rcm.bookings.time == pytest.approx(fleet.time(), abs=0.02)
-
-    run(story())
+    fleet, x, *_ = await booked("x", "y", "z")
+    asked = fleet.silent()
+    await asyncio.sleep(120)
+    assert asked
+    assert x.rcm is not None
+    assert x.rcm.bookings.time == pytest.approx(fleet.time(), abs=0.02)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from tests.mesh.kit import run, until
+from tests.mesh.kit import until
 from tests.services.journal.kit import holder, over, past, published
 from tests.services.rcm.kit import FakeClient, FakeFleet, request
 from zscout.config.node import JournalConfig
@@ -39,73 +39,67 @@ async def end(client: FakeClient, number: int) -> None:
     await client.do(Release(f"survey{number}"))
 
 
-def test_a_new_leader_knows_how_long_programs_take() -> None:
-    async def story() -> None:
-        fleet = FakeFleet("x", "y")
-        candidates: dict[str, Candidate] = {host: fleet.candidate(host) for host in ("x", "y")}
-        rc = fleet.rc("robot/a")
-        await until(lambda: candidates["x"].rcm)
+async def test_a_new_leader_knows_how_long_programs_take() -> None:
+    fleet = FakeFleet("x", "y")
+    candidates: dict[str, Candidate] = {host: fleet.candidate(host) for host in ("x", "y")}
+    rc = fleet.rc("robot/a")
+    await until(lambda: candidates["x"].rcm)
+    await fleet.joined(rc)
+    survey, other = fleet.client("survey"), fleet.client("other", "ws2")
+    for number in range(4):
+        await begin(survey, number)
+        told = await other.ask(f"early{number}", "robot/a", seconds=60, estimate=True)
+        assert told.starts_in == pytest.approx(600 if number < 3 else 30, abs=0.5)
+        assert ((await fleet.state()).holds[0].ends_in is None) == (number < 3)
+        await other.do(Cancel(f"early{number}"))
+        await asyncio.sleep(30)
+        await end(survey, number)
+    await begin(survey, 4)
+    told = await other.ask("next", "robot/a", seconds=60, estimate=True)
+    assert told.starts_in == pytest.approx(30, abs=0.5)
+    await asyncio.sleep(10)
+    assert (await fleet.state()).holds[0].ends_in == pytest.approx(20, abs=0.5)
+    assert rc.arcs == ["survey"]
+    # It is given back later than was foretold, and nobody took it.
+    await asyncio.sleep(50)
+    assert rc.arcs == ["survey"]
+    await end(survey, 4)
+    await until(lambda: rc.arcs == ["next"])
+    await candidates.pop("x").stop()
+    await until(lambda: candidates["y"].rcm)
+    await other.do(Release("next"))
+    await begin(survey, 5)
+    state = await fleet.state()
+    assert state.host == "y"
+    assert state.holds[0].ends_in == pytest.approx(30, abs=0.5)
+    await candidates.pop("y").stop()
+
+
+async def test_one_who_starts_anew_knows_what_its_journal_knows(tmp_path: Path) -> None:
+    fleet = FakeFleet("x")
+    for life in range(2):
+        mesh = fleet.mesh("x")
+        silent = fleet.fleet.silence / SECOND
+        journal = Journal(mesh, tmp_path, JournalConfig(), silent, wall=lambda: 1e9 + fleet.watcher.now() / SECOND)
+        journal.start()
+        candidate = Candidate(mesh, fleet.fleet, journal=journal)
+        candidate.start()
+        await until(partial(getattr, candidate, "rcm"))
+        await until(partial(getattr, journal, "_follower"))
+        rc, client = fleet.rc(f"robot/{'ab'[life]}"), fleet.client(f"c{life}")
         await fleet.joined(rc)
-        survey, other = fleet.client("survey"), fleet.client("other", "ws2")
-        for number in range(4):
-            await begin(survey, number)
-            told = await other.ask(f"early{number}", "robot/a", seconds=60, estimate=True)
-            assert told.starts_in == pytest.approx(600 if number < 3 else 30, abs=0.5)
-            assert ((await fleet.state()).holds[0].ends_in is None) == (number < 3)
-            await other.do(Cancel(f"early{number}"))
-            await asyncio.sleep(30)
-            await end(survey, number)
-        await begin(survey, 4)
-        told = await other.ask("next", "robot/a", seconds=60, estimate=True)
-        assert told.starts_in == pytest.approx(30, abs=0.5)
-        await asyncio.sleep(10)
-        assert (await fleet.state()).holds[0].ends_in == pytest.approx(20, abs=0.5)
-        assert rc.arcs == ["survey"]
-        # It is given back later than was foretold, and nobody took it.
-        await asyncio.sleep(50)
-        assert rc.arcs == ["survey"]
-        await end(survey, 4)
-        await until(lambda: rc.arcs == ["next"])
-        await candidates.pop("x").stop()
-        await until(lambda: candidates["y"].rcm)
-        await other.do(Release("next"))
-        await begin(survey, 5)
-        state = await fleet.state()
-        assert state.host == "y"
-        assert state.holds[0].ends_in == pytest.approx(30, abs=0.5)
-        await candidates.pop("y").stop()
-
-    run(story())
-
-
-def test_one_who_starts_anew_knows_what_its_journal_knows(tmp_path: Path) -> None:
-    async def story() -> None:
-        fleet = FakeFleet("x")
-        for life in range(2):
-            mesh = fleet.mesh("x")
-            silent = fleet.fleet.silence / SECOND
-            journal = Journal(mesh, tmp_path, JournalConfig(), silent, wall=lambda: 1e9 + fleet.watcher.now() / SECOND)
-            journal.start()
-            candidate = Candidate(mesh, fleet.fleet, journal=journal)
-            candidate.start()
-            await until(partial(getattr, candidate, "rcm"))
-            await until(partial(getattr, journal, "_follower"))
-            rc, client = fleet.rc(f"robot/{'ab'[life]}"), fleet.client(f"c{life}")
-            await fleet.joined(rc)
-            if life == 0:
-                for number in range(4):
-                    await begin(client, number)
-                    await asyncio.sleep(30)
-                    await end(client, number)
-            else:
-                # Of another RC, so that nothing but the name and the command tell what it is.
-                await begin(client, 4, "robot/b")
-                assert (await fleet.state()).holds[0].ends_in == pytest.approx(30, abs=0.5)
-            await candidate.stop()
-            await journal.stop()
-            await mesh.close()
-
-    run(story())
+        if life == 0:
+            for number in range(4):
+                await begin(client, number)
+                await asyncio.sleep(30)
+                await end(client, number)
+        else:
+            # Of another RC, so that nothing but the name and the command tell what it is.
+            await begin(client, 4, "robot/b")
+            assert (await fleet.state()).holds[0].ends_in == pytest.approx(30, abs=0.5)
+        await candidate.stop()
+        await journal.stop()
+        await mesh.close()
 
 
 def wish(need: str, asked: int = 60) -> Wish:

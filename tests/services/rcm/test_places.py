@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from tests.mesh.kit import run, until
+from tests.services.kit import answer
 from tests.services.rcm.kit import FakeFleet, Refusal, request
 from zscout.behaviors.client.request import OpenArc
 from zscout.keyexpr import client_of
@@ -164,10 +165,8 @@ def test_who_asks_under_a_new_id_has_its_place_and_no_second_arc() -> None:
         assert candidate.rcm is not None
         key = candidate.mesh.keys.schedule(client_of("desk/one"))
         asked = request("anew", "robot/a", place=first.place, was=first.id)
-        reply = await candidate.mesh.ask_one(key, asked, Notice, timeout=5)
-        assert reply is not None
-        assert reply.message is not None
-        assert (reply.message.place, reply.message.ahead) == (first.place, 0)
+        told = await answer(candidate.mesh, key, asked, Notice)
+        assert (told.place, told.ahead) == (first.place, 0)
         assert candidate.rcm.core.arcs_of("desk/one") == ["desk/one/anew"]
 
     play(story)

@@ -7,8 +7,9 @@ from decimal import Decimal
 
 import pytest
 
-from tests.mesh.kit import run, until
-from tests.services.rcm.kit import FakeFleet, Refusal
+from tests.mesh.kit import until
+from tests.services.rcm.booked_fleet import do
+from tests.services.rcm.kit import FakeFleet, Refusal, fleet_of
 from zscout.messages import Cancel, ClientRequests, Foresee, Foresight, HandOver, OpenRequest, Who
 from zscout.services.rcm.recovery import take_over
 from zscout.types import Place, Term
@@ -17,175 +18,129 @@ ALICE = Who("alice", "ws1", "survey.py")
 BOB = Who("bob", "ws2", "zscout take", "the gripper is stuck")
 
 
-def test_who_preempts_and_why_is_told_to_whom_it_preempts() -> None:
-    async def story() -> None:
-        fleet = FakeFleet()
-        fleet.rcm()
-        robot = fleet.rc("robot/a")
-        await fleet.joined(robot)
-        survey, operator = fleet.client("survey"), fleet.client("operator")
-        await survey.ask("survey", "robot/a", who=ALICE)
-        assert [holder.who for holder in robot.holders] == [ALICE]
-        await operator.ask("drive", "robot/a", priority=10, seconds=60, who=BOB)
-        (preempted,) = survey.notices
-        assert preempted.reason == "preempted by bob@ws2 (zscout take), priority 10: the gripper is stuck"
-        (revoked,) = fleet.published[-1].revoked
-        assert revoked.reason == preempted.reason
-        for why in (preempted.why, revoked.why):
-            assert why is not None
-            assert [(one.client, one.id, one.priority, one.who) for one in why.by] == [
-                ("desk/operator", "drive", 10, BOB)
-            ]
-        await until(lambda: len(survey.notices) == 2)
-        waits = survey.notices[1]
-        assert (waits.reason, waits.who) == ("waits for bob@ws2 (zscout take): robot/a", ALICE)
-        state = await fleet.state(arc="survey")
-        assert [(hold.arc, hold.who) for hold in state.holds] == [("drive", BOB)]
-        assert [(wait.arc, wait.who) for wait in state.queue] == [("survey", ALICE)]
-        assert [line.text for line in state.story] == [
-            "asked for robot/a at priority 0",
-            "granted robot/a",
-            "preempted by bob@ws2 (zscout take), priority 10: the gripper is stuck; queued again",
-            "waits for bob@ws2 (zscout take): robot/a",
-        ]
-
-    run(story())
+async def test_who_preempts_and_why_is_told_to_whom_it_preempts() -> None:
+    fleet, robot = await fleet_of("robot/a")
+    survey, operator = fleet.client("survey"), fleet.client("operator")
+    await survey.ask("survey", "robot/a", who=ALICE)
+    assert [holder.who for holder in robot.holders] == [ALICE]
+    await operator.ask("drive", "robot/a", priority=10, seconds=60, who=BOB)
+    (preempted,) = survey.notices
+    assert preempted.reason == "preempted by bob@ws2 (zscout take), priority 10: the gripper is stuck"
+    (revoked,) = fleet.published[-1].revoked
+    assert revoked.reason == preempted.reason
+    for why in (preempted.why, revoked.why):
+        assert why is not None
+        assert [(one.client, one.id, one.priority, one.who) for one in why.by] == [("desk/operator", "drive", 10, BOB)]
+    await until(lambda: len(survey.notices) == 2)
+    waits = survey.notices[1]
+    assert (waits.reason, waits.who) == ("waits for bob@ws2 (zscout take): robot/a", ALICE)
+    state = await fleet.state(arc="survey")
+    assert [(hold.arc, hold.who) for hold in state.holds] == [("drive", BOB)]
+    assert [(wait.arc, wait.who) for wait in state.queue] == [("survey", ALICE)]
+    assert [line.text for line in state.story] == [
+        "asked for robot/a at priority 0",
+        "granted robot/a",
+        "preempted by bob@ws2 (zscout take), priority 10: the gripper is stuck; queued again",
+        "waits for bob@ws2 (zscout take): robot/a",
+    ]
 
 
-def test_until_when_it_waits_at_the_latest_is_a_duration() -> None:
+async def test_until_when_it_waits_at_the_latest_is_a_duration() -> None:
     """Of whom it outranks or equals the end of the minimum runtime; of a kept hold of higher rank nothing is known."""
-
-    async def story() -> None:
-        fleet = FakeFleet()
-        fleet.rcm()
-        robots = [fleet.rc(f"robot/{name}") for name in "abc"]
-        await fleet.joined(*robots)
-        client = fleet.client("one")
-        await client.ask("equal", "robot/a", seconds=60, keep=True)
-        await client.ask("higher", "robot/b", seconds=60, priority=5)
-        await client.ask("kept", "robot/c", seconds=60, priority=5, keep=True)
-        waits = await client.ask("late", "robot/a", "robot/b", "robot/c")
-        assert waits.why is not None
-        told = {one.arc: one.yields_in for one in waits.why.by}
-        assert told == {"equal": pytest.approx(60, abs=0.1), "higher": pytest.approx(60, abs=0.1), "kept": None}
-        await asyncio.sleep(20)
-        (wait,) = (await fleet.state()).queue
-        assert wait.why is not None
-        assert {one.arc: one.yields_in for one in wait.why.by}["higher"] == pytest.approx(40, abs=0.1)
-
-    run(story())
+    fleet, *_ = await fleet_of("robot/a", "robot/b", "robot/c")
+    client = fleet.client("one")
+    await client.ask("equal", "robot/a", seconds=60, keep=True)
+    await client.ask("higher", "robot/b", seconds=60, priority=5)
+    await client.ask("kept", "robot/c", seconds=60, priority=5, keep=True)
+    waits = await client.ask("late", "robot/a", "robot/b", "robot/c")
+    assert waits.why is not None
+    told = {one.arc: one.yields_in for one in waits.why.by}
+    assert told == {"equal": pytest.approx(60, abs=0.1), "higher": pytest.approx(60, abs=0.1), "kept": None}
+    await asyncio.sleep(20)
+    (wait,) = (await fleet.state()).queue
+    assert wait.why is not None
+    assert {one.arc: one.yields_in for one in wait.why.by}["higher"] == pytest.approx(40, abs=0.1)
 
 
-def test_all_choices_of_a_pattern_are_named() -> None:
-    async def story() -> None:
-        fleet = FakeFleet()
-        fleet.rcm()
-        grabbers = [fleet.rc(f"framegrabber/fg{number}") for number in range(4)]
-        await fleet.joined(*grabbers, robot := fleet.rc("robot/a"))
-        client = fleet.client("one")
-        for number in range(4):
-            await client.ask(f"user{number}", f"framegrabber/fg{number}", priority=1, who=Who(f"u{number}", "ws", "x"))
-        answer = await client.ask("any", "framegrabber/*", "robot/a")
-        assert answer.reason == (
-            "waits for one of framegrabber/fg0 (held by u0@ws (x)), fg1 (held by u1@ws (x)), "
-            "fg2 (held by u2@ws (x)), fg3 (held by u3@ws (x))"
-        )
-        assert answer.why is not None
-        assert (answer.why.pattern, answer.why.count) == ("framegrabber/*", 4)
-        assert answer.why.patterns == ["framegrabber/*"] * 4
-        await client.ask("drives", "robot/a", priority=1, who=ALICE)
-        await until(lambda: client.notices and "robot/a" in client.notices[-1].reason)
-        assert client.notices[-1].reason.startswith(
-            "waits for alice@ws1 (survey.py): robot/a; for one of framegrabber/fg0 (held by u0@ws (x)), fg1 "
-        )
-        assert robot.arcs == ["drives"]
-
-    run(story())
+async def test_all_choices_of_a_pattern_are_named() -> None:
+    fleet = FakeFleet()
+    fleet.rcm()
+    grabbers = [fleet.rc(f"framegrabber/fg{number}") for number in range(4)]
+    await fleet.joined(*grabbers, robot := fleet.rc("robot/a"))
+    client = fleet.client("one")
+    for number in range(4):
+        await client.ask(f"user{number}", f"framegrabber/fg{number}", priority=1, who=Who(f"u{number}", "ws", "x"))
+    answer = await client.ask("any", "framegrabber/*", "robot/a")
+    assert answer.reason == (
+        "waits for one of framegrabber/fg0 (held by u0@ws (x)), fg1 (held by u1@ws (x)), "
+        "fg2 (held by u2@ws (x)), fg3 (held by u3@ws (x))"
+    )
+    assert answer.why is not None
+    assert (answer.why.pattern, answer.why.count) == ("framegrabber/*", 4)
+    assert answer.why.patterns == ["framegrabber/*"] * 4
+    await client.ask("drives", "robot/a", priority=1, who=ALICE)
+    await until(lambda: client.notices and "robot/a" in client.notices[-1].reason)
+    assert client.notices[-1].reason.startswith(
+        "waits for alice@ws1 (survey.py): robot/a; for one of framegrabber/fg0 (held by u0@ws (x)), fg1 "
+    )
+    assert robot.arcs == ["drives"]
 
 
-def test_who_is_unknown_is_named_by_client_and_arc_and_who_cancels_by_name() -> None:
-    async def story() -> None:
-        fleet = FakeFleet()
-        fleet.rcm()
-        await fleet.joined(fleet.rc("robot/a"))
-        plain, operator = fleet.client("plain"), fleet.client("operator")
-        await plain.ask("survey", "robot/a")
-        answer = await operator.ask("late", "robot/a")
-        assert answer.reason == "waits for desk/plain (survey): robot/a"
-        await operator.do(Cancel("survey", "desk/plain", BOB))
-        await until(lambda: plain.notices)
-        assert plain.notices[-1].reason == "cancelled by bob@ws2 (zscout take)"
-        await plain.do(Cancel("late", "desk/operator"))
-        await until(lambda: operator.notices and operator.notices[-1].state == "ended")
-        assert operator.notices[-1].reason == "cancelled by desk/plain"
-
-    run(story())
+async def test_who_is_unknown_is_named_by_client_and_arc_and_who_cancels_by_name() -> None:
+    fleet, *_ = await fleet_of("robot/a")
+    plain, operator = fleet.client("plain"), fleet.client("operator")
+    await plain.ask("survey", "robot/a")
+    answer = await operator.ask("late", "robot/a")
+    assert answer.reason == "waits for desk/plain (survey): robot/a"
+    await operator.do(Cancel("survey", "desk/plain", BOB))
+    await until(lambda: plain.notices)
+    assert plain.notices[-1].reason == "cancelled by bob@ws2 (zscout take)"
+    await plain.do(Cancel("late", "desk/operator"))
+    await until(lambda: operator.notices and operator.notices[-1].state == "ended")
+    assert operator.notices[-1].reason == "cancelled by desk/plain"
 
 
-def test_it_goes_on_elsewhere_under_the_same_user_on_the_new_host() -> None:
-    async def story() -> None:
-        fleet = FakeFleet()
-        fleet.rcm()
-        robot = fleet.rc("robot/a")
-        await fleet.joined(robot)
-        old, new = fleet.client("old"), fleet.client("new")
-        await old.ask("counter", "robot/a", who=ALICE)
-        await old.do(HandOver("counter", new.name))
-        assert [holder.who for holder in robot.holders] == [Who("alice", "", "survey.py")]
-        assert (await new.ask("late", "robot/a")).reason == "waits for alice@desk (survey.py): robot/a"
-
-    run(story())
+async def test_it_goes_on_elsewhere_under_the_same_user_on_the_new_host() -> None:
+    fleet, robot = await fleet_of("robot/a")
+    old, new = fleet.client("old"), fleet.client("new")
+    await old.ask("counter", "robot/a", who=ALICE)
+    await old.do(HandOver("counter", new.name))
+    assert [holder.who for holder in robot.holders] == [Who("alice", "", "survey.py")]
+    assert (await new.ask("late", "robot/a")).reason == "waits for alice@desk (survey.py): robot/a"
 
 
-def test_the_next_leader_knows_it_from_the_rcs_and_from_the_clients() -> None:
-    async def story() -> None:
-        fleet = FakeFleet()
-        first = fleet.rcm()
-        robot = fleet.rc("robot/a")
-        await fleet.joined(robot)
-        client, other = fleet.client("one"), fleet.client("two")
-        held = await client.ask("survey", "robot/a", who=ALICE)
-        client.open = [OpenRequest("survey", "survey", {"robot/a": {}}, 0, Decimal(60), place=held.place)]
-        first.stop()
-        waits = OpenRequest("late", "late", {"robot/a": {}}, 0, Decimal(60), place=Place(Term(1, "rcm"), 9), who=BOB)
-        other.open = [waits]
-        recovered = take_over([robot.state()], [ClientRequests(other.name, [waits])], client.mesh.now())
-        assert [held.grant for held in recovered.holds] == [held.grant]
-        fleet.rcm(2, recovered)
-        await fleet.joined(robot)
-        state = await fleet.state()
-        assert [hold.who for hold in state.holds] == [ALICE]
-        assert [(wait.who, wait.reason) for wait in state.queue] == [(BOB, "waits for alice@ws1 (survey.py): robot/a")]
-
-    run(story())
+async def test_the_next_leader_knows_it_from_the_rcs_and_from_the_clients() -> None:
+    fleet = FakeFleet()
+    first = fleet.rcm()
+    robot = fleet.rc("robot/a")
+    await fleet.joined(robot)
+    client, other = fleet.client("one"), fleet.client("two")
+    held = await client.ask("survey", "robot/a", who=ALICE)
+    client.open = [OpenRequest("survey", "survey", {"robot/a": {}}, 0, Decimal(60), place=held.place)]
+    first.stop()
+    waits = OpenRequest("late", "late", {"robot/a": {}}, 0, Decimal(60), place=Place(Term(1, "rcm"), 9), who=BOB)
+    other.open = [waits]
+    recovered = take_over([robot.state()], [ClientRequests(other.name, [waits])], client.mesh.now())
+    assert [held.grant for held in recovered.holds] == [held.grant]
+    fleet.rcm(2, recovered)
+    await fleet.joined(robot)
+    state = await fleet.state()
+    assert [hold.who for hold in state.holds] == [ALICE]
+    assert [(wait.who, wait.reason) for wait in state.queue] == [(BOB, "waits for alice@ws1 (survey.py): robot/a")]
 
 
-def test_a_forecast_names_whom_it_would_preempt() -> None:
-    async def story() -> None:
-        fleet = FakeFleet()
-        fleet.rcm()
-        await fleet.joined(fleet.rc("robot/a"))
-        client = fleet.client("one")
-        await client.ask("survey", "robot/a", who=ALICE)
-        mesh = client.mesh
-        asked = Foresee("x", "x", {"robot/a": {}}, 5, Decimal(1))
-        reply = await mesh.ask_one(mesh.keys.schedule(mesh.me), asked, Foresight, timeout=1)
-        assert reply is not None
-        assert reply.message is not None
-        assert reply.message.preempts == ["survey"]
-        assert [(one.id, one.who) for one in reply.message.victims] == [("survey", ALICE)]
-
-    run(story())
+async def test_a_forecast_names_whom_it_would_preempt() -> None:
+    fleet, *_ = await fleet_of("robot/a")
+    client = fleet.client("one")
+    await client.ask("survey", "robot/a", who=ALICE)
+    foreseen = await do(client, Foresee("x", "x", {"robot/a": {}}, 5, Decimal(1)), Foresight)
+    assert foreseen.preempts == ["survey"]
+    assert [(one.id, one.who) for one in foreseen.victims] == [("survey", ALICE)]
 
 
 @pytest.mark.parametrize("who", [Who("u" * 65), Who(host="h" * 65), Who(command="c" * 65), Who(comment="c" * 201)])
-def test_what_is_too_long_to_be_shown_is_refused(who: Who) -> None:
-    async def story() -> None:
-        fleet = FakeFleet()
-        fleet.rcm()
-        await fleet.joined(fleet.rc("robot/a"))
-        with pytest.raises(Refusal, match=r"malformed: not a valid operation: .*length <= "):
-            await fleet.client("one").ask("survey", "robot/a", who=who)
-        assert not (await fleet.state()).holds
-
-    run(story())
+async def test_what_is_too_long_to_be_shown_is_refused(who: Who) -> None:
+    fleet, *_ = await fleet_of("robot/a")
+    with pytest.raises(Refusal, match=r"malformed: not a valid operation: .*length <= "):
+        await fleet.client("one").ask("survey", "robot/a", who=who)
+    assert not (await fleet.state()).holds

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import rerun as rr
@@ -14,3 +15,9 @@ def _strict() -> Iterator[None]:
     rr.set_strict_mode(True)
     yield
     rr.set_strict_mode(False)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """Of a recording."""
+    return tmp_path / "run.rrd"

@@ -12,17 +12,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.mesh.kit import run, until
-from tests.services.rcm.booked_fleet import NOON, BookedFleet, book, do, led
+from tests.mesh.kit import until
+from tests.services.rcm.booked_fleet import NOON, book, do
+from tests.services.rcm.booked_fleet import booked as booked_fleet
+from tests.services.recorder.kit import recording
 from tests.services.recorder.paper_run import events, rows
-from zscout.keyexpr import Role, Token
 from zscout.messages import BookedDate, BookingsTold, BookingView, Unbook
 from zscout.services.recorder.ahead import LEFT, MARGIN, MAX_BARS, Bar, ChartLayer, rows_of
 from zscout.services.recorder.ahead import chart as chart_of_rows
 from zscout.services.recorder.blueprint import AHEAD, CHART_HEAD, CHART_WIDTH, MAX_CHART_ROWS, Ahead, chart_row
 from zscout.services.recorder.bookings import AGAIN, MAX_TOLD, STALE
 from zscout.services.recorder.colours import ALERT, FAILED, MAINTENANCE, PALETTE
-from zscout.services.recorder.recorder import Recorder
 from zscout.services.recorder.timeline import Timeline
 
 HOUR, DAY = 3_600, 86_400
@@ -171,8 +171,7 @@ def tells(*bookings: BookingView, after: float = 0) -> BookingsTold:
     return BookingsTold(NOW + after, list(bookings))
 
 
-def test_what_changes_is_said_once_and_what_stood_before_is_not(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_what_changes_is_said_once_and_what_stood_before_is_not(path: Path) -> None:
     survey = booked("survey", "robot/a", "radio/rf0")
     danger = [{"state": "open", "danger": "robot/* is gone", "bound": {"robot/*": "robot/b"}}, {"state": "open"}]
     with Timeline("lab", path=path) as timeline:
@@ -202,16 +201,14 @@ def test_what_changes_is_said_once_and_what_stood_before_is_not(tmp_path: Path) 
     ]
 
 
-def test_conflicts_and_danger_are_said_though_they_stood_before(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_conflicts_and_danger_are_said_though_they_stood_before(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         stuck = booked("stuck", "robot/a", dates=[{"state": "conflict", "danger": "crew of ws2 stands"}])
         timeline.bookings.told(0, tells(booked("fine", "robot/b"), stuck))
     assert events(path) == ["booking stuck of ws1, Fri 15 Jan, 09:00 to 10:00 UTC, can't be: crew of ws2 stands"]
 
 
-def test_a_danger_that_is_over_is_said(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_a_danger_that_is_over_is_said(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         for at, danger in enumerate(("robot/a is gone", "robot/a is gone", "", "")):
             timeline.bookings.told(at, tells(booked("fine", "robot/a", dates=[{"state": "open", "danger": danger}])))
@@ -221,8 +218,7 @@ def test_a_danger_that_is_over_is_said(tmp_path: Path) -> None:
     ]
 
 
-def test_a_flood_of_bookings_is_summed_up(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_a_flood_of_bookings_is_summed_up(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         timeline.bookings.told(0, tells())
         timeline.bookings.told(5, tells(*(booked(f"b{number}", "robot/a") for number in range(1_000))))
@@ -234,8 +230,7 @@ def drawn(path: Path, layer: str = "dates", column: str = "Boxes2D:labels") -> l
     return [(at, list(names)) for _, at, names in rows(path, f"/ahead/day/{layer}", column)]
 
 
-def test_outlines_have_the_colour_of_what_they_are_and_go_on_with_time(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_outlines_have_the_colour_of_what_they_are_and_go_on_with_time(path: Path) -> None:
     conflict, danger = {"state": "conflict"}, {"state": "open", "danger": "robot/d is gone"}
     with Timeline("lab", path=path) as timeline:
         timeline.holders(0, "robot/z", [])
@@ -266,37 +261,19 @@ def test_outlines_have_the_colour_of_what_they_are_and_go_on_with_time(tmp_path:
 # On the mesh
 
 
-async def recorder_sees(fleet: BookedFleet, timeline: Timeline, stop: asyncio.Event) -> asyncio.Task[None]:
-    recorder = Recorder(fleet.mesh("basil", "recorder"), fleet.fleet, timeline, wall=fleet.time)
-    recording = asyncio.create_task(recorder.run(stop))
-    seen: list[Token] = []
-    fleet.watcher.watch(fleet.watcher.keys.alive_any(Role.RECORDER), lambda token, _: seen.append(token))
-    await until(lambda: seen)
-    return recording
-
-
 @pytest.mark.parametrize("maintenance", [False, True])
-def test_a_booking_appears_and_vanishes(tmp_path: Path, maintenance: bool) -> None:
-    path = tmp_path / "run.rrd"
-
-    async def story() -> None:
-        fleet, stop = BookedFleet("x"), asyncio.Event()
-        await led(fleet, "x")
-        client = fleet.client("one")
-        with Timeline("lab", path=path, wall=True) as timeline:
-            recording = await recorder_sees(fleet, timeline, stop)
-            await asyncio.sleep(1)
-            needs = ["robot/a", "robot/b" if maintenance else "robot/*"]
-            what = book("crew", *needs, at=2 * HOUR, seconds=HOUR, maintenance=maintenance)
-            await do(client, what, BookingView)
-            await until(lambda: timeline.bookings.rows == 2)
-            await do(client, Unbook("crew"), BookingView)
-            await until(lambda: timeline.bookings.rows == 0)
-            assert timeline.layout(live=True).ahead == 0
-            stop.set()
-            await recording
-
-    run(story())
+async def test_a_booking_appears_and_vanishes(path: Path, maintenance: bool) -> None:
+    fleet, *_ = await booked_fleet("x")
+    client, here = fleet.client("one"), fleet.mesh("basil", "recorder")
+    async with recording(path, here, fleet.watcher, fleet.fleet, clock=True, wall=fleet.time) as timeline:
+        await asyncio.sleep(1)
+        needs = ["robot/a", "robot/b" if maintenance else "robot/*"]
+        what = book("crew", *needs, at=2 * HOUR, seconds=HOUR, maintenance=maintenance)
+        await do(client, what, BookingView)
+        await until(lambda: timeline.bookings.rows == 2)
+        await do(client, Unbook("crew"), BookingView)
+        await until(lambda: timeline.bookings.rows == 0)
+        assert timeline.layout(live=True).ahead == 0
     name = "maintenance: crew" if maintenance else "crew"
     # Erased, not left where it was.
     assert [names for _, names in drawn(path)] == [[name, name]]

@@ -24,8 +24,7 @@ from zscout.services.recorder.robots import MAX_WAITING, RATE, RateLimiter
 from zscout.services.recorder.timeline import Timeline
 
 
-def test_a_sender_s_last_word_comes_through_whatever_it_says(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_a_sender_s_last_word_comes_through_whatever_it_says(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         tracker = timeline.robots
         for number in range(1000):
@@ -76,8 +75,7 @@ def test_what_waits_of_a_sender_is_bounded() -> None:
     assert len(late) == MAX_WAITING
 
 
-def test_behaviors_end_with_their_client_unless_they_moved(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_behaviors_end_with_their_client_unless_they_moved(path: Path) -> None:
     heir = Sender("basil", "net")
     with Timeline("lab", path=path) as timeline:
         tracker = timeline.robots
@@ -93,10 +91,9 @@ def test_behaviors_end_with_their_client_unless_they_moved(tmp_path: Path) -> No
     }
 
 
-def test_lanes_are_bounded_and_keep_their_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lanes_are_bounded_and_keep_their_colours(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robots, "MAX_LANES", 2)
     monkeypatch.setattr(robots, "DETAILS", 5)
-    path = tmp_path / "run.rrd"
     deep = "/".join("abcdefghijk")
     with Timeline("lab", path=path) as timeline:
         tracker = timeline.robots
@@ -116,8 +113,7 @@ def test_lanes_are_bounded_and_keep_their_colours(tmp_path: Path, monkeypatch: p
     assert events(path) == ["timeline: more than 2 behaviors: the others have no lane"]
 
 
-def test_alerts_in_words(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_alerts_in_words(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         tracker = timeline.robots
         say(tracker, 0, "net/a", "alert", alert=True, robot="robot/scout33", detail="motion (3)")
@@ -167,10 +163,9 @@ def test_the_first_figure_of_a_device_lays_a_live_view_out_anew() -> None:
         assert "/device" in panes
 
 
-def test_devices_figures_and_health(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_devices_figures_and_health(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robots, "MAX_SERIES", 3)
     monkeypatch.setattr(robots, "MAX_FOLLOWED", 2)
-    path = tmp_path / "run.rrd"
 
     def state(at: float, rc: str, health: str = "ok", figures: dict[str, float] | None = None) -> None:
         tracker.state(at, RcState(rc, "cart", "i", sharable=False, health=health, figures=figures or {}))

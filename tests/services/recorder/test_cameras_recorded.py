@@ -19,8 +19,7 @@ from zscout.services.recorder.timeline import Timeline
 from zscout.types import Grant, Term
 
 
-def test_a_picture_that_is_old_says_so(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_a_picture_that_is_old_says_so(path: Path) -> None:
     picture = jpeg(0, "scout33", None)
     with Timeline("lab", path=path) as timeline:
         tracker = timeline.robots
@@ -47,8 +46,7 @@ def test_a_picture_that_is_old_says_so(tmp_path: Path) -> None:
     assert [at for _, at, _ in rows(path, "/camera/fgrab1/boxes", "Clear:is_recursive")] == [4]
 
 
-def test_boxes_end_with_what_they_mark(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_boxes_end_with_what_they_mark(path: Path) -> None:
     picture = jpeg(0, "scout33", None)
     next_grant, box = Grant(Term(1, "rcm"), 8), [10, 10, 20, 20]
     holds = {GRANT: HolderRow("a", robots=("robot/a",)), next_grant: HolderRow("b", robots=("robot/b",))}
@@ -71,9 +69,8 @@ def test_boxes_end_with_what_they_mark(tmp_path: Path) -> None:
     assert [at for _, at, _ in rows(path, "/camera/fgrab1/boxes", "Clear:is_recursive")] == [3, 5, 7, 9]
 
 
-def test_what_is_no_picture_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_no_picture_is_left_out(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(robots, "MAX_CAMERAS", 2)
-    path = tmp_path / "run.rrd"
     good = jpeg(0, "scout33", None)
     size = good.index(b"\xff\xc0") + 5
     with Timeline("lab", path=path) as timeline:

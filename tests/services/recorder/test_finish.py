@@ -53,8 +53,8 @@ def _pictures(path: Path, content: str) -> list[float]:
     return sorted(at for _, at, _ in rows(path, content, "EncodedImage:blob"))
 
 
-def test_of_old_pictures_one_a_second_stays(tmp_path: Path) -> None:
-    path, picture = tmp_path / "run.rrd", jpeg(0, "scout33", None)
+def test_of_old_pictures_one_a_second_stays(path: Path) -> None:
+    picture = jpeg(0, "scout33", None)
     end = WHOLE + 60
     with Timeline("lab", path=path) as timeline:
         for quarter in range(round(end) * 4 + 1):
@@ -92,8 +92,7 @@ def test_a_process_of_its_own_thins_what_is_over_and_says_what_it_can_t(tmp_path
     assert "third.rrd can't be written anew, and stays as it is" in words
 
 
-def test_what_can_t_be_written_anew_stays_as_it_is(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_what_can_t_be_written_anew_stays_as_it_is(path: Path, tmp_path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         timeline.event(0, "all is well")
         layout = timeline.layout(live=False)
@@ -128,8 +127,7 @@ def test_a_recording_goes_on_in_a_file_that_begins_with_what_is_shown(tmp_path: 
     assert len(list(rows(second, "/load/anvil", "SeriesLines:colors", static=True))) == 1
 
 
-def test_a_recording_that_can_t_go_on_in_another_file_goes_on_in_the_same(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_a_recording_that_can_t_go_on_in_another_file_goes_on_in_the_same(path: Path, tmp_path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         timeline.event(1, "before")
         with pytest.raises(TimelineError):
@@ -150,8 +148,7 @@ def test_the_oldest_recordings_make_room_but_not_what_is_written(tmp_path: Path)
     assert set(tmp_path.iterdir()) == {*made[3:]}
 
 
-def test_who_is_waited_for_comes_first_and_who_is_absent_last(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_who_is_waited_for_comes_first_and_who_is_absent_last(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         for rc in ("robot/a", "robot/b", "robot/c", "robot/d"):
             timeline.holders(0, rc, [HolderRow("survey")])
@@ -171,8 +168,7 @@ def test_who_is_waited_for_comes_first_and_who_is_absent_last(tmp_path: Path) ->
     assert colours(path, "/rc/robot/a")["/rc/robot/a"]["ws1 is gone"] == ABSENT
 
 
-def test_an_operator_is_red_among_arcs_and_events_as_well(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_an_operator_is_red_among_arcs_and_events_as_well(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         timeline.arc(0, "drive", "waiting", "for survey: robot/a", operator=True)
         timeline.arc(1, "drive", "running", "priority 10", operator=True)

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from tests.mesh.kit import run, until
+from tests.mesh.kit import until
 from tests.services.journal.kit import past
-from tests.services.journal.test_journal import START, Told
+from tests.services.journal.test_journal import START, telling
+from tests.services.recorder.kit import recording
 from tests.services.recorder.paper_run import colours, events, lanes
-from zscout.keyexpr import Role, Token
 from zscout.messages import History, JournalGap, Release
 from zscout.services.journal.asking import Told as Journals
 from zscout.services.journal.merging import Span
@@ -21,7 +21,6 @@ from zscout.services.recorder.colours import ABSENT, OPERATOR, PALETTE, faded
 from zscout.services.recorder.drawing import MAX_SLOTS, HolderRow
 from zscout.services.recorder.finish import finish
 from zscout.services.recorder.past import PastBar, past_lanes, past_of
-from zscout.services.recorder.recorder import Recorder
 from zscout.services.recorder.timeline import PAST_PART, Timeline
 
 ZERO = 1_000.0
@@ -106,8 +105,8 @@ def test_what_is_not_known_is_told_in_words() -> None:
     assert len(latest.gaps) == 1
 
 
-def test_the_past_is_drawn_paler_and_makes_the_run_no_longer(tmp_path: Path) -> None:
-    path, drive = tmp_path / "run.rrd", PastBar("drive", operator=True)
+def test_the_past_is_drawn_paler_and_makes_the_run_no_longer(path: Path) -> None:
+    drive = PastBar("drive", operator=True)
     with Timeline("lab", path=path) as timeline:
         timeline.holders(0.5, "robot/a", [HolderRow("survey")])
         timeline.past(
@@ -152,37 +151,23 @@ def test_only_the_first_file_has_the_past(tmp_path: Path) -> None:
     assert [states for _, states in lanes(second, "/rc/**")["/rc/robot/a"]] == [[""]]
 
 
-def test_a_recorder_that_comes_late_shows_what_journals_tell(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
-
-    async def story() -> None:
-        told, stop = Told(tmp_path, "x", "y"), asyncio.Event()
-        fleet = told.fleet
-        robots = [fleet.rc(f"robot/{name}") for name in "ab"]
-        await until(lambda: told.candidates["x"].rcm)
-        await fleet.joined(*robots)
-        one, two = fleet.client("one"), fleet.client("two")
-        await one.ask("survey", "robot/a", seconds=6_000)
-        await two.ask("film", "robot/b", seconds=600)
-        await asyncio.sleep(100)
-        await two.do(Release("film"))
-        await asyncio.sleep(50)
-        here = fleet.mesh("basil", "recorder")
-        with Timeline("lab", path=path, wall=True) as timeline:
-            recorder = Recorder(here, fleet.fleet, timeline, past=3_600, wall=lambda: START + here.now() / 10**9)
-            recording = asyncio.create_task(recorder.run(stop))
-            seen: list[Token] = []
-            fleet.watcher.watch(fleet.watcher.keys.alive_any(Role.RECORDER), lambda token, _: seen.append(token))
-            await until(lambda: seen)
-            await until(lambda: timeline.layout(live=True).past)
-            # What happens now is not the past, though the journals have it too.
-            await two.ask("again", "robot/b", seconds=600)
-            await asyncio.sleep(10)
-            stop.set()
-            await recording
-        await told.close()
-
-    run(story())
+async def test_a_recorder_that_comes_late_shows_what_journals_tell(path: Path, tmp_path: Path) -> None:
+    told, *_ = await telling(tmp_path, "x", "y", rcs=["robot/a", "robot/b"])
+    fleet = told.fleet
+    one, two = fleet.client("one"), fleet.client("two")
+    await one.ask("survey", "robot/a", seconds=6_000)
+    await two.ask("film", "robot/b", seconds=600)
+    await asyncio.sleep(100)
+    await two.do(Release("film"))
+    await asyncio.sleep(50)
+    here = fleet.mesh("basil", "recorder")
+    how: dict[str, Any] = {"past": 3_600, "wall": lambda: START + here.now() / 10**9}
+    async with recording(path, here, fleet.watcher, fleet.fleet, clock=True, **how) as timeline:
+        await until(lambda: timeline.layout(live=True).past)
+        # What happens now is not the past, though the journals have it too.
+        await two.ask("again", "robot/b", seconds=600)
+        await asyncio.sleep(10)
+    await told.close()
     found = lanes(path, "/rc/**")
     assert [states for _, states in found["/rc/robot/a"]] == [["survey (journal)"], [""], ["survey"]]
     assert [states for _, states in found["/rc/robot/b"]] == [["film (journal)"], [""], [""], ["again"]]

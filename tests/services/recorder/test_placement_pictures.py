@@ -30,8 +30,7 @@ def pixels(picture: Image.Image, colour: Rgb) -> list[tuple[int, int]]:
     return [(int(x), int(y)) for y, x in np.argwhere(off <= 3)]
 
 
-def test_an_hour_of_placements_at_a_glance(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_an_hour_of_placements_at_a_glance(path: Path, tmp_path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         play(timeline)
     with viewer(path, tmp_path, panes=8, height=HEIGHT) as client:
@@ -55,9 +54,8 @@ def test_an_hour_of_placements_at_a_glance(tmp_path: Path) -> None:
     assert abs(min(cross) / curves.width - 2600 / 3600) < 0.04
 
 
-def test_words_that_the_viewer_can_t_draw_do_not_end_it(tmp_path: Path) -> None:
+def test_words_that_the_viewer_can_t_draw_do_not_end_it(path: Path, tmp_path: Path) -> None:
     """Its font has no such letters, and it ends itself where it is to draw one."""
-    path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
         words = "日本 \U0001f916 ✖ عربى"
         timeline.arc(0, words, "waiting", words)
@@ -70,8 +68,7 @@ def test_words_that_the_viewer_can_t_draw_do_not_end_it(tmp_path: Path) -> None:
         assert [report for view in client.get_state().views for report in view.reports] == []
 
 
-def test_the_study_s_plots_show_all_and_compare(tmp_path: Path) -> None:
-    path = tmp_path / "study.rrd"
+def test_the_study_s_plots_show_all_and_compare(path: Path, tmp_path: Path) -> None:
     report, outcomes = study([1])
     record(path, report, outcomes)
     panes = len(SCENARIOS) * len(POLICIES) + 1

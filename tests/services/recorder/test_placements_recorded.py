@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
-from tests.hang import HANG
-from tests.live.lab import Lab
+from tests.services.recorder.kit import ears, recording
 from tests.services.recorder.paper_run import colours, events, lanes, rows
 from tests.services.recorder.placed_hour import TERM, placement, play
-from zscout.behaviors.client.client import Client
-from zscout.keyexpr import Sender
-from zscout.mesh import IncomingQuery, ZenohMesh
+from tests.services.recorder.test_service import Leader
+from zscout.mesh import IncomingQuery
 from zscout.messages import ComponentUse, ListPlacements, Placement, Placements, PlacerOperation
 from zscout.services.recorder import hosts as module
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.hosts import HostTracker
-from zscout.services.recorder.recorder import Recorder
 from zscout.services.recorder.timeline import Timeline
+from zscout.testing.memory import MemoryNetwork
 from zscout.types import Term
 
 SCALARS = "Scalars:scalars"
@@ -40,8 +37,7 @@ def curve(path: Path, entity: str) -> list[float]:
     return [value for _, value in points]
 
 
-def test_an_hour_reads_as_it_was(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_an_hour_reads_as_it_was(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         play(timeline)
     shown = lanes(path, "/host/**")
@@ -84,8 +80,7 @@ def test_an_hour_reads_as_it_was(tmp_path: Path) -> None:
     assert left == loads[1905]
 
 
-def test_a_component_has_the_colour_of_its_arc(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_a_component_has_the_colour_of_its_arc(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         timeline.holders(0, "robot/a", [HolderRow("first"), HolderRow("counter")])
         on_anvil = [placement(name, "running", "anvil", 1) for name in ("counter", "other")]
@@ -96,8 +91,7 @@ def test_a_component_has_the_colour_of_its_arc(tmp_path: Path) -> None:
     assert len(set(rc.values())) == 4
 
 
-def test_a_move_that_failed_is_told_and_leaves_no_mark(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_a_move_that_failed_is_told_and_leaves_no_mark(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         tracker = timeline.hosts
         say(tracker, 0, placement("counter", "running", "anvil", 1))
@@ -118,8 +112,7 @@ def say(tracker: HostTracker, at: float, *told: Placement, term: Term = TERM) ->
     tracker.placements(at, Placements(term, list(told)))
 
 
-def test_what_a_late_recorder_reads_did_not_happen_now(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_what_a_late_recorder_reads_did_not_happen_now(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         tracker = timeline.hosts
         say(tracker, 1, placement("newer", "running", "anvil", 2))
@@ -139,9 +132,8 @@ def test_what_a_late_recorder_reads_did_not_happen_now(tmp_path: Path) -> None:
     assert "crucible is being emptied: nothing is placed there any more" in events(path)
 
 
-def test_bad_names_are_left_out_and_lanes_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_names_are_left_out_and_lanes_are_bounded(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_HOSTS", 2)
-    path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
         tracker = timeline.hosts
         say(tracker, 0, placement("a/b", "running", "anvil", 1), placement("a", "running", "h" * 70, 1))
@@ -155,10 +147,9 @@ def use(component: str, cpu: float, memory: int = 0) -> ComponentUse:
     return ComponentUse(component, "kind", 1, cpu, memory)
 
 
-def test_the_heaviest_components_have_curves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_heaviest_components_have_curves(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_CURVES", 3)
     monkeypatch.setattr(module, "MAX_DRAWN", 5)
-    path = tmp_path / "run.rrd"
     many = [use(f"c{number}", 0.1 * number) for number in range(1, 7)]
     with Timeline("lab", path=path) as timeline:
         timeline.hosts.uses(0, "anvil", many)
@@ -183,8 +174,7 @@ def test_the_heaviest_components_have_curves(tmp_path: Path, monkeypatch: pytest
     assert sum("more than 5 components" in text for text in events(path)) == 1
 
 
-def test_no_line_is_drawn_through_a_host_s_silence(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_no_line_is_drawn_through_a_host_s_silence(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         for at in (0, 9, 60):
             timeline.hosts.load(at, "anvil", 1.0, 0.5)
@@ -194,8 +184,7 @@ def test_no_line_is_drawn_through_a_host_s_silence(tmp_path: Path) -> None:
         assert len(curve(path, f"/{folder}/anvil")) == 3
 
 
-def test_marks_of_one_moment_stand_above_each_other(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_marks_of_one_moment_stand_above_each_other(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         timeline.hosts.load(0, "anvil", 2.0)
         for at, name in ((1.0, "a"), (1.5, "b"), (1.9, "c"), (9.0, "d")):
@@ -205,48 +194,21 @@ def test_marks_of_one_moment_stand_above_each_other(tmp_path: Path) -> None:
     assert heights[0] < heights[1] < heights[2]
 
 
-@pytest.mark.live
-def test_a_recorder_hears_a_placer_and_asks_for_what_it_missed(tmp_path: Path) -> None:
-    """The words are a placer's, the mesh is real."""
-    path = tmp_path / "run.rrd"
+async def test_a_recorder_hears_a_placer_and_asks_for_what_it_missed(path: Path) -> None:
+    network = MemoryNetwork()
+    mesh = Leader(network).mesh
 
-    async def run() -> None:
-        async with Lab(tmp_path) as lab:
-            speaker: Client = await lab.client("speaker")
-            mesh, asked = speaker.mesh, asyncio.Event()
+    def list_all(query: IncomingQuery[PlacerOperation]) -> None:
+        assert isinstance(query.message, ListPlacements)
+        query.answer(Placements(TERM, [placement("counter", "running", "anvil", 1)]))
 
-            def answer(request: IncomingQuery[PlacerOperation]) -> None:
-                assert isinstance(request.message, ListPlacements)
-                request.answer(Placements(TERM, [placement("counter", "running", "anvil", 1)]))
-                asked.set()
-
-            served = mesh.serve(mesh.keys.placer(mesh.me), PlacerOperation, answer)
-            fleet = lab.fleet
-            async with await ZenohMesh.open(fleet, Sender("here", "recorder")) as ears:
-                with Timeline("lab", path=path) as timeline:
-                    there, stop = asyncio.Event(), asyncio.Event()
-                    show = timeline.hosts.lanes.show
-
-                    def seen(at: float, name: str, shown: Mapping[str, tuple[str, int]]) -> None:
-                        show(at, name, shown)
-                        there.set()
-
-                    timeline.hosts.lanes.show = seen  # type: ignore[method-assign]
-                    recording = asyncio.create_task(Recorder(ears, fleet, timeline).run(stop))
-                    async with asyncio.timeout(HANG):
-                        await asked.wait()
-                        await there.wait()
-                        there.clear()
-                        mesh.put(
-                            mesh.keys.placements,
-                            Placements(TERM, [placement("counter", "running", "basil", 2, moves=1, dead=0.5)]),
-                        )
-                        await there.wait()
-                    stop.set()
-                    await recording
-            served.close()
-
-    asyncio.run(run())
+    served = mesh.serve(mesh.keys.placer(mesh.me), PlacerOperation, list_all)
+    async with recording(path, ears(network), mesh):
+        await asyncio.sleep(1)
+        moved = placement("counter", "running", "basil", 2, moves=1, dead=0.5)
+        mesh.put(mesh.keys.placements, Placements(TERM, [moved]))
+        await asyncio.sleep(1)
+    served.close()
     assert [text for text in events(path) if text.startswith("counter")] == [
         "counter (counter) runs on anvil already",
         "counter moved anvil -> basil, dead 500 ms",

@@ -28,8 +28,7 @@ def pixels(picture: Image.Image, colour: Rgb, off: int = 3) -> list[tuple[int, i
     return [(int(x), int(y)) for y, x in np.argwhere(far <= off)]
 
 
-def test_a_minute_of_robots_at_a_glance(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_a_minute_of_robots_at_a_glance(path: Path, tmp_path: Path) -> None:
     record(path, until=37)
     with viewer(path, tmp_path, panes=10, height=HEIGHT) as client:
         picture = settled_picture(client, tmp_path / "picture.png")
@@ -74,9 +73,9 @@ def is_a_picture(pane: Image.Image) -> bool:
     return len(greys) > 100
 
 
-def test_garbled_pictures_and_words_do_not_end_the_viewer(tmp_path: Path) -> None:
+def test_garbled_pictures_and_words_do_not_end_the_viewer(path: Path, tmp_path: Path) -> None:
     """Seen as a live view shows it: the layout has grown with what came."""
-    path, live = tmp_path / "run.rrd", tmp_path / "live.rrd"
+    live = tmp_path / "live.rrd"
     good, plan = jpeg(0, "scout33", None), bytearray(png())
     torn = bytearray(good)
     torn[700::7] = b"\xff" * len(torn[700::7])

@@ -23,6 +23,8 @@ from zscout.services.recorder.process import RecorderJob, decode_job, encode_job
 from zscout.services.recorder.recorder import Recorder
 from zscout.services.recorder.timeline import Timeline
 
+REAL_TIME = True
+
 
 def test_how_many_pictures_a_recorder_takes_is_set_in_the_node_file(tmp_path: Path) -> None:
     def frames(text: str) -> float:
@@ -40,94 +42,84 @@ def test_how_many_pictures_a_recorder_takes_is_set_in_the_node_file(tmp_path: Pa
 
 
 @pytest.mark.live
-def test_who_takes_no_pictures_does_not_look(tmp_path: Path) -> None:
+async def test_who_takes_no_pictures_does_not_look(tmp_path: Path) -> None:
     """And who takes them looks only while the framegrabber is there."""
-
-    async def run() -> None:
-        async with Lab(tmp_path) as lab:
-            speaker = (await lab.client("speaker")).mesh
-            watched: asyncio.Queue[bool] = asyncio.Queue()
-            publisher = speaker.frame_publisher(speaker.keys.frame(CAMERA))
-            publisher.follow(watched.put_nowait)
-            here = Sender("here", "ears")
-            async with await ZenohMesh.open(lab.fleet, here) as ears:
-                with Timeline("lab", path=tmp_path / "run.rrd") as timeline:
-                    heard, offered, stop = asyncio.Event(), asyncio.Event(), asyncio.Event()
-                    timeline.robots.behavior = lambda *_: heard.set()  # type: ignore[method-assign]
-                    timeline.presence = lambda _, text, *level: offered.set() if CAMERA in text else None  # type: ignore[method-assign]
-                    recorders = [asyncio.create_task(Recorder(ears, lab.fleet, timeline, 0).run(stop))]
-                    token = speaker.alive(Token("cart", Role.RC, CAMERA, "i1"))
-                    # What blind has asked for so far is known to the speaker once a question of it is.
-                    said = speaker.publisher(speaker.keys.behavior(speaker.me), BehaviorSaid)
-                    async with asyncio.timeout(HANG):
-                        await offered.wait()
-                        while not heard.is_set():
-                            said.put(BehaviorSaid("net", "search"))
-                            await asyncio.sleep(0.02)
-                        assert not publisher.watched
-                        assert watched.empty()
-                        recorders.append(asyncio.create_task(Recorder(ears, lab.fleet, timeline, 20).run(stop)))
-                        assert await watched.get()
-                        token.close()
-                        assert not await watched.get()
-                        stop.set()
-                        await asyncio.gather(*recorders)
-            publisher.close()
-
-    asyncio.run(run())
+    async with Lab(tmp_path) as lab:
+        speaker = (await lab.client("speaker")).mesh
+        watched: asyncio.Queue[bool] = asyncio.Queue()
+        publisher = speaker.frame_publisher(speaker.keys.frame(CAMERA))
+        publisher.follow(watched.put_nowait)
+        here = Sender("here", "ears")
+        async with await ZenohMesh.open(lab.fleet, here) as ears:
+            with Timeline("lab", path=tmp_path / "run.rrd") as timeline:
+                heard, offered, stop = asyncio.Event(), asyncio.Event(), asyncio.Event()
+                timeline.robots.behavior = lambda *_: heard.set()  # type: ignore[method-assign]
+                timeline.presence = lambda _, text, *level: offered.set() if CAMERA in text else None  # type: ignore[method-assign]
+                recorders = [asyncio.create_task(Recorder(ears, lab.fleet, timeline, 0).run(stop))]
+                token = speaker.alive(Token("cart", Role.RC, CAMERA, "i1"))
+                # What blind has asked for so far is known to the speaker once a question of it is.
+                said = speaker.publisher(speaker.keys.behavior(speaker.me), BehaviorSaid)
+                async with asyncio.timeout(HANG):
+                    await offered.wait()
+                    while not heard.is_set():
+                        said.put(BehaviorSaid("net", "search"))
+                        await asyncio.sleep(0.02)
+                    assert not publisher.watched
+                    assert watched.empty()
+                    recorders.append(asyncio.create_task(Recorder(ears, lab.fleet, timeline, 20).run(stop)))
+                    assert await watched.get()
+                    token.close()
+                    assert not await watched.get()
+                    stop.set()
+                    await asyncio.gather(*recorders)
+        publisher.close()
 
 
 @pytest.mark.live
-def test_a_recorder_sees_what_robots_do(tmp_path: Path) -> None:
+async def test_a_recorder_sees_what_robots_do(path: Path, tmp_path: Path) -> None:
     """The RCs are a real node's; what framegrabber, building and behavior say, their holder says.
 
     A recorder beside it that takes no pictures leaves the framegrabber in peace."""
-    path, picture = tmp_path / "run.rrd", jpeg(0, "scout33", None)
-
-    async def run() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("a", "robot/scout33", CAMERA)
-            client = await lab.client("net")
-            mesh, keys = client.mesh, client.mesh.keys
-            frames, looked = mesh.frame_publisher(keys.frame(CAMERA)), asyncio.Event()
-            frames.follow(lambda watched: looked.set() if watched else None)
-            served = mesh.serve(
-                keys.building_plan(mesh.me),
-                PlanAsk,
-                lambda request: request.answer(BuildingPlan("room", 6.0, 4.5, png())),
-            )
-            walks = mesh.publisher(keys.building_poses(mesh.me), BuildingPoses)
-            says = mesh.publisher(keys.behavior(mesh.me), BehaviorSaid)
-            job = RecorderJob(RecorderConfig(tmp_path / "runs", "127.0.0.1", 0, frames=0), lab.fleet, "blind")
-            blind = run_recorder(lab, encode_job(job))
-            await lab.ready(client, "robot/scout33", CAMERA)
-            await recording(lab)
-            assert not frames.watched
-            assert blind.stdin is not None
-            blind.stdin.close()
-            assert await asyncio.to_thread(blind.wait, HANG) == 0
-            async with await ZenohMesh.open(lab.fleet, Sender("here", "recorder")) as ears:
-                with Timeline("lab", path=path) as timeline:
-                    stop = asyncio.Event()
-                    running = asyncio.create_task(Recorder(ears, lab.fleet, timeline, 20).run(stop))
-                    await recording(lab)
-                    needs: dict[str, dict[str, float]] = {"robot/scout33": {}, CAMERA: {}}
-                    async with asyncio.timeout(HANG), hold(client, "hide", needs, keep=True) as held:
-                        await looked.wait()
-                        number = 0
-                        # Until a plan and a picture have been shown.
-                        while number < 8 or not (timeline.robots.shown.floor and timeline.robots.shown.cameras):
-                            number += 1
-                            frames.put(FrameHead(number, number / 10, 160, 120, held.grant), picture)
-                            walks.put(BuildingPoses(number, robots=[Placed("scout33", 3, 2, camera=1)]))
-                            said = f"motion ({number})"
-                            says.put(BehaviorSaid("net/scout33", "alert", said, "robot/scout33", alert=True))
-                            await asyncio.sleep(0.1)
-                    stop.set()
-                    await running
-            served.close()
-
-    asyncio.run(run())
+    picture = jpeg(0, "scout33", None)
+    async with Lab(tmp_path) as lab:
+        lab.node("a", "robot/scout33", CAMERA)
+        client = await lab.client("net")
+        mesh, keys = client.mesh, client.mesh.keys
+        frames, looked = mesh.frame_publisher(keys.frame(CAMERA)), asyncio.Event()
+        frames.follow(lambda watched: looked.set() if watched else None)
+        served = mesh.serve(
+            keys.building_plan(mesh.me), PlanAsk, lambda request: request.answer(BuildingPlan("room", 6.0, 4.5, png()))
+        )
+        walks = mesh.publisher(keys.building_poses(mesh.me), BuildingPoses)
+        says = mesh.publisher(keys.behavior(mesh.me), BehaviorSaid)
+        job = RecorderJob(RecorderConfig(tmp_path / "runs", "127.0.0.1", 0, frames=0), lab.fleet, "blind")
+        blind = run_recorder(lab, encode_job(job))
+        await lab.ready(client, "robot/scout33", CAMERA)
+        await recording(lab)
+        assert not frames.watched
+        assert blind.stdin is not None
+        blind.stdin.close()
+        assert await asyncio.to_thread(blind.wait, HANG) == 0
+        async with await ZenohMesh.open(lab.fleet, Sender("here", "recorder")) as ears:
+            with Timeline("lab", path=path) as timeline:
+                stop = asyncio.Event()
+                running = asyncio.create_task(Recorder(ears, lab.fleet, timeline, 20).run(stop))
+                await recording(lab)
+                needs: dict[str, dict[str, float]] = {"robot/scout33": {}, CAMERA: {}}
+                async with asyncio.timeout(HANG), hold(client, "hide", needs, keep=True) as held:
+                    await looked.wait()
+                    number = 0
+                    # Until a plan and a picture have been shown.
+                    while number < 8 or not (timeline.robots.shown.floor and timeline.robots.shown.cameras):
+                        number += 1
+                        frames.put(FrameHead(number, number / 10, 160, 120, held.grant), picture)
+                        walks.put(BuildingPoses(number, robots=[Placed("scout33", 3, 2, camera=1)]))
+                        said = f"motion ({number})"
+                        says.put(BehaviorSaid("net/scout33", "alert", said, "robot/scout33", alert=True))
+                        await asyncio.sleep(0.1)
+                stop.set()
+                await running
+        served.close()
     assert "scout33 · alert" in [text for _, text, _ in captions(path, "fgrab1")]
     assert "scout33 sees motion (1)" in events(path)
     assert any(value == [[450, 375]] for _, _, value in rows(path, "/floor/robots", "Points2D:positions"))

@@ -17,8 +17,7 @@ from zscout.services.recorder.colours import DOING, HIDDEN, IN_THE_OPEN, OPERATO
 from zscout.services.recorder.timeline import Timeline
 
 
-def test_a_minute_reads_as_it_was(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_a_minute_reads_as_it_was(path: Path) -> None:
     record(path)
     shown = lanes(path, "/behavior/**")
     assert set(shown) == {
@@ -70,8 +69,7 @@ def test_what_behaviors_do_has_colours_well_apart() -> None:
     assert min(math.dist(lab_of(one), lab_of(two)) for one, two in combinations(floor, 2)) > 40
 
 
-def test_places_on_the_floor_are_pixels_of_its_plan(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_places_on_the_floor_are_pixels_of_its_plan(path: Path) -> None:
     far = [Placed("lost", 1e9, 0), Placed("porch", 3.0, -0.3)]
     with Timeline("lab", path=path) as timeline:
         tracker = timeline.robots
@@ -91,8 +89,7 @@ def test_places_on_the_floor_are_pixels_of_its_plan(tmp_path: Path) -> None:
     assert walkers == [[450, 720]]
 
 
-def test_trails_are_of_the_last_minute(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_trails_are_of_the_last_minute(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         tracker = timeline.robots
         tracker.floor.poses(0, BUILDING, poses([]))
@@ -121,8 +118,7 @@ def test_trails_are_of_the_last_minute(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_a_plan_that_can_t_be_shown_is_told_once(tmp_path: Path, plan: BuildingPlan, why: str) -> None:
-    path = tmp_path / "run.rrd"
+def test_a_plan_that_can_t_be_shown_is_told_once(path: Path, plan: BuildingPlan, why: str) -> None:
     with Timeline("lab", path=path) as timeline:
         tracker = timeline.robots
         for at in range(20):
@@ -134,8 +130,7 @@ def test_a_plan_that_can_t_be_shown_is_told_once(tmp_path: Path, plan: BuildingP
     assert list(rows(path, "/floor/**", "Points2D:positions")) == []
 
 
-def test_one_building_is_shown_until_it_is_silent(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_one_building_is_shown_until_it_is_silent(path: Path) -> None:
     other = Sender("basil", "office")
     with Timeline("lab", path=path) as timeline:
         tracker = timeline.robots
@@ -163,8 +158,7 @@ def test_one_building_is_shown_until_it_is_silent(tmp_path: Path) -> None:
     assert [at for _, at, _ in rows(path, "/floor/robots", "Clear:is_recursive")] == [20]
 
 
-def test_a_building_that_begins_anew_is_asked_for_its_plan(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_a_building_that_begins_anew_is_asked_for_its_plan(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         tracker = timeline.robots
         for at, time, metres in ((0, 50.0, (6.0, 4.5)), (3, 0.0, (12.0, 9.0))):

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 from collections.abc import Callable
 from decimal import Decimal
 from pathlib import Path
 
 import pytest
 
-from tests.mesh.kit import run, until
+from tests.services.recorder.kit import ears, recording
 from tests.services.recorder.paper_run import SCOUT33, events, lanes, rows
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
@@ -40,76 +39,48 @@ class Leader:
         ]
 
 
-async def rcm_sees(rcm: Leader, role: str) -> None:
-    seen: list[Token] = []
-    rcm.mesh.watch(rcm.mesh.keys.alive_any(role), lambda token, _: seen.append(token))
-    await until(lambda: seen)
-
-
 def grants(seq: int, *holders: Holder) -> Grants:
     return Grants(TERM, seq, seq - 1, 1, {SCOUT33: list(holders)})
 
 
-def test_it_reads_the_state_and_follows_what_is_published(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
-
-    async def play() -> None:
-        network, stop = MemoryNetwork(), asyncio.Event()
-        rcm, here = Leader(network), network.open("lab", Sender("basil", "recorder"))
-        with Timeline("lab", path=path) as timeline:
-            recording = asyncio.create_task(Recorder(here, default_fleet(), timeline).run(stop))
-            await rcm_sees(rcm, Role.RECORDER)
-            me = Sender("cart", "net")
-            notice = Notice("a1", "hide", str(me), "queued", TERM, 1, reason="robot/scout33 is held by drive")
-            rcm.mesh.put(rcm.mesh.keys.notice(me), notice)
-            await asyncio.sleep(1)
-            holder = Holder("a1", "hide", str(me), GRANT, PLACE, [SCOUT33], Decimal(5), 5, priority=1)
-            rcm.mesh.put(rcm.mesh.keys.grants, grants(1, holder))
-            await asyncio.sleep(1)
-            rcm.mesh.put(rcm.mesh.keys.grants, grants(2))
-            await asyncio.sleep(1)
-            stop.set()
-            await recording
-
-    run(play())
+async def test_it_reads_the_state_and_follows_what_is_published(path: Path) -> None:
+    network = MemoryNetwork()
+    rcm = Leader(network)
+    async with recording(path, ears(network), rcm.mesh):
+        me = Sender("cart", "net")
+        notice = Notice("a1", "hide", str(me), "queued", TERM, 1, reason="robot/scout33 is held by drive")
+        rcm.mesh.put(rcm.mesh.keys.notice(me), notice)
+        await asyncio.sleep(1)
+        holder = Holder("a1", "hide", str(me), GRANT, PLACE, [SCOUT33], Decimal(5), 5, priority=1)
+        rcm.mesh.put(rcm.mesh.keys.grants, grants(1, holder))
+        await asyncio.sleep(1)
+        rcm.mesh.put(rcm.mesh.keys.grants, grants(2))
+        await asyncio.sleep(1)
     assert [state for _, state in lanes(path, "/rc/**")[f"/rc/{SCOUT33}"]] == [["hide"], [""]]
     doing = [state[0] for _, state in lanes(path, "/arc/**")["/arc/hide"]]
     assert doing == ["waiting · robot/scout33 is held by drive", "running · priority 1 · min 5 s"]
     assert "hide runs on robot/scout33" in events(path)
 
 
-def test_bars_say_who_is_in_the_way_and_events_nothing_of_comings_and_goings(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
-
-    async def play() -> None:
-        network, stop = MemoryNetwork(), asyncio.Event()
-        queue: list[WaitView] = []
-        rcm = Leader(network, lambda: RcmState(TERM, 0, "anvil", queue=queue))
-        here = network.open("lab", Sender("basil", "recorder"))
-        with Timeline("lab", path=path) as timeline:
-            recording = asyncio.create_task(Recorder(here, default_fleet(), timeline).run(stop))
-            await rcm_sees(rcm, Role.RECORDER)
-            node = network.open("lab", Sender("cart", "node"))
-            tokens = [
-                node.alive(Token("cart", Role.NODE, "node", "i2")),
-                node.alive(Token("cart", Role.RC, SCOUT33, "i3")),
-            ]
-            await asyncio.sleep(1)
-            why = ReasonInfo("held", [SCOUT33], [ReasonParty("a0", "drive", "cart/teleop", priority=10)])
-            me = Sender("cart", "net")
-            notice = Notice("a1", "hide", str(me), "queued", TERM, 1, reason=REASON, why=why)
-            queue.append(WaitView("a1", "hide", str(me), 1, PLACE, {SCOUT33: {}}, Decimal(5), 0.0, REASON, why=why))
-            rcm.mesh.put(rcm.mesh.keys.notice(me), notice)
-            await asyncio.sleep(1)
-            assert list(timeline.layout(live=False).contended) == [f"/rc/{SCOUT33}"]
-            for token in tokens:
-                token.close()
-            await asyncio.sleep(1)
-            assert list(timeline.layout(live=False).absent) == [f"/rc/{SCOUT33}"]
-            stop.set()
-            await recording
-
-    run(play())
+async def test_bars_say_who_is_in_the_way_and_events_nothing_of_comings_and_goings(path: Path) -> None:
+    network = MemoryNetwork()
+    queue: list[WaitView] = []
+    rcm = Leader(network, lambda: RcmState(TERM, 0, "anvil", queue=queue))
+    async with recording(path, ears(network), rcm.mesh) as timeline:
+        node = network.open("lab", Sender("cart", "node"))
+        tokens = [node.alive(Token("cart", Role.NODE, "node", "i2")), node.alive(Token("cart", Role.RC, SCOUT33, "i3"))]
+        await asyncio.sleep(1)
+        why = ReasonInfo("held", [SCOUT33], [ReasonParty("a0", "drive", "cart/teleop", priority=10)])
+        me = Sender("cart", "net")
+        notice = Notice("a1", "hide", str(me), "queued", TERM, 1, reason=REASON, why=why)
+        queue.append(WaitView("a1", "hide", str(me), 1, PLACE, {SCOUT33: {}}, Decimal(5), 0.0, REASON, why=why))
+        rcm.mesh.put(rcm.mesh.keys.notice(me), notice)
+        await asyncio.sleep(1)
+        assert list(timeline.layout(live=False).contended) == [f"/rc/{SCOUT33}"]
+        for token in tokens:
+            token.close()
+        await asyncio.sleep(1)
+        assert list(timeline.layout(live=False).absent) == [f"/rc/{SCOUT33}"]
     assert [state for _, (state,) in lanes(path, "/arc/hide")["/arc/hide"]] == [f"waiting · for drive: {SCOUT33}"]
     assert [state for _, (state,) in lanes(path, f"/rc/{SCOUT33}")[f"/rc/{SCOUT33}"]] == ["", "not there"]
     assert events(path) == ["anvil leads", f"hide {REASON}"]
@@ -121,9 +92,8 @@ def test_bars_say_who_is_in_the_way_and_events_nothing_of_comings_and_goings(tmp
     ]
 
 
-def test_a_bar_names_first_who_holds_what_would_do(tmp_path: Path) -> None:
+async def test_a_bar_names_first_who_holds_what_would_do(path: Path) -> None:
     """By the names of their lanes: which choices there are, and what their users run, is told at length elsewhere."""
-    path = tmp_path / "run.rrd"
     net, crew = Sender("cart", "net"), Sender("dray", "request-7e3c")
     by = [
         ReasonParty("a1", "hide", str(net), priority=1, who=Who("root", "cart", "component place_sensor_net")),
@@ -136,18 +106,10 @@ def test_a_bar_names_first_who_holds_what_would_do(tmp_path: Path) -> None:
         WaitView("a3", "watch", str(net), 1, PLACE, {}, Decimal(5), 0.0, "waits for one of many words", why=why),
         WaitView("a4", "film", str(net), 1, PLACE, {}, Decimal(5), 0.0, "votes are out", why=ReasonInfo("voting")),
     ]
-
-    async def play() -> None:
-        network, stop = MemoryNetwork(), asyncio.Event()
-        rcm = Leader(network, lambda: RcmState(TERM, 0, "anvil", queue=queue))
-        with Timeline("lab", path=path) as timeline:
-            recorder = Recorder(network.open("lab", Sender("basil", "recorder")), default_fleet(), timeline)
-            recording = asyncio.create_task(recorder.run(stop))
-            await rcm_sees(rcm, Role.RECORDER)
-            stop.set()
-            await recording
-
-    run(play())
+    network = MemoryNetwork()
+    rcm = Leader(network, lambda: RcmState(TERM, 0, "anvil", queue=queue))
+    async with recording(path, ears(network), rcm.mesh):
+        pass
     blocked = f"for hide (root@cart), survey (alice@dray): {SCOUT33}; one of framegrabber/fg1, fg2 and 1 more"
     assert {entity: [text for _, (text,) in lane] for entity, lane in lanes(path, "/arc/**").items()} == {
         "/arc/watch": [f"waiting · {blocked}"],
@@ -156,42 +118,27 @@ def test_a_bar_names_first_who_holds_what_would_do(tmp_path: Path) -> None:
     assert events(path) == ["anvil leads", f"watch waits {blocked}", "film waits: votes are out"]
 
 
-def test_at_its_end_it_reads_what_was_published_and_missed(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
-
-    async def play() -> None:
-        network, stop = MemoryNetwork(), asyncio.Event()
-        view = HoldView("a1", "hide", "cart/net", 1, GRANT, PLACE, {SCOUT33: {}}, Decimal(5), 0.0, 5.0)
-        holds: list[HoldView] = []
-        rcm = Leader(network, lambda: RcmState(TERM, len(holds), "anvil", holds))
-        with Timeline("lab", path=path) as timeline:
-            recorder = Recorder(network.open("lab", Sender("basil", "recorder")), default_fleet(), timeline)
-            recording = asyncio.create_task(recorder.run(stop))
-            await rcm_sees(rcm, Role.RECORDER)
-            holds.append(view)
-            stop.set()
-            await recording
-
-    run(play())
+async def test_at_its_end_it_reads_what_was_published_and_missed(path: Path) -> None:
+    network = MemoryNetwork()
+    view = HoldView("a1", "hide", "cart/net", 1, GRANT, PLACE, {SCOUT33: {}}, Decimal(5), 0.0, 5.0)
+    holds: list[HoldView] = []
+    rcm = Leader(network, lambda: RcmState(TERM, len(holds), "anvil", holds))
+    async with recording(path, ears(network), rcm.mesh):
+        holds.append(view)
     assert [state for _, state in lanes(path, "/rc/**")[f"/rc/{SCOUT33}"]] == [["hide"]]
 
 
-def test_a_part_that_raises_is_logged_and_ends_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+async def test_a_part_that_raises_is_logged_and_ends_it(
+    path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async def play() -> None:
-        network = MemoryNetwork()
-        rcm, here = Leader(network), network.open("lab", Sender("basil", "recorder"))
-        with Timeline("lab", path=tmp_path / "run.rrd") as timeline:
-            recorder = Recorder(here, default_fleet(), timeline)
-            recording = asyncio.create_task(recorder.run(asyncio.Event()))
-            await asyncio.sleep(1)
-            monkeypatch.setattr(timeline, "holders", lambda *_: 1 / 0)
-            rcm.mesh.put(rcm.mesh.keys.grants, grants(1))
-            async with asyncio.timeout(60):
-                await recording
-
-    with caplog.at_level(logging.ERROR), pytest.raises(RecorderFailed):
-        run(play())
+    network = MemoryNetwork()
+    rcm = Leader(network)
+    with Timeline("lab", path=path) as timeline:
+        running = asyncio.create_task(Recorder(ears(network), default_fleet(), timeline).run(asyncio.Event()))
+        await asyncio.sleep(1)
+        monkeypatch.setattr(timeline, "holders", lambda *_: 1 / 0)
+        rcm.mesh.put(rcm.mesh.keys.grants, grants(1))
+        with pytest.raises(RecorderFailed):
+            await asyncio.wait_for(running, 60)
     assert "the recorder failed" in caplog.text
     assert "ZeroDivisionError" in caplog.text

@@ -37,8 +37,7 @@ from zscout.services.recorder.drawing import CURVE_TICK, Drawing, HolderRow
 from zscout.services.recorder.timeline import OPERATOR_MARK, Timeline, TimelineError
 
 
-def test_table_1_recorded_reads_as_table_2(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_table_1_recorded_reads_as_table_2(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         play_table1(timeline)
     shown = lanes(path, "/rc/**")
@@ -53,8 +52,7 @@ def test_table_1_recorded_reads_as_table_2(tmp_path: Path) -> None:
     ]
 
 
-def test_arc_lanes_tell_the_story(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_arc_lanes_tell_the_story(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         play_table1(timeline)
     shown = lanes(path, "/arc/**")
@@ -65,8 +63,7 @@ def test_arc_lanes_tell_the_story(tmp_path: Path) -> None:
     assert any("arc2 preempted" in text for text in events(path))
 
 
-def test_an_arc_has_one_colour_and_the_operator_has_its_own(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_an_arc_has_one_colour_and_the_operator_has_its_own(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         play_table1(timeline)
     by_text: dict[str, set[int]] = {}
@@ -86,9 +83,8 @@ def test_an_arc_has_one_colour_and_the_operator_has_its_own(tmp_path: Path) -> N
             assert (colour == OPERATOR) == text.startswith("preempted")
 
 
-def test_only_what_an_operator_did_is_red_among_the_events(tmp_path: Path) -> None:
+def test_only_what_an_operator_did_is_red_among_the_events(path: Path) -> None:
     """The viewer gives a line without a colour that of the line before."""
-    path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
         timeline.event(0, "one")
         timeline.warn(1, "two", operator=True)
@@ -99,8 +95,8 @@ def test_only_what_an_operator_did_is_red_among_the_events(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("epoch", [None, 1.8e9])
-def test_points_of_curves_come_in_few_pieces_and_none_is_lost(tmp_path: Path, epoch: float | None) -> None:
-    path, each = tmp_path / "run.rrd", rr.ChunkBatcherConfig.ALWAYS_TEST_ONLY()
+def test_points_of_curves_come_in_few_pieces_and_none_is_lost(path: Path, epoch: float | None) -> None:
+    each = rr.ChunkBatcherConfig.ALWAYS_TEST_ONLY()
     stream = rr.RecordingStream("zscout", batcher_config=each)
     stream.save(path)
     drawing = Drawing(stream)
@@ -150,8 +146,7 @@ def test_colours_are_well_apart() -> None:
     assert min(math.dist(lab_of(OPERATOR), lab_of(colour)) for colour in others) > 50
 
 
-def test_holders_of_a_sharable_rc_keep_their_rows(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_holders_of_a_sharable_rc_keep_their_rows(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         for at, names in enumerate(("a", "ab", "abc", "bc", "bcd", "")):
             timeline.holders(at, "radio/rf0", [HolderRow(name) for name in names])
@@ -165,8 +160,7 @@ def test_holders_of_a_sharable_rc_keep_their_rows(tmp_path: Path) -> None:
     ]
 
 
-def test_a_crowd_is_summed_up_in_the_last_row(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_a_crowd_is_summed_up_in_the_last_row(path: Path) -> None:
     crowd = [HolderRow(f"arc{number}") for number in range(11)]
     with Timeline("lab", path=path) as timeline:
         timeline.holders(0, "radio/rf0", crowd)
@@ -180,8 +174,7 @@ def test_a_crowd_is_summed_up_in_the_last_row(tmp_path: Path) -> None:
     assert changes[3] == [""] * 8
 
 
-def test_what_does_not_change_is_not_written_again(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_what_does_not_change_is_not_written_again(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         for at in range(100):
             timeline.holders(at, SCOUT33, [HolderRow("arc0")])
@@ -189,11 +182,10 @@ def test_what_does_not_change_is_not_written_again(tmp_path: Path) -> None:
     assert [len(changes) for changes in lanes(path, "/**").values()] == [1, 1]
 
 
-def test_names_past_the_limit_are_noted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_past_the_limit_are_noted_once(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "MAX_ARCS", 3)
     monkeypatch.setattr(module, "MAX_RCS", 2)
     monkeypatch.setattr(hosts, "MAX_HOSTS", 1)
-    path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
         for number in range(6):
             timeline.arc(number, f"arc{number}", "waiting")
@@ -209,17 +201,15 @@ def test_names_past_the_limit_are_noted_once(tmp_path: Path, monkeypatch: pytest
     assert all(note.startswith("timeline: more than ") for note in notes)
 
 
-def test_a_lane_forgets_the_colours_longest_unused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lane_forgets_the_colours_longest_unused(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "RC_STATES", 16)
-    path = tmp_path / "run.rrd"
     with Timeline("lab", path=path) as timeline:
         for number in range(40):
             timeline.holders(number, SCOUT33, [HolderRow(f"arc{number}")])
     assert list(colours(path, "/rc/**")[f"/rc/{SCOUT33}"]) == [f"arc{number}" for number in range(24, 40)]
 
 
-def test_hostile_names_and_texts_are_tamed(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_hostile_names_and_texts_are_tamed(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         timeline.arc(0, "../a b\n/\x00/" + "x" * 1000, "waiting", "because\n\x1b[31mof " + "y" * 1000)
         timeline.event(0, "one\ntwo\x07 \u65e5\u2716 é " + "z" * 10_000, "SHOUT")
@@ -245,8 +235,7 @@ def test_a_time_that_is_none_is_refused(tmp_path: Path, at: float) -> None:
         timeline.event(at, "text")
 
 
-def test_many_threads_keep_their_times(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_many_threads_keep_their_times(path: Path) -> None:
 
     def write(number: int) -> None:
         for step in range(50):
@@ -263,8 +252,8 @@ def test_many_threads_keep_their_times(tmp_path: Path) -> None:
     assert all(texts == [f"{at:.0f}"] for at, texts in written)
 
 
-def test_live_viewers_get_what_the_file_gets(tmp_path: Path) -> None:
-    path, copy = tmp_path / "run.rrd", tmp_path / "copy.rrd"
+def test_live_viewers_get_what_the_file_gets(path: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.rrd"
     with Timeline("lab", path=path, port=0) as timeline:
         assert timeline.url is not None
         play_table1(timeline)
@@ -296,8 +285,7 @@ def becomes_equal(viewer: subprocess.Popen[bytes], path: Path, copy: Path) -> bo
     return False
 
 
-def test_a_port_that_is_taken_is_a_clear_error(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_a_port_that_is_taken_is_a_clear_error(path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(TimelineError) as caught:
@@ -329,8 +317,7 @@ def test_loopback_unless_told_otherwise() -> None:
             socket.create_connection(("127.0.0.2", port), timeout=5)
 
 
-def test_closing_twice_and_writing_afterwards_do_nothing(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_closing_twice_and_writing_afterwards_do_nothing(path: Path) -> None:
     timeline = Timeline("lab", path=path)
     timeline.event(1, "first")
     timeline.close()
@@ -342,8 +329,7 @@ def test_closing_twice_and_writing_afterwards_do_nothing(tmp_path: Path) -> None
     assert events(path) == ["first"]
 
 
-def test_a_recording_is_named_by_fleet_and_start(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_a_recording_is_named_by_fleet_and_start(path: Path) -> None:
     Timeline("lab", path=path).close()
     (entry,) = RrdReader(path).recordings()
     assert entry.application_id == "zscout"

@@ -272,8 +272,7 @@ def height_of(picture: Image.Image, colour: int) -> float:
     return sum(rows) / len(rows)
 
 
-def test_a_recorder_that_was_killed_leaves_a_recording_that_opens(tmp_path: Path) -> None:
-    path = tmp_path / "run.rrd"
+def test_a_recorder_that_was_killed_leaves_a_recording_that_opens(path: Path, tmp_path: Path) -> None:
     code = (
         "import pathlib, sys, threading; from tests.services.recorder.paper_run import *;"
         "timeline = Timeline('lab', path=pathlib.Path(sys.argv[1]));"
