@@ -44,15 +44,11 @@ def text(value: Any, indent: int = 0, before: int = 0) -> str:
 
 
 def flat(value: Any, path: str) -> Iterator[tuple[str, object]]:
-    """Everything in a recorded value by its path. Texts in a list count by themselves, in whatever order, but
-    lines of output as one text."""
+    """Everything in a recorded value by its path. Texts in a list count by themselves, in whatever order."""
     if isinstance(value, dict) and value:
         for name, one in value.items():
             yield from flat(one, f"{path}{SEPARATOR}{name}")
     elif isinstance(value, list) and value:
-        if path.endswith((f"{SEPARATOR}out", f"{SEPARATOR}err")):
-            yield path, "\n".join(value)
-            return
         for number, one in enumerate(value):
             if isinstance(one, str):
                 yield f"{path}{SEPARATOR}{one}", True
