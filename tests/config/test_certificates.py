@@ -48,6 +48,7 @@ def test_it_tells_whose_it_is_until_when_and_whom_it_trusts(anvil: Path, ca: Cer
     assert (found.issuer,) == found.trusted == tuple(one.name for one in read_cas(ca.folder / "ca.pem"))
 
 
+@pytest.mark.live
 def test_it_is_read_without_cryptography(anvil: Path) -> None:
     block = "import sys; from pathlib import Path; sys.modules['cryptography'] = None; "
     read = "from zscout.config.certificates import read_certificates; print(read_certificates(Path(sys.argv[1])).name)"

@@ -8,7 +8,7 @@ import sys
 import pytest
 from msgspec import structs
 
-from tests.config.kit import NAME_RULE, RC_RULE, short, write
+from tests.config.kit import RC_RULE, short, write
 from zscout.config.devices import ExclusiveRc, FramegrabberRc, RadioRc, RcConfig, RobotRc, VideoRc
 from zscout.config.node import load_node
 from zscout.config.strict import BadInput
@@ -42,14 +42,9 @@ def psu(**keys: str) -> str:
 
 BAD = {
     table("radio/r"): 'rc[0].port (radio/r): is missing; add it, as in port = "/dev/ttyUSB0"',
-    radio(port='""'): ('rc[0].port (radio/r): "" can\'t be opened; name what to open, as in port = "/dev/ttyUSB0"'),
     radio(port=r'"\u0000"'): (
         'rc[0].port (radio/r): "\\x00" can\'t be opened; name what to open, as in port = "/dev/ttyUSB0"'
     ),
-    radio(baud="299"): "rc[0].baud (radio/r): is 299; write a whole number from 300 to 1000000",
-    radio(baud="9600.0"): "rc[0].baud (radio/r): is 9600.0; write a whole number from 300 to 1000000",
-    radio(bound="0"): "rc[0].bound (radio/r): is 0 s; write 0.01 to 10 seconds",
-    radio(bound="nan"): "rc[0].bound (radio/r): is not a finite number; write a number",
     radio(capacity="{ command_rate = 1 }"): (
         'rc[0].capacity (radio/r): the driver "radio" has none; remove it, or write driver = "capacity"'
     ),
@@ -69,28 +64,15 @@ BAD = {
     table("robot/a", id="33"): (
         'rc[0].radio (robot/a): is missing; add the radio that carries its halt, as in radio = "radio/rf0"'
     ),
-    robot(id="255"): "rc[0].id (robot/a): is 255; write a whole number from 0 to 254",
     robot(radio='"r"'): f'rc[0].radio (robot/a): "r" is not the name of an RC; {RC_RULE}',
     robot(radio='"video/r"'): ('rc[0].radio (robot/a): "video/r" is no radio; name one, as in "radio/..."'),
-    robot(channels='{ "video/1" = 16 }'): (
-        'rc[0].channels."video/1" (robot/a): is 16; write a whole number from 1 to 15'
-    ),
     robot(channels='{ "radio/r" = 1 }'): (
         'rc[0].channels."radio/r" (robot/a): "radio/r" is no video; name one, as in "video/..."'
     ),
     robot(channels='{ "video/1" = 1, "video/2" = 1 }'): (
         'rc[0].channels."video/2" (robot/a): is 1, as video/1 is; give each its own channel'
     ),
-    robot(dead_man="0"): "rc[0].dead_man (robot/a): is 0 s; write 0.05 to 5 seconds",
-    robot(warm_up="61"): "rc[0].warm_up (robot/a): is 61 s; write 0 to 60 seconds",
-    robot(port='"/dev/x"'): ('rc[0].port (robot/a): the driver "robot" has none; remove it, or write driver = "radio"'),
     robot(warmup="1"): "rc[0].warmup (robot/a): unknown key; did you mean warm_up?",
-    table("video/1", quality="1"): (
-        'rc[0].quality (video/1): the driver "video" has none; remove it, or write driver = "framegrabber"'
-    ),
-    psu(parameters="{ voltage = -1 }"): "rc[0].parameters.voltage (psu/a): is -1; write 0 or more",
-    psu(parameters='{ voltage = "12" }'): 'rc[0].parameters.voltage (psu/a): is the text "12"; write a number',
-    psu(parameters='{ "a b" = 1 }'): f'rc[0].parameters (psu/a): "a b" is not a name; {NAME_RULE}',
     table("framegrabber/f"): (
         'rc[0].source (framegrabber/f): is missing; add it, as in source = "/dev/video0", or a table sources'
     ),
@@ -102,12 +84,6 @@ BAD = {
     ),
     table("framegrabber/f", sources='{ ch1 = "b" }'): (
         f'rc[0].sources.ch1 (framegrabber/f): "ch1" is not the name of an RC; {RC_RULE}'
-    ),
-    table("framegrabber/f", source='"a"', rate="61"): (
-        "rc[0].rate (framegrabber/f): is 61; write a number from 0.1 to 60"
-    ),
-    table("framegrabber/f", source='"a"', quality="0"): (
-        "rc[0].quality (framegrabber/f): is 0; write a whole number from 1 to 100"
     ),
 }
 
@@ -142,16 +118,13 @@ def test_what_a_table_says_and_what_it_leaves_out() -> None:
 def test_every_device_has_its_driver() -> None:
     text = radio() + robot() + table("video/1") + table("robot/b", driver="exclusive", activation="1.5")
     drivers = [driver_for(rc) for rc in load_node(write("node.toml", text)).rcs]
-    assert [type(driver).__name__ for driver in drivers] == [
-        "RadioDriver",
-        "RobotDriver",
-        "VideoDriver",
-        "ExclusiveDriver",
-    ]
+    names = ["RadioDriver", "RobotDriver", "VideoDriver", "ExclusiveDriver"]
+    assert [type(driver).__name__ for driver in drivers] == names
     assert [driver.activation for driver in drivers] == [0, 2, 0, 1.5]
     assert [driver.sharable for driver in drivers] == [True, False, True, False]
 
 
+@pytest.mark.live
 def test_a_node_without_such_devices_loads_nothing_heavy() -> None:
     look = "import sys, zscout.node; print({'serial', 'cv2', 'rerun'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True)

@@ -45,18 +45,15 @@ BAD_FLEETS = {
     "[[fleet]]": "fleet: is a list; write a table, under [fleet]",
     # [fleet]
     '[fleet]\nname = "a b"': f'fleet.name: "a b" is not a name; {NAME_RULE}',
-    '[fleet]\nname = ""': f'fleet.name: "" is not a name; {NAME_RULE}',
     "[fleet]\nname = '''a\n'''": rf'fleet.name: "a\n" is not a name; {NAME_RULE}',
     f'[fleet]\nname = "{"x" * 65}"': f'fleet.name: "{"x" * 60}..." is not a name; {NAME_RULE}',
     '[fleet]\ncandidates = "anvil"': 'fleet.candidates: is the text "anvil"; write a list',
     '[fleet]\ncandidates = ["a", 1]': "fleet.candidates[1]: is 1; write a text in quotes",
-    '[fleet]\ncandidates = ["a", ""]': f'fleet.candidates[1]: "" is not a name; {NAME_RULE}',
     '[fleet]\ncandidates = ["a", "b", "a"]': (
         'fleet.candidates[2]: "a" stands at fleet.candidates[0] already; rename or remove one of the two'
     ),
     f"[fleet]\ncandidates = {['a'] * 1001}": "fleet.candidates: has 1,001 entries; at most 1,000 are allowed",
     '[fleet]\nstrategy = "fifo"': ('fleet.strategy: is the text "fifo"; write "adaptive", "optimal" or "priority"'),
-    '[fleet]\npreempt = "never"': 'fleet.preempt: is the text "never"; write "after_min_runtime" or "always"',
     "[fleet]\npatience = -1": "fleet.patience: is -1 s; write 0 to 31622400 seconds",
     "[fleet]\npatience = nan": "fleet.patience: is not a finite number; write a number",
     '[fleet]\npromise = "all"\npatience = 0': (
@@ -74,30 +71,22 @@ BAD_FLEETS = {
     "[fair_shares]\npatience = 100": (
         "fair_shares.patience: is 100 s, less than fleet.patience (142 s); write as much, or more"
     ),
-    "[fair_shares]\nhalf_life = 1": "fair_shares.half_life: is 1 s; write 60 to 31622400 seconds",
-    "[fair_shares.weights]\nbob = 0": "fair_shares.weights.bob: is 0; write a number from 0.001 to 1000",
     '[roles]\nclient = ["bob"]\n[groups]\narms = ["bob"]\n[fair_shares.weights]\nbob = 2': (
         'fair_shares.weights.bob: "bob" is of the group arms, and counts there; give the group a weight'
     ),
     '[roles]\nclient = ["bob"]\n[fair_shares.weights]\nlegs = 2': (
         'fair_shares.weights.legs: "legs" is no group and has no role; name it under [groups], or mend the name'
     ),
-    "[limits]\nmax_running_per_host = -1": (
-        "limits.max_running_per_host: is -1; write a whole number from 0 to 100000"
-    ),
-    "[fleet]\noperator_priority = -1": ("fleet.operator_priority: is -1; write a whole number from 0 to 1000000000"),
     "[fleet]\noperator_priority = 1.0": ("fleet.operator_priority: is 1.0; write a whole number from 0 to 1000000000"),
     "[fleet]\noperator_priority = true": (
         "fleet.operator_priority: is true; write a whole number from 0 to 1000000000"
     ),
     # [mesh]
     "[mesh]\nlease = 0.1": "mesh.lease: is 0.1; write a number from 0.2 to 30",
-    "[mesh]\nlease = nan": "mesh.lease: is not a finite number; write a number from 0.2 to 30",
     "[mesh]\nlease = 1979-05-27": "mesh.lease: is a date or a time; write a number from 0.2 to 30",
     '[mesh]\nlease = "soon"': f'mesh.lease: "soon" is not a duration; write {DURATIONS}',
     '[mesh]\nlease = "100ms"': "mesh.lease: is 0.100; write a number from 0.2 to 30",
     '[fleet]\nmin_runtime = "0s"': "fleet.min_runtime: is 0 s; write 0.001 to 31622400 seconds",
-    '[limits]\nmax_runtime = "2 h"': f'limits.max_runtime: "2 h" is not a duration; write {DURATIONS}',
     '[mesh]\nlisten = ["tcp/127.0.0.1"]': (f'mesh.listen[0]: "tcp/127.0.0.1" is not an endpoint; {ENDPOINT_RULE}'),
     '[mesh]\nlisten = ["tcp/a:0", "ipx/a:1"]': (f'mesh.listen[1]: "ipx/a:1" is not an endpoint; {ENDPOINT_RULE}'),
     '[mesh]\nconnect = ["tcp/1.2.3:7"]': (f'mesh.connect[0]: "tcp/1.2.3:7" is not an endpoint; {ENDPOINT_RULE}'),
@@ -118,17 +107,10 @@ BAD_FLEETS = {
     '[mesh]\nmulticast_address = "10.0.0.1:7446"': (
         f'mesh.multicast_address: "10.0.0.1:7446" is not a multicast address; {MULTICAST_RULE}'
     ),
-    '[mesh]\nmulticast_address = "224.0.0.224"': (
-        f'mesh.multicast_address: "224.0.0.224" is not a multicast address; {MULTICAST_RULE}'
-    ),
-    '[mesh]\ninterface = ""': 'mesh.interface: "" names no interface; write "auto", or as in "eth0"',
     # [limits]
     "[limits]\nmax_needs = 0": "limits.max_needs: is 0; write a whole number from 1 to 1000",
     "[limits]\nmax_payload = 1e400": ("limits.max_payload: is 1E+400; write a whole number from 1024 to 16777216"),
     # [timing]
-    "[timing]\nheartbeat = 0": "timing.heartbeat: is 0 s; write 0.05 to 10 seconds",
-    "[timing]\nrebuild = -0.1": "timing.rebuild: is -0.1 s; write 0.01 to 10 seconds",
-    "[timing]\nrebuild = inf": "timing.rebuild: is not a finite number; write a number",
     "[timing]\nrebuild = 1e99999999999999999999": "timing.rebuild: is not a finite number; write a number",
     "[timing]\nrebuild = 1e30": "timing.rebuild: is too large; write a number below 1e18",
     "[timing]\nrebuild = 1e-200": "timing.rebuild: has more than 100 decimal places; round it",
@@ -138,13 +120,9 @@ BAD_FLEETS = {
     ),
     "[mesh]\nlease = 2.9": ("timing.hold_lease: is 3 s; write more than mesh.lease + timing.rebuild, which is 3.1 s"),
     # [placement]
-    "[placement]\nback_off = 0": "placement.back_off: is 0 s; write 0.05 to 3600 seconds",
-    "[placement]\ngain = 0": "placement.gain: is 0; write a number from 0.05 to 100",
-    '[placement]\nrebalance = "yes"': 'placement.rebalance: is the text "yes"; write true or false',
     # Sites
     '[mesh]\nrelay = ["a", "b"]': "mesh.relay: unknown key; known here: connect, interface, lease, listen, multicast, "
     "multicast_address, site",
-    '[mesh]\nsite = "a b"': f'mesh.site: "a b" is not a name; {NAME_RULE}',
     # Security
     "[security]": "security.folder: is missing; add it",
     '[security]\nfolder = ""': 'security.folder: "" is no folder; name one, as in folder = "/etc/zscout/keys"',
@@ -172,9 +150,6 @@ BAD_FLEETS = {
         'access."robot/x"[0]: "arms" has no role; name it under [roles], or mend the name'
     ),
     "[quotas]\na = { rcs = 1 }": 'quotas[0]: "a" has no role; name it under [roles], or mend the name',
-    '[roles]\nclient = ["a"]\n[quotas]\na = { rcs = -1 }': (
-        "quotas.a.rcs: is -1; write a whole number from 0 to 100000"
-    ),
     "[ceilings.viewer]\npriority = 1": (
         'ceilings.viewer: only ARCs of clients and operators have a ceiling; write "client"'
     ),
@@ -193,16 +168,8 @@ def test_bad_fleet_file(text: str, line: str) -> None:
 
 
 def test_an_empty_fleet_file_means_the_defaults() -> None:
-    made = fleet("")
-    assert made == default_fleet()
-    assert (made.name, made.candidates, made.strategy, made.operator_priority) == ("zscout", (), "adaptive", 10)
-    assert made.scheduling == SchedulingPolicy()
-    assert made.mesh == MeshConfig(
-        listen=(), connect=(), multicast=True, multicast_address="224.0.0.224:7446", interface="auto", lease=1.0
-    )
-    assert made.limits == RcmLimits(10_000, 64, 256, 2_500, 65_536)
-    assert made.min_runtime == 60 * SECOND
-    assert made.timing == Timing(500_000_000, 3_000_000_000, 250_000_000, 200_000_000)
+    assert fleet("") == default_fleet()
+    assert fleet("").scheduling == SchedulingPolicy()
 
 
 def test_every_key_of_a_fleet_file() -> None:

@@ -14,6 +14,7 @@ from tests.cli.cli_fleet import CliFleet, fleet_of
 from zscout.config.fleet import load_fleet
 from zscout.config.node import load_node
 
+pytestmark = pytest.mark.essential
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
@@ -62,6 +63,6 @@ def test_the_files_are_read() -> None:
     assert load_fleet(EXAMPLES / "fleet.toml").candidates == ("anvil", "bellows")
 
 
-def test_the_workload_replays_as_it_says() -> None:
-    done = tools.zscout("replay", str(EXAMPLES / "workload.toml"), "--json")
-    assert '"outcome": "preempted"' in done.stdout, done.stderr
+def test_the_workload_replays_as_it_says(capsys: pytest.CaptureFixture[str]) -> None:
+    assert tools.zscout_here("replay", EXAMPLES / "workload.toml", "--json") == 0
+    assert '"outcome": "preempted"' in capsys.readouterr().out

@@ -428,13 +428,8 @@ class Script:
         }
         highest = max(known)
         terms = [
-            *known,
-            (highest.counter + 1, "f"),
-            (highest.counter + 7, "~"),
-            (0, ""),
-            (10**12, "f"),
-            (2**52 - 1, "f"),
-        ]
+            *known, (highest.counter + 1, "f"), (highest.counter + 7, "~"), (0, ""), (10**12, "f"), (2**52 - 1, "f"),
+        ]  # fmt: skip
         instances = [rc.instance for rc in self.fleet.rcs.values()]
         held = self.fleet.held
         ids = (*FIELDS["id"], held.id if held is not None else "r3")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import tempfile
 from collections.abc import Iterator
@@ -10,14 +11,12 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from decimal import Decimal
 from functools import cache
 from importlib.metadata import EntryPoint
-from inspect import cleandoc
 from pathlib import Path
 from typing import Any, Final
 from unittest.mock import patch
 
 import click
 
-from tests.ports import free_port
 from tests.surface.tree import PROJECT
 
 WIDTH: Final = 100
@@ -32,7 +31,7 @@ def scripts() -> dict[str, click.Command]:
 
 
 def commands() -> dict[str, Any]:
-    """Every command by its full name: its help, and what its options and arguments take."""
+    """Every command by its full name: its usage, and what its options and arguments take. Help is no surface."""
     with plain():
         return dict(found for name, script in scripts().items() for found in _walk(script, name))
 
@@ -43,15 +42,13 @@ def _walk(
     context = click.Context(command, parent, name, max_content_width=WIDTH, **_settings(command))
     options = [param for param in command.get_params(context) if isinstance(param, click.Option)]
     arguments = [param for param in command.params if isinstance(param, click.Argument)]
-    paragraphs = cleandoc(command.help or "").replace("\b\n", "").split("\n\n")
     yield (
         context.command_path,
         {
             "usage": command.get_usage(context),
-            "text": [" ".join(part.split()) for part in paragraphs],
-            "commands": _listed(command, context) if isinstance(command, click.Group) else {},
-            "options": {max(param.opts, key=len): _param(param, context) for param in options},
-            "arguments": {param.make_metavar(context): _param(param, context) for param in arguments},
+            "commands": command.list_commands(context) if isinstance(command, click.Group) else [],
+            "options": {max(param.opts, key=len): _param(param) for param in options},
+            "arguments": {param.make_metavar(context): _param(param) for param in arguments},
         },
     )
     if isinstance(command, click.Group):
@@ -65,15 +62,7 @@ def _settings(command: click.Command) -> dict[str, Any]:
     return {key: value for key, value in command.context_settings.items() if key != "max_content_width"}
 
 
-def _listed(command: click.Group, context: click.Context) -> dict[str, str]:
-    """The commands in the help of a group, each with what is said of it there."""
-    formatter = click.HelpFormatter(width=10 * WIDTH)
-    command.format_commands(context, formatter)
-    lines = [line.split(maxsplit=1) for line in formatter.getvalue().splitlines() if line.startswith(" ")]
-    return {name: " ".join(rest) for name, *rest in lines}
-
-
-def _param(param: click.Parameter, context: click.Context) -> dict[str, Any]:
+def _param(param: click.Parameter) -> dict[str, Any]:
     """What `click` knows of a parameter, but for what only the code sees and what is usual."""
     told = param.to_info_dict()
     kind = told["type"]
@@ -81,7 +70,6 @@ def _param(param: click.Parameter, context: click.Context) -> dict[str, Any]:
     path = kind.get("file_okay") and kind.get("dir_okay")
     shown = {
         "names": sorted([*param.opts, *param.secondary_opts]) if isinstance(param, click.Option) else None,
-        "help": " | ".join(param.get_help_record(context) or ()),
         "default": str(default) if isinstance(default, (Path, Decimal)) else default,
         "nargs": told["nargs"] if told["nargs"] != 1 else None,
         **{key: told.get(key) for key in ("required", "multiple", "envvar", "is_flag", "count", "hidden")},
@@ -100,120 +88,56 @@ BAD_FILES: Final = {
     'min_runtime = 1\n[arc.needs]\n"robot/a" = {}\n[[arc]]\nname = "y"\nat = 0\npriority = 1\n'
     'min_runtime = 2\n[arc.needs]\n"robot/b" = {}\n',
     "twice.toml": '[[arc]]\nname = "x"\nat = 0\npriority = 1\nmin_runtime = 1\n[arc.needs]\n',
-    "nobody.toml": '[fleet]\nname = "surface-nobody"\n[mesh]\nmulticast = false\n',
     "not.rrd": "no recording",
     "node.toml": '[[rc]]\nname = "robot/a"\ndriver = "robot"\n',
     "run.sh": "true\n",
 }
 CALLS: Final = (
-    "",
-    "--version",
-    "nonsense",
-    "reqest robot/a",
-    "--fleet none.toml status",
-    "--fleet bad.toml status",
-    "--fleet nobody.toml status",
-    "request",
-    "request robot",
-    "request robot/a robot/a",
-    "request robot/a:rate",
-    "request robot/a:rate=x",
-    "request robot/a:rate=1,rate=2",
-    "request robot/*#0",
-    "request robot/*:rate=1 robot/*:rate=2",
-    "request robot/a --min-runtime never",
-    "request robot/a --min-runtime 0",
-    "request robot/a --timeout -1",
-    "request robot/a --priority 1.5",
-    "request robot/a --grace 1d",
-    "request robot/a --name a/b",
-    "request robot/a -- no-such-command-anywhere",
-    "request robot/a -- ./run.sh",
-    "request true -- true",
-    "take",
-    "take robot/a:=",
-    "take robot/a --min-runtime 0",
-    "drive",
-    "drive radio/rf0",
-    "drive robot/a --speed 9",
-    "watch",
-    "watch --source none.avi",
-    "watch --source none.avi --limit 0",
-    "release",
-    "cancel",
-    "cancel \x07",
-    "status now",
-    "status --once",
-    "why",
-    "start",
-    "start a/b",
-    "start counter --set x",
-    "start counter --host a/b",
-    "start counter --memory much",
-    "start counter --restart seldom",
-    "stop",
-    "stop a/b",
-    "components a/b",
-    "logs",
-    "logs a/b",
-    "migrate",
-    "migrate counter --to a/b",
-    "drain",
-    "drain a/b",
-    "uncordon",
-    "uncordon a/b",
-    "keys --all --json",
-    "cert ca --days 0",
-    "cert issue anvil",
-    "cert issue a/b",
-    "cert renew none",
-    "cert show",
-    "cert show none",
-    "view none.rrd",
-    "view not.rrd",
-    "view --bind somewhere",
-    "view --port 0",
-    "replay",
-    "replay none.toml",
-    "replay bad.toml",
-    "replay twice.toml",
-    "replay workload.toml",
-    "replay workload.toml --json",
-    "replay workload.toml --strategy best",
-    "replay workload.toml --rrd picture.png",
-    "simulate --list",
-    "simulate nowhere",
-    "simulate office --http x:y",
-    "simulate office --speed 0",
-    "demo nothing",
-    "demo table1 --out picture.png",
-    "demo placement --policy best",
-    "demo robots --building nowhere",
-    "completion bash",
-    "completion tcsh",
-    "node none.toml",
-    "node bad.toml",
-    "node node.toml",
-    "node --log-level loud",
+    "", "--version", "nonsense", "reqest robot/a", "--fleet none.toml status", "--fleet bad.toml status", "request",
+    "request robot", "request robot/a robot/a", "request robot/a:rate", "request robot/a:rate=x",
+    "request robot/a:rate=1,rate=2", "request robot/*#0", "request robot/*:rate=1 robot/*:rate=2",
+    "request robot/a --min-runtime never", "request robot/a --min-runtime 0", "request robot/a --timeout -1",
+    "request robot/a --priority 1.5", "request robot/a --name a/b", "request robot/a -- no-such-command-anywhere",
+    "request robot/a -- ./run.sh", "request true -- true", "take", "take robot/a:=", "take robot/a --min-runtime 0",
+    "drive", "drive radio/rf0", "drive robot/a --speed 9", "watch", "watch --source none.avi",
+    "watch --source none.avi --limit 0", "release", "cancel", "cancel \x07", "status --once", "why", "start",
+    "start a/b", "start counter --set x", "start counter --host a/b", "start counter --memory much",
+    "start counter --restart seldom", "stop", "stop a/b", "components a/b", "logs", "logs a/b", "migrate",
+    "migrate counter --to a/b", "drain", "drain a/b", "uncordon", "uncordon a/b", "keys --all --json",
+    "cert ca --days 0", "cert issue anvil", "cert issue a/b", "cert renew none", "cert show", "cert show none",
+    "view none.rrd", "view not.rrd", "view --bind somewhere", "view --port 0", "replay", "replay none.toml",
+    "replay bad.toml", "replay twice.toml", "replay workload.toml", "replay workload.toml --json",
+    "replay workload.toml --strategy best", "replay workload.toml --rrd picture.png", "simulate --list",
+    "simulate nowhere", "simulate office --http x:y", "simulate office --speed 0", "demo nothing",
+    "demo table1 --out picture.png", "demo placement --policy best", "demo robots --building nowhere",
+    "completion bash", "completion tcsh", "node none.toml", "node bad.toml", "node node.toml", "node --log-level loud",
     "node --check node.toml",
-)
+)  # fmt: skip
 """Words after `zscout` (or, after `node`, those of `zscout-node`), parted by spaces."""
 
 
 def calls() -> dict[str, Any]:
-    """Exit code, stdout and stderr of each call of `CALLS`: help on wrong words, and what needs no mesh."""
+    """Of each call of `CALLS` its exit code, and what it prints: JSON as it is, and else in how many lines. Help and
+    the words of errors are no surface."""
     programs = scripts()
     found: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory() as folder, plain(ZSCOUT_FLEET=f"{folder}/alone.toml"), _inside(folder):
+    with tempfile.TemporaryDirectory() as folder, plain(), _inside(folder):
         for name, text in BAD_FILES.items():
             Path(name).write_text(text)
-        # As the default fleet, but where nobody else on this machine is heard.
-        Path("alone.toml").write_text(f'[mesh]\nmulticast_address = "224.0.0.224:{free_port()}"\ninterface = "lo"\n')
         for words in CALLS:
             name, _, rest = words.partition(" ")
             program, args = ("zscout-node", rest) if name == "node" else ("zscout", words)
-            found[f"{program} {args}".rstrip()] = printed(program, programs[program], args.split())
+            told = printed(program, programs[program], args.split())
+            found[f"{program} {args}".rstrip()] = {name: _printed(value) for name, value in told.items()}
     return found
+
+
+def _printed(told: Any) -> Any:
+    if not isinstance(told, list):
+        return told
+    if told[0].startswith("{"):
+        return [json.loads(line) for line in told]
+    return "a line" if len(told) == 1 else "lines"
 
 
 def printed(program: str, command: click.Command, args: list[str]) -> dict[str, Any]:

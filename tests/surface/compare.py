@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from typing import Final, NamedTuple
 
 SEPARATOR: Final = " > "
@@ -21,7 +20,4 @@ class Difference(NamedTuple):
             return f"added    {self.path}: {self.now!r}"
         if self.now is None:
             return f"removed  {self.path}: {self.before!r}"
-        if not (isinstance(self.before, str) and isinstance(self.now, str)):
-            return f"changed  {self.path}: {self.before!r} to {self.now!r}"
-        lines = difflib.ndiff(self.before.splitlines(), self.now.splitlines())
-        return "\n".join([f"changed  {self.path}:", *(f"    {line.rstrip()}" for line in lines)])
+        return f"changed  {self.path}: {self.before!r} to {self.now!r}"

@@ -1,309 +1,78 @@
-"""The fleet file and the node file: every key, its default, and what is said of values that can't be.
-
-Only the loaders are called: what stands behind them may change. That a key has its default is seen by this: a
-file with the key at that value means what a file without the key means, and with another value it does not.
-"""
+"""The fleet file and the node file as they are declared: each key with its type, bounds and default."""
 
 from __future__ import annotations
 
-import re
-import tempfile
-from collections.abc import Iterator, Mapping
-from pathlib import Path
-from typing import Any, Final, NamedTuple
+from collections.abc import Iterator
+from typing import Any, Final, get_args
 
-from tests.surface.tree import find
+import msgspec
+from msgspec import inspect
 
-FILE: Final = "surface.toml"
-UNKNOWN: Final = "zz_no_such_key"
+from zscout.config import devices, fleet, node
 
-
-class Key(NamedTuple):
-    """One key: its default as TOML (None: it has none), values that are taken, and some that are not."""
-
-    default: str | None
-    good: tuple[str, ...]
-    bad: tuple[str, ...]
+BUILT_IN: Final = get_args(devices.BuiltInRc)
 
 
-def _number(default: str, low: str, high: str, below: str, above: str) -> Key:
-    return Key(default, (low, high), (below, above, '"1"', "nan" if "." in default else "1.5"))
+def plain(kind: inspect.Type) -> inspect.Type:
+    return kind.type if isinstance(kind, inspect.Metadata) else kind
 
 
-TRUTH: Final = ('"yes"', "1")
-ROLES: Final = ("viewer", "client", "operator", "manager", "relay")
-NAMES: Final = ('"a/b"', '""', "5")
+def keys(table: Any, path: str = "") -> Iterator[tuple[str, inspect.Field]]:
+    """All keys below a table of a file, with what the code knows of them."""
+    for field in table.fields:
+        whole = inner = plain(field.type)
+        if isinstance(inner, inspect.VarTupleType):
+            inner = inner.item_type
+        if isinstance(whole, inspect.DictType) and not path:  # a table whose keys are names
+            if isinstance(whole.value_type, inspect.StructType):
+                yield from keys(whole.value_type, f"{field.encode_name}.")
+            else:
+                yield f"{field.encode_name}.{'host' if field.encode_name == 'devices' else 'name'}", field
+            continue
+        options = inner.types if isinstance(inner, inspect.UnionType) else (inner,)
+        tables = [option for option in options if isinstance(option, inspect.StructType)]
+        for struct in tables:
+            if struct.tag_field is not None:
+                yield f"{path}{field.encode_name}.{struct.tag_field}", field
+            yield from keys(struct, f"{path}{field.encode_name}.")
+        if not tables:
+            yield path + field.encode_name, field
 
-FLEET: Final[Mapping[str, Mapping[str, Key]]] = {
-    "fleet": {
-        "name": Key('"zscout"', ('"lab.2_b-c"',), NAMES),
-        "candidates": Key("[]", ('["anvil"]',), ('["a/b"]', '["a", "a"]', '"anvil"', "[1]")),
-        "strategy": Key('"adaptive"', ('"priority"', '"optimal"'), ('"best"', "1")),
-        "operator_priority": _number("10", "0", "1_000_000_000", "-1", "1_000_000_001"),
-        "min_runtime": _number("60.0", "0.001", "31_622_400", "0", "31_622_401"),
-        "preempt": Key('"always"', ('"after_min_runtime"',), ('"never"', "true")),
-        "patience": _number("142.0", "0", "31_622_400", "-1", "31_622_401"),
-        "promise": Key('"equals"', ('"all"',), ('"none"', "1")),
-    },
-    "mesh": {
-        "listen": Key(
-            "[]",
-            ('["tcp/0.0.0.0:7447"]', '["udp/[::1]:0"]'),
-            ('["tcp/7447"]', '["http/a:1"]', '["tcp/a:1", "tcp/a:1"]'),
-        ),
-        "connect": Key(
-            "[]", ('["tls/anvil:7447"]',), ('["tcp/a:0"]', '["tcp/a:70000"]', '["tcp/1.2.3:7"]', '"tcp/a:1"')
-        ),
-        "multicast": Key("true", ("false",), TRUTH),
-        "multicast_address": Key('"224.0.0.224:7446"', ('"239.1.2.3:99"',), ('"10.0.0.1:7446"', '"224.0.0.224"', "1")),
-        "interface": Key('"auto"', ('"eth0,lo"',), ('""', '"eth 0"', "0")),
-        "lease": _number("1.0", "0.2", "2.5", "0.1", "31"),
-        "site": Key(None, ('"north"',), NAMES),
-    },
-    "limits": {
-        "max_queued": _number("10_000", "1", "1_000_000", "0", "1_000_001"),
-        "max_needs": _number("64", "1", "1_000", "0", "1_001"),
-        "max_requests_per_client": _number("256", "1", "100_000", "0", "100_001"),
-        "max_bookings_per_host": _number("100", "0", "1_000", "-1", "1_001"),
-        "max_requests_per_host": _number("2_500", "1", "1_000_000", "0", "1_000_001"),
-        "max_payload": _number("65_536", "1_024", "16_777_216", "1_023", "16_777_217"),
-        "max_running_per_host": _number("0", "1", "100_000", "-1", "100_001"),
-        "max_runtime": _number("0.0", "1", "31_622_400", "-1", "31_622_401"),
-    },
-    "timing": {
-        "heartbeat": _number("0.5", "0.05", "1.4", "0.04", "11"),
-        "hold_lease": _number("3.0", "1.3", "300", "0.4", "301"),
-        "vote_timeout": _number("0.25", "0.01", "10", "0.001", "10.1"),
-        "rebuild": _number("0.2", "0.01", "1.9", "0.001", "10.1"),
-    },
-    "placement": {
-        "start_timeout": _number("15.0", "0.05", "600", "0.04", "601"),
-        "restarts": _number("5", "0", "1_000", "-1", "1_001"),
-        "back_off": _number("0.5", "0.05", "3600", "0.04", "3601"),
-        "longest_back_off": _number("30.0", "0.05", "86_400", "0.04", "86_401"),
-        "settled": _number("30.0", "0.05", "86_400", "0.04", "86_401"),
-        "rebalance": Key("false", ("true",), TRUTH),
-        "gain": _number("0.3", "0.05", "100", "0.04", "101"),
-        "steady": _number("10.0", "0.05", "3600", "0.04", "3601"),
-        "rest": _number("60.0", "0.05", "86_400", "0.04", "86_401"),
-    },
-    "roles": {
-        **{role: Key("[]", ('["ada"]',), ('["a/b"]', '["ada", "ada"]', '"ada"')) for role in ROLES},
-        "node": Key(
-            "{}", ('{ anvil = ["robot/scout33", "radio/*"] }',), ('{ anvil = ["robot"] }', '{ "a/b" = [] }', "1")
-        ),
-    },
-    "ceilings.client": {
-        "priority": Key(None, ("5",), ("1_000_001", '"5"')),
-        "runtime": _number("0.0", "1", "31_622_400", "-1", "31_622_401"),
-    },
-    "fair_shares": {
-        "half_life": _number("86_400.0", "60", "31_622_400", "59", "31_622_401"),
-        "weights": Key("{}", ("{ bob = 2 }",), ("{ bob = 0 }", '{ "a/b" = 1 }', "1")),
-        "patience": _number("3600.0", "142", "31_622_400", "141", "31_622_401"),
-    },
-    "quotas.bob": {
-        "arcs": Key(None, ("5",), ("-1", "100_001", '"5"')),
-        "rcs": Key(None, ("5",), ("-1", "100_001", '"5"')),
-    },
-}
-NODE: Final[Mapping[str, Mapping[str, Key]]] = {
-    "node": {
-        "host": Key(None, ('"anvil"',), NAMES),
-        "fleet": Key(None, ('"fleet.toml"',), ('"none.toml"', '"bad.toml"', "1")),
-        "candidate": Key("true", ("false",), TRUTH),
-        "load": Key("true", ("false", '"tree"'), ('"all"', "1")),
-        "labels": Key("[]", ('["gpu", "camera"]',), ('["a b"]', '["a", "a"]', '"gpu"')),
-        "state": Key(None, ('"state"', '"/var/lib/zscout"'), ('""', "1")),
-    },
-    "mesh": {
-        "listen": Key(None, ('["tcp/0.0.0.0:7447"]',), ('["tcp/7447"]',)),
-        "connect": Key(None, ('["tcp/anvil:7447"]',), ('["tcp/a:0"]',)),
-        "interface": Key(None, ('"eth0"',), ('""',)),
-        "site": Key(None, ('"north"',), NAMES),
-        "relay": Key(None, ('["north", "south"]',), ('["north"]', '["a/b", "c"]', '["a", "a"]', '"north"')),
-    },
-    "recorder": {
-        "path": Key('"runs"', ('"elsewhere"', '"/var/runs"'), ('""', "1")),
-        "bind": Key('"127.0.0.1"', ('"::1"', '"localhost"\nport = 9'), ('"0.0.0.0"', '"anvil"')),
-        "port": _number("9876", "1", "65_535", "0", "65_536"),
-        "allow_remote": Key("false", ('true\nbind = "0.0.0.0"',), TRUTH),
-        "frames": _number("2.0", "0", "30", "-1", "31"),
-        "limit": _number("5000", "300", "1_000_000", "299", "1_000_001"),
-        "past": _number("86400.0", "0", "2_678_400", "-1", "2_678_401"),
-    },
-    "metrics": {
-        "bind": Key('"127.0.0.1"', ('"::1"', '"localhost"\nport = 9'), ('"0.0.0.0"', '"anvil"')),
-        "port": _number("9464", "1", "65_535", "0", "65_536"),
-        "allow_remote": Key("false", ('true\nbind = "0.0.0.0"',), TRUTH),
-    },
-    "calendar": {
-        "bind": Key('"127.0.0.1"', ('"::1"', '"localhost"\nport = 9'), ('"0.0.0.0"', '"anvil"')),
-        "port": _number("9465", "1", "65_535", "0", "65_536"),
-        "allow_remote": Key("false", ('true\nbind = "0.0.0.0"',), TRUTH),
-    },
-    "notify": {
-        "urls": Key("[]", ('["json://localhost"]',), ('"json://localhost"', '["none://a:secret@b"]', '["a:secret@b"]')),
-        "events": Key(
-            '["yours_now", "preempted", "booking_in_danger", "certificate_ends"]',
-            ('["preempted"]',),
-            ('["ended"]', '"preempted"'),
-        ),
-        "users": Key(None, ('{ ada = ["json://localhost"] }',), ('{ ada = "json://localhost" }', '["ada"]')),
-        "after": _number("60.0", "0", "86_400", "-1", "86_401"),
-        "per_minute": _number("20", "1", "600", "0", "601"),
-    },
-    "components": {
-        "allow": Key("true", ("false",), TRUTH),
-        "kinds": Key(None, ("[]", '["counter"]'), ('["a/b"]', '"counter"')),
-        "max": _number("64", "1", "256", "0", "257"),
-    },
-    "journal": {
-        "off": Key("false", ("true",), TRUTH),
-        "max_age": _number("7776000.0", "3600", "315_360_000", "3599", "315_360_001"),
-        "max_size": _number("64", "1", "10_000", "0", "10_001"),
-    },
-}
-LEAST: Final[Mapping[str, tuple[str, ...]]] = {"notify": ('users = { bob = ["json://localhost/bob"] }',)}
-"""What a table can't be without, but where that is tried."""
-CHANNELS: Final = '{ "video/ch1" = 1 }'
-SOURCES: Final = '{ "video/ch1" = "/dev/video0" }'
-SETTLE: Final = _number("5.0", "0.5", "60", "0.4", "61")
-RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
-    "exclusive": ('name = "robot/a"', {"activation": _number("0.0", "0.5", "3600", "-1", "3601"), "settle": SETTLE}),
-    "capacity": (
-        'name = "radio/a"\ncapacity = { rate = 10 }',
-        {
-            "capacity": Key(None, ("{ rate = 0.1, width = 2 }",), ("{}", "{ rate = -1 }", '{ "a b" = 1 }', "10")),
-            "settle": SETTLE,
-            "activation": _number("0.0", "0.5", "3600", "-1", "3601"),
-        },
-    ),
-    "command": (
-        'name = "psu/a"\nsafe = ["psu", "off"]',
-        {
-            "start": Key("[]", ('["psu", "on"]',), ('"psu"', '[""]', "[1]")),
-            "stop": Key("[]", ('["psu", "save"]',), ('"psu"', '[""]')),
-            "safe": Key(None, ('["psu"]',), ('"psu"', '[""]', "[]")),
-            "health": Key("[]", ('["psu", "ping"]',), ('"psu"', '[""]')),
-            "every": _number("10.0", "0.5", "3600", "0.4", "3601"),
-            "timeout": _number("5.0", "0.1", "600", "0.09", "601"),
-            "settle": SETTLE,
-            "activation": _number("0.0", "0.5", "3600", "-1", "3601"),
-        },
-    ),
-    "radio": (
-        'name = "radio/a"\nport = "/dev/ttyUSB0"',
-        {
-            "port": Key(None, ('"loop://"',), ('""', "1")),
-            "baud": _number("9600", "300", "1_000_000", "299", "1_000_001"),
-            "settle": SETTLE,
-            "bound": _number("0.25", "0.01", "10", "0.009", "11"),
-        },
-    ),
-    "robot": (
-        'name = "robot/a"\nid = 33\nradio = "radio/a"',
-        {
-            "id": Key(None, ("0", "255"), ("-1", "256", '"a"')),
-            "radio": Key(None, ('"radio/b"',), ('"robot/b"', '"b"')),
-            "channels": Key(
-                "{}", (CHANNELS,), ('{ "robot/b" = 1 }', '{ "video/ch1" = 0 }', '{ "video/a" = 1, "video/b" = 1 }')
-            ),
-            "settle": SETTLE,
-            "warm_up": _number("2.0", "0", "60", "-1", "61"),
-            "dead_man": _number("0.5", "0.05", "5", "0.04", "5.1"),
-        },
-    ),
-    "video": ('name = "video/a"', {"settle": SETTLE}),
-    "framegrabber": (
-        'name = "framegrabber/a"\nsource = "/dev/video0"',
-        {
-            "source": Key(None, ('"/dev/video1"',), ('""', "1", f'"a"\nsources = {SOURCES}')),
-            "sources": Key(None, (), ("{}", '{ "robot/a" = "b" }')),
-            "rate": _number("10.0", "0.1", "60", "0.09", "61"),
-            "settle": SETTLE,
-            "quality": _number("80", "1", "100", "0", "101"),
-        },
-    ),
-}
-"""By driver: the least that a table needs, and what may stand in it besides `name` and `driver`."""
+
+def known(file: type) -> dict[str, inspect.Field]:
+    """All keys of a file, and those of each driver that comes with zscout."""
+    found = dict(keys(inspect.type_info(file)))
+    if rc := found.pop("rc", None):  # what its driver says
+        found["rc.driver"] = rc
+        for driver in BUILT_IN:
+            found |= keys(inspect.type_info(driver), "rc.")
+    return found
 
 
 def files() -> dict[str, Any]:
-    """For each key of both files: default, values that are taken, and the errors for others."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / FILE
-        (path.parent / "fleet.toml").write_text('[fleet]\nname = "other"\n')
-        (path.parent / "bad.toml").write_text("[fleet]\nnam = 1\n")
-        fleet, node = _Loader(find("load_fleet"), path), _Loader(find("load_node"), path)
-        return {
-            "fleet file": dict(_tables(fleet, FLEET)),
-            "node file": dict(_tables(node, NODE)) | {f'rc, driver = "{name}"': _rc(node, name) for name in RC},
-        }
-
-
-class _Loader:
-    """Loads texts as a file that always has the same name."""
-
-    def __init__(self, load: Any, path: Path) -> None:
-        self._load, self._path = load, path
-        self._bad: type[Exception] = find("BadInput")
-
-    def means(self, text: str) -> Any:
-        self._path.write_text(text)
-        return self._load(self._path)
-
-    def says(self, text: str) -> str:
-        """The error, or "taken"."""
-        try:
-            self.means(text)
-        except self._bad as error:
-            return str(error).replace(f"{self._path.parent}/", "")
-        return "taken"
-
-    def known(self, table: str) -> list[str]:
-        """The keys of a table, by what is said of one that it has not."""
-        said = self.says(f"{table}\n{UNKNOWN} = 1")
-        found = re.search(r"unknown key; known here: (.*)", said)
-        assert found is not None, said
-        return found[1].split(", ")
-
-
-def _tables(loader: _Loader, tables: Mapping[str, Mapping[str, Key]]) -> Iterator[tuple[str, Any]]:
-    yield "tables", sorted(loader.known(""))
-    for table, keys in tables.items():
-        head = "\n".join((f"[{table}]", *LEAST.get(table, ())))
-        assert loader.known(head) == sorted(keys), f"[{table}] has {loader.known(head)}; write them all here"
-        yield f"[{table}]", {key: _tried(loader, _without(head, key), key, about) for key, about in keys.items()}
-
-
-def _rc(loader: _Loader, driver: str) -> dict[str, Any]:
-    table, keys = RC[driver]
-    head = f'[[rc]]\ndriver = "{driver}"\n{table}'
-    others = {key: about for name in RC for key, about in RC[name][1].items() if key not in keys and about.good}
-    return {
-        **{key: _tried(loader, _without(head, key), key, about) for key, about in keys.items()},
-        "unnamed": loader.says(re.sub(r"name = .*\n?", "", head)),
-        "of others": {key: loader.says(f"{head}\n{key} = {about.good[0]}") for key, about in sorted(others.items())},
+    found = {
+        "fleet file": keys(inspect.type_info(fleet.FleetFile)),
+        "node file": keys(inspect.type_info(node.NodeFile)),
+        **{f"driver {kind.__struct_config__.tag}": keys(inspect.type_info(kind), "rc.") for kind in BUILT_IN},
     }
+    return {name: {key: _field(field) for key, field in some} for name, some in found.items()}
 
 
-def _without(head: str, key: str) -> str:
-    lines = head.splitlines()
-    # An RC that knows `sources` has no `source`.
-    gone = {"sources": "source"}.get(key, key)
-    return "\n".join(line for line in lines if not line.startswith(f"{gone} = "))
+def _field(field: inspect.Field) -> dict[str, Any]:
+    default = {} if field.default is msgspec.NODEFAULT else {"default": field.default}
+    return _type(field.type) | default | ({"required": True} if field.required else {})
 
 
-def _tried(loader: _Loader, head: str, key: str, about: Key) -> dict[str, Any]:
-    def said(value: str) -> str:
-        return loader.says(f"{head}\n{key} = {value}")
+def _type(kind: inspect.Type) -> dict[str, Any]:
+    """Without what is said of it."""
+    if isinstance(kind, inspect.Metadata):
+        bounds = {name: str(value) for name, value in (kind.extra or {}).items() if name in ("low", "high", "unit")}
+        return _type(kind.type) | bounds
+    shown = {name: value for name, value in msgspec.structs.asdict(kind).items() if value is not None}
+    return {"type": type(kind).__name__.removesuffix("Type")} | {name: _value(value) for name, value in shown.items()}
 
-    absent = loader.says(head)
-    told: dict[str, Any] = {"default": about.default} if about.default is not None else {"absent": absent}
-    if about.default is not None:
-        plain = loader.means(head)
-        assert loader.means(f"{head}\n{key} = {about.default}") == plain, f"{head} {key}: not {about.default}"
-        for value in about.good:
-            assert loader.means(f"{head}\n{key} = {value}") != plain, f"{head} {key}: {value} changes nothing"
-    return told | {"values": {value: said(value) for value in (*about.good, *about.bad)}}
+
+def _value(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_value(one) for one in value]
+    return _type(value) if isinstance(value, inspect.Type) else value

@@ -17,7 +17,7 @@ import click
 import msgspec
 
 import zscout
-from tests.surface.tree import PROJECT, find, homes, texts
+from tests.surface.tree import PROJECT, find, homes, sources
 from zscout import keyexpr, messages
 
 ENTERED: Final = ("__aenter__", "__aexit__", "__aiter__", "__await__", "__enter__", "__exit__", "__iter__")
@@ -211,4 +211,4 @@ def exit_codes() -> dict[str, int]:
 
 def variables() -> list[str]:
     """Environment variables that the code names."""
-    return sorted({word for _, text in texts() for word in re.findall(r"\b_?ZSCOUT_[A-Z_]*[A-Z]\b", text)})
+    return sorted({word for text in sources().values() for word in re.findall(r"\b_?ZSCOUT_[A-Z_]*[A-Z]\b", text)})

@@ -16,16 +16,10 @@ from tests.surface.compare import SEPARATOR
 
 RECORDED: Final = Path(__file__).with_name("surface.json")
 SECTIONS: Final[Mapping[str, Callable[[], Any]]] = {
-    "commands": commands.commands,
-    "what commands print": commands.calls,
-    "exit codes": interfaces.exit_codes,
-    "environment variables": interfaces.variables,
-    "files": files.files,
-    "components": interfaces.components,
-    "python": interfaces.python,
-    "keys": interfaces.keys,
-    "messages": interfaces.wire,
-}
+    "commands": commands.commands, "what commands print": commands.calls, "exit codes": interfaces.exit_codes,
+    "environment variables": interfaces.variables, "files": files.files, "components": interfaces.components,
+    "python": interfaces.python, "keys": interfaces.keys, "messages": interfaces.wire,
+}  # fmt: skip
 WIDTH: Final = 110
 
 
@@ -44,15 +38,11 @@ def text(value: Any, indent: int = 0, before: int = 0) -> str:
 
 
 def flat(value: Any, path: str) -> Iterator[tuple[str, object]]:
-    """Everything in a recorded value by its path. Texts in a list count by themselves, in whatever order, but
-    lines of output as one text."""
+    """Everything in a recorded value by its path. Texts in a list count by themselves, in whatever order."""
     if isinstance(value, dict) and value:
         for name, one in value.items():
             yield from flat(one, f"{path}{SEPARATOR}{name}")
     elif isinstance(value, list) and value:
-        if path.endswith((f"{SEPARATOR}out", f"{SEPARATOR}err")):
-            yield path, "\n".join(value)
-            return
         for number, one in enumerate(value):
             if isinstance(one, str):
                 yield f"{path}{SEPARATOR}{one}", True

@@ -8,7 +8,7 @@ import pytest
 
 from tests.surface.live import RECORDED, differences, play
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 
 def test_what_is_printed_on_a_mesh_is_what_was_recorded() -> None:

@@ -31,10 +31,6 @@ def test_table_1_as_it_is_shipped_comes_out_as_in_the_paper(strategy: str) -> No
     (file,) = PACKAGE.rglob("table1.toml")
     holds = json.loads(printed(str(file), "--strategy", strategy, "--json"))["holds"]
     assert [f"{hold['arc']} {hold['start']:g}-{hold['end']:g} {hold['outcome']}" for hold in holds] == [
-        "arc0 0-5 completed",
-        "arc1 5-10 completed",
-        "arc3 5-8 completed",
-        "arc2 8-11 preempted",
-        "arc4 11-14 completed",
-        "arc2 14-18 completed",
-    ]
+        "arc0 0-5 completed", "arc1 5-10 completed", "arc3 5-8 completed", "arc2 8-11 preempted",
+        "arc4 11-14 completed", "arc2 14-18 completed",
+    ]  # fmt: skip

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import ast
+import re
 import tomllib
-from collections.abc import Iterator
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -17,25 +16,21 @@ PROJECT: Final[dict[str, Any]] = tomllib.loads((PACKAGE.parent / "pyproject.toml
 
 
 @cache
-def sources() -> dict[str, ast.Module]:
-    """Every module of the package by its dotted name."""
-    found: dict[str, ast.Module] = {}
+def sources() -> dict[str, str]:
+    """The text of every module of the package by its dotted name."""
+    found: dict[str, str] = {}
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
         name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-        found[name] = ast.parse(path.read_text())
+        found[name] = path.read_text()
     return found
 
 
 @cache
 def homes(name: str) -> tuple[str, ...]:
     """The modules at whose top level a class or function of this name is defined."""
-    kinds = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-    return tuple(
-        module
-        for module, tree in sources().items()
-        if any(isinstance(node, kinds) and node.name == name for node in tree.body)
-    )
+    defined = re.compile(rf"^(?:class|def|async def) {name}\b", re.MULTILINE)
+    return tuple(module for module, text in sources().items() if defined.search(text))
 
 
 def find(*names: str, within: str = "zscout") -> Any:
@@ -45,11 +40,3 @@ def find(*names: str, within: str = "zscout") -> Any:
             if module.startswith(within):
                 return getattr(import_module(module), name)
     raise LookupError(f"{within} has none of {', '.join(names)}")
-
-
-def texts() -> Iterator[tuple[str, str]]:
-    """Every string in the code, with the module that it stands in."""
-    for module, tree in sources().items():
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Constant) and isinstance(node.value, str):
-                yield module, node.value

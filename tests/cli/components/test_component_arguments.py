@@ -30,17 +30,8 @@ def test_what_is_no_size_is_refused(text: str) -> None:
 def test_parameters_are_json_or_else_text() -> None:
     settings = ["a=1", "b=0.5", "c=true", "d=robot/a", 'e="1"', "f=[1, 2]", "g=", "h=x=y", "i=NaN"]
     assert gather_params('{"a": 7, "z": null}', settings) == {
-        "a": 1,
-        "b": 0.5,
-        "c": True,
-        "d": "robot/a",
-        "e": "1",
-        "f": [1, 2],
-        "g": "",
-        "h": "x=y",
-        "i": "NaN",
-        "z": None,
-    }
+        "a": 1, "b": 0.5, "c": True, "d": "robot/a", "e": "1", "f": [1, 2], "g": "", "h": "x=y", "i": "NaN", "z": None,
+    }  # fmt: skip
 
 
 @pytest.mark.parametrize(

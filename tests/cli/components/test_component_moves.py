@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 
 from tests.behaviors.components.kit import ROOT
-from tests.cli import tools
 from tests.cli.cli_fleet import CliFleet
 from tests.cli.tools import end, out_of, read_until
 from tests.hang import HANG
@@ -88,7 +87,7 @@ def counted(follower: subprocess.Popen[str], number: int) -> list[str]:
 def kept_by(fleet: CliFleet, host: str, name: str, *, until: Callable[[list[int]], object] = bool) -> list[int]:
     """What the counter that ran there last has counted, as its host keeps it; as soon as that is so."""
     logs = ("logs", name, "--host", host)
-    return numbers(tools.zscout_until(lambda done: until(numbers(done.stdout)), *logs, env=fleet.lab.env).stdout)
+    return numbers(fleet.until(lambda done: until(numbers(done.stdout)), *logs).stdout)
 
 
 def migrate(fleet: CliFleet, *args: str) -> subprocess.CompletedProcess[str]:
@@ -97,7 +96,7 @@ def migrate(fleet: CliFleet, *args: str) -> subprocess.CompletedProcess[str]:
     def begun(done: subprocess.CompletedProcess[str]) -> bool:
         return "can't move there" not in done.stderr and "no other host will do" not in done.stderr
 
-    return tools.zscout_until(begun, "migrate", *args, env=fleet.lab.env)
+    return fleet.until(begun, "migrate", *args)
 
 
 def told(done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
@@ -161,11 +160,10 @@ def test_what_can_not_be_migrated_is_one_line(fleet: CliFleet) -> None:
     def both_seen(done: subprocess.CompletedProcess[str]) -> bool:
         return "anvil, bellows" in done.stderr or "bellows?" in done.stderr
 
-    env = fleet.lab.env
-    nowhere = tools.zscout_until(both_seen, "migrate", "stayer", "--to", "nowhere", env=env)
+    nowhere = fleet.until(both_seen, "migrate", "stayer", "--to", "nowhere")
     assert (nowhere.returncode, nowhere.stdout) == (2, "")
     assert nowhere.stderr.startswith('zscout: --to: there is no host "nowhere"; there are: anvil, bellows')
-    near = tools.zscout_until(both_seen, "migrate", "stayer", "--to", "bellow", env=env)
+    near = fleet.until(both_seen, "migrate", "stayer", "--to", "bellow")
     assert (near.returncode, near.stderr) == (2, 'zscout: --to: there is no host "bellow"; did you mean bellows?\n')
     nobody = fleet.zscout("migrate", "stayr")
     assert (nobody.returncode, nobody.stdout) == (1, "")
@@ -227,10 +225,10 @@ def test_logs_of_what_runs_and_of_what_has_ended(fleet: CliFleet) -> None:
     def answered(done: subprocess.CompletedProcess[str]) -> bool:
         return done.returncode == 0
 
-    every = tools.zscout_until(answered, "logs", "speaker", env=fleet.lab.env)
+    every = fleet.until(answered, "logs", "speaker")
     counts = numbers(every.stdout)
     assert counts == list(range(1, len(counts) + 1))
-    some = tools.zscout_until(answered, "logs", "speaker", "--lines", "2", "--host", here, env=fleet.lab.env)
+    some = fleet.until(answered, "logs", "speaker", "--lines", "2", "--host", here)
     assert some.stdout.splitlines() == every.stdout.splitlines()[-2:]
     elsewhere = fleet.zscout("logs", "speaker", "--host", OTHER[here])
     assert (elsewhere.returncode, elsewhere.stdout) == (1, "")

@@ -11,9 +11,8 @@ from typing import Any
 import pytest
 
 from tests.behaviors.components.kit import ROOT, register_odd_kinds
-from tests.cli import tools
 from tests.cli.cli_fleet import CliFleet
-from tests.cli.tools import read_until, zscout_until
+from tests.cli.tools import read_until
 from tests.hang import HANG
 from zscout.behaviors.client.blocking import connect
 
@@ -136,7 +135,7 @@ def test_what_is_done_soon_is_no_failure(fleet: CliFleet) -> None:
     done = fleet.zscout("start", "brief", "--set", "how=return", "--json")
     assert (done.returncode, done.stderr) == (0, "")
     assert json.loads(done.stdout)["state"] in ("running", "ended")
-    followed = tools.zscout_until(lambda done: done.returncode == 0, "logs", "brief", "--follow", env=fleet.lab.env)
+    followed = fleet.until(lambda done: done.returncode == 0, "logs", "brief", "--follow")
     # Beside its own words there may be that its process stood still.
     assert [line for line in followed.stdout.splitlines() if "stood still" not in line] == ["last words"]
     assert followed.stderr.startswith("-- brief has ended")
@@ -214,8 +213,8 @@ def test_tab_offers_components_hosts_and_kinds(fleet: CliFleet) -> None:
     def offers(*words: str, it: Sequence[str]) -> None:
         """Tab again, until that is offered: at each it looks for two seconds at most."""
         line = {"COMP_WORDS": " ".join(words), "COMP_CWORD": str(len(words) - 1)}
-        env = fleet.lab.env | line | {"_ZSCOUT_COMPLETE": "bash_complete"}
-        zscout_until(lambda done: done.stdout.split() == [f"plain,{one}" for one in it], env=env)
+        wanted = [f"plain,{one}" for one in it]
+        fleet.until(lambda done: done.stdout.split() == wanted, env=line | {"_ZSCOUT_COMPLETE": "bash_complete"})
 
     offers("zscout", "stop", "off", it=["offered"])
     offers("zscout", "stop", "offered", "off", it=[])

@@ -135,13 +135,9 @@ def test_show_tells_each_state_and_its_exit_code_whether_all_can_be_used(capsys:
         for code, (one,) in [shown(capsys, name)]
     }
     assert states == {
-        "anvil": (0, "valid"),
-        "soon": (0, "ends_soon"),
-        "zscout-ca": (0, "valid"),
-        "late": (1, "expired"),
-        "early": (1, "not_yet"),
-        "broken": (1, "unusable"),
-    }
+        "anvil": (0, "valid"), "soon": (0, "ends_soon"), "zscout-ca": (0, "valid"), "late": (1, "expired"),
+        "early": (1, "not_yet"), "broken": (1, "unusable"),
+    }  # fmt: skip
     code, (valid, broken) = shown(capsys, "anvil", "broken")
     assert code == 1
     assert (valid["name"], valid["trusted"], valid["problem"]) == ("anvil", [valid["issuer"]], None)

@@ -72,14 +72,9 @@ def the_mend(one: Evidence) -> Finding:
 def test_a_fleet_that_is_well_has_nothing_to_mend() -> None:
     told = [(one.about, one.state) for one in findings(seen())]
     assert told == [
-        ("files", "ok"),
-        ("multicast", "ok"),
-        ("links", "ok"),
-        ("leader", "ok"),
-        ("versions", "ok"),
-        ("clock", "ok"),
+        ("files", "ok"), ("multicast", "ok"), ("links", "ok"), ("leader", "ok"), ("versions", "ok"), ("clock", "ok"),
         ("open", "note"),
-    ]
+    ]  # fmt: skip
     closed = findings(seen(CLOSED, certificates=certificates()))
     assert [one.about for one in closed if one.state != "ok"] == []
     assert closed[0].says == "fleet zscout (lab.toml), looked at as ada"

@@ -37,16 +37,10 @@ def test_what_is_listed_lives_and_answers(tmp_path: Path) -> None:
             client = await lab.client("program")
             state = await lab.ready(client, "robot/a", "radio/rf0")
             everybody = {
-                ("anvil", "node", "node"),
-                ("anvil", "candidate", "node"),
-                ("anvil", "rcm", "node"),
-                ("anvil", "load", "node"),
-                ("anvil", "rc", "robot/a"),
-                ("anvil", "rc", "radio/rf0"),
-                ("test", "client", "program"),
-                ("anvil", "session", "node"),
-                ("test", "session", "program"),
-            }
+                ("anvil", "node", "node"), ("anvil", "candidate", "node"), ("anvil", "rcm", "node"),
+                ("anvil", "load", "node"), ("anvil", "rc", "robot/a"), ("anvil", "rc", "radio/rf0"),
+                ("test", "client", "program"), ("anvil", "session", "node"), ("test", "session", "program"),
+            }  # fmt: skip
 
             def all_seen(done: subprocess.CompletedProcess[str]) -> bool:
                 alive = json.loads(done.stdout)["alive"] if done.returncode == 0 else []

@@ -43,15 +43,11 @@ async def comes_true(condition: Callable[[], bool]) -> None:
 @pytest.mark.parametrize(
     ("typed", "keys"),
     [
-        (b"", []),
-        (b"wasd", [b"w", b"a", b"s", b"d"]),
-        (b"\x1b[A\x1bOBq", [b"\x1b[A", b"\x1bOB", b"q"]),
-        (b"w\x1b[C ", [b"w", b"\x1b[C", b" "]),
-        (b"\x1b", [b"\x1b"]),
-        (b"\x1b[", [b"\x1b", b"["]),
+        (b"", []), (b"wasd", [b"w", b"a", b"s", b"d"]), (b"\x1b[A\x1bOBq", [b"\x1b[A", b"\x1bOB", b"q"]),
+        (b"w\x1b[C ", [b"w", b"\x1b[C", b" "]), (b"\x1b", [b"\x1b"]), (b"\x1b[", [b"\x1b", b"["]),
         (b"\xc3\xa4", [b"\xc3", b"\xa4"]),
     ],
-)
+)  # fmt: skip
 def test_keys_are_told_apart(typed: bytes, keys: list[bytes]) -> None:
     assert KEYS.findall(typed) == keys
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import CLOCK, COMMAND, by, course, end, events, gone, named, out_of, read_until, zscout_until
+from tests.cli.tools import CLOCK, COMMAND, by, course, end, events, gone, named, out_of, read_until
 from tests.hang import HANG
 from tests.live.bench import until
 from zscout.behaviors.client.client import QUERY_TIMEOUT, Client
@@ -271,7 +271,7 @@ def test_a_timeout_ends_the_wait(fleet: CliFleet) -> None:
     blocker = fleet.holder("patient", "robot/a", "--min-runtime", "10m")
     # Long enough to hear whom it waits for, though the RCM stands still.
     late = ("request", "robot/a", "--name", "late", "--timeout", "6s", "--json")
-    done = zscout_until(lambda done: '"holders"' in done.stdout, *late, env=fleet.lab.env)
+    done = fleet.until(lambda done: '"holders"' in done.stdout, *late)
     assert done.returncode == 1
     waits, ended = events(done.stdout)
     assert waits["needs"][0]["holders"][0]["arc"] == "patient"
