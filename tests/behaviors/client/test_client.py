@@ -65,7 +65,7 @@ async def test_who_is_preempted_goes_on_when_it_is_granted_again() -> None:
             async for attempt in holds(low, "low", {RC: {}}, min_runtime=60):
                 async with attempt:
                     entered.append("in")
-                    await asyncio.sleep(3600)
+                    await asyncio.sleep(90)
 
         working = asyncio.create_task(work())
         await until(lambda: entered)
