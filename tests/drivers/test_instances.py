@@ -124,7 +124,6 @@ async def test_of_two_that_did_not_see_each_other_the_one_that_was_taken_in_firs
 async def test_what_another_half_was_granted_ends_though_the_instance_that_is_meant_has_just_gone() -> None:
     """The one of the other half is taken in when that one's holder can't command any more: until then the leader knows
     of no hold of it, and tells its client so (seed 413304)."""
-
     fleet, term = FakeFleet(), Term(1, "other")
     rcm, first = fleet.rcm(2), await offer(fleet, "h2")
     await until(lambda: rcm.core.status().rcs)

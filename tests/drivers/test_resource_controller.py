@@ -260,7 +260,6 @@ async def test_a_command_under_a_grant_that_was_missed_waits_until_that_was_read
 
 async def test_an_rc_that_has_missed_something_does_not_say_that_it_knows_all() -> None:
     """Its RCM would take a hold for lost of which it has yet to read."""
-
     async with play() as (rcm, rc, _device, client):
         states: list[RcState] = []
         client.subscribe(client.keys.rc_state_any, RcState, lambda _key, state: states.append(state))
@@ -402,7 +401,6 @@ async def test_an_rc_that_an_rcm_and_the_mesh_contradict_joins_the_mesh_anew(
     sign: str | None, caplog: pytest.LogCaptureFixture
 ) -> None:
     """What the RCM answers is no sign that it is heard."""
-
     with caplog.at_level(logging.WARNING, "zscout.mesh"):
         async with play() as (rcm, rc, _device, client):
             if sign is not None and "not seen" in sign:

@@ -439,7 +439,6 @@ async def test_an_rc_that_ends_while_a_program_may_touch_its_device_leaves_it_to
 
 async def test_a_direct_hold_is_used_from_when_it_could_begin() -> None:
     """While a program of before may touch the device, nobody else does."""
-
     async with play() as place:
         assert await place.word(place.client, 1) == "done"
         await asyncio.sleep(5)

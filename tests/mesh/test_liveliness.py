@@ -91,8 +91,7 @@ async def test_neither_a_death_nor_the_end_of_a_query_is_lost_where_the_inbox_is
 
 async def test_what_waits_for_a_watch_that_is_closed_is_not_handled(world: World) -> None:
     a, b = await world.open("a", "b")
-    closed: list[Token] = []
-    open_: list[Token] = []
+    closed, open_ = list[Token](), list[Token]()
     key = a.keys.alive_any(Role.CLIENT)
     watch = a.watch(key, lambda token, _: closed.append(token))
     a.watch(key, lambda token, _: open_.append(token))

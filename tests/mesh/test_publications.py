@@ -22,8 +22,7 @@ from zscout.messages import MAX_FRAME, FrameHead
 
 async def test_publications_arrive_in_order(world: World) -> None:
     a, b = await world.open("a", "b")
-    heard: list[tuple[str, int]] = []
-    own: list[int] = []
+    heard, own = list[tuple[str, int]](), list[int]()
     a.subscribe("test/*", Ping, lambda key, ping: heard.append((key, ping.number)))
     b.subscribe(NEWS, Ping, lambda _, ping: own.append(ping.number))
     await world.declared()
@@ -70,8 +69,7 @@ async def test_a_peer_that_does_not_read_for_less_than_the_lease_misses_nothing(
 
 async def test_what_is_published_before_a_subscription_is_not_kept(world: World) -> None:
     a, b, witness = await world.open("a", "b", "c")
-    heard: list[int] = []
-    witnessed: list[int] = []
+    heard, witnessed = list[int](), list[int]()
     witness.subscribe(NEWS, Ping, lambda _, ping: witnessed.append(ping.number))
     await world.declared()
     b.put(NEWS, Ping(1))
@@ -103,8 +101,7 @@ async def test_of_deletes_and_keys_with_wildcards_nothing_is_heard(world: Zenoh)
 
 async def test_alike_subscriptions_are_closed_one_by_one(world: World) -> None:
     a, b = await world.open("a", "b")
-    one: list[int] = []
-    other: list[int] = []
+    one, other = list[int](), list[int]()
     first = a.subscribe(NEWS, Ping, lambda _, ping: one.append(ping.number))
     second = a.subscribe(NEWS, Ping, lambda _, ping: other.append(ping.number))
     assert len(a._shared) == 1

@@ -104,7 +104,6 @@ class _World:
 
 async def test_a_link_that_is_lost_is_made_again(stack: AsyncExitStack) -> None:
     """By who made it."""
-
     here, there = await _World(stack).pair()
     _cut(before := _ends(here, there))
     await until(lambda: _ends(here, there) - before)
@@ -163,7 +162,6 @@ async def test_the_session_that_introduces_it_is_no_link_to_anybody(stack: Async
 
 async def test_who_joins_with_a_lesser_id_is_linked_as_well(stack: AsyncExitStack) -> None:
     """Its clock is behind: the others make the links, and have to be told of it."""
-
     world = _World(stack)
     for _ in range(2):
         await world.peer(makes_links=True)

@@ -59,7 +59,6 @@ async def test_what_is_declared_goes_on_and_nobody_notices(world: World) -> None
 
 async def test_what_is_polled_seldom_goes_on_as_well(world: World) -> None:
     """The session that was polled last may be closed by then."""
-
     a, b = await world.open("a", "b")
     polled, publisher = a.poll_latest(f"{NEWS}/*", Ping), b.publisher(f"{NEWS}/b", Ping)
     await world.declared()
@@ -104,7 +103,6 @@ async def test_a_link_that_comes_back_without_its_token_is_noticed_and_left(capl
 @pytest.mark.parametrize("shows_another", [True, False])
 async def test_a_session_that_its_program_has_left_is_not_missed(shows_another: bool) -> None:
     """Zenoh may not close it: then it stays linked, without a token."""
-
     network = MemoryNetwork()
     watcher, left = (network.open("test", Sender(name, "test")) for name in ("w", "a"))
     for mesh in (watcher, left):

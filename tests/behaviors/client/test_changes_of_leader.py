@@ -64,7 +64,6 @@ async def test_holds_and_places_outlive_a_change_of_leader() -> None:
 @pytest.mark.parametrize("missing", [Role.SESSION, "requests"], ids=["it answers", "its session is seen"])
 async def test_who_shows_a_new_leader_that_it_lives_is_not_dropped_though_its_token_is_missing(missing: str) -> None:
     """As where links came back without all declarations while another led, and nobody noticed."""
-
     async with small_fleet("watch", "one") as (fleet, (watch, one)):
         next_leader = fleet.candidate("h1").mesh
         assert isinstance(next_leader, MemoryMesh)
@@ -105,7 +104,6 @@ async def test_without_an_rcm_a_hold_ends_after_its_lease_and_is_asked_again() -
 
 async def test_an_rcm_far_above_is_followed_once_no_other_is_heard() -> None:
     """As where the fleet had to go above a forged term while this client was cut off."""
-
     async with small_fleet("one") as (fleet, (one,)):
         await until(lambda: one.term.counter)
         await fleet.candidates.pop("h0").stop()
@@ -138,7 +136,6 @@ async def granted_unheard() -> AsyncIterator[tuple[SmallFleet, Client, OpenArc, 
 
 async def test_when_one_of_two_rcms_goes_the_other_is_asked_at_once() -> None:
     """Its answer may have come second, and nobody read it."""
-
     async with granted_unheard() as (_, _, waits, old):
         for one in old:
             one.close()

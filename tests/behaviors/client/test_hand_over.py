@@ -56,7 +56,6 @@ async def both_go_on(new: Client, grant: Grant, places: list[tuple[str, Place | 
 
 async def test_all_goes_on_in_another_client_though_its_rc_hears_of_it_late() -> None:
     """What a component's move rests on: nobody of equal priority gets in between."""
-
     async with small_fleet("old", "new", "rival") as (fleet, (old, new, rival)):
         arc = await old.request("tally", {RC: {}}, min_runtime=3600)
         await old.granted(arc)
@@ -85,7 +84,6 @@ async def test_all_goes_on_in_another_client_though_its_rc_hears_of_it_late() ->
 
 async def test_a_hand_over_that_dies_with_the_leader_once_it_is_answered_is_made_again() -> None:
     """A process that is killed takes along what it has sent and its links have not carried yet."""
-
     async with small_fleet("old", "new") as (fleet, (old, new)):
         grant, places = await runs_and_waits(old)
         next_leader = fleet.candidate("h1")
@@ -107,7 +105,6 @@ async def test_a_hand_over_that_dies_with_the_leader_once_it_is_answered_is_made
 
 async def test_what_a_new_leader_does_not_know_to_be_held_yet_is_handed_over_as_what_it_is() -> None:
     """Its client has answered that leader, and its RC, not in time, has not."""
-
     async with small_fleet("old", "new") as (fleet, (old, new)):
         grant, places = await runs_and_waits(old)
         next_leader = fleet.candidate("h1").mesh
@@ -126,7 +123,6 @@ async def test_what_a_new_leader_does_not_know_to_be_held_yet_is_handed_over_as_
 
 async def test_what_rcs_hold_for_the_new_client_is_handed_over_though_the_new_leader_does_not_see_that_one() -> None:
     """An RCM carried it out, and was heard by the RC alone."""
-
     async with small_fleet("old", "new") as (fleet, (old, new)):
         runs = await running(old)
         leader, next_leader = fleet.leader(), fleet.candidate("h1").mesh
@@ -151,7 +147,6 @@ async def test_what_rcs_hold_for_the_new_client_is_handed_over_though_the_new_le
 
 async def test_a_promise_that_is_made_as_a_hand_over_is_answered_counts() -> None:
     """Who stands for the lead has been told that the ARC is the old client's."""
-
     async with small_fleet("old", "new") as (fleet, (old, new)):
         runs = await running(old)
         old.pause()
@@ -173,7 +168,6 @@ async def test_a_promise_that_is_made_as_a_hand_over_is_answered_counts() -> Non
 
 async def test_what_an_rcm_that_was_replaced_has_handed_over_is_awaited_once_more() -> None:
     """Its old client has promised the next one to have it, and hands it over there; the new one asks before that."""
-
     async with small_fleet("old", "new", "rival") as (fleet, (old, new, rival)):
         await running(rival)
         waits = await old.request("waits", {RC: {}}, min_runtime=3600)
@@ -203,7 +197,6 @@ async def test_what_an_rcm_that_was_replaced_has_handed_over_is_awaited_once_mor
 
 async def test_what_is_awaited_once_more_is_handed_on() -> None:
     """The RCM of a later term has dropped the old client meanwhile."""
-
     async with small_fleet("one", "two") as (_, (one, two)):
         arc = await one.request("work", {"robot/z": {}}, min_runtime=3600)
         before = arc.id, arc.place
@@ -242,7 +235,6 @@ async def test_what_lost_its_rcm_as_it_is_handed_over_is_handed_over_all_the_sam
 
 async def test_what_the_new_client_does_not_hear_of_is_asked_for_as_what_it_was() -> None:
     """Neither a notice nor the question of the old client reaches it: the RCM's word has to do."""
-
     async with small_fleet("old", "new") as (fleet, (old, new)):
         grant, places = await runs_and_waits(old)
         old.pause()

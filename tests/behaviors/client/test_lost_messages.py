@@ -33,7 +33,6 @@ async def test_a_hold_is_over_when_its_rc_says_so_though_no_notice_does() -> Non
 @pytest.mark.parametrize("cut", [0.9, 1.5, 8.0])
 async def test_a_client_that_sees_its_rc_anew_is_granted_at_once(cut: float) -> None:
     """Not when what was held back longer each time is over: nobody else was cut off."""
-
     async with small_fleet("one") as (fleet, (one,)):
         network, (client, rc) = fleet.network, (one.mesh, fleet.devices)
         for source, target in ((client, rc), (rc, client)):
@@ -93,7 +92,6 @@ async def test_a_client_that_hears_no_publication_of_an_rcm_that_it_sees_joins_t
 @pytest.mark.parametrize("whose", ["client", "RC"])
 async def test_a_hold_goes_on_under_a_leader_that_does_not_know_who_listens_to_it(whose: str) -> None:
     """Links came back without the subscription of what RCMs publish, long before this one led."""
-
     async with small_fleet("one") as (fleet, (one,)):
         arc = await one.request("first", {RC: {}}, min_runtime=600)
         grant = await one.granted(arc)
@@ -119,7 +117,6 @@ async def test_a_hold_goes_on_under_a_leader_that_does_not_know_who_listens_to_i
 async def test_a_leader_that_is_asked_by_whom_it_does_not_see_joins_the_mesh_anew() -> None:
     """Links came back without its token, its subscription of notices and its `requests`: what it asks arrives, and it
     hears what is published."""
-
     async with small_fleet("one", "two") as (fleet, (one, _)):
         arc = await one.request("first", {RC: {}}, min_runtime=600)
         await one.granted(arc)

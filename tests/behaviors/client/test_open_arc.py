@@ -258,8 +258,7 @@ async def test_what_its_rc_does_not_confirm_is_asked_for_again_at_its_place(
     known = arc("robot/a")
     client._store.add(known)
     known.take(runs({}), NOW)
-    ended: list[OpenArc] = []
-    asked: list[Any] = []
+    ended, asked = list[OpenArc](), list[Any]()
 
     async def command(rc: str, *_: Any, **__: Any) -> Done:
         if (code := answers.pop(0)) is not None:

@@ -50,7 +50,6 @@ async def test_a_node_that_is_not_linked_yet_is_asked_again() -> None:
 
 async def test_where_the_rcm_refuses_the_hand_over_the_other_one_is_stopped() -> None:
     """An RCM that was replaced may have carried it out: both would act."""
-
     async with small_fleet("c.1") as (fleet, (client,)):
         arc = await client.request("work", {RC: {}}, min_runtime=3600)
         grant = await client.granted(arc)
@@ -106,7 +105,6 @@ async def test_a_node_that_was_there_and_is_gone_is_not_waited_for() -> None:
 @pytest.mark.parametrize("lease", [1.0, 3.0])
 async def test_a_successor_counts_as_gone_once_it_was_not_seen_for_longer_than_it_waits_itself(lease: float) -> None:
     """Behind a partition it runs a lease after it lost sight of this one, which is to go on after it."""
-
     network = MemoryNetwork()
     fleet = default_fleet()
     client = Client(network.open("f", Sender("a", "c.1")), replace(fleet, mesh=replace(fleet.mesh, lease=lease)))

@@ -28,7 +28,6 @@ COUNTER = "zscout.behaviors.components.shipped:Counter"
 async def test_what_is_handed_to_it_has_it_run_only_once_its_predecessor_is_not_seen(late: bool) -> None:
     """That one may have gone on: what was handed over to one behind a partition was taken back. `late`: as that is
     over, the link to it comes back after those to the others."""
-
     reports: list[ComponentReport] = []
 
     def report(one: ComponentReport) -> asyncio.Future[None]:

@@ -77,7 +77,6 @@ async def over(watching: asyncio.Task[Any]) -> None:
 
 async def test_a_camera_that_did_not_come_to_warm_up_is_not_waited_for_any_more() -> None:
     """All channels were taken until its turn came: it would begin to warm up as that is over."""
-
     async with robot_fleet("robot", "other", "asks") as (fleet, (client, other, _asks)):
         needs: dict[str, Any] = {"framegrabber/f": {}, "video/1": {}, "video/2": {}}
         await other.request("other", needs, priority=5, min_runtime=3, keep=False)
@@ -112,7 +111,6 @@ async def test_a_camera_is_switched_off_again_where_its_turn_does_not_come(why: 
 
 async def test_what_warms_up_is_its_own_again_where_a_move_has_failed() -> None:
     """It was left to nobody: held for as long as the client lived."""
-
     async with robot_fleet("robot", "other", "new", "asks") as (fleet, (client, other, new, _asks)):
         await other.request("other", {"framegrabber/f": {}}, priority=5, min_runtime=3.9, keep=False)
         watching = watches(client)
