@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import AsyncExitStack
+from typing import Any
 
 import pytest
 
@@ -28,14 +29,16 @@ def stack() -> AsyncExitStack:
 @pytest.hookimpl(tryfirst=True)
 def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     """Imported by the conftest of a folder with such tests."""
-    test, values = pyfuncitem.obj, pyfuncitem.funcargs
+    test = pyfuncitem.obj
+    values: dict[str, Any] = pyfuncitem.funcargs
     if not asyncio.iscoroutinefunction(test):
         return None
 
     real = "real_time" in values or isinstance(values.get("world"), Zenoh)
 
     async def main() -> None:
-        async with values.get("stack") or AsyncExitStack(), asyncio.timeout(3 * HANG if real else None):
+        opened = values.get("stack") or AsyncExitStack()
+        async with opened, asyncio.timeout(3 * HANG if real else None):
             await test(**{name: values[name] for name in pyfuncitem._fixtureinfo.argnames})
 
     (asyncio.run if real else kit.run)(main())

@@ -150,8 +150,7 @@ async def test_what_a_program_has_taken_up_it_has_at_its_date_though_the_leader_
         booking = await bookings.book({RC: {}}, start, 30, name="survey", every=1, until=start + timedelta(days=3))
         mine = await one.request("survey", **bookings.terms(booking))
         assert (mine.state, mine.booking) == ("queued", f"{booking.id}@{booking.start}"), "the first date"
-        fleet.network.kill(fleet.leader())
-        del fleet.candidates["h0"]
+        await fleet.lose_leader()
         await until(lambda: one.leader == "h1" and two.leader == "h1", within=30)
         # What would not be over by then does not start, though it is asked for first.
         long = await two.request("long", {RC: {}}, min_runtime=600)

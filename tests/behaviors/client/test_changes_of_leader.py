@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, SmallFleet, small_fleet
+from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, SmallFleet, held, small_fleet
 from tests.mesh.kit import until
 from zscout.behaviors.client.arc import hold
 from zscout.behaviors.client.client import Client
@@ -29,8 +29,7 @@ async def test_a_queued_request_that_the_next_leader_refuses_ends(monkeypatch: p
         await one.granted(await one.request("first", {RC: {}}, priority=5, min_runtime=600))
         waits = await two.request("second", {RC: {}}, priority=5, min_runtime=600)
         monkeypatch.setattr(request_handler, "MAX_PRIORITY", 4)
-        fleet.network.kill(fleet.leader())
-        del fleet.candidates["h0"]
+        await fleet.lose_leader()
         # The new leader does not hear of it while it takes the lead.
         link = fleet.network.link(two.mesh, fleet.candidates["h1"].mesh)
         link.loss = 1.0
@@ -50,8 +49,7 @@ async def test_holds_and_places_outlive_a_change_of_leader() -> None:
         async with hold(one, "first", {RC: {}}, min_runtime=60) as held:
             waits = [await client.request("next", {RC: {}}, min_runtime=60) for client in (two, three)]
             places, term = [arc.place for arc in waits], one.term
-            fleet.network.kill(fleet.leader())
-            del fleet.candidates["h0"]
+            await fleet.lose_leader()
             await until(lambda: one.leader == "h1" and all(c.term > term for c in (one, two, three)))
             assert held.active
             assert (await held.command(RC, ECHO)).result == 7
@@ -81,8 +79,7 @@ async def test_who_shows_a_new_leader_that_it_lives_is_not_dropped_though_its_to
         async with hold(one, "first", {RC: {}}, min_runtime=600) as held:
             outcomes: list[str | None] = []
             one.watch(lambda arc: outcomes.append(arc.outcome))
-            fleet.network.kill(fleet.leader())
-            del fleet.candidates["h0"]
+            await fleet.lose_leader()
             await until(lambda: watch.leader == "h1")
             await until(lambda: next_leader._transport.current is not before, within=10)
             await asyncio.sleep(10)
@@ -92,8 +89,7 @@ async def test_who_shows_a_new_leader_that_it_lives_is_not_dropped_though_its_to
 
 async def test_without_an_rcm_a_hold_ends_after_its_lease_and_is_asked_again() -> None:
     async with small_fleet("one") as (fleet, (one,)):
-        arc = await one.request("first", {RC: {}}, min_runtime=600)
-        assert await one.granted(arc) is not None
+        arc, _ = await held(one, "first")
         await fleet.candidates.pop("h0").stop()
         await until(lambda: arc.state == "asking", within=FLEET.timing.hold_lease / SECOND + 1)
         assert arc.ending is not None
@@ -111,8 +107,7 @@ async def test_an_rcm_far_above_is_followed_once_no_other_is_heard() -> None:
         candidate.known = far = Term(10**9, "far")
         candidate.start()
         await until(lambda: one.term > far, within=FLEET.timing.hold_lease / SECOND + 3)
-        arc = await one.request("first", {RC: {}}, min_runtime=600)
-        assert await one.granted(arc) is not None
+        await held(one, "first")
 
 
 @asynccontextmanager

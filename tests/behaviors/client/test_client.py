@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, SmallFleet, small_fleet
+from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, SmallFleet, held, small_fleet
 from tests.mesh.kit import until
 from zscout.behaviors.client.arc import Revoked, hold, holds
 from zscout.behaviors.client.client import Client, CommandRefused, RequestRefused
@@ -120,8 +120,7 @@ async def test_a_request_that_is_cancelled_before_its_answer_is_withdrawn() -> N
 
 async def test_a_client_that_is_cancelled_while_it_leaves_leaves_all_the_same() -> None:
     async with small_fleet("watch", "one") as (fleet, (_, one)):
-        arc = await one.request("first", {RC: {}}, min_runtime=600, keep=True)
-        await one.granted(arc)
+        await held(one, "first", keep=True)
         closed: list[bool] = []
         close = one.mesh.close
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.behaviors.client.small_fleet import FLEET, OTHER, RC, small_fleet
+from tests.behaviors.client.small_fleet import FLEET, OTHER, RC, held, small_fleet
 from tests.mesh.kit import until
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.direct import DirectHold
@@ -61,9 +61,7 @@ async def test_a_direct_hold_is_confirmed_again_and_may_be_relied_on_for_a_hold_
 
 async def test_a_hold_that_is_not_direct_has_nothing_of_this() -> None:
     async with small_fleet("one") as (fleet, (one,)):
-        arc = await one.request("first", {RC: {}}, min_runtime=600)
-        grant = await one.granted(arc)
-        assert grant is not None
+        _, grant = await held(one, "first")
         assert one.direct_hold(grant) is None
         await asyncio.sleep(5)
         assert not fleet.rcs[0].holds.may_be_direct(one.mesh.now())
@@ -134,7 +132,7 @@ async def test_a_hold_that_an_rc_has_not_confirmed_for_a_hold_lease_is_over_what
 
 @pytest.mark.parametrize("keep", [False, True])
 async def test_who_could_not_enter_in_its_time_is_queued_with_its_full_minimum_runtime(keep: bool) -> None:
-    async with small_fleet("one", "two", "three") as (_, (one, two, three)):
+    async with small_fleet("one", "two", "three") as (fleet, (one, two, three)):
         await enter(one, "first", keep=True)
         arc = await two.request("second", {RC: {}}, priority=1, min_runtime=2, keep=keep)
         first_grant, place = arc.grant, arc.place
@@ -150,8 +148,7 @@ async def test_who_could_not_enter_in_its_time_is_queued_with_its_full_minimum_r
         assert (two.mesh.now() - asked) / SECOND >= SETTLE - 0.1
         # What is kept goes on after its minimum runtime, which passed meanwhile.
         assert keep or (arc.end - two.mesh.now()) / SECOND > 0
-        state = await two.state()
-        assert state is not None
+        state = await fleet.state()
         (hold,) = state.holds
         assert (hold.arc, hold.min_runtime) == ("second", Decimal(2))
 

@@ -166,7 +166,6 @@ async def test_a_leader_that_begins_as_a_body_clears_up_after_its_time_does_not_
         await until(lambda: one.leader == "h1")
         assert not task.done()
         await task
-        state = await one.state()
-        assert state is not None
+        state = await fleet.state()
         assert (state.queue, state.holds) == ([], [])
         assert [one for one in told if one.startswith("queued")] == []

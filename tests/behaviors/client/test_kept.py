@@ -95,12 +95,11 @@ async def test_the_fleet_s_longest_time_ends_it(*, keep: bool) -> None:
 
 
 async def test_a_grant_is_waited_for_at_most_so_long() -> None:
-    async with small_fleet("one", "two") as (_, (one, two)):
+    async with small_fleet("one", "two") as (fleet, (one, two)):
         async with hold(one, "first", {RC: {}}):
             with pytest.raises(TimeoutError, match=r"second was not granted within 30 s: waits for h/one"):
                 await hold(two, "second", {RC: {}}, timeout=30).granted()
-            state = await one.state()
-            assert state is not None
+            state = await fleet.state()
             assert not state.queue
         # The time is for the wait alone.
         async with hold(two, "second", {RC: {}}, timeout=30) as held:

@@ -7,7 +7,7 @@ import logging
 
 import pytest
 
-from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, small_fleet
+from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, held, small_fleet
 from tests.mesh.kit import until
 from zscout.behaviors.client.confirmation import CONFIRM_TIMEOUT
 from zscout.behaviors.client.request import CommandRefused
@@ -19,9 +19,7 @@ from zscout.types import SECOND
 
 async def test_a_hold_is_over_when_its_rc_says_so_though_no_notice_does() -> None:
     async with small_fleet("one", "two") as (fleet, (one, two)):
-        arc = await one.request("first", {RC: {}}, min_runtime=600)
-        grant = await one.granted(arc)
-        assert grant is not None
+        arc, grant = await held(one, "first")
         fleet.network.disturb({"notice": Disturbance(lost=1.0)})
         await two.granted(await two.request("operator", {RC: {}}, priority=9, min_runtime=600))
         with pytest.raises(CommandRefused, match="is over"):
@@ -47,8 +45,7 @@ async def test_a_client_that_sees_its_rc_anew_is_granted_at_once(cut: float) -> 
 
 async def test_what_was_given_up_unheard_is_withdrawn_once_an_rcm_answers() -> None:
     async with small_fleet("one", "two") as (fleet, (one, two)):
-        arc = await one.request("first", {RC: {}}, min_runtime=600, keep=True)
-        await one.granted(arc)
+        arc, _ = await held(one, "first", keep=True)
         waits = await two.request("second", {RC: {}}, min_runtime=600)
         link = fleet.network.link(one.mesh, fleet.leader())
         link.loss = 1.0
@@ -95,18 +92,15 @@ async def test_a_hold_goes_on_under_a_leader_that_does_not_know_who_listens_to_i
     async with small_fleet("one") as (fleet, (one,)):
         arc = await one.request("first", {RC: {}}, min_runtime=600)
         grant = await one.granted(arc)
-        next_leader = fleet.candidate("h1").mesh
+        next_leader = await fleet.standby()
         listening = one.mesh if whose == "client" else fleet.devices
-        assert isinstance(next_leader, MemoryMesh)
         assert isinstance(listening, MemoryMesh)
-        await asyncio.sleep(2)
         transport = listening._transport.current
         assert isinstance(transport, MemoryTransport)
         hidden = [known for known in transport.subscribers.all if known[0] == listening.keys.grants]
         assert hidden
         fleet.network.link(listening, next_leader).hidden = {*hidden}
-        fleet.network.kill(fleet.leader())
-        await fleet.candidates.pop("h0").stop()
+        await fleet.lose_leader()
         states: list[str] = []
         one.watch(lambda arc: states.append(arc.state))
         await until(lambda: one.leader == "h1")
@@ -118,8 +112,7 @@ async def test_a_leader_that_is_asked_by_whom_it_does_not_see_joins_the_mesh_ane
     """Links came back without its token, its subscription of notices and its `requests`: what it asks arrives, and it
     hears what is published."""
     async with small_fleet("one", "two") as (fleet, (one, _)):
-        arc = await one.request("first", {RC: {}}, min_runtime=600)
-        await one.granted(arc)
+        arc, _ = await held(one, "first")
         leader, asking = fleet.leader(), one.mesh
         assert isinstance(asking, MemoryMesh)
         before, client = leader._transport.current, asking._transport.current

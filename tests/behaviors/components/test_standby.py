@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from tests.behaviors.client.small_fleet import FLEET, RC, small_fleet
+from tests.behaviors.client.small_fleet import FLEET, held, small_fleet
 from tests.mesh.kit import until
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.components.channel import (
@@ -46,8 +46,7 @@ async def test_what_is_handed_to_it_has_it_run_only_once_its_predecessor_is_not_
         def phases() -> list[str]:
             return [one.phase for one in reports if isinstance(one, PhaseReport)]
 
-        arc = await old.request("work", {RC: {}}, min_runtime=3600)
-        await old.granted(arc)
+        arc, _ = await held(old, "work", min_runtime=3600)
         predecessor = Token("h", Role.COMPONENT, "c", "1-older")
         token = None if late else old.mesh.alive(predecessor)
         start = StartComponent("c", 2, ComponentSpec("counter"), standby=True)

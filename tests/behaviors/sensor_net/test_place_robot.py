@@ -100,8 +100,7 @@ async def test_a_channel_that_was_asked_for_by_name_is_so_after_a_move() -> None
         await asyncio.sleep(2)
         robot = await moved(robot, old, new)
         await asyncio.sleep(1)
-        state = await fleet.clients[-1].state()
-        assert state is not None
+        state = await fleet.state(-1)
         assert [(view.arc, view.client) for view in state.holds] == [("z-hide", "h/new")]
         assert not state.queue
         await robot.stop()
@@ -113,8 +112,7 @@ async def test_no_channel_is_taken_that_its_parameters_leave_out() -> None:
         robot.scout.blindness._bad = {"video/1": 0.0}
         robot.start()
         await asyncio.sleep(2)
-        state = await fleet.clients[-1].state()
-        assert state is not None
+        state = await fleet.state(-1)
         assert "video/1" in state.holds[0].needs
         await robot.stop()
 

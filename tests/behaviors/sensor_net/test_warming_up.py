@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.behaviors.client.small_fleet import FLEET, SmallFleet, small_fleet
+from tests.behaviors.client.small_fleet import FLEET, SmallFleet, begin_move, small_fleet
 from tests.mesh.kit import until
 from zscout.behaviors.client.arc import Revoked
 from zscout.behaviors.client.client import Client
@@ -116,8 +116,7 @@ async def test_what_warms_up_is_its_own_again_where_a_move_has_failed() -> None:
         watching = watches(client)
         await asyncio.sleep(1)
         assert await fleet.arcs("z-warm") == ["running"]
-        client.pause()
-        new.expect(client.open_requests())
+        begin_move(client, new)
         await client.hand_over_all(new.mesh.me)
         # By now all of it is somebody else's, who does not come to anything.
         await asyncio.sleep(2)
@@ -133,8 +132,7 @@ async def test_a_camera_warms_up_after_a_move_too() -> None:
         await other.request("other", {"framegrabber/f": {}}, priority=5, min_runtime=20, keep=False)
         watching = watches(old)
         await until(lambda: [arc for arc in old._store.open if arc.start is not None])
-        old.pause()
-        new.expect(old.open_requests())
+        begin_move(old, new)
         await old.hand_over_all(new.mesh.me)
         await old.close()
         await over(watching)
