@@ -114,6 +114,7 @@ def test_the_grace_begins_at_the_order_where_the_deadline_is_later() -> None:
 # With processes
 
 
+@pytest.mark.live
 def test_the_end_is_told_when_the_last_process_is_gone(tmp_path: Path) -> None:
     script = f"{OWN_SESSION} while [ ! -s $0/grandchild ]; do sleep 0.01; done; exit 3"
     with guarded(*shell(tmp_path, script), grace=HANG) as command:
@@ -126,6 +127,7 @@ def test_the_end_is_told_when_the_last_process_is_gone(tmp_path: Path) -> None:
         assert command.guardian.wait(HANG) == 0
 
 
+@pytest.mark.live
 def test_all_of_it_is_killed_when_the_client_is_gone(tmp_path: Path) -> None:
     script = f"trap '' TERM; {OWN_SESSION} while [ ! -s $0/grandchild ]; do sleep 0.01; done; echo ready; wait"
     with guarded(*shell(tmp_path, script), grace=0.2) as command:
@@ -137,6 +139,8 @@ def test_all_of_it_is_killed_when_the_client_is_gone(tmp_path: Path) -> None:
         assert not lives(pid_in(tmp_path / "grandchild"))
 
 
+@pytest.mark.live
+@pytest.mark.slow
 def test_a_stubborn_one_is_told_first_and_killed_after_the_grace(tmp_path: Path) -> None:
     script = "trap 'echo told' TERM; echo ready; while :; do sleep 0.02; done"
     # Within the grace the shell has to come to its trap, though it stands still.
@@ -149,6 +153,7 @@ def test_a_stubborn_one_is_told_first_and_killed_after_the_grace(tmp_path: Path)
         assert now() - before >= 4 * SECOND
 
 
+@pytest.mark.live
 def test_who_may_not_wait_kills_at_once(tmp_path: Path) -> None:
     with guarded(*shell(tmp_path, "trap '' TERM; echo ready; while :; do sleep 0.02; done"), grace=HANG) as command:
         command.out.readline()
@@ -157,6 +162,7 @@ def test_who_may_not_wait_kills_at_once(tmp_path: Path) -> None:
         assert command.hears_rest()[1:] == ["ending client", "exited -9", "gone"]
 
 
+@pytest.mark.live
 def test_it_is_ended_at_the_deadline_that_was_given_last_though_the_client_says_nothing(tmp_path: Path) -> None:
     script = "trap '' TERM; echo ready; while :; do sleep 0.02; done"
     begin = now()
@@ -168,12 +174,14 @@ def test_it_is_ended_at_the_deadline_that_was_given_last_though_the_client_says_
         assert now() - begin >= 1.2 * SECOND
 
 
+@pytest.mark.live
 def test_nothing_is_started_after_the_deadline(tmp_path: Path) -> None:
     with guarded("touch", str(tmp_path / "ran"), until=now() - 1) as command:
         assert command.hears_rest() == ["ending deadline", "gone"]
     assert not (tmp_path / "ran").exists()
 
 
+@pytest.mark.live
 def test_a_stopped_one_hears_of_its_end(tmp_path: Path) -> None:
     script = (
         f"{OWN_SESSION.replace(' TERM', ' HUP')} while [ ! -s $0/grandchild ]; do sleep 0.01; done; echo ready; wait"
@@ -188,6 +196,7 @@ def test_a_stopped_one_hears_of_its_end(tmp_path: Path) -> None:
         assert command.hears_rest() == ["ending client", "exited -15", "gone"]
 
 
+@pytest.mark.live
 def test_the_command_dies_with_its_guardian() -> None:
     with guarded("sleep", "1000") as command:
         pid = int(command.hears().split()[1])
@@ -197,6 +206,7 @@ def test_the_command_dies_with_its_guardian() -> None:
             left.rmdir()
 
 
+@pytest.mark.live
 def test_all_in_a_control_group_are_killed_as_one() -> None:
     group = ControlGroup()
     if not group:
@@ -210,6 +220,7 @@ def test_all_in_a_control_group_are_killed_as_one() -> None:
     assert not folder.exists()
 
 
+@pytest.mark.live
 def test_a_command_is_in_the_group_that_its_guardian_kills() -> None:
     if not (group := ControlGroup()):
         pytest.skip("no control group (v2) may be made here")
@@ -218,6 +229,7 @@ def test_a_command_is_in_the_group_that_its_guardian_kills() -> None:
         assert command.out.read().endswith(f"/zscout.{command.guardian.pid}.request\n")
 
 
+@pytest.mark.live
 def test_what_can_not_be_executed_is_said_with_its_code(tmp_path: Path) -> None:
     with guarded(str(tmp_path / "missing")) as command:
         assert command.hears_rest()[1:] == ["exited 127", "gone"]

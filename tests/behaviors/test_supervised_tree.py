@@ -6,13 +6,12 @@ import asyncio
 
 import pytest
 
-from tests.mesh.kit import run
 from zscout.behaviors.tree import CarriedClock
 from zscout.mesh.supervision import supervised
 from zscout.types import SECOND
 
 
-def test_what_fails_beside_a_body_fails_the_body() -> None:
+async def test_what_fails_beside_a_body_fails_the_body() -> None:
     async def broken() -> None:
         await asyncio.sleep(1)
         raise RuntimeError("broken")
@@ -23,10 +22,10 @@ def test_what_fails_beside_a_body_fails_the_body() -> None:
             await asyncio.sleep(3600)
 
     with pytest.raises(RuntimeError, match="broken"):
-        run(body())
+        await body()
 
 
-def test_a_body_that_is_cancelled_from_outside_stays_so() -> None:
+async def test_a_body_that_is_cancelled_from_outside_stays_so() -> None:
     async def body(ended: list[str]) -> None:
         async def work() -> None:
             try:
@@ -38,16 +37,13 @@ def test_a_body_that_is_cancelled_from_outside_stays_so() -> None:
             supervisor.spawn(work())
             await asyncio.sleep(3600)
 
-    async def test() -> None:
-        ended: list[str] = []
-        task = asyncio.create_task(body(ended))
-        await asyncio.sleep(1)
-        task.cancel()
-        with pytest.raises(asyncio.CancelledError):
-            await task
-        assert ended == ["work"]
-
-    run(test())
+    ended: list[str] = []
+    task = asyncio.create_task(body(ended))
+    await asyncio.sleep(1)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert ended == ["work"]
 
 
 def test_a_clock_goes_on_at_another_host_where_it_was() -> None:

@@ -222,6 +222,7 @@ def test_a_silent_server_holds_up_nobody_and_stop_does_not_wait_for_it() -> None
         until(lambda: not blocked.alive)
 
 
+@pytest.mark.live
 @pytest.mark.parametrize("mode", ["run", "stall"])
 def test_a_process_ends_whatever_its_captures_do(mode: str) -> None:
     with MjpegServer() as server:

@@ -7,7 +7,7 @@ from decimal import Decimal
 from itertools import product
 from typing import Any
 
-from tests.mesh.kit import run, until
+from tests.mesh.kit import until
 from tests.services.rcm.kit import FakeClient, FakeFleet, grant_of
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.instances import InstanceState
@@ -62,146 +62,127 @@ def kill(fleet: FakeFleet, rc: ResourceController) -> None:
     fleet.network.kill(rc.mesh)
 
 
-def test_who_finds_another_instance_stands_by_and_serves_when_its_holds_are_surely_over() -> None:
-    async def story() -> None:
-        fleet = FakeFleet()
-        rcm = fleet.rcm()
-        first = await offer(fleet, "h2")
-        second = await offer(fleet, "h1")
-        assert [one.instances.state for one in (first, second)] == [InstanceState.SERVES, InstanceState.STANDS_BY]
-        assert second._rc_state([]).duplicate_of == "robot/a at h2"
-        client = fleet.client("one")
-        await until(lambda: rcm.core.status().rcs)
-        answer = await client.ask("tally", RC)
-        assert await confirms(client, grant_of(answer)) == [None]
-        assert (told(first), told(second)) == (["begin tally"], [])
-        # The first may let its holder command for as long as the hold lease.
-        kill(fleet, first)
-        killed = fleet.watcher.now()
-        await until(lambda: told(second))
-        assert fleet.watcher.now() - killed >= fleet.fleet.timing.hold_lease
-        assert (told(second), second.instances.state) == (["begin tally"], InstanceState.SERVES)
-        again = grant_of(client.notices[-1])
-        assert again > grant_of(answer)
-        assert await confirms(client, again) == [None]
-
-    run(story())
+async def test_who_finds_another_instance_stands_by_and_serves_when_its_holds_are_surely_over() -> None:
+    fleet = FakeFleet()
+    rcm = fleet.rcm()
+    first = await offer(fleet, "h2")
+    second = await offer(fleet, "h1")
+    assert [one.instances.state for one in (first, second)] == [InstanceState.SERVES, InstanceState.STANDS_BY]
+    assert second._rc_state([]).duplicate_of == "robot/a at h2"
+    client = fleet.client("one")
+    await until(lambda: rcm.core.status().rcs)
+    answer = await client.ask("tally", RC)
+    assert await confirms(client, grant_of(answer)) == [None]
+    assert (told(first), told(second)) == (["begin tally"], [])
+    # The first may let its holder command for as long as the hold lease.
+    kill(fleet, first)
+    killed = fleet.watcher.now()
+    await until(lambda: told(second))
+    assert fleet.watcher.now() - killed >= fleet.fleet.timing.hold_lease
+    assert (told(second), second.instances.state) == (["begin tally"], InstanceState.SERVES)
+    again = grant_of(client.notices[-1])
+    assert again > grant_of(answer)
+    assert await confirms(client, again) == [None]
 
 
-def test_who_leaves_in_order_is_followed_at_once() -> None:
-    async def story() -> None:
-        fleet = FakeFleet()
-        fleet.rcm()
-        first = await offer(fleet, "h2")
-        second = await offer(fleet, "h1")
-        client = fleet.client("one")
-        await client.ask("tally", RC)
-        await until(lambda: told(first))
-        stopped = fleet.watcher.now()
-        await first.stop()
-        await until(lambda: told(second))
-        assert fleet.watcher.now() - stopped < SECOND // 2
-        assert told(first) == ["begin tally", "safe"]
-
-    run(story())
+async def test_who_leaves_in_order_is_followed_at_once() -> None:
+    fleet = FakeFleet()
+    fleet.rcm()
+    first = await offer(fleet, "h2")
+    second = await offer(fleet, "h1")
+    client = fleet.client("one")
+    await client.ask("tally", RC)
+    await until(lambda: told(first))
+    stopped = fleet.watcher.now()
+    await first.stop()
+    await until(lambda: told(second))
+    assert fleet.watcher.now() - stopped < SECOND // 2
+    assert told(first) == ["begin tally", "safe"]
 
 
-def test_of_two_that_did_not_see_each_other_the_one_that_was_taken_in_first_goes_on() -> None:
-    async def story() -> None:
-        fleet = FakeFleet()
-        rcm = fleet.rcm()
-        first = await offer(fleet, "h2")
-        client = fleet.client("one")
-        await until(lambda: rcm.core.status().rcs)
-        answer = await client.ask("tally", RC)
-        apart = fleet.mesh("h1")
-        fleet.network.isolate(apart)
-        second = ResourceController(apart, RC, Recorded(), hold_lease=3.0, stall=StallWatch(apart.now).start())
-        await second.start()
-        assert second.instances.state is InstanceState.SERVES
-        fleet.network.heal()
-        await until(lambda: second.instances.state is InstanceState.STANDS_BY)
-        assert await confirms(client, grant_of(answer)) == [None]
-        assert (told(first), told(second)) == (["begin tally"], [])
-        # As it leaves, the device is the other one's holder's.
-        await second.stop()
-        assert told(second) == []
-
-    run(story())
+async def test_of_two_that_did_not_see_each_other_the_one_that_was_taken_in_first_goes_on() -> None:
+    fleet = FakeFleet()
+    rcm = fleet.rcm()
+    first = await offer(fleet, "h2")
+    client = fleet.client("one")
+    await until(lambda: rcm.core.status().rcs)
+    answer = await client.ask("tally", RC)
+    apart = fleet.mesh("h1")
+    fleet.network.isolate(apart)
+    second = ResourceController(apart, RC, Recorded(), hold_lease=3.0, stall=StallWatch(apart.now).start())
+    await second.start()
+    assert second.instances.state is InstanceState.SERVES
+    fleet.network.heal()
+    await until(lambda: second.instances.state is InstanceState.STANDS_BY)
+    assert await confirms(client, grant_of(answer)) == [None]
+    assert (told(first), told(second)) == (["begin tally"], [])
+    # As it leaves, the device is the other one's holder's.
+    await second.stop()
+    assert told(second) == []
 
 
-def test_what_another_half_was_granted_ends_though_the_instance_that_is_meant_has_just_gone() -> None:
+async def test_what_another_half_was_granted_ends_though_the_instance_that_is_meant_has_just_gone() -> None:
     """The one of the other half is taken in when that one's holder can't command any more: until then the leader knows
     of no hold of it, and tells its client so (seed 413304)."""
-
-    async def story() -> None:
-        fleet, term = FakeFleet(), Term(1, "other")
-        rcm, first = fleet.rcm(2), await offer(fleet, "h2")
-        await until(lambda: rcm.core.status().rcs)
-        apart, other = fleet.mesh("h1"), fleet.mesh("other")
-        for one, two in product((apart, other), (first.mesh, rcm.mesh)):
-            fleet.network.cut(one, two)
-            fleet.network.cut(two, one)
-        second = ResourceController(apart, RC, Recorded(), hold_lease=3.0, stall=StallWatch(apart.now).start())
-        await second.start()
-        held = Holder("tally", "tally", "other/one", Grant(term, 1), Place(term, 1), [RC], Decimal(60), 50.0)
-        other.put(other.keys.grants, Grants(term, 1, 1, 0.5, {RC: [held]}, []))
-        await until(lambda: told(second))
-        kill(fleet, first)
-        killed = fleet.watcher.now()
-        await until(lambda: rcm.membership.reported(RC) is None)
-        fleet.network.heal()
-        healed = fleet.watcher.now()
-        await until(lambda: "safe" in told(second))
-        assert fleet.watcher.now() - healed < SECOND
-        assert (second.holds.held, second.instances.state) == ({}, InstanceState.STANDS_BY)
-        await until(lambda: second.instances.state is InstanceState.SERVES)
-        assert fleet.watcher.now() - killed >= fleet.fleet.timing.hold_lease
-        assert told(second) == ["begin tally", "safe"]
-
-    run(story())
+    fleet, term = FakeFleet(), Term(1, "other")
+    rcm, first = fleet.rcm(2), await offer(fleet, "h2")
+    await until(lambda: rcm.core.status().rcs)
+    apart, other = fleet.mesh("h1"), fleet.mesh("other")
+    for one, two in product((apart, other), (first.mesh, rcm.mesh)):
+        fleet.network.cut(one, two)
+        fleet.network.cut(two, one)
+    second = ResourceController(apart, RC, Recorded(), hold_lease=3.0, stall=StallWatch(apart.now).start())
+    await second.start()
+    held = Holder("tally", "tally", "other/one", Grant(term, 1), Place(term, 1), [RC], Decimal(60), 50.0)
+    other.put(other.keys.grants, Grants(term, 1, 1, 0.5, {RC: [held]}, []))
+    await until(lambda: told(second))
+    kill(fleet, first)
+    killed = fleet.watcher.now()
+    await until(lambda: rcm.membership.reported(RC) is None)
+    fleet.network.heal()
+    healed = fleet.watcher.now()
+    await until(lambda: "safe" in told(second))
+    assert fleet.watcher.now() - healed < SECOND
+    assert (second.holds.held, second.instances.state) == ({}, InstanceState.STANDS_BY)
+    await until(lambda: second.instances.state is InstanceState.SERVES)
+    assert fleet.watcher.now() - killed >= fleet.fleet.timing.hold_lease
+    assert told(second) == ["begin tally", "safe"]
 
 
-def test_after_a_change_of_rcm_the_one_with_the_hold_is_meant() -> None:
-    async def story() -> None:
-        fleet = FakeFleet("h2", "h1")
-        candidates = [fleet.candidate(host) for host in ("h1", "h2")]
-        await until(lambda: candidates[1].rcm)
-        first = await offer(fleet, "h9")
-        client = fleet.client("one")
-        await until(lambda: candidates[1].rcm and candidates[1].rcm.core.status().rcs)
-        answer = await client.ask("tally", RC, seconds=600)
-        client.open = [OpenRequest("tally", "tally", {RC: {}}, 0, Decimal(600), place=answer.place)]
-        second = await offer(fleet, "h0")
-        await asyncio.sleep(0.1)
-        second.instances.take(second.instance)  # as though it had not heard
-        await candidates[1].stop()
-        await until(lambda: second.instances.state is InstanceState.STANDS_BY)
-        assert await confirms(client, grant_of(answer)) == [None]
-        assert told(second) == []
-        assert told(first) == ["begin tally"]
-        await candidates[0].stop()
-
-    run(story())
+async def test_after_a_change_of_rcm_the_one_with_the_hold_is_meant() -> None:
+    fleet = FakeFleet("h2", "h1")
+    candidates = [fleet.candidate(host) for host in ("h1", "h2")]
+    await until(lambda: candidates[1].rcm)
+    first = await offer(fleet, "h9")
+    client = fleet.client("one")
+    await until(lambda: candidates[1].rcm and candidates[1].rcm.core.status().rcs)
+    answer = await client.ask("tally", RC, seconds=600)
+    client.open = [OpenRequest("tally", "tally", {RC: {}}, 0, Decimal(600), place=answer.place)]
+    second = await offer(fleet, "h0")
+    await asyncio.sleep(0.1)
+    second.instances.take(second.instance)  # as though it had not heard
+    await candidates[1].stop()
+    await until(lambda: second.instances.state is InstanceState.STANDS_BY)
+    assert await confirms(client, grant_of(answer)) == [None]
+    assert told(second) == []
+    assert told(first) == ["begin tally"]
+    await candidates[0].stop()
 
 
-def test_a_new_instance_on_the_same_host_follows_at_once_and_the_hold_ends() -> None:
-    async def story() -> None:
-        fleet = FakeFleet()
-        rcm = fleet.rcm()
-        first = await offer(fleet, "h2")
-        client = fleet.client("one")
-        await until(lambda: rcm.core.status().rcs)
-        before = grant_of(await client.ask("tally", RC))
-        fleet.network.freeze(first.mesh)
-        first.supervisor.cancel()
-        began = fleet.watcher.now()
-        second = await offer(fleet, "h2")
-        assert second.instances.state is InstanceState.SERVES
-        await until(lambda: [one for one in client.notices if one.grant is not None and one.grant > before])
-        assert fleet.watcher.now() - began < SECOND // 2
-        assert told(second) == ["begin tally"]
-        await asyncio.sleep(2)
-        assert client.notices[-1].state == "running"
-
-    run(story())
+async def test_a_new_instance_on_the_same_host_follows_at_once_and_the_hold_ends() -> None:
+    fleet = FakeFleet()
+    rcm = fleet.rcm()
+    first = await offer(fleet, "h2")
+    client = fleet.client("one")
+    await until(lambda: rcm.core.status().rcs)
+    before = grant_of(await client.ask("tally", RC))
+    fleet.network.freeze(first.mesh)
+    first.supervisor.cancel()
+    began = fleet.watcher.now()
+    second = await offer(fleet, "h2")
+    assert second.instances.state is InstanceState.SERVES
+    await until(lambda: [one for one in client.notices if one.grant is not None and one.grant > before])
+    assert fleet.watcher.now() - began < SECOND // 2
+    assert told(second) == ["begin tally"]
+    await asyncio.sleep(2)
+    assert client.notices[-1].state == "running"

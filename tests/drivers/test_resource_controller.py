@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
 from typing import Any, cast
 
 import pytest
@@ -12,7 +13,7 @@ from msgspec.structs import replace
 
 from tests.drivers.rcs import ECHO, LEASE, TERM, Device, Rcm, answer, close, holder, started
 from tests.hang import HANG
-from tests.mesh.kit import run, until
+from tests.mesh.kit import until
 from zscout.drivers.confirm_server import CommandQuery
 from zscout.drivers.holds import HoldChange
 from zscout.drivers.repeated import MAX_HOSTS, MAX_PER_HOST, MAX_WAITING, CommandMemory
@@ -25,33 +26,28 @@ from zscout.testing.link import Disturbance
 from zscout.testing.memory import MemoryMesh, MemoryNetwork
 from zscout.types import SECOND, Grant
 
-Story = Callable[[Rcm, ResourceController, Device, Mesh], Awaitable[None]]
 
-
-def play(story: Story) -> None:
+@asynccontextmanager
+async def play() -> AsyncIterator[tuple[Rcm, ResourceController, Device, Mesh]]:
     """An RCM, an RC that `one` holds under grant 1, and its client `h/client`."""
-
-    async def all_of_it() -> None:
-        network = MemoryNetwork()
-        rcm, device = Rcm(network), Device()
-        client = network.open("f", Sender("h", "client"))
-        rc = await started(network, device)
-        rcm.publish(holder(1))
-        await until(lambda: device.calls == ["begin one"])
-        try:
-            await story(rcm, rc, device, client)
-        finally:
-            await close(rc, rcm.mesh, client)
-
-    run(all_of_it())
+    network = MemoryNetwork()
+    rcm, device = Rcm(network), Device()
+    client = network.open("f", Sender("h", "client"))
+    rc = await started(network, device)
+    rcm.publish(holder(1))
+    await until(lambda: device.calls == ["begin one"])
+    try:
+        yield rcm, rc, device, client
+    finally:
+        await close(rc, rcm.mesh, client)
 
 
 def grant(number: int) -> Grant:
     return Grant(TERM, number)
 
 
-def test_the_safe_state_waits_for_no_command_though_the_rcm_hangs() -> None:
-    async def story(rcm: Rcm, rc: ResourceController, device: Device, client: Mesh) -> None:
+async def test_the_safe_state_waits_for_no_command_though_the_rcm_hangs() -> None:
+    async with play() as (rcm, rc, device, client):
         rcm.hangs = True
         # Under a grant that nobody knows: each made the RC read `rcm/state` for half a second.
         early = [asyncio.create_task(answer(client, grant(99), ttl=60)) for _ in range(20)]
@@ -64,8 +60,6 @@ def test_the_safe_state_waits_for_no_command_though_the_rcm_hangs() -> None:
         assert await asyncio.gather(*early) == ["not_yet"] * EARLY_PER_HOST + ["busy"] * (20 - EARLY_PER_HOST)
         assert len(rcm.asked) == asked
 
-    play(story)
-
 
 class Carrying(Device):
     """Says, too, what goes on in what."""
@@ -75,33 +69,30 @@ class Carrying(Device):
 
 
 @pytest.mark.parametrize("kind", [Carrying, Device])
-def test_what_goes_on_in_another_hold_is_neither_ended_nor_made_safe(kind: type[Device]) -> None:
-    async def story() -> None:
-        network = MemoryNetwork()
-        rcm, device = Rcm(network), kind()
-        client = network.open("f", Sender("h", "client"))
+async def test_what_goes_on_in_another_hold_is_neither_ended_nor_made_safe(kind: type[Device]) -> None:
+    network = MemoryNetwork()
+    rcm, device = Rcm(network), kind()
+    client = network.open("f", Sender("h", "client"))
 
-        async def told(count: int) -> None:
-            await until(lambda: len(device.calls) >= count)
+    async def told(count: int) -> None:
+        await until(lambda: len(device.calls) >= count)
 
-        rc = await started(network, device)
-        warm, turn = holder(1, "warm"), replace(holder(2, "turn"), continues="warm")
-        moved = replace(turn, client="h/other", grant=grant(3))
-        begins = ["begin turn", "begin turn"]
-        if kind is Carrying:
-            begins = ["warm of h/client goes on in turn of h/client", "turn of h/client goes on in turn of h/other"]
-        expected = ["begin warm", *begins, "end turn", "safe", "begin last"]
-        for one, calls in (warm, 1), (turn, 2), (moved, 3), (holder(4, "last", "h/other"), 6):
-            rcm.publish(one)
-            await told(calls)
-        assert device.calls == expected
-        assert await answer(client, turn.grant) == "ended"
-        await close(rc, rcm.mesh, client)
-
-    run(story())
+    rc = await started(network, device)
+    warm, turn = holder(1, "warm"), replace(holder(2, "turn"), continues="warm")
+    moved = replace(turn, client="h/other", grant=grant(3))
+    begins = ["begin turn", "begin turn"]
+    if kind is Carrying:
+        begins = ["warm of h/client goes on in turn of h/client", "turn of h/client goes on in turn of h/other"]
+    expected = ["begin warm", *begins, "end turn", "safe", "begin last"]
+    for one, calls in (warm, 1), (turn, 2), (moved, 3), (holder(4, "last", "h/other"), 6):
+        rcm.publish(one)
+        await told(calls)
+    assert device.calls == expected
+    assert await answer(client, turn.grant) == "ended"
+    await close(rc, rcm.mesh, client)
 
 
-def test_a_hold_that_was_held_back_begins_in_the_one_that_continues_it() -> None:
+async def test_a_hold_that_was_held_back_begins_in_the_one_that_continues_it() -> None:
     """And what was the device's still is made safe before it: nothing was warm yet."""
 
     class Slow(Carrying):
@@ -109,24 +100,21 @@ def test_a_hold_that_was_held_back_begins_in_the_one_that_continues_it() -> None
             await asyncio.sleep(1)
             await super().safe()
 
-    async def story() -> None:
-        network = MemoryNetwork()
-        rcm, device = Rcm(network), Slow()
-        rc = await started(network, device, settle=2.0)
-        rcm.publish(holder(1))
-        await until(lambda: device.calls)
-        rcm.publish(holder(2, "warm"))
-        await asyncio.sleep(0.5)
-        rcm.publish(replace(holder(3, "turn"), continues="warm"))
-        await until(lambda: len(device.calls) >= 4)
-        assert device.calls == ["begin one", "end one", "safe", "begin turn"]
-        await close(rc, rcm.mesh)
-
-    run(story())
+    network = MemoryNetwork()
+    rcm, device = Rcm(network), Slow()
+    rc = await started(network, device, settle=2.0)
+    rcm.publish(holder(1))
+    await until(lambda: device.calls)
+    rcm.publish(holder(2, "warm"))
+    await asyncio.sleep(0.5)
+    rcm.publish(replace(holder(3, "turn"), continues="warm"))
+    await until(lambda: len(device.calls) >= 4)
+    assert device.calls == ["begin one", "end one", "safe", "begin turn"]
+    await close(rc, rcm.mesh)
 
 
-def test_the_safe_state_goes_before_commands_that_wait() -> None:
-    async def story(rcm: Rcm, _rc: ResourceController, device: Device, client: Mesh) -> None:
+async def test_the_safe_state_goes_before_commands_that_wait() -> None:
+    async with play() as (rcm, _rc, device, client):
         slow = asyncio.create_task(answer(client, grant(1), {"name": "slow", "seconds": 0.5}))
         await asyncio.sleep(0.1)
         waiting = [asyncio.create_task(answer(client, grant(1))) for _ in range(5)]
@@ -136,11 +124,9 @@ def test_the_safe_state_goes_before_commands_that_wait() -> None:
         assert {await task for task in waiting} == {"ended"}
         assert device.calls == ["begin one", "slow", "end one", "safe", "begin two"]
 
-    play(story)
 
-
-def test_early_commands_are_obeyed_in_their_order_once_the_grant_is_known() -> None:
-    async def story(rcm: Rcm, rc: ResourceController, device: Device, client: Mesh) -> None:
+async def test_early_commands_are_obeyed_in_their_order_once_the_grant_is_known() -> None:
+    async with play() as (rcm, rc, device, client):
         rcm.hangs = True
         told = [asyncio.create_task(answer(client, grant(2), {"name": "echo", "value": number})) for number in range(3)]
         await until(lambda: rc.queue.commands == 3)
@@ -151,11 +137,9 @@ def test_early_commands_are_obeyed_in_their_order_once_the_grant_is_known() -> N
         assert device.calls[-5:] == ["begin one", *(f"echo {number}" for number in range(4))]
         assert "safe" not in device.calls[-5:]
 
-    play(story)
 
-
-def test_an_early_command_makes_the_rc_read_what_it_missed() -> None:
-    async def story(rcm: Rcm, _rc: ResourceController, device: Device, client: Mesh) -> None:
+async def test_an_early_command_makes_the_rc_read_what_it_missed() -> None:
+    async with play() as (rcm, _rc, device, client):
         rcm.publish()
         await until(lambda: device.calls[-1] == "safe")
         rcm.seq = 5
@@ -164,11 +148,9 @@ def test_an_early_command_makes_the_rc_read_what_it_missed() -> None:
         assert await answer(client, grant(6)) == "not_yet"
         assert await answer(client, grant(5), ttl=0) == "bad_command"
 
-    play(story)
 
-
-def test_a_command_that_arrives_again_is_carried_out_once() -> None:
-    async def story(rcm: Rcm, _rc: ResourceController, device: Device, client: Mesh) -> None:
+async def test_a_command_that_arrives_again_is_carried_out_once() -> None:
+    async with play() as (rcm, _rc, device, client):
         rcm.publish(holder(1))
         await until(lambda: device.calls and device.calls[-1] == "begin one")
         key, other = client.keys.command("robot/x", client.me), client.keys.command("robot/x", Sender("h", "other"))
@@ -188,8 +170,6 @@ def test_a_command_that_arrives_again_is_carried_out_once() -> None:
         assert [await told(5, id_="d", key=other), await told(5, id_="d", key=other)] == ["wrong_client"] * 2
         assert [await told(5, id_="d"), await told(6, id_=None), await told(6, id_=None)] == [5, 6, 6]
         assert device.calls[-3:] == ["echo 5", "echo 6", "echo 6"]
-
-    play(story)
 
 
 def test_one_host_fills_no_others_memory_of_commands() -> None:
@@ -211,8 +191,8 @@ def test_one_host_fills_no_others_memory_of_commands() -> None:
     assert is_new("mine", "a")  # others commanded later
 
 
-def test_a_hold_ends_when_no_rcm_was_heard_for_the_lease() -> None:
-    async def story(rcm: Rcm, rc: ResourceController, device: Device, client: Mesh) -> None:
+async def test_a_hold_ends_when_no_rcm_was_heard_for_the_lease() -> None:
+    async with play() as (rcm, rc, device, client):
         ended: list[str] = []
         client.subscribe(
             client.keys.rc_state_any, RcState, lambda _key, state: ended.extend(hold.why for hold in state.ended)
@@ -224,12 +204,10 @@ def test_a_hold_ends_when_no_rcm_was_heard_for_the_lease() -> None:
         assert await answer(client, grant(1)) == "ended"
         assert rc.health == "ok"
 
-    play(story)
-
 
 @pytest.mark.parametrize("where", ["begin two", "safe"])
-def test_a_driver_that_raises_fails_its_rc_which_recovers(where: str) -> None:
-    async def story(rcm: Rcm, rc: ResourceController, device: Device, client: Mesh) -> None:
+async def test_a_driver_that_raises_fails_its_rc_which_recovers(where: str) -> None:
+    async with play() as (rcm, rc, device, client):
         device.broken = {where}
         rcm.publish(holder(2, "two"))
         await until(lambda: rc.health == f"its driver failed: {where} failed")
@@ -239,40 +217,35 @@ def test_a_driver_that_raises_fails_its_rc_which_recovers(where: str) -> None:
         rcm.publish(holder(3, "three"))
         await until(lambda: device.calls[-1] == "begin three")
 
-    play(story)
 
-
-def test_an_rc_that_fails_leaves_the_mesh_with_its_device_safe_and_tells_its_owner(
+async def test_an_rc_that_fails_leaves_the_mesh_with_its_device_safe_and_tells_its_owner(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    async def story() -> None:
-        network = MemoryNetwork()
-        rcm, device, failures = Rcm(network), Device(), list[Exception]()
-        tokens: dict[str, bool] = {}
-        key = rcm.mesh.keys.alive_any(Role.RC)
-        watch = rcm.mesh.watch(key, lambda token, alive: tokens.update({token.name: alive}))
-        rc = await started(network, device, on_failure=failures.append)
-        rcm.publish(holder(1))
-        await until(lambda: device.calls == ["begin one"] and tokens == {"robot/x": True})
+    network = MemoryNetwork()
+    rcm, device, failures = Rcm(network), Device(), list[Exception]()
+    tokens: dict[str, bool] = {}
+    key = rcm.mesh.keys.alive_any(Role.RC)
+    watch = rcm.mesh.watch(key, lambda token, alive: tokens.update({token.name: alive}))
+    rc = await started(network, device, on_failure=failures.append)
+    rcm.publish(holder(1))
+    await until(lambda: device.calls == ["begin one"] and tokens == {"robot/x": True})
 
-        def fault(*_args: object, **_how: object) -> None:
-            raise KeyError("a fault of ours")
+    def fault(*_args: object, **_how: object) -> None:
+        raise KeyError("a fault of ours")
 
-        monkeypatch.setattr(rc.holds, "apply_grants", fault)
-        rcm.publish()
-        await until(lambda: device.calls[-1] == "safe")
-        assert [type(error) for error in failures] == [KeyError]
-        assert "its resource controller failed" in rc.health
-        await until(lambda: tokens == {"robot/x": False})
-        watch.close()
-        await close(rc, rcm.mesh)
-        assert device.calls.count("safe") == 1
-
-    run(story())
+    monkeypatch.setattr(rc.holds, "apply_grants", fault)
+    rcm.publish()
+    await until(lambda: device.calls[-1] == "safe")
+    assert [type(error) for error in failures] == [KeyError]
+    assert "its resource controller failed" in rc.health
+    await until(lambda: tokens == {"robot/x": False})
+    watch.close()
+    await close(rc, rcm.mesh)
+    assert device.calls.count("safe") == 1
 
 
-def test_a_command_under_a_grant_that_was_missed_waits_until_that_was_read() -> None:
-    async def story(rcm: Rcm, rc: ResourceController, device: Device, client: Mesh) -> None:
+async def test_a_command_under_a_grant_that_was_missed_waits_until_that_was_read() -> None:
+    async with play() as (rcm, rc, _device, client):
         rcm.publish()
         await until(lambda: not rc.holds.held)
         rcm.hangs, rcm.seq = True, rcm.seq + 2
@@ -284,13 +257,10 @@ def test_a_command_under_a_grant_that_was_missed_waits_until_that_was_read() -> 
         rcm.asked[-1].answer(RcmState(TERM, rcm.seq, "rcm", [rcm.view(granted)]))
         assert await asking == "done"
 
-    play(story)
 
-
-def test_an_rc_that_has_missed_something_does_not_say_that_it_knows_all() -> None:
+async def test_an_rc_that_has_missed_something_does_not_say_that_it_knows_all() -> None:
     """Its RCM would take a hold for lost of which it has yet to read."""
-
-    async def story(rcm: Rcm, rc: ResourceController, _device: Device, client: Mesh) -> None:
+    async with play() as (rcm, rc, _device, client):
         states: list[RcState] = []
         client.subscribe(client.keys.rc_state_any, RcState, lambda _key, state: states.append(state))
         rcm.hangs = True
@@ -307,30 +277,25 @@ def test_an_rc_that_has_missed_something_does_not_say_that_it_knows_all() -> Non
         rc.publish()
         await until(lambda: states[-1].seq == rcm.seq)
 
-    play(story)
+
+async def test_figures_are_published_when_they_change() -> None:
+    network, device = MemoryNetwork(), Device()
+    watcher = network.open("f", Sender("w", "watcher"))
+    seen: list[float] = []
+    figures = {"packets": 1.0}
+    device.figures = figures.copy  # type: ignore[method-assign]
+    rc = await started(network, device)
+    watcher.subscribe(watcher.keys.rc_state_any, RcState, lambda _key, state: seen.append(state.figures["packets"]))
+    await asyncio.sleep(5)
+    assert seen == []
+    figures["packets"] = 2.0
+    await asyncio.sleep(5)
+    assert seen == [2.0]
+    await close(rc, watcher)
 
 
-def test_figures_are_published_when_they_change() -> None:
-    async def story() -> None:
-        network, device = MemoryNetwork(), Device()
-        watcher = network.open("f", Sender("w", "watcher"))
-        seen: list[float] = []
-        figures = {"packets": 1.0}
-        device.figures = figures.copy  # type: ignore[method-assign]
-        rc = await started(network, device)
-        watcher.subscribe(watcher.keys.rc_state_any, RcState, lambda _key, state: seen.append(state.figures["packets"]))
-        await asyncio.sleep(5)
-        assert seen == []
-        figures["packets"] = 2.0
-        await asyncio.sleep(5)
-        assert seen == [2.0]
-        await close(rc, watcher)
-
-    run(story())
-
-
-def test_how_long_it_was_used_is_told_within_a_second_of_the_end() -> None:
-    async def story(rcm: Rcm, rc: ResourceController, device: Device, client: Mesh) -> None:
+async def test_how_long_it_was_used_is_told_within_a_second_of_the_end() -> None:
+    async with play() as (rcm, _rc, device, client):
         states: list[RcState] = []
         client.subscribe(client.keys.rc_state_any, RcState, lambda _key, state: states.append(state))
         assert await answer(client, grant(1), {"name": "confirm"}) == "done"
@@ -357,10 +322,8 @@ def test_how_long_it_was_used_is_told_within_a_second_of_the_end() -> None:
         await asyncio.sleep(1.9)
         assert len(states) == 1
 
-    play(story)
 
-
-def test_a_command_that_takes_its_time_counts_once_it_is_carried_out() -> None:
+async def test_a_command_that_takes_its_time_counts_once_it_is_carried_out() -> None:
     class Slow(Device):
         """Answers a command some seconds later, beside others."""
 
@@ -373,54 +336,48 @@ def test_a_command_that_takes_its_time_counts_once_it_is_carried_out() -> None:
 
             return asyncio.ensure_future(take())
 
-    async def story() -> None:
-        network = MemoryNetwork()
-        rcm, client = Rcm(network), network.open("f", Sender("h", "client"))
-        rc = await started(network, Slow())
-        rcm.publish(holder(1))
-        await until(lambda: rc.holds.held)
+    network = MemoryNetwork()
+    rcm, client = Rcm(network), network.open("f", Sender("h", "client"))
+    rc = await started(network, Slow())
+    rcm.publish(holder(1))
+    await until(lambda: rc.holds.held)
 
-        async def used() -> float:
-            reply = await client.ask_one(client.keys.rc_state("robot/x"), RcAsk(), RcState, timeout=5)
-            assert reply is not None
-            assert reply.message is not None
-            (use,) = reply.message.used
-            return use.seconds
+    async def used() -> float:
+        reply = await client.ask_one(client.keys.rc_state("robot/x"), RcAsk(), RcState, timeout=5)
+        assert reply is not None
+        assert reply.message is not None
+        (use,) = reply.message.used
+        return use.seconds
 
-        assert await answer(client, grant(1), {"name": "fail", "seconds": 1}) == "failed"
-        assert await used() == 0.0
-        long = asyncio.create_task(answer(client, grant(1), {"name": "do", "seconds": 1}))
-        assert await answer(client, grant(1), {"name": "do", "seconds": 0.5}) == "done"
-        assert await used() == pytest.approx(0.5, abs=0.01)
-        assert await long == "done"
-        assert await used() == pytest.approx(1.0, abs=0.01)
-        await close(rc, rcm.mesh, client)
-
-    run(story())
+    assert await answer(client, grant(1), {"name": "fail", "seconds": 1}) == "failed"
+    assert await used() == 0.0
+    long = asyncio.create_task(answer(client, grant(1), {"name": "do", "seconds": 1}))
+    assert await answer(client, grant(1), {"name": "do", "seconds": 0.5}) == "done"
+    assert await used() == pytest.approx(0.5, abs=0.01)
+    assert await long == "done"
+    assert await used() == pytest.approx(1.0, abs=0.01)
+    await close(rc, rcm.mesh, client)
 
 
-def test_who_missed_that_an_rc_works_again_hears_it_later() -> None:
-    async def story() -> None:
-        network, device = MemoryNetwork(), Device()
-        watcher = network.open("f", Sender("w", "watcher"))
-        seen: list[str] = []
-        rc = await started(network, device)
-        watcher.subscribe(watcher.keys.rc_state_any, RcState, lambda _key, state: seen.append(state.health))
-        rc.fail("no power")
-        await until(lambda: seen == ["no power"])
-        network.disturb({"rc/state": Disturbance(lost=1.0)})
-        rc.recover()
-        await asyncio.sleep(1)
-        network.disturb({})
-        assert seen == ["no power"]
-        await until(lambda: seen[-1] == "ok", within=SAY_AGAIN + 2)
-        await close(rc, watcher)
-
-    run(story())
+async def test_who_missed_that_an_rc_works_again_hears_it_later() -> None:
+    network, device = MemoryNetwork(), Device()
+    watcher = network.open("f", Sender("w", "watcher"))
+    seen: list[str] = []
+    rc = await started(network, device)
+    watcher.subscribe(watcher.keys.rc_state_any, RcState, lambda _key, state: seen.append(state.health))
+    rc.fail("no power")
+    await until(lambda: seen == ["no power"])
+    network.disturb({"rc/state": Disturbance(lost=1.0)})
+    rc.recover()
+    await asyncio.sleep(1)
+    network.disturb({})
+    assert seen == ["no power"]
+    await until(lambda: seen[-1] == "ok", within=SAY_AGAIN + 2)
+    await close(rc, watcher)
 
 
-def test_a_publication_of_an_older_term_is_answered_by_the_state() -> None:
-    async def story(rcm: Rcm, _rc: ResourceController, _device: Device, client: Mesh) -> None:
+async def test_a_publication_of_an_older_term_is_answered_by_the_state() -> None:
+    async with play() as (_rcm, _rc, _device, client):
         states: list[RcState] = []
         client.subscribe(client.keys.rc_state_any, RcState, lambda _key, state: states.append(state))
         old = type(TERM)(1, "old")
@@ -428,8 +385,6 @@ def test_a_publication_of_an_older_term_is_answered_by_the_state() -> None:
         await until(lambda: bool(states))
         assert states[0].term == TERM
         assert await answer(client, grant(1), dict(ECHO)) == "done"
-
-    play(story)
 
 
 @pytest.mark.parametrize(
@@ -442,29 +397,26 @@ def test_a_publication_of_an_older_term_is_answered_by_the_state() -> None:
         "the RCM publishes and has not asked for its promise; another instance was asked",
     ],
 )
-def test_an_rc_that_an_rcm_and_the_mesh_contradict_joins_the_mesh_anew(
+async def test_an_rc_that_an_rcm_and_the_mesh_contradict_joins_the_mesh_anew(
     sign: str | None, caplog: pytest.LogCaptureFixture
 ) -> None:
     """What the RCM answers is no sign that it is heard."""
-
-    async def story(rcm: Rcm, rc: ResourceController, _device: Device, client: Mesh) -> None:
-        if sign is not None and "not seen" in sign:
-            rcm.token.close()
-        if sign is None or "not asked" not in sign or "another" in sign:
-            ask = RcAsk(promise=TERM, instance=rc.instance if sign is None or "another" not in sign else "i2")
-            await rcm.mesh.ask(rcm.mesh.keys.rc_state(rc.name), ask, RcState, timeout=1)
-        mesh = cast("MemoryMesh", rc.mesh)
-        before = mesh._transport.id()
-        for _ in range(12):
-            if sign is None or "not publish" not in sign:
-                rcm.publish(holder(1))
-            # It reads what it may have missed.
-            await answer(client, grant(99), ttl=0.1)
-            await asyncio.sleep(0.5)
-        assert (mesh._transport.id() != before) == (sign is not None)
-
     with caplog.at_level(logging.WARNING, "zscout.mesh"):
-        play(story)
+        async with play() as (rcm, rc, _device, client):
+            if sign is not None and "not seen" in sign:
+                rcm.token.close()
+            if sign is None or "not asked" not in sign or "another" in sign:
+                ask = RcAsk(promise=TERM, instance=rc.instance if sign is None or "another" not in sign else "i2")
+                await rcm.mesh.ask(rcm.mesh.keys.rc_state(rc.name), ask, RcState, timeout=1)
+            mesh = cast("MemoryMesh", rc.mesh)
+            before = mesh._transport.id()
+            for _ in range(12):
+                if sign is None or "not publish" not in sign:
+                    rcm.publish(holder(1))
+                # It reads what it may have missed.
+                await answer(client, grant(99), ttl=0.1)
+                await asyncio.sleep(0.5)
+            assert (mesh._transport.id() != before) == (sign is not None)
     said = [record.message for record in caplog.records if "joins the mesh anew" in record.message]
     told = sign and sign.partition(";")[0]
     assert said == ([f"robot/x: {told}: this process joins the mesh anew"] if sign is not None else [])
@@ -532,32 +484,26 @@ def test_who_waits_is_woken() -> None:
     asyncio.run(story())
 
 
-def test_figures_that_are_no_numbers_are_left_out() -> None:
+async def test_figures_that_are_no_numbers_are_left_out() -> None:
     """In a message they would make all of it unreadable."""
 
     class Odd(Device):
         def figures(self) -> dict[str, float]:
             return {"good": 1.5, "nan": float("nan"), "endless": float("inf")}
 
-    async def story() -> None:
-        network = MemoryNetwork()
-        asker, rc = network.open("f", Sender("h", "asker")), await started(network, Odd())
-        reply = await asker.ask_one(asker.keys.rc_state("robot/x"), RcAsk(), RcState, timeout=1)
-        assert reply is not None
-        assert reply.message is not None
-        assert reply.message.figures == {"good": 1.5}
-        await close(rc, asker)
-
-    run(story())
+    network = MemoryNetwork()
+    asker, rc = network.open("f", Sender("h", "asker")), await started(network, Odd())
+    reply = await asker.ask_one(asker.keys.rc_state("robot/x"), RcAsk(), RcState, timeout=1)
+    assert reply is not None
+    assert reply.message is not None
+    assert reply.message.figures == {"good": 1.5}
+    await close(rc, asker)
 
 
-def test_what_its_driver_declares_amiss_is_told_before_anybody_is_offered_it() -> None:
+async def test_what_its_driver_declares_amiss_is_told_before_anybody_is_offered_it() -> None:
     class Amiss(Device):
         def parameters(self) -> list[Any]:
             return ["voltage"]
 
-    async def story() -> None:
-        with pytest.raises(Malformed):
-            await started(MemoryNetwork(), Amiss())
-
-    run(story())
+    with pytest.raises(Malformed):
+        await started(MemoryNetwork(), Amiss())

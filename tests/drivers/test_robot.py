@@ -19,7 +19,7 @@ from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket, Packet
 from zscout.mesh import clock
 from zscout.types import SECOND, Grant, Ns
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow, pytest.mark.usefixtures("real_time")]
 
 
 def mast(lab: Lab, line: PtyLine, *, host: str = "mast") -> None:
@@ -58,28 +58,25 @@ def cart(lab: Lab, host: str, robot: int, **how: float) -> None:
     )
 
 
-def test_a_second_node_that_offers_a_held_robot_leaves_it_alone(tmp_path: Path) -> None:
-    async def story() -> None:
-        line = PtyLine(tmp_path / "tty")
-        async with Lab(tmp_path) as lab:
-            mast(lab, line)
-            cart(lab, "cart", 1)
-            client = await lab.client()
-            await lab.ready(client, "robot/r1", "radio/rf0", "video/ch1")
-            _, grant = await held(client, "drives", GANG)
+async def test_a_second_node_that_offers_a_held_robot_leaves_it_alone(tmp_path: Path) -> None:
+    line = PtyLine(tmp_path / "tty")
+    async with Lab(tmp_path) as lab:
+        mast(lab, line)
+        cart(lab, "cart", 1)
+        client = await lab.client()
+        await lab.ready(client, "robot/r1", "radio/rf0", "video/ch1")
+        _, grant = await held(client, "drives", GANG)
+        assert await answer(obeyed(client, "robot/r1", grant, TURN)) == "done"
+        # Until it drives, the halt from before it was held is repeated.
+        await line.until(is_in(DrivePacket))
+        halts = [packet for packet in line.packets if isinstance(packet, HaltPacket)]
+        cart(lab, "other", 1)
+        await lab.logged("other", "robot/r1 stands by: duplicate of robot/r1 at cart")
+        await lab.logged("other", "other is on the mesh")
+        for _ in range(20):
             assert await answer(obeyed(client, "robot/r1", grant, TURN)) == "done"
-            # Until it drives, the halt from before it was held is repeated.
-            await line.until(is_in(DrivePacket))
-            halts = [packet for packet in line.packets if isinstance(packet, HaltPacket)]
-            cart(lab, "other", 1)
-            await lab.logged("other", "robot/r1 stands by: duplicate of robot/r1 at cart")
-            await lab.logged("other", "other is on the mesh")
-            for _ in range(20):
-                assert await answer(obeyed(client, "robot/r1", grant, TURN)) == "done"
-                await asyncio.sleep(0.1)
-            assert [packet for packet in line.packets if isinstance(packet, HaltPacket)] == halts
-
-    asyncio.run(story())
+            await asyncio.sleep(0.1)
+        assert [packet for packet in line.packets if isinstance(packet, HaltPacket)] == halts
 
 
 def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_it(tmp_path: Path) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import os
 import socket
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,8 @@ from tests.hang import HANG
 from tests.live.bench import until
 from zscout.drivers.packets import DrivePacket, HaltPacket, encode
 from zscout.drivers.serial_line import DEPTH, SerialLine
-from zscout.mesh import clock
-from zscout.types import SECOND
+
+pytestmark = pytest.mark.usefixtures("real_time")
 
 
 class Ear:
@@ -57,24 +58,21 @@ def opened(port: str, ear: Ear) -> SerialLine:
     return SerialLine(port, 9600, up=ear.line_up, down=ear.line_down, wrote=ear.line_wrote)
 
 
-def live(story: Callable[[PtyLine, Ear, SerialLine], Any], link: Path, **how: Any) -> None:
-    """Runs a story over an open line."""
-
-    async def run() -> None:
-        pty, ear = PtyLine(link, **how), Ear()
-        line = opened(str(link), ear)
-        try:
-            await ear.until(lambda: ear.told == ["up"])
-            await story(pty, ear, line)
-        finally:
-            await line.stop()
-            pty.unplug()
-
-    asyncio.run(run())
+@asynccontextmanager
+async def live(link: Path, **how: Any) -> AsyncIterator[tuple[PtyLine, Ear, SerialLine]]:
+    """An open line."""
+    pty, ear = PtyLine(link, **how), Ear()
+    line = opened(str(link), ear)
+    try:
+        await ear.until(lambda: ear.told == ["up"])
+        yield pty, ear, line
+    finally:
+        await line.stop()
+        pty.unplug()
 
 
-def test_what_is_written_arrives_and_noise_does_not_hide_it(tmp_path: Path) -> None:
-    async def story(pty: PtyLine, ear: Ear, line: SerialLine) -> None:
+async def test_what_is_written_arrives_and_noise_does_not_hide_it(tmp_path: Path) -> None:
+    async with live(tmp_path / "tty") as (pty, ear, line):
         for number in range(4):
             garbled = encode(DrivePacket(1, number, 1, -1, 0.5))[:-3]
             assert line.write(garbled + encode(HaltPacket(1, number)))
@@ -85,11 +83,9 @@ def test_what_is_written_arrives_and_noise_does_not_hide_it(tmp_path: Path) -> N
         os.write(pty.master, b"OK\r\n" * 100)
         await until(lambda: line.received == 400)
 
-    live(story, tmp_path / "tty")
 
-
-def test_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
-    async def story(pty: PtyLine, ear: Ear, line: SerialLine) -> None:
+async def test_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
+    async with live(tmp_path / "tty") as (pty, ear, line):
         for _ in range(2):
             pty.unplug()
             await ear.until(lambda: len(ear.told) >= 2)
@@ -103,29 +99,24 @@ def test_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
             await pty.until(lambda packets: packets == [HaltPacket(3, 1)])
             ear.told, pty.heard = ["up"], []
 
-    live(story, tmp_path / "tty")
+
+async def test_a_second_program_is_refused_and_has_its_turn_later(tmp_path: Path) -> None:
+    pty, first, second = PtyLine(tmp_path / "tty"), Ear(), Ear()
+    line = opened(str(pty.link), first)
+    await first.until(lambda: first.told == ["up"])
+    with pytest.raises(serial.SerialException):
+        serial.Serial(str(pty.link), exclusive=True)
+    other = opened(str(pty.link), second)
+    await second.until(lambda: second.told)
+    assert second.told == [f"{pty.link} is used by another program"]
+    await line.stop()
+    await second.until(lambda: second.told[-1] == "up")
+    await other.stop()
+    pty.unplug()
 
 
-def test_a_second_program_is_refused_and_has_its_turn_later(tmp_path: Path) -> None:
-    async def run() -> None:
-        pty, first, second = PtyLine(tmp_path / "tty"), Ear(), Ear()
-        line = opened(str(pty.link), first)
-        await first.until(lambda: first.told == ["up"])
-        with pytest.raises(serial.SerialException):
-            serial.Serial(str(pty.link), exclusive=True)
-        other = opened(str(pty.link), second)
-        await second.until(lambda: second.told)
-        assert second.told == [f"{pty.link} is used by another program"]
-        await line.stop()
-        await second.until(lambda: second.told[-1] == "up")
-        await other.stop()
-        pty.unplug()
-
-    asyncio.run(run())
-
-
-def test_a_line_that_takes_nothing_is_told_of_and_its_backlog_thrown_away(tmp_path: Path) -> None:
-    async def story(pty: PtyLine, ear: Ear, line: SerialLine) -> None:
+async def test_a_line_that_takes_nothing_is_told_of_and_its_backlog_thrown_away(tmp_path: Path) -> None:
+    async with live(tmp_path / "tty", reads=False) as (pty, ear, line):
         block = encode(DrivePacket(1, 1, 1, 1, 0.5)) * 400
         sent = 0
         while len(ear.told) == 1 and sent < 100:
@@ -146,18 +137,16 @@ def test_a_line_that_takes_nothing_is_told_of_and_its_backlog_thrown_away(tmp_pa
         # All but what the other end had in its own hands already.
         assert len(left) < 4096 < ear.wrote * len(block)
 
-    live(story, tmp_path / "tty", reads=False)
 
-
-def test_ports_that_can_never_be_opened_are_named_in_plain_words(tmp_path: Path) -> None:
+async def test_ports_that_can_never_be_opened_are_named_in_plain_words(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("no tty")
-
-    async def run(refused: int) -> None:
+    with socket.socket() as bound:  # and not listening: its port refuses connections
+        bound.bind(("127.0.0.1", 0))
         for port, words in (
             (str(tmp_path / "none"), "is not there; is it plugged in?"),
             (str(file), "is no serial port"),
-            (f"socket://127.0.0.1:{refused}", "nobody listens there"),
+            (f"socket://127.0.0.1:{bound.getsockname()[1]}", "nobody listens there"),
             ("nonsense://x", "nonsense://x fails: "),
         ):
             ear = Ear()
@@ -166,31 +155,22 @@ def test_ports_that_can_never_be_opened_are_named_in_plain_words(tmp_path: Path)
             assert words in ear.told[0]
             await line.stop()
 
-    with socket.socket() as bound:  # and not listening: its port refuses connections
-        bound.bind(("127.0.0.1", 0))
-        asyncio.run(run(bound.getsockname()[1]))
 
+async def test_a_radio_on_another_machine(tmp_path: Path) -> None:
+    arrived: asyncio.Queue[bytes] = asyncio.Queue()
 
-def test_a_radio_on_another_machine(tmp_path: Path) -> None:
-    async def run() -> None:
-        arrived: asyncio.Queue[bytes] = asyncio.Queue()
+    async def served(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        arrived.put_nowait(await reader.readexactly(7))
+        writer.close()
 
-        async def served(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            arrived.put_nowait(await reader.readexactly(7))
-            writer.close()
-
-        server = await asyncio.start_server(served, "127.0.0.1", 0)
-        port = server.sockets[0].getsockname()[1]
-        ear = Ear()
-        line = opened(f"socket://127.0.0.1:{port}", ear)
-        await ear.until(lambda: ear.told == ["up"])
-        line.write(encode(HaltPacket(9, 9)))
-        assert await asyncio.wait_for(arrived.get(), HANG) == encode(HaltPacket(9, 9))
-        # The other machine hangs up: that is noticed though nothing is sent.
-        await ear.until(lambda: len(ear.told) > 1)
-        server.close()
-        await line.stop()
-
-    begun = clock.now()
-    asyncio.run(run())
-    assert clock.now() - begun < HANG * SECOND
+    server = await asyncio.start_server(served, "127.0.0.1", 0)
+    port = server.sockets[0].getsockname()[1]
+    ear = Ear()
+    line = opened(f"socket://127.0.0.1:{port}", ear)
+    await ear.until(lambda: ear.told == ["up"])
+    line.write(encode(HaltPacket(9, 9)))
+    assert await asyncio.wait_for(arrived.get(), HANG) == encode(HaltPacket(9, 9))
+    # The other machine hangs up: that is noticed though nothing is sent.
+    await ear.until(lambda: len(ear.told) > 1)
+    server.close()
+    await line.stop()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 from msgspec.structs import replace
 
 from tests.drivers.rcs import ECHO, LEASE, TERM, Device, Rcm, answer, close, holder, started
-from tests.mesh.kit import run, until
+from tests.mesh.kit import until
 from zscout.drivers.last_holder import LastHolder, LastHolderFile, UnknownLastHolder
 from zscout.drivers.resource_controller import SETTLE, ResourceController
 from zscout.keyexpr import Sender
@@ -79,26 +80,24 @@ class Place:
             await asyncio.sleep(0.5)
 
 
-def play(story: Callable[[Place], Awaitable[None]], first: Holder | None = None, **how: Any) -> None:
-    async def all_of_it() -> None:
-        network = MemoryNetwork()
-        rcm, device = Rcm(network), how.pop("device", None) or Device()
-        rc = await started(network, device, **how)
-        place = Place(network, rcm, rc, device)
-        heartbeat = asyncio.create_task(place.keep_alive())
-        rcm.publish(first or direct(1))
-        await until(lambda: rc.holds.held)
-        try:
-            await story(place)
-        finally:
-            heartbeat.cancel()
-            await close(rc, rcm.mesh, place.client, place.other)
-
-    run(all_of_it())
+@asynccontextmanager
+async def play(first: Holder | None = None, **how: Any) -> AsyncIterator[Place]:
+    network = MemoryNetwork()
+    rcm, device = Rcm(network), how.pop("device", None) or Device()
+    rc = await started(network, device, **how)
+    place = Place(network, rcm, rc, device)
+    heartbeat = asyncio.create_task(place.keep_alive())
+    rcm.publish(first or direct(1))
+    await until(lambda: rc.holds.held)
+    try:
+        yield place
+    finally:
+        heartbeat.cancel()
+        await close(rc, rcm.mesh, place.client, place.other)
 
 
-def test_the_next_holder_waits_until_the_program_of_a_direct_hold_has_left() -> None:
-    async def story(at: Place) -> None:
+async def test_the_next_holder_waits_until_the_program_of_a_direct_hold_has_left() -> None:
+    async with play() as at:
         assert await at.word(at.client, 1) == "done"
         at.next_holder()
         refused = await at.refusal(2)
@@ -111,22 +110,18 @@ def test_the_next_holder_waits_until_the_program_of_a_direct_hold_has_left() -> 
         # What the program did to the device past its RC since is undone before the next holder begins.
         assert at.device.calls == ["begin one", "end one", "safe", "safe", "begin next"]
 
-    play(story)
 
-
-def test_it_settles_for_settle_from_leaving_on() -> None:
-    async def story(at: Place) -> None:
+async def test_it_settles_for_settle_from_leaving_on() -> None:
+    async with play() as at:
         assert await at.word(at.client, 1) == "done"
         at.next_holder()
         await asyncio.sleep(1)
         assert await at.word(at.client, 1, LEAVING) == "done"
         assert await at.settled_after() == pytest.approx(SETTLE, abs=0.1)
 
-    play(story)
 
-
-def test_who_says_nothing_has_a_hold_lease_and_settle_from_its_last_confirmation_on() -> None:
-    async def story(at: Place) -> None:
+async def test_who_says_nothing_has_a_hold_lease_and_settle_from_its_last_confirmation_on() -> None:
+    async with play() as at:
         assert await at.word(at.client, 1) == "done"
         await asyncio.sleep(20)
         assert await at.word(at.client, 1) == "done"
@@ -134,22 +129,18 @@ def test_who_says_nothing_has_a_hold_lease_and_settle_from_its_last_confirmation
         at.next_holder()
         assert await at.settled_after() == pytest.approx(LEASE + SETTLE - 2, abs=0.1)
 
-    play(story)
 
-
-def test_the_word_may_come_before_the_end_is_heard() -> None:
-    async def story(at: Place) -> None:
+async def test_the_word_may_come_before_the_end_is_heard() -> None:
+    async with play() as at:
         assert await at.word(at.client, 1) == "done"
         assert await at.word(at.client, 1, LEAVING) == "done"
         await asyncio.sleep(1)
         at.next_holder()
         assert await at.settled_after() == pytest.approx(SETTLE - 1, abs=0.1)
 
-    play(story)
 
-
-def test_left_before_the_end_settles_nothing_unless_it_is_confirmed_again() -> None:
-    async def story(at: Place) -> None:
+async def test_left_before_the_end_settles_nothing_unless_it_is_confirmed_again() -> None:
+    async with play() as at:
         assert await at.word(at.client, 1) == "done"
         assert await at.word(at.client, 1, LEFT) == "done"
         at.next_holder()
@@ -161,23 +152,19 @@ def test_left_before_the_end_settles_nothing_unless_it_is_confirmed_again() -> N
         at.next_holder(4)
         assert await at.settled_after(4) > LEASE
 
-    play(story)
 
-
-def test_nobody_else_says_that_a_program_has_left() -> None:
-    async def story(at: Place) -> None:
+async def test_nobody_else_says_that_a_program_has_left() -> None:
+    async with play() as at:
         assert await at.word(at.client, 1) == "done"
         assert await at.word(at.other, 1, LEFT) == "wrong_client"
         at.next_holder()
         assert await at.word(at.other, 1, LEFT) == "ended"
         assert await at.word(at.other, 2) == "settling"
 
-    play(story)
-
 
 @pytest.mark.parametrize("released", ["with the next grant", "alone", "after its time"])
-def test_what_its_own_client_gives_back_does_not_settle(released: str) -> None:
-    async def story(at: Place) -> None:
+async def test_what_its_own_client_gives_back_does_not_settle(released: str) -> None:
+    async with play() as at:
         assert await at.word(at.client, 1) == "done"
         following = [holder(2, NEXT, "h/other")] if released == "with the next grant" else []
         if released == "after its time":
@@ -189,8 +176,6 @@ def test_what_its_own_client_gives_back_does_not_settle(released: str) -> None:
             at.next_holder(3)
         assert await at.settled_after(2 if following else 3) < 0.1
 
-    play(story)
-
 
 @pytest.mark.parametrize(
     ("end", "first"),
@@ -200,8 +185,8 @@ def test_what_its_own_client_gives_back_does_not_settle(released: str) -> None:
         pytest.param(lambda _: None, replace(direct(1), remaining=2.0), id="its time is over"),
     ],
 )
-def test_any_other_end_settles(end: Callable[[Place], object], first: Holder) -> None:
-    async def story(at: Place) -> None:
+async def test_any_other_end_settles(end: Callable[[Place], object], first: Holder) -> None:
+    async with play(first) as at:
         assert await at.word(at.client, 1) == "done"
         end(at)
         await until(lambda: grant(1) not in at.rc.holds.held)
@@ -209,48 +194,39 @@ def test_any_other_end_settles(end: Callable[[Place], object], first: Holder) ->
         at.next_holder(5)
         assert await at.word(at.other, 5) == "settling"
 
-    play(story, first)
+
+async def test_an_end_for_want_of_an_rcm_settles() -> None:
+    network = MemoryNetwork()
+    rcm, device = Rcm(network), Device()
+    rc = await started(network, device)
+    at = Place(network, rcm, rc, device)
+    rcm.publish(direct(1))
+    assert await at.word(at.client, 1) == "done"
+    await until(lambda: not rc.holds.held)
+    heartbeat = asyncio.create_task(at.keep_alive())
+    at.next_holder()
+    # It confirmed it a hold lease ago.
+    assert await at.settled_after() == pytest.approx(SETTLE, abs=0.2)
+    heartbeat.cancel()
+    await close(rc, rcm.mesh, at.client, at.other)
 
 
-def test_an_end_for_want_of_an_rcm_settles() -> None:
-    async def test() -> None:
-        network = MemoryNetwork()
-        rcm, device = Rcm(network), Device()
-        rc = await started(network, device)
-        at = Place(network, rcm, rc, device)
-        rcm.publish(direct(1))
-        assert await at.word(at.client, 1) == "done"
-        await until(lambda: not rc.holds.held)
-        heartbeat = asyncio.create_task(at.keep_alive())
-        at.next_holder()
-        # It confirmed it a hold lease ago.
-        assert await at.settled_after() == pytest.approx(SETTLE, abs=0.2)
-        heartbeat.cancel()
-        await close(rc, rcm.mesh, at.client, at.other)
-
-    run(test())
-
-
-def test_a_hold_that_was_never_confirmed_has_no_program() -> None:
-    async def story(at: Place) -> None:
+async def test_a_hold_that_was_never_confirmed_has_no_program() -> None:
+    async with play() as at:
         at.next_holder()
         assert await at.settled_after() < 0.1
 
-    play(story)
 
-
-def test_a_hold_that_is_not_direct_does_not_settle() -> None:
-    async def story(at: Place) -> None:
+async def test_a_hold_that_is_not_direct_does_not_settle() -> None:
+    async with play(holder(1)) as at:
         assert await at.word(at.client, 1) == "done"
         at.next_holder()
         assert await at.settled_after() < 0.1
         assert at.device.calls == ["begin one", "end one", "safe", "begin next"]
 
-    play(story, holder(1))
 
-
-def test_a_hand_over_does_not_settle_and_who_took_over_does() -> None:
-    async def story(at: Place) -> None:
+async def test_a_hand_over_does_not_settle_and_who_took_over_does() -> None:
+    async with play() as at:
         assert await at.word(at.client, 1) == "done"
         at.rcm.publish(replace(direct(2, client="h/other"), place=direct(1).place))
         assert await at.settled_after() < 0.1
@@ -260,15 +236,13 @@ def test_a_hand_over_does_not_settle_and_who_took_over_does() -> None:
         assert await at.word(at.client, 3) == "done"
         assert at.device.calls == ["begin one", "begin one", "end one", "safe", "safe", "begin next"]
 
-    play(story)
-
 
 class Shared(Device):
     sharable = True
 
 
-def test_who_held_before_goes_on_and_only_who_began_after_waits() -> None:
-    async def story(at: Place) -> None:
+async def test_who_held_before_goes_on_and_only_who_began_after_waits() -> None:
+    async with play(device=Shared()) as at:
         at.rcm.publish(direct(1), holder(2, "two", "h/other"))
         assert await at.word(at.client, 1) == "done"
         at.rcm.publish(holder(2, "two", "h/other"), holder(3, NEXT, "h/client"))
@@ -279,22 +253,18 @@ def test_who_held_before_goes_on_and_only_who_began_after_waits() -> None:
         assert await at.word(at.client, 3) == "done"
         assert "safe" not in at.device.calls
 
-    play(story, device=Shared())
-
 
 @pytest.mark.parametrize("name", ["stop", "halt"])
-def test_stop_and_halt_are_never_held_back(name: str) -> None:
-    async def story(at: Place) -> None:
+async def test_stop_and_halt_are_never_held_back(name: str) -> None:
+    async with play() as at:
         assert await at.word(at.client, 1) == "done"
         at.next_holder()
         assert await at.word(at.other, 2, {"name": name}) == "done"
         assert at.device.calls[-1] == name
 
-    play(story)
 
-
-def test_a_next_holder_whose_time_is_over_by_then_is_left_out_at_the_device() -> None:
-    async def story(at: Place) -> None:
+async def test_a_next_holder_whose_time_is_over_by_then_is_left_out_at_the_device() -> None:
+    async with play() as at:
         assert await at.word(at.client, 1) == "done"
         at.next_holder(remaining=2.0)
         await until(lambda: grant(2) in at.rc.holds.held)
@@ -302,8 +272,6 @@ def test_a_next_holder_whose_time_is_over_by_then_is_left_out_at_the_device() ->
         at.rcm.publish(holder(3, "third", "h/other"))
         assert await at.settled_after(3) == pytest.approx(LEASE + SETTLE - 2, abs=0.2)
         assert at.device.calls == ["begin one", "end one", "safe", "safe", "begin third"]
-
-    play(story)
 
 
 class Oven(Device):
@@ -319,8 +287,8 @@ class Oven(Device):
         return max(0.0, self.warm_at - asyncio.get_running_loop().time())
 
 
-def test_whom_a_device_begins_for_does_not_enter_before_it_has_begun() -> None:
-    async def story(at: Place) -> None:
+async def test_whom_a_device_begins_for_does_not_enter_before_it_has_begun() -> None:
+    async with play(device=Oven()) as at:
         at.next_holder()
         await until(lambda: "begin next" in at.device.calls)
         refused = await at.refusal(2)
@@ -332,8 +300,6 @@ def test_whom_a_device_begins_for_does_not_enter_before_it_has_begun() -> None:
         assert await at.word(at.client, 1) == "ended"
         assert await at.settled_after() == pytest.approx(4, abs=0.1)
         assert await at.word(at.other, 2, ECHO) == "done"
-
-    play(story, device=Oven())
 
 
 class Arm(Device):
@@ -354,8 +320,8 @@ class Arm(Device):
         self.calls.append("parked")
 
 
-def test_a_device_that_parks_itself_takes_its_time_before_the_next_holder() -> None:
-    async def story(at: Place) -> None:
+async def test_a_device_that_parks_itself_takes_its_time_before_the_next_holder() -> None:
+    async with play(holder(1), device=Arm(2.0)) as at:
         at.next_holder()
         began = at.rc.mesh.now()
         refused = await at.refusal(2)
@@ -371,11 +337,9 @@ def test_a_device_that_parks_itself_takes_its_time_before_the_next_holder() -> N
         assert await at.word(at.other, 2, ECHO) == "done"
         assert at.device.calls == ["begin one", "end one", "safe", "stop", "parked", "begin next", "echo 1"]
 
-    play(story, holder(1), device=Arm(2.0))
 
-
-def test_holds_end_while_a_device_parks_itself() -> None:
-    async def story(at: Place) -> None:
+async def test_holds_end_while_a_device_parks_itself() -> None:
+    async with play(holder(1), device=Arm(2.0)) as at:
         at.next_holder()
         assert await at.word(at.other, 2) == "settling"
         at.rcm.publish(holder(3, "third", "h/other"))
@@ -383,128 +347,99 @@ def test_holds_end_while_a_device_parks_itself() -> None:
         assert await at.settled_after(3) == pytest.approx(2, abs=0.2)
         assert at.device.calls == ["begin one", "end one", "safe", "parked", "begin third"]
 
-    play(story, holder(1), device=Arm(2.0))
 
-
-def test_a_device_that_is_not_safe_within_settle_counts_as_lost() -> None:
-    async def story(at: Place) -> None:
+async def test_a_device_that_is_not_safe_within_settle_counts_as_lost() -> None:
+    async with play(holder(1), device=Arm(600.0)) as at:
         at.next_holder()
         await until(lambda: at.rc.health != "ok")
         assert f"not safe after {SETTLE:g} s" in at.rc.health
         assert not at.rc.holds.held
         assert "begin next" not in at.device.calls
 
-    play(story, holder(1), device=Arm(600.0))
-
 
 # Over restarts
 
 
-def restarted(last: Callable[[], LastHolder], story: Callable[[Place, ResourceController], Awaitable[None]]) -> None:
-    """The RC is killed as it is held, and starts anew."""
-
-    async def test() -> None:
-        network = MemoryNetwork()
-        rcm, device = Rcm(network), Device()
-        first = await started(network, device, last_holder=last())
-        at = Place(network, rcm, first, device)
-        heartbeat = asyncio.create_task(at.keep_alive())
-        await story(at, first)
-        network.kill(first.mesh)
-        first.stall.stop()
-        await first.supervisor.close()
-        again = await started(network, device, last_holder=last())
-        at.rc = again
-        at.next_holder(7)
-        await until(lambda: grant(7) in again.holds.held)
-        await story(at, again)
-        heartbeat.cancel()
-        await close(again, rcm.mesh, at.client, at.other)
-
-    run(test())
+async def restarted(last: Callable[[], LastHolder]) -> AsyncIterator[Place]:
+    """An RC of which nobody holds anything; then it is killed and starts again, held under grant 7."""
+    network = MemoryNetwork()
+    rcm, device = Rcm(network), Device()
+    at = Place(network, rcm, await started(network, device, last_holder=last()), device)
+    heartbeat = asyncio.create_task(at.keep_alive())
+    yield at
+    network.kill(at.rc.mesh)
+    at.rc.stall.stop()
+    await at.rc.supervisor.close()
+    at.rc = await started(network, device, last_holder=last())
+    at.next_holder(7)
+    await until(lambda: grant(7) in at.rc.holds.held)
+    yield at
+    heartbeat.cancel()
+    await close(at.rc, rcm.mesh, at.client, at.other)
 
 
-def test_an_rc_that_starts_anew_settles_where_its_last_holder_may_have_been_direct(tmp_path: Path) -> None:
-    lives = 0
-
-    async def story(at: Place, rc: ResourceController) -> None:
-        nonlocal lives
-        lives += 1
-        if lives == 1:
-            at.rcm.publish(direct(1))
-            assert await at.word(at.client, 1) == "done"
-            assert (tmp_path / "direct" / "robot" / "x").exists()
-        else:
-            assert await at.settled_after(7) == pytest.approx(LEASE + SETTLE, abs=0.3)
-            await until(lambda: not (tmp_path / "direct" / "robot" / "x").exists())
-            assert rc.health == "ok"
-
-    restarted(lambda: LastHolderFile(tmp_path, "robot/x"), story)
+async def test_an_rc_that_starts_anew_settles_where_its_last_holder_may_have_been_direct(tmp_path: Path) -> None:
+    kept, lives = tmp_path / "direct" / "robot" / "x", restarted(lambda: LastHolderFile(tmp_path, "robot/x"))
+    at = await anext(lives)
+    at.rcm.publish(direct(1))
+    assert await at.word(at.client, 1) == "done"
+    assert kept.exists()
+    async for at in lives:
+        assert await at.settled_after(7) == pytest.approx(LEASE + SETTLE, abs=0.3)
+        await until(lambda: not kept.exists())
+        assert at.rc.health == "ok"
 
 
-def test_an_rc_that_starts_anew_does_not_settle_where_it_had_no_direct_holder(tmp_path: Path) -> None:
-    lives = 0
-
-    async def story(at: Place, rc: ResourceController) -> None:
-        nonlocal lives
-        lives += 1
-        if lives == 1:
-            at.rcm.publish(direct(1))
-            assert await at.word(at.client, 1) == "done"
-            at.publish(revoked=own(direct(1)))
-            at.rcm.publish(holder(3))
-            assert await at.word(at.client, 3) == "done"
-            await until(lambda: not (tmp_path / "direct" / "robot" / "x").exists())
-        else:
-            assert rc.holds.settling == {}
-            assert await at.settled_after(7) < 0.1
-
-    restarted(lambda: LastHolderFile(tmp_path, "robot/x"), story)
+async def test_an_rc_that_starts_anew_does_not_settle_where_it_had_no_direct_holder(tmp_path: Path) -> None:
+    kept, lives = tmp_path / "direct" / "robot" / "x", restarted(lambda: LastHolderFile(tmp_path, "robot/x"))
+    at = await anext(lives)
+    at.rcm.publish(direct(1))
+    assert await at.word(at.client, 1) == "done"
+    at.publish(revoked=own(direct(1)))
+    at.rcm.publish(holder(3))
+    assert await at.word(at.client, 3) == "done"
+    await until(lambda: not kept.exists())
+    async for at in lives:
+        assert at.rc.holds.settling == {}
+        assert await at.settled_after(7) < 0.1
 
 
-def test_an_rc_that_can_keep_nothing_settles_after_each_start() -> None:
-    async def story(at: Place, rc: ResourceController) -> None:
-        if rc.holds.held:
-            assert await at.settled_after(7) == pytest.approx(LEASE + SETTLE, abs=0.3)
+async def test_an_rc_that_can_keep_nothing_settles_after_each_start() -> None:
+    lives = restarted(UnknownLastHolder)
+    await anext(lives)
+    async for at in lives:
+        assert await at.settled_after(7) == pytest.approx(LEASE + SETTLE, abs=0.3)
 
-    restarted(UnknownLastHolder, story)
 
-
-def test_a_direct_hold_that_can_not_be_noted_is_not_confirmed(tmp_path: Path) -> None:
+async def test_a_direct_hold_that_can_not_be_noted_is_not_confirmed(tmp_path: Path) -> None:
     (tmp_path / "direct").write_text("in the way of a folder")
 
-    async def story(at: Place) -> None:
+    async with play(last_holder=LastHolderFile(tmp_path, "robot/x")) as at:
         assert await at.word(at.client, 1) == "failed"
         at.rcm.publish(holder(2))
         assert await at.word(at.client, 2) == "done"
 
-    play(story, last_holder=LastHolderFile(tmp_path, "robot/x"))
-
 
 @pytest.mark.parametrize(("first", "leaving"), [(direct(1), False), (holder(1), True)])
-def test_an_rc_that_ends_while_a_program_may_touch_its_device_leaves_it_to_no_other_at_once(
+async def test_an_rc_that_ends_while_a_program_may_touch_its_device_leaves_it_to_no_other_at_once(
     first: Holder, leaving: bool
 ) -> None:
-    async def test() -> None:
-        network, said = MemoryNetwork(), list[RcState]()
-        rcm, device = Rcm(network), Device()
-        rc = await started(network, device)
-        at = Place(network, rcm, rc, device)
-        at.client.subscribe(at.client.keys.rc_state("robot/x"), RcState, lambda _, state: said.append(state))
-        rcm.publish(first)
-        assert await at.word(at.client, 1) == "done"
-        await rc.stop()
-        await until(lambda: bool(said))
-        assert (said[-1].leaving, said[-1].settle) == (leaving, SETTLE)
-        await close(rc, rcm.mesh, at.client, at.other)
-
-    run(test())
+    network, said = MemoryNetwork(), list[RcState]()
+    rcm, device = Rcm(network), Device()
+    rc = await started(network, device)
+    at = Place(network, rcm, rc, device)
+    at.client.subscribe(at.client.keys.rc_state("robot/x"), RcState, lambda _, state: said.append(state))
+    rcm.publish(first)
+    assert await at.word(at.client, 1) == "done"
+    await rc.stop()
+    await until(lambda: bool(said))
+    assert (said[-1].leaving, said[-1].settle) == (leaving, SETTLE)
+    await close(rc, rcm.mesh, at.client, at.other)
 
 
-def test_a_direct_hold_is_used_from_when_it_could_begin() -> None:
+async def test_a_direct_hold_is_used_from_when_it_could_begin() -> None:
     """While a program of before may touch the device, nobody else does."""
-
-    async def story(place: Place) -> None:
+    async with play() as place:
         assert await place.word(place.client, 1) == "done"
         await asyncio.sleep(5)
         place.next_holder(direct=True)
@@ -519,16 +454,12 @@ def test_a_direct_hold_is_used_from_when_it_could_begin() -> None:
         assert waited > 1
         assert second.seconds == pytest.approx(4, abs=0.1)
 
-    play(story)
 
-
-def test_a_direct_hold_that_was_handed_over_is_used_by_its_new_client() -> None:
-    async def story(place: Place) -> None:
+async def test_a_direct_hold_that_was_handed_over_is_used_by_its_new_client() -> None:
+    async with play() as place:
         place.rcm.publish(replace(direct(2, client="h/other"), place=direct(1).place))
         await asyncio.sleep(2)
         reply = await place.client.ask_one(place.client.keys.rc_state("robot/x"), RcAsk(), RcState, timeout=5)
         assert reply is not None
         assert reply.message is not None
         assert [use.seconds for use in reply.message.used][1:] == [pytest.approx(2, abs=0.1)]
-
-    play(story)

@@ -7,7 +7,7 @@ import random
 import time
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
-from typing import Any, TypeAlias
+from typing import Any
 
 from msgspec.structs import replace
 
@@ -51,12 +51,12 @@ class World:
     """Processes of one fleet, all linked to each other."""
 
     def __init__(self, stack: AsyncExitStack) -> None:
-        self._stack = stack
+        self.stack = stack
         self.meshes: list[Mesh] = []
 
     async def open(self, *names: str) -> list[Mesh]:
         for name in names:
-            self.meshes.append(await self._stack.enter_async_context(await self._open(Sender(name, "test"))))
+            self.meshes.append(await self.stack.enter_async_context(await self._open(Sender(name, "test"))))
         await until(lambda: all(mesh.links() >= len(self.meshes) - 1 for mesh in self.meshes))
         return self.meshes
 
@@ -116,12 +116,6 @@ class Memory(World):
             loop.jump(0.001)
             for link in self.network.links.values():
                 link.pump()
-
-
-Story: TypeAlias = Callable[[World], Awaitable[None]]
-
-
-Play: TypeAlias = Callable[[Story], None]
 
 
 def token(host: str, name: str = "one", instance: str = "i") -> Token:

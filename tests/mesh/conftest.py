@@ -1,25 +1,18 @@
-"""`play` runs a story on each of both meshes."""
+"""A test that takes a `world` runs on each of both meshes."""
 
 from __future__ import annotations
 
-import asyncio
-from collections.abc import Callable
 from contextlib import AsyncExitStack
 
 import pytest
 
-from tests.hang import HANG
-from tests.mesh import kit
-from tests.mesh.both_meshes import Memory, Story, Zenoh
+from tests.mesh.async_tests import pytest_pyfunc_call, real_time, stack
+from tests.mesh.both_meshes import Memory, World, Zenoh
+
+__all__ = ["pytest_pyfunc_call", "real_time", "stack"]
 
 
 @pytest.fixture(params=[Memory, Zenoh])
-def play(request: pytest.FixtureRequest) -> Callable[[Story], None]:
-    def play(story: Story) -> None:
-        async def main() -> None:
-            async with AsyncExitStack() as stack, asyncio.timeout(2 * HANG):
-                await story(request.param(stack))
-
-        (kit.run if request.param is Memory else asyncio.run)(main())
-
-    return play
+def world(request: pytest.FixtureRequest, stack: AsyncExitStack) -> World:
+    world: World = request.param(stack)
+    return world

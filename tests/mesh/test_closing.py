@@ -11,7 +11,7 @@ import pytest
 import zenoh
 
 from tests.hang import HANG
-from tests.mesh.both_meshes import ASK, LONG, NEWS, Ping, Play, Pong, World, token
+from tests.mesh.both_meshes import ASK, LONG, NEWS, Ping, Pong, World, token
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender
 from zscout.mesh import ZenohMesh, zenoh_mesh
@@ -86,37 +86,31 @@ def test_a_caller_that_is_cancelled_while_it_joins_has_the_session_closed(
     session.released.set()
 
 
-def test_what_waits_for_a_mesh_that_is_closed_is_not_handled(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        handled: list[object] = []
-        a.watch(a.keys.alive_any(Role.CLIENT), lambda *args: handled.append(args))
-        await world.declared()
-        declared = b.alive(token("b"))
-        await world.occupied(lambda: a._inbox.items)
-        await a.close()
-        await asyncio.sleep(0.01)
-        assert handled == []
-        declared.close()
-
-    play(story)
+async def test_what_waits_for_a_mesh_that_is_closed_is_not_handled(world: World) -> None:
+    a, b = await world.open("a", "b")
+    handled: list[object] = []
+    a.watch(a.keys.alive_any(Role.CLIENT), lambda *args: handled.append(args))
+    await world.declared()
+    declared = b.alive(token("b"))
+    await world.occupied(lambda: a._inbox.items)
+    await a.close()
+    await asyncio.sleep(0.01)
+    assert handled == []
+    declared.close()
 
 
-def test_nothing_is_handled_after_the_mesh_is_closed(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        handled: list[object] = []
-        a.subscribe(NEWS, Ping, lambda *args: handled.append(args))
-        a.serve(ASK, Ping, handled.append)
-        a.watch(a.keys.alive_any(Role.CLIENT), lambda *args: handled.append(args))
-        await world.declared()
-        await a.close()
-        await a.close()
-        b.put(NEWS, Ping())
-        late = b.alive(token("b"))
-        assert await b.ask(ASK, Ping(), Pong, timeout=LONG) == []
-        assert handled == []
-        a.put(NEWS, Ping())
-        late.close()
-
-    play(story)
+async def test_nothing_is_handled_after_the_mesh_is_closed(world: World) -> None:
+    a, b = await world.open("a", "b")
+    handled: list[object] = []
+    a.subscribe(NEWS, Ping, lambda *args: handled.append(args))
+    a.serve(ASK, Ping, handled.append)
+    a.watch(a.keys.alive_any(Role.CLIENT), lambda *args: handled.append(args))
+    await world.declared()
+    await a.close()
+    await a.close()
+    b.put(NEWS, Ping())
+    late = b.alive(token("b"))
+    assert await b.ask(ASK, Ping(), Pong, timeout=LONG) == []
+    assert handled == []
+    a.put(NEWS, Ping())
+    late.close()

@@ -7,139 +7,119 @@ import itertools
 import logging
 import threading
 from collections.abc import Callable
-from contextlib import AsyncExitStack, closing
+from contextlib import closing
 from typing import Any, cast
 
 import pytest
 
 from tests.hang import HANG
-from tests.mesh.both_meshes import FRAMES, LONG, NEWS, Ping, Play, Pong, World, Zenoh
+from tests.mesh.both_meshes import FRAMES, LONG, NEWS, Ping, Pong, World, Zenoh
 from tests.mesh.kit import until
 from zscout.keyexpr import BadName
 from zscout.mesh.transport import Quality
 from zscout.messages import MAX_FRAME, FrameHead
 
 
-def test_publications_arrive_in_order(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        heard: list[tuple[str, int]] = []
-        own: list[int] = []
-        a.subscribe("test/*", Ping, lambda key, ping: heard.append((key, ping.number)))
-        b.subscribe(NEWS, Ping, lambda _, ping: own.append(ping.number))
-        await world.declared()
-        publisher = b.publisher(NEWS, Ping)
-        for number in range(0, 100, 2):
-            publisher.put(Ping(number))
-            b.put(NEWS, Ping(number + 1))
-        await until(lambda: len(heard) == 100 and len(own) == 100)
-        assert heard == [(NEWS, number) for number in range(100)]
-        assert own == list(range(100))
-        publisher.close()
-
-    play(story)
+async def test_publications_arrive_in_order(world: World) -> None:
+    a, b = await world.open("a", "b")
+    heard, own = list[tuple[str, int]](), list[int]()
+    a.subscribe("test/*", Ping, lambda key, ping: heard.append((key, ping.number)))
+    b.subscribe(NEWS, Ping, lambda _, ping: own.append(ping.number))
+    await world.declared()
+    publisher = b.publisher(NEWS, Ping)
+    for number in range(0, 100, 2):
+        publisher.put(Ping(number))
+        b.put(NEWS, Ping(number + 1))
+    await until(lambda: len(heard) == 100 and len(own) == 100)
+    assert heard == [(NEWS, number) for number in range(100)]
+    assert own == list(range(100))
+    publisher.close()
 
 
-def test_a_peer_that_does_not_read_for_less_than_the_lease_misses_nothing() -> None:
+@pytest.mark.parametrize("world", [Zenoh], indirect=True)
+async def test_a_peer_that_does_not_read_for_less_than_the_lease_misses_nothing(world: Zenoh) -> None:
     # As on a host without processor time; a link that is closed for it takes the liveliness of all behind it along.
     payload, count, sent = bytes(50_000), 640, 0  # more than the buffers of a connection take
 
-    def send(world: World) -> None:
+    def send() -> None:
         nonlocal sent
         for sent in range(1, count + 1):  # noqa: B007 - told to the story below
             world.meshes[1]._transport.put(NEWS, payload, Ping)
 
-    async def story() -> None:
-        async with AsyncExitStack() as stack, asyncio.timeout(HANG):
-            world = Zenoh(stack)
-            world.lease = 30.0
-            a, _ = await world.open("a", "b")
-            go_on, heard = threading.Event(), list[int]()
+    world.lease = 30.0
+    a, _ = await world.open("a", "b")
+    go_on, heard = threading.Event(), list[int]()
 
-            def on_sample(_key: str, payload: bytes, _head: bytes | None) -> None:
-                go_on.wait(HANG)
-                heard.append(len(payload))
+    def on_sample(_key: str, payload: bytes, _head: bytes | None) -> None:
+        go_on.wait(HANG)
+        heard.append(len(payload))
 
-            a._transport.subscriber(NEWS, on_sample)
-            await world.declared()
-            sending = asyncio.create_task(asyncio.to_thread(send, world))
-            before = 0
-            while sent == 0 or sent != before:  # until it stands still
-                before = sent
-                await asyncio.sleep(0.5)
-            assert sent < count
-            go_on.set()
-            await sending
-            await until(lambda: len(heard) == count)
-
-    asyncio.run(story())
+    a._transport.subscriber(NEWS, on_sample)
+    await world.declared()
+    sending = asyncio.create_task(asyncio.to_thread(send))
+    before = 0
+    while sent == 0 or sent != before:  # until it stands still
+        before = sent
+        await asyncio.sleep(0.5)
+    assert sent < count
+    go_on.set()
+    await sending
+    await until(lambda: len(heard) == count)
 
 
-def test_what_is_published_before_a_subscription_is_not_kept(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b, witness = await world.open("a", "b", "c")
-        heard: list[int] = []
-        witnessed: list[int] = []
-        witness.subscribe(NEWS, Ping, lambda _, ping: witnessed.append(ping.number))
-        await world.declared()
-        b.put(NEWS, Ping(1))
-        await until(lambda: witnessed)  # what is put goes out a little later
-        a.subscribe(NEWS, Ping, lambda _, ping: heard.append(ping.number))
-        await world.declared()
-        b.put(NEWS, Ping(2))
-        await until(lambda: heard)
-        assert heard == [2]
-
-    play(story)
+async def test_what_is_published_before_a_subscription_is_not_kept(world: World) -> None:
+    a, b, witness = await world.open("a", "b", "c")
+    heard, witnessed = list[int](), list[int]()
+    witness.subscribe(NEWS, Ping, lambda _, ping: witnessed.append(ping.number))
+    await world.declared()
+    b.put(NEWS, Ping(1))
+    await until(lambda: witnessed)  # what is put goes out a little later
+    a.subscribe(NEWS, Ping, lambda _, ping: heard.append(ping.number))
+    await world.declared()
+    b.put(NEWS, Ping(2))
+    await until(lambda: heard)
+    assert heard == [2]
 
 
-def test_of_deletes_and_keys_with_wildcards_nothing_is_heard() -> None:
-    async def story() -> None:
-        async with AsyncExitStack() as stack, asyncio.timeout(HANG):
-            world = Zenoh(stack)
-            a, b = await world.open("a", "b")
-            heard: list[int] = []
-            a.subscribe(NEWS, Ping, lambda _, ping: heard.append(ping.number))
-            polled, frames = a.poll_latest(NEWS, Ping), list[bytes]()
-            a._transport.subscriber(NEWS, lambda _key, payload, _head: frames.append(payload))
-            await world.declared()
-            transport = cast("Any", b._transport)
-            session = transport.current._session
-            session.put("test/*", b'{"number": 1}')
-            session.delete(NEWS)
-            b.put(NEWS, Ping(2))
-            await until(lambda: heard and frames)
-            assert (heard, frames) == ([2], [b'{"number":2}'])
-            assert [ping.number for _, ping in polled.each()] == [2]
-
-    asyncio.run(story())
+@pytest.mark.parametrize("world", [Zenoh], indirect=True)
+async def test_of_deletes_and_keys_with_wildcards_nothing_is_heard(world: Zenoh) -> None:
+    a, b = await world.open("a", "b")
+    heard: list[int] = []
+    a.subscribe(NEWS, Ping, lambda _, ping: heard.append(ping.number))
+    polled, frames = a.poll_latest(NEWS, Ping), list[bytes]()
+    a._transport.subscriber(NEWS, lambda _key, payload, _head: frames.append(payload))
+    await world.declared()
+    transport = cast("Any", b._transport)
+    session = transport.current._session
+    session.put("test/*", b'{"number": 1}')
+    session.delete(NEWS)
+    b.put(NEWS, Ping(2))
+    await until(lambda: heard and frames)
+    assert (heard, frames) == ([2], [b'{"number":2}'])
+    assert [ping.number for _, ping in polled.each()] == [2]
 
 
-def test_alike_subscriptions_are_closed_one_by_one(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        one: list[int] = []
-        other: list[int] = []
-        first = a.subscribe(NEWS, Ping, lambda _, ping: one.append(ping.number))
-        second = a.subscribe(NEWS, Ping, lambda _, ping: other.append(ping.number))
-        assert len(a._shared) == 1
-        await world.declared()
-        b.put(NEWS, Ping(1))
-        await until(lambda: other)
-        first.close()
-        b.put(NEWS, Ping(2))
-        await until(lambda: len(other) == 2)
-        assert one == [1]
-        second.close()
-        assert not a._shared
-
-    play(story)
+async def test_alike_subscriptions_are_closed_one_by_one(world: World) -> None:
+    a, b = await world.open("a", "b")
+    one, other = list[int](), list[int]()
+    first = a.subscribe(NEWS, Ping, lambda _, ping: one.append(ping.number))
+    second = a.subscribe(NEWS, Ping, lambda _, ping: other.append(ping.number))
+    assert len(a._shared) == 1
+    await world.declared()
+    b.put(NEWS, Ping(1))
+    await until(lambda: other)
+    first.close()
+    b.put(NEWS, Ping(2))
+    await until(lambda: len(other) == 2)
+    assert one == [1]
+    second.close()
+    assert not a._shared
 
 
-def test_a_malformed_publication_and_a_handler_that_fails_stop_nobody(
-    play: Play, caplog: pytest.LogCaptureFixture
+async def test_a_malformed_publication_and_a_handler_that_fails_stop_nobody(
+    world: World, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async def story(world: World) -> None:
+    with caplog.at_level(logging.WARNING):
         a, b = await world.open("a", "b")
         heard: list[int] = []
 
@@ -156,9 +136,6 @@ def test_a_malformed_publication_and_a_handler_that_fails_stop_nobody(
         b.put(NEWS, Ping(2))
         await until(lambda: len(heard) == 2)
         assert heard == [1, 2]
-
-    with caplog.at_level(logging.WARNING):
-        play(story)
     texts = [record.getMessage() for record in caplog.records if record.name.startswith("zscout")]
     assert len(texts) == 3
     assert "no name" in texts[0]
@@ -166,104 +143,92 @@ def test_a_malformed_publication_and_a_handler_that_fails_stop_nobody(
     assert texts[2] == "a handler failed"
 
 
-def test_publications_beyond_a_full_queue_are_counted_as_missed(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        heard: list[int] = []
-        subscription = a.subscribe(NEWS, Ping, lambda _, ping: heard.append(ping.number), depth=3)
-        await world.declared()
-        for number in range(10):
-            b.put(NEWS, Ping(number))
-        await world.occupied(lambda: subscription.missed == 7)
-        await until(lambda: heard)
-        assert heard == [0, 1, 2]
-        assert subscription.missed == 7
-
-    play(story)
+async def test_publications_beyond_a_full_queue_are_counted_as_missed(world: World) -> None:
+    a, b = await world.open("a", "b")
+    heard: list[int] = []
+    subscription = a.subscribe(NEWS, Ping, lambda _, ping: heard.append(ping.number), depth=3)
+    await world.declared()
+    for number in range(10):
+        b.put(NEWS, Ping(number))
+    await world.occupied(lambda: subscription.missed == 7)
+    await until(lambda: heard)
+    assert heard == [0, 1, 2]
+    assert subscription.missed == 7
 
 
-def test_poll_latest_keeps_the_latest(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        polled = a.poll_latest(NEWS, Ping, depth=3)
-        heard: list[int] = []
-        a.subscribe(NEWS, Ping, lambda _, ping: heard.append(ping.number))
-        await world.declared()
-        for number in range(5):
-            b.put(NEWS, Ping(number))
-        b._transport.put(NEWS, b"no JSON", Ping)
-        b.put(NEWS, Ping(6))
-        await until(lambda: 6 in heard)
-        await until(lambda: list(polled.each()) == [(NEWS, Ping(4)), (NEWS, Ping(6))])
-        assert list(polled.each()) == []
-        polled.close()
-
-    play(story)
+async def test_poll_latest_keeps_the_latest(world: World) -> None:
+    a, b = await world.open("a", "b")
+    polled = a.poll_latest(NEWS, Ping, depth=3)
+    heard: list[int] = []
+    a.subscribe(NEWS, Ping, lambda _, ping: heard.append(ping.number))
+    await world.declared()
+    for number in range(5):
+        b.put(NEWS, Ping(number))
+    b._transport.put(NEWS, b"no JSON", Ping)
+    b.put(NEWS, Ping(6))
+    await until(lambda: 6 in heard)
+    await until(lambda: list(polled.each()) == [(NEWS, Ping(4)), (NEWS, Ping(6))])
+    assert list(polled.each()) == []
+    polled.close()
 
 
-def test_after_burst_waits_for_all_that_arrived_together(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        events: list[str] = []
+async def test_after_burst_waits_for_all_that_arrived_together(world: World) -> None:
+    a, b = await world.open("a", "b")
+    events: list[str] = []
 
-        def handle(_: str, ping: Ping) -> None:
-            events.append(f"handled {ping.number}")
-            if ping.number == 0:
-                a.after_burst(lambda: events.append("burst over"))
+    def handle(_: str, ping: Ping) -> None:
+        events.append(f"handled {ping.number}")
+        if ping.number == 0:
+            a.after_burst(lambda: events.append("burst over"))
 
-        a.subscribe(NEWS, Ping, handle)
-        await world.declared()
-        a.after_burst(lambda: events.append("at once"))
-        assert events == ["at once"]
-        for number in range(3):
-            b.put(NEWS, Ping(number))
-        await world.occupied(lambda: len(a._inbox.items) == 3)
-        await until(lambda: len(events) == 5)
-        assert events == ["at once", "handled 0", "handled 1", "handled 2", "burst over"]
-
-    play(story)
+    a.subscribe(NEWS, Ping, handle)
+    await world.declared()
+    a.after_burst(lambda: events.append("at once"))
+    assert events == ["at once"]
+    for number in range(3):
+        b.put(NEWS, Ping(number))
+    await world.occupied(lambda: len(a._inbox.items) == 3)
+    await until(lambda: len(events) == 5)
+    assert events == ["at once", "handled 0", "handled 1", "handled 2", "burst over"]
 
 
-def test_the_newest_frame_is_taken_and_its_publisher_knows_of_subscribers(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        publisher = b.frame_publisher(FRAMES)
-        changes: list[bool] = []
-        publisher.follow(changes.append)
-        assert changes == []
-        assert not publisher.watched
-        with closing(a.frames("test/*")) as watch:
-            await until(lambda: publisher.watched)
-            sent = itertools.count()
+async def test_the_newest_frame_is_taken_and_its_publisher_knows_of_subscribers(world: World) -> None:
+    a, b = await world.open("a", "b")
+    publisher = b.frame_publisher(FRAMES)
+    changes: list[bool] = []
+    publisher.follow(changes.append)
+    assert changes == []
+    assert not publisher.watched
+    with closing(a.frames("test/*")) as watch:
+        await until(lambda: publisher.watched)
+        sent = itertools.count()
 
-            def publish(until: Callable[[], object]) -> bool:  # again: a frame that would have to wait is dropped
-                number = next(sent)
-                publisher.put(FrameHead(number=number, time=0, width=1, height=1), b"jpeg %d" % number)
-                return bool(until())
+        def publish(until: Callable[[], object]) -> bool:  # again: a frame that would have to wait is dropped
+            number = next(sent)
+            publisher.put(FrameHead(number=number, time=0, width=1, height=1), b"jpeg %d" % number)
+            return bool(until())
 
-            await until(lambda: publish(lambda: watch.missed >= 2))
-            frame = watch.take()
-            assert frame is not None
-            assert frame.head.number >= 2
-            assert (frame.key, frame.jpeg) == (FRAMES, b"jpeg %d" % frame.head.number)
-            assert frame.arrived <= a.now()
-            waiting = asyncio.create_task(watch.next(LONG))
-            await until(lambda: publish(waiting.done))
-            assert waiting.result() is not None
-            raw = b._transport.publisher(FRAMES, None, Quality.FRAME)
+        await until(lambda: publish(lambda: watch.missed >= 2))
+        frame = watch.take()
+        assert frame is not None
+        assert frame.head.number >= 2
+        assert (frame.key, frame.jpeg) == (FRAMES, b"jpeg %d" % frame.head.number)
+        assert frame.arrived <= a.now()
+        waiting = asyncio.create_task(watch.next(LONG))
+        await until(lambda: publish(waiting.done))
+        assert waiting.result() is not None
+        raw = b._transport.publisher(FRAMES, None, Quality.FRAME)
 
-            def publish_malformed() -> bool:
-                raw.put(b"no head")
-                watch.take()
-                return watch.malformed > 0
+        def publish_malformed() -> bool:
+            raw.put(b"no head")
+            watch.take()
+            return watch.malformed > 0
 
-            await until(publish_malformed)
-        with closing(a.frames("test/idle")) as idle:
-            assert await idle.next(0.01) is None
-        await until(lambda: not publisher.watched)
-        assert changes == [True, False]
-        with pytest.raises(ValueError, match="too large"):
-            publisher.put(FrameHead(number=1, time=0, width=1, height=1), b"x" * (MAX_FRAME + 1))
-        publisher.close()
-
-    play(story)
+        await until(publish_malformed)
+    with closing(a.frames("test/idle")) as idle:
+        assert await idle.next(0.01) is None
+    await until(lambda: not publisher.watched)
+    assert changes == [True, False]
+    with pytest.raises(ValueError, match="too large"):
+        publisher.put(FrameHead(number=1, time=0, width=1, height=1), b"x" * (MAX_FRAME + 1))
+    publisher.close()

@@ -3,131 +3,109 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Awaitable
+from typing import Any
 
 import pytest
 
-from tests.mesh.both_meshes import ASK, LONG, SHORT, Ping, Play, Pong, Replies, Strict, World, pong, timed
+from tests.mesh.both_meshes import ASK, LONG, SHORT, Ping, Pong, Replies, Strict, World, pong, timed
 from tests.mesh.kit import until
 from zscout import messages
 from zscout.keyexpr import BadName
-from zscout.mesh import IncomingQuery, MeshError, Refused, Tally
+from zscout.mesh import IncomingQuery, Mesh, MeshError, Refused, Tally
+
+PING = Ping()
 
 
-def test_all_who_serve_a_key_reply(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b, c = await world.open("a", "b", "c")
-        for mesh in (a, b, c):
-            mesh.serve(ASK, Ping, pong(mesh))
-        await world.declared()
-        replies = await a.ask(ASK, Ping(7), Pong, timeout=LONG)
-        assert {(reply.key, reply.message) for reply in replies} == {(ASK, Pong(7, host)) for host in ("a", "b", "c")}
-        assert all(reply.problem is None for reply in replies)
-
-    play(story)
+async def answer(mesh: Mesh, ping: Ping | None = PING, key: str = ASK) -> object:
+    """The key and message of a reply, or the code of its problem."""
+    reply = await mesh.ask_one(key, ping, Pong, timeout=LONG)
+    assert reply is not None
+    return reply.problem.code if reply.problem else (reply.key, reply.message)
 
 
-def test_two_that_serve_a_key_in_one_process_both_reply(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        b.serve(ASK, Ping, lambda query: query.answer(Pong(1)))
-        b.serve("test/*", Ping, lambda query: query.answer(Pong(2)))
-        await world.declared()
-        replies = await a.ask(ASK, Ping(), Pong, timeout=LONG)
-        assert {reply.message.number for reply in replies if reply.message} == {1, 2}
-
-    play(story)
+async def at_once(mesh: Mesh, asked: Awaitable[Any]) -> Any:
+    result, took = await timed(mesh, asked)
+    assert took < LONG / 2
+    return result
 
 
-def test_a_query_that_nobody_serves_is_over_at_once(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, _ = await world.open("a", "b")
-        replies, took = await timed(a, a.ask(ASK, Ping(), Pong, timeout=LONG))
-        assert replies == []
-        assert took < LONG / 2
-
-    play(story)
-
-
-def test_a_query_that_its_handler_forgets_is_over_at_once(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        b.serve(ASK, Ping, lambda _: None)
-        await world.declared()
-        replies, took = await timed(a, a.ask(ASK, Ping(), Pong, timeout=LONG))
-        assert replies == []
-        assert took < LONG / 2
-
-    play(story)
+async def test_all_who_serve_a_key_reply(world: World) -> None:
+    a, b, c = await world.open("a", "b", "c")
+    for mesh in (a, b, c):
+        mesh.serve(ASK, Ping, pong(mesh))
+    await world.declared()
+    replies = await a.ask(ASK, Ping(7), Pong, timeout=LONG)
+    assert {(reply.key, reply.message) for reply in replies} == {(ASK, Pong(7, host)) for host in ("a", "b", "c")}
+    assert all(reply.problem is None for reply in replies)
 
 
-def test_a_query_that_is_kept_is_over_at_its_timeout(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        kept: list[IncomingQuery[Ping]] = []
-        b.serve(ASK, Ping, kept.append)
-        await world.declared()
-        replies, took = await timed(a, a.ask(ASK, Ping(), Pong, timeout=SHORT))
-        assert replies == []
-        assert took >= SHORT * 0.99
-        assert len(kept) == 1
-        kept[0].answer(Pong(1))  # too late, and no harm
-
-    play(story)
+async def test_two_that_serve_a_key_in_one_process_both_reply(world: World) -> None:
+    a, b = await world.open("a", "b")
+    b.serve(ASK, Ping, lambda query: query.answer(Pong(1)))
+    b.serve("test/*", Ping, lambda query: query.answer(Pong(2)))
+    await world.declared()
+    replies = await a.ask(ASK, Ping(), Pong, timeout=LONG)
+    assert {reply.message.number for reply in replies if reply.message} == {1, 2}
 
 
-def test_a_query_may_be_answered_later_and_once(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        kept: list[IncomingQuery[Ping]] = []
-        b.serve(ASK, Ping, kept.append)
-        await world.declared()
-        asking = asyncio.create_task(a.ask(ASK, Ping(3), Pong, timeout=LONG))
-        await until(lambda: kept)
-        kept[0].answer(Pong(kept[0].message.number))
-        kept[0].answer(Pong(99))
-        kept[0].refuse(messages.Problem("late", "late"))
-        assert [reply.message for reply in await asking] == [Pong(3)]
-        assert kept[0].key == ASK
-
-    play(story)
+async def test_a_query_that_nobody_serves_or_its_handler_forgets_is_over_at_once(world: World) -> None:
+    a, b = await world.open("a", "b")
+    assert await at_once(a, a.ask(ASK, Ping(), Pong, timeout=LONG)) == []
+    b.serve(ASK, Ping, lambda _: None)
+    await world.declared()
+    assert await at_once(a, a.ask(ASK, Ping(), Pong, timeout=LONG)) == []
 
 
-def test_a_query_is_over_when_the_process_that_keeps_it_leaves(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        kept: list[IncomingQuery[Ping]] = []
-        b.serve(ASK, Ping, kept.append)
-        await world.declared()
-        asking = asyncio.create_task(timed(a, a.ask(ASK, Ping(), Pong, timeout=LONG)))
-        await until(lambda: kept)
-        await b.close()
-        replies, took = await asking
-        assert replies == []
-        assert took < LONG / 2
+async def test_a_query_that_is_kept_is_over_at_its_timeout(world: World) -> None:
+    a, b = await world.open("a", "b")
+    kept: list[IncomingQuery[Ping]] = []
+    b.serve(ASK, Ping, kept.append)
+    await world.declared()
+    replies, took = await timed(a, a.ask(ASK, Ping(), Pong, timeout=SHORT))
+    assert (replies, len(kept)) == ([], 1)
+    assert took >= SHORT * 0.99
+    kept[0].answer(Pong(1))  # too late, and no harm
 
-    play(story)
+
+async def test_a_query_may_be_answered_later_and_once(world: World) -> None:
+    a, b = await world.open("a", "b")
+    kept: list[IncomingQuery[Ping]] = []
+    b.serve(ASK, Ping, kept.append)
+    await world.declared()
+    asking = asyncio.create_task(a.ask(ASK, Ping(3), Pong, timeout=LONG))
+    await until(lambda: kept)
+    kept[0].answer(Pong(kept[0].message.number))
+    kept[0].answer(Pong(99))
+    kept[0].refuse(messages.Problem("late", "late"))
+    assert [reply.message for reply in await asking] == [Pong(3)]
+    assert kept[0].key == ASK
+
+
+async def test_a_query_is_over_when_the_process_that_keeps_it_leaves(world: World) -> None:
+    a, b = await world.open("a", "b")
+    kept: list[IncomingQuery[Ping]] = []
+    b.serve(ASK, Ping, kept.append)
+    await world.declared()
+    asking = asyncio.create_task(at_once(a, a.ask(ASK, Ping(), Pong, timeout=LONG)))
+    await until(lambda: kept)
+    await b.close()
+    assert await asking == []
 
 
 @pytest.mark.parametrize(
     ("error", "code"),
     [(Refused("not_yet", "wait"), "not_yet"), (BadName("no name"), "bad_name"), (ValueError("broken"), "internal")],
 )
-def test_what_a_handler_raises_is_replied_as_a_problem(play: Play, error: Exception, code: str) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
+async def test_what_a_handler_raises_is_replied_as_a_problem(world: World, error: Exception, code: str) -> None:
+    a, b = await world.open("a", "b")
 
-        def handle(_: IncomingQuery[Ping]) -> None:
-            raise error
+    def handle(_: IncomingQuery[Ping]) -> None:
+        raise error
 
-        b.serve(ASK, Ping, handle)
-        await world.declared()
-        reply = await a.ask_one(ASK, Ping(), Pong, timeout=LONG)
-        assert reply is not None
-        assert reply.message is None
-        assert reply.problem is not None
-        assert reply.problem.code == code
-
-    play(story)
+    b.serve(ASK, Ping, handle)
+    await world.declared()
+    assert await answer(a) == code
 
 
 @pytest.mark.parametrize(
@@ -139,161 +117,119 @@ def test_what_a_handler_raises_is_replied_as_a_problem(play: Play, error: Except
         (Strict, b'{"number": 1, "number": 2}'),
     ],
 )
-def test_a_malformed_query_never_reaches_its_handler(play: Play, kind: type, payload: bytes) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        handled: list[object] = []
-        b.serve(ASK, kind, handled.append, limit=100)
-        await world.declared()
-        collector = Replies()
-        a._transport.get(ASK, payload, kind, LONG, collector)
-        await until(lambda: collector.over)
-        ((reply, ok),) = collector.replies
-        problem: messages.Problem = messages.decode(reply, messages.Problem)
-        assert not ok
-        assert problem.code == "malformed"
-        assert handled == []
-
-    play(story)
+async def test_a_malformed_query_never_reaches_its_handler(world: World, kind: type, payload: bytes) -> None:
+    a, b = await world.open("a", "b")
+    handled: list[object] = []
+    b.serve(ASK, kind, handled.append, limit=100)
+    await world.declared()
+    collector = Replies()
+    a._transport.get(ASK, payload, kind, LONG, collector)
+    await until(lambda: collector.over)
+    ((reply, ok),) = collector.replies
+    problem: messages.Problem = messages.decode(reply, messages.Problem)
+    assert not ok
+    assert problem.code == "malformed"
+    assert handled == []
 
 
-def test_a_query_without_a_message_is_an_empty_one(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        b.serve(ASK, Ping, pong(b))
-        await world.declared()
-        reply = await a.ask_one(ASK, None, Pong, timeout=LONG)
-        assert reply is not None
-        assert reply.message == Pong(0, "b")
-
-    play(story)
+async def test_a_query_without_a_message_is_an_empty_one(world: World) -> None:
+    a, b = await world.open("a", "b")
+    b.serve(ASK, Ping, pong(b))
+    await world.declared()
+    assert await answer(a, None) == (ASK, Pong(0, "b"))
 
 
-def test_a_reply_that_is_malformed_or_too_long_is_dropped(play: Play, caplog: pytest.LogCaptureFixture) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        b.serve(ASK, Ping, lambda query: query.answer(Pong(1, "x" * 200)))
-        await world.declared()
-        assert await a.ask(ASK, Ping(), Pong, timeout=LONG, limit=100) == []
-
-    play(story)
+async def test_a_reply_that_is_malformed_or_too_long_is_dropped(world: World, caplog: pytest.LogCaptureFixture) -> None:
+    a, b = await world.open("a", "b")
+    b.serve(ASK, Ping, lambda query: query.answer(Pong(1, "x" * 200)))
+    await world.declared()
+    assert await a.ask(ASK, Ping(), Pong, timeout=LONG, limit=100) == []
     assert "malformed" in caplog.text
 
 
-def test_a_wildcard_is_answered_where_the_served_key_has_none_and_refused_elsewhere(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        b.serve("test/one", Ping, pong(b))
-        b.serve("test/many/*", Ping, pong(b))
-        await world.declared()
-        reply = await a.ask_one("test/*", Ping(), Pong, timeout=LONG)
-        assert reply is not None
-        assert (reply.key, reply.message) == ("test/one", Pong(0, "b"))
-        reply = await a.ask_one("test/many/*", Ping(), Pong, timeout=LONG)
-        assert reply is not None
-        assert reply.problem is not None
-        assert reply.problem.code == "bad_key"
-        reply = await a.ask_one("test/many/x", Ping(), Pong, timeout=LONG)
-        assert reply is not None
-        assert (reply.key, reply.message) == ("test/many/x", Pong(0, "b"))
-
-    play(story)
+async def test_a_wildcard_is_answered_where_the_served_key_has_none_and_refused_elsewhere(world: World) -> None:
+    a, b = await world.open("a", "b")
+    b.serve("test/one", Ping, pong(b))
+    b.serve("test/many/*", Ping, pong(b))
+    await world.declared()
+    for asked, answers in (
+        ("test/*", ("test/one", Pong(0, "b"))),
+        ("test/many/*", "bad_key"),
+        ("test/many/x", ("test/many/x", Pong(0, "b"))),
+    ):
+        assert await answer(a, key=asked) == answers
 
 
-def test_queries_beyond_a_full_queue_are_refused_as_busy(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        tally = Tally()
-        b.serve(ASK, Ping, pong(b), depth=2, tally=tally)
-        await world.declared()
-        outcomes: list[object] = []
-        for number in range(10):
-            a.ask_then(ASK, Ping(number), Pong, outcomes.append, timeout=LONG)
-        await world.occupied(lambda: len(a._inbox.items) == 16)  # a problem and an end each
-        await until(lambda: len(outcomes) == 10)
-        codes = [reply.problem.code for reply in outcomes if reply.problem]  # type: ignore[attr-defined]
-        assert codes == ["busy"] * 8
-        reply = await a.ask_one(ASK, Ping(), Pong, timeout=LONG)
-        assert reply is not None
-        assert (tally.answered, tally.refused()) == (3, {"busy": 8})
-        assert reply.message is not None
-
-    play(story)
+async def test_queries_beyond_a_full_queue_are_refused_as_busy(world: World) -> None:
+    a, b = await world.open("a", "b")
+    tally = Tally()
+    b.serve(ASK, Ping, pong(b), depth=2, tally=tally)
+    await world.declared()
+    outcomes: list[object] = []
+    for number in range(10):
+        a.ask_then(ASK, Ping(number), Pong, outcomes.append, timeout=LONG)
+    await world.occupied(lambda: len(a._inbox.items) == 16)  # a problem and an end each
+    await until(lambda: len(outcomes) == 10)
+    codes = [reply.problem.code for reply in outcomes if reply.problem]  # type: ignore[attr-defined]
+    assert codes == ["busy"] * 8
+    assert await answer(a, Ping(1)) == (ASK, Pong(1, "b"))
+    assert (tally.answered, tally.refused()) == (3, {"busy": 8})
 
 
-def test_one_host_fills_half_a_queue_at_most_and_is_refused_undecoded(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        b.serve("test/ask/*/*", Ping, pong(b), depth=4)
-        await world.declared()
-        outcomes: list[object] = []
-        for number in range(10):
-            a._transport.get(f"test/ask/one/{number}", b"no JSON", Ping, LONG, Replies())
-        for number in range(2):
-            a.ask_then(f"test/ask/two/{number}", Ping(number), Pong, outcomes.append, timeout=LONG)
-        await world.occupied(lambda: len(b._inbox.items) == 4)
-        await until(lambda: len(outcomes) == 2)
-        assert all(reply.message is not None for reply in outcomes)  # type: ignore[attr-defined]
-        reply = await a.ask_one("test/ask/one/x", Ping(7), Pong, timeout=LONG)
-        assert reply is not None
-        assert reply.message == Pong(7, "b")
-
-    play(story)
+async def test_one_host_fills_half_a_queue_at_most_and_is_refused_undecoded(world: World) -> None:
+    a, b = await world.open("a", "b")
+    b.serve("test/ask/*/*", Ping, pong(b), depth=4)
+    await world.declared()
+    outcomes: list[object] = []
+    for number in range(10):
+        a._transport.get(f"test/ask/one/{number}", b"no JSON", Ping, LONG, Replies())
+    for number in range(2):
+        a.ask_then(f"test/ask/two/{number}", Ping(number), Pong, outcomes.append, timeout=LONG)
+    await world.occupied(lambda: len(b._inbox.items) == 4)
+    await until(lambda: len(outcomes) == 2)
+    assert all(reply.message is not None for reply in outcomes)  # type: ignore[attr-defined]
+    assert await answer(a, Ping(7), "test/ask/one/x") == ("test/ask/one/x", Pong(7, "b"))
 
 
-def test_ask_ends_with_the_reply_that_is_enough(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b, c = await world.open("a", "b", "c")
-        kept: list[IncomingQuery[Ping]] = []
-        b.serve(ASK, Ping, pong(b))
-        c.serve(ASK, Ping, kept.append)
-        await world.declared()
-        asked = a.ask(ASK, Ping(), Pong, timeout=LONG, enough=lambda reply: reply.message == Pong(0, "b"))
-        replies, took = await timed(a, asked)
-        assert [reply.message for reply in replies] == [Pong(0, "b")]
-        assert took < LONG / 2
-
-    play(story)
+async def test_ask_ends_with_the_reply_that_is_enough(world: World) -> None:
+    a, b, c = await world.open("a", "b", "c")
+    kept: list[IncomingQuery[Ping]] = []
+    b.serve(ASK, Ping, pong(b))
+    c.serve(ASK, Ping, kept.append)
+    await world.declared()
+    asked = a.ask(ASK, Ping(), Pong, timeout=LONG, enough=lambda reply: reply.message == Pong(0, "b"))
+    assert [reply.message for reply in await at_once(a, asked)] == [Pong(0, "b")]
 
 
-def test_ask_then_calls_back_once(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b, c = await world.open("a", "b", "c")
-        outcomes: list[object] = []
-        a.ask_then(ASK, Ping(), Pong, outcomes.append, timeout=LONG)
-        await until(lambda: outcomes)
-        assert outcomes == [None]
-        for mesh in (b, c):
-            mesh.serve(ASK, Ping, pong(mesh))
-        await world.declared()
-        a.ask_then(ASK, Ping(), Pong, outcomes.append, timeout=LONG)
-        assert len(await a.ask(ASK, Ping(), Pong, timeout=LONG)) == 2
-        await until(lambda: len(outcomes) > 1)
-        assert len(outcomes) == 2
-
-    play(story)
+async def test_ask_then_calls_back_once(world: World) -> None:
+    a, b, c = await world.open("a", "b", "c")
+    outcomes: list[object] = []
+    a.ask_then(ASK, Ping(), Pong, outcomes.append, timeout=LONG)
+    await until(lambda: outcomes)
+    assert outcomes == [None]
+    for mesh in (b, c):
+        mesh.serve(ASK, Ping, pong(mesh))
+    await world.declared()
+    a.ask_then(ASK, Ping(), Pong, outcomes.append, timeout=LONG)
+    assert len(await a.ask(ASK, Ping(), Pong, timeout=LONG)) == 2
+    await until(lambda: len(outcomes) > 1)
+    assert len(outcomes) == 2
 
 
-def test_what_cannot_be_asked_raises(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, _ = await world.open("a", "b")
-        with pytest.raises(MeshError, match="no//key"):
-            await a.ask("no//key", Ping(), Pong, timeout=LONG)
-        await a.close()
-        with pytest.raises(MeshError):
-            await a.ask(ASK, Ping(), Pong, timeout=LONG)
-
-    play(story)
+async def test_what_cannot_be_asked_raises(world: World) -> None:
+    a, _ = await world.open("a", "b")
+    with pytest.raises(MeshError, match="no//key"):
+        await a.ask("no//key", Ping(), Pong, timeout=LONG)
+    await a.close()
+    with pytest.raises(MeshError):
+        await a.ask(ASK, Ping(), Pong, timeout=LONG)
 
 
-def test_what_is_undeclared_is_not_asked(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        served = b.serve(ASK, Ping, pong(b))
-        await world.declared()
-        assert len(await a.ask(ASK, Ping(), Pong, timeout=LONG)) == 1
-        served.close()
-        served.close()
-        assert await a.ask(ASK, Ping(), Pong, timeout=LONG) == []
-
-    play(story)
+async def test_what_is_undeclared_is_not_asked(world: World) -> None:
+    a, b = await world.open("a", "b")
+    served = b.serve(ASK, Ping, pong(b))
+    await world.declared()
+    assert len(await a.ask(ASK, Ping(), Pong, timeout=LONG)) == 1
+    served.close()
+    served.close()
+    assert await a.ask(ASK, Ping(), Pong, timeout=LONG) == []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import re
 import socket
@@ -23,9 +22,12 @@ from zscout.mesh.zenoh_mesh import ZenohTransport, _relinking, increasing_id, ze
 
 _PORT = re.compile(r":(\d+)(?:[?#].*)?$")
 
-pytestmark = pytest.mark.skipif(
-    len(socket.if_nameindex()) < 2, reason="there is no network but loopback, and peers tell of no address there"
-)
+pytestmark = [
+    pytest.mark.usefixtures("real_time"),
+    pytest.mark.skipif(
+        len(socket.if_nameindex()) < 2, reason="there is no network but loopback, and peers tell of no address there"
+    ),
+]
 
 
 def _ends(here: ZenohTransport, there: str) -> set[tuple[int, int]]:
@@ -100,36 +102,31 @@ class _World:
         return here, (await self.peer()).id()
 
 
-def test_a_link_that_is_lost_is_made_again() -> None:
+async def test_a_link_that_is_lost_is_made_again(stack: AsyncExitStack) -> None:
     """By who made it."""
-
-    async def story() -> None:
-        async with AsyncExitStack() as stack:
-            here, there = await _World(stack).pair()
-            _cut(before := _ends(here, there))
-            await until(lambda: _ends(here, there) - before)
-
-    asyncio.run(story())
+    here, there = await _World(stack).pair()
+    _cut(before := _ends(here, there))
+    await until(lambda: _ends(here, there) - before)
 
 
-def test_a_link_that_came_and_went_without_a_word_is_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_link_that_came_and_went_without_a_word_is_made_again(
+    stack: AsyncExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Zenoh tells of some that come that they do, and not that they are gone."""
     monkeypatch.setattr(relinking, "PAUSES", (0.5, *relinking.PAUSES))
 
-    async def story() -> None:
-        async with AsyncExitStack() as stack:
-            here, there = await _World(stack).pair()
-            looking = here._relinking
-            assert looking is not None
-            _cut(before := _ends(here, there))
-            await until(lambda: there in looking._lost)
-            looking._on_link(cast("Any", SimpleNamespace(kind=zenoh.SampleKind.PUT, link=SimpleNamespace(zid=there))))
-            await until(lambda: _ends(here, there) - before)
-
-    asyncio.run(story())
+    here, there = await _World(stack).pair()
+    looking = here._relinking
+    assert looking is not None
+    _cut(before := _ends(here, there))
+    await until(lambda: there in looking._lost)
+    looking._on_link(cast("Any", SimpleNamespace(kind=zenoh.SampleKind.PUT, link=SimpleNamespace(zid=there))))
+    await until(lambda: _ends(here, there) - before)
 
 
-def test_who_lost_two_links_made_by_others_sees_to_both(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_who_lost_two_links_made_by_others_sees_to_both(
+    stack: AsyncExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It was away itself. The second may be lost when it has looked for the first in vain."""
     looked: list[object] = []
 
@@ -141,48 +138,35 @@ def test_who_lost_two_links_made_by_others_sees_to_both(monkeypatch: pytest.Monk
     # However late this process comes to cut the second.
     monkeypatch.setattr(relinking, "TOGETHER", WITHIN)
 
-    async def story() -> None:
-        async with AsyncExitStack() as stack:
-            world = _World(stack)
-            await world.peer()
-            here = await world.peer(relinks=True, makes_links=True)
-            there = [(await world.peer()).id() for _ in range(2)]
-            before = [_ends(here, one) for one in there]
-            for number, (one, ends) in enumerate(zip(there, before, strict=True), 1):
-                _cut(ends)
-                # Or Zenoh was about to try another of its addresses.
-                await until(lambda: len(looked) >= number or _ends(here, one) - ends)  # noqa: B023 - awaited here
-            for one, ends in zip(there, before, strict=True):
-                await until(lambda: _ends(here, one) - ends)  # noqa: B023 - awaited here
-
-    asyncio.run(story())
+    world = _World(stack)
+    await world.peer()
+    here = await world.peer(relinks=True, makes_links=True)
+    there = [(await world.peer()).id() for _ in range(2)]
+    before = [_ends(here, one) for one in there]
+    for number, (one, ends) in enumerate(zip(there, before, strict=True), 1):
+        _cut(ends)
+        # Or Zenoh was about to try another of its addresses.
+        await until(lambda: len(looked) >= number or _ends(here, one) - ends)  # noqa: B023 - awaited here
+    for one, ends in zip(there, before, strict=True):
+        await until(lambda: _ends(here, one) - ends)  # noqa: B023 - awaited here
 
 
-def test_the_session_that_introduces_it_is_no_link_to_anybody() -> None:
-    async def story() -> None:
-        async with AsyncExitStack() as stack:
-            world = _World(stack)
-            here = await world.peer()
-            settings = world.meeting()
-            with zenoh.open(settings):
-                await until(lambda: here._session.info.links())
-                assert (here.links(), here.peers()) == (0, [])
-
-    asyncio.run(story())
+async def test_the_session_that_introduces_it_is_no_link_to_anybody(stack: AsyncExitStack) -> None:
+    world = _World(stack)
+    here = await world.peer()
+    settings = world.meeting()
+    with zenoh.open(settings):
+        await until(lambda: here._session.info.links())
+        assert (here.links(), here.peers()) == (0, [])
 
 
-def test_who_joins_with_a_lesser_id_is_linked_as_well() -> None:
+async def test_who_joins_with_a_lesser_id_is_linked_as_well(stack: AsyncExitStack) -> None:
     """Its clock is behind: the others make the links, and have to be told of it."""
-
-    async def story() -> None:
-        async with AsyncExitStack() as stack:
-            world = _World(stack)
-            for _ in range(2):
-                await world.peer(makes_links=True)
-            late = await world.peer(relinks=True, known=False)
-            assert len(late.peers()) == 2
-
-    asyncio.run(story())
+    world = _World(stack)
+    for _ in range(2):
+        await world.peer(makes_links=True)
+    late = await world.peer(relinks=True, known=False)
+    assert len(late.peers()) == 2
 
 
 def test_ids_increase_as_zenoh_compares_them() -> None:
@@ -191,54 +175,48 @@ def test_ids_increase_as_zenoh_compares_them() -> None:
     assert (by_last := [bytes.fromhex(one)[:9:-1] for one in ids]) == sorted(by_last)
 
 
-def test_whoever_ends_is_not_looked_for() -> None:
-    async def story() -> None:
-        async with AsyncExitStack() as stack:
-            world = _World(stack)
-            (first, here, there) = [await world.peer(relinks=True) for _ in range(3)]
-            gone = there.id()
-            await there.close()
+async def test_whoever_ends_is_not_looked_for(stack: AsyncExitStack) -> None:
+    world = _World(stack)
+    (first, here, there) = [await world.peer(relinks=True) for _ in range(3)]
+    gone = there.id()
+    await there.close()
 
-            def is_gone() -> bool:
-                # Once in fifty a Zenoh session that is closed makes its own links again, and they last as long as its
-                # process, which would end now.
-                for one in (first, here):
-                    if ends := _ends(one, gone):
-                        _cut(ends)
-                return len(here.peers()) == len(first.peers()) == 1
+    def is_gone() -> bool:
+        # Once in fifty a Zenoh session that is closed makes its own links again, and they last as long as its
+        # process, which would end now.
+        for one in (first, here):
+            if ends := _ends(one, gone):
+                _cut(ends)
+        return len(here.peers()) == len(first.peers()) == 1
 
-            await until(is_gone)
-            for one in (first, here):
-                assert one._relinking is not None
-                await until(lambda relinking=one._relinking: relinking._thread is None)  # type: ignore[misc]
-
-    asyncio.run(story())
+    await until(is_gone)
+    for one in (first, here):
+        assert one._relinking is not None
+        await until(lambda relinking=one._relinking: relinking._thread is None)  # type: ignore[misc]
 
 
-def test_who_listens_and_is_not_found_is_asked_once_whether_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_who_listens_and_is_not_found_is_asked_once_whether_it_does(
+    stack: AsyncExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Each connection that is closed unused keeps others from a TLS listener for a while."""
     monkeypatch.setattr(relinking, "PAUSES", (0.01,) * 5)
     monkeypatch.setattr(relinking, "SCOUT_TIMEOUT", 0.05)
 
-    async def story() -> None:
-        async with AsyncExitStack() as stack:
-            here = (await _World(stack).peer(relinks=True))._relinking
-            assert here is not None
-            await until(lambda: here._thread is None)
-            frozen = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
-            with here._lock:
-                here._lost["f"] = relinking._Lost(0.0, [f"tls/127.0.0.1:{frozen.getsockname()[1]}"])
-                here._begin(greet=False)
-            await until(lambda: here._thread is None)
-            frozen.setblocking(False)
-            frozen.accept()[0].close()
-            with pytest.raises(BlockingIOError):
-                frozen.accept()
-
-    asyncio.run(story())
+    here = (await _World(stack).peer(relinks=True))._relinking
+    assert here is not None
+    await until(lambda: here._thread is None)
+    frozen = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+    with here._lock:
+        here._lost["f"] = relinking._Lost(0.0, [f"tls/127.0.0.1:{frozen.getsockname()[1]}"])
+        here._begin(greet=False)
+    await until(lambda: here._thread is None)
+    frozen.setblocking(False)
+    frozen.accept()[0].close()
+    with pytest.raises(BlockingIOError):
+        frozen.accept()
 
 
-def test_a_relay_is_not_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_relay_is_not_looked_for(stack: AsyncExitStack, monkeypatch: pytest.MonkeyPatch) -> None:
     """It answers nobody who looks for peers."""
     looked: list[str] = []
 
@@ -248,18 +226,14 @@ def test_a_relay_is_not_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(relinking, "_listens", listens)
 
-    async def story() -> None:
-        async with AsyncExitStack() as stack:
-            world = _World(stack)
-            relay, address = world.relay()
-            here, there = await world.pair([address])
-            before = _ends(here, there)
-            await until(lambda: _ends(here, relay.id()))
-            await relay.close()
-            await until(lambda: not _ends(here, relay.id()))
-            _cut(before)
-            await until(lambda: _ends(here, there) - before)
-            assert looked
-            assert address not in looked
-
-    asyncio.run(story())
+    world = _World(stack)
+    relay, address = world.relay()
+    here, there = await world.pair([address])
+    before = _ends(here, there)
+    await until(lambda: _ends(here, relay.id()))
+    await relay.close()
+    await until(lambda: not _ends(here, relay.id()))
+    _cut(before)
+    await until(lambda: _ends(here, there) - before)
+    assert looked
+    assert address not in looked

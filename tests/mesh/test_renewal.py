@@ -8,83 +8,76 @@ import logging
 
 import pytest
 
-from tests.mesh.both_meshes import ASK, LONG, NEWS, Ping, Play, Pong, World, token
-from tests.mesh.kit import run, until
+from tests.mesh.both_meshes import ASK, LONG, NEWS, Ping, Pong, World, token
+from tests.mesh.kit import until
 from zscout.keyexpr import Role, Sender
 from zscout.mesh.renewal import LASTS, LONGEST, PATIENCE, SHORTEST, Suspicions
 from zscout.testing.memory import MemoryNetwork
 from zscout.types import SECOND
 
 
-def test_what_is_declared_goes_on_and_nobody_notices(play: Play) -> None:
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        seen: dict[str, list[tuple[str, bool]]] = {"a": [], "b": []}
-        heard: dict[str, set[int]] = {"a": set(), "b": set()}
-        handled: list[int] = []
-        for mesh, name in ((a, "a"), (b, "b")):
-            told, news = seen[name].append, heard[name].add
-            mesh.watch(mesh.keys.alive_any(Role.CLIENT), lambda one, alive, told=told: told((one.host, alive)))  # type: ignore[misc]
-            mesh.subscribe(f"{NEWS}/*", Ping, lambda _, ping, news=news: news(ping.number))  # type: ignore[misc]
-        tokens = [a.alive(token("a")), b.alive(token("b"))]
+async def test_what_is_declared_goes_on_and_nobody_notices(world: World) -> None:
+    a, b = await world.open("a", "b")
+    seen: dict[str, list[tuple[str, bool]]] = {"a": [], "b": []}
+    heard: dict[str, set[int]] = {"a": set(), "b": set()}
+    handled: list[int] = []
+    for mesh, name in ((a, "a"), (b, "b")):
+        told, news = seen[name].append, heard[name].add
+        mesh.watch(mesh.keys.alive_any(Role.CLIENT), lambda one, alive, told=told: told((one.host, alive)))  # type: ignore[misc]
+        mesh.subscribe(f"{NEWS}/*", Ping, lambda _, ping, news=news: news(ping.number))  # type: ignore[misc]
+    tokens = [a.alive(token("a")), b.alive(token("b"))]
 
-        def serve(query: object) -> None:
-            handled.append(query.message.number)  # type: ignore[attr-defined]
-            query.answer(Pong(query.message.number))  # type: ignore[attr-defined]
+    def serve(query: object) -> None:
+        handled.append(query.message.number)  # type: ignore[attr-defined]
+        query.answer(Pong(query.message.number))  # type: ignore[attr-defined]
 
-        a.serve(ASK, Ping, serve)
-        publishers = a.publisher(f"{NEWS}/a", Ping), b.publisher(f"{NEWS}/b", Ping)
-        await world.declared()
-        before = a._transport.id()
-        a._transport.renew()
-        asked = answered = 0
-        while a._transport._renewing is not None:
-            asked += 1
-            reply = await b.ask_one(ASK, Ping(asked), Pong, timeout=LONG)
-            answered += reply is not None
-            await asyncio.sleep(0.01)
-        assert a._transport.id() != before
-        # Each at most once. What was sent to the old session alone, as it was left, has no answer: it is asked again.
-        assert len(handled) == len(set(handled)) == answered > 0
-        await until(lambda: b._transport.peers() == [a._transport.id()])
-        await world.declared()
-        for publisher in publishers:
-            publisher.put(Ping(1_000))
-        await until(lambda: all(1_000 in news for news in heard.values()))
-        assert (await b.ask_one(ASK, Ping(0), Pong, timeout=LONG)) is not None
-        assert {name: sorted(told) for name, told in seen.items()} == {key: [("a", True), ("b", True)] for key in "ab"}
-        for one in tokens:
-            one.close()
-        await until(lambda: all(len(told) == 4 for told in seen.values()))
-
-    play(story)
+    a.serve(ASK, Ping, serve)
+    publishers = a.publisher(f"{NEWS}/a", Ping), b.publisher(f"{NEWS}/b", Ping)
+    await world.declared()
+    before = a._transport.id()
+    a._transport.renew()
+    asked = answered = 0
+    while a._transport._renewing is not None:
+        asked += 1
+        reply = await b.ask_one(ASK, Ping(asked), Pong, timeout=LONG)
+        answered += reply is not None
+        await asyncio.sleep(0.01)
+    assert a._transport.id() != before
+    # Each at most once. What was sent to the old session alone, as it was left, has no answer: it is asked again.
+    assert len(handled) == len(set(handled)) == answered > 0
+    await until(lambda: b._transport.peers() == [a._transport.id()])
+    await world.declared()
+    for publisher in publishers:
+        publisher.put(Ping(1_000))
+    await until(lambda: all(1_000 in news for news in heard.values()))
+    assert (await b.ask_one(ASK, Ping(0), Pong, timeout=LONG)) is not None
+    assert {name: sorted(told) for name, told in seen.items()} == {key: [("a", True), ("b", True)] for key in "ab"}
+    for one in tokens:
+        one.close()
+    await until(lambda: all(len(told) == 4 for told in seen.values()))
 
 
-def test_what_is_polled_seldom_goes_on_as_well(play: Play) -> None:
+async def test_what_is_polled_seldom_goes_on_as_well(world: World) -> None:
     """The session that was polled last may be closed by then."""
+    a, b = await world.open("a", "b")
+    polled, publisher = a.poll_latest(f"{NEWS}/*", Ping), b.publisher(f"{NEWS}/b", Ping)
+    await world.declared()
+    a._transport.renew()
+    await until(lambda: a._transport._renewing is None)
+    assert list(polled.each()) == []
+    publisher.put(Ping(7))
+    taken: list[tuple[str, Ping]] = []
 
-    async def story(world: World) -> None:
-        a, b = await world.open("a", "b")
-        polled, publisher = a.poll_latest(f"{NEWS}/*", Ping), b.publisher(f"{NEWS}/b", Ping)
-        await world.declared()
-        a._transport.renew()
-        await until(lambda: a._transport._renewing is None)
-        assert list(polled.each()) == []
-        publisher.put(Ping(7))
-        taken: list[tuple[str, Ping]] = []
+    def take() -> bool:
+        taken.extend(polled.each())
+        return bool(taken)
 
-        def take() -> bool:
-            taken.extend(polled.each())
-            return bool(taken)
-
-        await until(take)
-        assert [ping.number for _, ping in taken] == [7]
-
-    play(story)
+    await until(take)
+    assert [ping.number for _, ping in taken] == [7]
 
 
-def test_a_link_that_comes_back_without_its_token_is_noticed_and_left(caplog: pytest.LogCaptureFixture) -> None:
-    async def story() -> None:
+async def test_a_link_that_comes_back_without_its_token_is_noticed_and_left(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
         network = MemoryNetwork()
         a, b = (network.open("test", Sender(name, "test")) for name in "ab")
         for mesh in (a, b):
@@ -104,32 +97,25 @@ def test_a_link_that_comes_back_without_its_token_is_noticed_and_left(caplog: py
         await until(lambda: len(seen) == 4)
         for mesh in (a, b):
             await mesh.close()
-
-    with caplog.at_level(logging.WARNING):
-        run(story())
     assert [record.message.partition(":")[2] for record in caplog.records] == [" this process joins the mesh anew"] * 2
 
 
 @pytest.mark.parametrize("shows_another", [True, False])
-def test_a_session_that_its_program_has_left_is_not_missed(shows_another: bool) -> None:
+async def test_a_session_that_its_program_has_left_is_not_missed(shows_another: bool) -> None:
     """Zenoh may not close it: then it stays linked, without a token."""
-
-    async def story() -> None:
-        network = MemoryNetwork()
-        watcher, left = (network.open("test", Sender(name, "test")) for name in ("w", "a"))
-        for mesh in (watcher, left):
-            mesh.watch_links()
-        if shows_another:
-            network.open("test", Sender("a", "test")).watch_links()
-        before = watcher._transport.id()
-        await asyncio.sleep(1)
-        withdraw = left._kept[0]
-        assert callable(withdraw)
-        withdraw()
-        await asyncio.sleep(2 * PATIENCE)
-        assert (watcher._transport.id() == before) == shows_another
-
-    run(story())
+    network = MemoryNetwork()
+    watcher, left = (network.open("test", Sender(name, "test")) for name in ("w", "a"))
+    for mesh in (watcher, left):
+        mesh.watch_links()
+    if shows_another:
+        network.open("test", Sender("a", "test")).watch_links()
+    before = watcher._transport.id()
+    await asyncio.sleep(1)
+    withdraw = left._kept[0]
+    assert callable(withdraw)
+    withdraw()
+    await asyncio.sleep(2 * PATIENCE)
+    assert (watcher._transport.id() == before) == shows_another
 
 
 def test_a_contradiction_must_last_and_one_that_stays_is_acted_on_ever_more_seldom() -> None:

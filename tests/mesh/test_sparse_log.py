@@ -7,7 +7,7 @@ import logging
 
 import pytest
 
-from tests.mesh.kit import run, until
+from tests.mesh.kit import until
 from zscout.keyexpr import Sender
 from zscout.mesh.sparse_log import MAX_KEYS, SparseLog
 from zscout.mesh.transport import Quality
@@ -44,31 +44,28 @@ def test_who_takes_ever_new_keys_fills_neither_log_nor_memory(caplog: pytest.Log
     assert list(sparse._said) == [("odd", "new")]
 
 
-def test_malformed_answers_and_publications_and_bad_names_are_logged_so(caplog: pytest.LogCaptureFixture) -> None:
-    async def story() -> None:
-        network = MemoryNetwork()
-        here, other = network.open("f", Sender("h", "here")), network.open("f", Sender("h", "other"))
-        transport, keys = other._transport, here.keys
-        transport.queryable(keys.rcm_state, lambda query: query.reply(query.key, b"?", StateAsk))
-        heard: list[Grants] = []
+async def test_malformed_answers_and_publications_and_bad_names_are_logged_so(caplog: pytest.LogCaptureFixture) -> None:
+    network = MemoryNetwork()
+    here, other = network.open("f", Sender("h", "here")), network.open("f", Sender("h", "other"))
+    transport, keys = other._transport, here.keys
+    transport.queryable(keys.rcm_state, lambda query: query.reply(query.key, b"?", StateAsk))
+    heard: list[Grants] = []
 
-        def on_grants(_: str, grants: Grants) -> None:
-            heard.append(grants)
-            keys.rc_of("nonsense")
+    def on_grants(_: str, grants: Grants) -> None:
+        heard.append(grants)
+        keys.rc_of("nonsense")
 
-        here.subscribe(keys.grants, Grants, on_grants)
-        watched = here.watch(keys.alive_any(), lambda *_: None)
-        publisher = transport.publisher(keys.grants, Grants, Quality.CONTROL)
-        tokens = []
-        for number in range(50):
-            publisher.put(b"?")
-            other.put(keys.grants, Grants((1, "x"), number, number, 0.5))  # type: ignore[arg-type]
-            tokens.append(transport.token(f"{keys.base}/alive/odd"))
-            assert await here.ask(keys.rcm_state, StateAsk(), RcmState, timeout=1) == []
-            await asyncio.sleep(0.01)
-        await until(lambda: len(heard) == 50)
-        watched.close()
-
-    run(story())
+    here.subscribe(keys.grants, Grants, on_grants)
+    watched = here.watch(keys.alive_any(), lambda *_: None)
+    publisher = transport.publisher(keys.grants, Grants, Quality.CONTROL)
+    tokens = []
+    for number in range(50):
+        publisher.put(b"?")
+        other.put(keys.grants, Grants((1, "x"), number, number, 0.5))  # type: ignore[arg-type]
+        tokens.append(transport.token(f"{keys.base}/alive/odd"))
+        assert await here.ask(keys.rcm_state, StateAsk(), RcmState, timeout=1) == []
+        await asyncio.sleep(0.01)
+    await until(lambda: len(heard) == 50)
+    watched.close()
     starts = [" ".join(record.getMessage().split()[:3]) for record in caplog.records]
     assert sorted(starts) == ["a reply on", "ignored a liveliness", "ignored a publication", "ignored what came"]

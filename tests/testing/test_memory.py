@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
 
 from tests.mesh.kit import run, until
 from zscout.keyexpr import Role, Sender, Token
@@ -47,158 +46,132 @@ class Pair:
         return [reply.message.number for reply in replies if reply.message], took
 
 
-def play(story: Callable[[Pair], Awaitable[None]], network: Callable[[], MemoryNetwork]) -> None:
-    async def main() -> None:
-        pair = Pair(network())
-        await until(lambda: pair.lives == [True])
-        await story(pair)
-
-    run(main())
+async def linked(seed: int = 0) -> Pair:
+    pair = Pair(MemoryNetwork(seed=seed))
+    await until(lambda: pair.lives == [True])
+    return pair
 
 
-def test_each_direction_has_its_delay() -> None:
-    async def story(pair: Pair) -> None:
-        pair.network.link(pair.a, pair.b).delay = 2.0
-        pair.network.link(pair.b, pair.a).delay = 3.0
-        assert await pair.ask(7) == ([7], 5.0)
-
-    play(story, MemoryNetwork)
+async def test_each_direction_has_its_delay() -> None:
+    pair = await linked()
+    pair.network.link(pair.a, pair.b).delay = 2.0
+    pair.network.link(pair.b, pair.a).delay = 3.0
+    assert await pair.ask(7) == ([7], 5.0)
 
 
-def test_jitter_keeps_the_order() -> None:
-    async def story(pair: Pair) -> None:
-        pair.network.link(pair.b, pair.a).jitter = 1.0
-        for number in range(50):
-            pair.b.put(NEWS, Ping(number))
-            await asyncio.sleep(0.01)
-        await until(lambda: len(pair.heard) == 50)
-        assert pair.heard == list(range(50))
-
-    play(story, MemoryNetwork)
+async def test_jitter_keeps_the_order() -> None:
+    pair = await linked()
+    pair.network.link(pair.b, pair.a).jitter = 1.0
+    for number in range(50):
+        pair.b.put(NEWS, Ping(number))
+        await asyncio.sleep(0.01)
+    await until(lambda: len(pair.heard) == 50)
+    assert pair.heard == list(range(50))
 
 
 def test_losses_are_those_of_the_seed() -> None:
-    def heard(seed: int) -> list[int]:
-        found: list[int] = []
+    async def heard(seed: int) -> list[int]:
+        pair = await linked(seed)
+        pair.network.link(pair.b, pair.a).loss = 0.5
+        for number in range(40):
+            pair.b.put(NEWS, Ping(number))
+        await asyncio.sleep(1)
+        return pair.heard
 
-        async def story(pair: Pair) -> None:
-            pair.network.link(pair.b, pair.a).loss = 0.5
-            for number in range(40):
-                pair.b.put(NEWS, Ping(number))
-            await asyncio.sleep(1)
-            found.extend(pair.heard)
-
-        play(story, lambda: MemoryNetwork(seed=seed))
-        return found
-
-    assert 5 < len(heard(1)) < 35
-    assert heard(1) == heard(1)
-    assert heard(1) != heard(2)
+    first, again, other = (run(heard(seed)) for seed in (1, 1, 2))
+    assert 5 < len(first) < 35
+    assert first == again != other
 
 
-def test_a_query_that_is_lost_is_over_at_its_timeout() -> None:
-    async def story(pair: Pair) -> None:
-        pair.network.link(pair.a, pair.b).loss = 1.0
-        assert await pair.ask(timeout=2) == ([], 2.0)
-        assert pair.served == []
-
-    play(story, MemoryNetwork)
+async def test_a_query_that_is_lost_is_over_at_its_timeout() -> None:
+    pair = await linked()
+    pair.network.link(pair.a, pair.b).loss = 1.0
+    assert await pair.ask(timeout=2) == ([], 2.0)
+    assert pair.served == []
 
 
-def test_what_is_cut_for_less_than_the_lease_arrives_late() -> None:
-    async def story(pair: Pair) -> None:
-        pair.network.cut(pair.b, pair.a)
-        pair.b.put(NEWS, Ping(1))
-        asking = asyncio.create_task(pair.ask(2))
-        await asyncio.sleep(0.9)
-        assert pair.heard == []
-        assert pair.served == [2]  # the other direction works
-        pair.network.heal()
-        assert await asking == ([2], 0.9)
-        assert pair.heard == [1]
-        assert pair.lives == [True]
-
-    play(story, MemoryNetwork)
+async def test_what_is_cut_for_less_than_the_lease_arrives_late() -> None:
+    pair = await linked()
+    pair.network.cut(pair.b, pair.a)
+    pair.b.put(NEWS, Ping(1))
+    asking = asyncio.create_task(pair.ask(2))
+    await asyncio.sleep(0.9)
+    assert pair.heard == []
+    assert pair.served == [2]  # the other direction works
+    pair.network.heal()
+    assert await asking == ([2], 0.9)
+    assert pair.heard == [1]
+    assert pair.lives == [True]
 
 
-def test_a_link_that_is_cut_for_a_lease_is_given_up_until_it_is_healed() -> None:
-    async def story(pair: Pair) -> None:
-        pair.network.cut(pair.b, pair.a)
-        pair.b.put(NEWS, Ping(1))
-        assert await pair.ask(2) == ([], 1.0)
-        assert pair.lives == [True, False]
-        assert pair.a.links() == 0
-        assert await pair.ask(3) == ([], 0)
-        pair.network.heal()
-        await until(lambda: pair.lives == [True, False, True])
-        assert await pair.ask(4) == ([4], 0.0)
-        assert pair.served == [2, 4]
-        assert pair.heard == []
-        pair.b.put(NEWS, Ping(5))
-        await until(lambda: pair.heard == [5])
-
-    play(story, MemoryNetwork)
+async def test_a_link_that_is_cut_for_a_lease_is_given_up_until_it_is_healed() -> None:
+    pair = await linked()
+    pair.network.cut(pair.b, pair.a)
+    pair.b.put(NEWS, Ping(1))
+    assert await pair.ask(2) == ([], 1.0)
+    assert pair.lives == [True, False]
+    assert pair.a.links() == 0
+    assert await pair.ask(3) == ([], 0)
+    pair.network.heal()
+    await until(lambda: pair.lives == [True, False, True])
+    assert await pair.ask(4) == ([4], 0.0)
+    assert pair.served == [2, 4]
+    assert pair.heard == []
+    pair.b.put(NEWS, Ping(5))
+    await until(lambda: pair.heard == [5])
 
 
-def test_isolated_is_cut_from_all() -> None:
-    async def story(pair: Pair) -> None:
-        c = pair.network.open("test", Sender("c", "test"))
-        pair.network.isolate(pair.b)
-        await asyncio.sleep(1.1)
-        assert (pair.a.links(), pair.b.links(), c.links()) == (1, 0, 1)
-        pair.network.heal()
-        assert (pair.a.links(), pair.b.links(), c.links()) == (2, 2, 2)
-
-    play(story, MemoryNetwork)
+async def test_isolated_is_cut_from_all() -> None:
+    pair = await linked()
+    c = pair.network.open("test", Sender("c", "test"))
+    pair.network.isolate(pair.b)
+    await asyncio.sleep(1.1)
+    assert (pair.a.links(), pair.b.links(), c.links()) == (1, 0, 1)
+    pair.network.heal()
+    assert (pair.a.links(), pair.b.links(), c.links()) == (2, 2, 2)
 
 
-def test_a_server_frozen_for_less_than_its_lease_carries_out_what_waited() -> None:
-    async def story(pair: Pair) -> None:
-        pair.network.freeze(pair.b)
-        assert await pair.ask(1, timeout=0.5) == ([], 0.5)
-        assert pair.served == []
-        pair.network.thaw(pair.b)
-        await until(lambda: pair.served == [1])
-        assert pair.lives == [True]
-
-    play(story, MemoryNetwork)
+async def test_a_server_frozen_for_less_than_its_lease_carries_out_what_waited() -> None:
+    pair = await linked()
+    pair.network.freeze(pair.b)
+    assert await pair.ask(1, timeout=0.5) == ([], 0.5)
+    assert pair.served == []
+    pair.network.thaw(pair.b)
+    await until(lambda: pair.served == [1])
+    assert pair.lives == [True]
 
 
-def test_one_frozen_for_longer_is_given_up_and_returns() -> None:
-    async def story(pair: Pair) -> None:
-        seen: list[tuple[str, bool]] = []
-        token = pair.a.alive(Token("a", Role.NODE, "a", "i"))
-        pair.b.watch(pair.b.keys.alive_any(), lambda token, alive: seen.append((token.host, alive)))
-        await until(lambda: len(seen) == 2)
-        pair.network.freeze(pair.b)
-        assert await pair.ask(1) == ([], 1.0)
-        await until(lambda: pair.lives == [True, True, False])  # its own, too
-        assert len(seen) == 2  # who is frozen sees nothing
-        pair.network.thaw(pair.b)
-        await until(lambda: pair.lives == [True, True, False, True])
-        await until(lambda: len(seen) == 4)
-        assert seen[2:] == [("a", False), ("a", True)]
-        assert (await pair.ask(2))[0] == [2]
-        token.close()
-
-    play(story, MemoryNetwork)
+async def test_one_frozen_for_longer_is_given_up_and_returns() -> None:
+    pair = await linked()
+    seen: list[tuple[str, bool]] = []
+    token = pair.a.alive(Token("a", Role.NODE, "a", "i"))
+    pair.b.watch(pair.b.keys.alive_any(), lambda token, alive: seen.append((token.host, alive)))
+    await until(lambda: len(seen) == 2)
+    pair.network.freeze(pair.b)
+    assert await pair.ask(1) == ([], 1.0)
+    await until(lambda: pair.lives == [True, True, False])  # its own, too
+    assert len(seen) == 2  # who is frozen sees nothing
+    pair.network.thaw(pair.b)
+    await until(lambda: pair.lives == [True, True, False, True])
+    await until(lambda: len(seen) == 4)
+    assert seen[2:] == [("a", False), ("a", True)]
+    assert (await pair.ask(2))[0] == [2]
+    token.close()
 
 
-def test_one_that_stood_still_as_another_left_sees_that() -> None:
-    async def story(pair: Pair) -> None:
-        pair.network.freeze(pair.a)
-        await asyncio.sleep(1.1)
-        await pair.b.close()
-        pair.network.thaw(pair.a)
-        await until(lambda: pair.lives == [True, False])
-
-    play(story, MemoryNetwork)
+async def test_one_that_stood_still_as_another_left_sees_that() -> None:
+    pair = await linked()
+    pair.network.freeze(pair.a)
+    await asyncio.sleep(1.1)
+    await pair.b.close()
+    pair.network.thaw(pair.a)
+    await until(lambda: pair.lives == [True, False])
 
 
-def test_of_what_one_that_is_killed_sent_last_a_beginning_arrives() -> None:
+async def test_of_what_one_that_is_killed_sent_last_a_beginning_arrives() -> None:
     arrived: set[int] = set()
-
-    async def story(pair: Pair) -> None:
+    for seed in range(20):
+        pair = await linked(seed)
         pair.b.put(NEWS, Ping(0))
         await asyncio.sleep(1)
         for number in (1, 2):
@@ -214,59 +187,49 @@ def test_of_what_one_that_is_killed_sent_last_a_beginning_arrives() -> None:
         pair.b.put(NEWS, Ping(4))
         await asyncio.sleep(1)
         assert 4 not in pair.heard
-
-    for seed in range(20):
-        play(story, lambda seed=seed: MemoryNetwork(seed=seed))  # type: ignore[misc]
     assert arrived == {1, 2, 3}
 
 
-def test_one_may_be_killed_as_it_sends() -> None:
-    async def story(pair: Pair) -> None:
-        pair.network.after_sending(pair.b, ASK, lambda _: pair.network.kill(pair.b))
-        pair.b.put(NEWS, Ping(1))
-        await asyncio.sleep(1)
-        assert (pair.heard, pair.lives) == ([1], [True])
-        assert (await pair.ask(2))[1] == 0.0
-        assert (pair.served, pair.lives) == ([2], [True, False])
-
-    play(story, MemoryNetwork)
+async def test_one_may_be_killed_as_it_sends() -> None:
+    pair = await linked()
+    pair.network.after_sending(pair.b, ASK, lambda _: pair.network.kill(pair.b))
+    pair.b.put(NEWS, Ping(1))
+    await asyncio.sleep(1)
+    assert (pair.heard, pair.lives) == ([1], [True])
+    assert (await pair.ask(2))[1] == 0.0
+    assert (pair.served, pair.lives) == ([2], [True, False])
 
 
-def test_what_arrives_of_one_that_has_gone_leaves_no_link_with_it() -> None:
-    async def story(pair: Pair) -> None:
-        pair.network.link(pair.b, pair.a).delay = 0.5
-        other = pair.network.open("test", Sender("c", "test"))
-        before = len(pair.network.links)
-        pair.b.put(NEWS, Ping(1))
-        await pair.b.close()
-        await other.close()
-        await until(lambda: pair.heard == [1])
-        assert (before, len(pair.network.links)) == (9, 1)
-
-    play(story, MemoryNetwork)
+async def test_what_arrives_of_one_that_has_gone_leaves_no_link_with_it() -> None:
+    pair = await linked()
+    pair.network.link(pair.b, pair.a).delay = 0.5
+    other = pair.network.open("test", Sender("c", "test"))
+    before = len(pair.network.links)
+    pair.b.put(NEWS, Ping(1))
+    await pair.b.close()
+    await other.close()
+    await until(lambda: pair.heard == [1])
+    assert (before, len(pair.network.links)) == (9, 1)
 
 
 def test_the_same_seed_makes_the_same_run() -> None:
-    def trace() -> list[tuple[int, str, int]]:
+    async def trace() -> list[tuple[int, str, int]]:
         events: list[tuple[int, str, int]] = []
+        network = MemoryNetwork(seed=5)
+        meshes = [network.open("test", Sender(f"h{number}", "test")) for number in range(6)]
 
-        async def main() -> None:
-            network = MemoryNetwork(seed=5)
-            meshes = [network.open("test", Sender(f"h{number}", "test")) for number in range(6)]
+        def listen(mesh: MemoryMesh) -> None:
+            mesh.subscribe(NEWS, Ping, lambda _, ping: events.append((mesh.now(), mesh.me.host, ping.number)))
 
-            def listen(mesh: MemoryMesh) -> None:
-                mesh.subscribe(NEWS, Ping, lambda _, ping: events.append((mesh.now(), mesh.me.host, ping.number)))
-
-            for mesh in meshes:
-                listen(mesh)
-                for other in meshes:
-                    network.link(mesh, other).jitter = 0.5
-            for number, mesh in enumerate(meshes):
-                mesh.put(NEWS, Ping(number))
-            await asyncio.sleep(2)
-
-        run(main())
+        for mesh in meshes:
+            listen(mesh)
+            for other in meshes:
+                network.link(mesh, other).jitter = 0.5
+        for number, mesh in enumerate(meshes):
+            mesh.put(NEWS, Ping(number))
+        await asyncio.sleep(2)
         return events
 
-    assert len(trace()) == 36
-    assert trace() == trace()
+    first, again = run(trace()), run(trace())
+    assert len(first) == 36
+    assert first == again

@@ -55,8 +55,5 @@ def test_time_stands_still_while_a_thread_works() -> None:
 
 
 def test_waiting_for_nothing_is_an_error_rather_than_a_hang() -> None:
-    async def story() -> None:
-        await asyncio.Event().wait()
-
     with pytest.raises(Deadlock):
-        run(story())
+        run(asyncio.Event().wait())

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from typing import Any
 
 from tests.mesh.kit import until
 from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.request import OpenArc
 from zscout.config.fleet import Fleet, default_fleet
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
 from zscout.mesh.supervision import StallWatch
+from zscout.messages import RcmState
 from zscout.services.rcm.candidate import Candidate
 from zscout.testing.memory import MemoryMesh, MemoryNetwork
-from zscout.types import SECOND
+from zscout.types import SECOND, Grant
 
 RC, OTHER = "robot/x", "robot/y"
 ECHO = {"name": "echo", "value": 7}
@@ -56,10 +60,37 @@ class SmallFleet:
         assert isinstance(leader, MemoryMesh)
         return leader
 
-    async def holders(self, rc: str = RC) -> list[str]:
-        state = await self.clients[0].state()
+    async def standby(self) -> MemoryMesh:
+        """Another candidate, which knows the leader."""
+        mesh = self.candidate("h1").mesh
+        assert isinstance(mesh, MemoryMesh)
+        await asyncio.sleep(2)
+        return mesh
+
+    async def lose_leader(self) -> None:
+        self.network.kill(self.leader())
+        await self.candidates.pop("h0").stop()
+
+    async def state(self, client: int = 0) -> RcmState:
+        state = await self.clients[client].state()
         assert state is not None
-        return [view.arc for view in state.holds if rc in view.needs]
+        return state
+
+    async def holders(self, rc: str = RC) -> list[str]:
+        return [view.arc for view in (await self.state()).holds if rc in view.needs]
+
+
+async def held(client: Client, name: str, **how: Any) -> tuple[OpenArc, Grant]:
+    """A request for RC that is granted."""
+    arc = await client.request(name, {RC: {}}, **({"min_runtime": 600} | how))
+    grant = await client.granted(arc)
+    assert grant is not None
+    return arc, grant
+
+
+def begin_move(old: Client, new: Client) -> None:
+    old.pause()
+    new.expect(old.open_requests())
 
 
 @asynccontextmanager

@@ -14,7 +14,7 @@ from msgspec.structs import asdict
 
 from tests.behaviors.client.small_fleet import RC, SmallFleet, small_fleet
 from tests.behaviors.client.test_open_arc import NOW, RUNS, TAKEN, WAITS, arc
-from tests.mesh.kit import run, until
+from tests.mesh.kit import until
 from tests.services.rcm.booked_fleet import Disk
 from zscout.behaviors.client.bookings import BookingsClient, RcmSilent
 from zscout.behaviors.client.client import Client, RequestRefused
@@ -55,7 +55,7 @@ def view(book: Operation) -> BookingView:
     return BookingView(**asdict(book), owner="b")
 
 
-def test_a_booking_is_asked_for_until_it_is_told_and_stays_one() -> None:
+async def test_a_booking_is_asked_for_until_it_is_told_and_stays_one() -> None:
     codes = ["busy", "not_leading", ""]
 
     def answer(query: IncomingQuery[Operation]) -> None:
@@ -63,74 +63,59 @@ def test_a_booking_is_asked_for_until_it_is_told_and_stays_one() -> None:
             raise Refused(code, "no")
         query.answer(view(query.message))
 
-    async def story() -> None:
-        leader = Leader(answer)
-        booked = await BookingsClient(leader.client).book(NEEDS, AT, 7200, name="survey", every=7, comment="a class")
-        assert len(leader.asked) == 3
-        first = leader.asked[0]
-        assert leader.asked == [first] * 3, "under one id"
-        assert isinstance(first, Book)
-        assert (booked.id, len(first.id)) == (first.id, 32)
-        assert (first.start, first.zone, first.every) == (int(AT.timestamp()), "Europe/Berlin", 7)
-        assert first.needs["radio/rf0"] == {"command_rate": Decimal("0.1")}
-        assert [first.runtime, first.patience] == [7200, 900]
-        assert first.who == Who("alice", "b", comment="a class")
-        terms = BookingsClient.terms(booked)
-        assert terms == {"needs": first.needs, "priority": 0, "min_runtime": 7200, "booking": first.id}
-
-    run(story())
+    leader = Leader(answer)
+    booked = await BookingsClient(leader.client).book(NEEDS, AT, 7200, name="survey", every=7, comment="a class")
+    assert len(leader.asked) == 3
+    first = leader.asked[0]
+    assert leader.asked == [first] * 3, "under one id"
+    assert isinstance(first, Book)
+    assert (booked.id, len(first.id)) == (first.id, 32)
+    assert (first.start, first.zone, first.every) == (int(AT.timestamp()), "Europe/Berlin", 7)
+    assert first.needs["radio/rf0"] == {"command_rate": Decimal("0.1")}
+    assert [first.runtime, first.patience] == [7200, 900]
+    assert first.who == Who("alice", "b", comment="a class")
+    terms = BookingsClient.terms(booked)
+    assert terms == {"needs": first.needs, "priority": 0, "min_runtime": 7200, "booking": first.id}
 
 
-def test_a_refusal_is_raised_at_once_and_silence_after_the_time_given() -> None:
-    async def story() -> None:
-        def refuse(_: object) -> None:
-            raise Refused("not_free", "robot/a is booked by bob")
+async def test_a_refusal_is_raised_at_once_and_silence_after_the_time_given() -> None:
+    def refuse(_: object) -> None:
+        raise Refused("not_free", "robot/a is booked by bob")
 
-        leader = Leader(refuse)
-        with pytest.raises(RequestRefused, match="booked by bob") as refused:
-            await BookingsClient(leader.client).slots(NEEDS, 60, 3600)
-        assert (refused.value.code, len(leader.asked)) == ("not_free", 1)
-        silent = Leader(lambda _: None)
-        began = asyncio.get_running_loop().time()
-        with pytest.raises(RcmSilent, match="it may be done or not"):
-            await BookingsClient(silent.client, timeout=12.0).unbook("x")
-        assert len(set(map(id, silent.asked))) >= 2
-        assert 12 <= asyncio.get_running_loop().time() - began < 20
-
-    run(story())
+    leader = Leader(refuse)
+    with pytest.raises(RequestRefused, match="booked by bob") as refused:
+        await BookingsClient(leader.client).slots(NEEDS, 60, 3600)
+    assert (refused.value.code, len(leader.asked)) == ("not_free", 1)
+    silent = Leader(lambda _: None)
+    began = asyncio.get_running_loop().time()
+    with pytest.raises(RcmSilent, match="it may be done or not"):
+        await BookingsClient(silent.client, timeout=12.0).unbook("x")
+    assert len(set(map(id, silent.asked))) >= 2
+    assert 12 <= asyncio.get_running_loop().time() - began < 20
 
 
-def test_an_rcm_that_knows_no_bookings_is_told_as_such() -> None:
-    async def story() -> None:
-        with pytest.raises(RcmSilent, match="does not tell of bookings; it may be older"):
-            await BookingsClient(Leader(lambda _: None).client).list()
-
-    run(story())
+async def test_an_rcm_that_knows_no_bookings_is_told_as_such() -> None:
+    with pytest.raises(RcmSilent, match="does not tell of bookings; it may be older"):
+        await BookingsClient(Leader(lambda _: None).client).list()
 
 
-def test_what_is_no_date_is_refused_before_anybody_is_asked() -> None:
-    async def story() -> None:
-        leader = Leader(lambda _: None)
-        bookings = BookingsClient(leader.client)
-        offset = AT.astimezone(timezone(timedelta(hours=1)))
-        for start, every, why in ((AT.replace(tzinfo=None), 0, "has no zone"), (offset, 7, "ZoneInfo")):
-            with pytest.raises(ValueError, match=why):
-                await bookings.book(NEEDS, start, 60, name="x", every=every)
-        with pytest.raises(ValueError, match="runtime"):
-            await bookings.book(NEEDS, AT, 0, name="x")
-        assert not leader.asked
-
-    run(story())
+async def test_what_is_no_date_is_refused_before_anybody_is_asked() -> None:
+    leader = Leader(lambda _: None)
+    bookings = BookingsClient(leader.client)
+    offset = AT.astimezone(timezone(timedelta(hours=1)))
+    for start, every, why in ((AT.replace(tzinfo=None), 0, "has no zone"), (offset, 7, "ZoneInfo")):
+        with pytest.raises(ValueError, match=why):
+            await bookings.book(NEEDS, start, 60, name="x", every=every)
+    with pytest.raises(ValueError, match="runtime"):
+        await bookings.book(NEEDS, AT, 0, name="x")
+    assert not leader.asked
 
 
 @pytest.mark.parametrize("start", [AT, AT.astimezone(UTC), AT.astimezone(timezone(timedelta(hours=1)))])
-def test_an_instant_is_one_in_any_zone(start: datetime) -> None:
-    async def story() -> None:
-        leader = Leader(lambda query: query.answer(view(query.message)))
-        booked = await BookingsClient(leader.client).book(NEEDS, start, 600, name="x")
-        assert [booked.start, booked.patience] == [int(AT.timestamp()), 600]
-
-    run(story())
+async def test_an_instant_is_one_in_any_zone(start: datetime) -> None:
+    leader = Leader(lambda query: query.answer(view(query.message)))
+    booked = await BookingsClient(leader.client).book(NEEDS, start, 600, name="x")
+    assert [booked.start, booked.patience] == [int(AT.timestamp()), 600]
 
 
 def test_the_date_that_an_rcm_has_linked_is_shown_to_the_next() -> None:
@@ -157,32 +142,28 @@ class BookedFleet(SmallFleet):
         return candidate
 
 
-def test_what_a_program_has_taken_up_it_has_at_its_date_though_the_leader_dies() -> None:
-    async def story() -> None:
-        async with small_fleet("one", "two", kind=BookedFleet) as (fleet, (one, two)):
-            fleet.candidate("h1")
-            bookings = BookingsClient(one)
-            start = datetime.fromtimestamp((await bookings.list()).time + 60, UTC)
-            booking = await bookings.book({RC: {}}, start, 30, name="survey", every=1, until=start + timedelta(days=3))
-            mine = await one.request("survey", **bookings.terms(booking))
-            assert (mine.state, mine.booking) == ("queued", f"{booking.id}@{booking.start}"), "the first date"
-            fleet.network.kill(fleet.leader())
-            del fleet.candidates["h0"]
-            await until(lambda: one.leader == "h1" and two.leader == "h1", within=30)
-            # What would not be over by then does not start, though it is asked for first.
-            long = await two.request("long", {RC: {}}, min_runtime=600)
-            assert await one.granted(mine) is not None
-            told = await bookings.list()
-            assert 0 <= told.time - booking.start < 1
-            [dates] = [view.dates for view in told.bookings]
-            assert [(date.state, date.arc) for date in dates][:2] == [("taken", f"h/one/{mine.id}"), ("open", None)]
-            assert mine.booking == f"{booking.id}@{booking.start}"
-            assert long.state == "queued"
-            # At its end it yields to who waits, and what asks for the booking anew has its next date.
-            assert await two.granted(long) is not None
-            assert 30 <= (await bookings.list()).time - booking.start < 32
-            assert mine.outcome == "completed"
-            again = await one.request("survey", **bookings.terms(booking))
-            assert again.booking == f"{booking.id}@{booking.start + 86_400}"
-
-    run(story())
+async def test_what_a_program_has_taken_up_it_has_at_its_date_though_the_leader_dies() -> None:
+    async with small_fleet("one", "two", kind=BookedFleet) as (fleet, (one, two)):
+        fleet.candidate("h1")
+        bookings = BookingsClient(one)
+        start = datetime.fromtimestamp((await bookings.list()).time + 60, UTC)
+        booking = await bookings.book({RC: {}}, start, 30, name="survey", every=1, until=start + timedelta(days=3))
+        mine = await one.request("survey", **bookings.terms(booking))
+        assert (mine.state, mine.booking) == ("queued", f"{booking.id}@{booking.start}"), "the first date"
+        await fleet.lose_leader()
+        await until(lambda: one.leader == "h1" and two.leader == "h1", within=30)
+        # What would not be over by then does not start, though it is asked for first.
+        long = await two.request("long", {RC: {}}, min_runtime=600)
+        assert await one.granted(mine) is not None
+        told = await bookings.list()
+        assert 0 <= told.time - booking.start < 1
+        [dates] = [view.dates for view in told.bookings]
+        assert [(date.state, date.arc) for date in dates][:2] == [("taken", f"h/one/{mine.id}"), ("open", None)]
+        assert mine.booking == f"{booking.id}@{booking.start}"
+        assert long.state == "queued"
+        # At its end it yields to who waits, and what asks for the booking anew has its next date.
+        assert await two.granted(long) is not None
+        assert 30 <= (await bookings.list()).time - booking.start < 32
+        assert mine.outcome == "completed"
+        again = await one.request("survey", **bookings.terms(booking))
+        assert again.booking == f"{booking.id}@{booking.start + 86_400}"

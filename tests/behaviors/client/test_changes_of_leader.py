@@ -8,8 +8,8 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, SmallFleet, small_fleet
-from tests.mesh.kit import run, until
+from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, SmallFleet, held, small_fleet
+from tests.mesh.kit import until
 from zscout.behaviors.client.arc import hold
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import OpenArc
@@ -23,113 +23,91 @@ from zscout.testing.memory import MemoryMesh, MemoryTransport
 from zscout.types import SECOND, Place, Term
 
 
-def test_a_queued_request_that_the_next_leader_refuses_ends(monkeypatch: pytest.MonkeyPatch) -> None:
-    async def test() -> None:
-        async with small_fleet("one", "two") as (fleet, (one, two)):
-            fleet.candidate("h1")
-            await one.granted(await one.request("first", {RC: {}}, priority=5, min_runtime=600))
-            waits = await two.request("second", {RC: {}}, priority=5, min_runtime=600)
-            monkeypatch.setattr(request_handler, "MAX_PRIORITY", 4)
-            fleet.network.kill(fleet.leader())
-            del fleet.candidates["h0"]
-            # The new leader does not hear of it while it takes the lead.
-            link = fleet.network.link(two.mesh, fleet.candidates["h1"].mesh)
-            link.loss = 1.0
-            await until(lambda: one.leader == "h1")
-            await asyncio.sleep(1)
-            link.loss = 0.0
-            await until(lambda: waits.state == "ended", within=20)
-            assert waits.outcome == "lost"
-            assert waits.reason == "the RCM refuses it: priority must lie between -4 and 4"
-            assert await two.granted(waits) is None
-            assert two.open_requests() == []
-
-    run(test())
+async def test_a_queued_request_that_the_next_leader_refuses_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with small_fleet("one", "two") as (fleet, (one, two)):
+        fleet.candidate("h1")
+        await one.granted(await one.request("first", {RC: {}}, priority=5, min_runtime=600))
+        waits = await two.request("second", {RC: {}}, priority=5, min_runtime=600)
+        monkeypatch.setattr(request_handler, "MAX_PRIORITY", 4)
+        await fleet.lose_leader()
+        # The new leader does not hear of it while it takes the lead.
+        link = fleet.network.link(two.mesh, fleet.candidates["h1"].mesh)
+        link.loss = 1.0
+        await until(lambda: one.leader == "h1")
+        await asyncio.sleep(1)
+        link.loss = 0.0
+        await until(lambda: waits.state == "ended", within=20)
+        assert waits.outcome == "lost"
+        assert waits.reason == "the RCM refuses it: priority must lie between -4 and 4"
+        assert await two.granted(waits) is None
+        assert two.open_requests() == []
 
 
-def test_holds_and_places_outlive_a_change_of_leader() -> None:
-    async def test() -> None:
-        async with small_fleet("one", "two", "three") as (fleet, (one, two, three)):
-            fleet.candidate("h1")
-            async with hold(one, "first", {RC: {}}, min_runtime=60) as held:
-                waits = [await client.request("next", {RC: {}}, min_runtime=60) for client in (two, three)]
-                places, term = [arc.place for arc in waits], one.term
-                fleet.network.kill(fleet.leader())
-                del fleet.candidates["h0"]
-                await until(lambda: one.leader == "h1" and all(c.term > term for c in (one, two, three)))
-                assert held.active
-                assert (await held.command(RC, ECHO)).result == 7
-                # Each asks again, and keeps its place.
-                await asyncio.sleep(7)
-                assert [(arc.state, arc.place) for arc in waits] == [("queued", place) for place in places]
-            assert await two.granted(waits[0]) is not None
-
-    run(test())
+async def test_holds_and_places_outlive_a_change_of_leader() -> None:
+    async with small_fleet("one", "two", "three") as (fleet, (one, two, three)):
+        fleet.candidate("h1")
+        async with hold(one, "first", {RC: {}}, min_runtime=60) as held:
+            waits = [await client.request("next", {RC: {}}, min_runtime=60) for client in (two, three)]
+            places, term = [arc.place for arc in waits], one.term
+            await fleet.lose_leader()
+            await until(lambda: one.leader == "h1" and all(c.term > term for c in (one, two, three)))
+            assert held.active
+            assert (await held.command(RC, ECHO)).result == 7
+            # Each asks again, and keeps its place.
+            await asyncio.sleep(7)
+            assert [(arc.state, arc.place) for arc in waits] == [("queued", place) for place in places]
+        assert await two.granted(waits[0]) is not None
 
 
 @pytest.mark.parametrize("missing", [Role.SESSION, "requests"], ids=["it answers", "its session is seen"])
-def test_who_shows_a_new_leader_that_it_lives_is_not_dropped_though_its_token_is_missing(missing: str) -> None:
+async def test_who_shows_a_new_leader_that_it_lives_is_not_dropped_though_its_token_is_missing(missing: str) -> None:
     """As where links came back without all declarations while another led, and nobody noticed."""
-
-    async def test() -> None:
-        async with small_fleet("watch", "one") as (fleet, (watch, one)):
-            next_leader = fleet.candidate("h1").mesh
-            assert isinstance(next_leader, MemoryMesh)
-            before, client = (mesh._transport.current for mesh in (next_leader, one.mesh))
-            assert isinstance(before, MemoryTransport)
-            assert isinstance(client, MemoryTransport)
-            await asyncio.sleep(0.1)
-            link = fleet.network.link(one.mesh, next_leader)
-            hidden = f"/{Role.CLIENT}/one/", f"/{missing}"
-            link.hidden = {one for one in client.declarations() if any(part in str(one) for part in hidden)}
-            before.disconnected(client)
-            for token in client.declared:
-                if token not in link.hidden:
-                    before.on_token(client, token, True)
-            async with hold(one, "first", {RC: {}}, min_runtime=600) as held:
-                outcomes: list[str | None] = []
-                one.watch(lambda arc: outcomes.append(arc.outcome))
-                fleet.network.kill(fleet.leader())
-                del fleet.candidates["h0"]
-                await until(lambda: watch.leader == "h1")
-                await until(lambda: next_leader._transport.current is not before, within=10)
-                await asyncio.sleep(10)
-                assert held.active
-                assert "client_lost" not in outcomes
-
-    run(test())
+    async with small_fleet("watch", "one") as (fleet, (watch, one)):
+        next_leader = fleet.candidate("h1").mesh
+        assert isinstance(next_leader, MemoryMesh)
+        before, client = (mesh._transport.current for mesh in (next_leader, one.mesh))
+        assert isinstance(before, MemoryTransport)
+        assert isinstance(client, MemoryTransport)
+        await asyncio.sleep(0.1)
+        link = fleet.network.link(one.mesh, next_leader)
+        hidden = f"/{Role.CLIENT}/one/", f"/{missing}"
+        link.hidden = {one for one in client.declarations() if any(part in str(one) for part in hidden)}
+        before.disconnected(client)
+        for token in client.declared:
+            if token not in link.hidden:
+                before.on_token(client, token, True)
+        async with hold(one, "first", {RC: {}}, min_runtime=600) as held:
+            outcomes: list[str | None] = []
+            one.watch(lambda arc: outcomes.append(arc.outcome))
+            await fleet.lose_leader()
+            await until(lambda: watch.leader == "h1")
+            await until(lambda: next_leader._transport.current is not before, within=10)
+            await asyncio.sleep(10)
+            assert held.active
+            assert "client_lost" not in outcomes
 
 
-def test_without_an_rcm_a_hold_ends_after_its_lease_and_is_asked_again() -> None:
-    async def test() -> None:
-        async with small_fleet("one") as (fleet, (one,)):
-            arc = await one.request("first", {RC: {}}, min_runtime=600)
-            assert await one.granted(arc) is not None
-            await fleet.candidates.pop("h0").stop()
-            await until(lambda: arc.state == "asking", within=FLEET.timing.hold_lease / SECOND + 1)
-            assert arc.ending is not None
-            assert arc.ending.outcome == "lost"
-            fleet.candidate("h1")
-            assert await one.granted(arc) is not None
-
-    run(test())
+async def test_without_an_rcm_a_hold_ends_after_its_lease_and_is_asked_again() -> None:
+    async with small_fleet("one") as (fleet, (one,)):
+        arc, _ = await held(one, "first")
+        await fleet.candidates.pop("h0").stop()
+        await until(lambda: arc.state == "asking", within=FLEET.timing.hold_lease / SECOND + 1)
+        assert arc.ending is not None
+        assert arc.ending.outcome == "lost"
+        fleet.candidate("h1")
+        assert await one.granted(arc) is not None
 
 
-def test_an_rcm_far_above_is_followed_once_no_other_is_heard() -> None:
+async def test_an_rcm_far_above_is_followed_once_no_other_is_heard() -> None:
     """As where the fleet had to go above a forged term while this client was cut off."""
-
-    async def test() -> None:
-        async with small_fleet("one") as (fleet, (one,)):
-            await until(lambda: one.term.counter)
-            await fleet.candidates.pop("h0").stop()
-            candidate = fleet.candidates["h1"] = Candidate(fleet.mesh("h1", "node"), FLEET)
-            candidate.known = far = Term(10**9, "far")
-            candidate.start()
-            await until(lambda: one.term > far, within=FLEET.timing.hold_lease / SECOND + 3)
-            arc = await one.request("first", {RC: {}}, min_runtime=600)
-            assert await one.granted(arc) is not None
-
-    run(test())
+    async with small_fleet("one") as (fleet, (one,)):
+        await until(lambda: one.term.counter)
+        await fleet.candidates.pop("h0").stop()
+        candidate = fleet.candidates["h1"] = Candidate(fleet.mesh("h1", "node"), FLEET)
+        candidate.known = far = Term(10**9, "far")
+        candidate.start()
+        await until(lambda: one.term > far, within=FLEET.timing.hold_lease / SECOND + 3)
+        await held(one, "first")
 
 
 @asynccontextmanager
@@ -151,43 +129,33 @@ async def granted_unheard() -> AsyncIterator[tuple[SmallFleet, Client, OpenArc, 
         yield fleet, two, waits, declared
 
 
-def test_when_one_of_two_rcms_goes_the_other_is_asked_at_once() -> None:
+async def test_when_one_of_two_rcms_goes_the_other_is_asked_at_once() -> None:
     """Its answer may have come second, and nobody read it."""
-
-    async def test() -> None:
-        async with granted_unheard() as (_, _, waits, old):
-            for one in old:
-                one.close()
-            await until(lambda: waits.state == "running", within=0.1)
-
-    run(test())
+    async with granted_unheard() as (_, _, waits, old):
+        for one in old:
+            one.close()
+        await until(lambda: waits.state == "running", within=0.1)
 
 
-def test_what_changes_while_all_is_asked_for_again_has_it_asked_once_more() -> None:
-    async def test() -> None:
-        async with small_fleet("one", "two") as (fleet, (one, two)):
-            first = await one.request("first", {RC: {}}, min_runtime=600, keep=True)
-            waits = await two.request("second", {RC: {}}, min_runtime=600)
-            await asyncio.sleep(0.5)
-            fleet.network.disturb({"notice": Disturbance(lost=1.0)})
-            fleet.network.link(fleet.leader(), two.mesh).delay = 0.5
-            token = fleet.mesh("other", "node").alive(Token("other", Role.RCM, "node", "other"))
-            await asyncio.sleep(0.1)  # the question is answered, and the answer on its way
-            await one.end(first)
-            token.close()
-            await until(lambda: waits.state == "running", within=1.5)
-
-    run(test())
+async def test_what_changes_while_all_is_asked_for_again_has_it_asked_once_more() -> None:
+    async with small_fleet("one", "two") as (fleet, (one, two)):
+        first = await one.request("first", {RC: {}}, min_runtime=600, keep=True)
+        waits = await two.request("second", {RC: {}}, min_runtime=600)
+        await asyncio.sleep(0.5)
+        fleet.network.disturb({"notice": Disturbance(lost=1.0)})
+        fleet.network.link(fleet.leader(), two.mesh).delay = 0.5
+        token = fleet.mesh("other", "node").alive(Token("other", Role.RCM, "node", "other"))
+        await asyncio.sleep(0.1)  # the question is answered, and the answer on its way
+        await one.end(first)
+        token.close()
+        await until(lambda: waits.state == "running", within=1.5)
 
 
-def test_the_answer_of_an_rcm_that_has_been_replaced_is_none() -> None:
-    async def test() -> None:
-        async with granted_unheard() as (fleet, two, waits, _):
-            answers = fleet.network.link(fleet.leader(), two.mesh)
-            answers.loss = 1.0
-            fleet.mesh("third", "node").alive(Token("third", Role.RCM, "node", "third"))
-            await asyncio.sleep(0.5)
-            answers.loss = 0.0
-            await until(lambda: waits.state == "running", within=1.3)
-
-    run(test())
+async def test_the_answer_of_an_rcm_that_has_been_replaced_is_none() -> None:
+    async with granted_unheard() as (fleet, two, waits, _):
+        answers = fleet.network.link(fleet.leader(), two.mesh)
+        answers.loss = 1.0
+        fleet.mesh("third", "node").alive(Token("third", Role.RCM, "node", "third"))
+        await asyncio.sleep(0.5)
+        answers.loss = 0.0
+        await until(lambda: waits.state == "running", within=1.3)

@@ -15,37 +15,31 @@ from zscout.testing.link import kind_of
 from zscout.types import SECOND
 
 
-def test_a_body_is_entered_at_the_grant_and_asks_each_host_once() -> None:
-    async def test() -> None:
-        async with small_fleet("one") as (_, (one,)):
-            asked: list[str] = []
-            get = one.mesh._transport.get
+async def test_a_body_is_entered_at_the_grant_and_asks_each_host_once() -> None:
+    async with small_fleet("one") as (_, (one,)):
+        asked: list[str] = []
+        get = one.mesh._transport.get
 
-            def listed(key: str, *rest: Any) -> None:
-                asked.append(kind_of(key))
-                get(key, *rest)
+        def listed(key: str, *rest: Any) -> None:
+            asked.append(kind_of(key))
+            get(key, *rest)
 
-            one.mesh._transport.get = listed  # type: ignore[assignment,method-assign]
-            async with hold(one, "first", {RC: {}, OTHER: {}}) as held:
-                assert {*asked} == {"schedule"}
-                assert held.arc.hosts == {RC: "devices", OTHER: "devices"}
-                assert await held.confirmed()
-                assert [one for one in asked if one != "schedule"] == ["confirm"]
-                assert (await held.command(RC, ECHO)).result == 7
-
-    run(test())
+        one.mesh._transport.get = listed  # type: ignore[assignment,method-assign]
+        async with hold(one, "first", {RC: {}, OTHER: {}}) as held:
+            assert {*asked} == {"schedule"}
+            assert held.arc.hosts == {RC: "devices", OTHER: "devices"}
+            assert await held.confirmed()
+            assert [one for one in asked if one != "schedule"] == ["confirm"]
+            assert (await held.command(RC, ECHO)).result == 7
 
 
-def test_what_is_commanded_before_the_publication_waits_for_it_at_the_rc() -> None:
-    async def test() -> None:
-        async with small_fleet("one") as (fleet, (one,)):
-            fleet.network.link(fleet.leader(), fleet.devices).delay = 0.2
-            async with hold(one, "first", {RC: {}}) as held:
-                began = one.mesh.now()
-                assert (await held.command(RC, ECHO)).result == 7
-                assert 0.1 * SECOND < one.mesh.now() - began < 0.25 * SECOND
-
-    run(test())
+async def test_what_is_commanded_before_the_publication_waits_for_it_at_the_rc() -> None:
+    async with small_fleet("one") as (fleet, (one,)):
+        fleet.network.link(fleet.leader(), fleet.devices).delay = 0.2
+        async with hold(one, "first", {RC: {}}) as held:
+            began = one.mesh.now()
+            assert (await held.command(RC, ECHO)).result == 7
+            assert 0.1 * SECOND < one.mesh.now() - began < 0.25 * SECOND
 
 
 @pytest.mark.parametrize("again", [False, True])

@@ -7,8 +7,8 @@ import logging
 
 import pytest
 
-from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, small_fleet
-from tests.mesh.kit import run, until
+from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, held, small_fleet
+from tests.mesh.kit import until
 from zscout.behaviors.client.confirmation import CONFIRM_TIMEOUT
 from zscout.behaviors.client.request import CommandRefused
 from zscout.scheduling.model import HOLD_BACK
@@ -17,79 +17,63 @@ from zscout.testing.memory import MemoryMesh, MemoryTransport
 from zscout.types import SECOND
 
 
-def test_a_hold_is_over_when_its_rc_says_so_though_no_notice_does() -> None:
-    async def test() -> None:
-        async with small_fleet("one", "two") as (fleet, (one, two)):
-            arc = await one.request("first", {RC: {}}, min_runtime=600)
-            grant = await one.granted(arc)
-            assert grant is not None
-            fleet.network.disturb({"notice": Disturbance(lost=1.0)})
-            await two.granted(await two.request("operator", {RC: {}}, priority=9, min_runtime=600))
-            with pytest.raises(CommandRefused, match="is over"):
-                await one.command(RC, grant, ECHO)
-            await until(lambda: arc.grant is None, within=1.5)
-            await until(lambda: arc.state == "queued", within=1.0)
-
-    run(test())
+async def test_a_hold_is_over_when_its_rc_says_so_though_no_notice_does() -> None:
+    async with small_fleet("one", "two") as (fleet, (one, two)):
+        arc, grant = await held(one, "first")
+        fleet.network.disturb({"notice": Disturbance(lost=1.0)})
+        await two.granted(await two.request("operator", {RC: {}}, priority=9, min_runtime=600))
+        with pytest.raises(CommandRefused, match="is over"):
+            await one.command(RC, grant, ECHO)
+        await until(lambda: arc.grant is None, within=1.5)
+        await until(lambda: arc.state == "queued", within=1.0)
 
 
 @pytest.mark.parametrize("cut", [0.9, 1.5, 8.0])
-def test_a_client_that_sees_its_rc_anew_is_granted_at_once(cut: float) -> None:
+async def test_a_client_that_sees_its_rc_anew_is_granted_at_once(cut: float) -> None:
     """Not when what was held back longer each time is over: nobody else was cut off."""
-
-    async def test() -> None:
-        async with small_fleet("one") as (fleet, (one,)):
-            network, (client, rc) = fleet.network, (one.mesh, fleet.devices)
-            for source, target in ((client, rc), (rc, client)):
-                network.cut(source, target)
-            arc = await one.request("first", {RC: {}}, min_runtime=600)
-            granting = asyncio.create_task(one.granted(arc, confirmed=True))
-            await asyncio.sleep(cut)
-            assert not granting.done()
-            network.heal()
-            await asyncio.wait_for(granting, 0.3 if cut > CONFIRM_TIMEOUT else HOLD_BACK / SECOND)
-
-    run(test())
+    async with small_fleet("one") as (fleet, (one,)):
+        network, (client, rc) = fleet.network, (one.mesh, fleet.devices)
+        for source, target in ((client, rc), (rc, client)):
+            network.cut(source, target)
+        arc = await one.request("first", {RC: {}}, min_runtime=600)
+        granting = asyncio.create_task(one.granted(arc, confirmed=True))
+        await asyncio.sleep(cut)
+        assert not granting.done()
+        network.heal()
+        await asyncio.wait_for(granting, 0.3 if cut > CONFIRM_TIMEOUT else HOLD_BACK / SECOND)
 
 
-def test_what_was_given_up_unheard_is_withdrawn_once_an_rcm_answers() -> None:
-    async def test() -> None:
-        async with small_fleet("one", "two") as (fleet, (one, two)):
-            arc = await one.request("first", {RC: {}}, min_runtime=600, keep=True)
-            await one.granted(arc)
-            waits = await two.request("second", {RC: {}}, min_runtime=600)
-            link = fleet.network.link(one.mesh, fleet.leader())
-            link.loss = 1.0
-            await one.end(arc)
-            link.loss = 0.0
-            assert await fleet.holders() == ["first"]
-            await until(lambda: waits.state == "running", within=7)
-
-    run(test())
+async def test_what_was_given_up_unheard_is_withdrawn_once_an_rcm_answers() -> None:
+    async with small_fleet("one", "two") as (fleet, (one, two)):
+        arc, _ = await held(one, "first", keep=True)
+        waits = await two.request("second", {RC: {}}, min_runtime=600)
+        link = fleet.network.link(one.mesh, fleet.leader())
+        link.loss = 1.0
+        await one.end(arc)
+        link.loss = 0.0
+        assert await fleet.holders() == ["first"]
+        await until(lambda: waits.state == "running", within=7)
 
 
-def test_what_had_its_time_before_its_client_heard_of_it_is_asked_for_anew_at_its_place() -> None:
-    async def test() -> None:
-        async with small_fleet("one", "two") as (fleet, (one, two)):
-            first = await one.request("first", {RC: {}}, min_runtime=600, keep=True)
-            waits = await two.request("second", {RC: {}}, min_runtime=0.5, keep=False)
-            known_as, place = waits.id, waits.place
-            fleet.network.disturb({"notice": Disturbance(lost=1.0)})
-            await one.end(first)
-            assert await fleet.holders() == ["second"]
-            await asyncio.sleep(1)
-            fleet.network.disturb({})
-            assert waits.state == "queued"
-            assert await two.granted(waits) is not None
-            assert (waits.id != known_as, waits.place) == (True, place)
-
-    run(test())
+async def test_what_had_its_time_before_its_client_heard_of_it_is_asked_for_anew_at_its_place() -> None:
+    async with small_fleet("one", "two") as (fleet, (one, two)):
+        first = await one.request("first", {RC: {}}, min_runtime=600, keep=True)
+        waits = await two.request("second", {RC: {}}, min_runtime=0.5, keep=False)
+        known_as, place = waits.id, waits.place
+        fleet.network.disturb({"notice": Disturbance(lost=1.0)})
+        await one.end(first)
+        assert await fleet.holders() == ["second"]
+        await asyncio.sleep(1)
+        fleet.network.disturb({})
+        assert waits.state == "queued"
+        assert await two.granted(waits) is not None
+        assert (waits.id != known_as, waits.place) == (True, place)
 
 
-def test_a_client_that_hears_no_publication_of_an_rcm_that_it_sees_joins_the_mesh_anew(
+async def test_a_client_that_hears_no_publication_of_an_rcm_that_it_sees_joins_the_mesh_anew(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    async def test() -> None:
+    with caplog.at_level(logging.WARNING, "zscout.mesh"):
         async with small_fleet("one") as (fleet, (one,)):
             await one.request("absent", {"robot/z": {}}, min_runtime=60)
             await asyncio.sleep(60)
@@ -98,64 +82,49 @@ def test_a_client_that_hears_no_publication_of_an_rcm_that_it_sees_joins_the_mes
             fleet.network.disturb({"grants": Disturbance(lost=1.0)})
             await until(lambda: one.mesh._transport.id() != before)
             fleet.network.disturb({})
-
-    with caplog.at_level(logging.WARNING, "zscout.mesh"):
-        run(test())
     said = {record.message.partition(": this process")[0] for record in caplog.records}
     assert "an RCM is seen that does not publish" in said
 
 
 @pytest.mark.parametrize("whose", ["client", "RC"])
-def test_a_hold_goes_on_under_a_leader_that_does_not_know_who_listens_to_it(whose: str) -> None:
+async def test_a_hold_goes_on_under_a_leader_that_does_not_know_who_listens_to_it(whose: str) -> None:
     """Links came back without the subscription of what RCMs publish, long before this one led."""
-
-    async def test() -> None:
-        async with small_fleet("one") as (fleet, (one,)):
-            arc = await one.request("first", {RC: {}}, min_runtime=600)
-            grant = await one.granted(arc)
-            next_leader = fleet.candidate("h1").mesh
-            listening = one.mesh if whose == "client" else fleet.devices
-            assert isinstance(next_leader, MemoryMesh)
-            assert isinstance(listening, MemoryMesh)
-            await asyncio.sleep(2)
-            transport = listening._transport.current
-            assert isinstance(transport, MemoryTransport)
-            hidden = [known for known in transport.subscribers.all if known[0] == listening.keys.grants]
-            assert hidden
-            fleet.network.link(listening, next_leader).hidden = {*hidden}
-            fleet.network.kill(fleet.leader())
-            await fleet.candidates.pop("h0").stop()
-            states: list[str] = []
-            one.watch(lambda arc: states.append(arc.state))
-            await until(lambda: one.leader == "h1")
-            await asyncio.sleep(10)
-            assert (arc.grant, {*states}) == (grant, {"running"})
-
-    run(test())
+    async with small_fleet("one") as (fleet, (one,)):
+        arc = await one.request("first", {RC: {}}, min_runtime=600)
+        grant = await one.granted(arc)
+        next_leader = await fleet.standby()
+        listening = one.mesh if whose == "client" else fleet.devices
+        assert isinstance(listening, MemoryMesh)
+        transport = listening._transport.current
+        assert isinstance(transport, MemoryTransport)
+        hidden = [known for known in transport.subscribers.all if known[0] == listening.keys.grants]
+        assert hidden
+        fleet.network.link(listening, next_leader).hidden = {*hidden}
+        await fleet.lose_leader()
+        states: list[str] = []
+        one.watch(lambda arc: states.append(arc.state))
+        await until(lambda: one.leader == "h1")
+        await asyncio.sleep(10)
+        assert (arc.grant, {*states}) == (grant, {"running"})
 
 
-def test_a_leader_that_is_asked_by_whom_it_does_not_see_joins_the_mesh_anew() -> None:
+async def test_a_leader_that_is_asked_by_whom_it_does_not_see_joins_the_mesh_anew() -> None:
     """Links came back without its token, its subscription of notices and its `requests`: what it asks arrives, and it
     hears what is published."""
-
-    async def test() -> None:
-        async with small_fleet("one", "two") as (fleet, (one, _)):
-            arc = await one.request("first", {RC: {}}, min_runtime=600)
-            await one.granted(arc)
-            leader, asking = fleet.leader(), one.mesh
-            assert isinstance(asking, MemoryMesh)
-            before, client = leader._transport.current, asking._transport.current
-            assert isinstance(before, MemoryTransport)
-            assert isinstance(client, MemoryTransport)
-            heard = [known for known in client.subscribers.all if known[0] == one.mesh.keys.grants]
-            fleet.network.link(one.mesh, leader).hidden = {*client.declarations()} - {*heard}
-            before.disconnected(client)
-            await until(lambda: leader._transport.current is not before)
-            await asyncio.sleep(FLEET.mesh.lease + 1)
-            outcomes: list[str | None] = []
-            one.watch(lambda arc: outcomes.append(arc.outcome))
-            await asyncio.sleep(10)
-            assert arc.state == "running"
-            assert "client_lost" not in outcomes
-
-    run(test())
+    async with small_fleet("one", "two") as (fleet, (one, _)):
+        arc, _ = await held(one, "first")
+        leader, asking = fleet.leader(), one.mesh
+        assert isinstance(asking, MemoryMesh)
+        before, client = leader._transport.current, asking._transport.current
+        assert isinstance(before, MemoryTransport)
+        assert isinstance(client, MemoryTransport)
+        heard = [known for known in client.subscribers.all if known[0] == one.mesh.keys.grants]
+        fleet.network.link(one.mesh, leader).hidden = {*client.declarations()} - {*heard}
+        before.disconnected(client)
+        await until(lambda: leader._transport.current is not before)
+        await asyncio.sleep(FLEET.mesh.lease + 1)
+        outcomes: list[str | None] = []
+        one.watch(lambda arc: outcomes.append(arc.outcome))
+        await asyncio.sleep(10)
+        assert arc.state == "running"
+        assert "client_lost" not in outcomes

@@ -14,7 +14,6 @@ import msgspec
 import pytest
 
 from tests.behaviors.client.small_fleet import small_fleet
-from tests.mesh import kit
 from zscout.behaviors.client.arc import Held, Revoked, hold
 from zscout.behaviors.client.client import Client, CommandRefused
 from zscout.behaviors.client.request import OpenArc, RequestStore
@@ -213,37 +212,34 @@ def test_what_moved_and_is_taken_back_keeps_its_place_and_its_wait(held: bool) -
     assert known.take(notice(1, "running", grant=FIRST, remaining=5.0, term=OLD), NOW + 3 * SECOND)
 
 
-def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_later() -> None:
-    async def story() -> None:
-        store = RequestStore(lambda: NOW)
-        known = arc()
-        store.add(known)
-        store.take(known, RUNS)
-        store.resumed.clear()
-        gone = notice(9, "ended", outcome="handed_over", grant=FIRST)
-        store.take(known, gone)
-        assert (known.state, store.acknowledged) == ("running", [known])
-        store.move(known, notice(10, "running", client="h/new", grant=SECOND_GRANT))
-        assert (store.open, store.moved, known.last) == ([], {"id": known}, (TERM, 10))
-        # What is expected is told of without a place: the RCs decide whose it is.
-        store.expected["other"] = OpenArc.expected(msgspec.structs.replace(EXPECTED, id="other"), NOW)
-        assert [(told.id, told.place, told.grant) for told in store.open_requests()] == [("other", None, None)]
-        store.resumed.set()
-        store.reclaim(known)
-        assert (list(store.arcs), store.moved, known.state) == ([known.id], {}, "asking")
-        assert known.id != "id"
-        # Of what may have been handed over it is told so afterwards: once more it is its own, elsewhere over.
-        store.reclaimed = {second := known.id}
-        store.take(known, notice(1, "ended", id=second, outcome="handed_over"))
-        assert (list(store.arcs), known.state) == ([known.id], "asking")
-        assert known.id != second
-        # A second answer about the old id says nothing of the new one.
-        store.take(known, notice(2, "ended", id=second, outcome="handed_over"))
-        assert known.state == "asking"
-        store.take(known, notice(2, "ended", id=known.id, outcome="handed_over"))
-        assert (store.arcs, known.state) == ({}, "ended")
-
-    asyncio.run(story())
+async def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_later() -> None:
+    store = RequestStore(lambda: NOW)
+    known = arc()
+    store.add(known)
+    store.take(known, RUNS)
+    store.resumed.clear()
+    gone = notice(9, "ended", outcome="handed_over", grant=FIRST)
+    store.take(known, gone)
+    assert (known.state, store.acknowledged) == ("running", [known])
+    store.move(known, notice(10, "running", client="h/new", grant=SECOND_GRANT))
+    assert (store.open, store.moved, known.last) == ([], {"id": known}, (TERM, 10))
+    # What is expected is told of without a place: the RCs decide whose it is.
+    store.expected["other"] = OpenArc.expected(msgspec.structs.replace(EXPECTED, id="other"), NOW)
+    assert [(told.id, told.place, told.grant) for told in store.open_requests()] == [("other", None, None)]
+    store.resumed.set()
+    store.reclaim(known)
+    assert (list(store.arcs), store.moved, known.state) == ([known.id], {}, "asking")
+    assert known.id != "id"
+    # Of what may have been handed over it is told so afterwards: once more it is its own, elsewhere over.
+    store.reclaimed = {second := known.id}
+    store.take(known, notice(1, "ended", id=second, outcome="handed_over"))
+    assert (list(store.arcs), known.state) == ([known.id], "asking")
+    assert known.id != second
+    # A second answer about the old id says nothing of the new one.
+    store.take(known, notice(2, "ended", id=second, outcome="handed_over"))
+    assert known.state == "asking"
+    store.take(known, notice(2, "ended", id=known.id, outcome="handed_over"))
+    assert (store.arcs, known.state) == ({}, "ended")
 
 
 @pytest.mark.parametrize(
@@ -255,102 +251,91 @@ def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_lat
         (["failed"], "failed"),
     ],
 )
-def test_what_its_rc_does_not_confirm_is_asked_for_again_at_its_place(answers: list[str | None], told: Any) -> None:
-    async def story() -> None:
-        client = Client(mesh(lambda: NOW), default_fleet())
-        known = arc("robot/a")
-        client._store.add(known)
-        known.take(runs({}), NOW)
-        ended: list[OpenArc] = []
-        asked: list[Any] = []
+async def test_what_its_rc_does_not_confirm_is_asked_for_again_at_its_place(
+    answers: list[str | None], told: Any
+) -> None:
+    client = Client(mesh(lambda: NOW), default_fleet())
+    known = arc("robot/a")
+    client._store.add(known)
+    known.take(runs({}), NOW)
+    ended, asked = list[OpenArc](), list[Any]()
 
-        async def command(rc: str, *_: Any, **__: Any) -> Done:
-            if (code := answers.pop(0)) is not None:
-                raise CommandRefused(rc, Problem(code, code))
-            return Done()
+    async def command(rc: str, *_: Any, **__: Any) -> Done:
+        if (code := answers.pop(0)) is not None:
+            raise CommandRefused(rc, Problem(code, code))
+        return Done()
 
-        async def end(given_up: OpenArc) -> None:
-            ended.append(given_up)
+    async def end(given_up: OpenArc) -> None:
+        ended.append(given_up)
 
-        async def submit(again: OpenArc) -> None:
-            assert (again.state, again.grant) == ("asking", None)
-            ask = again.ask(NOW)
-            asked.append((ask.grant, ask.unconfirmed))
-            again.take(runs({}, 3, SECOND_GRANT), NOW)
-            client._store.notify(again)
-            assert again.ask(NOW).unconfirmed == []
+    async def submit(again: OpenArc) -> None:
+        assert (again.state, again.grant) == ("asking", None)
+        ask = again.ask(NOW)
+        asked.append((ask.grant, ask.unconfirmed))
+        again.take(runs({}, 3, SECOND_GRANT), NOW)
+        client._store.notify(again)
+        assert again.ask(NOW).unconfirmed == []
 
-        client._confirmations._command = command
-        client.end, client._rcm.submit = end, submit  # type: ignore[assignment,method-assign]
-        if told == "failed":
-            with pytest.raises(CommandRefused, match="failed"):
-                await client.granted(known, confirmed=True)
-            assert (ended, asked) == ([known], [])
-        else:
-            assert await client.granted(known, confirmed=True) == (FIRST if told is None else SECOND_GRANT)
-            assert (ended, asked) == ([], [] if told is None else [told])
-        assert answers == []
-
-    asyncio.run(story())
+    client._confirmations._command = command
+    client.end, client._rcm.submit = end, submit  # type: ignore[assignment,method-assign]
+    if told == "failed":
+        with pytest.raises(CommandRefused, match="failed"):
+            await client.granted(known, confirmed=True)
+        assert (ended, asked) == ([known], [])
+    else:
+        assert await client.granted(known, confirmed=True) == (FIRST if told is None else SECOND_GRANT)
+        assert (ended, asked) == ([], [] if told is None else [told])
+    assert answers == []
 
 
-def test_a_grant_is_confirmed_by_an_rc_whose_link_comes_within_the_second() -> None:
-    async def story() -> None:
-        loop = asyncio.get_running_loop()
-        client, known = Client(mesh(lambda: round(loop.time() * SECOND)), default_fleet()), arc()
-        known.take(runs({}), client.mesh.now())
-        linked = loop.time() + 0.99
+async def test_a_grant_is_confirmed_by_an_rc_whose_link_comes_within_the_second() -> None:
+    loop = asyncio.get_running_loop()
+    client, known = Client(mesh(lambda: round(loop.time() * SECOND)), default_fleet()), arc()
+    known.take(runs({}), client.mesh.now())
+    linked = loop.time() + 0.99
 
-        async def command(rc: str, *_: Any, **__: Any) -> Done:
-            if loop.time() < linked:
-                raise CommandRefused(rc, Problem("unknown", "no answer, at once"))
-            return Done()
+    async def command(rc: str, *_: Any, **__: Any) -> Done:
+        if loop.time() < linked:
+            raise CommandRefused(rc, Problem("unknown", "no answer, at once"))
+        return Done()
 
-        client._confirmations._command = command
-        assert await client.granted(known, confirmed=True) == FIRST
-
-    kit.run(story())
+    client._confirmations._command = command
+    assert await client.granted(known, confirmed=True) == FIRST
 
 
-def test_a_client_that_stood_still_itself_gives_its_rcs_a_second_all_the_same() -> None:
-    async def story() -> None:
-        loop, still = asyncio.get_running_loop(), 0.0
-        client, known = Client(mesh(lambda: round((loop.time() + still) * SECOND)), default_fleet()), arc()
-        known.take(runs({}), client.mesh.now())
+async def test_a_client_that_stood_still_itself_gives_its_rcs_a_second_all_the_same() -> None:
+    loop, still = asyncio.get_running_loop(), 0.0
+    client, known = Client(mesh(lambda: round((loop.time() + still) * SECOND)), default_fleet()), arc()
+    known.take(runs({}), client.mesh.now())
 
-        async def command(rc: str, *_: Any, **__: Any) -> Done:
-            nonlocal still
-            if not still:
-                still = 2.0
-                raise CommandRefused(rc, Problem("unknown", "no answer"))
-            if loop.time() < wakes:
-                raise CommandRefused(rc, Problem("stale", "it stood still as well"))
-            return Done()
+    async def command(rc: str, *_: Any, **__: Any) -> Done:
+        nonlocal still
+        if not still:
+            still = 2.0
+            raise CommandRefused(rc, Problem("unknown", "no answer"))
+        if loop.time() < wakes:
+            raise CommandRefused(rc, Problem("stale", "it stood still as well"))
+        return Done()
 
-        wakes = loop.time() + 0.3
-        client._confirmations._command = command
-        assert await client.granted(known, confirmed=True) == FIRST
-
-    kit.run(story())
+    wakes = loop.time() + 0.3
+    client._confirmations._command = command
+    assert await client.granted(known, confirmed=True) == FIRST
 
 
-def test_who_shows_a_place_shows_the_term_as_well() -> None:
-    async def story() -> None:
-        mesh = SimpleNamespace(me=Sender("h", "c"), keys=Keys("fleet"), now=lambda: NOW)
-        client, known, asked = Client(cast("Mesh", mesh), default_fleet()), arc(), list[Any]()
+async def test_who_shows_a_place_shows_the_term_as_well() -> None:
+    mesh = SimpleNamespace(me=Sender("h", "c"), keys=Keys("fleet"), now=lambda: NOW)
+    client, known, asked = Client(cast("Mesh", mesh), default_fleet()), arc(), list[Any]()
 
-        async def query(operation: Any) -> None:
-            asked.append(operation.term)
+    async def query(operation: Any) -> None:
+        asked.append(operation.term)
 
-        client._rcm.query = query  # type: ignore[method-assign]
-        await client._rcm.ask(known)
-        client._rcm.accept(TERM)
-        known.take(notice(1, place=Place(TERM, 1)), NOW)
-        await client._rcm.ask(known)
-        # An RCM of a lower term steps down at that, and does not refuse the place as one that can't be.
-        assert asked == [None, TERM]
-
-    asyncio.run(story())
+    client._rcm.query = query  # type: ignore[method-assign]
+    await client._rcm.ask(known)
+    client._rcm.accept(TERM)
+    known.take(notice(1, place=Place(TERM, 1)), NOW)
+    await client._rcm.ask(known)
+    # An RCM of a lower term steps down at that, and does not refuse the place as one that can't be.
+    assert asked == [None, TERM]
 
 
 @pytest.mark.parametrize(
@@ -366,11 +351,8 @@ def test_who_shows_a_place_shows_the_term_as_well() -> None:
         ({"timeout": True}, "timeout is True;"),
     ],
 )
-def test_arguments_that_make_no_sense_are_told_in_one_line(how: dict[str, Any], words: str) -> None:
-    async def story() -> None:
-        async with small_fleet("one") as (_, (one,)):
-            with pytest.raises((TypeError, ValueError), match=re.escape(words)):
-                async with hold(one, "x", **{"needs": {"robot/x": {}}, **how}):
-                    pass
-
-    kit.run(story())
+async def test_arguments_that_make_no_sense_are_told_in_one_line(how: dict[str, Any], words: str) -> None:
+    async with small_fleet("one") as (_, (one,)):
+        with pytest.raises((TypeError, ValueError), match=re.escape(words)):
+            async with hold(one, "x", **{"needs": {"robot/x": {}}, **how}):
+                pass

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from tests.mesh.kit import run, until
+from tests.mesh.kit import until
 from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
 from zscout.behaviors.client.request import RequestRefused
 from zscout.keyexpr import Sender
@@ -36,7 +36,7 @@ class FakePlacer:
         self._answer(query)
 
 
-def test_a_request_is_repeated_while_the_placer_can_not_answer_and_not_when_it_refuses() -> None:
+async def test_a_request_is_repeated_while_the_placer_can_not_answer_and_not_when_it_refuses() -> None:
     codes = ["busy", "not_leading", "", "exists"]
 
     def answer(query: IncomingQuery[PlacerOperation]) -> None:
@@ -45,42 +45,33 @@ def test_a_request_is_repeated_while_the_placer_can_not_answer_and_not_when_it_r
             raise Refused(code, "no")
         query.answer(RUNNING)
 
-    async def story() -> None:
-        placer = FakePlacer(answer)
-        client = PlacerClient(placer.client)
-        assert await client.place("counter", JOB) == RUNNING
-        assert len(placer.operations) == 3
-        with pytest.raises(RequestRefused, match="no") as refused:
-            await client.place("counter", JOB)
-        assert refused.value.code == "exists"
-        assert len(placer.operations) == 4
-
-    run(story())
+    placer = FakePlacer(answer)
+    client = PlacerClient(placer.client)
+    assert await client.place("counter", JOB) == RUNNING
+    assert len(placer.operations) == 3
+    with pytest.raises(RequestRefused, match="no") as refused:
+        await client.place("counter", JOB)
+    assert refused.value.code == "exists"
+    assert len(placer.operations) == 4
 
 
-def test_an_answer_is_waited_for_as_long_as_the_operation_may_wait() -> None:
-    async def story() -> None:
-        loop = asyncio.get_running_loop()
-        placer = FakePlacer(lambda query: loop.call_later(query.message.wait, query.answer, RUNNING))  # type: ignore[union-attr]
-        assert await PlacerClient(placer.client).place("counter", JOB, wait=20.0) == RUNNING
-        assert len(placer.operations) == 1
-
-    run(story())
+async def test_an_answer_is_waited_for_as_long_as_the_operation_may_wait() -> None:
+    loop = asyncio.get_running_loop()
+    placer = FakePlacer(lambda query: loop.call_later(query.message.wait, query.answer, RUNNING))  # type: ignore[union-attr]
+    assert await PlacerClient(placer.client).place("counter", JOB, wait=20.0) == RUNNING
+    assert len(placer.operations) == 1
 
 
-def test_a_placer_that_never_answers_is_given_up_after_the_patience() -> None:
-    async def story() -> None:
-        placer = FakePlacer(lambda _: None)
-        loop = asyncio.get_running_loop()
-        before = loop.time()
-        with pytest.raises(PlacerSilent, match="of fleet test did not answer for 15 s; see zscout status"):
-            await PlacerClient(placer.client, timeout=15.0).request(ListPlacements(), Placements)
-        assert 15 <= loop.time() - before <= 21
-
-    run(story())
+async def test_a_placer_that_never_answers_is_given_up_after_the_patience() -> None:
+    placer = FakePlacer(lambda _: None)
+    loop = asyncio.get_running_loop()
+    before = loop.time()
+    with pytest.raises(PlacerSilent, match="of fleet test did not answer for 15 s; see zscout status"):
+        await PlacerClient(placer.client, timeout=15.0).request(ListPlacements(), Placements)
+    assert 15 <= loop.time() - before <= 21
 
 
-def test_an_operation_that_was_done_though_its_answer_is_missing_is_not_repeated() -> None:
+async def test_an_operation_that_was_done_though_its_answer_is_missing_is_not_repeated() -> None:
     done: list[Placement] = []
 
     def answer(query: IncomingQuery[PlacerOperation]) -> None:
@@ -89,29 +80,23 @@ def test_an_operation_that_was_done_though_its_answer_is_missing_is_not_repeated
         else:
             done.append(RUNNING)
 
-    async def story() -> None:
-        placer = FakePlacer(answer)
-        client = PlacerClient(placer.client, {"counter"})
-        operation = PlaceComponent("counter", JOB, wait=0.0)
-        assert await client.request_once(operation, lambda one: one.spec == JOB) == RUNNING
-        assert placer.operations == [operation, ListPlacements("counter")]
-
-    run(story())
+    placer = FakePlacer(answer)
+    client = PlacerClient(placer.client, {"counter"})
+    operation = PlaceComponent("counter", JOB, wait=0.0)
+    assert await client.request_once(operation, lambda one: one.spec == JOB) == RUNNING
+    assert placer.operations == [operation, ListPlacements("counter")]
 
 
-def test_it_follows_what_is_published_and_nothing_of_an_earlier_term() -> None:
-    async def story() -> None:
-        placer = FakePlacer(lambda query: query.answer(Placements(Term(2, "rcm"), [RUNNING], ["b"])))
-        with PlacerClient(placer.client) as client:
-            await client.refresh()
-            assert client.placements == {"counter": RUNNING}
-            assert client.cordoned == {"b"}
-            other = Placement("other", JOB, "waiting")
-            placer.publisher.put(Placements(Term(1, "rcm"), [], [], ["counter"]))
-            placer.publisher.put(Placements(Term(2, "rcm"), [other]))
-            await until(lambda: "other" in client.placements)
-            assert client.placements == {"counter": RUNNING, "other": other}
-            placer.publisher.put(Placements(Term(2, "rcm"), [], [], ["other"]))
-            await until(lambda: list(client.placements) == ["counter"])
-
-    run(story())
+async def test_it_follows_what_is_published_and_nothing_of_an_earlier_term() -> None:
+    placer = FakePlacer(lambda query: query.answer(Placements(Term(2, "rcm"), [RUNNING], ["b"])))
+    with PlacerClient(placer.client) as client:
+        await client.refresh()
+        assert client.placements == {"counter": RUNNING}
+        assert client.cordoned == {"b"}
+        other = Placement("other", JOB, "waiting")
+        placer.publisher.put(Placements(Term(1, "rcm"), [], [], ["counter"]))
+        placer.publisher.put(Placements(Term(2, "rcm"), [other]))
+        await until(lambda: "other" in client.placements)
+        assert client.placements == {"counter": RUNNING, "other": other}
+        placer.publisher.put(Placements(Term(2, "rcm"), [], [], ["other"]))
+        await until(lambda: list(client.placements) == ["counter"])

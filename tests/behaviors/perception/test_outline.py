@@ -18,12 +18,12 @@ WIDTH, HEIGHT = 640, 480
 WALKER = (40, 120)
 
 
-def scene(rng: np.random.Generator, at: int | None, *, noise: float = 4.0) -> NDArray[np.uint8]:
-    """A wall with a pattern in colours, and somebody whose left edge is at that column."""
+def scene(rng: np.random.Generator, at: int | None, *, noise: float = 4.0, scale: int = 1) -> NDArray[np.uint8]:
+    """A wall with a pattern in colours, and somebody whose left edge is at that column; of `scale` pixels one."""
     pattern = np.random.default_rng(1).uniform(60, 190, (12, 16, 3)).astype(np.float32)
-    plane = cv2.resize(pattern, (WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
+    plane = cv2.resize(pattern, (WIDTH // scale, HEIGHT // scale), interpolation=cv2.INTER_LINEAR)
     if at is not None:
-        plane[200 : 200 + WALKER[1], at : at + WALKER[0]] = (30, 20, 200)
+        plane[200 // scale : (200 + WALKER[1]) // scale, at // scale : (at + WALKER[0]) // scale] = (30, 20, 200)
     return np.asarray(np.clip(plane + rng.normal(0, noise, plane.shape), 0, 255), np.uint8)
 
 
@@ -84,7 +84,7 @@ def test_the_table_of_a_sequence_of_cdnet(tmp_path: Path, capsys: pytest.Capture
         truth = np.zeros((HEIGHT, WIDTH), np.uint8)
         if at is not None:
             truth[200 : 200 + WALKER[1], at : at + WALKER[0]] = 255
-        for folder, kind, plane in (("input", "in", scene(rng, at)), ("groundtruth", "gt", truth)):
+        for folder, kind, plane in (("input", "in", scene(rng, at, scale=2)), ("groundtruth", "gt", truth)):
             suffix = "jpg" if kind == "in" else "png"
             small = cv2.resize(plane, coarse, interpolation=cv2.INTER_NEAREST)
             assert cv2.imwrite(str(tmp_path / "walk" / folder / f"{kind}{number:06d}.{suffix}"), small)

@@ -28,7 +28,10 @@ class Watch:
         return [self.look(start + (end - start) * step / steps) for step in range(steps + 1)]
 
 
-@pytest.mark.parametrize("seed", range(6))
+SEEDS = [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("noise", [1.0, 4.0, 9.0])
 def test_who_stops_is_present_until_he_goes(seed: int, noise: float) -> None:
     watch = Watch(seed, noise)
@@ -42,7 +45,7 @@ def test_who_stops_is_present_until_he_goes(seed: int, noise: float) -> None:
     assert not any(seen.present for seen in watch.stay(None, 10.0)[round(4 * RATE) :])
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", SEEDS)
 def test_who_walks_through_is_not_present_afterwards(seed: int) -> None:
     watch = Watch(seed)
     assert any(seen.moving for seen in watch.walk(-20, 190))

@@ -12,7 +12,7 @@ import pytest
 
 from tests.behaviors.client.small_fleet import small_fleet
 from tests.behaviors.sensor_net.test_warming_up import NEEDS, RobotFleet, Willing, robot_fleet
-from tests.mesh.kit import run, until
+from tests.mesh.kit import until
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.perception.lens import Picture
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
@@ -71,74 +71,60 @@ async def moved(robot: Robot, old: Client, new: Client, between: Callable[[], An
 
 
 @pytest.mark.parametrize(("taken", "phase"), [(False, "hidden"), (True, "check")], ids=["held on", "taken meanwhile"])
-def test_who_is_driven_away_as_he_moves_looks_whether_he_is_still_hidden(taken: bool, phase: str) -> None:
-    async def story() -> None:
-        async with robot_fleet("old", "new", "operator", "asks") as (fleet, (old, new, operator, _asks)):
-            robot = Robot(old)
-            robot.is_hidden()
-            robot.start()
-            await asyncio.sleep(2)
-            robot.is_hidden()
+async def test_who_is_driven_away_as_he_moves_looks_whether_he_is_still_hidden(taken: bool, phase: str) -> None:
+    async with robot_fleet("old", "new", "operator", "asks") as (fleet, (old, new, operator, _asks)):
+        robot = Robot(old)
+        robot.is_hidden()
+        robot.start()
+        await asyncio.sleep(2)
+        robot.is_hidden()
 
-            async def drive() -> None:
-                if taken:
-                    await operator.request("drive", {"robot/z": {}}, priority=9, min_runtime=20, keep=False)
+        async def drive() -> None:
+            if taken:
+                await operator.request("drive", {"robot/z": {}}, priority=9, min_runtime=20, keep=False)
 
-            robot = await moved(robot, old, new, drive)
-            await asyncio.sleep(25)
-            assert await fleet.arcs("z-watch") == ["running"]
-            assert robot.scout.hider._robot.phase == phase
-            await robot.stop()
-
-    run(story())
+        robot = await moved(robot, old, new, drive)
+        await asyncio.sleep(25)
+        assert await fleet.arcs("z-watch") == ["running"]
+        assert robot.scout.hider._robot.phase == phase
+        await robot.stop()
 
 
-def test_a_channel_that_was_asked_for_by_name_is_so_after_a_move() -> None:
-    async def story() -> None:
-        async with robot_fleet("old", "new", "asks") as (fleet, (old, new, _asks)):
-            robot = Robot(old)
-            robot.behavior._clock.seconds = 100.0
-            # The other one is to be avoided for one more second.
-            robot.scout.blindness._bad = {"video/1": 41.0}
-            robot.start()
-            await asyncio.sleep(2)
-            robot = await moved(robot, old, new)
-            await asyncio.sleep(1)
-            state = await fleet.clients[-1].state()
-            assert state is not None
-            assert [(view.arc, view.client) for view in state.holds] == [("z-hide", "h/new")]
-            assert not state.queue
-            await robot.stop()
-
-    run(story())
+async def test_a_channel_that_was_asked_for_by_name_is_so_after_a_move() -> None:
+    async with robot_fleet("old", "new", "asks") as (fleet, (old, new, _asks)):
+        robot = Robot(old)
+        robot.behavior._clock.seconds = 100.0
+        # The other one is to be avoided for one more second.
+        robot.scout.blindness._bad = {"video/1": 41.0}
+        robot.start()
+        await asyncio.sleep(2)
+        robot = await moved(robot, old, new)
+        await asyncio.sleep(1)
+        state = await fleet.state(-1)
+        assert [(view.arc, view.client) for view in state.holds] == [("z-hide", "h/new")]
+        assert not state.queue
+        await robot.stop()
 
 
-def test_no_channel_is_taken_that_its_parameters_leave_out() -> None:
-    async def story() -> None:
-        async with robot_fleet("one", "asks") as (fleet, (client, _asks)):
-            robot = Robot(client, needs=replace(NEEDS, video="video/1"))
-            robot.scout.blindness._bad = {"video/1": 0.0}
-            robot.start()
-            await asyncio.sleep(2)
-            state = await fleet.clients[-1].state()
-            assert state is not None
-            assert "video/1" in state.holds[0].needs
-            await robot.stop()
-
-    run(story())
+async def test_no_channel_is_taken_that_its_parameters_leave_out() -> None:
+    async with robot_fleet("one", "asks") as (fleet, (client, _asks)):
+        robot = Robot(client, needs=replace(NEEDS, video="video/1"))
+        robot.scout.blindness._bad = {"video/1": 0.0}
+        robot.start()
+        await asyncio.sleep(2)
+        state = await fleet.state(-1)
+        assert "video/1" in state.holds[0].needs
+        await robot.stop()
 
 
-def test_a_robot_may_have_as_long_a_name_as_an_arc() -> None:
-    async def story() -> None:
-        async with robot_fleet("one", "asks") as (fleet, (client, _asks)):
-            robot = Robot(client, name="z" * 64)
-            robot.is_hidden()
-            robot.start()
-            await asyncio.sleep(2)
-            assert await fleet.arcs(f"{'z' * 58}-watch") == ["running"]
-            await robot.stop()
-
-    run(story())
+async def test_a_robot_may_have_as_long_a_name_as_an_arc() -> None:
+    async with robot_fleet("one", "asks") as (fleet, (client, _asks)):
+        robot = Robot(client, name="z" * 64)
+        robot.is_hidden()
+        robot.start()
+        await asyncio.sleep(2)
+        assert await fleet.arcs(f"{'z' * 58}-watch") == ["running"]
+        await robot.stop()
 
 
 class Slow(Willing):
@@ -149,28 +135,25 @@ class Slow(Willing):
         return True
 
 
-def test_who_is_preempted_in_the_step_that_was_the_last_of_his_task_goes_on_with_the_other() -> None:
-    async def story() -> None:
-        async with small_fleet("one", "operator", "asks", kind=RobotFleet) as (fleet, (client, operator, _asks)):
-            assert isinstance(fleet, RobotFleet)
-            next(rc for rc in fleet.rcs if rc.name == "robot/z").driver = Slow()
-            robot = Robot(client)
-            see, looks = robot.scout.see, 0
+async def test_who_is_preempted_in_the_step_that_was_the_last_of_his_task_goes_on_with_the_other() -> None:
+    async with small_fleet("one", "operator", "asks", kind=RobotFleet) as (fleet, (client, operator, _asks)):
+        assert isinstance(fleet, RobotFleet)
+        next(rc for rc in fleet.rcs if rc.name == "robot/z").driver = Slow()
+        robot = Robot(client)
+        see, looks = robot.scout.see, 0
 
-            def hides_at_last(now: float, picture: Picture | None, channel: str) -> Step:
-                nonlocal looks
-                looks += 1
-                if looks == 3:
-                    robot.is_hidden()
-                step = see(now, picture, channel)
-                return replace(step, left=0.3, right=0.3, lasts=0.5) if looks == 2 else step
+        def hides_at_last(now: float, picture: Picture | None, channel: str) -> Step:
+            nonlocal looks
+            looks += 1
+            if looks == 3:
+                robot.is_hidden()
+            step = see(now, picture, channel)
+            return replace(step, left=0.3, right=0.3, lasts=0.5) if looks == 2 else step
 
-            robot.scout.see = hides_at_last  # type: ignore[method-assign]
-            robot.start()
-            await until(lambda: robot.scout.task == "watch")
-            await operator.request("drive", {"robot/z": {}}, priority=9, min_runtime=3, keep=False)
-            await asyncio.sleep(5)
-            assert [await fleet.arcs(name) for name in ("z-hide", "z-watch")] == [[], ["running"]]
-            await robot.stop()
-
-    run(story())
+        robot.scout.see = hides_at_last  # type: ignore[method-assign]
+        robot.start()
+        await until(lambda: robot.scout.task == "watch")
+        await operator.request("drive", {"robot/z": {}}, priority=9, min_runtime=3, keep=False)
+        await asyncio.sleep(5)
+        assert [await fleet.arcs(name) for name in ("z-hide", "z-watch")] == [[], ["running"]]
+        await robot.stop()

@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager, suppress
 from typing import Any
 
 from tests.behaviors.sensor_net.test_warming_up import RobotFleet, robot_fleet
-from tests.mesh.kit import run, until
+from tests.mesh.kit import until
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.sensor_net.net import SensorNet
 from zscout.behaviors.sensor_net.place_sensor_net import PlaceSensorNet
@@ -75,51 +75,42 @@ class Net:
             await self.task
 
 
-def test_a_net_that_moves_as_it_has_a_component_placed_knows_it_and_stops_it() -> None:
-    async def story() -> None:
-        async with placing("old", "new") as (placer, (old, new, _asks)):
-            placer.silent = True
-            before = Net(old)
-            await until(lambda: placer.placed)
-            state = before.behavior.checkpoint()
-            placer.silent = False
-            after = Net(new, state)
-            await until(lambda: after.behavior._there)
-            assert placer.placed == ["net-z"]
-            await after.stop()
-            assert placer.placed == []
-            await before.stop()
-
-    run(story())
+async def test_a_net_that_moves_as_it_has_a_component_placed_knows_it_and_stops_it() -> None:
+    async with placing("old", "new") as (placer, (old, new, _asks)):
+        placer.silent = True
+        before = Net(old)
+        await until(lambda: placer.placed)
+        state = before.behavior.checkpoint()
+        placer.silent = False
+        after = Net(new, state)
+        await until(lambda: after.behavior._there)
+        assert placer.placed == ["net-z"]
+        await after.stop()
+        assert placer.placed == []
+        await before.stop()
 
 
-def test_what_was_asked_for_as_the_net_moved_and_never_arrived_is_asked_for_again() -> None:
-    async def story() -> None:
-        async with placing("old", "new") as (placer, (old, new, _asks)):
-            before = Net(old)
-            await until(lambda: before.behavior._there)
-            state = before.behavior.checkpoint()
-            placer.placed.clear()
-            after = Net(new, state)
-            await until(lambda: placer.placed == ["net-z"])
-            await after.stop()
-            await before.stop()
-
-    run(story())
+async def test_what_was_asked_for_as_the_net_moved_and_never_arrived_is_asked_for_again() -> None:
+    async with placing("old", "new") as (placer, (old, new, _asks)):
+        before = Net(old)
+        await until(lambda: before.behavior._there)
+        state = before.behavior.checkpoint()
+        placer.placed.clear()
+        after = Net(new, state)
+        await until(lambda: placer.placed == ["net-z"])
+        await after.stop()
+        await before.stop()
 
 
-def test_a_component_is_stopped_until_the_placer_says_so() -> None:
-    async def story() -> None:
-        async with placing("one") as (placer, (client, _asks)):
-            net = Net(client)
-            await until(lambda: net.behavior._there)
-            placer.silent = True
-            net.behavior.net.report(net.behavior._now(), "robot/z", "lost")
-            await asyncio.sleep(40)
-            assert placer.placed == ["net-z"]
-            placer.silent = False
-            await asyncio.sleep(10)
-            assert placer.placed == []
-            await net.stop()
-
-    run(story())
+async def test_a_component_is_stopped_until_the_placer_says_so() -> None:
+    async with placing("one") as (placer, (client, _asks)):
+        net = Net(client)
+        await until(lambda: net.behavior._there)
+        placer.silent = True
+        net.behavior.net.report(net.behavior._now(), "robot/z", "lost")
+        await asyncio.sleep(40)
+        assert placer.placed == ["net-z"]
+        placer.silent = False
+        await asyncio.sleep(10)
+        assert placer.placed == []
+        await net.stop()

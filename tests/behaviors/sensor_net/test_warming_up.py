@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from tests.behaviors.client.small_fleet import FLEET, SmallFleet, small_fleet
-from tests.mesh.kit import run, until
+from tests.behaviors.client.small_fleet import FLEET, SmallFleet, begin_move, small_fleet
+from tests.mesh.kit import until
 from zscout.behaviors.client.arc import Revoked
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.sensor_net.held_robot import RobotNeeds
@@ -75,85 +75,69 @@ async def over(watching: asyncio.Task[Any]) -> None:
         await watching
 
 
-def test_a_camera_that_did_not_come_to_warm_up_is_not_waited_for_any_more() -> None:
+async def test_a_camera_that_did_not_come_to_warm_up_is_not_waited_for_any_more() -> None:
     """All channels were taken until its turn came: it would begin to warm up as that is over."""
-
-    async def test() -> None:
-        async with robot_fleet("robot", "other", "asks") as (fleet, (client, other, _asks)):
-            needs: dict[str, Any] = {"framegrabber/f": {}, "video/1": {}, "video/2": {}}
-            await other.request("other", needs, priority=5, min_runtime=3, keep=False)
-            watching = watches(client)
-            await asyncio.sleep(1)
-            assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [["queued"], ["queued"]]
-            await asyncio.sleep(3)
-            assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [["running"], []]
-            await over(watching)
-            assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [[], []]
-
-    run(test())
+    async with robot_fleet("robot", "other", "asks") as (fleet, (client, other, _asks)):
+        needs: dict[str, Any] = {"framegrabber/f": {}, "video/1": {}, "video/2": {}}
+        await other.request("other", needs, priority=5, min_runtime=3, keep=False)
+        watching = watches(client)
+        await asyncio.sleep(1)
+        assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [["queued"], ["queued"]]
+        await asyncio.sleep(3)
+        assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [["running"], []]
+        await over(watching)
+        assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [[], []]
 
 
 @pytest.mark.parametrize("why", ["another hides first", "the framegrabber is gone"])
-def test_a_camera_is_switched_off_again_where_its_turn_does_not_come(why: str) -> None:
-    async def test() -> None:
-        async with robot_fleet("robot", "other", "asks") as (fleet, (client, other, _asks)):
-            await other.request("other", {"framegrabber/f": {}}, priority=1, min_runtime=8)
-            watching = watches(client)
-            await asyncio.sleep(5.5)
-            assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [["queued"], ["running"]]
-            if why == "another hides first":
-                await other.request("hides", {"framegrabber/f": {}}, priority=2, min_runtime=60, keep=False)
-            else:
-                next(rc for rc in fleet.rcs if rc.name == "framegrabber/f").fail("unplugged")
-            await asyncio.sleep(8)
-            assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [["queued"], []]
-            if why == "another hides first":
-                # And on again, ahead of when it does.
-                await asyncio.sleep(50)
-                assert await fleet.arcs("z-warm") == ["running"]
-            await over(watching)
-
-    run(test())
+async def test_a_camera_is_switched_off_again_where_its_turn_does_not_come(why: str) -> None:
+    async with robot_fleet("robot", "other", "asks") as (fleet, (client, other, _asks)):
+        await other.request("other", {"framegrabber/f": {}}, priority=1, min_runtime=8)
+        watching = watches(client)
+        await asyncio.sleep(5.5)
+        assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [["queued"], ["running"]]
+        if why == "another hides first":
+            await other.request("hides", {"framegrabber/f": {}}, priority=2, min_runtime=60, keep=False)
+        else:
+            next(rc for rc in fleet.rcs if rc.name == "framegrabber/f").fail("unplugged")
+        await asyncio.sleep(8)
+        assert [await fleet.arcs(name) for name in ("z-watch", "z-warm")] == [["queued"], []]
+        if why == "another hides first":
+            # And on again, ahead of when it does.
+            await asyncio.sleep(50)
+            assert await fleet.arcs("z-warm") == ["running"]
+        await over(watching)
 
 
-def test_what_warms_up_is_its_own_again_where_a_move_has_failed() -> None:
+async def test_what_warms_up_is_its_own_again_where_a_move_has_failed() -> None:
     """It was left to nobody: held for as long as the client lived."""
-
-    async def test() -> None:
-        async with robot_fleet("robot", "other", "new", "asks") as (fleet, (client, other, new, _asks)):
-            await other.request("other", {"framegrabber/f": {}}, priority=5, min_runtime=3.9, keep=False)
-            watching = watches(client)
-            await asyncio.sleep(1)
-            assert await fleet.arcs("z-warm") == ["running"]
-            client.pause()
-            new.expect(client.open_requests())
-            await client.hand_over_all(new.mesh.me)
-            # By now all of it is somebody else's, who does not come to anything.
-            await asyncio.sleep(2)
-            await new.close()
-            client.take_back()
-            await asyncio.sleep(0.5)
-            await over(watching)
-            assert await fleet.arcs("z-warm") == []
-
-    run(test())
+    async with robot_fleet("robot", "other", "new", "asks") as (fleet, (client, other, new, _asks)):
+        await other.request("other", {"framegrabber/f": {}}, priority=5, min_runtime=3.9, keep=False)
+        watching = watches(client)
+        await asyncio.sleep(1)
+        assert await fleet.arcs("z-warm") == ["running"]
+        begin_move(client, new)
+        await client.hand_over_all(new.mesh.me)
+        # By now all of it is somebody else's, who does not come to anything.
+        await asyncio.sleep(2)
+        await new.close()
+        client.take_back()
+        await asyncio.sleep(0.5)
+        await over(watching)
+        assert await fleet.arcs("z-warm") == []
 
 
-def test_a_camera_warms_up_after_a_move_too() -> None:
-    async def test() -> None:
-        async with robot_fleet("old", "other", "new", "asks") as (fleet, (old, other, new, _asks)):
-            await other.request("other", {"framegrabber/f": {}}, priority=5, min_runtime=20, keep=False)
-            watching = watches(old)
-            await until(lambda: [arc for arc in old._store.open if arc.start is not None])
-            old.pause()
-            new.expect(old.open_requests())
-            await old.hand_over_all(new.mesh.me)
-            await old.close()
-            await over(watching)
-            watching = watches(new)
-            await asyncio.sleep(17.5)
-            assert await fleet.arcs("z-warm") == ["running"]
-            await over(watching)
-            assert await fleet.arcs("z-warm") == []
-
-    run(test())
+async def test_a_camera_warms_up_after_a_move_too() -> None:
+    async with robot_fleet("old", "other", "new", "asks") as (fleet, (old, other, new, _asks)):
+        await other.request("other", {"framegrabber/f": {}}, priority=5, min_runtime=20, keep=False)
+        watching = watches(old)
+        await until(lambda: [arc for arc in old._store.open if arc.start is not None])
+        begin_move(old, new)
+        await old.hand_over_all(new.mesh.me)
+        await old.close()
+        await over(watching)
+        watching = watches(new)
+        await asyncio.sleep(17.5)
+        assert await fleet.arcs("z-warm") == ["running"]
+        await over(watching)
+        assert await fleet.arcs("z-warm") == []
