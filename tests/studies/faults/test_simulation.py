@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 
 import pytest
 
@@ -14,6 +15,7 @@ from studies.faults.guards import GUARDS, without
 from studies.faults.runs import shrink
 from studies.faults.simulation import Simulation, Size, simulate
 from tests.hang import HANG
+from tests.scheduling.seeds import in_parts
 from tests.studies.tools import STUDIES
 
 SEEDS = [seed for seed in range(1, 200) if seed % 10 != 9]
@@ -85,21 +87,14 @@ MISSED = {
 `python -m studies faults --without` tries the others."""
 
 
-def parts(seeds: list[int], size: int = 8) -> list[list[int]]:
-    return [seeds[first : first + size] for first in range(0, len(seeds), size)]
-
-
 @pytest.mark.parametrize(
     "seeds",
     [
         *(pytest.param([seed], id=str(seed), marks=pytest.mark.essential) for seed in QUICK),
-        *(
-            pytest.param(part, id=f"{part[0]}-{part[-1]}", marks=pytest.mark.slow)
-            for part in parts([seed for seed in SEEDS if seed not in QUICK] + FOUND)
-        ),
+        *in_parts([seed for seed in SEEDS if seed not in QUICK] + FOUND, quick=0, size=8),
     ],
 )
-def test_promises_are_kept_under_faults(seeds: list[int]) -> None:
+def test_promises_are_kept_under_faults(seeds: Sequence[int]) -> None:
     broken = {seed: simulate(seed).broken for seed in seeds}
     assert {seed: texts for seed, texts in broken.items() if texts} == {}, "python -m studies faults --seed SEED"
 
