@@ -15,20 +15,23 @@ try:
     why_not = ""
 except NoTlc as error:
     why_not = str(error)
-pytestmark = pytest.mark.skipif(bool(why_not), reason=why_not)
+pytestmark = [pytest.mark.live, pytest.mark.skipif(bool(why_not), reason=why_not)]
 
 
+@pytest.mark.slow
 def test_two_reigns_keep_what_is_promised() -> None:
     outcome = check(Instance("small", terms=2, steps=2, joins=2))
     assert outcome.violated is None
     assert outcome.states > 1_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("instance", WITHOUT, ids=lambda instance: instance.name)
 def test_without_a_guard_some_promise_breaks(instance: Instance) -> None:
     assert check(instance).violated is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("without", ["", *ENTERING])
 def test_a_grant_is_answered_first_and_confirmed_beside_its_body_unless_a_guard_is_taken_out(without: str) -> None:
     outcome = check_entering(without, terms=2, numbers=3 if without == "by name" else 2)
@@ -37,6 +40,7 @@ def test_a_grant_is_answered_first_and_confirmed_beside_its_body_unless_a_guard_
     assert outcome.states > 1_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("without", ["", *SETTLING])
 def test_no_two_programs_are_at_an_rc_that_settles_unless_a_guard_is_taken_out(without: str) -> None:
     outcome = check_settling(without, holds=2)
@@ -49,6 +53,7 @@ def trace() -> list[str]:
     return simulate(21, traced=True).trace
 
 
+@pytest.mark.slow
 def test_what_the_fleet_does_is_a_behaviour_of_the_model(trace: list[str]) -> None:
     """Whole, and in pieces, each of which begins with what the one before it led to."""
     whole, cut = Behaviour(trace, piece=10_000), Behaviour(trace, piece=50)
@@ -61,6 +66,7 @@ def test_what_the_fleet_does_is_a_behaviour_of_the_model(trace: list[str]) -> No
     assert verdict.states == 2 * whole.actions + 2 + 2 * (len(cut.pieces) - 1)
 
 
+@pytest.mark.slow
 def test_a_forged_step_is_refused_in_any_piece(trace: list[str]) -> None:
     events = [msgspec.json.decode(line) for line in trace]
     # Of sharable RCs the model knows nothing.
@@ -84,8 +90,10 @@ def test_a_forged_step_is_refused_in_any_piece(trace: list[str]) -> None:
     assert "does not lead to" in verdict.refused[3]
 
 
-def test_who_promises_once_more_goes_on_with_what_it_holds() -> None:
+def test_who_promises_once_more_goes_on_with_what_it_holds(monkeypatch: pytest.MonkeyPatch) -> None:
     """A leader that was away itself asks its RCs again, and names what they hold as before."""
+    # Java's second compiler takes half a second, which only long runs get back.
+    monkeypatch.setenv("JAVA_TOOL_OPTIONS", "-XX:TieredStopAtLevel=1")
     term, robot, radio = [1, "z"], {"rc": "robot/a", "instance": "a"}, {"rc": "radio/b", "instance": "b"}
     both, grant = {"robot/a": "a", "radio/b": "b"}, [[1, "z"], 2]
     held = [[grant, "arc", [term, 1], ["robot/a"]]]

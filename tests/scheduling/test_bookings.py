@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import itertools
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
 
 import pytest
 from msgspec import structs
 
+from tests.scheduling.seeds import in_parts
 from tests.scheduling.validate import validate
 from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy
@@ -49,8 +50,7 @@ from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.slots import Slot
 from zscout.types import Ns, Params, RcName
 
-RUNS = times(1_000)
-PARTS = 10
+SEEDS = range(times(1_000))
 PATIENCE = 40
 POLICY = SchedulingPolicy(patience=PATIENCE)
 CAPACITY = {"rate": Fraction(4)}
@@ -268,18 +268,18 @@ def story(seed: int) -> Iterator[tuple[Fleet, Booking, bool]]:
                 yield fleet, one, fleet.core.is_running(arc_id)
 
 
-@pytest.mark.parametrize("part", range(PARTS))
-def test_what_is_taken_up_starts_at_its_date(part: int) -> None:
+@pytest.mark.parametrize("seeds", in_parts(SEEDS, quick=30, size=250))
+def test_what_is_taken_up_starts_at_its_date(seeds: Sequence[int]) -> None:
     started = late = 0
-    for seed in range(part, RUNS, PARTS):
+    for seed in seeds:
         for fleet, one, runs in story(seed):
             started += runs
             late += not runs
             told = seed, fleet.now, one, fleet.core.arc(fleet.core._state.claims[one.id].arc.id)
             assert runs or excused(fleet, one), told
             assert runs == (fleet.dangers.get(one.id) is None), told
-    assert started > RUNS // PARTS
-    assert late > RUNS // PARTS, "hardly any was in danger: these runs prove nothing"
+    assert started > len(seeds)
+    assert late > len(seeds), "hardly any was in danger: these runs prove nothing"
 
 
 def exhaustive(fleet: Fleet, wanted: Booking, until: Ns, *, bookings_only: bool = False) -> Ns | None:
@@ -321,10 +321,10 @@ def exhaustive(fleet: Fleet, wanted: Booking, until: Ns, *, bookings_only: bool 
     return None
 
 
-@pytest.mark.parametrize("part", range(PARTS))
-def test_slots_are_those_of_exhaustive_search(part: int) -> None:
+@pytest.mark.parametrize("seeds", in_parts(SEEDS, quick=100, size=450))
+def test_slots_are_those_of_exhaustive_search(seeds: Sequence[int]) -> None:
     found = none = 0
-    for seed in range(part, RUNS, PARTS):
+    for seed in seeds:
         draw = random.Random(f"slots {seed}")  # noqa: S311
         fleet = Fleet(Core(Adaptive(), SchedulingPolicy(patience=None)))
         fleet.send(*(RcJoined(rc, sharable=False) for rc in ROBOTS), RcJoined(RADIO, sharable=True))
@@ -347,7 +347,7 @@ def test_slots_are_those_of_exhaustive_search(part: int) -> None:
             if told:
                 fleet.send(Booked(structs.replace(one, start=told[0].start, bound=told[0].bound)))
             fleet.until(fleet.now + draw.randint(0, 5))
-    assert found > RUNS // PARTS
+    assert found > len(seeds)
     assert none > 0
 
 

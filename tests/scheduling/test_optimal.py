@@ -101,7 +101,7 @@ def test_promises_hold_in_replay(workload: Workload) -> None:
     assert not ledger.open
 
 
-@settings(max_examples=times(60))
+@settings(max_examples=times(35))
 @given(workloads(keep=False))
 def test_free_rcs_are_shared_out_as_by_trying_all(workload: Workload) -> None:
     """All ask at once; the RCs' own sums, not their votes, say which sets are ruled out."""

@@ -161,7 +161,7 @@ def test_memory_is_bounded() -> None:
     assert estimator.runtime(wish(HOUR, "used")) == MINUTE
 
 
-@settings(max_examples=times(60))
+@settings(max_examples=times(30))
 @given(workloads(keep=False), st.integers(0, 99))
 def test_a_forecast_by_one_who_knows_nothing_is_that_of_what_was_asked_for(workload: Workload, seed: int) -> None:
     workload, lasting = overestimated(workload, Random(seed))  # noqa: S311 - a test's
@@ -172,7 +172,7 @@ def test_a_forecast_by_one_who_knows_nothing_is_that_of_what_was_asked_for(workl
     replay(workload, watch, lasting=lasting)
 
 
-@settings(max_examples=times(60))
+@settings(max_examples=times(30))
 @given(workloads(), st.integers(0, 99))
 def test_what_was_learned_ends_no_hold_and_touches_no_decision(workload: Workload, seed: int) -> None:
     """The same run, with and without forecasts by what was learned; and who is told to start early is not started."""

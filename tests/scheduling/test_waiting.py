@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 from dataclasses import replace
 from fractions import Fraction
 
@@ -10,6 +11,7 @@ import pytest
 from msgspec import structs
 
 from tests.scheduling.invariants import Ledger
+from tests.scheduling.seeds import in_parts
 from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy
 from zscout.scheduling.adaptive import Adaptive
@@ -20,8 +22,7 @@ from zscout.simulation.replay import Replay, replay
 from zscout.simulation.workload import Arrival, Workload, WorkloadRc
 from zscout.types import NO_TERM, SECOND, Ns, Params, Place, RcName, Term
 
-RUNS = times(1_000)
-PARTS = 10
+SEEDS = range(times(1_000))
 PATIENCE = 6 * SECOND
 POLICY = SchedulingPolicy(patience=PATIENCE)
 RADIO = WorkloadRc("radio/rf", sharable=True, capacity={"rate": Fraction(10)})
@@ -83,30 +84,30 @@ def check_bound(workload: Workload, played: Replay, patience: Ns, late: Ns = 0) 
     return tried
 
 
-@pytest.mark.parametrize("part", range(PARTS))
-def test_nobody_waits_longer_than_promised(part: int) -> None:
+@pytest.mark.parametrize("seeds", in_parts(SEEDS, quick=100, size=450))
+def test_nobody_waits_longer_than_promised(seeds: Sequence[int]) -> None:
     tried = 0
-    for seed in range(part, RUNS, PARTS):
+    for seed in seeds:
         work = workload(seed)
         played = replay(work, strategy=Adaptive(), policy=POLICY)
         assert not played.unserved, seed
         tried += check_bound(work, played, PATIENCE)
-    assert tried > RUNS // PARTS, "hardly anybody had to wait for his patience: these runs prove nothing"
+    assert tried > len(seeds), "hardly anybody had to wait for his patience: these runs prove nothing"
 
 
-@pytest.mark.parametrize("part", range(PARTS))
-def test_nobody_waits_longer_than_promised_for_what_is_kept(part: int) -> None:
+@pytest.mark.parametrize("seeds", in_parts(SEEDS, quick=100, size=450))
+def test_nobody_waits_longer_than_promised_for_what_is_kept(seeds: Sequence[int]) -> None:
     """As `zscout request` asks by default: whoever waits, the kept ones of equal priority are gone in time."""
     tried = outstayed = 0
-    for seed in range(part, RUNS, PARTS):
+    for seed in seeds:
         work = workload(seed, kept=(0.3, 0.7, 1.0)[seed % 3])
         played = replay(work, strategy=Adaptive(), policy=POLICY)
         assert not played.unserved, seed
         tried += check_bound(work, played, PATIENCE)
         runtime = {one.request.arc: one.request.min_runtime for one in work.arrivals}
         outstayed += sum(hold.end - hold.start > runtime[hold.arc] for hold in played.holds)
-    assert tried > RUNS // PARTS, "hardly anybody had to wait for his patience: these runs prove nothing"
-    assert outstayed > RUNS // PARTS, "hardly anything was kept"
+    assert tried > len(seeds), "hardly anybody had to wait for his patience: these runs prove nothing"
+    assert outstayed > len(seeds), "hardly anything was kept"
 
 
 def test_a_kept_hold_of_higher_priority_is_waited_for_as_long_as_the_fleet_lets_it_last() -> None:

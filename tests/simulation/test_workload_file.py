@@ -250,7 +250,7 @@ ODD = ["", "0", "-1", "nan", "1e999", "true", '""', '"x"', "[]", "[{}]", "{}", "
         st.sampled_from(ODD) | st.text(max_size=5),
     ),
 )
-@settings(max_examples=times(200))
+@settings(max_examples=times(100))
 def test_no_file_ends_in_another_error(heads: list[str], keys: dict[str, str]) -> None:
     text = "\n".join([*heads, *(f"{key} = {value}" for key, value in keys.items())])
     try:

@@ -75,7 +75,7 @@ def test_a_seed_is_the_same_every_time() -> None:
         ("processor_speed", {"processor_speed"}),
         # Where nothing misleads `composite`, it ranks hosts exactly as the load does.
         ("load_average", {"load_average", "composite"}),
-        ("available_memory", {"available_memory"}),
+        pytest.param("available_memory", {"available_memory"}, marks=pytest.mark.slow),
     ],
 )
 def test_auto_finds_the_metric_that_foretells(decides: str, right: set[Metric]) -> None:

@@ -23,6 +23,8 @@ from zscout.simulation.replay import HoldRecord, Replay, replay
 from zscout.simulation.workload import Arrival, Workload, WorkloadRc
 from zscout.types import SECOND
 
+SOON_PLAYED = ("paper", "calm", "narrow")
+
 
 def steps() -> Callable[[], int]:
     """A clock on which every reading is one ns later."""
@@ -192,7 +194,7 @@ def test_the_best_is_that_of_exhaustive_search(seed: int) -> None:
     assert first.behind == (first.used < best)
 
 
-@pytest.mark.parametrize("name", ["paper", "larger", "narrow"])
+@pytest.mark.parametrize("name", ["paper", pytest.param("larger", marks=pytest.mark.slow), "narrow"])
 def test_where_nothing_within_reach_is_idle_nothing_is_lost(name: str) -> None:
     """With one priority and no sharable RC this is a proof; the study must not contradict it."""
     found = [one for seed in range(2) for one in run(SchedulingJob(name, seed, "priority"), steps()).situations]
@@ -204,8 +206,14 @@ def test_where_nothing_within_reach_is_idle_nothing_is_lost(name: str) -> None:
 # Trials and their summary
 
 
-@pytest.mark.parametrize("strategy", list(STRATEGIES))
-@pytest.mark.parametrize("name", list(FAMILIES))
+@pytest.mark.parametrize(
+    ("name", "strategy"),
+    [
+        pytest.param(name, strategy, marks=[pytest.mark.slow] * (strategy != "adaptive" and name not in SOON_PLAYED))
+        for name in FAMILIES
+        for strategy in STRATEGIES
+    ],
+)
 def test_every_strategy_serves_all_of_every_family(name: str, strategy: str) -> None:
     trial = run(SchedulingJob(name, 1, strategy, drawn=True), steps())
     drawn = FAMILIES[name].workload(1)

@@ -46,6 +46,7 @@ def test_what_is_cut_short_by_the_end_counts_as_far_as_it_came() -> None:
     assert uses["one"].useful == 30.0
 
 
+@pytest.mark.slow
 def test_with_fair_shares_a_burst_and_a_stream_come_out_equal() -> None:
     without, fair = (play_week(Week(0, on)) for on in (False, True))
     assert without.apart > 0.1

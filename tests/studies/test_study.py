@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
-import multiprocessing
 import os
 import random
 import re
 import signal
 import subprocess
 import time
-from collections.abc import Iterator
-from contextlib import aclosing, suppress
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 
@@ -22,10 +20,9 @@ from rerun.chunk import RrdReader
 
 from studies.__main__ import STUDIES as STUDY_TABLE
 from studies.options import MAX_SEED, parse_seeds
-from studies.process_pool import answers
 from studies.recording import VIRTUAL_TIME
 from studies.scheduling.families import FAMILIES
-from studies.scheduling.trial import STRATEGIES, SchedulingJob, run_timed
+from studies.scheduling.trial import STRATEGIES
 from tests.cli.tools import Terminal
 from tests.hang import HANG
 from tests.studies.tools import STUDIES, study, study_here
@@ -41,6 +38,8 @@ def timeless(text: str) -> str:
     return re.sub(r'"decision_us":\{[^}]*\}', "", text)
 
 
+@pytest.mark.live
+@pytest.mark.slow
 def test_the_same_seeds_give_the_same_bytes_on_any_number_of_processors() -> None:
     some = ("--family", "paper", "--family", "calm", "--seeds", "1-2", "--json")
     spread, alone = study("schedule", *some), study("schedule", *some, "--jobs", "1")
@@ -88,6 +87,7 @@ def test_the_list_names_each_study_as_the_page_does(capsys: pytest.CaptureFixtur
         assert callable(getattr(import_module(f"studies.{module}"), entry)), name
 
 
+@pytest.mark.live
 def test_at_a_terminal_a_bar_shows_how_far_it_is() -> None:
     with Terminal("schedule", "--family", "paper", "--seeds", "3", command=STUDIES) as terminal:
         terminal.until(f"/{3 * len(STRATEGIES)}")
@@ -95,7 +95,8 @@ def test_at_a_terminal_a_bar_shows_how_far_it_is() -> None:
         assert terminal.code() == 0
 
 
-@pytest.mark.parametrize("left", ["-:--:--", "0:"])
+@pytest.mark.live
+@pytest.mark.parametrize("left", ["-:--:--", pytest.param("0:", marks=pytest.mark.slow)])
 def test_ctrl_c_at_a_terminal_says_nothing(left: str) -> None:
     """At the beginning as well, when its processes are about to start."""
     with Terminal(*LONG, command=STUDIES) as terminal:
@@ -106,36 +107,6 @@ def test_ctrl_c_at_a_terminal_says_nothing(left: str) -> None:
         assert terminal.code() == 130
         assert "Traceback" not in terminal.text
         assert re.sub(rf"trials|\d+/{total}|[━╸╺\s:\d-]|\^C", "", terminal.text[said:]) == ""
-
-
-def workers(process: subprocess.Popen[str]) -> list[psutil.Process]:
-    """Its two processes and the one that tracks their semaphores, once they are there."""
-    deadline = time.monotonic() + HANG
-    while time.monotonic() < deadline:
-        found = psutil.Process(process.pid).children(recursive=True)
-        # A process that has worked has started for good.
-        if len(found) >= 3 and sum(child.cpu_times().user > 0.5 for child in found) >= 2:
-            return found
-        assert process.poll() is None
-        time.sleep(0.02)
-    pytest.fail("no processes came up")
-
-
-def started(*options: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [*STUDIES, *LONG, *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_all_of_it_without_a_word(number: signal.Signals) -> None:
-    with started() as process:
-        children = workers(process)
-        process.send_signal(number)
-        out, err = process.communicate(timeout=HANG)
-        assert (process.returncode, out, err) == (128 + number, "", "")
-        _, alive = psutil.wait_procs(children, timeout=HANG)
-        assert alive == []
 
 
 def session_is_empty(session: int) -> bool:
@@ -153,58 +124,41 @@ def session_is_empty(session: int) -> bool:
     return False
 
 
-@pytest.mark.parametrize("seed", range(times(2)))
-def test_interrupted_at_any_time_it_ends_and_leaves_nothing(seed: int) -> None:
-    """Its results are bigger than a pipe: a process may be killed in the middle of one."""
-    chance = random.Random(seed)  # noqa: S311
-    number = chance.choice([signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-    with started("--strategy", "priority") as process:
+@pytest.mark.live
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(times(1)))
+@pytest.mark.parametrize(
+    ("number", "send"),
+    [(signal.SIGINT, os.killpg), (signal.SIGTERM, os.kill), (signal.SIGHUP, os.kill), (signal.SIGKILL, os.kill)],
+    ids=["ctrl-c", "term", "hangup", "kill"],
+)
+def test_ended_at_any_time_it_says_nothing_and_leaves_nothing(
+    number: signal.Signals, send: Callable[[int, int], None], seed: int
+) -> None:
+    """Its results are bigger than a pipe: a process may be killed in the middle of one. Ctrl-C, as from a terminal,
+    reaches all of its processes; another signal the first one alone."""
+    command = [*STUDIES, *LONG, "--strategy", "priority"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
         while not psutil.Process(process.pid).children():
             assert process.poll() is None
             time.sleep(0.005)
-        time.sleep(chance.uniform(0, 2))
-        # As from a terminal: all its processes get it.
-        os.killpg(process.pid, number)
+        time.sleep(random.Random(f"{number} {seed}").uniform(0, 2))  # noqa: S311
+        send(process.pid, number)
         out, err = process.communicate(timeout=HANG)
-        assert (process.returncode, out, err) == (128 + number, "", "")
+        code = -number if number == signal.SIGKILL else 128 + number
+        assert (process.returncode, out, err) == (code, "", "")
         assert session_is_empty(process.pid)
 
 
-def test_killed_it_leaves_nothing_either() -> None:
-    with started() as process:
-        children = workers(process)
-        process.kill()
-        _, alive = psutil.wait_procs(children, timeout=HANG)
-        assert alive == []
-
-
-def test_a_process_that_dies_is_one_line() -> None:
-    with started() as process:
-        children = workers(process)
-        max(children, key=lambda child: child.cpu_times().user).kill()
-        out, err = process.communicate(timeout=HANG)
-        assert (process.returncode, out) == (Failed.exit_code, "")
-        assert err == "zscout: a process of the study died, perhaps for want of memory; use fewer with --jobs 1\n"
-
-
+@pytest.mark.live
 def test_processes_that_can_not_start_are_one_line() -> None:
     few = ("sh", "-c", 'ulimit -n 40; exec "$@"', "sh")
     done = subprocess.run([*few, *STUDIES, *LONG, "--jobs", "200"], capture_output=True, text=True, timeout=HANG)
     assert (done.returncode, done.stdout) == (Failed.exit_code, "")
     line = "zscout: a process can't be started (Too many open files); use fewer with --jobs 1\n"
     assert done.stderr == line
-
-
-def test_a_bug_in_a_trial_is_shown_and_leaves_nothing() -> None:
-    async def trials() -> list[SchedulingJob]:
-        async with aclosing(
-            answers(run_timed, [SchedulingJob("paper", 1, "priority"), SchedulingJob("paper", 1, "luck")], 2)
-        ) as found:
-            return [trial.job async for trial in found]
-
-    with pytest.raises(RuntimeError, match=r"strategy='luck'.* failed:\nTraceback[^$]*KeyError: 'luck'"):
-        asyncio.run(trials())
-    assert multiprocessing.active_children() == []
 
 
 def test_the_recording_has_curves_and_bars_of_every_strategy(tmp_path: Path) -> None:
@@ -241,27 +195,41 @@ def changes(path: Path) -> Iterator[tuple[str, float]]:
 
 
 @pytest.mark.parametrize(
-    ("args", "words"),
+    ("study", "args", "words"),
     [
-        (["schedule", "--seeds", "0"], '--seeds "0" is no seed at all'),
-        (["schedule", "--seeds", "9-5"], "is no seed at all"),
-        (["schedule", "--seeds", "many"], "write how many, as in 20"),
-        (["schedule", "--seeds", f"{MAX_SEED}-{MAX_SEED + 1}"], f"a seed is at most {MAX_SEED}"),
-        (["schedule", "--seeds", "100000"], "are more than 5000; ask for fewer seeds or families"),
-        (["schedule", "--family", "nothing"], "'nothing' is not one of"),
-        (["schedule", "--strategy", "luck"], "'luck' is not one of"),
-        (["schedule", "--jobs", "0"], "--jobs"),
-        (["schedule", "--rrd", "picture.png"], "end it in .rrd"),
-        (["schedule", "--rrd", "no/such/folder/x.rrd"], "it can't be written"),
-        (["replacement"], "unknown study 'replacement'"),
+        ("schedule", ["--seeds", "0"], '--seeds "0" is no seed at all'),
+        ("schedule", ["--seeds", "9-5"], "is no seed at all"),
+        ("schedule", ["--seeds", "many"], "write how many, as in 20"),
+        ("schedule", ["--seeds", f"{MAX_SEED}-{MAX_SEED + 1}"], f"a seed is at most {MAX_SEED}"),
+        ("schedule", ["--seeds", "100000"], "are more than 5000; ask for fewer seeds or families"),
+        ("schedule", ["--family", "nothing"], "'nothing' is not one of"),
+        ("schedule", ["--strategy", "luck"], "'luck' is not one of"),
+        ("schedule", ["--jobs", "0"], "--jobs"),
+        ("schedule", ["--rrd", "picture.png"], "end it in .rrd"),
+        ("schedule", ["--rrd", "no/such/folder/x.rrd"], "it can't be written"),
+        ("placement", ["--seeds", "1001"], "1001 are more than 1000; ask for fewer"),
+        ("placement", ["--rrd", "picture.png"], "end it in .rrd"),
+        ("robots", ["--robots", "four"], '--robots "four": write numbers and ranges of them'),
+        ("robots", ["--robots", "0-4"], '"0-4" is not within 1 to 16'),
+        ("robots", ["--channels", "3-1"], "or backwards"),
+        ("robots", ["--channels", "17"], "not within 1 to 16"),
+        ("robots", ["--baud", "300-900"], "more than 64 numbers"),
+        ("robots", ["--baud", "9"], "not within 110 to 1000000"),
+        ("robots", ["--slot", "0"], "not within 1 to 3600"),
+        ("robots", ["--building", "palace"], '--building "palace" is unknown'),
+        ("robots", ["--building", "no/where.toml"], "no/where.toml"),
+        ("robots", ["--seeds", "1000"], "runs are more than 5000"),
+        ("robots", ["--rrd", "picture.png"], "end it in .rrd"),
+        ("robots", ["--svg", "no/such/folder"], "does not exist"),
+        ("replacement", [], "unknown study 'replacement'"),
     ],
 )
-def test_bad_input_is_one_line_and_code_2(args: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert study_here(*args) == 2
+def test_bad_input_is_one_line_and_code_2(
+    study: str, args: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert study_here(study, *args) == 2
     out, line = capsys.readouterr()
-    assert out == ""
-    assert words in line
-    assert line.count("\n") == 1
+    assert (out, line.count("\n"), words in line) == ("", 1, True), line
 
 
 def test_seeds_are_a_number_or_a_range() -> None:

@@ -14,6 +14,7 @@ from tests.studies.tools import STUDIES, study_here
 from zscout.types import POLICIES
 
 
+@pytest.mark.slow
 def test_json_has_every_policy_and_metric(capsys: pytest.CaptureFixture[str]) -> None:
     assert study_here("placement", "--seeds", "3-3", "--json") == 0
     told = json.loads(capsys.readouterr().out)
@@ -28,6 +29,7 @@ def test_json_has_every_policy_and_metric(capsys: pytest.CaptureFixture[str]) ->
     assert len(told["learnt"]) == 3
 
 
+@pytest.mark.slow
 def test_a_pipe_gets_plain_tables_and_the_recording_has_the_curves_and_marks(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -49,33 +51,10 @@ def test_a_pipe_gets_plain_tables_and_the_recording_has_the_curves_and_marks(
     assert "/summary" in entities
 
 
+@pytest.mark.live
 def test_at_a_terminal_a_bar_shows_how_far_it_is_and_ctrl_c_ends_it() -> None:
     with Terminal("placement", "--seeds", "500", command=STUDIES) as terminal:
         terminal.until(f"/{500 * parts()}")
         terminal.press("\x03")
         assert terminal.code() == 130
         assert "Traceback" not in terminal.text
-
-
-def test_the_help_has_examples(capsys: pytest.CaptureFixture[str]) -> None:
-    assert study_here("schedule", "--help") == 0
-    assert "placement  Compares how" in capsys.readouterr().out
-    assert study_here("placement", "--help") == 0
-    assert "python -m studies placement --seeds 50 --json" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        (["--seeds", "0"], '--seeds "0" is no seed at all'),
-        (["--seeds", "1001"], "1001 are more than 1000; ask for fewer"),
-        (["--rrd", "picture.png"], "end it in .rrd"),
-        (["--rrd", "no/such/folder/x.rrd"], "it can't be written"),
-    ],
-)
-def test_bad_input_is_one_line_and_code_2(args: list[str], words: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert study_here("placement", *args) == 2
-    out, line = capsys.readouterr()
-    assert out == ""
-    assert words in line
-    assert line.count("\n") == 1

@@ -59,6 +59,7 @@ def test_clocks_of_hosts_are_seconds_off_or_in_some_runs_hours() -> None:
     assert 20 < off[True] < 60
 
 
+@pytest.mark.slow
 def test_programs_do_all_that_there_is_to_do_with_bookings() -> None:
     counts = Counter[str]()
     for seed in (3, 4, 13):

@@ -7,17 +7,21 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 
 import pytest
 
 from studies.faults.guards import GUARDS, without
 from studies.faults.runs import shrink
-from studies.faults.simulation import Simulation, simulate
+from studies.faults.simulation import Simulation, Size, simulate
 from tests.hang import HANG
+from tests.scheduling.seeds import in_parts
+from tests.studies.tools import STUDIES
 
 SEEDS = [seed for seed in range(1, 200) if seed % 10 != 9]
 """Small runs; every tenth is one of many programs."""
-BLOCK = 20
+QUICK = [1, 2, 3, 4, 8, 10, 13, 15, 47, 103]
+"""Seeds that break a promise without most of the guards below: of each size one at least, but of 47 only moves fail."""
 FOUND = [
     1923,
     302274,
@@ -83,12 +87,20 @@ MISSED = {
 `python -m studies faults --without` tries the others."""
 
 
-@pytest.mark.parametrize("first", range(0, len(SEEDS) + len(FOUND), BLOCK))
-def test_promises_are_kept_under_faults(first: int) -> None:
-    broken = {seed: simulate(seed).broken for seed in [*SEEDS, *FOUND][first : first + BLOCK]}
+@pytest.mark.parametrize(
+    "seeds",
+    [
+        *(pytest.param([seed], id=str(seed), marks=pytest.mark.essential) for seed in QUICK),
+        *in_parts([seed for seed in SEEDS if seed not in QUICK] + FOUND, quick=0, size=8),
+    ],
+)
+def test_promises_are_kept_under_faults(seeds: Sequence[int]) -> None:
+    broken = {seed: simulate(seed).broken for seed in seeds}
     assert {seed: texts for seed, texts in broken.items() if texts} == {}, "python -m studies faults --seed SEED"
 
 
+@pytest.mark.live
+@pytest.mark.slow
 def test_a_seed_is_one_run_to_the_byte_whatever_the_order_of_sets() -> None:
     program = (
         "from studies.faults.simulation import simulate\n"
@@ -110,16 +122,22 @@ def test_a_run_leaves_nothing_in_memory() -> None:
         return sum(type(one) is Simulation for one in gc.get_objects())
 
     before = left()
-    simulate(1)
+    simulate(1, Size(faults=2, span=10.0))
     assert left() == before
 
 
-@pytest.mark.parametrize("guard", MISSED)
+COSTLY = ("snapshots", "caught up", "one stands", "dates first", "step down")
+
+
+@pytest.mark.parametrize(
+    "guard", [pytest.param(guard, marks=[pytest.mark.slow] * (guard in COSTLY)) for guard in MISSED]
+)
 def test_without_a_guard_a_promise_breaks(guard: str) -> None:
     with without(guard):
         assert any(simulate(seed).broken for seed in (MISSED[guard], *SEEDS[:60])), GUARDS[guard].what
 
 
+@pytest.mark.slow
 def test_what_is_left_of_the_faults_of_a_failing_run_fails_alike() -> None:
     with without("reopen"):
         failed = next(result for seed in SEEDS if (result := simulate(seed)).broken)
@@ -128,28 +146,28 @@ def test_what_is_left_of_the_faults_of_a_failing_run_fails_alike() -> None:
         assert 0 < len(less.faults) < len(failed.faults)
 
 
-def test_runs_are_added_up_as_json() -> None:
-    done = study("1-2")
-    told = json.loads(done.stdout)
-    assert (told["runs"], told["broken"], sum(told["faults"].values()) > 0) == (2, {}, True)
-    assert (done.returncode, done.stderr) == (0, "")
-
-
-def test_a_run_that_breaks_a_promise_is_told_with_its_seed() -> None:
+@pytest.mark.live
+@pytest.mark.slow
+def test_runs_are_added_up_as_json_and_one_that_breaks_a_promise_is_told_with_its_seed() -> None:
     done = study("1-2", "--without", "safe first")
-    assert done.returncode == 1
-    assert 1 in {seed for seeds in json.loads(done.stdout)["broken"].values() for seed in seeds}
+    told = json.loads(done.stdout)
+    assert (done.returncode, told["runs"], sum(told["faults"].values()) > 0) == (1, 2, True)
+    assert 1 in {seed for seeds in told["broken"].values() for seed in seeds}
     assert done.stderr.startswith("seed 1 BROKEN ")
 
 
 def study(seeds: str, *more: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "studies", "faults", "--seed", seeds, "--json", *more]
+    command = [*STUDIES, "faults", "--seed", seeds, "--json", *more]
     return subprocess.run(command, capture_output=True, text=True, timeout=3 * HANG)
 
 
+@pytest.mark.live
+@pytest.mark.slow
 def test_only_runs_of_bookings_are_counted_where_those_are_wanted() -> None:
-    told = json.loads(study("2", "--runs", "1", "--bookings").stdout)
-    assert (told["seed"], told["counts"]["booked"] > 5) == (3, True)
+    done = study("2", "--runs", "1", "--bookings")
+    told = json.loads(done.stdout)
+    assert (told["seed"], told["counts"]["booked"] > 5, told["broken"]) == (3, True, [])
+    assert (done.returncode, done.stderr) == (0, "")
     done = study("5-7", "--bookings")
     assert (done.returncode, done.stderr.count("\n")) == (2, 1)
     assert "in none of these runs programs book" in done.stderr
