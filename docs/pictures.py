@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tokenize
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -81,17 +82,21 @@ def digest(paths: Sequence[str]) -> str:
     for path in paths:
         place = ROOT / path
         for file in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
-            tree = ast.parse(file.read_text())
-            for node in ast.walk(tree):
-                body = getattr(node, "body", None)
-                if isinstance(body, list):
-                    node.body = [one for one in body if not _is_text(one)]  # type: ignore[attr-defined]
-            total.update(ast.dump(tree).encode())
+            total.update("\n".join(code_of(file.read_text())).encode())
     return total.hexdigest()[:16]
 
 
-def _is_text(node: object) -> bool:
-    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+def code_of(text: str) -> Iterator[str]:
+    """The lines of Python source that hold code, without comments: the same under each version of Python."""
+    lines = text.splitlines()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            lines[node.lineno - 1 : node.end_lineno] = [""] * (node.end_lineno - node.lineno + 1)  # type: ignore[operator]
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type == tokenize.COMMENT:
+            row, column = token.start
+            lines[row - 1] = lines[row - 1][:column]
+    yield from (line.rstrip() for line in lines if line.strip())
 
 
 def zscout(*words: str) -> list[str]:
