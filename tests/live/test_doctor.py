@@ -23,7 +23,7 @@ from msgspec.structs import replace
 from tests.cli.tools import COMMAND, zscout_soon
 from tests.hang import HANG
 from tests.live.closed import DAY, ClosedLab, make_authority
-from tests.live.lab import Lab
+from tests.live.lab import Lab, awaited
 from tests.live.test_closed_doors import bare, tls
 from tests.ports import free_port
 from zscout.config.certificates import KEYS_VARIABLE, read_cas
@@ -57,15 +57,7 @@ async def doctor(lab: Lab, *words: object, **env: object) -> Told:
 
 async def told_that(lab: Lab, so: Callable[[Told], bool], *words: object, **env: object) -> Told:
     """Asks until it is so: on a busy machine who is called may not answer in time."""
-    told = None
-    try:
-        async with asyncio.timeout(HANG):
-            while True:
-                told = await doctor(lab, *words, **env)
-                if so(told):
-                    return told
-    except TimeoutError:
-        raise AssertionError(f"never said so; last {told}") from None
+    return await awaited(lambda: doctor(lab, *words, **env), so)
 
 
 async def told_of(lab: Lab, about: str, pattern: str, *words: object, **env: object) -> Told:

@@ -23,6 +23,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from tests.hang import HANG
+from tests.live.bench import until
 from tests.live.lab import Lab
 from tests.ports import free_port
 from tests.services.recorder.paper_run import colours, events, lanes, rows
@@ -53,15 +54,6 @@ async def recording(lab: Lab) -> None:
     async with asyncio.timeout(HANG):
         await there.wait()
     watch.close()
-
-
-async def until(ask: Callable[[], bool]) -> None:
-    """Waits for what no event tells of."""
-    async with asyncio.timeout(HANG):
-        while True:
-            if ask():
-                return
-            await asyncio.sleep(0.05)
 
 
 async def recorded(folder: Path, ask: Callable[[Path], bool]) -> None:
