@@ -250,9 +250,8 @@ def test_a_wait_for_the_end_is_told_by_its_answer_and_by_nothing_else(fleet: Cli
 
 
 def test_who_was_not_told_is_told_at_the_end(fleet: CliFleet) -> None:
-    assert preempted(fleet, holding("while held.active:\n    time.sleep(0.01)", how=", interrupt=False")) == [
-        "preempted"
-    ]
+    body = "while held.active:\n    time.sleep(0.01)"
+    assert preempted(fleet, holding(body, how=", interrupt=False")) == ["preempted"]
 
 
 @pytest.mark.slow

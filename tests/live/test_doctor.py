@@ -107,6 +107,7 @@ async def test_a_fleet_that_is_well_is_told_to_be_and_a_device_on_two_hosts(tmp_
         assert told.code == 1
 
 
+@pytest.mark.slow
 async def test_why_nobody_leads_is_told_and_what_a_node_should_offer_is_missed(tmp_path: Path) -> None:
     async with Lab(tmp_path, candidates=("forge",)) as lab:
         lab.node("anvil", "robot/a")
@@ -124,6 +125,7 @@ async def test_why_nobody_leads_is_told_and_what_a_node_should_offer_is_missed(t
         assert nobody.startswith("nobody leads")  # it joins all the same
 
 
+@pytest.mark.slow
 async def test_beside_a_node_that_listens_where_the_file_says_commands_listen_elsewhere(lab: Lab) -> None:
     address = f"tcp/127.0.0.1:{free_port()}"
     text = lab.fleet_file.read_text()
@@ -141,6 +143,7 @@ async def test_beside_a_node_that_listens_where_the_file_says_commands_listen_el
     assert (done.returncode, done.stderr) == (0, "")
 
 
+@pytest.mark.slow
 async def test_a_relay_that_is_not_linked_is_told(lab: Lab) -> None:
     plain = lab.fleet_file.read_text()
     lab.fleet_file.write_text(plain.replace("[mesh]\n", '[mesh]\nsite = "north"\n'))
@@ -156,6 +159,7 @@ async def test_a_relay_that_is_not_linked_is_told(lab: Lab) -> None:
         assert (await told_of(lab, "site", lost, ZSCOUT_FLEET=file)).code == 0
 
 
+@pytest.mark.slow
 async def test_whose_role_is_taken_away_is_told_first(tmp_path: Path, lab: ClosedLab) -> None:
     before = lab.folder / "before.toml"
     before.write_text(lab.fleet_file.read_text())
@@ -170,6 +174,7 @@ async def test_whose_role_is_taken_away_is_told_first(tmp_path: Path, lab: Close
     assert told.mends() == [f"{keys}/cert.pem: ada has no role in fleet {lab.fleet.name}"]
 
 
+@pytest.mark.slow
 async def test_another_name_of_the_fleet_is_told(lab: Lab) -> None:
     lab.node("anvil", "robot/a")
     await lab.ready(await lab.client(), "robot/a")
@@ -179,6 +184,7 @@ async def test_another_name_of_the_fleet_is_told(lab: Lab) -> None:
     assert (await told_of(lab, "links", others, ZSCOUT_FLEET=other)).code == 1
 
 
+@pytest.mark.slow
 async def test_a_plain_host_and_a_secured_fleet_are_told_of_each_other(tmp_path: Path, lab: ClosedLab) -> None:
     lab.node("anvil", "robot/a")
     await shown(lab, "ada", "anvil")
@@ -199,6 +205,7 @@ async def test_a_plain_host_and_a_secured_fleet_are_told_of_each_other(tmp_path:
     assert told.of("leader")[0][0] == "ok"
 
 
+@pytest.mark.slow
 async def test_certificates_of_another_ca_are_told_by_both_sides_and_expired_ones(
     tmp_path: Path, lab: ClosedLab
 ) -> None:
@@ -229,6 +236,7 @@ async def test_certificates_of_another_ca_are_told_by_both_sides_and_expired_one
     assert len(told.mends()) == 1
 
 
+@pytest.mark.slow
 async def test_a_name_that_is_not_the_certificates_is_told_before_joining(tmp_path: Path, lab: ClosedLab) -> None:
     file = lab.folder / "bench.toml"
     file.write_text('[node]\nhost = "bench"\nfleet = "fleet.toml"\n[security]\nfolder = "keys/anvil"')
@@ -244,6 +252,7 @@ async def test_a_name_that_is_not_the_certificates_is_told_before_joining(tmp_pa
     await mends(lab, [f"{keys}/ca.pem: may be written by others (mode 666)"], file)
 
 
+@pytest.mark.slow
 async def test_status_and_doctor_warn_of_every_certificate_that_ends_soon(tmp_path: Path, lab: ClosedLab) -> None:
     for name in ("anvil", "ada"):  # of ten hours one is left
         lab.authority.issue(name, tmp_path / "keys" / name, DAY * 10 / 24, datetime.now(UTC) - DAY * 9 / 24)
@@ -289,6 +298,7 @@ def nowhere() -> tuple[str, ...]:
     return words
 
 
+@pytest.mark.slow
 def test_without_a_network_multicast_is_told_to_be_impossible(tmp_path: Path, nowhere: tuple[str, ...]) -> None:
     file = tmp_path / "fleet.toml"
     file.write_text('[mesh]\nconnect = ["tcp/10.83.0.1:7447"]')

@@ -96,7 +96,7 @@ async def test_what_is_no_frame_is_passed_over(lab: Lab) -> None:
         publisher, watch = here.frame_publisher(key), there.frames(there.keys.frame_any)
 
         async def arrives(number: int, jpeg: bytes) -> None:
-            got = []
+            got: list[Frame] = []
 
             def there() -> bool:
                 # A session that has just joined may be sent what came before it subscribed.
@@ -329,6 +329,7 @@ async def test_tuning_by_hand(tmp_path: Path) -> None:
         await at.client.end(arc)
 
 
+@pytest.mark.slow
 async def test_a_source_that_falls_silent_loses_the_framegrabber_until_it_is_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

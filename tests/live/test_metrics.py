@@ -80,10 +80,8 @@ class PrometheusServer:
         """Waits until the query has such a result, of at least so much."""
 
         async def found() -> list[float]:
-            values = [
-                float(one["value"][1]) for one in await self.ask(query) if labels.items() <= one["metric"].items()
-            ]
-            return [value for value in values if value >= least]
+            results = [one for one in await self.ask(query) if labels.items() <= one["metric"].items()]
+            return [float(one["value"][1]) for one in results if float(one["value"][1]) >= least]
 
         return (await awaited(found, bool))[0]
 
@@ -146,6 +144,7 @@ async def test_a_node_shows_what_it_knows(tmp_path: Path) -> None:
         assert re.search(f"^{line}$", text, re.MULTILINE), f"{line}\n{text}"
 
 
+@pytest.mark.slow
 @without
 async def test_prometheus_scrapes_it_and_answers_from_that(tmp_path: Path) -> None:
     async with measured(tmp_path) as (_, client, port):
