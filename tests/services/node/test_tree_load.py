@@ -118,6 +118,7 @@ def test_averages_fade_as_the_kernels_do() -> None:
     assert faded(averages, 0.0, 3_600.0)[0] < 1e-9
 
 
+@pytest.mark.live
 def test_a_real_tree_reports_itself_alone() -> None:
     processes: list[subprocess.Popen[str]] = []
     try:
