@@ -29,6 +29,8 @@ from zscout.messages import (
     RcAsk,
     RcmState,
     RcState,
+    RcView,
+    Revocation,
     StateAsk,
 )
 from zscout.services.rcm.candidate import Candidate
@@ -179,6 +181,10 @@ class FakeFleet(MemoryFleet):
         self.newer: list[Term] = []
         self.watcher.subscribe(self.watcher.keys.grants, Grants, self._on_grants)
 
+    @property
+    def revoked(self) -> list[Revocation]:
+        return [revoked for grants in self.published for revoked in grants.revoked]
+
     def _on_grants(self, _key: str, grants: Grants) -> None:
         if grants.rcs or grants.revoked:
             self.published.append(grants)
@@ -225,6 +231,21 @@ async def fleet_of(*rcs: str) -> tuple[FakeFleet, *tuple[FakeRc, ...]]:
     found = [fleet.rc(rc) for rc in rcs]
     await fleet.joined(*found)
     return fleet, *found
+
+
+async def sees(mesh: MemoryMesh, rc: str, **wanted: Any) -> RcView:
+    """Waits until the leader that is seen from here says so of the RC."""
+    view: RcView | None = None
+    try:
+        async with asyncio.timeout(60):
+            while view is None or any(getattr(view, name) != value for name, value in wanted.items()):
+                await asyncio.sleep(0.05)
+                reply = await mesh.ask_one(mesh.keys.rcm_state, StateAsk(), RcmState, timeout=1)
+                views = reply.message.rcs if reply is not None and reply.message is not None else []
+                view = next((view for view in views if view.rc == rc), None)
+    except TimeoutError:
+        raise AssertionError(f"waited in vain for {wanted}; last {view}") from None
+    return view
 
 
 def grant_of(notice: Notice) -> Grant:

@@ -201,4 +201,3 @@ async def test_refusals_are_counted_by_code() -> None:
     with pytest.raises(Exception, match="unknown_client"):
         await client.do(HandOver("first", "desk/nobody"))
     assert candidate.tally.refused() == {"bad_request": 3, "unknown_client": 1}
-    await candidate.stop()

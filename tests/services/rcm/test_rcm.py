@@ -266,7 +266,6 @@ async def test_a_hold_that_is_adopted_and_displaced_in_one_instant_is_told_as_it
     assert [(told.state, told.outcome, told.grant) for told in one.notices] == [
         ("ended", "completed", Grant(before, 3))
     ]
-    rcm.stop()
 
 
 async def test_who_waited_is_told_of_its_grant_before_the_rcs_are() -> None:
