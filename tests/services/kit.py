@@ -39,7 +39,7 @@ class MemoryFleet:
     def mesh(self, host: str, client: str = "node") -> MemoryMesh:
         return self.network.open("test", Sender(host, client))
 
-    def cut(self, one: MemoryMesh, *others: MemoryMesh) -> None:
+    def cut(self, one: Mesh, *others: Mesh) -> None:
         """Both ways."""
         for other in others:
             self.network.cut(one, other)

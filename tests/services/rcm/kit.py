@@ -224,13 +224,13 @@ class FakeFleet(MemoryFleet):
                 await asyncio.sleep(0.001)
 
 
-async def fleet_of(*rcs: str) -> tuple[FakeFleet, *tuple[FakeRc, ...]]:
+async def fleet_of(*rcs: str) -> tuple[FakeFleet, list[FakeRc]]:
     """A fleet whose leader counts these RCs as there."""
     fleet = FakeFleet()
     fleet.rcm()
     found = [fleet.rc(rc) for rc in rcs]
     await fleet.joined(*found)
-    return fleet, *found
+    return fleet, found
 
 
 async def sees(mesh: MemoryMesh, rc: str, **wanted: Any) -> RcView:

@@ -107,7 +107,7 @@ async def test_a_booking_right_after_another_stands_though_fleet_time_is_slewed(
 
 
 async def test_after_a_restart_of_all_hosts_nothing_is_decided_by_one_wrong_clock() -> None:
-    fleet, *old = await booked("x", "y", "z")
+    fleet, old = await booked("x", "y", "z")
     client = fleet.client("one")
     await do(client, book("b", "robot/a", at=300, patience=Decimal(30)), BookingView)
     await do(client, book("c", "robot/b", at=400), BookingView)
@@ -128,7 +128,7 @@ async def test_after_a_restart_of_all_hosts_nothing_is_decided_by_one_wrong_cloc
 
 
 async def test_what_ends_by_one_wrong_clock_after_a_restart_of_all_is_not_over() -> None:
-    fleet, *old = await booked("x", "y", "z")
+    fleet, old = await booked("x", "y", "z")
     client = fleet.client("one")
     await do(client, book("m", "robot/a", at=300, maintenance=True), BookingView)
     await do(client, book("b", "robot/b", at=300, patience=Decimal(100)), BookingView)
@@ -154,7 +154,7 @@ async def test_what_ends_by_one_wrong_clock_after_a_restart_of_all_is_not_over()
 async def test_who_waits_for_a_date_does_not_begin_by_one_wrong_clock_after_a_restart_of_all(
     ahead: float, known: bool
 ) -> None:
-    fleet, *old = await booked("x", "y", "z")
+    fleet, old = await booked("x", "y", "z")
     client = fleet.client("one")
     await do(client, book("b", "robot/b", at=300, patience=Decimal(100)), BookingView)
     mine = await client.ask("mine", "robot/b", seconds=100, booking="b")
@@ -204,7 +204,7 @@ async def test_the_older_of_two_fleet_times_goes_on() -> None:
 
 async def test_a_host_that_does_not_answer_turns_no_clock_back() -> None:
     """What others have answered is older by as long as it was waited for."""
-    fleet, x, *_ = await booked("x", "y", "z")
+    fleet, (x, *_) = await booked("x", "y", "z")
     asked = fleet.silent()
     await asyncio.sleep(120)
     assert asked

@@ -11,7 +11,7 @@ import pytest
 from msgspec.structs import replace
 
 from tests.mesh.kit import until
-from tests.services.rcm.kit import FakeFleet, FakeRc, sees
+from tests.services.rcm.kit import FakeFleet, FakeRc, fleet_of, sees
 from zscout.config.fleet import default_fleet
 from zscout.mesh import IncomingQuery
 from zscout.messages import Holder, OpenRequest, RcAsk, RcState
@@ -388,7 +388,7 @@ async def test_the_link_to_one_rc_of_a_host_may_be_the_first_that_a_leader_which
 
 
 async def test_a_client_whose_whole_host_dies_is_dropped_as_soon_as_another_host_answers() -> None:
-    fleet, rc = await fleet_of("robot/a")
+    fleet, _ = await fleet_of("robot/a")
     client = fleet.client("one")
     await client.ask("tally", "robot/a", seconds=60)
     fleet.network.kill(client.mesh)

@@ -152,7 +152,7 @@ def test_only_the_first_file_has_the_past(tmp_path: Path) -> None:
 
 
 async def test_a_recorder_that_comes_late_shows_what_journals_tell(path: Path, tmp_path: Path) -> None:
-    told, *_ = await telling(tmp_path, "x", "y", rcs=["robot/a", "robot/b"])
+    told, _ = await telling(tmp_path, "x", "y", rcs=["robot/a", "robot/b"])
     fleet = told.fleet
     one, two = fleet.client("one"), fleet.client("two")
     await one.ask("survey", "robot/a", seconds=6_000)
