@@ -226,9 +226,7 @@ async def test_only_an_rc_tells_of_its_own_use_and_only_ends_wake_the_disk(tmp_p
     await told.close()
 
 
-async def test_no_flood_of_words_on_use_takes_room_without_bound(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_no_flood_of_words_on_use_takes_unbounded_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(journal_module, "MAX_USES", 20)
     told, (rc,) = await telling(tmp_path, "x")
     client = told.fleet.client("one")
@@ -282,9 +280,7 @@ async def test_more_than_can_be_kept_is_a_gap(tmp_path: Path, monkeypatch: pytes
     await told.close()
 
 
-async def test_a_disk_that_fails_stops_nothing_and_is_told_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_failing_disk_stops_nothing_and_is_told_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "x" / FILE).mkdir(parents=True)
     told, _ = await telling(tmp_path, "x")
     client = told.fleet.client("one")

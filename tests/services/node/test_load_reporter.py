@@ -141,18 +141,6 @@ def test_there_is_a_limit_to_components(proc: Proc) -> None:
     assert len(meter.measure()) == messages.MAX_COMPONENTS
 
 
-@pytest.fixture
-def started() -> Iterator[list[subprocess.Popen[str]]]:
-    """Processes that are gone afterwards, with their children."""
-    processes: list[subprocess.Popen[str]] = []
-    yield processes
-    for process in processes:
-        for child in psutil.Process(process.pid).children(recursive=True):
-            child.kill()
-        process.kill()
-        process.communicate()
-
-
 def start(processes: list[subprocess.Popen[str]], program: str, core: int | None = None) -> int:
     """Starts a parent and its child, on one core if one is given; returns the parent's pid."""
     mine = os.sched_getaffinity(0)

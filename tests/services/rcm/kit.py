@@ -163,10 +163,8 @@ def request(
     arc: str, *needs: str, priority: int = 0, seconds: float = 60, place: Place | None = None, **more: Any
 ) -> Ask:
     """An Ask whose id is the ARC's name; needs as `radio/rf0:5`, with a command rate."""
-    split = [need.partition(":") for need in needs]
-    rates: dict[str, dict[str, Decimal]] = {
-        rc: {"command_rate": Decimal(rate)} if rate else {} for rc, _, rate in split
-    }
+    told = [need.partition(":") for need in needs]
+    rates: dict[str, dict[str, Decimal]] = {rc: {"command_rate": Decimal(rate)} if rate else {} for rc, _, rate in told}
     return Ask(arc, arc, rates, priority, Decimal(str(seconds)), place=place, **more)
 
 

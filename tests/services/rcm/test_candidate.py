@@ -277,9 +277,7 @@ async def test_a_leader_goes_above_what_somebody_whom_it_sees_obeys(who: str) ->
     await until(lambda: candidate.rcm and candidate.rcm.term > far)
 
 
-async def test_of_two_that_stand_at_once_one_leads_and_the_other_leaves_it_alone(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+async def test_of_two_that_stand_at_once_one_leads_and_the_other_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
     """It would depose the first with a term above, and the RCs would be led by who may fail next."""
     fleet = FakeFleet("h1", "h2")
     fleet.rc("robot/a")

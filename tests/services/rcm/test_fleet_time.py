@@ -134,7 +134,7 @@ async def test_what_ends_by_one_wrong_clock_after_a_restart_of_all_is_not_over()
     await do(client, book("b", "robot/b", at=300, patience=Decimal(100)), BookingView)
     mine = await client.ask("mine", "robot/b", seconds=100, booking="b")
     client.open = [
-        OpenRequest("mine", "mine", {"robot/b": {}}, 0, Decimal(100), place=mine.place, booking="b@1800000300")
+        OpenRequest("mine", "mine", {"robot/b": {}}, 0, Decimal(100), place=mine.place, booking=mine.booking)
     ]
     await kill_all(fleet, old)
     # By the clock of the first to be back both end as it has just begun to lead.
@@ -151,9 +151,7 @@ async def test_what_ends_by_one_wrong_clock_after_a_restart_of_all_is_not_over()
 
 @pytest.mark.parametrize("ahead", [NOON + 310, NOON + 2 * 86_400], ids=["its date has come", "it is over"])
 @pytest.mark.parametrize("known", [True, False], ids=["known", "not known"])
-async def test_who_waits_for_a_date_does_not_begin_by_one_wrong_clock_after_a_restart_of_all(
-    ahead: float, known: bool
-) -> None:
+async def test_who_waits_for_a_date_does_not_begin_by_one_clock_after_all_restart(ahead: float, known: bool) -> None:
     fleet, old = await booked("x", "y", "z")
     client = fleet.client("one")
     await do(client, book("b", "robot/b", at=300, patience=Decimal(100)), BookingView)

@@ -55,9 +55,7 @@ async def test_it_is_kept_over_a_restart_of_the_only_candidate(tmp_path: Path) -
     assert (view.host, view.reason) == ("devices", "devices is gone")
 
 
-async def test_a_file_that_is_none_is_not_used_and_written_anew(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_file_that_is_none_is_replaced(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / FILE).write_text('{"written": "now"')
     fleet = FakeFleet()
     candidate = fleet.candidate("x", tmp_path)

@@ -446,9 +446,7 @@ async def seconds_until_used(fleet: FakeFleet, rc: FakeRc) -> float:
 
 
 @pytest.mark.parametrize("settle", [None, 2.0])
-async def test_an_instance_elsewhere_is_taken_in_once_the_one_before_has_let_go_and_settled(
-    settle: float | None,
-) -> None:
+async def test_an_instance_elsewhere_is_taken_in_once_the_one_before_let_go_and_settled(settle: float | None) -> None:
     fleet = FakeFleet()
     fleet.rcm()
     first = elsewhere(fleet, "d1", "i1")
@@ -462,9 +460,7 @@ async def test_an_instance_elsewhere_is_taken_in_once_the_one_before_has_let_go_
 
 
 @pytest.mark.parametrize(("home", "waits"), [("d2", 0.0), ("d1", 5.0 + default_fleet().timing.hold_lease / SECOND)])
-async def test_a_reign_that_never_saw_the_instance_at_home_waits_before_it_takes_in_another(
-    home: str, waits: float
-) -> None:
+async def test_a_reign_that_never_saw_the_instance_at_home_lets_others_wait(home: str, waits: float) -> None:
     fleet = FakeFleet()
     fleet.fleet = replace(fleet.fleet, devices={home: (RC,)})
     elsewhere(fleet, "d2", "i2")

@@ -263,9 +263,7 @@ async def test_a_hold_that_is_adopted_and_displaced_in_one_instant_is_told_as_it
     held = RecoveredHold(kept, Place(before, 1), Grant(before, 3), at - 5 * SECOND, at - 4 * SECOND)
     rcm._receive(RcJoined("robot/a", sharable=False), Adopted(held))
     await until(lambda: one.notices)
-    assert [(told.state, told.outcome, told.grant) for told in one.notices] == [
-        ("ended", "completed", Grant(before, 3))
-    ]
+    assert [(it.state, it.outcome, it.grant) for it in one.notices] == [("ended", "completed", Grant(before, 3))]
 
 
 async def test_who_waited_is_told_of_its_grant_before_the_rcs_are() -> None:
