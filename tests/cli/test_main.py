@@ -10,14 +10,12 @@ import sys
 from decimal import Decimal
 from pathlib import Path
 
-import click
 import pytest
-from click.testing import CliRunner
 
 from tests.cli import tools
 from tests.hang import HANG
 from tests.live.lab import Lab
-from zscout.cli.main import COMMANDS, main
+from zscout.cli.main import COMMANDS
 from zscout.cli.requests.options import gather_needs, parse_duration, parse_need
 from zscout.config.strict import BadInput
 from zscout.terminal import Table, span
@@ -38,54 +36,6 @@ def test_help_loads_nothing_heavy_and_lists_all() -> None:
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=HANG)
     assert (done.returncode, done.stderr) == (0, "")
     assert all(f"\n  {name} " in done.stdout for name in COMMANDS)
-
-
-@pytest.mark.parametrize("name", list(COMMANDS))
-def test_every_command_is_there_and_its_help_has_examples(name: str) -> None:
-    command = main.get_command(click.Context(main), name)
-    assert command is not None
-    assert command.name == name
-    assert command.help is not None
-    assert "Example" in command.help
-
-
-def test_an_unknown_command_is_one_line_with_a_hint() -> None:
-    done = zscout("requst")
-    assert done.returncode == 2
-    assert done.stderr == "zscout: there is no command 'requst'; did you mean request? (see zscout --help)\n"
-
-
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        (["request"], "Missing argument 'NEED...'"),
-        (["request", "robot/a", "--"], "no command follows the --"),
-        (["request", "robot/a", "--priority", "high"], "'high' is not a whole number"),
-        (["request", "robot"], "need \"robot\": RC 'robot' is not valid: write kind/name"),
-        (["request", "robot/a", "robot/a"], "robot/a is named twice"),
-        (["request", "robot/a", "--again"], "--again runs a command again"),
-        (["request", "robot/a", "--min-runtime", "0"], "--min-runtime must be positive"),
-        (["request", "robot/a", "sleep", "5"], "a command goes after --"),
-        (["request", "robot/a:rate"], "rate has no number; write parameter=number"),
-        (["cancel"], "Missing argument 'ARC'"),
-        (["cancel", ""], '"" names no ARC; zscout status lists them'),
-    ],
-)
-def test_bad_input_is_one_line_and_2(args: list[str], words: str) -> None:
-    done = CliRunner().invoke(main, args)
-    assert (done.exit_code, done.stdout) == (2, "")
-    assert done.stderr.count("\n") == 1
-    assert done.stderr.startswith("zscout")
-    assert words in done.stderr
-
-
-def test_a_fleet_file_that_is_not_there_is_named() -> None:
-    done = zscout("--fleet", "nowhere.toml", "cancel", "x")
-    assert done.returncode == 2
-    assert done.stderr == "zscout: nowhere.toml: there is no such file; check the path\n"
-    named = zscout("cancel", "x", ZSCOUT_FLEET="nowhere.toml")
-    assert named.returncode == 2
-    assert "named by $ZSCOUT_FLEET" in named.stderr
 
 
 @pytest.mark.live
@@ -179,14 +129,6 @@ def test_bash_completes_at_tab(tmp_path: Path) -> None:
         # An interactive shell does not heed SIGTERM.
         terminal.press("\x15exit\n")
         assert terminal.code() == 0
-
-
-@pytest.mark.parametrize(
-    ("text", "seconds"),
-    [("5", "5"), ("1.5", "1.5"), (".5", "0.5"), ("300ms", "0.3"), ("2m", "120"), ("1h", "3600"), ("7s", "7")],
-)
-def test_durations(text: str, seconds: str) -> None:
-    assert parse_duration(text, "--timeout") == Decimal(seconds)
 
 
 @pytest.mark.parametrize("text", ["", "5x", "-1", "1e3", "nan", "1_0", "٣", "5 s", "mm", "0", "1ss", "99999999h"])

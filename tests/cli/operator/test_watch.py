@@ -12,14 +12,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from rerun.chunk import RrdReader
 
 from tests.behaviors.perception.scenes import Scene, box_of, overlap
 from tests.cli.tools import COMMAND, Terminal, end, zscout_here
 from tests.drivers.mjpeg import MjpegServer, jpeg
 from tests.hang import HANG
-from zscout.cli.operator.watch import watch as command
 
 RATE = 10.0
 COMES, GOES = 5.0, 7.0
@@ -181,9 +179,3 @@ def test_at_a_terminal_there_is_a_live_line(video: Path) -> None:
         terminal.until("9.9 s watched, 100 pictures; 1 event")
         assert terminal.code() == 0
         assert "\x1b[" in terminal.raw
-
-
-def test_help_has_examples() -> None:
-    shown = CliRunner().invoke(command, ["--help"]).output
-    assert "zscout watch --source /dev/video0" in shown
-    assert "--json" in shown

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
+import zscout as package
 from tests.cli.tools import Terminal, zscout, zscout_here
-from tests.services.recorder.paper_run import RCS, TABLE1, TABLE2, events, lanes, second_by_second
+from tests.services.recorder.paper_run import RCS, TABLE2, events, lanes, second_by_second
 
 JSON = (
     '{"strategy": "priority", "holds": ['
@@ -67,13 +68,9 @@ min_runtime = 3
 
 
 @pytest.fixture
-def table1(tmp_path: Path) -> Path:
-    text = "".join(f'[[rc]]\nname = "{rc}"\n' for rc in RCS)
-    for name, at, priority, runtime, needs in TABLE1:
-        text += f'[[arc]]\nname = "{name}"\nat = {at}\npriority = {priority}\nmin_runtime = {runtime}\n'
-        text += "[arc.needs]\n" + "".join(f'"{rc}" = {{}}\n' for rc in needs)
-    file = tmp_path / "table1.toml"
-    file.write_text(text)
+def table1() -> Path:
+    """As it is shipped."""
+    (file,) = Path(package.__file__).parent.rglob("table1.toml")
     return file
 
 
