@@ -27,6 +27,7 @@ def zscout(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
     return tools.zscout(*args, env=os.environ | env)
 
 
+@pytest.mark.live
 def test_help_loads_nothing_heavy_and_lists_all() -> None:
     script = (
         "import sys; from zscout.cli.main import main\n"
@@ -48,6 +49,7 @@ def test_a_mesh_without_an_rcm_is_3(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.live
 def test_a_closed_pipe_is_quiet() -> None:
     read, write = os.pipe()
     os.close(read)
@@ -57,6 +59,7 @@ def test_a_closed_pipe_is_quiet() -> None:
     assert (process.returncode, errors) == (1, "")
 
 
+@pytest.mark.live
 @pytest.mark.parametrize(("command", "code"), [("completion fish", 1), ("completion no-such-shell", 2), ("--help", 1)])
 def test_a_terminal_that_is_gone_is_quiet(command: str, code: int) -> None:
     """As where a terminal window is closed and SIGHUP is ignored: all that is written to it fails with EIO."""
@@ -71,6 +74,7 @@ def test_a_terminal_that_is_gone_is_quiet(command: str, code: int) -> None:
     os.close(theirs)
 
 
+@pytest.mark.live
 @pytest.mark.parametrize(("command", "code"), [("--help", 0), ("replay nowhere.toml", 2)])
 @pytest.mark.parametrize("closed", [">&-", "2>&-"])
 def test_a_closed_stream_is_no_error(command: str, code: int, closed: str) -> None:
@@ -79,6 +83,7 @@ def test_a_closed_stream_is_no_error(command: str, code: int, closed: str) -> No
     assert (done.returncode, "Traceback" in done.stdout + done.stderr) == (code, False), done.stderr
 
 
+@pytest.mark.live
 def test_a_full_disk_is_told_in_one_line() -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
@@ -87,6 +92,7 @@ def test_a_full_disk_is_told_in_one_line() -> None:
     assert (done.returncode, done.stderr) == (1, "zscout: No space left on device; free some\n")
 
 
+@pytest.mark.live
 def test_completion_knows_the_commands_without_loading_them() -> None:
     script = zscout("completion", "bash")
     assert script.returncode == 0
@@ -106,6 +112,7 @@ def test_completion_knows_the_commands_without_loading_them() -> None:
     assert "write one of bash, zsh, fish" in unknown.stderr
 
 
+@pytest.mark.live
 def test_bash_completes_at_tab(tmp_path: Path) -> None:
     """A real bash at a terminal, with `zscout` on its path and the script read."""
     here = tmp_path / "zscout"

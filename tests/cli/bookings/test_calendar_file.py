@@ -6,9 +6,10 @@ import time
 from contextlib import suppress
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.thorough import times
 from zscout.cli.bookings.calendar_file import MAX_BYTES, MAX_EVENTS, CalendarEvent, read_calendar
 from zscout.config.strict import BadInput
 
@@ -104,6 +105,7 @@ parts = st.sampled_from(["BEGIN:VCALENDAR", "END:VCALENDAR", "BEGIN:VEVENT", "EN
 lines = st.lists(parts | st.builds("{}{}:{}".format, names, params, values) | values, max_size=20)
 
 
+@settings(max_examples=times(40))
 @given(lines)
 def test_whatever_a_file_has_it_is_read_or_refused_in_a_line(some: list[str]) -> None:
     text = "\r\n".join(["BEGIN:VCALENDAR", "BEGIN:VEVENT", *some, "END:VEVENT", "END:VCALENDAR", ""])

@@ -131,6 +131,8 @@ def camera() -> Iterator[MjpegServer]:
         yield server
 
 
+@pytest.mark.live
+@pytest.mark.slow
 def test_a_camera_that_breaks_off_is_opened_again_and_ctrl_c_ends_with_a_summary(camera: MjpegServer) -> None:
     process = subprocess.Popen(
         [*COMMAND, "watch", "--source", camera.url, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -159,6 +161,8 @@ def test_a_camera_that_breaks_off_is_opened_again_and_ctrl_c_ends_with_a_summary
     assert camera.accepted >= 2
 
 
+@pytest.mark.live
+@pytest.mark.slow
 def test_ctrl_c_does_not_wait_for_a_camera_that_is_silent(camera: MjpegServer) -> None:
     camera.mode = "stall"
     process = subprocess.Popen([*COMMAND, "watch", "--source", camera.url], stdout=subprocess.PIPE, text=True)
@@ -173,6 +177,7 @@ def test_ctrl_c_does_not_wait_for_a_camera_that_is_silent(camera: MjpegServer) -
         end(process)
 
 
+@pytest.mark.live
 def test_at_a_terminal_there_is_a_live_line(video: Path) -> None:
     with Terminal("watch", "--source", video) as terminal:
         terminal.until("motion for")
