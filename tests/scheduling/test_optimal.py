@@ -7,7 +7,6 @@ from fractions import Fraction
 from hypothesis import given, settings
 
 from tests.scheduling.exhaustive import best_set
-from tests.scheduling.invariants import Ledger
 from tests.scheduling.workloads import workloads
 from tests.thorough import times
 from zscout.scheduling import optimal
@@ -28,7 +27,6 @@ from zscout.scheduling.model import (
     VoteOverdue,
 )
 from zscout.scheduling.packing import PackingItem
-from zscout.simulation.replay import replay
 from zscout.simulation.workload import Workload, WorkloadRc
 from zscout.types import SECOND, ArcId
 
@@ -91,14 +89,6 @@ def test_a_slow_voter_stops_nobody_who_has_nothing_to_do_with_it() -> None:
 def test_one_question_settles_a_set_that_an_rc_accepts() -> None:
     _, effects = core_of("R", *(arc(f"a{number}", "R") for number in range(8)))
     assert [len(one.holders) for one in proposed(effects)] == [8]
-
-
-@settings(max_examples=times(60))
-@given(workloads())
-def test_promises_hold_in_replay(workload: Workload) -> None:
-    ledger = Ledger(workload.rcs, [arrival.request for arrival in workload.arrivals])
-    replay(workload, ledger.take, strategy=optimal.Optimal())
-    assert not ledger.open
 
 
 @settings(max_examples=times(35))
