@@ -24,18 +24,9 @@ from zscout.types import SECOND, HostName
 
 NAMES = ("a", "b", "c", "d")
 OPS = (
-    *["time"] * 10,
-    *["move"] * 6,
-    *["place"] * 2,
-    *["crash"] * 2,
-    "stop",
-    "complete",
-    "drain",
-    *["uncordon"] * 3,
-    *["dies", "is cut off", "freezes"],
-    *["is back"] * 3,
-    "leader",
-)
+    *["time"] * 10, *["move"] * 6, *["place"] * 2, *["crash"] * 2, "stop", "complete", "drain", *["uncordon"] * 3,
+    *["dies", "is cut off", "freezes"], *["is back"] * 3, "leader",
+)  # fmt: skip
 POLICIES: tuple[Restart, ...] = ("never", *("on_failure", "always") * 3)
 SETTLING = 60 * SECOND
 """Longer than any back-off, grace, look or time to stand by."""

@@ -69,16 +69,6 @@ def question(effects: list[Effect]) -> int:
     return proposal.proposal
 
 
-def vote_all(core: Core, effects: list[Effect]) -> list[Effect]:
-    """Answers all questions at once, for RCs that carry two holders; returns all effects to the end."""
-    told = list(effects)
-    while questions := only(Propose, effects):
-        votes = [Vote(one.proposal, accept=len(one.holders) <= 2) for one in questions]
-        effects = core.handle(1, *votes)
-        told += effects
-    return told
-
-
 # Slow voters
 
 
@@ -115,7 +105,7 @@ def test_who_is_blocked_only_by_what_an_open_visit_would_free_keeps_its_place() 
     core.handle(1, Requested(request("next", "robot/b", "robot/c", priority=5)))
     # Its equal must not take robot/c before it: equal priority would never give it back.
     assert granted(core.handle(1, Requested(request("last", "robot/c", priority=5)))) == []
-    assert granted(vote_all(core, asked)) == ["top", "next"]
+    assert granted(core.handle(1, Vote(question(asked), accept=True))) == ["top", "next"]
 
 
 # Votes

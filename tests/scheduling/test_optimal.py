@@ -7,15 +7,15 @@ from fractions import Fraction
 from hypothesis import given, settings
 
 from tests.scheduling.exhaustive import best_set
-from tests.scheduling.workloads import workloads
+from tests.scheduling.workloads import voter, workloads
 from tests.thorough import times
 from zscout.scheduling import optimal
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
+from zscout.scheduling.forecast import play_instant
 from zscout.scheduling.model import (
     ArcRequest,
     Effect,
-    Event,
     Granted,
     HoldEnded,
     Outcome,
@@ -102,12 +102,8 @@ def test_free_rcs_are_shared_out_as_by_trying_all(workload: Workload) -> None:
     able = [one for one in requests if one.needs.keys() <= there.keys()]
     core = Core(optimal.Optimal())
     core.handle(0, *(RcJoined(rc.name, rc.sharable) for rc in workload.rcs))
-    batch: list[Event] = [Requested(request) for request in requests]
-    while batch:
-        effects = core.handle(0, *batch)
-        batch = [
-            Vote(one.proposal, not excess(there[one.rc].capacity, one.holders.items())) for one in proposed(effects)
-        ]
+    for _ in play_instant(core, 0, map(Requested, requests), voter(workload)):
+        pass
     assert core._state.running.keys() == {able[one].arc for one in expected(able, there)}
 
 

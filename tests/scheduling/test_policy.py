@@ -13,9 +13,9 @@ from msgspec import structs
 from tests.scheduling.invariants import Ledger
 from tests.scheduling.test_waiting import workload
 from tests.scheduling.validate import validate
+from tests.scheduling.workloads import voter
 from tests.thorough import times
 from zscout.config.scheduling_policy import RcQuota, SchedulingPolicy, StrategyName
-from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import play_instant
 from zscout.scheduling.model import (
@@ -27,13 +27,11 @@ from zscout.scheduling.model import (
     HoldEnded,
     LeadTaken,
     Outcome,
-    Propose,
     RcJoined,
     RecoveredHold,
     Released,
     Requested,
     Tick,
-    Vote,
     WakeAt,
 )
 from zscout.scheduling.strategies import STRATEGIES
@@ -338,22 +336,16 @@ def check_longest(strategy: StrategyName, seed: int, longest: Ns) -> None:
 
 def play(core: Core, work: Workload, watch: Callable[[Ns, Core, list[Effect]], None]) -> None:
     """A workload to its end, by the wakes of the core alone."""
-    capacity = {rc.name: rc.capacity for rc in work.rcs if rc.sharable}
-
-    def vote(asked: Propose) -> Vote:
-        return Vote(asked.proposal, accept=not excess(capacity[asked.rc], asked.holders.items()))
-
-    def step(now: Ns, events: list[Event]) -> None:
-        for effects in play_instant(core, now, events, vote):
-            watch(now, core, effects)
-
-    step(0, [RcJoined(rc.name, rc.sharable) for rc in work.rcs])
-    left = sorted(work.arrivals, key=lambda one: one.at)
-    while left or core._state.running:
-        at = min([*(one.at for one in left[:1]), *([core._wake] if core._wake is not None else [])])
-        events: list[Event] = [Requested(one.request) for one in left if one.at == at]
+    events: list[Event] = [RcJoined(rc.name, rc.sharable) for rc in work.rcs]
+    left, at = sorted(work.arrivals, key=lambda one: one.at), 0
+    while events:
+        for effects in play_instant(core, at, events, voter(work)):
+            watch(at, core, effects)
+        at = min([*(one.at for one in left[:1]), *([core._wake] if core._wake is not None else [])], default=at)
+        events = [Requested(one.request) for one in left if one.at == at]
         left = [one for one in left if one.at > at]
-        step(at, events or [Tick()])
+        if not events and core._state.running:
+            events = [Tick()]
 
 
 def _changed(work: Workload, change: Callable[[ArcRequest], ArcRequest]) -> Workload:

@@ -215,20 +215,8 @@ def _request(text: str) -> tuple[ArcRequest, dict[str, str]]:
         pairs = (pair.split("=") for pair in (match[2] or "").split())
         wanted[match[1]] = {key: Fraction(value) for key, value in pairs}
     words = (word for word in rest if word not in {"keep", "maintenance", "bookings", "tentative"})
-    known = (
-        "priority",
-        "runtime",
-        "client",
-        "place",
-        "grant",
-        "start",
-        "booking",
-        "patience",
-        "since",
-        "bound",
-        "until",
-    )
-    options = settings(words, *known)
+    known = "priority runtime client place grant start booking patience since bound until"
+    options = settings(words, *known.split())
     request = ArcRequest(
         arc=arc,
         client=options.get("client", "host/" + arc),
