@@ -19,7 +19,7 @@ seen HOST      lost HOST                its node, without a report
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from random import Random
 from typing import Any
@@ -171,38 +171,34 @@ class PlacerPlayer:
             case "place", name, *options:
                 self.specs[name] = _spec(options)
                 return PlaceComponent(name, self.specs[name])
-            case "end", name:
-                return EndComponent(name)
-            case "move", name, *to:
-                return MigrateComponent(name, to[0] if to else None)
-            case "drain", host:
-                return DrainHost(host)
-            case "uncordon", host:
-                return UncordonHost(host)
             case "start", name, incarnation, host, result, *rest:
                 return _start_answered(name, int(incarnation), host, result, rest)
             case "stop", name, incarnation, host, "done" | "said" | "unknown" as result:
                 return StopAnswered(name, int(incarnation), host, done=result != "unknown")
             case "moved", name, incarnation, host, result, *rest:
                 return _move_answered(name, int(incarnation), host, result, rest)
-            case "appeared", name, incarnation, host:
-                return TokenAppeared(name, int(incarnation), host)
-            case "vanished", name, incarnation, host:
-                return TokenVanished(name, int(incarnation), host)
             case "told", host, *rest:
                 only = next((word[5:] for word in rest if word.startswith("only=")), None)
                 kinds = next((frozenset(_names(word[6:])) for word in rest if word.startswith("kinds=")), None)
                 told = [self.seen(host, word) for word in rest if not word.startswith(("only=", "kinds="))]
                 return ComponentsListed(host, tuple(told), only, kinds)
-            case "seen", host:
-                return HostJoined(host)
             case "lost", host:
                 self.reports.pop(host, None)
                 return HostLost(host)
             case ("tick",):
                 return None
-            case _:
-                raise ValueError(f"no such command: {' '.join([verb, *words])}")
+        others: dict[str, Callable[..., PlacerEvent]] = {
+            "end": EndComponent,
+            "move": lambda name, to=None: MigrateComponent(name, to),
+            "drain": DrainHost,
+            "uncordon": UncordonHost,
+            "appeared": lambda name, incarnation, host: TokenAppeared(name, int(incarnation), host),
+            "vanished": lambda name, incarnation, host: TokenVanished(name, int(incarnation), host),
+            "seen": HostJoined,
+        }
+        if verb not in others:
+            raise ValueError(f"no such command: {' '.join([verb, *words])}")
+        return others[verb](*words)
 
     def seen(self, host: HostName, word: str) -> ComponentView:
         name, incarnation, phase, *rest = word.split(":")

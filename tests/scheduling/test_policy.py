@@ -5,13 +5,12 @@ from __future__ import annotations
 import random
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 
 import pytest
 from msgspec import structs
 
 from tests.scheduling.invariants import Ledger
-from tests.scheduling.test_waiting import workload
+from tests.scheduling.test_waiting import changed, workload
 from tests.scheduling.validate import validate
 from tests.scheduling.workloads import voter
 from tests.thorough import times
@@ -230,7 +229,7 @@ def test_nobody_ever_has_more_than_the_quota(strategy: StrategyName, of: str) ->
 
 def check_quota(strategy: StrategyName, seed: int, *, rcs: bool) -> None:
     draw = random.Random(seed)  # noqa: S311
-    work = _changed(workload(seed), lambda one: structs.replace(one, client=f"h{draw.randint(1, 3)}/c"))
+    work = changed(workload(seed), lambda one: structs.replace(one, client=f"h{draw.randint(1, 3)}/c"))
     owners = {one.request.arc: one.request.client.partition("/")[0] for one in work.arrivals}
     most = max(len(one.request.needs) for one in work.arrivals) + 1
     held: Counter[str] = Counter()
@@ -309,7 +308,7 @@ def test_no_hold_is_ever_longer_than_the_longest_time(strategy: StrategyName) ->
 
 
 def check_longest(strategy: StrategyName, seed: int, longest: Ns) -> None:
-    work = _changed(
+    work = changed(
         workload(seed, kept=0.5), lambda one: structs.replace(one, min_runtime=min(one.min_runtime, longest))
     )
     ledger = Ledger(work.rcs, [one.request for one in work.arrivals])
@@ -348,9 +347,5 @@ def play(core: Core, work: Workload, watch: Callable[[Ns, Core, list[Effect]], N
             events = [Tick()]
 
 
-def _changed(work: Workload, change: Callable[[ArcRequest], ArcRequest]) -> Workload:
-    return Workload(work.rcs, tuple(replace(one, request=change(one.request)) for one in work.arrivals))
-
-
 def _with_priorities(work: Workload, draw: random.Random, highest: int) -> Workload:
-    return _changed(work, lambda one: structs.replace(one, priority=draw.randint(highest - 3, highest)))
+    return changed(work, lambda one: structs.replace(one, priority=draw.randint(highest - 3, highest)))

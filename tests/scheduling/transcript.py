@@ -20,6 +20,7 @@ is `kind/name`, with parameters `kind/name{rate=5 width=0.1}`; a TERM is `COUNTE
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, cast
@@ -109,6 +110,7 @@ class CorePlayer:
 
     def event(self, verb: str, rest: str) -> Event | None:
         first, _, second = rest.partition(" ")
+        words = second.split()
         match verb:
             case "ask":
                 request, options = _request(rest)
@@ -116,15 +118,6 @@ class CorePlayer:
             case "standing":
                 self.standing.append(_held(rest))
                 return None
-            case "adopt":
-                return Adopted(_held(rest))
-            case "place":
-                return PlaceShown(first, _place(second))
-            case "unconfirmed":
-                grant, rcs = second.split()
-                return Unconfirmed(first, Grant(*_place(grant)), tuple(rcs.split(",")))
-            case "reachable":
-                return Reachable(first)
             case "waiting":
                 request, options = _request(rest)
                 self.waiting.append(Requested(request, _place(options["place"])))
@@ -133,45 +126,38 @@ class CorePlayer:
                 lead = LeadTaken(_term(first), tuple(self.standing), tuple(self.waiting))
                 self.standing, self.waiting = [], []
                 return lead
-            case "join":
-                return RcJoined(first, sharable=_flag(second, "sharable"))
-            case "leave":
-                return RcLost(first, second) if second else RcLost(first)
-            case "lost":
-                return ClientLost(first)
-            case "cancel":
-                return Cancelled(first)
-            case "release":
-                return Released(first)
-            case "handover":
-                client, renamed = second.split()
-                return HandedOver(first, client, renamed)
             case "vote":
                 answer, _, reason = second.partition(" ")
                 return Vote(int(first), accept=_choice(answer, yes="yes", no="no"), reason=reason)
-            case "overdue":
-                return VoteOverdue(int(first))
-            case "rules":
-                return RcReported(first, rules_changed=True)
-            case "ended":
-                return RcReported(first, ended=tuple(second.split(",")))
-            case "book":
-                return Booked(_booking(rest, self.now)[0], tentative="tentative" in rest.split())
-            case "redate":
-                return Redated(first, ns(second))
-            case "unbook":
-                return Unbooked(first, at_present=_flag(second, "now"))
             case "strategy":
-                options = settings(second.split(), "patience", "half_life")
+                options = settings(words, "patience", "half_life")
                 patience = ns(options["patience"]) if "patience" in options else DEFAULT.patience
                 fair = FairShares(ns(options["half_life"])) if "half_life" in options else None
                 policy = replace(DEFAULT, patience=patience, fair_shares=fair)
                 self.core = Core(STRATEGIES[cast("StrategyName", first)](), policy)
                 return None
-            case "tick":
-                return Tick()
-            case _:
-                raise ValueError(f"no such command: {verb}")
+        others: dict[str, Callable[[], Event]] = {
+            "adopt": lambda: Adopted(_held(rest)),
+            "place": lambda: PlaceShown(first, _place(second)),
+            "unconfirmed": lambda: Unconfirmed(first, Grant(*_place(words[0])), tuple(words[1].split(","))),
+            "reachable": lambda: Reachable(first),
+            "join": lambda: RcJoined(first, sharable=_flag(second, "sharable")),
+            "leave": lambda: RcLost(first, second) if second else RcLost(first),
+            "lost": lambda: ClientLost(first),
+            "cancel": lambda: Cancelled(first),
+            "release": lambda: Released(first),
+            "handover": lambda: HandedOver(first, *words),
+            "overdue": lambda: VoteOverdue(int(first)),
+            "rules": lambda: RcReported(first, rules_changed=True),
+            "ended": lambda: RcReported(first, ended=tuple(second.split(","))),
+            "book": lambda: Booked(_booking(rest, self.now)[0], tentative="tentative" in rest.split()),
+            "redate": lambda: Redated(first, ns(second)),
+            "unbook": lambda: Unbooked(first, at_present=_flag(second, "now")),
+            "tick": Tick,
+        }
+        if verb not in others:
+            raise ValueError(f"no such command: {verb}")
+        return others[verb]()
 
 
 def _held(text: str) -> RecoveredHold:
