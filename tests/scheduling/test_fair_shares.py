@@ -12,7 +12,7 @@ from msgspec import structs
 from tests.scheduling import oracle
 from tests.scheduling.oracle import SlowShares
 from tests.scheduling.seeds import in_parts
-from tests.scheduling.test_waiting import check_bound, workload
+from tests.scheduling.test_waiting import changed, check_bound, workload
 from tests.scheduling.validate import validate
 from tests.scheduling.workloads import workloads
 from tests.thorough import times
