@@ -64,6 +64,7 @@ health = ["sh", "-c", "test -z \\"$NOTIFY_SOCKET\\""]
 """What a node does all at once: pictures, commands, components, a recording."""
 
 
+@pytest.mark.live
 @ANALYZE
 def test_systemd_finds_nothing_wrong_with_the_units(tmp_path: Path) -> None:
     for unit in (PROJECT / "deploy" / "systemd").iterdir():
@@ -76,6 +77,7 @@ def test_systemd_finds_nothing_wrong_with_the_units(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
 
 
+@pytest.mark.live
 @ANALYZE
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
 def test_a_unit_is_closed_to_what_it_does_not_need(unit: Path) -> None:

@@ -13,7 +13,7 @@ from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import IncomingQuery, Mesh
 from zscout.mesh.supervision import StallWatch
-from zscout.messages import Command, Done, Grants, Holder, HoldView, RcmState, StateAsk
+from zscout.messages import Command, Done, Grants, Holder, HoldView, RcAsk, RcmState, RcState, StateAsk
 from zscout.testing.memory import MemoryNetwork
 from zscout.types import Grant, Place, Term
 
@@ -98,6 +98,24 @@ class Rcm:
             held=0,
             remaining=60,
         )
+
+
+def grant(number: int) -> Grant:
+    return Grant(TERM, number)
+
+
+async def rc_state(mesh: Mesh) -> RcState:
+    reply = await mesh.ask_one(mesh.keys.rc_state("robot/x"), RcAsk(), RcState, timeout=5)
+    assert reply is not None
+    assert reply.message is not None
+    return reply.message
+
+
+def states_published(mesh: Mesh) -> list[RcState]:
+    """All that RCs publish from now on."""
+    states: list[RcState] = []
+    mesh.subscribe(mesh.keys.rc_state_any, RcState, lambda _key, state: states.append(state))
+    return states
 
 
 async def answer(mesh: Mesh, grant: Grant | None, do: Mapping[str, Any] = ECHO, *, ttl: float = 5.0) -> str:

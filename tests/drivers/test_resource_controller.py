@@ -11,7 +11,20 @@ from typing import Any, cast
 import pytest
 from msgspec.structs import replace
 
-from tests.drivers.rcs import ECHO, LEASE, TERM, Device, Rcm, answer, close, holder, started
+from tests.drivers.rcs import (
+    ECHO,
+    LEASE,
+    TERM,
+    Device,
+    Rcm,
+    answer,
+    close,
+    grant,
+    holder,
+    rc_state,
+    started,
+    states_published,
+)
 from tests.hang import HANG
 from tests.mesh.kit import until
 from zscout.drivers.confirm_server import CommandQuery
@@ -24,26 +37,22 @@ from zscout.mesh import IncomingQuery, Mesh, Refused
 from zscout.messages import Command, Done, Grants, Holder, Malformed, RcAsk, RcmState, RcState
 from zscout.testing.link import Disturbance
 from zscout.testing.memory import MemoryMesh, MemoryNetwork
-from zscout.types import SECOND, Grant
+from zscout.types import SECOND
 
 
 @asynccontextmanager
-async def play() -> AsyncIterator[tuple[Rcm, ResourceController, Device, Mesh]]:
+async def play(kind: type[Device] = Device, **how: Any) -> AsyncIterator[tuple[Rcm, ResourceController, Device, Mesh]]:
     """An RCM, an RC that `one` holds under grant 1, and its client `h/client`."""
     network = MemoryNetwork()
-    rcm, device = Rcm(network), Device()
+    rcm, device = Rcm(network), kind()
     client = network.open("f", Sender("h", "client"))
-    rc = await started(network, device)
+    rc = await started(network, device, **how)
     rcm.publish(holder(1))
     await until(lambda: device.calls == ["begin one"])
     try:
         yield rcm, rc, device, client
     finally:
         await close(rc, rcm.mesh, client)
-
-
-def grant(number: int) -> Grant:
-    return Grant(TERM, number)
 
 
 async def test_the_safe_state_waits_for_no_command_though_the_rcm_hangs() -> None:
@@ -74,9 +83,6 @@ async def test_what_goes_on_in_another_hold_is_neither_ended_nor_made_safe(kind:
     rcm, device = Rcm(network), kind()
     client = network.open("f", Sender("h", "client"))
 
-    async def told(count: int) -> None:
-        await until(lambda: len(device.calls) >= count)
-
     rc = await started(network, device)
     warm, turn = holder(1, "warm"), replace(holder(2, "turn"), continues="warm")
     moved = replace(turn, client="h/other", grant=grant(3))
@@ -86,7 +92,7 @@ async def test_what_goes_on_in_another_hold_is_neither_ended_nor_made_safe(kind:
     expected = ["begin warm", *begins, "end turn", "safe", "begin last"]
     for one, calls in (warm, 1), (turn, 2), (moved, 3), (holder(4, "last", "h/other"), 6):
         rcm.publish(one)
-        await told(calls)
+        await until(lambda: len(device.calls) >= calls)  # noqa: B023 - awaited here
     assert device.calls == expected
     assert await answer(client, turn.grant) == "ended"
     await close(rc, rcm.mesh, client)
@@ -100,17 +106,12 @@ async def test_a_hold_that_was_held_back_begins_in_the_one_that_continues_it() -
             await asyncio.sleep(1)
             await super().safe()
 
-    network = MemoryNetwork()
-    rcm, device = Rcm(network), Slow()
-    rc = await started(network, device, settle=2.0)
-    rcm.publish(holder(1))
-    await until(lambda: device.calls)
-    rcm.publish(holder(2, "warm"))
-    await asyncio.sleep(0.5)
-    rcm.publish(replace(holder(3, "turn"), continues="warm"))
-    await until(lambda: len(device.calls) >= 4)
-    assert device.calls == ["begin one", "end one", "safe", "begin turn"]
-    await close(rc, rcm.mesh)
+    async with play(Slow, settle=2.0) as (rcm, _rc, device, _client):
+        rcm.publish(holder(2, "warm"))
+        await asyncio.sleep(0.5)
+        rcm.publish(replace(holder(3, "turn"), continues="warm"))
+        await until(lambda: len(device.calls) >= 4)
+        assert device.calls == ["begin one", "end one", "safe", "begin turn"]
 
 
 async def test_the_safe_state_goes_before_commands_that_wait() -> None:
@@ -221,26 +222,21 @@ async def test_a_driver_that_raises_fails_its_rc_which_recovers(where: str) -> N
 async def test_an_rc_that_fails_leaves_the_mesh_with_its_device_safe_and_tells_its_owner(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    network = MemoryNetwork()
-    rcm, device, failures = Rcm(network), Device(), list[Exception]()
-    tokens: dict[str, bool] = {}
-    key = rcm.mesh.keys.alive_any(Role.RC)
-    watch = rcm.mesh.watch(key, lambda token, alive: tokens.update({token.name: alive}))
-    rc = await started(network, device, on_failure=failures.append)
-    rcm.publish(holder(1))
-    await until(lambda: device.calls == ["begin one"] and tokens == {"robot/x": True})
+    failures, tokens = list[Exception](), dict[str, bool]()
 
     def fault(*_args: object, **_how: object) -> None:
         raise KeyError("a fault of ours")
 
-    monkeypatch.setattr(rc.holds, "apply_grants", fault)
-    rcm.publish()
-    await until(lambda: device.calls[-1] == "safe")
-    assert [type(error) for error in failures] == [KeyError]
-    assert "its resource controller failed" in rc.health
-    await until(lambda: tokens == {"robot/x": False})
-    watch.close()
-    await close(rc, rcm.mesh)
+    async with play(on_failure=failures.append) as (rcm, rc, device, client):
+        watch = client.watch(client.keys.alive_any(Role.RC), lambda token, alive: tokens.update({token.name: alive}))
+        await until(lambda: tokens == {"robot/x": True})
+        monkeypatch.setattr(rc.holds, "apply_grants", fault)
+        rcm.publish()
+        await until(lambda: device.calls[-1] == "safe")
+        assert [type(error) for error in failures] == [KeyError]
+        assert "its resource controller failed" in rc.health
+        await until(lambda: tokens == {"robot/x": False})
+        watch.close()
     assert device.calls.count("safe") == 1
 
 
@@ -261,8 +257,7 @@ async def test_a_command_under_a_grant_that_was_missed_waits_until_that_was_read
 async def test_an_rc_that_has_missed_something_does_not_say_that_it_knows_all() -> None:
     """Its RCM would take a hold for lost of which it has yet to read."""
     async with play() as (rcm, rc, _device, client):
-        states: list[RcState] = []
-        client.subscribe(client.keys.rc_state_any, RcState, lambda _key, state: states.append(state))
+        states = states_published(client)
         rcm.hangs = True
         rcm.seq += 1
         rcm.publish(rc="robot/y")
@@ -296,8 +291,7 @@ async def test_figures_are_published_when_they_change() -> None:
 
 async def test_how_long_it_was_used_is_told_within_a_second_of_the_end() -> None:
     async with play() as (rcm, _rc, device, client):
-        states: list[RcState] = []
-        client.subscribe(client.keys.rc_state_any, RcState, lambda _key, state: states.append(state))
+        states = states_published(client)
         assert await answer(client, grant(1), {"name": "confirm"}) == "done"
         await asyncio.sleep(0.2)
         assert await answer(client, grant(1), {"name": "slow", "seconds": 0.5}) == "done"
@@ -315,10 +309,8 @@ async def test_how_long_it_was_used_is_told_within_a_second_of_the_end() -> None
         assert states == []
         rcm.publish(holder(2, "two"))
         await until(lambda: states, within=1.1)
-        assert [(use.grant, use.seconds) for use in states[0].used] == [
-            (grant(1), pytest.approx(1.5, abs=0.01)),
-            (grant(2), 0.0),
-        ]
+        uses = [(use.grant, use.seconds) for use in states[0].used]
+        assert uses == [(grant(1), pytest.approx(1.5, abs=0.01)), (grant(2), 0.0)]
         await asyncio.sleep(1.9)
         assert len(states) == 1
 
@@ -336,27 +328,18 @@ async def test_a_command_that_takes_its_time_counts_once_it_is_carried_out() -> 
 
             return asyncio.ensure_future(take())
 
-    network = MemoryNetwork()
-    rcm, client = Rcm(network), network.open("f", Sender("h", "client"))
-    rc = await started(network, Slow())
-    rcm.publish(holder(1))
-    await until(lambda: rc.holds.held)
-
-    async def used() -> float:
-        reply = await client.ask_one(client.keys.rc_state("robot/x"), RcAsk(), RcState, timeout=5)
-        assert reply is not None
-        assert reply.message is not None
-        (use,) = reply.message.used
+    async def used(client: Mesh) -> float:
+        (use,) = (await rc_state(client)).used
         return use.seconds
 
-    assert await answer(client, grant(1), {"name": "fail", "seconds": 1}) == "failed"
-    assert await used() == 0.0
-    long = asyncio.create_task(answer(client, grant(1), {"name": "do", "seconds": 1}))
-    assert await answer(client, grant(1), {"name": "do", "seconds": 0.5}) == "done"
-    assert await used() == pytest.approx(0.5, abs=0.01)
-    assert await long == "done"
-    assert await used() == pytest.approx(1.0, abs=0.01)
-    await close(rc, rcm.mesh, client)
+    async with play(Slow) as (_rcm, _rc, _device, client):
+        assert await answer(client, grant(1), {"name": "fail", "seconds": 1}) == "failed"
+        assert await used(client) == 0.0
+        long = asyncio.create_task(answer(client, grant(1), {"name": "do", "seconds": 1}))
+        assert await answer(client, grant(1), {"name": "do", "seconds": 0.5}) == "done"
+        assert await used(client) == pytest.approx(0.5, abs=0.01)
+        assert await long == "done"
+        assert await used(client) == pytest.approx(1.0, abs=0.01)
 
 
 async def test_who_missed_that_an_rc_works_again_hears_it_later() -> None:
@@ -378,8 +361,7 @@ async def test_who_missed_that_an_rc_works_again_hears_it_later() -> None:
 
 async def test_a_publication_of_an_older_term_is_answered_by_the_state() -> None:
     async with play() as (_rcm, _rc, _device, client):
-        states: list[RcState] = []
-        client.subscribe(client.keys.rc_state_any, RcState, lambda _key, state: states.append(state))
+        states = states_published(client)
         old = type(TERM)(1, "old")
         client.publisher(client.keys.grants, Grants).put(Grants(term=old, seq=9, prev=8, every=0.5))
         await until(lambda: bool(states))
@@ -491,13 +473,8 @@ async def test_figures_that_are_no_numbers_are_left_out() -> None:
         def figures(self) -> dict[str, float]:
             return {"good": 1.5, "nan": float("nan"), "endless": float("inf")}
 
-    network = MemoryNetwork()
-    asker, rc = network.open("f", Sender("h", "asker")), await started(network, Odd())
-    reply = await asker.ask_one(asker.keys.rc_state("robot/x"), RcAsk(), RcState, timeout=1)
-    assert reply is not None
-    assert reply.message is not None
-    assert reply.message.figures == {"good": 1.5}
-    await close(rc, asker)
+    async with play(Odd) as (*_, client):
+        assert (await rc_state(client)).figures == {"good": 1.5}
 
 
 async def test_what_its_driver_declares_amiss_is_told_before_anybody_is_offered_it() -> None:

@@ -30,7 +30,7 @@ import msgspec
 from tests.chaos import net
 from tests.hang import HANG
 from tests.live.closed import make_keys
-from tests.live.lab import HolderProcess
+from tests.live.lab import HolderProcess, awaited
 from zscout.messages import RcmState
 from zscout.types import Grant, Ns
 
@@ -48,7 +48,6 @@ NODES: Final = {
 }
 """The hosts of both sites, with their RCs. The first of each may lead."""
 ALL: Final = frozenset(rc for rcs in NODES.values() for rc in rcs)
-LOOK: Final = 0.02
 Fault: TypeAlias = Literal["killed", "frozen", "cut"]
 """What happens to the relay; the last: site b's line to it."""
 INSIDE, ACROSS = "inside", "across"
@@ -269,17 +268,13 @@ class Sites:
 
     async def sees(self, program: Program, until: Callable[[RcmState], bool]) -> RcmState:
         """The RCM's state, as this program is told it, as soon as `until` holds of it."""
-        seen = None
-        try:
-            async with asyncio.timeout(HANG):
-                while True:
-                    seen = await program.state() or seen
-                    if seen is not None and until(seen):
-                        return seen
-                    await asyncio.sleep(LOOK)
-        except TimeoutError:
-            logs = "\n".join(f"--- {host}\n{(self.folder / f'{host}.log').read_text()}" for host in (GATE, *NODES))
-            raise AssertionError(f"{program.name} waited in vain; last seen {seen}\n{logs}") from None
+
+        def logs() -> str:
+            return "\n".join(f"--- {host}\n{(self.folder / f'{host}.log').read_text()}" for host in (GATE, *NODES))
+
+        seen = await awaited(program.state, lambda state: state is not None and until(state), logs)
+        assert seen is not None
+        return seen
 
     async def whole(self, *programs: Program) -> RcmState:
         """Waits until one RCM has the devices of both sites, for all of these programs."""

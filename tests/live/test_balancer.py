@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 import signal
 from pathlib import Path
 
 import pytest
 
 from tests.hang import HANG
-from tests.live.lab import Lab
+from tests.live.lab import Lab, answered, awaited
 from zscout.behaviors.client.client import Client
 from zscout.keyexpr import Role
 from zscout.messages import HostRanking, RankAsk
@@ -21,13 +20,11 @@ HOSTS = {"h1", "h2", "h3"}
 
 async def ranked(client: Client, asked: RankAsk, hosts: set[str]) -> HostRanking:
     """The answer, once it names exactly these hosts."""
-    answer: HostRanking | None = None
-    async with asyncio.timeout(HANG):
-        while answer is None or {one.host for one in answer.hosts} != hosts:
-            reply = await client.mesh.ask_one(client.mesh.keys.rank, asked, HostRanking, timeout=HANG)
-            answer = reply.message if reply is not None else None
-            await asyncio.sleep(0.05)
-    return answer
+    mesh = client.mesh
+    return await awaited(
+        lambda: answered(lambda: mesh.ask_one(mesh.keys.rank, asked, HostRanking, timeout=HANG)),
+        lambda ranking: {one.host for one in ranking.hosts} == hosts,
+    )
 
 
 async def test_the_balancer_ranks_whom_it_hears(tmp_path: Path) -> None:

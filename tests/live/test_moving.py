@@ -106,18 +106,6 @@ def test_the_target_dies_and_it_lives_in_exactly_one_place(tmp_path: Path) -> No
     asyncio.run(_target_dies(tmp_path, "component", STEPS))
 
 
-async def appears(path: Path) -> None:
-    async with asyncio.timeout(HANG):
-        while True:
-            if there(path):
-                return
-            await asyncio.sleep(0.002)
-
-
-def there(path: Path) -> bool:
-    return path.exists()
-
-
 def let_go(folder: Path) -> None:
     """Holds up nothing any more."""
     for held in folder.glob("hold-*"):
@@ -189,17 +177,17 @@ async def kill(lab: Lab, host: str, victim: str) -> None:
 
 async def at_starting(lab: Lab, placing: Placing, folder: Path, target: str) -> None:
     (folder / "hold-init").touch()
-    await appears(folder / "at-init")
+    await until((folder / "at-init").exists)
 
 
 async def at_standing_by(lab: Lab, placing: Placing, folder: Path, target: str) -> None:
     (folder / "hold-checkpoint").touch()
-    await appears(folder / "at-checkpoint")
+    await until((folder / "at-checkpoint").exists)
 
 
 async def at_restoring(lab: Lab, placing: Placing, folder: Path, target: str) -> None:
     (folder / "hold-restore").touch()
-    await appears(folder / "at-restore")
+    await until((folder / "at-restore").exists)
 
 
 async def at_restored(lab: Lab, placing: Placing, folder: Path, target: str) -> None:
@@ -207,7 +195,7 @@ async def at_restored(lab: Lab, placing: Placing, folder: Path, target: str) -> 
     await at_restoring(lab, placing, folder, target)
     lab.signal("h0", signal.SIGSTOP)
     (folder / "hold-restore").unlink()
-    await appears(folder / "restored")
+    await until((folder / "restored").exists)
     asyncio.get_running_loop().call_later(0.3, lab.signal, "h0", signal.SIGCONT)
 
 
@@ -224,7 +212,7 @@ async def at_handed_over(lab: Lab, placing: Placing, folder: Path, target: str) 
     await at_restoring(lab, placing, folder, target)
     lab.signal("h0", signal.SIGSTOP)
     (folder / "hold-restore").unlink()
-    await appears(folder / "restored")
+    await until((folder / "restored").exists)
     # Nothing shows that its node, and the source's, have heard so: they may not have run meanwhile.
     await asyncio.sleep(2)
     for child in psutil.Process(lab.nodes[target].pid).children(recursive=True):

@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
+from itertools import chain
+
 from hypothesis import given, settings
 
-from tests.scheduling.workloads import workloads
+from tests.scheduling.workloads import voter, workloads
 from tests.thorough import times
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.booking import Booked, Booking
-from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
-from zscout.scheduling.forecast import forecast
-from zscout.scheduling.model import (
-    ArcRequest,
-    Effect,
-    Event,
-    Granted,
-    HoldEnded,
-    Outcome,
-    Propose,
-    RcJoined,
-    Requested,
-    Tick,
-    Vote,
-)
+from zscout.scheduling.forecast import forecast, play_instant
+from zscout.scheduling.model import ArcRequest, Event, Granted, HoldEnded, Outcome, RcJoined, Requested, Tick
 from zscout.simulation.workload import Workload
 from zscout.types import SECOND, ArcId, Ns
 
@@ -70,25 +59,14 @@ def test_a_kept_hold_is_foretold_to_yield_after_its_time() -> None:
 def test_what_is_foretold_comes(workload: Workload) -> None:
     """After the last arrival, the forecast's starts are those of the run itself."""
     core, wake = Core(), 0
-    capacity = {rc.name: rc.capacity for rc in workload.rcs if rc.sharable}
     starts: dict[ArcId, Ns] = {}
 
     def step(now: Ns, *events: Event) -> None:
-        batch: list[Event] = list(events)
-        while batch:
-            votes: list[Event] = []
-            effects: list[Effect] = core.handle(now, *batch)
-            for effect in effects:
-                match effect:
-                    case Granted(arc=arc, start=start):
-                        starts.setdefault(arc, start)
-                    case Propose(proposal=proposal, rc=rc, holders=holders):
-                        votes.append(Vote(proposal, not excess(capacity[rc], holders.items())))
-                    case HoldEnded(outcome=outcome):
-                        assert outcome in (Outcome.COMPLETED, Outcome.PREEMPTED)
-                    case _:
-                        pass
-            batch = votes
+        for effect in chain.from_iterable(play_instant(core, now, events, voter(workload))):
+            if isinstance(effect, Granted):
+                starts.setdefault(effect.arc, effect.start)
+            elif isinstance(effect, HoldEnded):
+                assert effect.outcome in (Outcome.COMPLETED, Outcome.PREEMPTED)
 
     step(0, *(RcJoined(rc.name, rc.sharable) for rc in workload.rcs))
     for arrival in sorted(workload.arrivals, key=lambda arrival: arrival.at):

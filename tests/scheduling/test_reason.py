@@ -68,14 +68,6 @@ def held(*rcs: tuple[str, Party, str], number: int = 0) -> Reason:
             ),
         ),
         (
-            held(("robot/a", TAKE, ""), ("fg/0", SURVEY, "fg/*"), ("fg/1", FOREIGN, "fg/*")),
-            (
-                "waits for bob@ws2 (zscout take): robot/a; for one of fg/0 (held by alice@ws1 (survey.py)), "
-                "1 (held by ws3/plain (mapping))"
-            ),
-            None,
-        ),
-        (
             held(("fg/0", TAKE, "fg/*"), ("fg/1", TAKE, "fg/*"), number=9),
             "waits for one of fg/0 (held by bob@ws2 (zscout take)), 1 (held by bob@ws2 (zscout take)) and 7 more",
             None,

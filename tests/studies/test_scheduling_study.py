@@ -17,7 +17,7 @@ from studies.scheduling.foretell import FEWEST, Condition, correlations, fit
 from studies.scheduling.measures import Curve, curve, measure, percentile
 from studies.scheduling.situations import FEATURES, Situation
 from studies.scheduling.summary import Study
-from studies.scheduling.trial import STRATEGIES, SchedulingJob, SchedulingTrial, play, run
+from studies.scheduling.trial import STRATEGIES, SchedulingJob, play, run
 from zscout.scheduling.model import ArcRequest, Outcome
 from zscout.simulation.replay import HoldRecord, Replay, replay
 from zscout.simulation.workload import Arrival, Workload, WorkloadRc
@@ -262,15 +262,6 @@ def test_without_the_heuristic_nothing_is_said_of_it() -> None:
     report = study.report()
     assert report.families[0].degenerate is None
     assert (report.correlations, report.rule) == ({}, None)
-
-
-def test_a_trial_can_be_sent_between_processes() -> None:
-    import pickle
-
-    trial = run(SchedulingJob("paper", 0, "priority", drawn=True), steps())
-    copy = pickle.loads(pickle.dumps(trial))  # noqa: S301 - our own
-    assert isinstance(copy, SchedulingTrial)
-    assert copy == trial
 
 
 # What foretells

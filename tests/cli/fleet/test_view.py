@@ -86,6 +86,7 @@ def descendants(process: subprocess.Popen[bytes]) -> list[psutil.Process]:
     return psutil.Process(process.pid).children(recursive=True)
 
 
+@pytest.mark.live
 def test_the_page_is_served_with_the_recording_and_ctrl_c_ends_all(recording: Path, tmp_path: Path) -> None:
     with viewing(tmp_path, recording, "--web") as process:
         url, stream = page(tmp_path, process)
@@ -118,6 +119,7 @@ def shows_table_2(path: Path) -> bool:
     return False
 
 
+@pytest.mark.live
 def test_as_json_it_says_once_where_all_is(recording: Path, tmp_path: Path) -> None:
     with viewing(tmp_path, recording, "--web", "--json") as process:
         said = said_as_json(tmp_path, process)
@@ -137,6 +139,7 @@ def said_as_json(folder: Path, process: subprocess.Popen[bytes]) -> dict[str, An
     return said
 
 
+@pytest.mark.live
 def test_the_viewer_does_not_outlive_a_command_that_is_killed(recording: Path, tmp_path: Path) -> None:
     with viewing(tmp_path, recording, "--web") as process:
         _, stream = page(tmp_path, process)
@@ -147,6 +150,7 @@ def test_the_viewer_does_not_outlive_a_command_that_is_killed(recording: Path, t
         assert not listens(stream)
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: Path) -> None:
     def shown() -> list[str]:
@@ -193,6 +197,7 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
     asyncio.run(story())
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_where_a_node_of_this_host_records_its_recording_is_shown(tmp_path: Path) -> None:
     async def story() -> None:
@@ -265,6 +270,7 @@ def test_without_a_display_it_names_web(
         assert "--web" in line
 
 
+@pytest.mark.live
 def test_a_display_that_does_not_answer_is_one_line(recording: Path, tmp_path: Path) -> None:
     env = {key: value for key, value in os.environ.items() if key != "WAYLAND_DISPLAY"}
     with viewing(tmp_path, recording, env=env | {"DISPLAY": "127.0.0.1:4711"}) as process:
@@ -297,6 +303,8 @@ def test_what_can_t_be_opened_or_served_is_one_line_and_code_2(
             assert words in line
 
 
+@pytest.mark.live
+@pytest.mark.slow
 def test_a_live_stream_on_a_taken_port_is_one_line_and_code_2(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

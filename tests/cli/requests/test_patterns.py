@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import CLOCK, course, end, events, named, out_of, read_until, zscout_here
+from tests.cli.tools import CLOCK, course, end, events, named, out_of, read_until
 from tests.hang import HANG
 from zscout.cli.operator.take import takeover_cost
 from zscout.cli.requests.options import HoldOptions
@@ -166,33 +166,6 @@ def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
     assert (done.returncode, done.stdout) == (0, f"{F1} robot/a\n"), done.stderr
     end(high)
     assert fleet.idle(F1, F2, "robot/a")
-
-
-@pytest.mark.parametrize(
-    ("args", "line"),
-    [
-        (("request", "framegrabber/**"), "need \"framegrabber/**\": need 'framegrabber/**' is not valid: write"),
-        (("request", "framegrabber/f*"), "write kind/name with * for a whole name or $* for a part of one"),
-        (("take", "framegrabber/*#0"), "#2, #3 and so on behind it for a second and third"),
-        (("request", "radio/*:rate=1", "radio/*:rate=2"), "have different parameters; give all the same"),
-        (("request", "*/x", "radio/*:rate=2"), "can't stand beside parameters; name its kind"),
-        (("request", "fg/*#2", "fg/*#2"), "fg/*#2 is named twice; leave the numbers out, and they are given"),
-    ],
-)
-def test_bad_patterns_are_one_line_with_the_remedy(
-    args: tuple[str, ...], line: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert zscout_here(*args) == 2
-    said = capsys.readouterr().err
-    assert line in said
-    assert said.count("\n") == 1
-
-
-def test_the_help_says_how_to_quote(capsys: pytest.CaptureFixture[str]) -> None:
-    assert zscout_here("request", "--help") == 0
-    said = capsys.readouterr().out
-    assert "zscout request 'framegrabber/*' 'framegrabber/*' robot/scout33 -- python3 -i" in said
-    assert "ZSCOUT_BOUND" in said
 
 
 # What is made of the RCM's state

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.cli_fleet import patient_timing
-from tests.cli.tools import CLOCK, ours, zscout_here, zscout_soon
+from tests.cli.tools import CLOCK, ours, zscout_soon
 from tests.live.lab import PATIENT, Lab
 
 pytestmark = pytest.mark.live
@@ -87,12 +87,6 @@ def test_the_story_of_an_arc(tmp_path: Path) -> None:
             assert unknown.stderr == 'zscout: no ARC "mappin" is known; did you mean mapping?\n'
 
     asyncio.run(story())
-
-
-def test_what_names_no_arc_is_bad_input(capsys: pytest.CaptureFixture[str]) -> None:
-    for name in ("", "a\nb", "x" * 300):
-        assert zscout_here("why", name) == 2
-        assert capsys.readouterr().err.endswith("names no ARC; zscout status lists them\n")
 
 
 def test_how_long_such_holds_usually_last_is_told(tmp_path: Path) -> None:

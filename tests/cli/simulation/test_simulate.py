@@ -67,6 +67,7 @@ def simulating(*args: object, env: dict[str, str] | None = None) -> Iterator[tup
         process.stdout.close()
 
 
+@pytest.mark.live
 def test_it_serves_what_it_tells_and_leaves_nothing_behind(closet: Path, tmp_path: Path) -> None:
     link, file = tmp_path / "radio0", tmp_path / "lab.toml"
     how = ("--radio", link, "--node", file, "--speed", 2, "--baud", 1200, "--channels", 2, "--framegrabbers", 3)
@@ -108,6 +109,7 @@ def test_it_ends_by_itself_and_says_how_it_was(closet: Path, capfd: pytest.Captu
     assert "0 packets heard, 0 lost" in said[-1]
 
 
+@pytest.mark.live
 def test_at_a_terminal_a_line_tells_how_it_goes(closet: Path) -> None:
     with Terminal("simulate", closet, "--speed", 2) as terminal:
         terminal.until("scout33")
@@ -116,6 +118,7 @@ def test_at_a_terminal_a_line_tells_how_it_goes(closet: Path) -> None:
         assert terminal.code() == 130
 
 
+@pytest.mark.live
 def test_the_mesh_hears_who_is_where(closet: Path, tmp_path: Path) -> None:
     async def run() -> None:
         async with Lab(tmp_path) as lab:

@@ -141,18 +141,6 @@ def test_there_is_a_limit_to_components(proc: Proc) -> None:
     assert len(meter.measure()) == messages.MAX_COMPONENTS
 
 
-@pytest.fixture
-def started() -> Iterator[list[subprocess.Popen[str]]]:
-    """Processes that are gone afterwards, with their children."""
-    processes: list[subprocess.Popen[str]] = []
-    yield processes
-    for process in processes:
-        for child in psutil.Process(process.pid).children(recursive=True):
-            child.kill()
-        process.kill()
-        process.communicate()
-
-
 def start(processes: list[subprocess.Popen[str]], program: str, core: int | None = None) -> int:
     """Starts a parent and its child, on one core if one is given; returns the parent's pid."""
     mine = os.sched_getaffinity(0)
@@ -204,6 +192,7 @@ def compute(pid: int, seconds: float) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.live
 def test_a_real_tree_is_what_psutil_says(started: list[subprocess.Popen[str]]) -> None:
     pid = start(started, PARENT)
     meter = UseMeter(lambda: [RunningComponent("one", "spinner", 3, pid)])
@@ -220,6 +209,7 @@ def test_a_real_tree_is_what_psutil_says(started: list[subprocess.Popen[str]]) -
     assert (use.component, use.kind, use.incarnation) == ("one", "spinner", 3)
 
 
+@pytest.mark.live
 @pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="the system does not tell")
 def test_two_that_share_a_core_have_at_most_half_of_it(started: list[subprocess.Popen[str]]) -> None:
     pid = start(started, PAIR, core=min(os.sched_getaffinity(0)))
@@ -233,6 +223,7 @@ def test_two_that_share_a_core_have_at_most_half_of_it(started: list[subprocess.
     assert 0 < use.served < 0.6
 
 
+@pytest.mark.live
 def test_the_report_of_this_host_is_all_that_the_balancer_knows(started: list[subprocess.Popen[str]]) -> None:
     pid = start(started, PARENT)
     gauge = Gauge("anvil", ("gpu", "arm64"), lambda: [RunningComponent("anvil/one", "spinner", 2, pid)])

@@ -118,27 +118,20 @@ def test_averages_fade_as_the_kernels_do() -> None:
     assert faded(averages, 0.0, 3_600.0)[0] < 1e-9
 
 
-def test_a_real_tree_reports_itself_alone() -> None:
-    processes: list[subprocess.Popen[str]] = []
-    try:
-        pid = start(processes, PARENT)
-        cores = Bounds(pid)
-        with cores.look():
-            gauge = Gauge("anvil", load=TreeLoad(pid))
-        compute(pid, 0.6)
-        with cores.look():
-            report = gauge.report()
-        assert cores.least <= report.cpu * report.cores / 100 <= cores.most
-        assert report.load_average[0] > 0
-        tree = [psutil.Process(pid), *psutil.Process(pid).children()]
-        memory = sum(one.memory_info().rss for one in tree)
-        assert report.memory_total - report.memory_available == pytest.approx(memory, rel=0.05)
-    finally:
-        for process in processes:
-            for child in psutil.Process(process.pid).children(recursive=True):
-                child.kill()
-            process.kill()
-            process.communicate()
+@pytest.mark.live
+def test_a_real_tree_reports_itself_alone(started: list[subprocess.Popen[str]]) -> None:
+    pid = start(started, PARENT)
+    cores = Bounds(pid)
+    with cores.look():
+        gauge = Gauge("anvil", load=TreeLoad(pid))
+    compute(pid, 0.6)
+    with cores.look():
+        report = gauge.report()
+    assert cores.least <= report.cpu * report.cores / 100 <= cores.most
+    assert report.load_average[0] > 0
+    tree = [psutil.Process(pid), *psutil.Process(pid).children()]
+    memory = sum(one.memory_info().rss for one in tree)
+    assert report.memory_total - report.memory_available == pytest.approx(memory, rel=0.05)
 
 
 @pytest.mark.live

@@ -169,3 +169,10 @@ class PlacerFleet(MemoryFleet):
         keys = self.watcher.keys
         key = keys.rank if isinstance(operation, RankAsk) else keys.placer(self.watcher.me)
         return await answer(self.watcher, key, operation, kind, timeout)
+
+
+async def placing(*hosts: str) -> PlacerFleet:
+    """With a placer, once all hosts have reported."""
+    fleet = PlacerFleet(*hosts)
+    await fleet.lead()
+    return fleet

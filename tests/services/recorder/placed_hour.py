@@ -75,14 +75,14 @@ def story() -> list[tuple[float, Placements]]:
     return says
 
 
-def play(timeline: Timeline) -> None:
-    """The hour, as the recorder would write it."""
+def play(timeline: Timeline, every: int = REPORT_EVERY) -> None:
+    """The hour, as the recorder would write it. `every`: seconds between reports of a host."""
     written = timeline.hosts
     written.placements(0, Placements(TERM), set())
     says = story()
     runs: dict[str, str] = {}
     loads = dict.fromkeys(HOSTS, 0.2)
-    for at in range(0, HOUR + 1, REPORT_EVERY):
+    for at in range(0, HOUR + 1, every):
         while says and says[0][0] <= at:
             moment, told = says.pop(0)
             written.placements(moment, told)

@@ -263,7 +263,7 @@ def test_outlines_have_the_colour_of_what_they_are_and_go_on_with_time(path: Pat
 
 @pytest.mark.parametrize("maintenance", [False, True])
 async def test_a_booking_appears_and_vanishes(path: Path, maintenance: bool) -> None:
-    fleet, *_ = await booked_fleet("x")
+    fleet, _ = await booked_fleet("x")
     client, here = fleet.client("one"), fleet.mesh("basil", "recorder")
     async with recording(path, here, fleet.watcher, fleet.fleet, clock=True, wall=fleet.time) as timeline:
         await asyncio.sleep(1)

@@ -56,13 +56,8 @@ def test_holds_are_shown_at_their_times_and_none_of_what_was_recorded() -> None:
 def test_several_holders_keep_their_rows() -> None:
     holds = [past(1, 10, 30, arc="a"), past(2, 20, 50, arc="b"), past(3, 30, 40, arc="c")]
     a, b, c = (PastBar(name) for name in "abc")
-    assert shown(*holds)["robot/a"] == [
-        (10, [a, None]),
-        (20, [a, b]),
-        (30, [c, b]),
-        (40, [None, b]),
-        (50, [None, None]),
-    ]
+    lane = shown(*holds)["robot/a"]
+    assert lane == [(10, [a, None]), (20, [a, b]), (30, [c, b]), (40, [None, b]), (50, [None, None])]
     crowd = [past(number, 10, 30, arc=f"arc{number}") for number in range(MAX_SLOTS + 3)]
     assert [len(bars) for _, bars in shown(*crowd)["robot/a"]] == [MAX_SLOTS, MAX_SLOTS]
 
@@ -152,7 +147,7 @@ def test_only_the_first_file_has_the_past(tmp_path: Path) -> None:
 
 
 async def test_a_recorder_that_comes_late_shows_what_journals_tell(path: Path, tmp_path: Path) -> None:
-    told, *_ = await telling(tmp_path, "x", "y", rcs=["robot/a", "robot/b"])
+    told, _ = await telling(tmp_path, "x", "y", rcs=["robot/a", "robot/b"])
     fleet = told.fleet
     one, two = fleet.client("one"), fleet.client("two")
     await one.ask("survey", "robot/a", seconds=6_000)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from studies.placement.plots import record
@@ -17,6 +18,8 @@ from zscout.services.recorder.blueprint import MARK_WORDS
 from zscout.services.recorder.colours import FAILED, LINES, MARKS, PALETTE
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import POLICIES, Term
+
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 HEIGHT = 900
 PANES = 0.62

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from tests.services.recorder.robot_run import BUILDING, GRANT, head, jpeg, png, poses, record, say
@@ -14,6 +15,8 @@ from zscout.services.recorder.blueprint import FLOOR_WORDS
 from zscout.services.recorder.colours import ALERT, DOING, HIDDEN, IN_THE_OPEN, OPERATOR, PERSON
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import Timeline
+
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 HEIGHT = 900
 PANES = 0.57

@@ -252,6 +252,8 @@ def test_many_threads_keep_their_times(path: Path) -> None:
     assert all(texts == [f"{at:.0f}"] for at, texts in written)
 
 
+@pytest.mark.live
+@pytest.mark.slow
 def test_live_viewers_get_what_the_file_gets(path: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy.rrd"
     with Timeline("lab", path=path, port=0) as timeline:

@@ -40,6 +40,8 @@ from zscout.services.recorder.colours import ABSENT, ALERT, LINES, MAINTENANCE, 
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import Timeline
 
+pytestmark = pytest.mark.live
+
 SECONDS = 18
 WIDTH, HEIGHT = 1600, 1000
 PANES = 0.62
@@ -164,6 +166,7 @@ def bars_of(picture: Image.Image, colours: dict[str, int], start: float, length:
     return [text for text, _ in groupby(bars)]
 
 
+@pytest.mark.essential
 def test_the_paper_s_example_in_the_viewer(tmp_path: Path) -> None:
     record(tmp_path / "run.rrd")
     with viewer(tmp_path / "run.rrd", tmp_path) as client:
@@ -202,6 +205,7 @@ def test_the_paper_s_example_in_the_viewer(tmp_path: Path) -> None:
         assert pixels.get(rgb(colour), 0) > 500
 
 
+@pytest.mark.slow
 def test_what_several_want_stands_above_and_what_is_not_there_below(tmp_path: Path) -> None:
     with Timeline("lab", path=tmp_path / "run.rrd") as timeline:
         # By their names they would stand the other way round.
@@ -218,6 +222,7 @@ def test_what_several_want_stands_above_and_what_is_not_there_below(tmp_path: Pa
     assert bars == sorted(bars)
 
 
+@pytest.mark.slow
 def test_what_is_booked_is_outlined_ahead_of_now(tmp_path: Path) -> None:
     now, hour = 1_800_000_000, 3_600
 
@@ -272,6 +277,7 @@ def height_of(picture: Image.Image, colour: int) -> float:
     return sum(rows) / len(rows)
 
 
+@pytest.mark.slow
 def test_a_recorder_that_was_killed_leaves_a_recording_that_opens(path: Path, tmp_path: Path) -> None:
     code = (
         "import pathlib, sys, threading; from tests.services.recorder.paper_run import *;"

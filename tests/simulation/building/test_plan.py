@@ -74,9 +74,6 @@ y = 1.0
 BAD = {
     ('name = "study"', 'name = "my study"'): (f'name: "my study" is not a name; {NAME_RULE}'),
     ("width = 4.0", "width = 40"): ("width: is 40; write a number from 1.5 to 20"),
-    ("width = 4.0", "width = nan"): ("width: is not a finite number; write a number from 1.5 to 20"),
-    ("width = 4.0", ""): ("width: is missing; add it"),
-    ("depth = 3.0", 'depth = 3.0\ncovring = "tiles"'): ("covring: unknown key; did you mean covering?"),
     ("depth = 3.0", 'depth = 3.0\ncovering = "grass"'): (
         'covering: is the text "grass"; write "carpet", "plain", "planks" or "tiles"'
     ),
@@ -98,9 +95,6 @@ BAD = {
         "furniture[1].leg (desk): is 0.301; write a number from 0.02 to 0.3"
     ),
     ("width = 1.0\n", "width = 0.05\n"): ("furniture[1].leg (desk): is 0.05 m; write at most 0.025, half of the piece"),
-    ('name = "desk"', 'name = "couch"'): (
-        'furniture[1].name: "couch" stands at furniture[0] already; rename or remove one of the two'
-    ),
     ("x = 0.0\n", "x = 0.5\n"): ("light[1] (window): is a window in no outer wall; put its x or y on an outer wall"),
     ("z = 1.5", "z = 0.4"): (
         "light[1].z (window): is 0.4 m, so the window leaves its wall; "
@@ -119,7 +113,6 @@ BAD = {
     ("[3.0, 1.0]]", "[1, 2, 3]]"): ("person[0].path[1] (ada): has 3 entries; at most 2 are allowed"),
     ("id = 33", "id = 255"): ("robot[0].id (scout33): is 255; write a whole number from 0 to 254"),
     ("id = 33", "id = 35"): ('robot[1].id (35): "35" stands at robot[0] already; rename or remove one of the two'),
-    ("id = 33", "id = true"): ("robot[0].id (scout33): is true; write a whole number from 0 to 254"),
     ('name = "ada"', 'name = "ada"\nspeed = 0'): ("person[0].speed (ada): is 0; write a number from 0.1 to 3"),
     ("x = 1.0\ny = 1.0", "x = 2.6\ny = 1.62"): (
         "robot[0] (scout33): (2.6, 1.62) is in a wall or furniture, or touches it; leave 0.06 m around its middle"
@@ -130,7 +123,6 @@ BAD = {
     ("x = 1.0\ny = 1.0", "x = 0.05\ny = 1.0"): (
         "robot[0] (scout33): (0.05, 1) is in a wall or furniture, or touches it; leave 0.06 m around its middle"
     ),
-    ("[[person]]", "[[noise]]\nsensor = 1\n\n[[person]]"): ("noise: is a list; write a table, under [noise]"),
 }
 
 
