@@ -53,8 +53,8 @@ def refusal(check: Callable[[], None]) -> str:
     try:
         check()
     except Refused as refused:
-        assert refused.problem.code == "not_allowed"
-        return refused.problem.message
+        problem = refused.problem
+        return problem.message if problem.code == "not_allowed" else problem.code
     return ""
 
 

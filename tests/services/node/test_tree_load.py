@@ -135,6 +135,7 @@ def test_a_real_tree_reports_itself_alone(started: list[subprocess.Popen[str]]) 
 
 
 @pytest.mark.live
+@pytest.mark.slow
 def test_of_two_nodes_on_a_machine_each_reports_its_own(tmp_path: Path) -> None:
     asyncio.run(_each_its_own(tmp_path))
 

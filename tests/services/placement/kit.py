@@ -176,3 +176,7 @@ async def placing(*hosts: str) -> PlacerFleet:
     fleet = PlacerFleet(*hosts)
     await fleet.lead()
     return fleet
+
+
+def fail(*_: Any, **__: Any) -> None:
+    raise RuntimeError("a fault of the core")
