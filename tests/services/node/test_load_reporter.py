@@ -44,18 +44,17 @@ class Proc:
         self,
         pid: int,
         parent: int,
-        *,
-        cpu: float = 0.0,
-        waited_for: float = 0.0,
+        cpu: float = 0,
+        waited_for: float = 0,
         pages: int = 1,
         state: str = "S",
-        name: str = "python",
+        of: str = "a",
     ) -> None:
-        """`cpu` in seconds, `waited_for` that of children that have ended."""
+        """Of a program: `cpu` in seconds, `waited_for` that of children that have ended."""
         mine, theirs = round(cpu / TICK), round(waited_for / TICK)
         start = round(90 / TICK)
         times = f"{mine} 0 {theirs} 0 20 0 1 0 {start}"
-        stat = f"{pid} ({name}) {state} {parent} 1 1 0 -1 0 0 0 0 0 {times} 9 {pages} 7"
+        stat = f"{pid} ({of}) {state} {parent} 1 1 0 -1 0 0 0 0 0 {times} 9 {pages} 7"
         (self.folder / str(pid)).mkdir(exist_ok=True)
         (self.folder / str(pid) / "stat").write_text(stat + " 0" * 20)
 
@@ -78,7 +77,7 @@ def proc(tmp_path: Path) -> Proc:
 
 def test_a_tree_is_summed_up_and_nothing_else(proc: Proc) -> None:
     proc.process(10, 1, cpu=1.0, pages=10)
-    proc.process(11, 10, cpu=2.0, pages=20, name="a) S 1 (b c")
+    proc.process(11, 10, cpu=2.0, pages=20, of="a) S 1 (b c")
     proc.process(12, 11, cpu=2.0, pages=30)
     proc.process(20, 1, cpu=50.0, pages=500)
     (use,) = proc.meter(10).measure()

@@ -44,14 +44,10 @@ def boxes(layers: dict[str, ChartLayer]) -> list[tuple[str, float, float, int]]:
     """Text, begin and end in hours from now, and row of each outline, as they are drawn."""
     fields = layers["dates"].fields
     scale = TODAY.seconds / HOUR / (CHART_WIDTH - LEFT)
+    drawn = zip(fields["labels"], fields["mins"], fields["sizes"], strict=True)
+    ends = [(text, x - LEFT, x - LEFT + wide, y - CHART_HEAD) for text, (x, y), (wide, _) in drawn]
     return [
-        (
-            text,
-            round((x - LEFT) * scale, 6),
-            round((x - LEFT + wide) * scale, 6),
-            round((y - CHART_HEAD) // chart_row(1)),
-        )
-        for text, (x, y), (wide, _) in zip(fields["labels"], fields["mins"], fields["sizes"], strict=True)
+        (text, round(begin * scale, 6), round(end * scale, 6), round(y // chart_row(1))) for text, begin, end, y in ends
     ]
 
 
