@@ -41,17 +41,10 @@ class Proc:
     at: float = 100.0
 
     def process(
-        self,
-        pid: int,
-        parent: int,
-        cpu: float = 0,
-        waited_for: float = 0,
-        pages: int = 1,
-        state: str = "S",
-        of: str = "a",
+        self, pid: int, parent: int, cpu: float = 0, reaped: float = 0, pages: int = 1, state: str = "S", of: str = "a"
     ) -> None:
-        """Of a program: `cpu` in seconds, `waited_for` that of children that have ended."""
-        mine, theirs = round(cpu / TICK), round(waited_for / TICK)
+        """Of a program: `cpu` in seconds, `reaped` that of children that have ended and were waited for."""
+        mine, theirs = round(cpu / TICK), round(reaped / TICK)
         start = round(90 / TICK)
         times = f"{mine} 0 {theirs} 0 20 0 1 0 {start}"
         stat = f"{pid} ({of}) {state} {parent} 1 1 0 -1 0 0 0 0 0 {times} 9 {pages} 7"
@@ -92,7 +85,7 @@ def test_cpu_is_that_since_the_last_look_with_children_that_ended_meanwhile(proc
     meter.measure()
     proc.at += 2
     (proc.folder / "11" / "stat").unlink()
-    proc.process(10, 1, cpu=1.5, waited_for=3.5)
+    proc.process(10, 1, cpu=1.5, reaped=3.5)
     (use,) = meter.measure()
     assert (use.cpu, use.processes) == (0.5, 1)
     # A child that found another parent takes its time with it; that is no use below nothing.

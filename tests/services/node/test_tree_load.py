@@ -49,7 +49,7 @@ def test_cores_and_memory_are_the_trees_alone_and_since_the_last_look(proc: Proc
     assert (use.elapsed, use.cores, use.memory) == (2.0, 0.5, 40 * PAGE)
 
 
-def test_a_child_that_ended_is_counted_once_before_and_after_it_is_waited_for(proc: Proc) -> None:
+def test_a_child_that_ended_is_counted_once_before_and_after_it_is_reaped(proc: Proc) -> None:
     proc.process(10, 1, cpu=1.0)
     proc.process(11, 10, cpu=100.0)
     meter = meter_of(proc, 10)
@@ -58,11 +58,11 @@ def test_a_child_that_ended_is_counted_once_before_and_after_it_is_waited_for(pr
     assert meter.measure().cores == 0.5
     proc.at += 1
     (proc.folder / "11" / "stat").unlink()
-    proc.process(10, 1, cpu=1.25, waited_for=100.5)
+    proc.process(10, 1, cpu=1.25, reaped=100.5)
     assert meter.measure().cores == 0.25
     # Time that comes from nowhere is no more than the processors could give.
     proc.at += 1
-    proc.process(10, 1, cpu=1.25, waited_for=900.0)
+    proc.process(10, 1, cpu=1.25, reaped=900.0)
     assert meter.measure().cores == os.cpu_count()
     proc.at += 1
     proc.process(10, 1, cpu=1.25)
@@ -70,7 +70,7 @@ def test_a_child_that_ended_is_counted_once_before_and_after_it_is_waited_for(pr
     assert meter.measure().elapsed == 0.0
 
 
-def test_wanted_is_what_threads_ran_and_waited_for(proc: Proc) -> None:
+def test_wanted_is_what_threads_ran_and_reaped(proc: Proc) -> None:
     proc.process(10, 1)
     proc.thread(10, 10, "1000000000 0 5")
     proc.thread(10, 11, "5000000000 9000000000 5")

@@ -153,14 +153,8 @@ class PlacerFleet(MemoryFleet):
         return self.place(inherited)
 
     def place(self, inherited: Inherited | None = None) -> ComponentPlacer:
-        placer = ComponentPlacer(
-            self.leader,
-            default_fleet(),
-            Term(1, "rcm"),
-            self.balancer,
-            inherited or Inherited(()),
-            self.failures.append,
-        )
+        kept, term = inherited or Inherited(()), Term(1, "rcm")
+        placer = ComponentPlacer(self.leader, default_fleet(), term, self.balancer, kept, self.failures.append)
         placer.start()
         return placer
 

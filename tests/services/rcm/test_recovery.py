@@ -25,7 +25,7 @@ GANG = ("robot/a", "radio/b")
 def hold(
     rcs: tuple[str, ...] = GANG, seq: int = 5, term: Term = TERM, name: str = "gang", remaining: float = 10, **more: Any
 ) -> Holder:
-    fields = {"client": "h/one", "min_runtime": Decimal(60), "priority": 3, "keep": True} | more
+    fields: dict[str, Any] = {"client": "h/one", "min_runtime": Decimal(60), "priority": 3, "keep": True} | more
     return Holder(f"{name}-id", name, grant=Grant(term, seq), place=PLACE, rcs=list(rcs), remaining=remaining, **fields)
 
 
