@@ -49,7 +49,7 @@ def test_cores_and_memory_are_the_trees_alone_and_since_the_last_look(proc: Proc
     assert (use.elapsed, use.cores, use.memory) == (2.0, 0.5, 40 * PAGE)
 
 
-def test_a_child_that_ended_is_counted_once_before_and_after_it_is_reaped(proc: Proc) -> None:
+def test_a_child_that_ended_is_counted_once_before_and_after_it_is_waited_for(proc: Proc) -> None:
     proc.process(10, 1, cpu=1.0)
     proc.process(11, 10, cpu=100.0)
     meter = meter_of(proc, 10)
@@ -70,7 +70,7 @@ def test_a_child_that_ended_is_counted_once_before_and_after_it_is_reaped(proc: 
     assert meter.measure().elapsed == 0.0
 
 
-def test_wanted_is_what_threads_ran_and_reaped(proc: Proc) -> None:
+def test_wanted_is_what_threads_ran_and_waited_for(proc: Proc) -> None:
     proc.process(10, 1)
     proc.thread(10, 10, "1000000000 0 5")
     proc.thread(10, 11, "5000000000 9000000000 5")
