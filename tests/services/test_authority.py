@@ -39,6 +39,10 @@ runtime = 60
 """
 
 
+TOO_MANY_RCS = "arms may hold 3 RCs at one time, and this asks for more"
+OTHERS_MAY = "; ada, anvil, bellows, bob and 1 more may"
+
+
 def authority(folder: Path, text: str = FILE) -> Authority:
     (folder / "fleet.toml").write_text(text)
     return Authority(load_fleet(folder / "fleet.toml"))
@@ -53,8 +57,8 @@ def refusal(check: Callable[[], None]) -> str:
     try:
         check()
     except Refused as refused:
-        assert refused.problem.code == "not_allowed"
-        return refused.problem.message
+        problem = refused.problem
+        return problem.message if problem.code == "not_allowed" else problem.code
     return ""
 
 
@@ -75,18 +79,14 @@ def test_who_is_in_several_groups_counts_in_the_first(tmp_path: Path) -> None:
         ("bob", ask("robot/scout1", priority=10), "bob (client) may not ask for priority 10; at most 9; ada may"),
         ("ada", ask("robot/scout1", priority=10, keep=True, min_runtime=600), ""),
         ("anvil", ask("robot/scout1", priority=10), "anvil (manager) may not ask for priority 10; at most 9; ada may"),
-        ("wall", ask("robot/scout1"), "wall (viewer) may not ask for an ARC; ada, anvil, bellows, bob and 1 more may"),
-        (
-            "mallory",
-            ask("robot/scout1"),
-            "mallory, who has no role here, may not ask for an ARC; ada, anvil, bellows, bob and 1 more may",
-        ),
+        ("wall", ask("robot/scout1"), "wall (viewer) may not ask for an ARC" + OTHERS_MAY),
+        ("mallory", ask("robot/scout1"), "mallory, who has no role here, may not ask for an ARC" + OTHERS_MAY),
         ("bob", ask("robot/arm1"), "bob (client) may not hold robot/arm1; ada, eve may"),
         ("eve", ask("robot/arm1"), ""),
         ("bob", ask("robot/*"), ""),
         ("bob", ask("robot/scout1", keep=True), "bob (client) may not keep a hold; ada may"),
         ("bob", ask("robot/scout1", min_runtime=61), "bob (client) may not ask for 61 s; at most 60; ada may"),
-        ("eve", ask("a/1", "a/2", "a/3", "a/4"), "arms may hold 3 RCs at one time, and this asks for more"),
+        ("eve", ask("a/1", "a/2", "a/3", "a/4"), TOO_MANY_RCS),
     ],
 )
 def test_what_a_name_may_ask_for(tmp_path: Path, name: str, asked: Ask, why: str) -> None:
@@ -116,18 +116,10 @@ def given(*needs: str, priority: int = 1, keep: bool = False, runs: bool = False
         ("bob", [given("robot/arm1")], "bob (client) may not hold robot/arm1; ada, eve may"),
         ("bob", [given("robot/s1", priority=10)], "bob (client) may not ask for priority 10; at most 9; ada may"),
         ("bob", [given("robot/s1", keep=True)], "bob (client) may not keep a hold; ada may"),
-        (
-            "wall",
-            [given("robot/s1")],
-            "wall (viewer) may not take over an ARC; ada, anvil, bellows, bob and 1 more may",
-        ),
+        ("wall", [given("robot/s1")], "wall (viewer) may not take over an ARC" + OTHERS_MAY),
         # Of one group: it has no more than before.
         ("eve", [given("a/1", "a/2", runs=True)], ""),
-        (
-            "eve",
-            [given("a/1", "a/2", "a/3", "a/4", runs=True)],
-            "arms may hold 3 RCs at one time, and this asks for more",
-        ),
+        ("eve", [given("a/1", "a/2", "a/3", "a/4", runs=True)], TOO_MANY_RCS),
     ],
 )
 def test_who_is_handed_an_arc_has_no_more_than_it_may_ask_for(

@@ -102,13 +102,8 @@ def test_labels_have_bounds() -> None:
 
 def test_codes_of_refusals_have_bounds() -> None:
     tally = Tally()
-    for code in (
-        "busy",
-        "busy",
-        "Not a code",
-        "x" * 33,
-        *(f"code_{chr(97 + n // 26)}{chr(97 + n % 26)}" for n in range(90)),
-    ):
+    many = [f"code_{chr(97 + n // 26)}{chr(97 + n % 26)}" for n in range(90)]
+    for code in ("busy", "busy", "Not a code", "x" * 33, *many):
         tally.refuse(code)
     found = tally.refused()
     assert found["busy"] == 2

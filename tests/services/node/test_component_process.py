@@ -45,19 +45,13 @@ def made(
 
 
 def play(
-    folder: Path,
-    kind: str,
-    params: dict[str, Any],
-    story: Callable[[ComponentProcess], Awaitable[None]],
-    *,
-    memory_limit: int = 0,
-    cpu_limit: float = 0,
+    folder: Path, kind: str, params: dict[str, Any], story: Callable[[ComponentProcess], Awaitable[None]], **limits: Any
 ) -> ComponentProcess:
     """Runs a kind of `odd.py` as a process on a host without control groups; returns how it ended."""
     fleet = default_fleet()
     mesh = msgspec.structs.replace(fleet.mesh, multicast=False)
     rules = msgspec.structs.replace(fleet, name=f"test-{new_instance()}", mesh=mesh)
-    spec = ComponentSpec(kind, params, memory_limit=memory_limit, cpu_limit=cpu_limit)
+    spec = ComponentSpec(kind, params, **limits)
     ends: list[ComponentProcess] = []
     failures: list[Exception] = []
 

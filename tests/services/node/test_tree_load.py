@@ -58,11 +58,11 @@ def test_a_child_that_ended_is_counted_once_before_and_after_it_is_waited_for(pr
     assert meter.measure().cores == 0.5
     proc.at += 1
     (proc.folder / "11" / "stat").unlink()
-    proc.process(10, 1, cpu=1.25, waited_for=100.5)
+    proc.process(10, 1, cpu=1.25, reaped=100.5)
     assert meter.measure().cores == 0.25
     # Time that comes from nowhere is no more than the processors could give.
     proc.at += 1
-    proc.process(10, 1, cpu=1.25, waited_for=900.0)
+    proc.process(10, 1, cpu=1.25, reaped=900.0)
     assert meter.measure().cores == os.cpu_count()
     proc.at += 1
     proc.process(10, 1, cpu=1.25)
@@ -135,6 +135,7 @@ def test_a_real_tree_reports_itself_alone(started: list[subprocess.Popen[str]]) 
 
 
 @pytest.mark.live
+@pytest.mark.slow
 def test_of_two_nodes_on_a_machine_each_reports_its_own(tmp_path: Path) -> None:
     asyncio.run(_each_its_own(tmp_path))
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
 
 import pytest
 
 from tests.mesh.kit import until
 from tests.services.kit import Refusal
-from tests.services.placement.kit import JOB, PlacerFleet, placing
+from tests.services.placement.kit import JOB, PlacerFleet, fail, placing
 from zscout.messages import (
     ComponentSpec,
     DrainHost,
@@ -147,11 +146,7 @@ async def test_a_core_that_raises_fails_the_placer_once_and_it_does_nothing_more
 ) -> None:
     fleet = await placing("a")
     await fleet.ask(PlaceComponent("counter", JOB), Placement)
-
-    def handle(*_: Any) -> None:
-        raise RuntimeError("a fault of the core")
-
-    monkeypatch.setattr(Placer, "handle", handle)
+    monkeypatch.setattr(Placer, "handle", fail)
     with pytest.raises(Refusal, match="internal"):
         await fleet.ask(PlaceComponent("other", JOB), Placement)
     fleet.nodes["a"].end("counter", 1001)
@@ -162,15 +157,11 @@ async def test_a_core_that_raises_fails_the_placer_once_and_it_does_nothing_more
 
 async def test_an_answer_that_makes_the_core_raise_fails_the_placer(monkeypatch: pytest.MonkeyPatch) -> None:
     fleet = await placing("a")
-
-    def enter(*_: Any) -> None:
-        raise ValueError("counter: from running to starting")
-
     await fleet.ask(ListPlacements(), Placements)
-    monkeypatch.setattr("zscout.placement.lifecycle.Lifecycle.start_answered", enter)
+    monkeypatch.setattr("zscout.placement.lifecycle.Lifecycle.start_answered", fail)
     await fleet.ask(PlaceComponent("counter", JOB), Placement)
     await until(lambda: fleet.failures)
-    assert [str(error) for error in fleet.failures] == ["counter: from running to starting"]
+    assert [str(error) for error in fleet.failures] == ["a fault of the core"]
 
 
 async def test_what_no_host_can_start_is_given_up_with_the_hosts_reasons() -> None:

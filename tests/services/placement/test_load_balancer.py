@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
 
 import pytest
 
 from tests.mesh.kit import until
 from tests.services.kit import Refusal
-from tests.services.placement.kit import PlacerFleet
+from tests.services.placement.kit import PlacerFleet, fail
 from tests.services.rcm.kit import FakeFleet
 from zscout.keyexpr import Role, Token
 from zscout.messages import HostRanking, RankAsk
@@ -78,10 +77,6 @@ async def test_a_report_from_before_its_host_was_lost_does_not_bring_it_back() -
 @pytest.mark.parametrize("method", ["reported", "rank", "lost"])
 async def test_a_core_that_raises_fails_the_balancer_once(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
     fleet, _ = await balancing()
-
-    def fail(*_: Any, **__: Any) -> None:
-        raise RuntimeError("a fault of the core")
-
     monkeypatch.setattr(Balancer, method, fail)
     if method == "rank":
         with pytest.raises(Refusal, match="internal"):
@@ -102,10 +97,6 @@ async def test_a_candidate_whose_balancer_or_placer_fails_steps_down_and_leads_a
     await until(lambda: candidate.rcm)
     assert candidate.rcm is not None
     term = candidate.rcm.term
-
-    def fail(*_: Any, **__: Any) -> None:
-        raise RuntimeError("a fault of the core")
-
     with monkeypatch.context() as patched:
         patched.setattr(method, fail)
         keys = fleet.watcher.keys

@@ -58,25 +58,11 @@ def test_an_rc_that_presents_what_was_handed_over_has_not_heard_of_it_yet() -> N
     assert discrepancies(reports(core), core.holders(RC), NOW, current=True) == ((), False)
 
 
-HELD = Holder(
-    "tally",
-    "tally",
-    "desk/one",
-    grant=Grant(Term(4, "before"), 9),
-    place=Place(Term(4, "before"), 7),
-    rcs=["robot/a", "robot/b"],
-    min_runtime=Decimal(60),
-    remaining=50.0,
-)
+BEFORE = Term(4, "before")
+RCS, MINUTE = ["robot/a", "robot/b"], Decimal(60)
+HELD = Holder("tally", "tally", "desk/one", Grant(BEFORE, 9), Place(BEFORE, 7), RCS, MINUTE, remaining=50.0)
 """What robot/a and robot/b hold together since an earlier term."""
-OTHER = replace(
-    HELD,
-    id="other",
-    arc="other",
-    grant=HELD.grant._replace(seq=5),
-    place=HELD.place._replace(arrival=3),
-    rcs=["robot/c"],
-)
+OTHER = replace(HELD, id="other", arc="other", grant=Grant(BEFORE, 5), place=Place(BEFORE, 3), rcs=["robot/c"])
 """What robot/c holds for the same client."""
 BELIEVED: dict[str, Any] = {"grant": HELD.grant, "rcs": HELD.rcs, "place": HELD.place}
 """What its client says of it when it asks again."""

@@ -40,11 +40,8 @@ def test_who_handed_it_over_and_who_has_it_may_both_claim_it() -> None:
     of.bind(place, "desk/one/q1", 0)
     of.bind(place, "cart/two/q1", 0)
     of.end("desk/one/q1", 0, MINUTE)
-    assert [of.may_claim(place, who, "x", None, seen=True) for who in ("desk/one", "cart/two", "h/c")] == [
-        True,
-        True,
-        False,
-    ]
+    claims = [of.may_claim(place, client, "x", None, seen=True) for client in ("desk/one", "cart/two", "h/c")]
+    assert claims == [True, True, False]
 
 
 def test_a_place_goes_with_its_arc_and_may_be_kept_for_a_while() -> None:

@@ -25,7 +25,7 @@ GANG = ("robot/a", "radio/b")
 def hold(
     rcs: tuple[str, ...] = GANG, seq: int = 5, term: Term = TERM, name: str = "gang", remaining: float = 10, **more: Any
 ) -> Holder:
-    fields = {"client": "h/one", "min_runtime": Decimal(60), "priority": 3, "keep": True} | more
+    fields: dict[str, Any] = {"client": "h/one", "min_runtime": Decimal(60), "priority": 3, "keep": True} | more
     return Holder(f"{name}-id", name, grant=Grant(term, seq), place=PLACE, rcs=list(rcs), remaining=remaining, **fields)
 
 
@@ -158,10 +158,8 @@ def test_patterns_and_what_meets_them_are_restored(states: list[RcState], client
 
 
 def test_an_rc_that_read_of_its_hold_in_a_snapshot_passes_on_its_binding() -> None:
-    grant, needs = Grant(TERM, 5), {"robot/a": dict[str, Decimal]()}
-    view = HoldView(
-        "gang-id", "gang", "h/one", 3, grant, PLACE, needs, Decimal(60), 50, 10, bound={"robot/*": "robot/a"}
-    )
+    grant, needs, bound = Grant(TERM, 5), {"robot/a": dict[str, Decimal]()}, {"robot/*": "robot/a"}
+    view = HoldView("gang-id", "gang", "h/one", 3, grant, PLACE, needs, Decimal(60), 50, 10, bound=bound)
     holding = HoldTable("robot/a", hold_lease=3 * SECOND)
     holding.apply_snapshot(RcmState(TERM, 5, "h", [view]), NOW)
     (held,) = recover([rc("robot/a", *holding.holders(NOW))], [], NOW).holds

@@ -24,14 +24,8 @@ USE: Final = {"counter": (0.3, 80e6), "mapper": (1.1, 900e6), "watch": (0.5, 260
 
 def placement(name: str, state: str, host: str | None, incarnation: int, **more: object) -> Placement:
     """As JSON brings it: nothing is taken that a real message could not hold."""
-    told = {
-        "component": name,
-        "spec": {"kind": name.split("-")[0]},
-        "state": state,
-        "host": host,
-        "incarnation": incarnation,
-    }
-    return msgspec.convert(told | more, Placement)
+    told = {"component": name, "spec": {"kind": name.split("-")[0]}, "state": state, "host": host}
+    return msgspec.convert(told | {"incarnation": incarnation} | more, Placement)
 
 
 def story() -> list[tuple[float, Placements]]:

@@ -42,15 +42,8 @@ def test_holds_are_shown_at_their_times_and_none_of_what_was_recorded() -> None:
         past(4, ZERO, None, arc="recorded"),
         past(5, -10, 0.0, arc="long ago"),
     ]
-    assert shown(*holds) == {
-        "robot/a": [
-            (0, [SURVEY]),
-            (100, [PastBar("drive", operator=True)]),
-            (200, [None]),
-            (900, [SURVEY]),
-            (ZERO, [None]),
-        ]
-    }
+    drive = PastBar("drive", operator=True)
+    assert shown(*holds) == {"robot/a": [(0, [SURVEY]), (100, [drive]), (200, [None]), (900, [SURVEY]), (ZERO, [None])]}
 
 
 def test_several_holders_keep_their_rows() -> None:
@@ -117,13 +110,8 @@ def test_the_past_is_drawn_paler_and_makes_the_run_no_longer(path: Path) -> None
     timeline.past(600, {"robot/late": [(-1, [SURVEY])]})
     assert layout.only_past == ("/rc/robot/gone",)
     assert (layout.past, layout.span) == (600.0, (0.5, 9.0))
-    assert lanes(path, "/rc/robot/a")["/rc/robot/a"] == [
-        (-500, ["survey (journal)"]),
-        (-400, ["not known"]),
-        (-300, ["drive (operator) (journal)"]),
-        (0, [""]),
-        (0.5, ["survey"]),
-    ]
+    before = [(-500, ["survey (journal)"]), (-400, ["not known"]), (-300, ["drive (operator) (journal)"])]
+    assert lanes(path, "/rc/robot/a")["/rc/robot/a"] == [*before, (0, [""]), (0.5, ["survey"])]
     assert colours(path, "/rc/robot/a")["/rc/robot/a"] == {
         "survey": PALETTE[0],
         "survey (journal)": faded(PALETTE[0], PAST_PART),

@@ -153,13 +153,7 @@ def test_the_heaviest_components_have_curves(path: Path, monkeypatch: pytest.Mon
         timeline.hosts.uses(4, "anvil", [])
         timeline.hosts.uses(5, "anvil", [use(f"d{number}", 9) for number in range(3)])
     drawn = {entity for entity, _, _ in rows(path, "/use/cpu/**", SCALARS)}
-    assert drawn == {
-        "/use/cpu/anvil/c6",
-        "/use/cpu/anvil/c5",
-        "/use/cpu/anvil/c4",
-        "/use/cpu/basil/heavy",
-        "/use/cpu/anvil/d0",
-    }
+    assert drawn == {f"/use/cpu/{name}" for name in ("anvil/c6", "anvil/c5", "anvil/c4", "basil/heavy", "anvil/d0")}
     # c4 gave way to the heavy one; c5 and c6 went on until they were gone.
     assert [len(curve(path, f"/use/cpu/anvil/c{number}")) for number in (4, 5, 6)] == [1, 2, 3]
     assert curve(path, "/use/memory/anvil/c6") == [0, 0, 5]
