@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from tests.cli.tools import zscout_soon
+from tests.live.bench import granted
 from tests.live.lab import PATIENT, Lab, awaited
 from zscout.keyexpr import Role
 from zscout.messages import Grants
@@ -59,8 +60,7 @@ async def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> 
         await lab.held_by(client, "robot/b", "survey")
         take = await client.request("take", {"robot/b": {}}, priority=10, min_runtime=600)
         await lab.held_by(client, "robot/b", "take")
-        granted = await client.granted(take)
-        assert granted is not None
+        granted = await granted(client, take)
         for _ in range(20):
             await client.command("robot/b", granted, {"name": "echo"})
         both = {"anvil", "bellows"}
