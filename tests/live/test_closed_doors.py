@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import pytest
 import zenoh
@@ -71,7 +71,10 @@ class Inside:
         await until(lambda: mesh.links() >= len(self.meshes) - 1, within=HANG)
         return mesh
 
-    async def close(self) -> None:
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
         for mesh in self.meshes:
             await mesh.close()
 
@@ -102,8 +105,7 @@ def has_seen(session: zenoh.Session) -> list[str]:
 
 @pytest.mark.parametrize("name", ["plain TCP", "no certificate", "another CA's", "expired"])
 async def test_an_intruder_has_no_link_no_token_and_no_key(lab: ClosedLab, name: str) -> None:
-    inside = Inside(lab)
-    try:
+    async with Inside(lab) as inside:
         # Whoever joins makes the links: one member joins before the intruder, one after.
         await inside.join("anvil")
         with bare(lab, **intruders(lab)[name]) as intruder:
@@ -113,8 +115,6 @@ async def test_an_intruder_has_no_link_no_token_and_no_key(lab: ClosedLab, name:
             # Either end may tell later than the other.
             await until(lambda: {one.links() for one in inside.meshes} == {1}, within=HANG)
             assert mesh.links() == 1
-    finally:
-        await inside.close()
 
 
 def without(settings: dict[str, Any], path: str) -> dict[str, Any]:
@@ -142,14 +142,11 @@ async def test_each_setting_keeps_somebody_out(
 ) -> None:
     closed = zenoh_mesh._closed
     monkeypatch.setattr(zenoh_mesh, "_closed", lambda security: without(closed(security), setting))
-    inside = Inside(lab)
-    try:
+    async with Inside(lab) as inside:
         await inside.join("anvil")
         with bare(lab, **intruders(lab)[name]) as intruder:
             await inside.join("bench")
             await until(lambda: linked(intruder), within=HANG)
-    finally:
-        await inside.close()
 
 
 # Roles

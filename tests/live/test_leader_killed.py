@@ -12,6 +12,7 @@ from tests.live.bench import running, until
 from tests.live.crew import Crew, Stand
 from tests.live.lab import PATIENT, Lab, LeaderWatch
 from tests.live.unpublished import deaths
+from tests.thorough import times
 from zscout.behaviors.client.client import Client, CommandRefused
 from zscout.keyexpr import Role
 from zscout.mesh import clock
@@ -72,8 +73,8 @@ async def test_a_successor_carries_everything_on(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 async def test_a_leader_killed_between_answer_and_publication_has_granted_nothing(tmp_path: Path) -> None:
-    found = await deaths(tmp_path, 3, lambda _: None)
-    assert [one.trouble for one in found] == [""] * 3
+    found = await deaths(tmp_path, times(3))
+    assert {one.trouble for one in found} == {""}
     assert any(one.answered for one in found)
 
 

@@ -112,7 +112,7 @@ async def test_a_hold_keeps_its_rcs_over_a_change_of_rcm_and_gets_another_after_
 
             await client.end(blockers[1])
             await client.end(arc)
-            both = await granted(client, waiting)
+            await granted(client, waiting)
             assert sorted(waiting.bound) == [ANY, MORE]
             assert sorted(waiting.bound.values()) == waiting.rcs == BOTH
 
