@@ -106,6 +106,11 @@ async def answer(command: Awaitable[Done]) -> str:
     return "done"
 
 
+def ended(arc: OpenArc) -> str:
+    """How its last hold did."""
+    return arc.ending.outcome if arc.ending is not None else ""
+
+
 async def comes_to(arc: OpenArc, state: str, reason: str = "") -> None:
     """Waits until a request stands so: on a slow machine votes may come late."""
     await until(lambda: arc.state == state and reason in arc.reason)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.hang import HANG
-from tests.live.bench import Bench, Stand, comes_to, granted, running
+from tests.live.bench import Bench, Stand, comes_to, ended, granted, running
 from tests.live.lab import TTL, Lab
 from tests.live.stranger import Stranger, beside_a_node, command, good_ask
 from tests.live.test_protocol import PlainProcess
@@ -107,8 +107,7 @@ async def test_a_hold_keeps_its_rcs_over_a_change_of_rcm_and_gets_another_after_
             found = Held(client, arc, again)
             assert (found.rc(ANY), held.rc(ANY)) == ("framegrabber/f1", "framegrabber/f3")
             assert await echo(found, ANY) == ANY
-            assert arc.ending is not None
-            assert arc.ending.outcome == "lost"
+            assert ended(arc) == "lost"
 
             await client.end(blockers[1])
             await client.end(arc)

@@ -12,7 +12,7 @@ import pytest
 from tests.behaviors.components.kit import ComponentLab, lives
 from tests.hang import HANG
 from tests.live.lab import Lab, answered, awaited
-from tests.live.placing import Placing, WitnessRc, register
+from tests.live.placing import Placing, WitnessRc, register, three
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.sensor_net.place_sensor_net import component_of
 from zscout.keyexpr import Role
@@ -35,16 +35,6 @@ from zscout.types import SECOND
 pytestmark = pytest.mark.live
 
 RC = "robot/scout33"
-
-
-async def three(lab: Lab) -> Placing:
-    """Three nodes that report, of which h0 and h1 may lead."""
-    for host in ("h0", "h1", "h2"):
-        lab.node(host)
-    client = await lab.begun()
-    placing = Placing(client)
-    await placing.hosts(3)
-    return placing
 
 
 def family(lab: Lab, host: str) -> list[psutil.Process]:
@@ -119,12 +109,7 @@ async def test_what_ran_on_a_host_that_dies_runs_elsewhere(tmp_path: Path) -> No
     # The leader is not the one that dies.
     async with ComponentLab(tmp_path, candidates=["h0"]) as lab, WitnessRc(lab, RC) as rc:
         register(lab)
-        for host in ("h0", "h1", "h2"):
-            lab.node(host)
-        client = await lab.client()
-        await lab.ready(client, RC)
-        placing = Placing(client)
-        await placing.hosts(3)
+        placing = await three(lab, RC)
         held = await placing.place("held", "tally", {"rc": RC, "period": 0.02}, hosts=["h1", "h2"])
         victim = held.host
         assert victim is not None

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.live.bench import ECHO, SharedBench, Stand, answer, comes_to, running
+from tests.live.bench import ECHO, SharedBench, Stand, answer, comes_to, ended, running
 from tests.live.lab import Lab
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import OpenArc, RequestRefused
@@ -61,8 +61,7 @@ async def test_a_capacity_is_filled_and_never_exceeded(lab: Lab) -> None:
     await comes_to(two, "queued")
     assert one.state == "running"
     await lab.held_by(client, "radio/rf", "idle", "one", "operator")
-    assert two.ending is not None
-    assert two.ending.outcome == "preempted"
+    assert ended(two) == "preempted"
 
     await client.end(one)
     await comes_to(three, "running")
@@ -136,7 +135,6 @@ async def test_a_voter_that_does_not_answer_stops_nobody_else(tmp_path: Path) ->
         lab.signal("v", signal.SIGCONT)
         await comes_to(boss, "running")
         await comes_to(late, "queued")
-        assert late.ending is not None
-        assert late.ending.outcome == "preempted"
+        assert ended(late) == "preempted"
         assert await answer(client.command("robot/a", late_grant, ECHO)) == "ended"
         await lab.held_by(client, "radio/rf", "boss")
