@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import functools
 import signal
-import statistics
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 
@@ -68,24 +67,18 @@ async def test_a_component_that_moves_keeps_its_count_and_its_hold(tmp_path: Pat
         await placing.until(ARC, lambda one: one.movable)
         await rc.witness.more()
         rival = await rival_of(lab)
-        dead, grants = [], set[Grant]()
+        grants = set[Grant]()
         for number in range(MOVES):
             to = "h1" if placed.host == "h2" else "h2"
             placed = await placing.get(MigrateComponent(ARC, to, wait=LONGEST), Placement)
             assert (placed.state, placed.host, placed.moves) == ("running", to, number + 1), placed
             assert placed.dead is not None
-            dead.append(placed.dead)
             await rc.witness.more()
             grants.update(holder.grant for holder in (await lab.rc(placing.client, RC)).holders)
         rival.check()
         rc.witness.check()
         assert len(grants) == MOVES
         assert rc.witness.released == 0
-        worst = max(dead)
-        print(
-            f"\n{MOVES} moves, {len(rc.witness.counts)} counts; dead time median "
-            f"{1000 * statistics.median(dead):.1f} ms, longest {1000 * worst:.1f} ms"
-        )
 
 
 # Each step at which the target may die: how the move is held there.
