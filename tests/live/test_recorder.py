@@ -23,7 +23,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from tests.hang import HANG
-from tests.live.bench import until
+from tests.live import bench
 from tests.live.lab import Lab
 from tests.ports import free_port
 from tests.services.recorder.paper_run import colours, events, lanes, rows
@@ -40,6 +40,7 @@ from zscout.types import SECOND
 pytestmark = pytest.mark.live
 
 MARK = " (operator)"
+until = bench.until
 
 
 def recorder(folder: str = "runs") -> str:
