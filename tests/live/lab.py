@@ -11,7 +11,6 @@ import subprocess
 import sys
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import psutil
@@ -256,9 +255,7 @@ class Lab:
         confirmation.CONFIRM_TIMEOUT = CONFIRM_TIMEOUT
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc: object) -> None:
         confirmation.CONFIRM_TIMEOUT = self._confirm_timeout
         for holder in self.holders:
             holder.kill()

@@ -218,6 +218,16 @@ class Stepper(Component):
         (self.folder / "restored").touch()
 
 
+async def three(lab: Lab, *rcs: str) -> Placing:
+    """Starts h0, h1 and h2, and waits until all report, and these RCs of others are there."""
+    for host in ("h0", "h1", "h2"):
+        lab.node(host)
+    placing = Placing(await lab.client())
+    await lab.ready(placing.client, *rcs)
+    await placing.hosts(3)
+    return placing
+
+
 def register(lab: Lab) -> None:
     """Makes `stepper` and `tally` kinds that the lab's nodes can start, as if they were installed."""
     info = lab.folder / "site" / "stepper-1.dist-info"

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from tests.cli.tools import zscout_soon
+from tests.live.bench import granted
 from tests.live.lab import PATIENT, Lab, awaited
 from zscout.keyexpr import Role
 from zscout.messages import Grants
@@ -59,10 +60,9 @@ async def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> 
         await lab.held_by(client, "robot/b", "survey")
         take = await client.request("take", {"robot/b": {}}, priority=10, min_runtime=600)
         await lab.held_by(client, "robot/b", "take")
-        granted = await client.granted(take)
-        assert granted is not None
+        grant = await granted(client, take)
         for _ in range(20):
-            await client.command("robot/b", granted, {"name": "echo"})
+            await client.command("robot/b", grant, {"name": "echo"})
         both = {"anvil", "bellows"}
         first = await told(
             lab,
@@ -82,7 +82,7 @@ async def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> 
         await lab.living(client, Role.RCM, lambda hosts: hosts == ["bellows"])
         await client.end(take)
         await lab.held_by(client, "robot/b", "survey")
-        (last,) = [use.seconds for use in (await lab.rc(client, "robot/b")).used if use.grant == granted]
+        (last,) = [use.seconds for use in (await lab.rc(client, "robot/b")).used if use.grant == grant]
         # What it said while they stood may have been less.
         later = await told(
             lab,

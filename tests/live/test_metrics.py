@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from tests.hang import HANG
-from tests.live.bench import comes_to
+from tests.live.bench import comes_to, granted
 from tests.live.lab import Lab, awaited
 from tests.ports import free_port
 from zscout.behaviors.client.client import Client
@@ -103,8 +103,7 @@ async def measured(folder: Path) -> AsyncIterator[tuple[Lab, Client, int]]:
         ]
         while second.start is None:
             await client.changed(second)
-        grant = await client.granted(first, confirmed=True)
-        assert grant is not None
+        grant = await granted(client, first, confirmed=True)
         await client.command("robot/a", grant, {"name": "echo", "value": 1})
         await client.end(first)
         with pytest.raises(CommandRefused):

@@ -23,7 +23,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from tests.hang import HANG
-from tests.live.bench import until
+from tests.live import bench
 from tests.live.lab import Lab
 from tests.ports import free_port
 from tests.services.recorder.paper_run import colours, events, lanes, rows
@@ -40,6 +40,7 @@ from zscout.types import SECOND
 pytestmark = pytest.mark.live
 
 MARK = " (operator)"
+until = bench.until
 
 
 def recorder(folder: str = "runs") -> str:
@@ -294,6 +295,13 @@ def run_recorder(lab: Lab, job: bytes, *program: str) -> subprocess.Popen[bytes]
     return process
 
 
+async def at_its_end(process: subprocess.Popen[bytes]) -> None:
+    """Ends it as its node does, by closing its input."""
+    assert process.stdin is not None
+    process.stdin.close()
+    assert await asyncio.to_thread(process.wait, HANG) == 0
+
+
 @pytest.mark.parametrize(
     "number", [signal.SIGTERM, *(pytest.param(number, marks=pytest.mark.slow) for number in (signal.SIGINT, None))]
 )
@@ -359,9 +367,7 @@ async def test_a_recorder_that_comes_late_has_what_a_journal_kept(tmp_path: Path
             await recorded(runs, lambda path: any("before this recording" in text for text in events(path)))
         await client.end(film)
         await lab.state(client, lambda state: not state.holds)
-        assert process.stdin is not None
-        process.stdin.close()
-        assert await asyncio.to_thread(process.wait, HANG) == 0
+        await at_its_end(process)
     shown = [state for (state,) in lane(the_file(runs), "/rc/robot/a") if state]
     assert shown == (["survey (journal)", "film (journal)"] if past else []) + ["film"]
     RrdReader(the_file(runs)).store()
@@ -408,9 +414,7 @@ async def test_parts_follow_one_another_and_the_oldest_make_room(tmp_path: Path)
         await client.end(arc)
         await lab.state(client, lambda state: not state.holds)
         written = parts()
-        assert process.stdin is not None
-        process.stdin.close()
-        assert await asyncio.to_thread(process.wait, HANG) == 0
+        await at_its_end(process)
         assert [path.exists() for path in (*old, newer)] == [False, False, True, True]
         assert set(written) <= set(parts())
 

@@ -22,7 +22,7 @@ from tests.cli.fleet.test_status import section
 from tests.cli.tools import COMMAND
 from tests.hang import HANG
 from tests.live import message_samples
-from tests.live.bench import comes_to, running, until
+from tests.live.bench import comes_to, ended, granted, running, until
 from tests.live.crew import Crew, Stand
 from tests.live.former import MixedLab, environment, unpack
 from tests.live.lab import PATIENT, HolderProcess, awaited
@@ -91,8 +91,7 @@ async def test_a_gang_over_nodes_of_both_versions(tmp_path: Path, former: Path, 
         second = await client.request("second", needs, min_runtime=600)
         assert (second.state, second.ahead) == ("queued", 0)
         await old.order("end")
-        grant = await client.granted(second, confirmed=True)
-        assert grant is not None
+        grant = await granted(client, second, confirmed=True)
         for rc in rcs:
             assert (await client.command(rc, grant, ECHO)).result == ECHO["value"]
 
@@ -100,8 +99,7 @@ async def test_a_gang_over_nodes_of_both_versions(tmp_path: Path, former: Path, 
         await enters(old, "boss", {"robot/a": {}}, priority=9)
         await lab.state(client, lambda state: [one.arc for one in state.queue] == ["second"])
         await comes_to(second, "queued")
-        assert second.ending is not None
-        assert second.ending.outcome == "preempted"
+        assert ended(second) == "preempted"
         old.kill()
         assert await client.granted(second) is not None
         await lab.held_by(client, "radio/b", "second")
