@@ -39,6 +39,7 @@ async def until_stopped(pid: int) -> None:
             await asyncio.sleep(0.01)
 
 
+@pytest.mark.slow
 def test_a_node_says_that_it_is_ready_that_it_lives_and_that_it_ends(tmp_path: Path) -> None:
     told, control = tmp_path / "told", NotifySocket(str(tmp_path / "control"))
 

@@ -31,6 +31,7 @@ class Gauge(Bench):
         return dict(self.told)
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_health_and_figures_of_devices(tmp_path: Path) -> None:
     async def story() -> None:

@@ -109,6 +109,7 @@ def test_at_a_narrow_terminal_every_key_can_be_copied(tmp_path: Path) -> None:
     asyncio.run(story())
 
 
+@pytest.mark.slow
 def test_where_nobody_is_it_says_so(tmp_path: Path) -> None:
     async def story() -> None:
         async with Lab(tmp_path) as lab:

@@ -29,6 +29,7 @@ def section(text: str, title: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.split("  ") if cell.strip()] for line in lines[1:]]
 
 
+@pytest.mark.slow
 def test_the_fleet_is_shown_to_people_and_programs(tmp_path: Path) -> None:
     async def story() -> None:
         async with Lab(tmp_path, lease=PATIENT, extra=patient_timing()) as lab:
@@ -114,6 +115,7 @@ def test_the_fleet_is_shown_to_people_and_programs(tmp_path: Path) -> None:
     asyncio.run(story())
 
 
+@pytest.mark.slow
 def test_a_candidate_that_died_is_shown(tmp_path: Path) -> None:
     async def story() -> None:
         async with Lab(tmp_path, candidates=("anvil", "bellows")) as lab:
@@ -157,6 +159,7 @@ def test_a_candidate_that_died_is_shown(tmp_path: Path) -> None:
     asyncio.run(story())
 
 
+@pytest.mark.slow
 def test_watching_in_a_pipe_prints_a_block_when_something_happens(tmp_path: Path) -> None:
     async def story() -> None:
         async with Lab(tmp_path) as lab:
@@ -233,6 +236,7 @@ def test_watching_as_json_prints_a_line_each_time(tmp_path: Path) -> None:
     asyncio.run(story())
 
 
+@pytest.mark.slow
 def test_watching_at_a_terminal_draws_in_place_until_q(tmp_path: Path) -> None:
     async def story() -> None:
         async with Lab(tmp_path) as lab:

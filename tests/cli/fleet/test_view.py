@@ -243,6 +243,7 @@ def test_a_recording_of_another_host_is_not_taken_for_one_of_this_host(tmp_path:
     assert reached() is None
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_a_live_view_as_json(tmp_path: Path) -> None:
     lab = Lab(tmp_path)

@@ -18,6 +18,7 @@ US = re.escape(ours())
 SOON = r"\d+(\.\d)? s"
 
 
+@pytest.mark.slow
 def test_the_story_of_an_arc(tmp_path: Path) -> None:
     async def story() -> None:
         async with Lab(tmp_path, lease=PATIENT, extra=patient_timing()) as lab:
