@@ -12,21 +12,18 @@ import zscout as package
 from tests.cli.tools import Terminal, zscout, zscout_here
 from tests.services.recorder.paper_run import RCS, TABLE2, events, lanes, second_by_second
 
-JSON = (
-    '{"strategy": "priority", "holds": ['
-    '{"arc": "arc0", "start": 0.0, "end": 5.0, "outcome": "completed", '
-    '"rcs": ["framegrabber/fgrab1", "robot/scout33"]}, '
-    '{"arc": "arc1", "start": 5.0, "end": 10.0, "outcome": "completed", '
-    '"rcs": ["framegrabber/fgrab1", "robot/scout35"]}, '
-    '{"arc": "arc3", "start": 5.0, "end": 8.0, "outcome": "completed", '
-    '"rcs": ["framegrabber/fgrab2", "robot/scout33"]}, '
-    '{"arc": "arc2", "start": 8.0, "end": 11.0, "outcome": "preempted", '
-    '"rcs": ["framegrabber/fgrab2", "robot/scout33"]}, '
-    '{"arc": "arc4", "start": 11.0, "end": 14.0, "outcome": "completed", '
-    '"rcs": ["framegrabber/fgrab1", "robot/scout33", "robot/scout35"]}, '
-    '{"arc": "arc2", "start": 14.0, "end": 18.0, "outcome": "completed", '
-    '"rcs": ["framegrabber/fgrab2", "robot/scout33"]}], "unserved": []}\n'
+HOLDS = (
+    ("arc0", 0, 5, "completed", "fgrab1 scout33"), ("arc1", 5, 10, "completed", "fgrab1 scout35"),
+    ("arc3", 5, 8, "completed", "fgrab2 scout33"), ("arc2", 8, 11, "preempted", "fgrab2 scout33"),
+    ("arc4", 11, 14, "completed", "fgrab1 scout33 scout35"), ("arc2", 14, 18, "completed", "fgrab2 scout33"),
+)  # fmt: skip
+LINES = ", ".join(
+    f'{{"arc": "{arc}", "start": {start}.0, "end": {end}.0, "outcome": "{outcome}", "rcs": ['
+    + ", ".join(f'"{"robot" if name.startswith("scout") else "framegrabber"}/{name}"' for name in names.split())
+    + "]}"
+    for arc, start, end, outcome, names in HOLDS
 )
+JSON = f'{{"strategy": "priority", "holds": [{LINES}], "unserved": []}}\n'
 
 SHARED = """
 [[rc]]
