@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from datetime import UTC, date, datetime, time, timedelta
+from datetime import UTC, date, datetime, time
 from decimal import Decimal
-from itertools import pairwise
 from pathlib import Path
 from zoneinfo import ZoneInfo
 
@@ -126,19 +125,6 @@ def series(start: datetime, every: int, until: float, zone: ZoneInfo) -> list[da
     at, day = int(start.timestamp()), Decimal(3600)
     record = BookingRecord("id", "n", {"robot/a": {}}, 0, at, day, day, zone.key, every, int(until))
     return [datetime.fromtimestamp(one, zone) for one in dates(record, at, until + 1)]
-
-
-def test_a_weekly_date_keeps_its_hour_over_both_changes() -> None:
-    for zone, summer, winter in ((BERLIN, 2, 1), (NEW_YORK, -4, -5)):
-        start = datetime(2026, 10, 20, 14, 0, tzinfo=zone)
-        found = series(start, 7, (start + timedelta(days=200)).timestamp(), zone)
-        assert len(found) == 29
-        assert {one.hour for one in found} == {14}
-        assert {one.weekday() for one in found} == {1}
-        offsets = [one.utcoffset() for one in found]
-        changes = [b for a, b in pairwise(offsets) if a != b]
-        assert (offsets[0], changes) == (timedelta(hours=summer), [timedelta(hours=winter), timedelta(hours=summer)])
-        assert not remarks([int(one.timestamp()) for one in found], zone, time(14))
 
 
 def test_of_a_series_the_hours_that_a_day_has_not_or_twice_are_told() -> None:

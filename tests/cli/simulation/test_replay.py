@@ -176,40 +176,7 @@ def test_the_other_strategies_serve_table_1_as_the_paper_does(
     assert capsys.readouterr().out == JSON.replace('"priority"', f'"{strategy}"', 1)
 
 
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [(["--rrd", "picture.png"], "end it in .rrd"), (["--rrd", "no/such/folder/x.rrd"], "can't write the recording")],
-)
-def test_what_can_t_be_done_is_one_line_and_code_2(
-    table1: Path, args: list[str], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert zscout_here("replay", table1, *args) == 2
-    out, line = capsys.readouterr()
-    assert (out, len(line.splitlines())) == ("", 1)
-    assert words in line
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("[[rc", "line 1"),
-        ('[[arc]]\nname = "a"\nat = -1\npriority = 1\nmin_runtime = 1\n[arc.needs]\n"x/y" = {}', "arc[0].at"),
-        ('[[arc]]\nname = "a"\nat = nan\npriority = 1\nmin_runtime = 1\n[arc.needs]\n"x/y" = {}', "arc[0].at"),
-        ('[[arc]]\nname = "a"\nat = 0\npriority = 1\nmin_runtime = 1\n[arc.needs]', "at least one RC"),
-    ],
-)
-def test_a_bad_workload_is_one_line_that_names_the_file_and_code_2(
-    tmp_path: Path, text: str, words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = tmp_path / "bad.toml"
-    file.write_text(text)
-    assert zscout_here("replay", file, "--json") == 2
-    out, line = capsys.readouterr()
-    assert (out, len(line.splitlines())) == ("", 1)
-    assert "bad.toml" in line
-    assert words in line
-
-
+@pytest.mark.slow
 def test_a_recording_shows_table_2(table1: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recording = tmp_path / "run.rrd"
     assert zscout_here("replay", table1, "--rrd", recording) == 0
