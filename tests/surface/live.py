@@ -23,6 +23,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any, Final, Self
 
+from tests.cli.tools import end
 from tests.hang import HANG
 from tests.ports import free_port
 from tests.surface.commands import plain, printed, scripts
@@ -127,7 +128,7 @@ class Story:
             text=True,
             cwd=self.folder,
         )
-        self._stack.callback(_end, process)
+        self._stack.callback(end, process)
         return process
 
     def _ask(self, name: str, command: str, *words: str) -> Program:
@@ -192,15 +193,6 @@ class Program:
         """Reads what comes until it ends."""
         self._lines += map(json.loads, self._out)
         story.note(self._name, self._lines, self._process.wait(HANG))
-
-
-def _end(process: subprocess.Popen[str]) -> None:
-    process.terminate()
-    try:
-        process.wait(10)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
 
 
 def _reported(state: Any) -> set[str]:

@@ -310,15 +310,6 @@ def test_what_can_never_start_is_refused_at_once_with_code_2(fleet: CliFleet) ->
     fleet.state(lambda state: not state.queue and not state.holds)
 
 
-def test_refusals_by_the_rcm_are_one_line(fleet: CliFleet) -> None:
-    blank = fleet.zscout("request", "robot/a", "--name", "not valid")
-    assert blank.returncode == 2
-    assert blank.stderr == "zscout: --name 'not valid' is not valid: use 1 to 64 of A-Z a-z 0-9 _ . -\n"
-    needless = fleet.zscout("request", *(f"robot/{number}" for number in range(65)))
-    assert needless.returncode == 2
-    assert needless.stderr.startswith("zscout: 65 RCs; at most 64 are allowed")
-
-
 def test_the_live_line_shows_and_ctrl_c_ends_the_wait(fleet: CliFleet) -> None:
     blocker = fleet.holder("blocker", "robot/a")
     with fleet.terminal("request", "robot/a", "--name", "seen") as terminal:
