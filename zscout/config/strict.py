@@ -17,6 +17,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
@@ -161,9 +162,13 @@ def parse_toml(text: str, source: str, type: type[T]) -> T:  # noqa: A002 - msgs
 def convert(data: object, type: type[T], where: Where) -> T:  # noqa: A002 - msgspec's word
     """What TOML or JSON gave, as a struct or dataclass. Raises BadInput, TypeError for a type that is none of these."""
     try:
-        return msgspec.convert(_checked(inspect.type_info(type), data, where), type)
+        return msgspec.convert(_checked(_type_info(type), data, where), type)
     except msgspec.ValidationError as error:  # what only msgspec knows of, as other bounds than `key` gives
         raise where.bad(str(error), "mend it") from None
+
+
+_type_info = cache(inspect.type_info)
+"""Of a type some 10 ms, and a node file converts each of its `[[rc]]` tables."""
 
 
 def check_name(value: str, where: Where) -> None:
