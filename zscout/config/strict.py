@@ -167,8 +167,10 @@ def convert(data: object, type: type[T], where: Where) -> T:  # noqa: A002 - msg
         raise where.bad(str(error), "mend it") from None
 
 
-_type_info = cache(inspect.type_info)
-"""Of a type some 10 ms, and a node file converts each of its `[[rc]]` tables."""
+@cache
+def _type_info(type: Any) -> inspect.Type:  # noqa: A002 - msgspec's word
+    # Some 10 ms for a type, and a node file converts each of its `[[rc]]` tables.
+    return inspect.type_info(type)
 
 
 def check_name(value: str, where: Where) -> None:
