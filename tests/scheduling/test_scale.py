@@ -99,15 +99,11 @@ class Twins:
         plain = self.plain.handle(self.now, *events)
         assert decisions(effects) == decisions(plain), f"after {events[:3]} at {self.now}"
         for effect in effects:
-            match effect:
-                case Propose(proposal=proposal):
-                    self.out[proposal] = effect
-                case Granted():
-                    self.grants += 1
-                case HoldEnded(by=by):
-                    self.preemptions += by is not None
-                case _:
-                    pass
+            if isinstance(effect, Propose):
+                self.out[effect.proposal] = effect
+            elif isinstance(effect, Granted | HoldEnded):
+                self.grants += isinstance(effect, Granted)
+                self.preemptions += isinstance(effect, HoldEnded) and effect.by is not None
         return bool(decisions(effects))
 
     def play(self) -> None:

@@ -152,17 +152,9 @@ def test_a_degenerate_case_is_found_and_described() -> None:
     assert (one.used, one.best, one.behind) == (1, 3, True)
     features = dict(zip(FEATURES, one.features, strict=True))
     assert features == {
-        "waiting": 2,
-        "pressure": pytest.approx(4 / 3),
-        "mean width": 2,
-        "levels": 1,
-        "sharable needs": 0,
-        "free before": 1,
-        "startable": 2,
-        "clashes": 1,
-        "narrow first": 2,
-        "unreached": 2,
-    }
+        "waiting": 2, "pressure": pytest.approx(4 / 3), "mean width": 2, "levels": 1, "sharable needs": 0,
+        "free before": 1, "startable": 2, "clashes": 1, "narrow first": 2, "unreached": 2,
+    }  # fmt: skip
     # When narrow is over, wide starts: nobody waits, and there is nothing to judge.
     assert later == []
 
