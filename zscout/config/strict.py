@@ -161,8 +161,9 @@ def parse_toml(text: str, source: str, type: type[T]) -> T:  # noqa: A002 - msgs
 
 def convert(data: object, type: type[T], where: Where) -> T:  # noqa: A002 - msgspec's word
     """What TOML or JSON gave, as a struct or dataclass. Raises BadInput, TypeError for a type that is none of these."""
+    kind: Any = type
     try:
-        return msgspec.convert(_checked(_type_info(type), data, where), type)
+        return msgspec.convert(_checked(_type_info(kind), data, where), type)
     except msgspec.ValidationError as error:  # what only msgspec knows of, as other bounds than `key` gives
         raise where.bad(str(error), "mend it") from None
 
