@@ -9,8 +9,9 @@ import pytest
 
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.sensor_net.scout import BAD_FOR, QUIET, Alerts, Blindness
-from zscout.behaviors.tree import MAX_CHILDREN, MAX_DEPTH, Behavior, BehaviorContext
+from zscout.behaviors.tree import MAX_CHILDREN, MAX_DEPTH, Behavior, BehaviorContext, CarriedClock
 from zscout.messages import BehaviorSaid
+from zscout.types import SECOND
 
 
 class Count(Behavior):
@@ -115,6 +116,14 @@ def test_trees_have_bounds() -> None:
         deep = child
     with pytest.raises(ValueError, match="deep"):
         deep.add(Count("too-deep"))
+
+
+def test_a_clock_goes_on_at_another_host_where_it_was() -> None:
+    here, there = CarriedClock(), CarriedClock()
+    readings = [here.read(at * SECOND, 2.0) for at in (1000, 1003)]
+    there.seconds = here.seconds
+    readings += [there.read(at * SECOND, 2.0) for at in (5, 6)]
+    assert readings == [0.0, 6.0, 6.0, 8.0]
 
 
 # Whose fault it is that there is no picture

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from decimal import Decimal
 from typing import Any
 
@@ -24,32 +24,13 @@ SAME_COUNTER = Term(5, "n")
 def holder(
     seq: int, client: str = "h/one", *, term: Term = TERM, remaining: float = 60, keep: bool = False, place: int = 0
 ) -> Holder:
-    return Holder(
-        id=f"id{seq}",
-        arc=f"arc{seq}",
-        client=client,
-        grant=Grant(term, seq),
-        place=Place(TERM, place or seq),
-        rcs=[RC],
-        min_runtime=Decimal(60),
-        remaining=remaining,
-        keep=keep,
-    )
+    at, time = Place(TERM, place or seq), Decimal(60)
+    return Holder(f"id{seq}", f"arc{seq}", client, Grant(term, seq), at, [RC], time, remaining, keep=keep)
 
 
 def view(seq: int, client: str = "h/one", *, rc: str = RC, term: Term = TERM, remaining: float = 60) -> HoldView:
-    return HoldView(
-        id=f"id{seq}",
-        arc=f"arc{seq}",
-        client=client,
-        priority=0,
-        grant=Grant(term, seq),
-        place=Place(TERM, seq),
-        needs={rc: {"rate": Decimal(2)}},
-        min_runtime=Decimal(60),
-        held=0,
-        remaining=remaining,
-    )
+    at, needs = Place(TERM, seq), {rc: {"rate": Decimal(2)}}
+    return HoldView(f"id{seq}", f"arc{seq}", client, 0, Grant(term, seq), at, needs, Decimal(60), 0, remaining)
 
 
 def said(
@@ -58,13 +39,9 @@ def said(
     prev: int | None = None,
     term: Term = TERM,
     touches: bool = True,
-    revoked: Holder | None = None,
+    revoked: Sequence[Holder] = (),
 ) -> Grants:
-    words = []
-    if revoked is not None:
-        words = [
-            Revocation(revoked.id, revoked.arc, revoked.client, revoked.grant, [RC], "preempted", "by an operator")
-        ]
+    words = [Revocation(r.id, r.arc, r.client, r.grant, [RC], "preempted", "by an operator") for r in revoked]
     rcs = {RC: list(holders)} if touches else {"robot/other": []}
     return Grants(term=term, seq=seq, prev=seq - 1 if prev is None else prev, every=0.5, rcs=rcs, revoked=words)
 
@@ -319,7 +296,7 @@ def test_a_command_is_judged_by_the_time_at_which_it_is_carried_out() -> None:
 
 
 def test_the_reason_given_with_a_revocation_is_what_a_late_command_is_told() -> None:
-    rc = holding(HELD, said(3, TWO, revoked=ONE))
+    rc = holding(HELD, said(3, TWO, revoked=[ONE]))
     refusal = rc.check(ONE.grant, "h/one", NOW)
     assert refusal is not None
     assert refusal.message.endswith("preempted: by an operator")

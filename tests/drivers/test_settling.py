@@ -115,7 +115,8 @@ async def test_the_next_holder_waits_until_the_program_of_a_direct_hold_has_left
     async with play() as at:
         at.next_holder()
         refused = await at.refusal(2)
-        assert (refused.code, refused.left) == ("settling", pytest.approx(LEASE + SETTLE, abs=0.1))
+        assert refused.code == "settling"
+        assert refused.left == pytest.approx(LEASE + SETTLE, abs=0.1)
         assert await at.word(at.other, 2, ECHO) == "settling"
         assert at.device.calls == ["begin one", "end one", "safe"]
         assert await at.word(at.client, 1, LEFT) == "done"
@@ -288,7 +289,8 @@ async def test_whom_a_device_begins_for_does_not_enter_before_it_has_begun() -> 
         at.next_holder()
         await until(lambda: "begin next" in at.device.calls)
         refused = await at.refusal(2)
-        assert (refused.code, refused.left) == ("settling", pytest.approx(4, abs=0.1))
+        assert refused.code == "settling"
+        assert refused.left == pytest.approx(4, abs=0.1)
         assert refused.message == "robot/x is being started, for 4.0 s at most"
         assert await at.word(at.other, 2, ECHO) == "settling"
         assert await at.word(at.other, 2, {"name": "stop"}) == "done"

@@ -15,7 +15,9 @@ from tests.hang import HANG
 from zscout.keyexpr import BadName
 from zscout.mesh import supervision
 from zscout.mesh.exchange import Refused
-from zscout.mesh.supervision import Supervisor, done_within
+from zscout.mesh.supervision import AFTERMATH, StallWatch, Supervisor, done_within, supervised
+from zscout.testing.virtual_time import VirtualTimeLoop
+from zscout.types import SECOND, Ns
 
 
 class Owner:
@@ -287,3 +289,75 @@ async def test_done_within_tells_its_own_timeout_from_the_work_s() -> None:
     assert await done_within(1, asyncio.sleep(0.5))
     with pytest.raises(TimeoutError, match="of the work"):
         await done_within(1, work())
+
+
+async def test_what_fails_beside_a_body_fails_the_body() -> None:
+    async def broken() -> None:
+        await asyncio.sleep(1)
+        raise RuntimeError("broken")
+
+    async def body() -> None:
+        async with supervised("tree") as supervisor:
+            supervisor.spawn(broken())
+            await asyncio.sleep(3600)
+
+    with pytest.raises(RuntimeError, match="broken"):
+        await body()
+
+
+async def test_a_body_that_is_cancelled_from_outside_stays_so() -> None:
+    async def body(ended: list[str]) -> None:
+        async def work() -> None:
+            try:
+                await asyncio.sleep(3600)
+            finally:
+                ended.append("work")
+
+        async with supervised("tree") as supervisor:
+            supervisor.spawn(work())
+            await asyncio.sleep(3600)
+
+    ended: list[str] = []
+    task = asyncio.create_task(body(ended))
+    await asyncio.sleep(1)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert ended == ["work"]
+
+
+# A process that stood still
+
+
+def _loop() -> VirtualTimeLoop:
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualTimeLoop)
+    return loop
+
+
+def _now() -> Ns:
+    return round(_loop().time() * SECOND)
+
+
+async def test_a_stall_is_measured_and_soon_over() -> None:
+    watch = StallWatch(_now).start()
+    await asyncio.sleep(10.05)
+    assert not watch.fresh()
+    assert watch.waited_through(_now()) == 0
+    _loop().jump(3.0)  # nothing runs meanwhile
+    assert watch.fresh()
+    arrived = _now()
+    assert watch.waited_through(arrived) == pytest.approx(2.8 * SECOND, rel=0.001)
+    await asyncio.sleep(AFTERMATH / SECOND + 0.01)
+    assert not watch.fresh()
+    assert watch.waited_through(_now()) == 0
+    assert watch.waited_through(arrived) > 0
+    watch.stop()
+
+
+async def test_a_short_delay_is_no_stall() -> None:
+    watch = StallWatch(_now).start()
+    await asyncio.sleep(1)
+    _loop().jump(0.35)
+    assert not watch.fresh()
+    watch.stop()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import cv2
@@ -11,7 +12,7 @@ import pytest
 from studies.robots.watch import Case, Watched, cases, plan_of, watch
 from tests.behaviors.perception.recordings import EMPTY_LAWN, GARDEN, HAND, PASSERS_BY, PEOPLE, covered, pictures
 from tests.behaviors.perception.scenes import Scene, box_of, overlap
-from zscout.behaviors.perception.motion import MAX_SIDE, MotionDetector
+from zscout.behaviors.perception.motion import MAX_SIDE, Box, Event, EventTracker, MotionDetector, Seen, around
 from zscout.simulation.building.plan_file import load_plan, shipped_plans
 
 MISSING = "needs Debian's package opencv-doc (apt-get install opencv-doc)"
@@ -27,6 +28,13 @@ def settled(scene: Scene, rate: float = 10.0, seconds: float = 4.0) -> MotionDet
     detector = MotionDetector()
     for time in times(rate, seconds):
         detector.see(time, scene.picture())
+    return detector
+
+
+def paused(scene: Scene) -> MotionDetector:
+    """After 8 seconds of the empty scene."""
+    detector = settled(scene, rate=4.0, seconds=8.0)
+    detector.pause()
     return detector
 
 
@@ -49,13 +57,12 @@ def test_nobody_is_no_alarm_and_a_walker_is_one_within_a_second(noise: float, ra
     assert best > 0.5
 
 
-def told_after(detector: MotionDetector, scene: Scene, start: float, rate: float = 4.0) -> float | None:
-    """Seconds from the first picture of a walker, who comes at `start` and is not much darker than the wall, until he
-    is told."""
+def told_after(detector: MotionDetector, scene: Scene, start: float, rate: float = 4.0) -> float:
+    """Seconds until a walker is seen who comes at `start` and is not much darker than the wall."""
     for time in times(rate, 3.0, start):
         if detector.see(time, scene.picture(20 + 40 * (time - start), shade=80)).moving:
             return time - start
-    return None
+    return math.inf
 
 
 def test_what_a_camera_shows_as_it_warms_up_is_not_learned() -> None:
@@ -67,52 +74,40 @@ def test_what_a_camera_shows_as_it_warms_up_is_not_learned() -> None:
         spoiled = scene.picture() + scene.rng.normal(0, snow, scene.wall.shape)
         detector.see(time, np.clip(spoiled, 0, 255).astype(np.uint8))
     assert not any(detector.see(time, scene.picture()).moving for time in times(4.0, 1.75, 2.25))
-    told = told_after(detector, scene, 4.0)
-    assert told is not None
-    assert told <= 0.5
+    assert told_after(detector, scene, 4.0) <= 0.5
 
 
 def test_after_a_pause_the_background_is_known() -> None:
     scene = Scene(4)
-    detector = settled(scene, rate=4.0, seconds=8.0)
-    detector.pause()
+    detector = paused(scene)
     # Somebody else's picture, and what is half snow, are waited out.
     assert detector.see(60.0, Scene(40).picture()).learning
     spoiled = scene.picture() + scene.rng.normal(0, 20, scene.wall.shape)
     assert detector.see(61.75, np.clip(spoiled, 0, 255).astype(np.uint8)).learning
     assert detector.see(62.0, scene.picture()).learning
     assert not detector.see(62.25, scene.picture()).learning
-    told = told_after(detector, scene, 62.5)
-    assert told is not None
-    assert told <= 0.5
+    assert told_after(detector, scene, 62.5) <= 0.5
 
 
 def test_what_has_changed_in_a_pause_is_no_motion() -> None:
     scene = Scene(5)
-    detector = settled(scene, rate=4.0, seconds=8.0)
-    detector.pause()
+    detector = paused(scene)
     assert not any(detector.see(time, scene.picture(70)).moving for time in times(4.0, 10.0, 60.0))
-    told = told_after(detector, scene, 80.0)
-    assert told is not None
-    assert told <= 1.0
+    assert told_after(detector, scene, 80.0) <= 1.0
 
 
 def test_what_has_come_before_white_in_a_pause_is_no_motion() -> None:
     """White hardly has noise, as the camera cuts it off: what stands before it now has."""
     scene = Scene(8, noise=9.0)
     scene.wall[20:110, 40:120] = 275
-    detector = settled(scene, rate=4.0, seconds=8.0)
-    detector.pause()
+    detector = paused(scene)
     assert not any(detector.see(time, scene.picture(70, shade=40)).moving for time in times(4.0, 10.0, 60.0))
-    told = told_after(detector, scene, 80.0)
-    assert told is not None
-    assert told <= 1.0
+    assert told_after(detector, scene, 80.0) <= 1.0
 
 
 def test_lines_that_are_torn_as_a_pause_ends_are_not_learned() -> None:
     scene = Scene(9)
-    detector = settled(scene, rate=4.0, seconds=8.0)
-    detector.pause()
+    detector = paused(scene)
     assert detector.see(60.0, scene.picture()).learning
     torn = scene.picture()
     torn[60:70] = np.roll(torn[60:70], 24, axis=1)
@@ -122,8 +117,7 @@ def test_lines_that_are_torn_as_a_pause_ends_are_not_learned() -> None:
 
 def test_who_walks_as_a_pause_ends_is_told_at_once() -> None:
     scene = Scene(10)
-    detector = settled(scene, rate=4.0, seconds=8.0)
-    detector.pause()
+    detector = paused(scene)
     seen = [detector.see(time, scene.picture(20 + 40 * (time - 60))) for time in times(4.0, 1.5, 60.0)]
     assert [one.moving for one in seen[2:]] == [True] * 4
     # He leaves nothing behind of which more could be told.
@@ -146,13 +140,10 @@ def test_after_a_pause_pictures_may_come_slowly(apart: float) -> None:
 
 
 def test_who_was_moved_in_a_pause_learns_anew() -> None:
-    detector = settled(Scene(6), rate=4.0, seconds=8.0)
-    detector.pause()
+    detector = paused(Scene(6))
     scene = Scene(60)
     assert not any(detector.see(time, scene.picture()).moving for time in times(4.0, 6.0, 60.0))
-    told = told_after(detector, scene, 66.0)
-    assert told is not None
-    assert told <= 0.5
+    assert told_after(detector, scene, 66.0) <= 0.5
 
 
 def test_who_paused_before_he_knew_anything_learns_anew() -> None:
@@ -160,7 +151,7 @@ def test_who_paused_before_he_knew_anything_learns_anew() -> None:
     detector.see(0.0, Scene(70).picture())
     detector.pause()
     assert not any(detector.see(time, scene.picture()).moving for time in times(4.0, 3.0, 10.0))
-    assert told_after(detector, scene, 13.0) is not None
+    assert told_after(detector, scene, 13.0) < math.inf
 
 
 def test_pictures_at_uneven_times_with_gaps() -> None:
@@ -364,3 +355,68 @@ def test_a_batch_is_even_however_soon_it_is_cut() -> None:
     }
     assert {case.seed for case in some[: 2 * len(names)]} == {0}
     assert plan_of(some[0]).people[0].first < load_plan(shipped_plans()[names[0]]).people[0].first
+
+
+# From sightings to events
+
+
+STILL = Seen(False)
+A, B, BIG = Box(10, 10, 5, 8), Box(40, 20, 4, 4), Box(12, 10, 30, 30)
+
+
+def played(tracker: EventTracker, *sights: tuple[float, Seen]) -> list[Event]:
+    return [event for time, seen in sights if (event := tracker.see(time, seen)) is not None]
+
+
+def test_an_event_begins_with_the_sighting_that_was_confirmed_and_ends_with_the_last() -> None:
+    tracker = EventTracker()
+    events = played(
+        tracker,
+        (0.0, STILL),
+        (1.0, Seen(False, (A,))),
+        (1.2, Seen(True, (BIG, B))),
+        (1.4, Seen(True, (A,))),
+        (1.6, STILL),
+        (2.4, STILL),
+        (2.5, STILL),
+    )
+    assert events == [Event(1.0, 1.4, 1.2, (BIG, B), Box(10, 10, 34, 30), 3)]
+    assert tracker.current is None
+    assert tracker.close() is None
+
+
+def test_a_short_pause_goes_on_with_the_event_and_a_long_one_ends_it() -> None:
+    tracker = EventTracker()
+    sights = [(0.0, Seen(True, (A,))), (1.0, Seen(True, (A,))), (2.1, Seen(True, (B,))), (9.0, STILL)]
+    events = played(tracker, *sights)
+    assert [(event.start, event.end, event.frames) for event in events] == [(0.0, 1.0, 2), (2.1, 2.1, 1)]
+
+
+def test_a_sighting_long_ago_begins_nothing() -> None:
+    tracker = EventTracker()
+    played(tracker, (0.0, Seen(False, (A,))), (5.0, Seen(True, (B,))))
+    assert tracker.current == Event(5.0, 5.0, 5.0, (B,), B, 1)
+
+
+def test_pictures_that_stay_away_end_it_as_well() -> None:
+    tracker = EventTracker()
+    tracker.see(3.0, Seen(True, (A,)))
+    assert tracker.quiet(4.0) is None
+    ended = tracker.quiet(4.1)
+    assert ended is not None
+    assert not ended.going_on
+    assert tracker.quiet(9.0) is None
+
+
+def test_what_was_not_over_says_so() -> None:
+    tracker = EventTracker()
+    tracker.see(3.0, Seen(True, (A,)))
+    last = tracker.close()
+    assert last is not None
+    assert last.going_on
+    assert tracker.close() is None
+
+
+def test_boxes_around() -> None:
+    assert around((A, B)) == Box(10, 10, 34, 14)
+    assert around(()) == Box(0, 0, 0, 0)
