@@ -167,5 +167,4 @@ def test_an_alert_for_each_event() -> None:
     words = [alerts.see(at, at in moves) for at in (0.5, 1.0, 1.1, 2.0, 1.0 + QUIET, 5.5, 8.0)]
     assert words == ["", "start", "", "", "", "end", "start"]
     alerts.rest()
-    assert alerts.see(8.1, True) == "start"
-    assert alerts.count == 3
+    assert (alerts.see(8.1, True), alerts.count) == ("start", 3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
+from typing import Any, Self
 
 from tests.hang import HANG
 from tests.live.lab import Lab
@@ -87,7 +87,7 @@ class Post:
                     code = "done" if reply.problem is None else reply.problem.code
         return code
 
-    async def __aenter__(self) -> Post:
+    async def __aenter__(self) -> Self:
         self.stall.start()
         return self
 

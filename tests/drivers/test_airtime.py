@@ -100,8 +100,7 @@ def test_a_line_is_filled_and_one_more_is_refused_in_figures() -> None:
     assert objection(rate, BOUND, slow[:-1]) == ""
     mixed = [*robots, Share(Fraction(4), Fraction(20))]
     assert objection(rate, BOUND, mixed) == "its holders would send 880 of 864 bytes/s"
-    assert objection(rate, BOUND, []) == ""
-    assert line_rate(1_000_000) == MAX_RATE
+    assert (objection(rate, BOUND, []), line_rate(1_000_000)) == ("", MAX_RATE)
 
 
 def test_sums_are_exact() -> None:
@@ -263,12 +262,10 @@ def test_a_faster_holder_replaces_its_own_waiting_packet_and_nobody_elses() -> N
             actions.append((now, partial(queue.offer, place(2), grant(2), drive(2), now)))
     told = run(queue, 3 * SECOND, actions)
     count = Counter(packet.robot for packet in told.packets)
-    assert count == {1: 6, 2: 5}
-    assert queue.replaced == 50 - 6
+    assert (count, queue.replaced) == ({1: 6, 2: 5}, 50 - 6)
     # What goes out is the newest of its moment, and the last word is the last command.
     lefts = [packet.left for packet in told.packets if isinstance(packet, DrivePacket) and packet.robot == 1]
-    assert lefts == sorted(lefts)
-    assert lefts[-1] == 49 / 50
+    assert (lefts, lefts[-1]) == (sorted(lefts), 49 / 50)
 
 
 def test_what_a_holder_made_robots_do_is_passed_on_and_what_waits_for_it_is_not() -> None:
@@ -303,8 +300,7 @@ def test_halts_and_stops_go_first_and_void_what_waits_for_their_robot() -> None:
     after = queue.send_urgent(3, HaltPacket, 1)
     queue.send_urgent(2, StopPacket, 2)
     queue.send_urgent(2, HaltPacket, 3)
-    assert queue.replaced == 2
-    assert after == round(Fraction((2 * 10 + 7) * SECOND, 120) - 1)
+    assert (queue.replaced, after) == (2, round(Fraction((2 * 10 + 7) * SECOND, 120) - 1))
     rest = run(queue, 5 * SECOND, begin=3)
     kinds = [(type(packet), packet.robot) for packet in rest.packets]
     assert kinds[:2] == [(HaltPacket, 3), (HaltPacket, 2)]
@@ -362,13 +358,10 @@ def test_a_packet_whose_hold_is_over_does_not_go_out() -> None:
     fill(queue, 4)
     first = queue.next(0, lambda _: True)
     assert first is not None
-    assert first.packet.robot == 0
-    assert queue.leave(place(3)) == {3}
+    assert (first.packet.robot, queue.leave(place(3))) == (0, {3})
     second = queue.next(0, lambda held: held != grant(1))
     assert second is not None
-    assert second.packet.robot == 2
-    assert queue.dropped == 2
-    assert queue.waiting == 0
+    assert (second.packet.robot, queue.dropped, queue.waiting) == (2, 2, 0)
 
 
 def test_a_robot_is_halted_at_the_end_of_the_hold_under_which_it_was_last_driven() -> None:
@@ -376,8 +369,7 @@ def test_a_robot_is_halted_at_the_end_of_the_hold_under_which_it_was_last_driven
     fill(queue, 2)
     queue.offer(place(1), grant(1), RadioCamera(0, 0), 0)  # which leaves the wheels as they are
     queue.offer(place(0), grant(0), drive(1), 0)
-    assert queue.leave(place(1)) == {0}
-    assert queue.leave(place(0)) == {0, 1}
+    assert (queue.leave(place(1)), queue.leave(place(0))) == ({0}, {0, 1})
 
 
 def test_what_a_share_has_no_room_for_is_refused_in_words() -> None:

@@ -131,8 +131,7 @@ def test_a_server_that_goes_away_and_comes_back() -> None:
         opened = capture.opened
         server.open()
         assert picture_of(capture, gone).number > gone
-        assert capture.opened == opened + 1
-        assert capture.stalls == 0
+        assert (capture.opened, capture.stalls) == (opened + 1, 0)
 
 
 @pytest.mark.parametrize("mode", ["half", "torn"])
@@ -229,8 +228,7 @@ def test_a_process_ends_whatever_its_captures_do(mode: str) -> None:
             [sys.executable, "-c", code, server.url], stdin=subprocess.PIPE, stderr=subprocess.PIPE
         )
         until(lambda: server.accepted == 1 and (mode == "stall" or server.sent > 5))
-        assert process.communicate(timeout=HANG)[1] == b""
-        assert process.returncode == 0
+        assert (process.communicate(timeout=HANG)[1], process.returncode) == (b"", 0)
 
 
 def test_who_waits_is_let_go_by_stop() -> None:

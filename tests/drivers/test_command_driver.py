@@ -128,9 +128,7 @@ async def test_each_is_run_in_its_turn_and_told_what_it_is_about() -> None:
         await driver.safe()
         assert told() == ["safe", "start", "stop", "safe"]
         assert told("about") == ["psu/bench", "survey", "h/client", "{}"]
-        assert driver.figures()["starts"] == 1
-        assert driver.figures()["failures"] == 0
-        assert rc.said == []
+        assert (driver.figures()["starts"], driver.figures()["failures"], rc.said) == (1, 0, [])
 
 
 async def test_a_start_that_has_ended_begins_no_longer() -> None:
@@ -243,8 +241,7 @@ async def test_of_what_is_written_the_end_is_kept() -> None:
     reader.feed_eof()
     tail = command_driver.OutputTail(reader)
     await tail.drain()
-    assert tail.said == ": last"
-    assert len(tail._kept) == command_driver.KEPT_OUTPUT
+    assert (tail.said, len(tail._kept)) == (": last", command_driver.KEPT_OUTPUT)
 
 
 async def test_a_program_that_is_not_there_is_the_reason() -> None:
@@ -264,9 +261,7 @@ async def test_a_start_that_goes_on_holds_up_nobody_and_ends_with_its_hold() -> 
         assert rc.said == []
         await driver.end(holder(1))
         await driver.safe()
-        assert driver.begins_for() == 0
-        assert told() == ["safe", "stop", "safe"]
-        assert rc.said == []
+        assert (driver.begins_for(), told(), rc.said) == (0, ["safe", "stop", "safe"], [])
 
 
 async def test_a_safe_state_that_its_rc_does_not_wait_for_is_made_later() -> None:

@@ -97,8 +97,7 @@ def test_hear(heard: Grants, now_holds: list[int], announce: bool, reread: bool)
     assert (grants(rc), change.announce, change.reread) == (now_holds, announce, reread)
     began = {held.grant.seq for held in change.began}
     stopped = {held.grant.seq for held in change.removed}
-    assert {2} - stopped | began == set(now_holds)
-    assert bool(change) == bool(began or stopped)
+    assert ({2} - stopped | began, bool(change)) == (set(now_holds), bool(began or stopped))
     assert change.stayed == (2 in now_holds and bool(change))
 
 

@@ -12,7 +12,7 @@ from tests.drivers.post import GANG, RADIO, TURN, Post, held, is_in, obeyed, rob
 from tests.drivers.ptys import PtyLine
 from tests.live.bench import answer, comes_to, until
 from tests.live.lab import Lab
-from zscout.behaviors.client.client import CommandRefused
+from zscout.behaviors.client.client import Client, CommandRefused
 from zscout.drivers.generic import VideoDriver
 from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket, StopPacket
 from zscout.drivers.radio import RadioDriver
@@ -20,17 +20,26 @@ from zscout.drivers.radio import RadioDriver
 pytestmark = [pytest.mark.live, pytest.mark.usefixtures("real_time")]
 
 
-async def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: Path) -> None:
-    line = PtyLine(tmp_path / "tty")
-    async with Lab(tmp_path) as lab, Post(lab) as post:
-        lab.node("a")
-        client = await lab.client()
-        driver = RadioDriver(str(line.link), baud=9600, bound=0.25)
-        radio = await post.rc("mast", "radio/rf0", driver)
-        r1 = await post.rc("cart", "robot/r1", robot(1))
+class Mast(Post):
+    """A radio with its line, a robot and three channels, an RCM and a client."""
+
+    async def ready(self, folder: Path) -> Client:
+        self.lab.node("a")
+        client = await self.lab.client()
+        self.line = PtyLine(folder / "tty")
+        self.driver = RadioDriver(str(self.line.link), baud=9600, bound=0.25)
+        self.radio = await self.rc("mast", "radio/rf0", self.driver)
+        self.robot = await self.rc("cart", "robot/r1", robot(1))
         for number in (1, 2, 3):
-            await post.rc("mast", f"video/ch{number}", VideoDriver())
-        await lab.ready(client, "radio/rf0", "robot/r1", "video/ch1", "video/ch3")
+            await self.rc("mast", f"video/ch{number}", VideoDriver())
+        await self.lab.ready(client, "radio/rf0", "robot/r1", "video/ch1", "video/ch3")
+        return client
+
+
+async def test_who_is_heard_by_a_radio_and_what_a_gang_must_have(tmp_path: Path) -> None:
+    async with Lab(tmp_path) as lab, Mast(lab) as post:
+        client = await post.ready(tmp_path)
+        line = post.line
         arc, grant = await held(client, "hide", GANG)
 
         # Who is heard: the holder, the node of its robot, and for what stops the robot its node alone.
@@ -62,6 +71,37 @@ async def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_
         await client.end(other)
         await line.until(is_in(HaltPacket, 77), since=since)
 
+        await client.end(arc)
+
+        # What a gang must have for a robot to do as it is told.
+        for needs, do, word in (
+            ({"robot/r1": {}}, TURN, "your ARC holds no radio: nothing reaches the robot; ask also for radio/rf0"),
+            ({"robot/r1": {}, **RADIO}, {"name": "camera", "on": True}, "ask also for video/*"),
+            (GANG | {"video/ch2": {}}, {"name": "camera", "on": True}, "one transmitter"),
+            ({"robot/r1": {}, "video/ch3": {}, **RADIO}, {"name": "camera", "on": True}, "no channel of video/ch3"),
+        ):
+            arc, grant = await held(client, "poor", needs)
+            with pytest.raises(CommandRefused, match=re.escape(word)):
+                await obeyed(client, "robot/r1", grant, do)
+            await client.end(arc)
+
+        # The vote reaches who asks; all of its figures are tried in test_airtime.py.
+        fast = {"radio/rf0": {"command_rate": 45}}
+        first, _ = await held(client, "first", fast)
+        second = await client.request("second", fast, min_runtime=600)
+        await comes_to(second, "queued", "radio/rf0 refuses more: its holders would send 90 of 86.4 packets/s")
+        await client.end(second)
+        await client.end(first)
+        assert post.driver.figures()["longest_wait_ms"] > 0
+    line.unplug()
+
+
+async def test_what_a_radio_and_a_channel_carry_and_how_a_radio_is_lost(tmp_path: Path) -> None:
+    async with Lab(tmp_path) as lab, Mast(lab) as post:
+        client = await post.ready(tmp_path)
+        line, driver, radio, r1 = post.line, post.driver, post.radio, post.robot
+        arc, grant = await held(client, "hide", GANG)
+
         # What comes faster than was asked for is replaced by the newest, at the robot or at the radio.
         since = len(line.heard)
         done = await asyncio.gather(
@@ -88,27 +128,6 @@ async def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_
         assert await answer(obeyed(client, "robot/r1", grant, TURN)) == "ended"
         client.resume()
         await heir.end(inherited)
-
-        # What a gang must have for a robot to do as it is told.
-        for needs, do, word in (
-            ({"robot/r1": {}}, TURN, "your ARC holds no radio: nothing reaches the robot; ask also for radio/rf0"),
-            ({"robot/r1": {}, **RADIO}, {"name": "camera", "on": True}, "ask also for video/*"),
-            (GANG | {"video/ch2": {}}, {"name": "camera", "on": True}, "one transmitter"),
-            ({"robot/r1": {}, "video/ch3": {}, **RADIO}, {"name": "camera", "on": True}, "no channel of video/ch3"),
-        ):
-            arc, grant = await held(client, "poor", needs)
-            with pytest.raises(CommandRefused, match=re.escape(word)):
-                await obeyed(client, "robot/r1", grant, do)
-            await client.end(arc)
-
-        # The vote reaches who asks; all of its figures are tried in test_airtime.py.
-        fast = {"radio/rf0": {"command_rate": 45}}
-        first, _ = await held(client, "first", fast)
-        second = await client.request("second", fast, min_runtime=600)
-        await comes_to(second, "queued", "radio/rf0 refuses more: its holders would send 90 of 86.4 packets/s")
-        await client.end(second)
-        await client.end(first)
-        assert driver.figures()["longest_wait_ms"] > 0
 
         send, _ = await held(client, "send", {"video/ch1": {}})
         two = await client.request("two", {"video/ch1": {"transmitters": 1}}, min_runtime=600)

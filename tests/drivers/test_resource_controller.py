@@ -93,8 +93,7 @@ async def test_what_goes_on_in_another_hold_is_neither_ended_nor_made_safe(kind:
     for one, calls in (warm, 1), (turn, 2), (moved, 3), (holder(4, "last", "h/other"), 6):
         rcm.publish(one)
         await until(lambda: len(device.calls) >= calls)  # noqa: B023 - awaited here
-    assert device.calls == expected
-    assert await answer(client, turn.grant) == "ended"
+    assert (device.calls, await answer(client, turn.grant)) == (expected, "ended")
     await close(rc, rcm.mesh, client)
 
 
@@ -121,8 +120,7 @@ async def test_the_safe_state_goes_before_commands_that_wait() -> None:
         waiting = [asyncio.create_task(answer(client, grant(1))) for _ in range(5)]
         await asyncio.sleep(0.1)
         rcm.publish(holder(2, "two"))
-        assert await slow == "done"
-        assert {await task for task in waiting} == {"ended"}
+        assert (await slow, {await task for task in waiting}) == ("done", {"ended"})
         assert device.calls == ["begin one", "slow", "end one", "safe", "begin two"]
 
 
@@ -202,8 +200,7 @@ async def test_a_hold_ends_when_no_rcm_was_heard_for_the_lease() -> None:
         await until(lambda: device.calls[-1] == "safe")
         assert abs(rcm.mesh.now() - begun - LEASE * SECOND) < 0.1 * SECOND
         await until(lambda: ended == ["lease"])
-        assert await answer(client, grant(1)) == "ended"
-        assert rc.health == "ok"
+        assert (await answer(client, grant(1)), rc.health) == ("ended", "ok")
 
 
 @pytest.mark.parametrize("where", ["begin two", "safe"])
@@ -365,8 +362,7 @@ async def test_a_publication_of_an_older_term_is_answered_by_the_state() -> None
         old = type(TERM)(1, "old")
         client.publisher(client.keys.grants, Grants).put(Grants(term=old, seq=9, prev=8, every=0.5))
         await until(lambda: bool(states))
-        assert states[0].term == TERM
-        assert await answer(client, grant(1), dict(ECHO)) == "done"
+        assert (states[0].term, await answer(client, grant(1), dict(ECHO))) == (TERM, "done")
 
 
 @pytest.mark.parametrize(
@@ -434,8 +430,7 @@ def test_what_was_set_aside_comes_back_before_other_commands_in_its_order() -> N
     assert queue.put_command(query("late"), "host")
     assert queue.commands == 4
     queue.resume(lambda command: cast("str", command) != "two")
-    assert queue.drop_early() == [query("two")]
-    assert queue.commands == 3
+    assert (queue.drop_early(), queue.commands) == ([query("two")], 3)
     assert drained(queue, 3) == ["one", "three", "late"]
 
 

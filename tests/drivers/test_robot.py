@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import signal
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from tests.drivers.ptys import PtyLine
 from tests.hang import HANG
 from tests.live.bench import answer
 from tests.live.lab import Lab
+from zscout.behaviors.client.client import Client
 from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket, Packet, StopPacket
 from zscout.mesh import clock
 from zscout.types import SECOND, Grant, Ns
@@ -22,9 +24,9 @@ from zscout.types import SECOND, Grant, Ns
 pytestmark = [pytest.mark.live, pytest.mark.slow, pytest.mark.usefixtures("real_time")]
 
 
-def mast(lab: Lab, line: PtyLine, *, host: str = "mast") -> None:
+def mast(lab: Lab, line: PtyLine) -> None:
     lab.node(
-        host,
+        "mast",
         extra=f"""
         [[rc]]
         name = "radio/rf0"
@@ -36,41 +38,44 @@ def mast(lab: Lab, line: PtyLine, *, host: str = "mast") -> None:
         [[rc]]
         name = "video/ch2"
         driver = "video"
-        [[rc]]
-        name = "video/ch3"
-        driver = "video"
         """,
     )
 
 
-def cart(lab: Lab, host: str, robot: int, **how: float) -> None:
+def cart(lab: Lab, host: str) -> None:
     lab.node(
         host,
-        extra=f"""candidate = false
+        extra="""candidate = false
         [[rc]]
-        name = "robot/r{robot}"
+        name = "robot/r1"
         driver = "robot"
-        id = {robot}
+        id = 1
         radio = "radio/rf0"
-        channels = {{ "video/ch1" = 1, "video/ch2" = 7 }}
-        {chr(10).join(f"{key} = {value}" for key, value in how.items())}
+        channels = { "video/ch1" = 1, "video/ch2" = 7 }
         """,
     )
+
+
+@asynccontextmanager
+async def driven(folder: Path) -> AsyncIterator[tuple[Lab, PtyLine, Client]]:
+    line = PtyLine(folder / "tty")
+    async with Lab(folder) as lab:
+        mast(lab, line)
+        cart(lab, "cart")
+        client = await lab.client()
+        await lab.ready(client, *GANG)
+        yield lab, line, client
+    line.unplug()
 
 
 async def test_a_second_node_that_offers_a_held_robot_leaves_it_alone(tmp_path: Path) -> None:
-    line = PtyLine(tmp_path / "tty")
-    async with Lab(tmp_path) as lab:
-        mast(lab, line)
-        cart(lab, "cart", 1)
-        client = await lab.client()
-        await lab.ready(client, "robot/r1", "radio/rf0", "video/ch1")
+    async with driven(tmp_path) as (lab, line, client):
         _, grant = await held(client, "drives", GANG)
         assert await answer(obeyed(client, "robot/r1", grant, TURN)) == "done"
         # Until it drives, the halt from before it was held is repeated.
         await line.until(is_in(DrivePacket))
         halts = [packet for packet in line.packets if isinstance(packet, HaltPacket)]
-        cart(lab, "other", 1)
+        cart(lab, "other")
         await lab.logged("other", "robot/r1 stands by: duplicate of robot/r1 at cart")
         await lab.logged("other", "other is on the mesh")
         for _ in range(20):
@@ -80,13 +85,8 @@ async def test_a_second_node_that_offers_a_held_robot_leaves_it_alone(tmp_path: 
 
 
 async def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_drives_it(tmp_path: Path) -> None:
-    line = PtyLine(tmp_path / "tty")
-    async with Lab(tmp_path) as lab:
-        mast(lab, line)
-        cart(lab, "cart", 1)
+    async with driven(tmp_path) as (lab, line, client):
         brief = asyncio.create_task(lab.holder("brief"))
-        client = await lab.client()
-        await lab.ready(client, "robot/r1", "radio/rf0", "video/ch1")
         # Nobody knows what it did before: it was halted first.
         assert isinstance(await line.until(lambda packets: packets and packets[0]), HaltPacket)
 
@@ -182,20 +182,15 @@ async def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_dr
         print(f"{how}: {wait / 1e6:.1f} ms until the halt is through the line")
     # The hold lease and the mesh's are seconds; nothing here waits for the former.
     assert max(wait for _, wait in worst) < HANG * SECOND
-    line.unplug()
 
 
 @pytest.mark.parametrize("said", [True, False])
 async def test_a_camera_that_warmed_up_under_one_hold_stays_on_in_the_one_that_continues_it(
     tmp_path: Path, said: bool
 ) -> None:
-    line = PtyLine(tmp_path / "tty")
-    async with Lab(tmp_path) as lab:
-        mast(lab, line)
-        cart(lab, "cart", 1)
+    async with driven(tmp_path) as (lab, line, client):
         lab.node("desk", "framegrabber/f")
-        client = await lab.client()
-        await lab.ready(client, *GANG, "framegrabber/f")
+        await lab.ready(client, "framegrabber/f")
         warm, grant = await held(client, "warm", GANG, priority=-1, min_runtime=0.01)
         await obeyed(client, "robot/r1", grant, {"name": "camera", "on": True})
         await line.until(transmitting(1))
@@ -212,7 +207,6 @@ async def test_a_camera_that_warmed_up_under_one_hold_stays_on_in_the_one_that_c
         await client.end(warm)
         await client.end(arc)
         await line.until(is_in(HaltPacket), since=since)
-    line.unplug()
 
 
 def turning(packets: list[Packet]) -> Packet | None:

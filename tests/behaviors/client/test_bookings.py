@@ -159,8 +159,7 @@ async def test_what_a_program_has_taken_up_it_has_at_its_date_though_the_leader_
         assert 0 <= told.time - booking.start < 1
         [dates] = [view.dates for view in told.bookings]
         assert [(date.state, date.arc) for date in dates][:2] == [("taken", f"h/one/{mine.id}"), ("open", None)]
-        assert mine.booking == f"{booking.id}@{booking.start}"
-        assert long.state == "queued"
+        assert (mine.booking, long.state) == (f"{booking.id}@{booking.start}", "queued")
         # At its end it yields to who waits, and what asks for the booking anew has its next date.
         assert await two.granted(long) is not None
         assert 30 <= (await bookings.list()).time - booking.start < 32

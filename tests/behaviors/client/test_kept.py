@@ -59,8 +59,7 @@ async def test_who_goes_on_asks_anew_behind_those_who_wait() -> None:
             await until(lambda: len(entered) == turn + 1)  # noqa: B023 - awaited here
         await working
         # Turns of a minute each.
-        assert entered == [0, 120, 240]
-        assert await fleet.holders() == []
+        assert (entered, await fleet.holders()) == ([0, 120, 240], [])
 
 
 async def test_what_others_released_is_not_asked_for_again() -> None:
@@ -78,8 +77,7 @@ async def test_what_others_released_is_not_asked_for_again() -> None:
         await asyncio.sleep(5)
         await operator._rcm.query(Release(id=entered[0], client=str(one.mesh.me)))
         await working
-        assert len(entered) == 1
-        assert await fleet.holders() == []
+        assert (len(entered), await fleet.holders()) == (1, [])
 
 
 @pytest.mark.parametrize("keep", [True, False])

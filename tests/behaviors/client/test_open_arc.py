@@ -89,8 +89,7 @@ def test_words_of_the_rcm(words: list[Notice], state: str, grant: Grant | None, 
     for number, word in enumerate(words):
         known.take(word, NOW + number)
     assert (known.state, known.grant, known.ending) == (state, grant, ending)
-    assert known.open_request(NOW).grant == grant
-    assert known.place == Place(TERM, 1)
+    assert (known.open_request(NOW).grant, known.place) == (grant, Place(TERM, 1))
 
 
 def test_what_meets_a_pattern_is_what_the_newest_hold_says() -> None:
