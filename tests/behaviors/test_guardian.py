@@ -163,8 +163,7 @@ def test_who_may_not_wait_kills_at_once(tmp_path: Path) -> None:
 
 @pytest.mark.live
 def test_it_is_ended_at_the_deadline_that_was_given_last_though_the_client_says_nothing(tmp_path: Path) -> None:
-    script = "trap '' TERM; echo ready; while :; do sleep 0.02; done"
-    begin = now()
+    script, begin = "trap '' TERM; echo ready; while :; do sleep 0.02; done", now()
     with guarded(*shell(tmp_path, script), grace=0.2, until=begin + round(HANG * SECOND)) as command:
         command.out.readline()
         begin = now()

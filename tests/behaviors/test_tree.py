@@ -162,8 +162,7 @@ def test_a_picture_that_comes_and_goes_is_no_fault() -> None:
 
 
 def test_an_alert_for_each_event() -> None:
-    alerts = Alerts()
-    moves = {1.0, 1.1, 1.0 + QUIET, 8.0}
+    alerts, moves = Alerts(), {1.0, 1.1, 1.0 + QUIET, 8.0}
     words = [alerts.see(at, at in moves) for at in (0.5, 1.0, 1.1, 2.0, 1.0 + QUIET, 5.5, 8.0)]
     assert words == ["", "start", "", "", "", "end", "start"]
     alerts.rest()

@@ -84,8 +84,7 @@ def test_a_slow_reader_gets_the_newest_picture() -> None:
         for _ in range(3):
             before = got
             until(lambda before=before: capture.number >= before.number + 20)  # type: ignore[misc]
-            newest = capture.number
-            got = picture_of(capture, before.number)
+            newest, got = capture.number, picture_of(capture, before.number)
             # Whatever gathered meanwhile is skipped.
             assert got.number >= newest
             assert number_of(got.picture) >= number_of(before.picture) + 20
@@ -97,8 +96,7 @@ def test_each_picture_is_given_once_and_read_ones_are_not_dropped() -> None:
         number = picture_of(capture).number
         server.mode = "stall"
         until(lambda: capture.stalls > 0)
-        last = capture.number
-        dropped = capture.dropped
+        last, dropped = capture.number, capture.dropped
         assert capture.wait(last, 0) is None
         assert capture.wait(last, 0.01) is None
         assert last == number or capture.wait(number, 0) is not None
@@ -127,8 +125,7 @@ def test_a_server_that_goes_away_and_comes_back() -> None:
         picture_of(capture)
         server.close()
         until(lambda: "can't be opened" in capture.health)
-        gone = capture.number
-        opened = capture.opened
+        gone, opened = capture.number, capture.opened
         server.open()
         assert picture_of(capture, gone).number > gone
         assert (capture.opened, capture.stalls) == (opened + 1, 0)

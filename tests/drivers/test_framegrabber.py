@@ -33,8 +33,7 @@ def test_a_pace_admits_no_more_than_its_rate_and_little_less(source: float) -> N
 
 
 def test_uneven_pictures_at_the_very_rate_are_all_admitted() -> None:
-    pace = pace_of(10)
-    rng = np.random.default_rng(1)
+    pace, rng = pace_of(10), np.random.default_rng(1)
     jitter = rng.uniform(-0.02, 0.02, 600)
     assert all(pace.admits(1, ns(n / 10 + late)) for n, late in enumerate(jitter))
 

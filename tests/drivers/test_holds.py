@@ -205,8 +205,7 @@ def test_who_has_heard_of_nobody_promises_much_but_not_everything() -> None:
 
 
 def test_who_heard_no_rcm_for_the_hold_lease_or_must_follow_the_fleet_believes_a_far_jump() -> None:
-    far = Term(10**9, "x")
-    rc = holding(HELD)
+    far, rc = Term(10**9, "x"), holding(HELD)
     assert not rc.promise(far, NOW + LEASE - 1)
     assert rc.promise(far, NOW + LEASE)
     rc = holding(HELD)
@@ -349,8 +348,7 @@ def test_of_two_holds_of_one_name_one_goes_on_and_one_is_over() -> None:
 
 def test_a_grant_that_a_snapshot_names_is_not_refused_before_its_publication_comes() -> None:
     """A confirmation may overtake the publication: the snapshot read for it must not decide against it."""
-    rc = holding(HELD)
-    handed_over = Grant(TERM, 3)
+    rc, handed_over = holding(HELD), Grant(TERM, 3)
     codes = []
     for step in (
         lambda: None,

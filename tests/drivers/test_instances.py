@@ -35,8 +35,7 @@ class Recorded(ExclusiveDriver):
 
 
 async def offer(fleet: FakeFleet, host: str, mesh: MemoryMesh | None = None) -> ResourceController:
-    mesh = mesh or fleet.mesh(host)
-    lease = fleet.fleet.timing.hold_lease / SECOND
+    mesh, lease = mesh or fleet.mesh(host), fleet.fleet.timing.hold_lease / SECOND
     rc = ResourceController(mesh, RC, Recorded(), hold_lease=lease, stall=StallWatch(mesh.now).start())
     await rc.start()
     return rc
@@ -57,8 +56,7 @@ def told(rc: ResourceController) -> list[str]:
 
 async def confirms(client: FakeClient, grant: Grant) -> list[Any]:
     """All that answer a confirmation, as a code, or as nothing."""
-    mesh = client.mesh
-    command = Command(grant=grant, do={"name": "confirm"})
+    mesh, command = client.mesh, Command(grant=grant, do={"name": "confirm"})
     replies = await mesh.ask(mesh.keys.command(RC, mesh.me), command, Done, timeout=1)
     return [reply.problem and reply.problem.code for reply in replies]
 

@@ -358,8 +358,7 @@ async def test_who_missed_that_an_rc_works_again_hears_it_later() -> None:
 
 async def test_a_publication_of_an_older_term_is_answered_by_the_state() -> None:
     async with play() as (_rcm, _rc, _device, client):
-        states = states_published(client)
-        old = type(TERM)(1, "old")
+        states, old = states_published(client), type(TERM)(1, "old")
         client.publisher(client.keys.grants, Grants).put(Grants(term=old, seq=9, prev=8, every=0.5))
         await until(lambda: bool(states))
         assert (states[0].term, await answer(client, grant(1), dict(ECHO))) == (TERM, "done")
@@ -434,18 +433,12 @@ def test_what_was_set_aside_comes_back_before_other_commands_in_its_order() -> N
     assert drained(queue, 3) == ["one", "three", "late"]
 
 
-def test_one_host_can_not_fill_what_is_set_aside() -> None:
-    queue = WorkQueue()
-    assert all(queue.set_aside(query(str(number)), "stranger") for number in range(EARLY_PER_HOST))
-    assert not queue.set_aside(query("more"), "stranger")
-    assert queue.set_aside(query("mine"), "host")
-
-
-def test_one_host_can_not_fill_the_queue() -> None:
-    queue = WorkQueue()
-    assert all(queue.put_command(query(str(number)), "stranger") for number in range(COMMANDS_PER_HOST))
-    assert not queue.put_command(query("more"), "stranger")
-    assert queue.put_command(query("mine"), "host")
+@pytest.mark.parametrize("take", ["set_aside", "put_command"])
+def test_one_host_can_not_fill_the_queue_or_what_is_set_aside(take: str) -> None:
+    put, limit = getattr(WorkQueue(), take), EARLY_PER_HOST if take == "set_aside" else COMMANDS_PER_HOST
+    assert all(put(query(str(number)), "stranger") for number in range(limit))
+    assert not put(query("more"), "stranger")
+    assert put(query("mine"), "host")
 
 
 def test_who_waits_is_woken() -> None:

@@ -194,8 +194,7 @@ async def test_a_camera_that_warmed_up_under_one_hold_stays_on_in_the_one_that_c
         warm, grant = await held(client, "warm", GANG, priority=-1, min_runtime=0.01)
         await obeyed(client, "robot/r1", grant, {"name": "camera", "on": True})
         await line.until(transmitting(1))
-        since = len(line.heard)
-        more = GANG | {"framegrabber/f": {}}
+        since, more = len(line.heard), GANG | {"framegrabber/f": {}}
         arc, watching = await held(client, "watch", more, priority=0, continues=warm.name if said else "")
         await obeyed(client, "robot/r1", watching, TURN)
         await line.until(is_in(DrivePacket), since=since)

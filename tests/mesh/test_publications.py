@@ -55,8 +55,7 @@ async def test_a_peer_that_does_not_read_for_less_than_the_lease_misses_nothing(
 
     a._transport.subscriber(NEWS, on_sample)
     await world.declared()
-    sending = asyncio.create_task(asyncio.to_thread(send))
-    before = 0
+    sending, before = asyncio.create_task(asyncio.to_thread(send)), 0
     while sent == 0 or sent != before:  # until it stands still
         before = sent
         await asyncio.sleep(0.5)

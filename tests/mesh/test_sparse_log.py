@@ -56,8 +56,7 @@ async def test_malformed_answers_and_publications_and_bad_names_are_logged_so(ca
 
     here.subscribe(keys.grants, Grants, on_grants)
     watched = here.watch(keys.alive_any(), lambda *_: None)
-    publisher = transport.publisher(keys.grants, Grants, Quality.CONTROL)
-    tokens = []
+    publisher, tokens = transport.publisher(keys.grants, Grants, Quality.CONTROL), []
     for number in range(50):
         publisher.put(b"?")
         other.put(keys.grants, Grants((1, "x"), number, number, 0.5))  # type: ignore[arg-type]

@@ -177,8 +177,7 @@ async def test_an_owner_that_fails_to_handle_a_failure_is_logged_and_its_tasks_e
 async def test_a_task_that_ends_or_is_cancelled_by_itself_has_not_failed(
     owner: Owner, caplog: pytest.LogCaptureFixture
 ) -> None:
-    other = owner.supervisor.spawn(forever())
-    one = owner.supervisor.spawn(forever())
+    other, one = owner.supervisor.spawn(forever()), owner.supervisor.spawn(forever())
     await owner.supervisor.spawn(asyncio.sleep(0, result=None))
     one.cancel()
     await asyncio.wait([one])
@@ -246,8 +245,7 @@ async def test_a_task_may_close_its_own_supervisor(owner: Owner) -> None:
 
 
 async def test_an_owner_that_is_cancelled_while_it_closes_has_cancelled_its_tasks(owner: Owner) -> None:
-    cancelled = asyncio.Event()
-    release = asyncio.Event()
+    cancelled, release = asyncio.Event(), asyncio.Event()
 
     async def slow() -> None:
         try:

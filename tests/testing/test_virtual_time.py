@@ -26,8 +26,7 @@ def test_hours_pass_at_once_and_in_order() -> None:
             tasks.create_task(sleeper("day", 100_000))
         return seen
 
-    before = time.monotonic()
-    seen = run(story())
+    before, seen = time.monotonic(), run(story())
     assert time.monotonic() - before < 60
     assert seen == [("early", 3_600.5), ("late", 7_200), ("day", 100_000)]
 

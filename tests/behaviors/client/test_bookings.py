@@ -86,8 +86,7 @@ async def test_a_refusal_is_raised_at_once_and_silence_after_the_time_given() ->
     with pytest.raises(RequestRefused, match="booked by bob") as refused:
         await BookingsClient(leader.client).slots(NEEDS, 60, 3600)
     assert (refused.value.code, len(leader.asked)) == ("not_free", 1)
-    silent = Leader(lambda _: None)
-    began = asyncio.get_running_loop().time()
+    silent, began = Leader(lambda _: None), asyncio.get_running_loop().time()
     with pytest.raises(RcmSilent, match="it may be done or not"):
         await BookingsClient(silent.client, timeout=12.0).unbook("x")
     assert len(set(map(id, silent.asked))) >= 2

@@ -212,8 +212,7 @@ def test_what_moved_and_is_taken_back_keeps_its_place_and_its_wait(held: bool) -
 
 
 async def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_later() -> None:
-    store = RequestStore(lambda: NOW)
-    known = arc()
+    store, known = RequestStore(lambda: NOW), arc()
     store.add(known)
     store.take(known, RUNS)
     store.resumed.clear()
@@ -253,8 +252,7 @@ async def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_f
 async def test_what_its_rc_does_not_confirm_is_asked_for_again_at_its_place(
     answers: list[str | None], told: Any
 ) -> None:
-    client = Client(mesh(lambda: NOW), default_fleet())
-    known = arc("robot/a")
+    client, known = Client(mesh(lambda: NOW), default_fleet()), arc("robot/a")
     client._store.add(known)
     known.take(runs({}), NOW)
     ended, asked = list[OpenArc](), list[Any]()

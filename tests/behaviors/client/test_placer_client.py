@@ -61,8 +61,7 @@ async def test_an_answer_is_waited_for_as_long_as_the_operation_may_wait() -> No
 
 
 async def test_a_placer_that_never_answers_is_given_up_after_the_patience() -> None:
-    placer = FakePlacer(lambda _: None)
-    loop = asyncio.get_running_loop()
+    placer, loop = FakePlacer(lambda _: None), asyncio.get_running_loop()
     before = loop.time()
     with pytest.raises(PlacerSilent, match="of fleet test did not answer for 15 s; see zscout status"):
         await PlacerClient(placer.client, timeout=15.0).request(ListPlacements(), Placements)

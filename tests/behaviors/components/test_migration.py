@@ -102,8 +102,7 @@ async def test_a_node_that_was_there_and_is_gone_is_not_waited_for() -> None:
 @pytest.mark.parametrize("lease", [1.0, 3.0])
 async def test_a_successor_counts_as_gone_once_it_was_not_seen_for_longer_than_it_waits_itself(lease: float) -> None:
     """Behind a partition it runs a lease after it lost sight of this one, which is to go on after it."""
-    network = MemoryNetwork()
-    fleet = default_fleet()
+    network, fleet = MemoryNetwork(), default_fleet()
     client = Client(network.open("f", Sender("a", "c.1")), replace(fleet, mesh=replace(fleet.mesh, lease=lease)))
     token = network.open("f", Sender("b", "node")).alive(Token("b", Role.NODE, "node", "i"))
     move = OutgoingMove(client, Counter({}), SafePointGate(), MoveComponent("c", 1, "b", 2))

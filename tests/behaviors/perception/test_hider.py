@@ -95,8 +95,7 @@ def test_a_checkpoint_changes_nothing(story: list[Frame], cuts: set[int]) -> Non
 
 
 def test_another_hosts_clock_changes_nothing(story: list[Frame]) -> None:
-    hider = Hider()
-    half = len(story) // 2
+    hider, half = Hider(), len(story) // 2
     for frame in story[:half]:
         hider.see(frame.now, frame.picture)
     moved = Hider.restore(hider.checkpoint())
