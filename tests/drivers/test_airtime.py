@@ -288,8 +288,7 @@ def test_what_a_holder_made_robots_do_is_passed_on_and_what_waits_for_it_is_not(
 
 
 def test_halts_and_stops_go_first_and_void_what_waits_for_their_robot() -> None:
-    queue = filled(1200, 4)
-    told = []
+    queue, told = filled(1200, 4), []
     while (out := queue.next(0, lambda _: True)) is not None:
         told.append(out.packet)
     assert [packet.robot for packet in told] == [0, 1]  # one under way and one in the kernel

@@ -88,14 +88,9 @@ def test_any_bytes_are_taken_and_little_is_kept(pieces: list[bytes]) -> None:
 @pytest.mark.parametrize(
     ("kind", "arguments"),
     [
-        (StopPacket, (-1, 0)),
-        (StopPacket, (MAX_ROBOT + 1, 0)),
-        (StopPacket, (1, 256)),
-        (CameraPacket, (1, 0, -1)),
-        (CameraPacket, (1, 0, MAX_CHANNEL + 1)),
-        (DrivePacket, (1, 0, 1.01, 0, 1)),
-        (DrivePacket, (1, 0, 0, float("nan"), 1)),
-        (DrivePacket, (1, 0, 0, 0, 0)),
+        *((StopPacket, said) for said in ((-1, 0), (MAX_ROBOT + 1, 0), (1, 256))),
+        *((CameraPacket, (1, 0, channel)) for channel in (-1, MAX_CHANNEL + 1)),
+        *((DrivePacket, (1, 0, *said)) for said in ((1.01, 0, 1), (0, float("nan"), 1), (0, 0, 0))),
         (DrivePacket, (1, 0, 0, 0, MAX_LASTS + 0.01)),
     ],
 )

@@ -105,22 +105,11 @@ def test_another_hosts_clock_changes_nothing(story: list[Frame]) -> None:
     assert {act.doing for act in acts} <= STATES
 
 
-@pytest.mark.parametrize(
-    "data",
-    [
-        b"",
-        b"\xc1",
-        b"{}",
-        b"\x00" * (MAX_CHECKPOINT + 1),
-        msgspec.msgpack.encode({"form": 99}),
-        msgspec.msgpack.encode({"phase": "dance"}),
-        msgspec.msgpack.encode({"tones": b"abc"}),
-        msgspec.msgpack.encode({"clock": "late"}),
-    ],
-)
-def test_a_bad_checkpoint_is_refused(data: bytes) -> None:
-    with pytest.raises(BadCheckpoint):
-        Hider.restore(data)
+def test_a_bad_checkpoint_is_refused() -> None:
+    wrong: list[dict[str, object]] = [{"form": 99}, {"phase": "dance"}, {"tones": b"abc"}, {"clock": "late"}]
+    for data in (b"", b"\xc1", b"{}", b"\x00" * (MAX_CHECKPOINT + 1), *map(msgspec.msgpack.encode, wrong)):
+        with pytest.raises(BadCheckpoint):
+            Hider.restore(data)
 
 
 def test_a_picture_of_another_form_is_refused() -> None:
