@@ -12,8 +12,7 @@ from zscout.mesh import session
 
 async def test_tokens_live_from_before_and_die_with_their_declaration_or_process(world: World) -> None:
     a, b, c = await world.open("a", "b", "c")
-    kept = [b.alive(token("b"))]
-    declared = c.alive(token("c", "early"))
+    kept, declared = [b.alive(token("b"))], c.alive(token("c", "early"))
     await world.declared()
     seen: list[tuple[str, bool]] = []
     key = a.keys.alive_any(Role.CLIENT)

@@ -16,8 +16,7 @@ PLAN = room(sofa(4.0), carton(1.2))
 @pytest.mark.parametrize("degrees", [-40, -20, -5, 0, 3, 15, 36])
 @pytest.mark.parametrize("heading", [0.3, 2.0, 4.1])
 def test_a_turn_is_measured(degrees: float, heading: float) -> None:
-    angle = math.radians(degrees)
-    before = seen_from(PLAN, 2.4, 1.6, heading, seed=1)
+    angle, before = math.radians(degrees), seen_from(PLAN, 2.4, 1.6, heading, seed=1)
     after = seen_from(PLAN, 2.4, 1.6, heading + angle, seed=2)
     # The wheels were told otherwise: they slipped.
     turn = turned(strip_and_tones(before)[0], strip_and_tones(after)[0], angle * 0.85)

@@ -51,8 +51,7 @@ def test_who_moves_with_his_hold_goes_on_and_who_lost_it_on_the_way_looks_again(
     old.hider._robot.phase = "hidden"
     scout.recall(old.memory())
     scout.held(60.0, goes_on=goes_on)
-    assert scout.hider._robot.phase == phase
-    assert scout.task == "watch"
+    assert (scout.hider._robot.phase, scout.task) == (phase, "watch")
 
 
 def test_what_moves_after_a_while_of_bad_pictures_is_another_event() -> None:
