@@ -23,7 +23,7 @@ from zscout.mesh import Supervisor
 from zscout.messages import Parameter
 from zscout.types import SECOND
 
-pytestmark = [pytest.mark.live, pytest.mark.usefixtures("real_time")]
+pytestmark = [pytest.mark.live, pytest.mark.real_time]
 
 TELL = 'echo "$ZSCOUT_DO" >> told; '
 

@@ -17,7 +17,7 @@ from zscout.drivers.generic import VideoDriver
 from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket, StopPacket
 from zscout.drivers.radio import RadioDriver
 
-pytestmark = [pytest.mark.live, pytest.mark.usefixtures("real_time")]
+pytestmark = [pytest.mark.live, pytest.mark.real_time]
 
 
 class Mast(Post):

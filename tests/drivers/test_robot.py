@@ -21,7 +21,7 @@ from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket, Packet
 from zscout.mesh import clock
 from zscout.types import SECOND, Grant, Ns
 
-pytestmark = [pytest.mark.live, pytest.mark.slow, pytest.mark.usefixtures("real_time")]
+pytestmark = [pytest.mark.live, pytest.mark.slow, pytest.mark.real_time]
 
 
 def mast(lab: Lab, line: PtyLine) -> None:

@@ -19,7 +19,7 @@ from tests.live.bench import until
 from zscout.drivers.packets import DrivePacket, HaltPacket, encode
 from zscout.drivers.serial_line import DEPTH, SerialLine
 
-pytestmark = pytest.mark.usefixtures("real_time")
+pytestmark = pytest.mark.real_time
 
 
 class Ear:
