@@ -13,7 +13,6 @@ import pytest
 
 from tests.drivers.post import GANG, TURN, held, is_in, obeyed
 from tests.drivers.ptys import PtyLine
-from tests.hang import HANG
 from tests.live.bench import answer
 from tests.live.lab import Lab
 from zscout.behaviors.client.client import Client
@@ -135,10 +134,8 @@ async def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_dr
 
         # The hold ends while it drives.
         since = await driving(obeyed(client, "robot/r1", grant, TURN))
-        began = clock.now()
         await client.end(arc)
         await line.until(is_in(HaltPacket), since=since)
-        worst = [("released", line_time(line, HaltPacket, since) - began)]
         # The radio may know that the hold has ended before the robot does.
         await lab.held_by(client, "robot/r1")
         assert await answer(drive(grant)) == "ended"
@@ -147,10 +144,8 @@ async def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_dr
         again, grant = await held(client, "patrol", GANG)
         operator = await lab.client()
         since = await driving(obeyed(client, "robot/r1", grant, TURN))
-        began = clock.now()
         over, his = await held(operator, "operator", GANG, priority=10)
         await line.until(is_in(HaltPacket), since=since)
-        worst.append(("preempted", line_time(line, HaltPacket, since) - began))
         await lab.held_by(client, "robot/r1", "operator")
         assert await answer(drive(grant)) == "ended"
         # No halt of the earlier hold, repeated or late, stops the robot under the next one.
@@ -164,9 +159,8 @@ async def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_dr
         await holder.order("ask", arc="brief", needs=GANG, priority=5, min_runtime=600)
         await holder.event("entered")
         since = await driving(holder.order("command", rc="robot/r1", do=TURN, ttl=10))
-        began = holder.kill()
+        holder.kill()
         await line.until(is_in(HaltPacket), since=since)
-        worst.append(("client killed", line_time(line, HaltPacket, since) - began))
 
         # The robot's node is killed while it drives: its radio halts what was driven under the hold.
         patrol = await client.granted(again)
@@ -175,13 +169,8 @@ async def test_a_robot_is_driven_only_by_its_holder_and_stops_whenever_nobody_dr
         figures = (await lab.rc(client, "robot/r1")).figures
         assert figures["commands"] >= 5
         assert figures["halts"] >= 3
-        began = lab.signal("cart", signal.SIGKILL)
+        lab.signal("cart", signal.SIGKILL)
         await line.until(is_in(HaltPacket), since=since)
-        worst.append(("robot's node killed", line_time(line, HaltPacket, since) - began))
-    for how, wait in worst:
-        print(f"{how}: {wait / 1e6:.1f} ms until the halt is through the line")
-    # The hold lease and the mesh's are seconds; nothing here waits for the former.
-    assert max(wait for _, wait in worst) < HANG * SECOND
 
 
 @pytest.mark.parametrize("said", [True, False])

@@ -277,9 +277,8 @@ def test_large_colour_pictures_have_boxes_in_their_own_pixels() -> None:
 
 
 def test_what_is_no_picture_is_refused() -> None:
-    planes: list[Any] = [
-        np.zeros(shape, np.uint8) for shape in ((120, 160, 4), (0, 160), (7, 160), (8, MAX_SIDE + 1), (160,))
-    ]
+    shapes = (120, 160, 4), (0, 160), (7, 160), (8, MAX_SIDE + 1), (160,)
+    planes: list[Any] = [np.zeros(shape, np.uint8) for shape in shapes]
     for picture in (*planes, np.zeros((120, 160), np.float32), np.zeros((120, 160), np.uint16)):
         with pytest.raises(ValueError, match="no picture"):
             MotionDetector().see(0.0, picture)
