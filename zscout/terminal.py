@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from itertools import zip_longest
+from operator import gt
 from typing import IO, TYPE_CHECKING, Any, Final, Self
 
 import msgspec
@@ -22,13 +23,19 @@ from zscout.types import clean as clean
 from zscout.types import span as span
 
 if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
+    from rich.console import Console, Group, RenderableType
     from rich.live import Live
 
-NARROW: Final = 110
-"""Columns of a terminal below which tables leave out what matters least."""
+GAP: Final = 2
+"""Spaces between two columns."""
+INDENT: Final = 3
+"""Spaces before a line that stands beneath a row."""
 CUT: Final = 0.3
-"""Of a terminal's width: what a column has at most whose texts are cut short."""
+"""Part of a terminal's width that a column keeps whose texts are shortened."""
+LISTED: Final = 0.4
+"""Part of a terminal's width that a column of lists or sentences should have before others are given up for it."""
+WHOLE, ITEMS, WORDS, OUTSIDE = "(?!)", "\n", "[ \n]", r" (?!\()(?![^()]*\))"
+"""Where a cell is divided: nowhere, between its items, between words, or those outside of parentheses."""
 NEAR: Final = 120.0
 """Seconds from now within which a time of day is told with its seconds."""
 MAX_CLOCK: Final = 1e9
@@ -84,20 +91,29 @@ def many(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
+Line = tuple[str, str]
+"""One line at a terminal, and Rich's style for it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of texts, made safe to print where they are. `styles` has Rich's style for each row, `spare` the
-    columns that a narrow terminal omits, `cut` those whose texts are cut short at a terminal."""
+    """Rows of texts, made safe to print where they are. A newline in a cell stands for a space; a cell that has some is
+    broken over lines only there, any other at spaces.
+
+    `styles` has Rich's style for each row. `spare` names the columns that a narrow terminal gives up, first things
+    first: those that are also in `beneath` get lines of their own below each row, the others are left out. Texts in the
+    columns `cut` are shortened before others are broken."""
 
     title: str
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
     styles: Sequence[str] = ()
-    spare: Collection[str] = ()
+    spare: Sequence[str] = ()
     cut: Collection[str] = ()
+    beneath: Collection[str] = ()
 
     def lines(self) -> list[str]:
-        """Without colours: two spaces between columns."""
+        """Without colours, as wide as the texts are: two spaces between columns."""
         table = [self.columns, *([clean(cell) for cell in row] for row in self.rows)]
         widths = [max(map(len, column)) for column in zip(*table, strict=True)]
         lines = [
@@ -105,39 +121,98 @@ class Table:
         ]
         return [self.title, *lines] if self.title else lines
 
-    def picture(self, most: int | None = None) -> RenderableType:
-        """For a terminal, no more than `most` rows."""
-        from rich.table import Table
-        from rich.text import Text
+    def fitted(self, width: int, most: int | None = None) -> list[Line]:
+        """For a terminal of this width, no more than `most` rows."""
+        safe = [["\n".join(map(clean, cell.split("\n"))) for cell in row] for row in self.rows[:most]]
+        texts = [list(column) for column in zip(self.columns, *safe, strict=True)]
+        sizes = [tuple(_longest(column, part) for part in (WHOLE, ITEMS, WORDS)) for column in texts]
+        kept = [at for at, name in enumerate(self.columns) if name not in self.beneath or any(texts[at][1:])]
+        cuts = {at for at in kept if self.columns[at] in self.cut}
 
-        table = Table(
-            title=self.title or None,
-            title_justify="left",
-            title_style="bold cyan",
-            header_style="bold",
-            box=None,
-            padding=(0, 2, 0, 0),
-        )
-        narrow = console().width < NARROW
-        kept = [at for at, name in enumerate(self.columns) if not (narrow and name in self.spare)]
-        for at in kept:
-            name = self.columns[at]
-            # A name or key that is cut short can't be copied.
-            if name in self.cut:
-                table.add_column(name, overflow="ellipsis", no_wrap=True, max_width=round(CUT * console().width))
-            else:
-                table.add_column(name, overflow="fold")
-        for row, style in zip_longest(self.rows[:most], self.styles[:most], fillvalue=""):
-            table.add_row(*(Text(clean(row[at])) for at in kept), style=style)
-        return table
+        def wanted(at: int, listed: int) -> int:
+            """The width that this column should have before another is given up for it."""
+            whole, items, words = sizes[at]
+            if at in cuts:
+                return min(whole, round(CUT * width))
+            return min(
+                whole, max(listed, items) if self.columns[at] in self.beneath else max(round(LISTED * width), words)
+            )
+
+        below = []
+        for name in self.spare:
+            at, listed = self.columns.index(name), 0 if name in self.beneath else round(LISTED * width)
+            if at in kept and sum(wanted(other, listed) + GAP for other in kept) - GAP > width:
+                kept.remove(at)
+                below += [at] if name in self.beneath else []
+        limits = [round(CUT * width) if at in cuts else width for at in kept]
+        widths = [sizes[at][0] for at in kept]
+        floors = [[min(limit, sizes[at][part]) for limit, at in zip(limits, kept, strict=True)] for part in range(3)]
+        for floor in (*floors, [1] * len(kept)):
+            while sum(widths) + GAP * (len(kept) - 1) > width and any(map(gt, widths, floor)):
+                # The widest gives way, as far as it may.
+                widths[max(range(len(kept)), key=lambda at: (widths[at] > floor[at], widths[at]))] -= 1
+        lines = [(self.title, "bold cyan")] if self.title else []
+        styles = ["bold" if self.title else "bold cyan", *self.styles[: len(safe)]]
+        for number, style in enumerate([*styles, *[""] * (1 + len(safe) - len(styles))]):
+            cells = [
+                [shortened(texts[at][number].replace("\n", " "), wide)]
+                if at in cuts
+                else wrapped(texts[at][number], wide)
+                for at, wide in zip(kept, widths, strict=True)
+            ]
+            for parts in zip_longest(*cells, fillvalue=""):
+                padded = (part + " " * (wide - _wide(part)) for part, wide in zip(parts, widths, strict=True))
+                lines.append((shortened((" " * GAP).join(padded).rstrip(), width), style))
+            for text in (texts[at][number] for at in below if number and texts[at][number]):
+                lines += [(" " * INDENT + line, f"{style} dim") for line in wrapped(text, max(1, width - INDENT))]
+        return lines
 
     def print(self) -> None:
         """Coloured at a terminal, aligned plain lines elsewhere."""
         if at_terminal():
-            console().print(self.picture())
+            console().print(picture(self.fitted(console().width)))
         else:
             for line in self.lines():
                 print_line(line)
+
+
+def _wide(text: str) -> int:
+    """Columns of a terminal that a text takes."""
+    from rich.cells import cell_len
+
+    return cell_len(text)
+
+
+def _longest(texts: Sequence[str], breaks: str) -> int:
+    return max(_wide(part.replace("\n", " ")) for text in texts for part in re.split(breaks, text))
+
+
+def shortened(text: str, width: int) -> str:
+    from rich.cells import set_cell_size
+
+    return text if _wide(text) <= width else set_cell_size(text, width - 1).rstrip() + "…"
+
+
+def wrapped(text: str, width: int) -> list[str]:
+    """On lines of this width, broken at newlines if there are some, otherwise at spaces, within parentheses only where
+    nothing else will do. Words that are too long are shortened."""
+    lines = [""]
+    for part in re.split(ITEMS if "\n" in text else OUTSIDE, text):
+        for word in [part] if _wide(part) <= width else part.split(" "):
+            joined = f"{lines[-1]} {word}" if lines[-1] else shortened(word, width)
+            if _wide(joined) <= width:
+                lines[-1] = joined
+            else:
+                lines.append(shortened(word, width))
+    return lines
+
+
+def picture(lines: Sequence[Line]) -> Group:
+    """For Rich: lines that fit the terminal."""
+    from rich.console import Group
+    from rich.text import Text
+
+    return Group(*(Text(text, style=style, no_wrap=True, overflow="crop") for text, style in lines))
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = "") -> None:
