@@ -34,8 +34,8 @@ CUT: Final = 0.3
 """Part of a terminal's width that a column keeps whose texts are shortened."""
 LISTED: Final = 0.4
 """Part of a terminal's width that a column of lists or sentences should have before others are given up for it."""
-WHOLE, ITEMS, WORDS, OUTSIDE = "(?!)", "\n", "[ \n]", r" (?!\()(?![^()]*\))"
-"""Where a cell is divided: nowhere, between its items, between words, or those outside of parentheses."""
+WHOLE, ITEMS, WORDS = "(?!)", "\n", r"\n| (?!\()(?![^()]*\))"
+"""Where a cell may be broken: nowhere, between its items, between words that are not in parentheses."""
 NEAR: Final = 120.0
 """Seconds from now within which a time of day is told with its seconds."""
 MAX_CLOCK: Final = 1e9
@@ -138,12 +138,19 @@ class Table:
                 whole, max(listed, items) if self.columns[at] in self.beneath else max(round(LISTED * width), words)
             )
 
-        below = []
+        def fits(kept: Sequence[int], listed: int) -> bool:
+            return sum(wanted(at, listed) + GAP for at in kept) - GAP <= width
+
+        left_out: list[int] = []
+        below: list[int] = []
         for name in self.spare:
             at, listed = self.columns.index(name), 0 if name in self.beneath else round(LISTED * width)
-            if at in kept and sum(wanted(other, listed) + GAP for other in kept) - GAP > width:
+            if at in kept and not fits(kept, listed):
                 kept.remove(at)
-                below += [at] if name in self.beneath else []
+                (below if name in self.beneath else left_out).append(at)
+        for at in reversed(left_out):
+            # What has moved beneath may have made room.
+            kept = sorted([*kept, at]) if fits([*kept, at], round(LISTED * width)) else kept
         limits = [round(CUT * width) if at in cuts else width for at in kept]
         widths = [sizes[at][0] for at in kept]
         floors = [[min(limit, sizes[at][part]) for limit, at in zip(limits, kept, strict=True)] for part in range(3)]
@@ -197,7 +204,7 @@ def wrapped(text: str, width: int) -> list[str]:
     """On lines of this width, broken at newlines if there are some, otherwise at spaces, within parentheses only where
     nothing else will do. Words that are too long are shortened."""
     lines = [""]
-    for part in re.split(ITEMS if "\n" in text else OUTSIDE, text):
+    for part in re.split(ITEMS if "\n" in text else WORDS, text):
         for word in [part] if _wide(part) <= width else part.split(" "):
             joined = f"{lines[-1]} {word}" if lines[-1] else shortened(word, width)
             if _wide(joined) <= width:

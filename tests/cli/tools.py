@@ -80,6 +80,11 @@ def named(name: str) -> str:
     return by(f"zscout request --name {name}")
 
 
+def mine(name: str) -> str:
+    """A request of that name of this user, as it is named to people."""
+    return f"{name} ({by('').partition(' ')[0]})"
+
+
 def ours() -> str:
     """Whose those of clients in this process are."""
     who = this_program("test")

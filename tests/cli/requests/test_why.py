@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from tests.cli.cli_fleet import patient_timing
-from tests.cli.tools import CLOCK, ours, zscout_here, zscout_soon
+from tests.cli.tools import CLOCK, mine, ours, zscout_here, zscout_soon
 from tests.live.lab import PATIENT, Lab
 
 pytestmark = pytest.mark.live
-US = re.escape(ours())
+US, TAKE, MAPPING = re.escape(ours()), re.escape(mine("take")), re.escape(mine("mapping"))
 SOON = r"\d+(\.\d)? s"
 
 
@@ -38,16 +38,16 @@ def test_the_story_of_an_arc(tmp_path: Path) -> None:
             lines = plain.stdout.splitlines()
             assert re.fullmatch(rf"survey of {US}, priority 0, has waited since {CLOCK} \({SOON}\)", lines[0])
             assert lines[1] == f"  id {survey.id}, client test/program"
-            assert re.fullmatch(rf"  waits for {US}: robot/a, until {CLOCK} at the latest", lines[2])
+            assert re.fullmatch(rf"  waits for {TAKE}: robot/a, until {CLOCK} at the latest", lines[2])
             assert lines[3].endswith("in the queue of 2; it wants 10 min")
             spans = r"\(in (10 min|9 min \d+ s)\)"
             assert re.fullmatch(rf"  it may start at {CLOCK} {spans}, if nothing else comes", lines[4])
             assert lines[5:7] == ["  it was preempted once", "Needs"]
             since, until = rf"since {CLOCK} \({SOON}\)", rf"until {CLOCK} \((10 min|9 min \d+ s)\) at the latest"
             assert re.fullmatch(
-                rf"  radio/rf0 \(rate=4\): shared with {US} \(rate=5\), priority 0, {since}, {until}", lines[7]
+                rf"  radio/rf0 \(rate=4\): shared with {MAPPING} \(rate=5\), priority 0, {since}, {until}", lines[7]
             )
-            assert re.fullmatch(rf"  robot/a: held by {US}, priority 10, {since}, {until}", lines[8])
+            assert re.fullmatch(rf"  robot/a: held by {TAKE}, priority 10, {since}, {until}", lines[8])
             assert lines[9] == "Story"
             told = [line.split(" ago)  ", 1)[1] for line in lines[10:]]
             assert re.match(rf" +{CLOCK} \(", lines[10])
@@ -66,7 +66,7 @@ def test_the_story_of_an_arc(tmp_path: Path) -> None:
 
             missing = (await zscout_soon("why", "late", env=lab.env)).stdout
             assert "  robot/nowhere: not on the mesh\n" in missing
-            assert "  robot/b: no other ARC holds it\n" in missing
+            assert "  robot/b: no other request holds it\n" in missing
 
             # Two of one name are told of one by one; ended ones from memory; unknown ones with what is near.
             twin = await client.request("take", {"robot/nowhere": {}}, min_runtime=1, wait_for_device=True)
@@ -84,7 +84,7 @@ def test_the_story_of_an_arc(tmp_path: Path) -> None:
             assert "cancelled" in ended.stdout.splitlines()[-1]
             unknown = await zscout_soon("why", "mappin", env=lab.env)
             assert (unknown.returncode, unknown.stdout) == (1, "")
-            assert unknown.stderr == 'zscout: no ARC "mappin" is known; did you mean mapping?\n'
+            assert unknown.stderr == 'zscout: no request "mappin" is known; did you mean mapping?\n'
 
     asyncio.run(story())
 

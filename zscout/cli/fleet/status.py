@@ -140,7 +140,8 @@ class Standing:
         ]
         if self._advisory():
             rows.append(("roles", "they are only advisory: set [security], so that names are proved"))
-        rows += [("clock", f"{booked.clock_words(*clock)}; set it") for clock in sorted(self._clocks().items())]
+        clocks = sorted(self._clocks().items())
+        rows += [("clock", f"{booked.clock_words(host, differs)}; set it") for host, differs in clocks]
         if (versions := mixture(self._versions())) is not None:
             rows.append(("versions", versions))
         return Table("Warnings", ("ABOUT", "WARNING"), rows, ["yellow"] * len(rows))
@@ -213,14 +214,14 @@ class Standing:
             device, words = known.get(rc), said.get(rc, [])
             figures = device.figures if device is not None else {}
             if device is not None and device.health != "ok":
-                words = [device.health, *(word for word in words if word != device.health)]
+                words = words if words and words[0].startswith(device.health) else [device.health, *words]
             if words or (self.every and figures):
                 rows.append((rc, "; ".join(words) or "ok", figures_text(figures)))
                 styles.append("red" if words else "")
         return Table("Health", ("DEVICE", "HEALTH", "FIGURES"), rows, styles)
 
     def as_object(self) -> dict[str, Any]:
-        """The output of `--json`, with spans in seconds and memory in bytes; `rcm` is null if no node leads. `advisory`:
+        """The output of `--json`, spans in seconds and memory in bytes; `rcm` is null if no node leads. `advisory`:
         rights are listed and not enforced; `ending`: certificates that end soon; `clocks`: how far hosts' clocks
         differ from fleet time; `booked_soon`: dates of bookings within 24 h."""
         chosen, versions = self.selection(), self._versions()
@@ -334,8 +335,8 @@ def running(state: RcmState, operator_priority: int, *, plain: bool) -> Table:
         rows.append((hold.arc, by, str(hold.priority), since, until, "\n".join(sorted(hold.needs)), more))
         styles.append("bold red" if hold.priority >= operator_priority else "")
     columns = (_head("RUNNING", plain=plain), "WHO", "PRIORITY", "SINCE", "UNTIL", "DEVICES", _more(plain=plain))
-    spare = (_more(plain=plain), "SINCE", "PRIORITY", "DEVICES")
-    return Table("Running", columns, rows, styles, spare, beneath={"DEVICES", _more(plain=plain)})
+    spare = (_more(plain=plain), "SINCE", "PRIORITY", "DEVICES", "WHO")
+    return Table("Running", columns, rows, styles, spare, beneath={"DEVICES", "WHO", _more(plain=plain)})
 
 
 def waiting(state: RcmState, ranks: Mapping[str, int], *, plain: bool) -> Table:
@@ -352,8 +353,8 @@ def waiting(state: RcmState, ranks: Mapping[str, int], *, plain: bool) -> Table:
     head = _head("WAITING", plain=plain) + ("" if plain else rest)
     columns = ("#", head, "WHO", "PRIORITY", "SINCE", "RUNTIME", "STARTS", "PREEMPTED", "WHY", _more(plain=plain))
     # Rows stand in rank order: priority and age add little where there is little room.
-    spare = ("WHY", _more(plain=plain), "PREEMPTED", "RUNTIME", "SINCE", "PRIORITY")
-    return Table(f"Waiting{rest}", columns, rows, spare=spare, beneath={"WHY", _more(plain=plain)})
+    spare = ("WHY", _more(plain=plain), "PREEMPTED", "RUNTIME", "SINCE", "PRIORITY", "WHO")
+    return Table(f"Waiting{rest}", columns, rows, spare=spare, beneath={"WHY", "WHO", _more(plain=plain)})
 
 
 def _head(title: str, *, plain: bool) -> str:
@@ -366,8 +367,10 @@ def _more(*, plain: bool) -> str:
 
 def _by(view: HoldView | WaitView, *, plain: bool) -> tuple[str, str]:
     """WHO, and the last column: people read the comment there, and the command in `zscout why`."""
-    words = comment(view.who)
-    return (whose(view) + words, view.client) if plain else (person(view.who, view.client), words.removeprefix(": "))
+    if plain:
+        return whose(view) + comment(view.who), view.client
+    words = view.who.comment if view.who is not None else ""
+    return person(view.who, view.client), f'"{words}"' if words else ""
 
 
 def _doing(host: Host) -> str:

@@ -77,18 +77,19 @@ class Overview:
         terminal of the usual height."""
         style = "bold red" if self.alarm else "bold"
         lines = [(line, style) for line in terminal.wrapped(terminal.clean(self.headline), width)]
-        blocks = [table.fitted(width, MAX_ROWS) for table in self.tables if table.rows]
+        tables = [table for table in self.tables if table.rows]
+        blocks = [table.fitted(width, MAX_ROWS) for table in tables]
         divided = len(lines) + sum(len(block) + 1 for block in blocks) <= USUAL
-        for table, block in zip(filter(lambda table: table.rows, self.tables), blocks, strict=True):
-            lines += [*([("", "")] if divided else []), *block]
+        for table, block in zip(tables, blocks, strict=True):
+            lines += [("", ""), *block] if divided else block
             if (more := len(table.rows) - MAX_ROWS) > 0:
                 lines.append((f"... {more} more rows: --json has all", "dim"))
         return lines
 
 
 class Scrolled:
-    """The part of an overview that fits a terminal: its headline, as many lines of its tables as there is room for, from
-    the line on that keys have chosen, and a hint."""
+    """The part of an overview that fits a terminal: its headline, as many lines of its tables as there is room for,
+    starting at the line that keys have chosen, and a hint."""
 
     def __init__(self) -> None:
         self._first = self._last = 0
@@ -133,8 +134,8 @@ class Displayed(Protocol):
 async def show(
     shown: Displayed, news: asyncio.Event, refresh: Callable[[], Awaitable[None]], *, watch: bool, as_json: bool
 ) -> None:
-    """Show it once; with `watch` again after news and each second, after a `refresh`, until the user presses q: in place
-    at a terminal, in a pipe as a block if more has changed than loads and spans of time."""
+    """Show it once; with `watch` again after news and each second, after a `refresh`, until the user presses q: in
+    place at a terminal, in a pipe as a block if more has changed than loads and spans of time."""
     stop = asyncio.Event()
     printed: Any = None
     scrolled = Scrolled()
