@@ -80,9 +80,14 @@ def named(name: str) -> str:
     return by(f"zscout request --name {name}")
 
 
-def mine(name: str) -> str:
-    """A request of that name of this user, as it is named to people."""
+def held_by(name: str) -> str:
+    """The request of `zscout request --name NAME`, and its person."""
     return f"{name} ({by('').partition(' ')[0]})"
+
+
+def mine(name: str) -> str:
+    """A request of a client in this process, and its person."""
+    return f"{name} ({ours().partition(' ')[0]})"
 
 
 def ours() -> str:
