@@ -125,46 +125,14 @@ class Table:
         """For a terminal of this width, no more than `most` rows."""
         safe = [["\n".join(map(clean, cell.split("\n"))) for cell in row] for row in self.rows[:most]]
         texts = [list(column) for column in zip(self.columns, *safe, strict=True)]
-        sizes = [tuple(_longest(column, part) for part in (WHOLE, ITEMS, WORDS)) for column in texts]
-        kept = [at for at, name in enumerate(self.columns) if name not in self.beneath or any(texts[at][1:])]
-        cuts = {at for at in kept if self.columns[at] in self.cut}
-
-        def wanted(at: int, listed: int) -> int:
-            """The width that this column should have before another is given up for it."""
-            whole, items, words = sizes[at]
-            if at in cuts:
-                return min(whole, round(CUT * width))
-            return min(
-                whole, max(listed, items) if self.columns[at] in self.beneath else max(round(LISTED * width), words)
-            )
-
-        def fits(kept: Sequence[int], listed: int) -> bool:
-            return sum(wanted(at, listed) + GAP for at in kept) - GAP <= width
-
-        left_out: list[int] = []
-        below: list[int] = []
-        for name in self.spare:
-            at, listed = self.columns.index(name), 0 if name in self.beneath else round(LISTED * width)
-            if at in kept and not fits(kept, listed):
-                kept.remove(at)
-                (below if name in self.beneath else left_out).append(at)
-        for at in reversed(left_out):
-            # What has moved beneath may have made room.
-            kept = sorted([*kept, at]) if fits([*kept, at], round(LISTED * width)) else kept
-        limits = [round(CUT * width) if at in cuts else width for at in kept]
-        widths = [sizes[at][0] for at in kept]
-        floors = [[min(limit, sizes[at][part]) for limit, at in zip(limits, kept, strict=True)] for part in range(3)]
-        for floor in (*floors, [1] * len(kept)):
-            while sum(widths) + GAP * (len(kept) - 1) > width and any(map(gt, widths, floor)):
-                # The widest gives way, as far as it may.
-                widths[max(range(len(kept)), key=lambda at: (widths[at] > floor[at], widths[at]))] -= 1
+        kept, below, widths = self._layout(texts, width)
         lines = [(self.title, "bold cyan")] if self.title else []
         styles = ["bold" if self.title else "bold cyan", *self.styles[: len(safe)]]
         for number, style in enumerate([*styles, *[""] * (1 + len(safe) - len(styles))]):
             cells = [
-                [shortened(texts[at][number].replace("\n", " "), wide)]
-                if at in cuts
-                else wrapped(texts[at][number], wide)
+                wrapped(texts[at][number], wide)
+                if self.columns[at] not in self.cut
+                else [shortened(clean(texts[at][number]), wide)]
                 for at, wide in zip(kept, widths, strict=True)
             ]
             for parts in zip_longest(*cells, fillvalue=""):
@@ -173,6 +141,43 @@ class Table:
             for text in (texts[at][number] for at in below if number and texts[at][number]):
                 lines += [(" " * INDENT + line, f"{style} dim") for line in wrapped(text, max(1, width - INDENT))]
         return lines
+
+    def _layout(self, texts: list[list[str]], width: int) -> tuple[list[int], list[int], list[int]]:
+        """The columns that stay beside each other, those that move beneath them, and the widths of the former."""
+        names, share = self.columns, round(LISTED * width)
+        whole = [_longest(column, WHOLE) for column in texts]
+        least = [
+            _longest(column, ITEMS if name in self.beneath else WORDS)
+            for name, column in zip(names, texts, strict=True)
+        ]
+        limits = [round(CUT * width) if name in self.cut else width for name in names]
+
+        def fits(kept: Sequence[int], listed: int) -> bool:
+            """`listed`: the width that columns should have at least which may move beneath."""
+            shares = (max(least[at], listed if names[at] in self.beneath else share) for at in kept)
+            return (
+                sum(min(whole[at], limits[at], wide) + GAP for at, wide in zip(kept, shares, strict=True)) - GAP
+                <= width
+            )
+
+        kept = [at for at, name in enumerate(names) if name not in self.beneath or any(texts[at][1:])]
+        left_out: list[int] = []
+        below: list[int] = []
+        for name in self.spare:
+            at = names.index(name)
+            if at in kept and not fits(kept, 0 if name in self.beneath else share):
+                kept.remove(at)
+                (below if name in self.beneath else left_out).append(at)
+        for at in reversed(left_out):
+            # What has moved beneath may have made room.
+            kept = sorted([*kept, at]) if fits([*kept, at], share) else kept
+        widths = [whole[at] for at in kept]
+        for floors in (whole, least, [1] * len(names)):
+            floor = [min(limits[at], floors[at]) for at in kept]
+            while sum(widths) + GAP * (len(kept) - 1) > width and any(map(gt, widths, floor)):
+                # The widest gives way, as far as it may.
+                widths[max(range(len(kept)), key=lambda at: (widths[at] > floor[at], widths[at]))] -= 1
+        return kept, below, widths
 
     def print(self) -> None:
         """Coloured at a terminal, aligned plain lines elsewhere."""

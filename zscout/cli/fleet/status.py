@@ -116,12 +116,8 @@ class Standing:
             headline = f"Fleet {fleet}: {leader} leads, term {term} ({links})"
             headline += f"; {many(count, 'booking')} within 24 h" if (count := booked.soon(self.booked)) else ""
             ranks = {f"{wait.client}/{wait.id}": number for number, wait in enumerate(self.state.queue, 1)}
-            operators = self.fleet_view.client.fleet.operator_priority
-            tables = [
-                self._rcs(chosen.state),
-                running(chosen.state, operators, plain=plain),
-                waiting(chosen.state, ranks, plain=plain),
-            ]
+            held = running(chosen.state, self.fleet_view.client.fleet.operator_priority, plain=plain)
+            tables = [self._rcs(chosen.state), held, waiting(chosen.state, ranks, plain=plain)]
             tables += [] if self.names else [shares_table(self._shares())]
         tables = [self._warnings(), *tables, self._hosts(chosen), self._devices(chosen)]
         if not plain:  # the heads name what stands below them
@@ -168,7 +164,7 @@ class Standing:
             there = "held" if holders else "maintenance" if view.rc in maintained else "free"
             words = there if view.present else "lost" if view.rc in lost else "absent"
             kind = "shared" if view.sharable else "exclusive"
-            names = ",\n".join(request_words(hold, hold.needs[view.rc]) for hold in holders)
+            names = ",\n".join(request_words(hold.arc, hold.who, hold.client, hold.needs[view.rc]) for hold in holders)
             rows.append((view.rc, kind, words, homes.get(view.rc, "-"), names))
             styles.append(
                 {"absent": "red", "lost": "red", "held": "yellow", "maintenance": "yellow", "free": "green"}[words]
@@ -334,9 +330,12 @@ def running(state: RcmState, operator_priority: int, *, plain: bool) -> Table:
         by, more = _by(hold, plain=plain)
         rows.append((hold.arc, by, str(hold.priority), since, until, "\n".join(sorted(hold.needs)), more))
         styles.append("bold red" if hold.priority >= operator_priority else "")
-    columns = (_head("RUNNING", plain=plain), "WHO", "PRIORITY", "SINCE", "UNTIL", "DEVICES", _more(plain=plain))
-    spare = (_more(plain=plain), "SINCE", "PRIORITY", "DEVICES", "WHO")
-    return Table("Running", columns, rows, styles, spare, beneath={"DEVICES", "WHO", _more(plain=plain)})
+    head, last = ("REQUEST", "CLIENT") if plain else ("RUNNING REQUEST", "COMMENT")
+    columns, spare = (
+        (head, "WHO", "PRIORITY", "SINCE", "UNTIL", "DEVICES", last),
+        (last, "SINCE", "PRIORITY", "DEVICES", "WHO"),
+    )
+    return Table("Running", columns, rows, styles, spare, beneath={"DEVICES", "WHO", last})
 
 
 def waiting(state: RcmState, ranks: Mapping[str, int], *, plain: bool) -> Table:
@@ -350,19 +349,11 @@ def waiting(state: RcmState, ranks: Mapping[str, int], *, plain: bool) -> Table:
         why = reason_text(wait.reason, wait.why)
         rows.append((str(number), wait.arc, by, str(wait.priority), *spans, str(wait.preemptions), why, more))
     rest = f", and {state.more} more" if state.more else ""
-    head = _head("WAITING", plain=plain) + ("" if plain else rest)
-    columns = ("#", head, "WHO", "PRIORITY", "SINCE", "RUNTIME", "STARTS", "PREEMPTED", "WHY", _more(plain=plain))
+    head, last = ("REQUEST", "CLIENT") if plain else (f"WAITING REQUEST{rest}", "COMMENT")
+    columns = ("#", head, "WHO", "PRIORITY", "SINCE", "RUNTIME", "STARTS", "PREEMPTED", "WHY", last)
     # Rows stand in rank order: priority and age add little where there is little room.
-    spare = ("WHY", _more(plain=plain), "PREEMPTED", "RUNTIME", "SINCE", "PRIORITY", "WHO")
-    return Table(f"Waiting{rest}", columns, rows, spare=spare, beneath={"WHY", "WHO", _more(plain=plain)})
-
-
-def _head(title: str, *, plain: bool) -> str:
-    return "REQUEST" if plain else f"{title} REQUEST"
-
-
-def _more(*, plain: bool) -> str:
-    return "CLIENT" if plain else "COMMENT"
+    spare = ("WHY", last, "PREEMPTED", "RUNTIME", "SINCE", "PRIORITY", "WHO")
+    return Table(f"Waiting{rest}", columns, rows, spare=spare, beneath={"WHY", "WHO", last})
 
 
 def _by(view: HoldView | WaitView, *, plain: bool) -> tuple[str, str]:

@@ -106,14 +106,10 @@ def person(who: Who | None, client: str) -> str:
     return clean(client if who is None or not who.user else f"{who.user}@{host}" if host else who.user)
 
 
-def request_words(view: HoldView | WaitView | ReasonParty, params: Mapping[str, Decimal] | None = None) -> str:
+def request_words(arc: str, who: Who | None, client: str, params: Mapping[str, Decimal] | None = None) -> str:
     """The name of a request and its person: `survey (alice@ws1)`, with the `params` under which it holds a device."""
-    return _request_words(view.arc, view.who, view.client, params or {})
-
-
-def _request_words(arc: str, who: Who | None, client: str, params: Mapping[str, Decimal]) -> str:
     by = person(who, client)
-    return clean(common.with_amounts(f"{arc} ({by})" if by else arc, params))
+    return clean(common.with_amounts(f"{arc} ({by})" if by else arc, params or {}))
 
 
 def comment(who: Who | None) -> str:
@@ -127,7 +123,9 @@ def reason_text(reason: str, why: ReasonInfo | None, age: float = 0) -> str:
     if why is None or why.code not in NAMING or not why.rcs or (why.code != ReasonCode.HELD and not why.by):
         return reason
     # A party without a client is shown by its name alone.
-    parties = [Party("", request_words(one), one.priority, until=_ns(one.yields_in, age)) for one in why.by]
+    parties = [
+        Party("", request_words(by.arc, by.who, by.client), by.priority, until=_ns(by.yields_in, age)) for by in why.by
+    ]
     words = Reason(
         ReasonCode(why.code), tuple(why.rcs), tuple(parties), why.detail, why.count, why.pattern, tuple(why.patterns)
     )
@@ -145,7 +143,7 @@ def hold_text(hold: HoldView, priority: int) -> str:
 
 def hold_words(hold: Mapping[str, Any], priority: int) -> str:
     """The same of a hold as `hold_json` gives it, with `params` if it has any."""
-    holder = _request_words(hold["arc"], hold["who"], hold["client"], hold.get("params", {}))
+    holder = request_words(hold["arc"], hold["who"], hold["client"], hold.get("params"))
     since = f"since {clock(-hold['held'])} ({span(hold['held'])})"
     return f"{holder}, priority {hold['priority']}, {since}, {_until(hold, priority)}{comment(hold['who'])}"
 
