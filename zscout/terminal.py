@@ -168,9 +168,9 @@ class Table:
             if at in kept and not fits(kept, 0 if name in self.beneath else share):
                 kept.remove(at)
                 (below if name in self.beneath else left_out).append(at)
-        for at in reversed(left_out):
-            # What has moved beneath may have made room.
-            kept = sorted([*kept, at]) if fits([*kept, at], share) else kept
+        # Columns that have moved beneath may have made room.
+        while left_out and fits([*kept, left_out[-1]], share):
+            kept = sorted([*kept, left_out.pop()])
         widths = [whole[at] for at in kept]
         for floors in (whole, least, [1] * len(names)):
             floor = [min(limits[at], floors[at]) for at in kept]
