@@ -26,7 +26,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from statistics import median
-from types import TracebackType
 from typing import Any, Final, Literal, NamedTuple, Self
 
 from tests.chaos import net
@@ -161,13 +160,11 @@ class Rounds:
                     node = [*self._in(host), "-m", "zscout.node", str(file)]
                     self._started.append(subprocess.Popen(node, env=self._env, stdout=log, stderr=log))
         except BaseException:
-            self.__exit__(None, None, None)
+            self.__exit__()
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         processes = [*(request.process for request in self._requests), *self._started]
         for process in processes:
             if process.poll() is None:

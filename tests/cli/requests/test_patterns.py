@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import CLOCK, course, end, events, held_by, named, out_of, read_until, zscout_here
+from tests.cli.tools import CLOCK, course, end, events, held_by, named, out_of, read_until
 from tests.hang import HANG
 from zscout.cli.operator.take import takeover_cost
 from zscout.cli.requests.options import HoldOptions
@@ -82,13 +82,13 @@ def test_who_waits_hears_who_has_all_that_match_and_gets_the_first(fleet: CliFle
     assert fleet.idle(F1, F2, ANY)
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_in_a_pipe_and_at_a_terminal_those_in_the_way_are_named_once(fleet: CliFleet) -> None:
     first, robot = fleet.holder("first", F1), fleet.holder("robot", "robot/a")
     line = fleet.waits("both", ANY, ANY, until=lambda line: f"; {F1}: " in line)
-    blocker = (
-        rf"{F1}: {re.escape(held_by('first'))}, priority 0, since {CLOCK} [^;]*, until {CLOCK} [^;]* at the latest"
-    )
+    times = rf"since {CLOCK} [^;]*, until {CLOCK} [^;]* at the latest"
+    blocker = rf"{F1}: {re.escape(held_by('first'))}, priority 0, {times}"
     assert re.search(rf"starts at {CLOCK} .*; {blocker}$", line)
     # One framegrabber is free: who has the other is in nobody's way.
     line = fleet.waits("easy", ANY, "robot/a", until=lambda line: "; robot/a: " in line)
@@ -105,6 +105,7 @@ def test_in_a_pipe_and_at_a_terminal_those_in_the_way_are_named_once(fleet: CliF
     assert fleet.idle(F1, F2)
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_why_tells_of_all_that_match(fleet: CliFleet) -> None:
     first, second = fleet.holder("first", F1), fleet.holder("second", ANY)
@@ -143,6 +144,7 @@ def test_why_tells_of_all_that_match(fleet: CliFleet) -> None:
     assert fleet.idle(F1, F2, "radio/rf0")
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
     at_once = fleet.zscout("request", ANY, ANY, "--dry-run")
@@ -168,33 +170,6 @@ def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
     assert (done.returncode, done.stdout) == (0, f"{F1} robot/a\n"), done.stderr
     end(high)
     assert fleet.idle(F1, F2, "robot/a")
-
-
-@pytest.mark.parametrize(
-    ("args", "line"),
-    [
-        (("request", "framegrabber/**"), "need \"framegrabber/**\": need 'framegrabber/**' is not valid: write"),
-        (("request", "framegrabber/f*"), "write kind/name with * for a whole name or $* for a part of one"),
-        (("take", "framegrabber/*#0"), "#2, #3 and so on behind it for a second and third"),
-        (("request", "radio/*:rate=1", "radio/*:rate=2"), "have different parameters; give all the same"),
-        (("request", "*/x", "radio/*:rate=2"), "can't stand beside parameters; name its kind"),
-        (("request", "fg/*#2", "fg/*#2"), "fg/*#2 is named twice; leave the numbers out, and they are given"),
-    ],
-)
-def test_bad_patterns_are_one_line_with_the_remedy(
-    args: tuple[str, ...], line: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert zscout_here(*args) == 2
-    said = capsys.readouterr().err
-    assert line in said
-    assert said.count("\n") == 1
-
-
-def test_the_help_says_how_to_quote(capsys: pytest.CaptureFixture[str]) -> None:
-    assert zscout_here("request", "--help") == 0
-    said = capsys.readouterr().out
-    assert "zscout request 'framegrabber/*' 'framegrabber/*' robot/scout33 -- python3 -i" in said
-    assert "ZSCOUT_BOUND" in said
 
 
 # What is made of the RCM's state
