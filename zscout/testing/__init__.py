@@ -17,7 +17,7 @@ docs/how-to/test-your-code.md shows more."""
 from __future__ import annotations
 
 from zscout.testing.device import FakeDevice
-from zscout.testing.fleet import MemoryFleet, RunningComponent, until
+from zscout.testing.fleet import MemoryFleet, ComponentRun, until
 from zscout.testing.memory import MemoryMesh, MemoryNetwork
 from zscout.testing.virtual_time import Deadlock, in_virtual_time, run
 
@@ -27,7 +27,7 @@ __all__ = [
     "MemoryFleet",
     "MemoryMesh",
     "MemoryNetwork",
-    "RunningComponent",
+    "ComponentRun",
     "in_virtual_time",
     "run",
     "until",

@@ -42,7 +42,7 @@ async def until(condition: Callable[[], object], *, within: float = WITHIN) -> N
 
 
 @dataclass(slots=True)
-class RunningComponent:
+class ComponentRun:
     """A component that runs in a MemoryFleet."""
 
     component: Component
@@ -148,12 +148,12 @@ class MemoryFleet:
         return next((view.arc for view in state.holds if rc in view.needs), "") if state is not None else ""
 
     @asynccontextmanager
-    async def running(self, component: Component, name: str = "component") -> AsyncIterator[RunningComponent]:
+    async def running(self, component: Component, name: str = "component") -> AsyncIterator[ComponentRun]:
         """Run a component on a client of its own, until the end of the block; raises what it raised."""
         gate, client = SafePointGate(), self.client(f"{name}.1")
         task = asyncio.ensure_future(component.run(ComponentContext(client, name, 1, gate)))
         try:
-            yield RunningComponent(component, task, gate)
+            yield ComponentRun(component, task, gate)
         finally:
             task.cancel()
             with suppress(asyncio.CancelledError):
