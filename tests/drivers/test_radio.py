@@ -82,9 +82,9 @@ def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: 
             # Handed over, the robot goes on driving: no safe state between, and only the heir is obeyed.
             heir, since = await lab.client(), len(line.heard)
             await obeyed(client, "robot/r1", grant, TURN)
-            client.pause()
-            heir.expect(client.open_requests())
-            await client.hand_over_all(heir.mesh.me)
+            client.internals.pause()
+            heir.internals.expect(client.internals.open_requests())
+            await client.internals.hand_over_all(heir.mesh.me)
             inherited = await heir.request("hide", GANG, min_runtime=600)
             under = await heir.granted(inherited)
             assert under is not None
@@ -94,7 +94,7 @@ def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: 
             )
             assert not is_in(HaltPacket)(line.packets[since:])
             assert await answer(obeyed(client, "robot/r1", grant, TURN)) == "ended"
-            client.resume()
+            client.internals.resume()
             await heir.end(inherited)
 
             # What a gang must have for a robot to do as it is told.

@@ -104,7 +104,7 @@ class Held:
 
     async def confirmed(self) -> bool:
         """Waits until all RCs have confirmed this hold, which they do once they have settled. False: it is over."""
-        return self.active and await self._client.confirmed(self.arc) and self.active
+        return self.active and await self._client.internals.confirmed(self.arc) and self.active
 
     async def command(self, need: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Done:
         """Has one of the held RCs do something: the one of this name, or that meets this pattern.
@@ -115,7 +115,7 @@ class Held:
 
     async def resumed(self) -> None:
         """Waits while the client is paused: what becomes of the hold meanwhile counts from then on."""
-        await self._client.resumed()
+        await self._client.internals.resumed()
 
     async def over(self) -> None:
         """Waits until the hold is over; for bodies that work elsewhere."""
@@ -185,7 +185,7 @@ class Attempt:
     async def __aenter__(self) -> Held:
         held, body = await self.granted(), asyncio.current_task()
         assert body is not None  # noqa: S101 - this is a coroutine
-        direct, self._cancelled = self._client.direct_hold(held.grant), 0
+        direct, self._cancelled = self._client.internals.direct_hold(held.grant), 0
         self._entered = held, body, asyncio.create_task(self._interrupt_when_over(held, body, direct)), direct
         return held
 
@@ -197,7 +197,7 @@ class Attempt:
             direct.end()
             if held.active:
                 # By our clock it had its time. An RCM that takes the lead as it clears up would queue it again.
-                self._client.expire(held.arc)
+                self._client.internals.expire(held.arc)
             await asyncio.sleep(max(0, direct.gone_by - held.now()) / SECOND)
             log.warning(
                 "%s clears up for too long after its hold, and is interrupted: the next holder begins", held.arc.name
@@ -222,7 +222,7 @@ class Attempt:
             # What somebody released is not to be had again.
             by_hand = arc.why is not None and arc.why.code == "released"
             self._anew = self._again and interrupted and arc.keep and not by_hand
-            self._client.complete(arc)
+            self._client.internals.complete(arc)
             return interrupted
         # Whose body was interrupted is over for it, though a new RCM may have found that it stands all the same.
         if not interrupted and (held.active or kind is not None):

@@ -159,7 +159,7 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
         self._watch = asyncio.create_task(self._interrupt_when_over(held))
 
     async def _interrupt_when_over(self, held: BlockingHeld) -> None:
-        direct = self._lab.client.direct_hold(held.grant)
+        direct = self._lab.client.internals.direct_hold(held.grant)
         await held._held.over()
         await held._body.interrupt()
         if direct is not None:
@@ -177,11 +177,11 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
             # It was interrupted, and withdraws what it asked for.
             await asyncio.wait([self._entering])
         arc, client = self._attempt.arc, self._lab.client
-        if self._held is not None and (direct := client.direct_hold(self._held.grant)) is not None:
+        if self._held is not None and (direct := client.internals.direct_hold(self._held.grant)) is not None:
             direct.returned()
         if arc is not None and arc.open:
             if self._held is not None and self._held.completed:
-                client.complete(arc)
+                client.internals.complete(arc)
             else:
                 await client.end(arc)
 

@@ -7,7 +7,7 @@ import itertools
 import logging
 import os
 import socket
-from collections.abc import Callable, Coroutine, Generator, Mapping
+from collections.abc import Coroutine, Generator, Mapping
 from contextlib import ExitStack, closing
 from decimal import Decimal
 from typing import Any, Final, Generic, Self, TypeVar
@@ -15,10 +15,9 @@ from typing import Any, Final, Generic, Self, TypeVar
 from msgspec.structs import replace
 
 from zscout import messages
-from zscout.behaviors.client.confirmation import NOT_DONE, NOT_HELD, Confirmations
-from zscout.behaviors.client.direct import DirectHold
-from zscout.behaviors.client.handover import MovableClient
+from zscout.behaviors.client.confirmation import NOT_DONE, NOT_HELD
 from zscout.behaviors.client.identity import checked_comment, this_program
+from zscout.behaviors.client.internals import ClientInternals
 from zscout.behaviors.client.rcm_link import QUERY_TIMEOUT, TRY_AGAIN
 from zscout.behaviors.client.request import (
     CommandRefused,
@@ -32,11 +31,11 @@ from zscout.behaviors.client.request import (
 from zscout.config.certificates import read_certificates
 from zscout.config.fleet import FLEET_VARIABLE, Fleet, beside, fleet_from_env
 from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_name
-from zscout.mesh import Declaration, Mesh, ZenohMesh
+from zscout.mesh import Mesh, ZenohMesh
 from zscout.mesh.exchange import naming_versions
-from zscout.mesh.supervision import Supervisor, done_within
+from zscout.mesh.supervision import done_within
 from zscout.messages import Done, Foresight, Notice, Problem, RcmState, Who
-from zscout.types import SECOND, Grant, Ns, Term
+from zscout.types import SECOND, Grant
 
 __all__ = ["QUERY_TIMEOUT", "TRY_AGAIN", "Client", "CommandRefused", "NoRcm", "RequestRefused"]
 
@@ -47,43 +46,28 @@ LOOK_FOR_RCM: Final = 3.0
 LOOK_FOR_TAKEOVER: Final = 5.0
 """The same where a candidate is seen."""
 MAX_NAMED: Final = 5
-LAST_WORD: Final = 0.5
-"""Seconds at most for which a client that closes tells RCs that its programs are gone."""
 TOLD_WITHIN = 1.0
 """Seconds within which a notice says so too; else the RC is believed."""
-RENEW_TOKEN: Final[Ns] = SECOND // 2
-"""A client that is dropped again after its token was renewed renews it no sooner."""
 
 
-class Client(MovableClient):
+class Client:
     """One program on the mesh. Open with `async with Client.connect(...) as client`, or `await
     Client.connect(...)` and `close` it."""
 
     def __init__(self, mesh: Mesh, fleet: Fleet) -> None:
-        super().__init__(mesh, fleet, Supervisor(f"client {mesh.me}", self._failed))
+        self.mesh, self.fleet = mesh, fleet
+        # What zscout's own modules use beside the rest of this class; it may change at any time.
+        self.internals = own = ClientInternals(mesh, fleet, self._command, self._on_notice)
+        self._store, self._rcm, self._supervisor = own.store, own.rcm, own.supervisor
+        self._confirmations = own.confirmations
         self.who: Who | None = None
-        """Who asks, as others are told; `connect` fills it in."""
-        self._leaving: asyncio.Task[None] | None = None
-        self._declared: list[Declaration] = []
-        self._token: Declaration | None = None
-        self._instance = ""
-        """Of its token."""
+        """Who asks, as other people are told: user, host and command. `connect` fills it in."""
+        self.waits_for_devices = False
+        """What a request does that does not say `wait_for_device`: whether a need that nobody knows is waited for
+        instead of refused."""
         self._commanded = itertools.count(1)
-        self._shown: Ns = 0
-        """When the present token was declared."""
         self._denied: set[Grant] = set()
         """Grants that an RC says are over, and no notice yet."""
-        self._confirmations = Confirmations(
-            mesh,
-            fleet,
-            self._store,
-            self._rcm,
-            self._supervisor,
-            self._command,
-            lambda arc: self._supervisor.spawn(self._ask_again(arc)),
-        )
-        self.waits_for_devices = False
-        """Whether its requests wait for what nobody knows, instead of being refused, if they do not say."""
 
     @classmethod
     def connect(
@@ -103,9 +87,16 @@ class Client(MovableClient):
             host = host or read_certificates(fleet.security).name
         host = host or os.environ.get("ZSCOUT_HOST") or machine
         me = Sender(check_name(host, "host"), check_name(name or f"client-{new_instance()}", "client"))
-        client = cls(await ZenohMesh.open(replace(fleet, mesh=beside(fleet.mesh)), me), fleet)
+        client = cls.on(await ZenohMesh.open(replace(fleet, mesh=beside(fleet.mesh)), me), fleet)
         client.who = this_program(host if fleet.security is None else machine)
-        return client.start()
+        return client
+
+    @classmethod
+    def on(cls, mesh: Mesh, fleet: Fleet) -> Self:
+        """A client on a mesh that is open already, which it closes: for tests, on a `zscout.testing.MemoryMesh`."""
+        client = cls(mesh, fleet)
+        client.internals.start()
+        return client
 
     async def __aenter__(self) -> Self:
         return self
@@ -113,74 +104,9 @@ class Client(MovableClient):
     async def __aexit__(self, *exc: object) -> None:
         await self.close()
 
-    def start(self) -> Self:
-        """Declares on the mesh what a client has; `connect` does so."""
-        keys, mesh = self.mesh.keys, self.mesh
-        self._declared = [mesh.subscribe(keys.notice(mesh.me), Notice, self._on_notice), *self._rcm.start()]
-        mesh.watch_links()
-        self._store.ask_again = self._on_dropped
-        self._renew_token()
-        self._supervisor.spawn(self._rcm.keep_asking())
-        self._supervisor.spawn(self._rcm.watch_lease())
-        return self
-
-    def _renew_token(self) -> None:
-        """Shows that this client lives, by a token that nobody can have taken for gone."""
-        mesh = self.mesh
-        self._instance = new_instance()
-        token = mesh.alive(Token(mesh.me.host, Role.CLIENT, mesh.me.client, self._instance))
-        if self._token is not None:
-            self._token.close()
-        self._token, self._shown = token, mesh.now()
-
-    def _on_dropped(self, arc: OpenArc) -> None:
-        # All that was dropped together is asked for with one token.
-        if arc.outcome == "client_lost" and self.mesh.now() - self._shown > RENEW_TOKEN:
-            self._renew_token()
-        self._supervisor.spawn(self._ask_again(arc))
-
     async def close(self) -> None:
-        """Gives back everything and leaves the mesh."""
-        try:
-            if self._leaving is None:
-                self._store.resumed.set()
-                self._may_end.set()
-                await self._supervisor.close()
-                await asyncio.gather(*(self.end(arc) for arc in self._store.open))
-                if telling := self._confirmations.telling:
-                    await asyncio.wait(telling, timeout=LAST_WORD)
-        finally:
-            await self.leave()
-
-    async def leave(self) -> None:
-        """Leaves the mesh without ending anything or giving it back: for who has handed over all. What is
-        still this client's goes when the RCM sees that its token has gone."""
-        self._leaving = self._leaving or asyncio.create_task(self._leave())
-        # Its token must go even if the caller is cancelled.
-        await asyncio.shield(self._leaving)
-
-    async def _leave(self) -> None:
-        self._may_end.set()
-        try:
-            await self._supervisor.close()
-        finally:
-            for telling in self._confirmations.telling:
-                telling.cancel()
-            for declared in (*filter(None, [self._token]), *reversed(self._declared)):
-                declared.close()
-            await self.mesh.close()
-
-    def _failed(self, error: Exception) -> None:
-        """A task of this client failed: its holds end here, and at the RCM when its token has gone."""
-        for arc in self._store.open:
-            arc.finish("lost", f"this client failed: {error!r}", self.mesh.now())
-            self._store.notify(arc)
-        self._leaving = self._leaving or asyncio.create_task(self._leave())
-
-    @property
-    def term(self) -> Term:
-        """The highest term received or promised; what is of an older one is ignored."""
-        return self._rcm.term
+        """Gives back everything that is held or asked for, and leaves the mesh."""
+        await self.internals.close()
 
     @property
     def leader(self) -> str | None:
@@ -253,7 +179,7 @@ class Client(MovableClient):
         An ARC of this name and these needs that another client hands over is returned instead, as it is."""
         wanted = amounts(needs)
         who = replace(self.who or Who(), comment=checked_comment(comment)) if comment else self.who
-        arc = await self._claim(check_name(name, "arc"), wanted)
+        arc = await self.internals.claim(check_name(name, "arc"), wanted)
         if arc is None:
             seconds, now = self._protected(min_runtime), self.mesh.now()
             arc = OpenArc(new_instance(), name, wanted, priority, seconds, keep, estimate, direct, since=now)
@@ -312,43 +238,10 @@ class Client(MovableClient):
                 await self.end(arc)
                 raise confirmation.refused
 
-    async def confirmed(self, arc: OpenArc) -> bool:
-        """Waits until all RCs of the present grant have confirmed it. False: they do not, or it is over."""
-        if (grant := arc.grant) is None:
-            return False
-        confirmation = self._confirmations.begin(arc, grant)
-        await confirmation.over()
-        return arc.grant == grant and confirmation.all
-
-    def direct_hold(self, grant: Grant) -> DirectHold | None:
-        """For who runs the program of a direct request: how long its hold may be relied on, and what is to be told when
-        the program is gone. None where the request was not direct, or that has been told."""
-        return self._confirmations.direct(grant)
-
     async def end(self, arc: OpenArc) -> None:
-        """Gives back a hold, or leaves the queue: once the client is no longer paused, if that was not handed
-        over then. The program of a direct one is gone by then. Tried a few times; the RCM sees our token die
-        otherwise."""
-        await self._may_end.wait()
-        if self._leaving is not None:
-            return
-        if arc.state == "moved":
-            self._store.forget(arc)
-            return
-        self._confirmations.program_is_gone(arc)
-        await self._rcm.end(arc)
-
-    def complete(self, arc: OpenArc) -> None:
-        """An ARC has had its time by this host's clock, and its body has returned; RCs and RCM end it by theirs."""
-        self._confirmations.program_is_gone(arc)
-        self.expire(arc)
-
-    def expire(self, arc: OpenArc) -> None:
-        """An ARC has had its time by this host's clock: it is not asked for any more, though a direct body may clear
-        up yet."""
-        arc.finish("completed", "its minimum runtime is over", self.mesh.now())
-        self._store.notify(arc)
-        self._store.forget(arc)
+        """Gives back a hold, or takes a request out of the queue. Returns when the RCM has answered, or has been told a
+        few times."""
+        await self.internals.end(arc)
 
     async def hand_over(self, arc: OpenArc, to: Sender) -> None:
         """Lets one ARC, queued or running, go on in another client. Raises RequestRefused."""
@@ -356,10 +249,6 @@ class Client(MovableClient):
         if reply is None or reply.message is None:
             unknown = Problem("unknown", "the RCM did not answer; ask how the ARC stands")
             raise RequestRefused(reply.problem or unknown if reply is not None else unknown)
-
-    def watch(self, watcher: Callable[[OpenArc], None]) -> None:
-        """Calls `watcher(arc)` whenever there is news of any of this client's requests."""
-        self._store.watchers.append(watcher)
 
     # Operators' questions
 
@@ -415,7 +304,7 @@ class Client(MovableClient):
         self, rc: str, grant: Grant, do: Mapping[str, Any], *, ttl: float = 1.0, timeout: float = 2.0
     ) -> Done:
         key = self.mesh.keys.command(rc, self.mesh.me)
-        id_ = f"{self._instance}-{next(self._commanded)}"
+        id_ = f"{self.internals.instance}-{next(self._commanded)}"
         command = messages.Command(grant=grant, do=dict(do), ttl=ttl, id=id_)
         reply = await self.mesh.ask_one(key, command, Done, timeout=timeout)
         if reply is None:
@@ -435,14 +324,14 @@ class Client(MovableClient):
         if arc.grant == grant and arc.id in self._store.arcs and self._store.resumed.is_set():
             arc.lose(reason, self.mesh.now())
             self._store.notify(arc)
-            self._supervisor.spawn(self._ask_again(arc))
+            self._supervisor.spawn(self.internals.ask_again(arc))
 
     def _on_notice(self, _key: str, notice: Notice) -> None:
         if not self._rcm.accept(notice.term):
             return
         if (arc := self._store.arcs.get(notice.id)) is not None:
             self._store.take(arc, notice)
-        elif not self._take_moving(notice) and notice.id not in self._store.withdrawn:
+        elif not self.internals.take_moving(notice) and notice.id not in self._store.withdrawn:
             # What nobody here asked for, or what was over here before an RCM that took the lead heard of it.
             if notice.state == "running":
                 self._supervisor.spawn(self._rcm.give_back(messages.Release(id=notice.id)))
