@@ -4,44 +4,41 @@ All that the author of a driver needs can be imported from here; docs/how-to/wri
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Final, Protocol, Self
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 from msgspec import Struct
 
-from zscout.drivers.holds import HoldTable
-from zscout.drivers.instances import Instances
-from zscout.keyexpr import Role, Sender, Token
-from zscout.mesh import Declaration, Mesh, Refused, Supervisor
-from zscout.messages import Amounts, Figures, Holder, Parameter, ProposedHolder
-from zscout.types import SECOND, Grant, Ns
+from zscout.keyexpr import Sender
+from zscout.mesh import Refused, Supervisor
+from zscout.messages import Amounts, Figures, FrameHead, Holder, Parameter, ProposedHolder
+from zscout.types import Grant, Ns
 
-__all__ = ["Driver", "Figures", "Holder", "Parameter", "ProposedHolder", "RcDirectory", "RcHandle", "Refused"]
+if TYPE_CHECKING:
+    from zscout.mesh.frames import FramePublisher
 
-NODE: Final = "node"
-"""The client name of a node."""
-DEPARTED_RC_GRACE: Final[Ns] = 10 * SECOND
-"""A node that ends sends its last command for an RC after the token of that RC has gone."""
+__all__ = ["Driver", "Figures", "FrameHead", "Holder", "Parameter", "ProposedHolder", "RcHandle", "Refused", "Sender"]
 
 
 class RcHandle(Protocol):
-    """The RC as its driver sees it."""
+    """The RC around a driver, as the driver sees it: `Driver.open` is given it."""
 
-    mesh: Mesh
     name: str
-    holds: HoldTable
-    instances: Instances
-    """Whether this one serves, or stands by for another host's."""
-    directory: RcDirectory | None
-    """Only of a driver that relays."""
-    supervisor: Supervisor
-    """Of tasks, timers and handlers of the driver: closed before `safe` and `close` at the end. What fails
-    there fails the RC."""
+    """Of the device: `kind/name`."""
     health: str
     """`ok`, or in words why the device can't carry a holder."""
+    supervisor: Supervisor
+    """Runs the driver's tasks, by `spawn`, and its timers, by `call_later`. They end before `safe` and `close` are
+    called at the end. One that raises fails the RC."""
+
+    def now(self) -> Ns:
+        """The time in ns, by the clock of this host that counts from its start and goes on while it sleeps."""
+
+    def holders(self) -> list[Holder]:
+        """Who holds the device now."""
 
     def fail(self, why: str) -> None:
-        """The device can't carry its holders any longer: their holds end, the RC counts as lost."""
+        """The device can't carry its holders any longer: their holds end, and the RC counts as lost. `why`: one line."""
 
     def recover(self) -> None:
         """The device works again."""
@@ -52,6 +49,10 @@ class RcHandle(Protocol):
     def used(self, grant: Grant) -> None:
         """The device has just done something under a hold, beside its commands, which are counted without this: it
         published a picture, say. From any one thread."""
+
+    def frame_publisher(self) -> FramePublisher:
+        """Publishes pictures of the device, under its own name: `put(FrameHead(...), jpeg)`. `close` it in the driver's
+        `close`."""
 
 
 class NoOptions(Struct, frozen=True):
@@ -142,44 +143,3 @@ class Driver:
     def usable_cold(self, do: Mapping[str, Any]) -> bool:
         """Whether this command can be carried out while the device still warms up."""
         return False
-
-
-class RcDirectory:
-    """Which host offers which RC, by the liveliness tokens, from `watch` on: its node may act for an RC, and
-    no other."""
-
-    def __init__(self, mesh: Mesh, on_change: Callable[[], object] = lambda: None) -> None:
-        self._mesh = mesh
-        self._tokens: dict[str, set[Token]] = {}
-        self._recent: dict[tuple[str, str], Ns] = {}
-        """(host, RC): until when its node may still act for it."""
-        self._on_change = on_change
-
-    def watch(self) -> Declaration:
-        return self._mesh.watch(self._mesh.keys.alive_any(Role.RC), self.on_token)
-
-    def on_token(self, token: Token, alive: bool) -> None:
-        if alive:
-            self._tokens.setdefault(token.name, set()).add(token)
-        else:
-            living = self._tokens.get(token.name, set())
-            living.discard(token)
-            if not living:
-                self._tokens.pop(token.name, None)
-            now = self._mesh.now()
-            self._recent = {key: until for key, until in self._recent.items() if until > now}
-            self._recent[token.host, token.name] = now + DEPARTED_RC_GRACE
-        self._on_change()
-
-    def hosts(self, rc: str) -> set[str]:
-        """The hosts that offer this RC now: one, unless two nodes are at odds."""
-        return {token.host for token in self._tokens.get(rc, ())}
-
-    def is_node_of_gang(self, sender: Sender, holder: Holder, but: str) -> bool:
-        """Whether `sender` is the node of an RC of this holder's gang, `but` aside."""
-        return sender.client == NODE and any(sender.host in self.hosts(rc) for rc in holder.rcs if rc != but)
-
-    def is_node_of(self, sender: Sender, rc: str) -> bool:
-        """Whether `sender` is the node that offers this RC, or did so until a moment ago."""
-        offered = sender.host in self.hosts(rc) or self._recent.get((sender.host, rc), 0) > self._mesh.now()
-        return sender.client == NODE and offered
