@@ -51,8 +51,9 @@ TOLD_WITHIN = 1.0
 
 
 class Client:
-    """One program on the mesh. Open with `async with Client.connect(...) as client`, or `await
-    Client.connect(...)` and `close` it."""
+    """A program's connection to the mesh.
+
+    Open it with `async with Client.connect(...) as client`, or `await Client.connect(...)` and `close` it."""
 
     def __init__(self, mesh: Mesh, fleet: Fleet) -> None:
         self.mesh, self.fleet = mesh, fleet
@@ -73,9 +74,11 @@ class Client:
     def connect(
         cls, name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None
     ) -> Connecting[Self]:
-        """Joins the mesh: await the result, or enter it. `name` must be the only one of this host; the default is.
+        """Join the mesh: await the result, or use it with `async with`.
 
-        Without a `fleet`, the one that ZSCOUT_FLEET names, or the default. Raises MeshError, BadInput."""
+        `name` must be unique on this host; the default is random. `fleet` defaults to the fleet file named by
+        $ZSCOUT_FLEET, else to the default fleet. `host` defaults to $ZSCOUT_HOST, else to the name of this
+        machine; in a secured fleet, to the name in the certificate. Raises MeshError, BadInput."""
         return Connecting(cls._connect(name, fleet, host))
 
     @classmethod
@@ -93,7 +96,7 @@ class Client:
 
     @classmethod
     def on(cls, mesh: Mesh, fleet: Fleet) -> Self:
-        """A client on a mesh that is open already, which it closes: for tests, on a `zscout.testing.MemoryMesh`."""
+        """Return a client on an open mesh, which it closes: for tests, on a `zscout.testing.MemoryMesh`."""
         client = cls(mesh, fleet)
         client.internals.start()
         return client
@@ -105,17 +108,19 @@ class Client:
         await self.close()
 
     async def close(self) -> None:
-        """Gives back everything that is held or asked for, and leaves the mesh."""
+        """Give back everything held or requested, and leave the mesh."""
         await self.internals.close()
 
     @property
     def leader(self) -> str | None:
-        """The host whose node leads, or None where no RCM is seen."""
+        """The host of the leading node; None while no leader is visible."""
         return self._rcm.leader
 
     async def see_rcm(self, seconds: float = LOOK_FOR_RCM, takeover: float = LOOK_FOR_TAKEOVER) -> None:
-        """Returns as soon as an RCM is seen. Raises NoRcm where none is within `seconds`, or within `takeover` where a
-        candidate is seen, which may be about to take the lead."""
+        """Return as soon as a leader is visible.
+
+        Raises NoRcm if none appears within `seconds`, or within `takeover` seconds if a node is visible that may
+        lead."""
         if self.leader is not None:
             return
         seen, candidates = asyncio.Event(), set[Token]()
@@ -161,22 +166,28 @@ class Client:
         booking: str = "",
         continues: str = "",
     ) -> OpenArc:
-        """Asks for an ARC and returns when the RCM has answered, for as long as that takes.
+        """Request devices, and return when the leader has answered, however long that takes.
 
-        Once granted it is protected for `min_runtime` seconds (default: the fleet's, 60), and held until somebody of
-        equal or higher priority waits for what it holds; without `keep`, it ends when they are over.
+        Once granted, the hold is protected for `min_runtime` seconds (default: the fleet's, 60), and continues
+        until a request of equal or higher priority waits for one of its devices. With `keep=False` it ends after
+        `min_runtime`.
 
-        A need names an RC, or is a pattern that any one RC meets: `framegrabber/*`; `framegrabber/*#2` is one
-        more. With `estimate` its notices say when it will start. `direct`: its program touches devices past their RCs;
-        see `direct_hold`. The `comment` is shown to others. What can never start is refused at once: a parameter that
-        its RC does not know, more of one than that ever carries, and, unless it is to `wait_for_device` (default:
-        `waits_for_devices`), a need that nobody knows. With a `booking`, by its id, it takes that up, whose needs and
-        priority it has (`BookingsClient.terms`), and waits for its next date. It `continues` this client's ARC of that
-        name, which holds less at a lower priority: where it takes over all RCs of that one in one step, their devices
-        are not made safe in between. Raises RequestRefused where the request can't be taken as it is, ValueError for
-        too long a comment.
+        `needs` maps each need to its parameters: `{"robot/scout33": {}}`. A need is a device, or a pattern that
+        any one matching device satisfies: `framegrabber/*`, and `framegrabber/*#2` for one more.
 
-        An ARC of this name and these needs that another client hands over is returned instead, as it is."""
+        - `estimate`: the returned request has an estimated start.
+        - `direct`: the program also reaches its devices past zscout; `zscout.hold(direct=True)` handles what
+          follows.
+        - `comment`: shown to other people.
+        - `wait_for_device`: wait for an unknown device instead of raising (default: `waits_for_devices`).
+        - `booking`: the id of a booking to take up. The request has its needs and priority
+          (`BookingsClient.terms`), and waits for its next date.
+        - `continues`: the name of this client's request whose hold this one replaces. It must hold less, at a
+          lower priority. If all its devices pass over in one step, they are not made safe in between.
+
+        If another client is handing over a request of this name and these needs, that request is returned.
+
+        Raises RequestRefused if the request can never be granted as it is, ValueError if the comment is too long."""
         wanted = amounts(needs)
         who = replace(self.who or Who(), comment=checked_comment(comment)) if comment else self.who
         arc = await self.internals.claim(check_name(name, "arc"), wanted)
@@ -209,17 +220,16 @@ class Client:
         return self.waits_for_devices if wait_for_device is None else wait_for_device
 
     async def changed(self, arc: OpenArc) -> None:
-        """Waits until there is news of `arc`."""
+        """Wait for the next change of the request `arc`."""
         await self._store.changed(arc)
 
     async def granted(self, arc: OpenArc, *, confirmed: bool = False) -> Grant | None:
-        """Waits until `arc` is granted; None if it ended instead. Its RCs are asked beside whether they know of it, and
-        if not, it is taken away again: `arc` has no grant then, and waits for another one.
+        """Wait until the request `arc` is granted. Return None if it ended instead.
 
-        With `confirmed`, and for a direct request, it waits until all RCs have confirmed it, which they do once they
-        have settled; raises CommandRefused where one refuses it for a reason that waiting does not mend.
-
-        Nothing is entered while the client is paused, nor is what it hands over reported as ended."""
+        Its devices are asked at the same time whether they know of the grant. If one does not confirm it within a
+        second, the grant is withdrawn and the request waits again. With `confirmed`, and for a direct request,
+        return only when all devices have confirmed the grant, which they do once they are ready. Raises
+        CommandRefused if a device refuses it for a reason that does not pass with time."""
         while True:
             await self._store.resumed.wait()
             if not arc.open:
@@ -239,12 +249,12 @@ class Client:
                 raise confirmation.refused
 
     async def end(self, arc: OpenArc) -> None:
-        """Gives back a hold, or takes a request out of the queue. Returns when the RCM has answered, or has been told a
-        few times."""
+        """Give back a hold, or take a request out of the queue. Return when the leader has answered, or after a few
+        tries."""
         await self.internals.end(arc)
 
     async def hand_over(self, arc: OpenArc, to: Sender) -> None:
-        """Lets one ARC, queued or running, go on in another client. Raises RequestRefused."""
+        """Pass one request, queued or running, to the client `to`. Raises RequestRefused."""
         reply = await self._rcm.query(messages.HandOver(id=arc.id, to=str(to)))
         if reply is None or reply.message is None:
             unknown = Problem("unknown", "the RCM did not answer; ask how the ARC stands")
@@ -255,8 +265,9 @@ class Client:
     async def state(
         self, arc: str | None = None, *, forecast: bool = False, timeout: float = QUERY_TIMEOUT
     ) -> RcmState | None:
-        """The RCM's state, with the history of `arc` if one is named, and with a `forecast` of when those who
-        wait will start; None if no RCM answered."""
+        """Return the leader's state: what is held and what waits. None if no leader answered in `timeout` seconds.
+
+        With `arc`, the state includes the history of that request; with `forecast`, the estimated starts."""
         asked = messages.StateAsk(arc=arc, forecast=forecast)
         reply = await self.mesh.ask_one(self.mesh.keys.rcm_state, asked, RcmState, timeout=timeout)
         return reply.message if reply is not None else None
@@ -271,7 +282,9 @@ class Client:
         keep: bool = True,
         wait_for_device: bool | None = None,
     ) -> Foresight | None:
-        """What would come of a request, without making it; None if no RCM answered. Raises RequestRefused."""
+        """Return what a request would lead to, without making it. None if no leader answered.
+
+        Takes what `request` takes. Raises RequestRefused."""
         seconds = self._protected(min_runtime)
         waits, wanted = self._waits(wait_for_device), amounts(needs)
         asked = messages.Foresee(
@@ -286,8 +299,11 @@ class Client:
     async def command(
         self, rc: str, grant: Grant, do: Mapping[str, Any], *, ttl: float = 1.0, timeout: float = 2.0
     ) -> Done:
-        """Has an RC do something under `grant`. An RC that may not know of it yet, or settles, has `ttl` seconds to
-        confirm it. Raises CommandRefused."""
+        """Have the device `rc` carry out a command under `grant`, and return its answer: `result` is what it
+        returned.
+
+        A device that does not know of the grant yet, or is not ready yet, has `ttl` seconds to become so. Waits
+        `timeout` seconds for the answer. Raises CommandRefused."""
         began = self.mesh.now()
         try:
             return await self._command(rc, grant, do, ttl=ttl, timeout=timeout)

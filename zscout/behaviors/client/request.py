@@ -20,7 +20,7 @@ Needs = Mapping[str, Mapping[str, Any]]
 
 
 class RequestRefused(Exception):
-    """The RCM will not take this request as it is; the message says why, `code` is the protocol's."""
+    """The request was refused. The message is the reason; `code` is one of the codes of the protocol."""
 
     def __init__(self, problem: Problem) -> None:
         super().__init__(problem.message)
@@ -28,11 +28,12 @@ class RequestRefused(Exception):
 
 
 class NoRcm(Exception):
-    """No RCM is on the mesh; the message says what to look at."""
+    """No leader is on the mesh; the message says what to check."""
 
 
 class CommandRefused(Exception):
-    """An RC did not obey; `code` is the protocol's, or `unknown` where no answer came."""
+    """A device refused a command. `rc` names it, `code` is one of the codes of the protocol, or `unknown` if no
+    answer came."""
 
     def __init__(self, rc: str, problem: Problem) -> None:
         super().__init__(f"{rc}: {problem.message}")
