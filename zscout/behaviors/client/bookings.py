@@ -91,7 +91,7 @@ class BookingsClient:
 
         - `every`: repeat it every so many days, at the same hour in the zone of `start`, whose zone must be a
           `ZoneInfo`.
-        - `until`: the last day of the series, at most a year from now.
+        - `until`: repeat it no later than this, at most a year from now.
         - `maintenance`: keep the devices free of holders. Needs the rights of an operator.
 
         Raises RequestRefused, with `code` `not_free` if a device is taken; RcmSilent if no leader answers;

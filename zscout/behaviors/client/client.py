@@ -57,15 +57,14 @@ class Client:
 
     def __init__(self, mesh: Mesh, fleet: Fleet) -> None:
         self.mesh, self.fleet = mesh, fleet
-        # What zscout's own modules use beside the rest of this class; it may change at any time.
+        # For zscout's own modules; may change without notice.
         self.internals = own = ClientInternals(mesh, fleet, self._command, self._on_notice)
         self._store, self._rcm, self._supervisor = own.store, own.rcm, own.supervisor
         self._confirmations = own.confirmations
         self.who: Who | None = None
-        """Who asks, as other people are told: user, host and command. `connect` fills it in."""
+        """User, host and command, shown to other people. `connect` sets it."""
         self.waits_for_devices = False
-        """What a request does that does not say `wait_for_device`: whether a need that nobody knows is waited for
-        instead of refused."""
+        """Default of the argument `wait_for_device`."""
         self._commanded = itertools.count(1)
         self._denied: set[Grant] = set()
         """Grants that an RC says are over, and no notice yet."""
@@ -167,6 +166,9 @@ class Client:
         continues: str = "",
     ) -> OpenArc:
         """Request devices, and return when the leader has answered, however long that takes.
+
+        The result is passed to the other methods. Its `state` is `queued`, `running` or `ended`; it has a `reason`, and
+        while it runs a `grant` and its `rcs`.
 
         Once granted, the hold is protected for `min_runtime` seconds (default: the fleet's, 60), and continues
         until a request of equal or higher priority waits for one of its devices. With `keep=False` it ends after

@@ -40,7 +40,7 @@ class CommandRefused(Exception):
         self.rc, self.problem = rc, problem
         self.code, self.message = problem.code, problem.message
         self.left = problem.left
-        """With `settling`: the seconds for which the RC may go on to settle."""
+        """With `code` `settling`: seconds, at most, until the device is ready."""
 
 
 class HoldEnd(NamedTuple):

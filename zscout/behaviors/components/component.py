@@ -53,7 +53,9 @@ class ComponentContext:
 
     def __init__(self, client: Client, component: str, incarnation: int, gate: SafePointGate) -> None:
         self.client = client
+        """A connected `zscout.Client`."""
         self.component = component
+        """The component's name."""
         self.incarnation = incarnation
         """The number of this start of the component."""
         self._gate = gate
