@@ -11,7 +11,14 @@ from click.testing import CliRunner
 
 from zscout.cli.main import main
 
+ARC: Final = '[[arc]]\nname = "a"\nat = {}\npriority = 1\nmin_runtime = 1\n[arc.needs]\n{}'
+NEEDS: Final = '"robot/a" = {}'
 FILES: Final = {
+    "work.toml": f'[[rc]]\nname = "robot/a"\n{ARC.format(0, NEEDS)}',
+    "torn.toml": "[[rc",
+    "early.toml": ARC.format(-1, NEEDS),
+    "nan.toml": ARC.format("nan", NEEDS),
+    "needless.toml": ARC.format(0, ""),
     "bad.toml": "[fleet]\nnam = 1\n",
     "node.toml": '[[rc]]\nname = "robot/a"\ndriver = "robot"\n',
     "not.rrd": "no recording",
@@ -119,6 +126,20 @@ view --port 0 | 0 is not in the range
 replay none.toml | none.toml: there is no such file
 replay bad.toml | bad.toml: fleet: unknown key; known here: arc, rc
 replay none.toml --strategy best | 'best' is not one of 'priority'
+replay work.toml --rrd picture.png | end it in .rrd
+replay work.toml --rrd no/such/folder/x.rrd | can't write the recording
+replay torn.toml | torn.toml: line 1
+replay early.toml | early.toml: arc[0].at
+replay nan.toml | nan.toml: arc[0].at
+replay needless.toml | needless.toml: arc[0].needs (a): an ARC needs at least one RC
+simulate | which building? name one of living_room, office, random:SEED, or a file
+simulate castle | there is no building "castle"; name one of living_room, office
+simulate castle.toml | castle.toml
+simulate random:x | write random: and a number
+simulate living_room --http nowhere | write HOST:PORT, as in
+simulate living_room --http 127.0.0.1:99999 | write HOST:PORT, as in
+simulate living_room --radio /dev/null | /dev/null: is there already; give another name
+simulate living_room --node /no/such/folder/lab.toml | can't be written
 simulate office --speed 0 | 0.0 is not in the range
 demo nothing | No such command 'nothing'
 demo table1 --out picture.png | let it end in .rrd

@@ -115,6 +115,7 @@ def machine(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mach
         yield machine
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_a_node_does_all_that_it_does_as_its_unit_has_it(machine: Machine, lab: Lab, tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
@@ -157,6 +158,7 @@ def test_a_node_does_all_that_it_does_as_its_unit_has_it(machine: Machine, lab: 
     assert machine.path("/var/lib/zscout/safe").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_reload_goes_on_and_a_bad_file_is_told(machine: Machine) -> None:
     machine.write("/etc/zscout/node.toml", SMALL)
@@ -169,6 +171,7 @@ def test_reload_goes_on_and_a_bad_file_is_told(machine: Machine) -> None:
     machine.until("zscout-node", ActiveState="active", SubState="running", NRestarts="0", **pid)
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_a_frozen_node_is_started_anew_and_one_with_a_bad_file_is_not(machine: Machine) -> None:
     drop_in = "[Service]\nWatchdogSec=8\nTimeoutAbortSec=1\nExecStopPost=sh -c 'echo ended: $SERVICE_RESULT'\n"
@@ -191,6 +194,7 @@ def test_a_frozen_node_is_started_anew_and_one_with_a_bad_file_is_not(machine: M
     machine.until("zscout-node", ActiveState="inactive", Result="success", ExecMainStatus="0")
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_a_certificate_that_ends_soon_is_among_what_failed(machine: Machine, tmp_path: Path) -> None:
     machine.run("systemctl", "start", "zscout-cert-renew")  # a host of a plain mesh has none
@@ -211,6 +215,7 @@ def test_a_certificate_that_ends_soon_is_among_what_failed(machine: Machine, tmp
     assert "ends soon: renew it" in machine.log()
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_the_sample_relay_joins_two_sites_as_its_unit_has_it(machine: Machine, tmp_path: Path) -> None:
     endpoint = f"tls/127.0.0.1:{free_port()}"

@@ -27,17 +27,29 @@ from tests.drivers.rcs import (
 )
 from tests.hang import HANG
 from tests.mesh.kit import until
-from zscout.drivers.confirm_server import CommandQuery
+from zscout.drivers.confirm_server import CommandQuery, ConfirmServer
 from zscout.drivers.holds import HoldChange
 from zscout.drivers.repeated import MAX_HOSTS, MAX_PER_HOST, MAX_WAITING, CommandMemory
 from zscout.drivers.resource_controller import SAY_AGAIN, ResourceController
 from zscout.drivers.work_queue import COMMANDS_PER_HOST, EARLY_PER_HOST, WorkQueue
 from zscout.keyexpr import Role, Sender
 from zscout.mesh import IncomingQuery, Mesh, Refused
-from zscout.messages import Command, Done, Grants, Holder, Malformed, RcAsk, RcmState, RcState
+from zscout.messages import (
+    Command,
+    Confirm,
+    Confirmed,
+    Done,
+    Grants,
+    Holder,
+    Malformed,
+    Problem,
+    RcAsk,
+    RcmState,
+    RcState,
+)
 from zscout.testing.link import Disturbance
 from zscout.testing.memory import MemoryMesh, MemoryNetwork
-from zscout.types import SECOND
+from zscout.types import SECOND, Grant, Term
 
 
 @asynccontextmanager
@@ -93,8 +105,7 @@ async def test_what_goes_on_in_another_hold_is_neither_ended_nor_made_safe(kind:
     for one, calls in (warm, 1), (turn, 2), (moved, 3), (holder(4, "last", "h/other"), 6):
         rcm.publish(one)
         await until(lambda: len(device.calls) >= calls)  # noqa: B023 - awaited here
-    assert device.calls == expected
-    assert await answer(client, turn.grant) == "ended"
+    assert (device.calls, await answer(client, turn.grant)) == (expected, "ended")
     await close(rc, rcm.mesh, client)
 
 
@@ -121,8 +132,7 @@ async def test_the_safe_state_goes_before_commands_that_wait() -> None:
         waiting = [asyncio.create_task(answer(client, grant(1))) for _ in range(5)]
         await asyncio.sleep(0.1)
         rcm.publish(holder(2, "two"))
-        assert await slow == "done"
-        assert {await task for task in waiting} == {"ended"}
+        assert (await slow, {await task for task in waiting}) == ("done", {"ended"})
         assert device.calls == ["begin one", "slow", "end one", "safe", "begin two"]
 
 
@@ -202,8 +212,7 @@ async def test_a_hold_ends_when_no_rcm_was_heard_for_the_lease() -> None:
         await until(lambda: device.calls[-1] == "safe")
         assert abs(rcm.mesh.now() - begun - LEASE * SECOND) < 0.1 * SECOND
         await until(lambda: ended == ["lease"])
-        assert await answer(client, grant(1)) == "ended"
-        assert rc.health == "ok"
+        assert (await answer(client, grant(1)), rc.health) == ("ended", "ok")
 
 
 @pytest.mark.parametrize("where", ["begin two", "safe"])
@@ -361,12 +370,10 @@ async def test_who_missed_that_an_rc_works_again_hears_it_later() -> None:
 
 async def test_a_publication_of_an_older_term_is_answered_by_the_state() -> None:
     async with play() as (_rcm, _rc, _device, client):
-        states = states_published(client)
-        old = type(TERM)(1, "old")
+        states, old = states_published(client), type(TERM)(1, "old")
         client.publisher(client.keys.grants, Grants).put(Grants(term=old, seq=9, prev=8, every=0.5))
         await until(lambda: bool(states))
-        assert states[0].term == TERM
-        assert await answer(client, grant(1), dict(ECHO)) == "done"
+        assert (states[0].term, await answer(client, grant(1), dict(ECHO))) == (TERM, "done")
 
 
 @pytest.mark.parametrize(
@@ -434,23 +441,16 @@ def test_what_was_set_aside_comes_back_before_other_commands_in_its_order() -> N
     assert queue.put_command(query("late"), "host")
     assert queue.commands == 4
     queue.resume(lambda command: cast("str", command) != "two")
-    assert queue.drop_early() == [query("two")]
-    assert queue.commands == 3
+    assert (queue.drop_early(), queue.commands) == ([query("two")], 3)
     assert drained(queue, 3) == ["one", "three", "late"]
 
 
-def test_one_host_can_not_fill_what_is_set_aside() -> None:
-    queue = WorkQueue()
-    assert all(queue.set_aside(query(str(number)), "stranger") for number in range(EARLY_PER_HOST))
-    assert not queue.set_aside(query("more"), "stranger")
-    assert queue.set_aside(query("mine"), "host")
-
-
-def test_one_host_can_not_fill_the_queue() -> None:
-    queue = WorkQueue()
-    assert all(queue.put_command(query(str(number)), "stranger") for number in range(COMMANDS_PER_HOST))
-    assert not queue.put_command(query("more"), "stranger")
-    assert queue.put_command(query("mine"), "host")
+@pytest.mark.parametrize("take", ["set_aside", "put_command"])
+def test_one_host_can_not_fill_the_queue_or_what_is_set_aside(take: str) -> None:
+    put, limit = getattr(WorkQueue(), take), EARLY_PER_HOST if take == "set_aside" else COMMANDS_PER_HOST
+    assert all(put(query(str(number)), "stranger") for number in range(limit))
+    assert not put(query("more"), "stranger")
+    assert put(query("mine"), "host")
 
 
 def test_who_waits_is_woken() -> None:
@@ -484,3 +484,42 @@ async def test_what_its_driver_declares_amiss_is_told_before_anybody_is_offered_
 
     with pytest.raises(Malformed):
         await started(MemoryNetwork(), Amiss())
+
+
+# One question to all RCs of a process, and to two processes of one host
+
+GRANT = Grant(Term(1, "a"), 2)
+BUSY = Refused("busy", "ask again")
+
+
+async def test_each_rc_answers_for_itself_and_nothing_is_said_of_others() -> None:
+    network = MemoryNetwork()
+    server, other = (ConfirmServer(network.open("f", Sender("bench", name))) for name in ("node", "drivers"))
+    client = network.open("f", Sender("desk", "one"))
+    asked: list[CommandQuery] = []
+
+    def refuse(_: CommandQuery) -> None:
+        raise BUSY
+
+    for rc, take in (("robot/a", asked.append), ("robot/b", asked.append), ("robot/c", refuse)):
+        server.serve(rc, take)
+    gone = server.serve("robot/gone", asked.append)
+    gone.close()
+    other.serve("radio/r", lambda query: query.answer(Done(warming=2.0)))
+    rcs = ["robot/a", "robot/b", "robot/a", "robot/c", "robot/gone", "robot/foreign", "radio/r"]
+    key = client.keys.confirm("bench", client.me)
+    asking = asyncio.create_task(client.ask(key, Confirm(GRANT, rcs, ttl=0.5), Confirmed, timeout=1))
+    await asyncio.sleep(0.1)
+    for query in asked:
+        assert (query.message.grant, query.message.do, query.message.ttl) == (GRANT, {"name": "confirm"}, 0.5)
+        assert client.keys.sender_of(query.key) == client.me
+    first, second = asked
+    second.refuse(Problem("settling", "it settles", left=1.0))
+    await asyncio.sleep(0.1)
+    assert not asking.done()
+    first.answer(Done(settle=5.0))
+    first.answer(Done(settle=9.0))
+    replies = [reply.message for reply in await asking]
+    assert Confirmed({"radio/r": Done(warming=2.0)}) in replies
+    settles = {"robot/b": Problem("settling", "it settles", left=1.0), "robot/c": BUSY.problem}
+    assert Confirmed({"robot/a": Done(settle=5.0)}, settles) in replies

@@ -115,11 +115,11 @@ async def test_the_next_holder_waits_until_the_program_of_a_direct_hold_has_left
     async with play() as at:
         at.next_holder()
         refused = await at.refusal(2)
-        assert (refused.code, refused.left) == ("settling", pytest.approx(LEASE + SETTLE, abs=0.1))
+        assert refused.code == "settling"
+        assert refused.left == pytest.approx(LEASE + SETTLE, abs=0.1)
         assert await at.word(at.other, 2, ECHO) == "settling"
         assert at.device.calls == ["begin one", "end one", "safe"]
-        assert await at.word(at.client, 1, LEFT) == "done"
-        assert await at.word(at.other, 2) == "done"
+        assert (await at.word(at.client, 1, LEFT), await at.word(at.other, 2)) == ("done", "done")
         # What the program did to the device past its RC since is undone before the next holder begins.
         assert at.device.calls == ["begin one", "end one", "safe", "safe", "begin next"]
 
@@ -155,8 +155,7 @@ async def test_left_before_the_end_settles_nothing_unless_it_is_confirmed_again(
         at.next_holder()
         assert await at.settled_after() < 0.1
         at.rcm.publish(direct(3))
-        assert await at.word(at.client, 3) == "done"
-        assert await at.word(at.client, 3, LEFT) == "done"
+        assert (await at.word(at.client, 3), await at.word(at.client, 3, LEFT)) == ("done", "done")
         assert await at.word(at.client, 3) == "done"
         at.next_holder(4)
         assert await at.settled_after(4) > LEASE
@@ -230,8 +229,7 @@ async def test_a_hand_over_does_not_settle_and_who_took_over_does() -> None:
         assert await at.settled_after() < 0.1
         at.rcm.publish(holder(3, NEXT, "h/client"))
         assert await at.word(at.client, 3) == "settling"
-        assert await at.word(at.other, 2, LEFT) == "done"
-        assert await at.word(at.client, 3) == "done"
+        assert (await at.word(at.other, 2, LEFT), await at.word(at.client, 3)) == ("done", "done")
         assert at.device.calls == ["begin one", "begin one", "end one", "safe", "safe", "begin next"]
 
 
@@ -244,11 +242,9 @@ async def test_who_held_before_goes_on_and_only_who_began_after_waits() -> None:
         at.rcm.publish(direct(1), holder(2, "two", "h/other"))
         assert await at.word(at.client, 1) == "done"
         at.rcm.publish(holder(2, "two", "h/other"), holder(3, NEXT, "h/client"))
-        assert await at.word(at.other, 2) == "done"
-        assert await at.word(at.other, 2, ECHO) == "done"
+        assert (await at.word(at.other, 2), await at.word(at.other, 2, ECHO)) == ("done", "done")
         assert await at.word(at.client, 3) == "settling"
-        assert await at.word(at.client, 1, LEFT) == "done"
-        assert await at.word(at.client, 3) == "done"
+        assert (await at.word(at.client, 1, LEFT), await at.word(at.client, 3)) == ("done", "done")
         assert "safe" not in at.device.calls
 
 
@@ -256,8 +252,7 @@ async def test_who_held_before_goes_on_and_only_who_began_after_waits() -> None:
 async def test_stop_and_halt_are_never_held_back(name: str) -> None:
     async with play() as at:
         at.next_holder()
-        assert await at.word(at.other, 2, {"name": name}) == "done"
-        assert at.device.calls[-1] == name
+        assert (await at.word(at.other, 2, {"name": name}), at.device.calls[-1]) == ("done", name)
 
 
 async def test_a_next_holder_whose_time_is_over_by_then_is_left_out_at_the_device() -> None:
@@ -288,7 +283,8 @@ async def test_whom_a_device_begins_for_does_not_enter_before_it_has_begun() -> 
         at.next_holder()
         await until(lambda: "begin next" in at.device.calls)
         refused = await at.refusal(2)
-        assert (refused.code, refused.left) == ("settling", pytest.approx(4, abs=0.1))
+        assert refused.code == "settling"
+        assert refused.left == pytest.approx(4, abs=0.1)
         assert refused.message == "robot/x is being started, for 4.0 s at most"
         assert await at.word(at.other, 2, ECHO) == "settling"
         assert await at.word(at.other, 2, {"name": "stop"}) == "done"

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from studies.overlap import Programs
 from tests.cli.cli_fleet import CliFleet, fleet_of
 from tests.cli.tools import end, read_until
 from tests.hang import HANG
-from tests.live.overlap import Programs
 from tests.thorough import times
 
 pytestmark = pytest.mark.live

@@ -151,7 +151,7 @@ def run(seed: int) -> World:
     return chaos.world
 
 
-@pytest.mark.parametrize("seeds", in_parts(range(times(400)), quick=150, size=250))
+@pytest.mark.parametrize("seeds", in_parts(range(times(400)), quick=100, size=300))
 def test_whatever_happens_one_incarnation_of_each_component_runs_in_the_end(seeds: Sequence[int]) -> None:
     for seed in seeds:
         try:

@@ -24,6 +24,9 @@ from dataclasses import dataclass, field
 from random import Random
 from typing import Any
 
+from msgspec.structs import replace
+
+from tests.placement.test_balancer import report
 from tests.transcripts import ns, seconds, settings
 from zscout import messages
 from zscout.config.fleet import PlacementPolicy
@@ -122,22 +125,12 @@ class PlacerPlayer:
 
     def report(self, host: HostName) -> None:
         known = self.reports[host]
-        load = float(known.get("load", 0))
         memory = int(known.get("memory", 4_000)) * MEGABYTE
-        self.balancer.reported(
-            self.now,
-            messages.LoadReport(
-                host=host,
-                number=self.number,
-                cores=float(known.get("cores", 1)),
-                load_average=(load, load, load),
-                cpu=0.0,
-                memory_available=memory,
-                memory_total=2 * memory,
-                speed=float(known.get("speed", 1)),
-                labels=tuple(_names(known.get("labels"))),
-            ),
+        figures = {key: float(known.get(key, 1)) for key in ("cores", "speed")}
+        told = report(
+            host, self.number, float(known.get("load", 0)), labels=tuple(_names(known.get("labels"))), **figures
         )
+        self.balancer.reported(self.now, replace(told, memory_available=memory, memory_total=2 * memory))
 
     def event(self, verb: str, words: Sequence[str]) -> PlacerEvent | None:
         match verb, *words:

@@ -74,6 +74,16 @@ def instant(core: Core, now: Ns, workload: Workload, events: list[Event]) -> Non
     assert sum(1 for _ in islice(passes, MANY_PASSES)) < MANY_PASSES, "the instant never ends"
 
 
+def searched(core: Core, *events: Event) -> list[Effect]:
+    """All effects of an instant in which no RC votes."""
+    passes = islice(play_instant(core, 0, events or [Tick()], unasked), MANY_PASSES)
+    return [effect for effects in passes for effect in effects]
+
+
+def unasked(question: Propose) -> Vote:
+    raise AssertionError(question)
+
+
 def in_use(core: Core, now: Ns) -> Counter[int]:
     """(ARC, RC) pairs by priority, but for those past their minimum runtime."""
     pairs: Counter[int] = Counter()
@@ -205,11 +215,7 @@ def test_an_arc_that_ends_during_the_search_is_not_started() -> None:
     core.handle(0, *map(Requested, experiment(2, 300, 600)))
     core.handle(0, Tick())
     core.handle(0, *(Cancelled(f"a{number}") for number in range(0, 600, 2)))
-    effects = core.handle(0, Tick())
-    for _ in range(MANY_PASSES):
-        if not wants_more(0, effects):
-            break
-        effects = core.handle(0, Tick())
+    searched(core)
     validate(core)
     assert core._state.running
     assert all(int(one[1:]) % 2 for one in core._state.running)
@@ -253,11 +259,7 @@ def test_a_veto_brings_the_next_best() -> None:
 def test_the_outcome_is_the_same_every_time() -> None:
     def run() -> list[Effect]:
         core = free(100)
-        told = core.handle(0, *map(Requested, experiment(5, 100, 200)))
-        effects = told
-        while wants_more(0, effects):
-            effects = core.handle(0, Tick())
-            told += effects
+        told = searched(core, *map(Requested, experiment(5, 100, 200)))
         return [effect for effect in told if isinstance(effect, (Granted, HoldEnded, Propose))]
 
     assert run() == run()

@@ -21,18 +21,6 @@ def request(arc: str, *rcs: str, priority: int = 0, seconds: int = 1, keep: bool
     return ArcRequest(arc, "test/" + arc, {rc: {} for rc in rcs}, priority, seconds * SECOND, keep)
 
 
-def test_a_queue_is_foretold_in_its_order() -> None:
-    core = Core()
-    core.handle(0, RcJoined("robot/a", sharable=False))
-    core.handle(0, Requested(request("first", "robot/a", seconds=5)))
-    core.handle(1 * SECOND, Requested(request("long", "robot/a", seconds=4)))
-    core.handle(2 * SECOND, Requested(request("short", "robot/a", seconds=3)))
-    core.handle(2 * SECOND, Requested(request("never", "robot/b")))
-    foretold = forecast(core, 3 * SECOND)
-    assert foretold.starts == {"short": 5 * SECOND, "long": 8 * SECOND}
-    assert not foretold.preempts
-
-
 def test_a_newcomer_is_told_whom_it_would_preempt_and_the_core_is_not_touched() -> None:
     core = Core()
     core.handle(0, RcJoined("robot/a", sharable=False), RcJoined("robot/b", sharable=False))

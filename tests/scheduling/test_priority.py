@@ -67,15 +67,13 @@ class SlowPlayer:
         effects = self.core.handle(now, *events)
         self.ledger.take(now, self.core, effects)
         for effect in effects:
-            match effect:
-                case Propose():
-                    self.out.append(effect)
-                case Granted(arc=arc):
-                    self.open[arc] = effect
-                case HoldEnded(arc=arc, outcome=outcome, rcs=rcs):
-                    self.holds.append(HoldRecord(arc, self.open.pop(arc).start, now, outcome, rcs))
-                case _:
-                    pass
+            if isinstance(effect, Propose):
+                self.out.append(effect)
+            elif isinstance(effect, Granted):
+                self.open[effect.arc] = effect
+            elif isinstance(effect, HoldEnded):
+                start = self.open.pop(effect.arc).start
+                self.holds.append(HoldRecord(effect.arc, start, now, effect.outcome, effect.rcs))
 
 
 @pytest.mark.essential

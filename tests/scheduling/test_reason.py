@@ -105,9 +105,7 @@ def test_who_blocks_whom_comes_first_and_choices_are_named_as_such(
 
 def test_to_whom_it_was_lost_and_why_is_told_once() -> None:
     preempted = Reason(ReasonCode.PREEMPTED, by=(TAKE,))
-    assert ended("preempted", str(preempted)) == (
-        "preempted by bob@ws2 (zscout take), priority 10: the gripper is stuck"
-    )
+    assert ended("preempted", str(preempted)) == "preempted by bob@ws2 (zscout take), priority 10: the gripper is stuck"
     displaced = Reason(ReasonCode.DISPLACED, by=(TAKE,))
     assert ended("completed", str(displaced)) == (
         "completed: its minimum runtime is over and bob@ws2 (zscout take), priority 10, needs its RCs: "

@@ -178,11 +178,11 @@ def test_what_was_learned_ends_no_hold_and_touches_no_decision(workload: Workloa
 
     def watch(now: Ns, core: Core, effects: list[Effect]) -> None:
         for effect in effects:
-            match effect:
-                case Granted(arc=arc, start=start):
-                    since[arc] = start
-                case HoldEnded(arc=arc, outcome=outcome):
-                    estimator.observe(Wish.of(requests[arc]), now - since[arc], whole=outcome in SERVED)
+            if isinstance(effect, Granted):
+                since[effect.arc] = effect.start
+            elif isinstance(effect, HoldEnded):
+                lasted = now - since[effect.arc]
+                estimator.observe(Wish.of(requests[effect.arc]), lasted, whole=effect.outcome in SERVED)
         told = forecast(core, now, runtimes=estimator)
         assert all(start >= now for start in told.starts.values())
 

@@ -160,12 +160,6 @@ def test_times_are_exact() -> None:
     assert held == [("one", 100_000_000, 300_000_000), ("two", 300_000_000, 1_000_000_000)]
 
 
-def test_an_arc_that_needs_an_unknown_rc_is_unserved() -> None:
-    result = replay(parse_workload(RC + arc("here") + arc("gone", needs='{"robot/b" = {}}'), "w"))
-    assert [hold.arc for hold in result.holds] == ["here"]
-    assert result.unserved == ("gone",)
-
-
 def test_an_empty_file_is_an_empty_workload() -> None:
     assert parse_workload("", "w") == Workload((), ())
 

@@ -57,16 +57,6 @@ def test_what_can_not_be_is_refused(at: str, every: int | None, until: str | Non
         asked(at, every, until)
 
 
-def test_hours_that_a_day_has_not_or_twice_are_told() -> None:
-    assert asked("2026-12-01 14:00").remarks() == []
-    [note] = asked("2027-03-28 02:30").remarks()
-    assert note.endswith("03:30 is taken")
-    summer = datetime(2026, 10, 20, 12, 0, tzinfo=BERLIN).timestamp()
-    twice, never = asked("2026-10-21 02:30", 1, now=summer).remarks()
-    assert twice.startswith("2026-10-25 02:30 comes twice in Europe/Berlin")
-    assert never.startswith("2027-03-28 02:30 does not exist")
-
-
 def test_a_year_of_days_is_told_in_a_moment() -> None:
     # In the time that this process ran.
     began = time.process_time()

@@ -21,6 +21,7 @@ from urllib.parse import parse_qs, urlsplit
 import psutil
 import pytest
 
+from tests.cli.cli_fleet import in_lab
 from tests.cli.tools import COMMAND, zscout_here
 from tests.hang import HANG
 from tests.live.lab import Lab
@@ -199,28 +200,25 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
 
 @pytest.mark.slow
 @pytest.mark.live
-def test_where_a_node_of_this_host_records_its_recording_is_shown(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            port = free_port()
-            lab.node("anvil", "robot/a", extra=f'[recorder]\npath = "runs"\nport = {port}')
-            client = await lab.client("program")
-            await lab.ready(client, "robot/a")
-            await lab.living(client, Role.RECORDER, lambda hosts: hosts == ["anvil"])
-            options = ("--web", "--json", "--out", tmp_path / "out", "--past", "1h")
-            with viewing(tmp_path, *options, env=lab.env) as process:
-                said = await asyncio.to_thread(said_as_json, tmp_path, process)
-                assert said["live"] == f"rerun+http://127.0.0.1:{port}/proxy"
-                assert [Path(said["file"])] == list((tmp_path / "runs").glob("*.rrd"))
-                assert "--past: a node records" in (tmp_path / "view.log").read_text()
-                # No second recorder was started.
-                assert [child.name() for child in descendants(process)] == ["rerun"]
-                assert not (tmp_path / "out").exists()
-                process.send_signal(signal.SIGINT)
-                assert await asyncio.to_thread(process.wait, HANG) == 130
-            assert listens(said["live"])
-
-    asyncio.run(story())
+@in_lab()
+async def test_where_a_node_of_this_host_records_its_recording_is_shown(lab: Lab) -> None:
+    port = free_port()
+    lab.node("anvil", "robot/a", extra=f'[recorder]\npath = "runs"\nport = {port}')
+    client = await lab.client("program")
+    await lab.ready(client, "robot/a")
+    await lab.living(client, Role.RECORDER, lambda hosts: hosts == ["anvil"])
+    options = ("--web", "--json", "--out", lab.folder / "out", "--past", "1h")
+    with viewing(lab.folder, *options, env=lab.env) as process:
+        said = await asyncio.to_thread(said_as_json, lab.folder, process)
+        assert said["live"] == f"rerun+http://127.0.0.1:{port}/proxy"
+        assert [Path(said["file"])] == list((lab.folder / "runs").glob("*.rrd"))
+        assert "--past: a node records" in (lab.folder / "view.log").read_text()
+        # No second recorder was started.
+        assert [child.name() for child in descendants(process)] == ["rerun"]
+        assert not (lab.folder / "out").exists()
+        process.send_signal(signal.SIGINT)
+        assert await asyncio.to_thread(process.wait, HANG) == 130
+    assert listens(said["live"])
 
 
 def test_a_recording_of_another_host_is_not_taken_for_one_of_this_host(tmp_path: Path) -> None:
@@ -243,6 +241,7 @@ def test_a_recording_of_another_host_is_not_taken_for_one_of_this_host(tmp_path:
     assert reached() is None
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_a_live_view_as_json(tmp_path: Path) -> None:
     lab = Lab(tmp_path)

@@ -52,6 +52,7 @@ def test_anything_but_a_yes_takes_nothing(fleet: CliFleet, answer: str) -> None:
     end(survey)
 
 
+@pytest.mark.slow
 def test_without_a_terminal_it_needs_yes(fleet: CliFleet) -> None:
     survey = fleet.holder("survey", "robot/a")
     refused = fleet.zscout("take", "robot/a", stdin="y\n")

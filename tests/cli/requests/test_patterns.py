@@ -82,6 +82,7 @@ def test_who_waits_hears_who_has_all_that_match_and_gets_the_first(fleet: CliFle
     assert fleet.idle(F1, F2, ANY)
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_in_a_pipe_and_at_a_terminal_those_in_the_way_are_named_once(fleet: CliFleet) -> None:
     first, robot = fleet.holder("first", F1), fleet.holder("robot", "robot/a")
@@ -103,6 +104,7 @@ def test_in_a_pipe_and_at_a_terminal_those_in_the_way_are_named_once(fleet: CliF
     assert fleet.idle(F1, F2)
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_why_tells_of_all_that_match(fleet: CliFleet) -> None:
     first, second = fleet.holder("first", F1), fleet.holder("second", ANY)
@@ -141,6 +143,7 @@ def test_why_tells_of_all_that_match(fleet: CliFleet) -> None:
     assert fleet.idle(F1, F2, "radio/rf0")
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
     at_once = fleet.zscout("request", ANY, ANY, "--dry-run")

@@ -172,29 +172,6 @@ def test_a_building_is_drawn_by_its_seed() -> None:
     assert plan_named("random:3") != plan_named("random:4")
 
 
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        ((), "which building? name one of living_room, office, random:SEED, or a file"),
-        (("castle",), 'there is no building "castle"; name one of living_room, office'),
-        (("castle.toml",), "castle.toml"),
-        (("random:x",), "write random: and a number"),
-        (("living_room", "--http", "nowhere"), "write HOST:PORT, as in"),
-        (("living_room", "--http", "127.0.0.1:99999"), "write HOST:PORT, as in"),
-        (("living_room", "--radio", "/dev/null"), "/dev/null: is there already; give another name"),
-        (("living_room", "--node", "/no/such/folder/lab.toml"), "can't be written"),
-    ],
-)
-def test_what_cannot_be_served_is_said_in_one_line(
-    args: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert zscout_here("simulate", *args) == 2
-    said = capsys.readouterr()
-    assert words in said.err
-    assert said.err.count("\n") == 1
-    assert said.out == ""
-
-
 def test_a_port_in_use_is_said_so(closet: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"

@@ -26,8 +26,7 @@ from zscout.services.node.component_process import ComponentProcess
 from zscout.services.node.limits import ControlGroups
 from zscout.types import SECOND
 
-REAL_TIME = True
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.real_time]
 
 
 ODD = "tests.behaviors.components.odd:"

@@ -22,8 +22,7 @@ from zscout.services.notify.notices import Notification
 from zscout.services.notify.notifier import QUEUE, Notifier
 from zscout.types import SECOND
 
-REAL_TIME = True
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.real_time]
 
 WHERE = Where("anvil.toml", ("notify",))
 NEWS = Notification("preempted", "ada", "a title", "a body")

@@ -23,7 +23,7 @@ from zscout.services.recorder.process import RecorderJob, decode_job, encode_job
 from zscout.services.recorder.recorder import Recorder
 from zscout.services.recorder.timeline import Timeline
 
-REAL_TIME = True
+pytestmark = pytest.mark.real_time
 
 
 def test_how_many_pictures_a_recorder_takes_is_set_in_the_node_file(tmp_path: Path) -> None:

@@ -66,10 +66,14 @@ def with_opencv(url: str, count: int) -> list[Picture]:
         capture.release()
 
 
+def address(server: VideoServer) -> tuple[str, int]:
+    host, port = server.page.removeprefix("http://").rstrip("/").split(":")
+    return host, int(port)
+
+
 async def asked(server: VideoServer, request: bytes, *, ends: bool = False) -> bytes:
     """What the server answers to these bytes until it closes."""
-    host, port = server.page.removeprefix("http://").rstrip("/").split(":")
-    reader, writer = await asyncio.open_connection(host, int(port))
+    reader, writer = await asyncio.open_connection(*address(server))
     try:
         writer.write(request)
         with suppress(ConnectionError):
@@ -105,7 +109,7 @@ async def test_opencv_reads_two_channels_at_a_time(server: VideoServer) -> None:
 @served
 async def test_a_channel_is_watched_only_while_somebody_looks(server: VideoServer) -> None:
     assert server.watched == ()
-    reader, writer = await asyncio.open_connection(*server.page[7:-1].split(":"))
+    reader, writer = await asyncio.open_connection(*address(server))
     writer.write(get("/ch2"))
     await until(lambda: server.watched == ("ch2",))
     server.stall("ch2")
@@ -146,8 +150,7 @@ async def test_a_frame_that_never_comes_is_refused_in_the_end(
 async def test_who_does_not_read_holds_up_nobody_and_gets_the_newest_in_the_end(server: VideoServer) -> None:
     with socket.socket() as slow:
         slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        host, port = server.page[7:-1].split(":")
-        await asyncio.to_thread(slow.connect, (host, int(port)))
+        await asyncio.to_thread(slow.connect, address(server))
         slow.sendall(get("/ch1"))
         await until(lambda: server.watched == ("ch1",))
         noise = np.random.default_rng(1).integers(0, 255, (60, 60), np.uint8)
@@ -182,8 +185,7 @@ async def test_who_reads_nothing_for_long_is_cut_off(server: VideoServer, monkey
     monkeypatch.setattr(video_server, "SEND_TIME", 0.2)
     with socket.socket() as deaf:
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        host, port = server.page[7:-1].split(":")
-        await asyncio.to_thread(deaf.connect, (host, int(port)))
+        await asyncio.to_thread(deaf.connect, address(server))
         deaf.sendall(get("/ch1"))
         await until(lambda: server.watched == ("ch1",))
         async with Showing(server, "ch1", lambda: bytes(500_000)):
@@ -233,8 +235,7 @@ async def test_half_a_request_is_refused_when_it_ends_or_takes_too_long(
 
 @served
 async def test_more_clients_than_there_is_room_for_are_told_so(server: VideoServer) -> None:
-    host, port = server.page[7:-1].split(":")
-    many = [await asyncio.open_connection(host, int(port)) for _ in range(MAX_CLIENTS)]
+    many = [await asyncio.open_connection(*address(server)) for _ in range(MAX_CLIENTS)]
     for _, writer in many:
         writer.write(get("/ch1"))
     await until(lambda: server.clients == MAX_CLIENTS)
@@ -248,7 +249,7 @@ async def test_more_clients_than_there_is_room_for_are_told_so(server: VideoServ
 @in_real_time
 async def test_an_address_that_cannot_be_served_on() -> None:
     async with VideoServer(["ch1"]) as server:
-        port = int(server.page[:-1].rpartition(":")[2])
+        _, port = address(server)
         for host, number, words in (
             ("127.0.0.1", port, "in use"),
             ("192.0.2.1", 0, "choose another"),
@@ -261,7 +262,7 @@ async def test_an_address_that_cannot_be_served_on() -> None:
 @in_real_time
 async def test_the_server_ends_with_clients_that_stay() -> None:
     async with VideoServer(["ch1"]) as server:
-        _, writer = await asyncio.open_connection(*server.page[7:-1].split(":"))
+        _, writer = await asyncio.open_connection(*address(server))
         writer.write(get("/ch1"))
         await until(lambda: server.watched == ("ch1",))
     assert server.clients == 0

@@ -1,7 +1,7 @@
 """A fleet over two sites, whose hosts reach each other by a relay alone: what that costs, and whether a hold inside a
 site feels that the relay dies and comes back.
 
-    python -m tests.live.sites --merges 20 --frozen 5 --cut 5      (needs root, network namespaces, iproute2)
+    python -m studies sites --merges 20 --frozen 5 --cut 5      (needs root, network namespaces, iproute2)
 
 Two programs that hold and command devices of their own sites run through all merges. Exit code 0: none of them was
 disturbed; 1: else; 2: it can't run here."""
@@ -398,7 +398,7 @@ async def measure(asked: argparse.Namespace, folder: Path) -> bool:
 
 
 def main() -> int:
-    options = argparse.ArgumentParser(prog="python -m tests.live.sites", description=__doc__.partition("\n\n")[0])
+    options = argparse.ArgumentParser(prog="python -m studies sites", description=__doc__.partition("\n\n")[0])
     options.add_argument("--merges", type=int, default=20, help="so often the relay goes and comes back (20)")
     options.add_argument("--frozen", type=int, default=0, help="of these it is frozen, not killed (0)")
     options.add_argument("--cut", type=int, default=0, help="of these a site's line to it is cut (0)")
@@ -423,7 +423,3 @@ def main() -> int:
         return 1
     shutil.rmtree(folder, ignore_errors=True)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
