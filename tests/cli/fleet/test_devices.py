@@ -68,19 +68,19 @@ async def test_health_and_figures_of_devices(lab: Lab) -> None:
         ill_row = ["framegrabber/ill", "the lens is dirty", "frames_per_second=9.8, opened=3"]
 
         def plain(text: str) -> bool:
-            rows = {row[0]: row[1:] for row in section(text, "RCs")}
+            rows = {row[0]: row[1:] for row in section(text, "Devices")}
             return (
                 rows["framegrabber/ill"] == ["exclusive", "lost", "bench"]
                 and rows["framegrabber/well"] == ["exclusive", "free", "bench"]
                 # Without being asked for, only what is wrong is shown.
-                and section(text, "Devices") == [ill_row]
+                and section(text, "Health") == [ill_row]
             )
 
         def every(text: str) -> bool:
-            return section(text, "Devices") == [ill_row, ["framegrabber/well", "ok", "frames_per_second=4.5"]]
+            return section(text, "Health") == [ill_row, ["framegrabber/well", "ok", "frames_per_second=4.5"]]
 
         def why(text: str) -> bool:
-            told = {"  framegrabber/ill: the lens is dirty", "  robot/a: no other ARC holds it"}
+            told = {"  framegrabber/ill: the lens is dirty", "  robot/a: no other request holds it"}
             return told <= set(text.splitlines())
 
         def machine(text: str) -> bool:

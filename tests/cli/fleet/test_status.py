@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from tests.cli.cli_fleet import in_lab, patient_timing
-from tests.cli.tools import CLOCK, COMMAND, Terminal, ours, zscout_soon_until
+from tests.cli.tools import CLOCK, COMMAND, Terminal, mine, ours, zscout_soon_until
 from tests.hang import HANG
 from tests.live.lab import PATIENT, Lab
 
@@ -50,16 +50,16 @@ async def test_the_fleet_is_shown_to_people_and_programs(lab: Lab) -> None:
             return False
         seen = {row[0]: row for row in section(done.stdout, "Hosts")}
         loads = [" of " in seen[host][2] for host in ("anvil", "bellows") if host in seen]
-        whole = {"anvil": "node, 2 RCs", "bellows": "node, 1 RC", "test": "2 clients"}
+        whole = {"anvil": "node, 2 devices", "bellows": "node, 1 device", "test": "2 clients"}
         return {host: row[-1] for host, row in seen.items()} == whole and loads == [True, True]
 
     plain = await zscout_soon_until(all_seen, "status", env=lab.env)
     assert (plain.returncode, plain.stderr) == (0, "")
     assert f"Fleet {lab.fleet.name}: {state.host} leads, term {state.term.counter}" in plain.stdout
-    assert section(plain.stdout, "RCs") == [
-        ["radio/rf0", "shared", "held", "anvil", f"{ours()} (rate=4)"],
-        ["robot/a", "exclusive", "held", "anvil", ours()],
-        ["robot/b", "exclusive", "held", "bellows", ours()],
+    assert section(plain.stdout, "Devices") == [
+        ["radio/rf0", "shared", "held", "anvil", f"{mine('survey')} (rate=4)"],
+        ["robot/a", "exclusive", "held", "anvil", mine("survey")],
+        ["robot/b", "exclusive", "held", "bellows", mine("take")],
     ]
     running = section(plain.stdout, "Running")
     assert [(*row[:3], *row[-2:]) for row in running] == [
@@ -72,13 +72,13 @@ async def test_the_fleet_is_shown_to_people_and_programs(lab: Lab) -> None:
     assert [(*row[:2], row[3]) for row in waiting] == [("1", "first", "2"), ("2", "second", "1"), ("3", "ghost", "0")]
     assert waiting[0][2] == ours()
     # It is kept by a higher rank: nobody knows for how long.
-    assert waiting[0][-2:] == [f"waits for {ours()}: robot/b", "test/program"]
+    assert waiting[0][-2:] == [f"waits for {mine('take')}: robot/b", "test/program"]
     assert waiting[2][-2] == "robot/nowhere not on the mesh"
     hosts = {row[0]: row for row in section(plain.stdout, "Hosts")}
     assert set(hosts) == {"anvil", "bellows", "test"}
     assert hosts[state.host][1] == "leads"
     assert " of " in hosts["anvil"][2]
-    assert hosts["anvil"][-1] == "node, 2 RCs"
+    assert hosts["anvil"][-1] == "node, 2 devices"
     assert hosts["test"][1:] == ["alive", "-", "-", "-", "2 clients"]
     assert "\x1b" not in plain.stdout
 
@@ -176,7 +176,7 @@ async def test_watching_in_a_pipe_prints_a_block_when_something_happens(lab: Lab
 
     await block_with("robot/a  exclusive  free", "bellows")
     arc = await client.request("survey", {"robot/a": {}}, min_runtime=600)
-    await block_with(f"robot/a  exclusive  held   anvil    {ours()}")
+    await block_with(f"robot/a  exclusive  held   anvil    {mine('survey')}")
     await client.end(arc)
     await block_with("robot/a  exclusive  free")
     bellows.kill()
@@ -231,7 +231,7 @@ async def test_watching_at_a_terminal_draws_in_place_until_q(lab: Lab) -> None:
         assert isinstance(modes, int)
         assert not modes & termios.ICANON
         await client.request("survey", {"robot/a": {}}, priority=10, min_runtime=600)
-        await asyncio.to_thread(terminal.until, "Running")
+        await asyncio.to_thread(terminal.until, "RUNNING")
         assert "\x1b[1A" in terminal.raw, "the picture is drawn over the last"
         assert "\x1b[1;31m" in terminal.raw, "an operator's hold is red"
         terminal.press("q")
@@ -256,7 +256,7 @@ async def test_without_an_rcm_it_shows_what_is_there_and_says_so(lab: Lab) -> No
         await there.wait()
 
     def all_seen(done: subprocess.CompletedProcess[str]) -> bool:
-        return ["anvil", "node, 1 RC"] in [[row[0], row[-1]] for row in section(done.stdout, "Hosts")]
+        return ["anvil", "node, 1 device"] in [[row[0], row[-1]] for row in section(done.stdout, "Hosts")]
 
     shown = await zscout_soon_until(all_seen, "status", env=lab.env)
     assert shown.returncode == 3

@@ -8,11 +8,11 @@ import re
 import pytest
 
 from tests.cli.cli_fleet import in_lab, patient_timing
-from tests.cli.tools import CLOCK, ours, zscout_soon
+from tests.cli.tools import CLOCK, mine, ours, zscout_soon
 from tests.live.lab import PATIENT, Lab
 
 pytestmark = pytest.mark.live
-US = re.escape(ours())
+US, TAKE, MAPPING = re.escape(ours()), re.escape(mine("take")), re.escape(mine("mapping"))
 SOON = r"\d+(\.\d)? s"
 
 
@@ -36,14 +36,16 @@ async def test_the_story_of_an_arc(lab: Lab) -> None:
     lines = plain.stdout.splitlines()
     assert re.fullmatch(rf"survey of {US}, priority 0, has waited since {CLOCK} \({SOON}\)", lines[0])
     assert lines[1] == f"  id {survey.id}, client test/program"
-    assert re.fullmatch(rf"  waits for {US}: robot/a, until {CLOCK} at the latest", lines[2])
+    assert re.fullmatch(rf"  waits for {TAKE}: robot/a, until {CLOCK} at the latest", lines[2])
     assert lines[3].endswith("in the queue of 2; it wants 10 min")
     spans = r"\(in (10 min|9 min \d+ s)\)"
     assert re.fullmatch(rf"  it may start at {CLOCK} {spans}, if nothing else comes", lines[4])
     assert lines[5:7] == ["  it was preempted once", "Needs"]
     since, until = rf"since {CLOCK} \({SOON}\)", rf"until {CLOCK} \((10 min|9 min \d+ s)\) at the latest"
-    assert re.fullmatch(rf"  radio/rf0 \(rate=4\): shared with {US} \(rate=5\), priority 0, {since}, {until}", lines[7])
-    assert re.fullmatch(rf"  robot/a: held by {US}, priority 10, {since}, {until}", lines[8])
+    assert re.fullmatch(
+        rf"  radio/rf0 \(rate=4\): shared with {MAPPING} \(rate=5\), priority 0, {since}, {until}", lines[7]
+    )
+    assert re.fullmatch(rf"  robot/a: held by {TAKE}, priority 10, {since}, {until}", lines[8])
     assert lines[9] == "Story"
     told = [line.split(" ago)  ", 1)[1] for line in lines[10:]]
     assert re.match(rf" +{CLOCK} \(", lines[10])
@@ -62,7 +64,7 @@ async def test_the_story_of_an_arc(lab: Lab) -> None:
 
     missing = (await zscout_soon("why", "late", env=lab.env)).stdout
     assert "  robot/nowhere: not on the mesh\n" in missing
-    assert "  robot/b: no other ARC holds it\n" in missing
+    assert "  robot/b: no other request holds it\n" in missing
 
     # Two of one name are told of one by one; ended ones from memory; unknown ones with what is near.
     twin = await client.request("take", {"robot/nowhere": {}}, min_runtime=1, wait_for_device=True)
@@ -80,7 +82,7 @@ async def test_the_story_of_an_arc(lab: Lab) -> None:
     assert "cancelled" in ended.stdout.splitlines()[-1]
     unknown = await zscout_soon("why", "mappin", env=lab.env)
     assert (unknown.returncode, unknown.stdout) == (1, "")
-    assert unknown.stderr == 'zscout: no ARC "mappin" is known; did you mean mapping?\n'
+    assert unknown.stderr == 'zscout: no request "mappin" is known; did you mean mapping?\n'
 
 
 @in_lab()
