@@ -39,27 +39,10 @@ _NAMES = {
 _HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = [
-    "BadInput",
-    "BlockingHeld",
-    "BookingsClient",
-    "Client",
-    "CommandRefused",
-    "Component",
-    "ComponentContext",
-    "Fleet",
-    "Held",
-    "Lab",
-    "MeshError",
-    "NoRcm",
-    "RequestRefused",
-    "Revoked",
-    "Stage",
-    "__version__",
-    "connect",
-    "hold",
-    "holds",
-    "load_fleet",
-]
+    "BadInput", "BlockingHeld", "BookingsClient", "Client", "CommandRefused", "Component", "ComponentContext",
+    "Fleet", "Held", "Lab", "MeshError", "NoRcm", "RequestRefused", "Revoked",
+    "Stage", "__version__", "connect", "hold", "holds", "load_fleet",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -62,9 +62,7 @@ class NoOptions(Struct, frozen=True):
 
 class Driver:
     """Base class of drivers: one instance for each device. Its defaults are those of an exclusive device without
-    commands.
-
-    All methods run in the node's event loop, one call at a time, and must not block."""
+    commands. All methods run in the node's event loop, one call at a time, and must not block."""
 
     Options: ClassVar[type] = NoOptions
     """A msgspec struct or a dataclass: the keys of its table in the node file, besides those of every device. For an
@@ -104,10 +102,8 @@ class Driver:
 
     async def carry_on(self, before: Holder, after: Holder) -> None:
         """The hold `before` continues as `after`, without a safe state in between: in another client, or in another
-        request of the same client.
-
-        Calls `begin(after)` by default. A sharable driver that keeps state for each holder drops the state of
-        `before`, unless both have the same `place`."""
+        request of the same client. Calls `begin(after)` by default. A sharable driver that keeps state for each holder
+        drops the state of `before`, unless both have the same `place`."""
         await self.begin(after)
 
     async def end(self, holder: Holder) -> None:
@@ -117,9 +113,8 @@ class Driver:
         """The last hold has ended: stop motors, switch transmitters off. Must not raise."""
 
     async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
-        """Carry out the command `do` and return its result. Raise Refused if it can't be done.
-
-        Return a Future if the result takes time: other calls do not wait for it."""
+        """Carry out the command `do` and return its result. Raise Refused if it can't be done. Return a Future if the
+        result takes time: other calls do not wait for it."""
         raise Refused("unknown_command", f"this device does not know {str(do.get('name'))[:64]!r}")
 
     async def command_without_grant(self, sender: Sender, do: Mapping[str, Any]) -> Any:

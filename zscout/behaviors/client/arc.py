@@ -28,10 +28,8 @@ log = logging.getLogger(__name__)
 
 
 class Revoked(Exception):
-    """The hold was taken away, or its time is over.
-
-    `outcome` is one of the outcomes of the protocol, such as `preempted`; `by` names the request that took it;
-    the message is the reason."""
+    """The hold was taken away, or its time is over. `outcome` is one of the outcomes of the protocol, such as
+    `preempted`; `by` names the request that took it; the message is the reason."""
 
     def __init__(self, arc: OpenArc, ending: HoldEnd | None = None) -> None:
         ending = ending or arc.ending or HoldEnd(arc.outcome or "lost", arc.reason, arc.by)
@@ -53,9 +51,8 @@ class Held:
         """For each pattern of the needs, the device that satisfies it."""
 
     def rc(self, need: str) -> str:
-        """Return the device that satisfies a need: `held.rc("framegrabber/*")`.
-
-        Raises KeyError for a need that was not requested."""
+        """Return the device that satisfies a need: `held.rc("framegrabber/*")`. Raises KeyError for a need that was not
+        requested."""
         rc = self.bound.get(need, need)
         if rc not in self.rcs:
             asked = ", ".join(sorted(self.arc.needs))
@@ -95,10 +92,9 @@ class Held:
         return self.active and await self._client.internals.confirmed(self.arc) and self.active
 
     async def command(self, need: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Done:
-        """Have a held device carry out a command, and return its answer: `result` is what the device returned.
-
-        `need`: the name of the device, or the pattern that it satisfies. A device that is not ready has `ttl`
-        seconds. Raises CommandRefused, and KeyError for a pattern that was not requested."""
+        """Have a held device carry out a command, and return its answer: `result` is what the device returned. `need`:
+        the name of the device, or the pattern that it satisfies. A device that is not ready has `ttl` seconds. Raises
+        CommandRefused, and KeyError for a pattern that was not requested."""
         rc = self.rc(need) if is_pattern(need) else need
         return await self._client.command(rc, self.grant, do, ttl=ttl)
 
@@ -251,17 +247,16 @@ def hold(
 ) -> Attempt:
     """Hold devices for the body of an `async with`, which gives a `Held`.
 
-    Entering waits for the grant. The body is cancelled when the hold ends: after its minimum runtime the `async
-    with` then ends normally and `held.completed` is true; before it, the `async with` raises Revoked.
+    Entering waits for the grant. The body is cancelled when the hold ends: after its minimum runtime the `async with`
+    then ends normally and `held.completed` is true; before it, the `async with` raises Revoked.
 
     Takes what `Client.request` takes, and:
 
     - `confirmed`: enter when all devices have confirmed the grant, instead of at the grant.
-    - `direct`: the body also reaches its devices past zscout. It is entered when all devices have confirmed the
-      grant. When the hold ends, `finally` and `except CancelledError` have nine tenths of the devices' `settle`
-      to clean up; the next holder waits for that.
-    - `timeout`: seconds to wait for the grant. Entering raises TimeoutError after that, and the request is
-      cancelled.
+    - `direct`: the body also reaches its devices past zscout. It is entered when all devices have confirmed the grant.
+      When the hold ends, `finally` and `except CancelledError` have nine tenths of the devices' `settle` to clean up;
+      the next holder waits for that.
+    - `timeout`: seconds to wait for the grant. Entering raises TimeoutError after that, and the request is cancelled.
 
     Entering also raises RequestRefused and Revoked."""
     ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device, booking)
@@ -284,10 +279,9 @@ async def holds(
     estimate: bool = False,
     continues: str = "",
 ) -> AsyncIterator[Attempt]:
-    """Hold devices again and again: yields a `hold` to enter, and another whenever that ended for other requests.
-
-    Ends after a body that ended by itself, and with `keep=False` after the minimum runtime. `estimate` and
-    `continues` are those of `Client.request`."""
+    """Hold devices again and again: yields a `hold` to enter, and another whenever that ended for other requests. Ends
+    after a body that ended by itself, and with `keep=False` after the minimum runtime. `estimate` and `continues` are
+    those of `Client.request`."""
     ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device, booking)
     ask |= {"estimate": estimate, "continues": continues}
     attempt = Attempt(client, ask, again=True, confirmed=confirmed)

@@ -85,16 +85,14 @@ class BlockingHeld:
         return list(self._held.rcs)
 
     def rc(self, need: str) -> str:
-        """Return the device that satisfies a need: `held.rc("framegrabber/*")`.
-
-        Raises KeyError for a need that was not requested."""
+        """Return the device that satisfies a need: `held.rc("framegrabber/*")`. Raises KeyError for a need that was not
+        requested."""
         return self._held.rc(need)
 
     def command(self, need: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Any:
-        """Have a held device carry out a command, and return its result.
-
-        `need`: the name of the device, or the pattern that it satisfies. A device that is not ready has `ttl`
-        seconds. Raises CommandRefused, and KeyError for a pattern that was not requested."""
+        """Have a held device carry out a command, and return its result. `need`: the name of the device, or the pattern
+        that it satisfies. A device that is not ready has `ttl` seconds. Raises CommandRefused, and KeyError for a
+        pattern that was not requested."""
         return self._lab.run(self._held.command(need, do, ttl=ttl)).result
 
     async def _over_within(self, timeout: float | None) -> bool:
@@ -186,9 +184,8 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
 
 
 class Lab:
-    """A program's connection to the mesh, for code without asyncio. Close it, or use it with `with`.
-
-    `client` is the `zscout.Client` behind it, whose event loop runs in a thread of its own."""
+    """A program's connection to the mesh, for code without asyncio. Close it, or use it with `with`. `client` is the
+    `zscout.Client` behind it, whose event loop runs in a thread of its own."""
 
     def __init__(self, name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None) -> None:
         self._loop = uvloop.new_event_loop()
@@ -215,9 +212,8 @@ class Lab:
         return self._stopped or not self._thread.is_alive()
 
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
-        """Run a coroutine in the client's event loop, and return its result.
-
-        Raises RuntimeError if the lab is closed, or is closed meanwhile by another thread."""
+        """Run a coroutine in the client's event loop, and return its result. Raises RuntimeError if the lab is closed,
+        or is closed meanwhile by another thread."""
         with self._asking:
             if closed := self.closed:
                 coroutine.close()
@@ -260,25 +256,24 @@ class Lab:
     ) -> AbstractContextManager[BlockingHeld, None]:
         """Hold devices for the body of a `with`, which gives a `BlockingHeld`.
 
-        Entering waits for all of `needs`, at most `timeout` seconds; leaving gives them back. The hold is
-        protected for `min_runtime` seconds (default: the fleet's, 60), and continues until a request of equal or
-        higher priority waits for one of its devices. With `keep=False` it ends after `min_runtime`.
+        Entering waits for all of `needs`, at most `timeout` seconds; leaving gives them back. The hold is protected for
+        `min_runtime` seconds (default: the fleet's, 60), and continues until a request of equal or higher priority
+        waits for one of its devices. With `keep=False` it ends after `min_runtime`.
 
         When the hold ends, Revoked is raised in a body in the main thread, whatever it is doing; its `outcome` is
-        `completed` after the minimum runtime. In other threads, and with `interrupt=False`, call `held.check()`
-        or `held.wait()`.
+        `completed` after the minimum runtime. In other threads, and with `interrupt=False`, call `held.check()` or
+        `held.wait()`.
 
         - `confirmed`: enter when all devices have confirmed the grant, instead of at the grant.
-        - `direct`: the body also reaches its devices past zscout. After the end of the hold it has nine tenths of
-          the devices' `settle` to clean up, then Revoked is raised once more; the next holder waits for that.
+        - `direct`: the body also reaches its devices past zscout. After the end of the hold it has nine tenths of the
+          devices' `settle` to clean up, then Revoked is raised once more; the next holder waits for that.
         - `comment`: shown to other people.
         - `wait_for_device`: wait for an unknown device instead of raising RequestRefused.
-        - `booking`: the id of a booking to take up. The request has its needs and priority, and waits for its
-          next date.
+        - `booking`: the id of a booking to take up. The request has its needs and priority, and waits for its next
+          date.
 
-        Entering raises TimeoutError, RequestRefused, Revoked if somebody ended the request, and NoRcm if no
-        leader is visible within 3 s. Leaving raises Revoked if the hold was taken away and the body was not
-        interrupted."""
+        Entering raises TimeoutError, RequestRefused, Revoked if somebody ended the request, and NoRcm if no leader is
+        visible within 3 s. Leaving raises Revoked if the hold was taken away and the body was not interrupted."""
         how: dict[str, Any] = {"priority": priority, "min_runtime": min_runtime, "keep": keep, "timeout": timeout}
         how |= {"comment": comment, "direct": direct, "confirmed": confirmed, "wait_for_device": wait_for_device}
         how["booking"] = booking
@@ -304,9 +299,7 @@ class Lab:
 
 
 def connect(name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None) -> Lab:
-    """Join the mesh, for code without asyncio.
-
-    `name` must be unique on this host; the default is random. `fleet` defaults to the fleet file named by
-    $ZSCOUT_FLEET, else to the default fleet. `host` defaults to the name of this machine. Raises MeshError,
-    BadInput."""
+    """Join the mesh, for code without asyncio. `name` must be unique on this host; the default is random. `fleet`
+    defaults to the fleet file named by $ZSCOUT_FLEET, else to the default fleet. `host` defaults to the name of this
+    machine. Raises MeshError, BadInput."""
     return Lab(name, fleet=fleet, host=host)

@@ -135,10 +135,9 @@ class BookingsClient:
         priority: int = 0,
         limit: int = 5,
     ) -> SlotsTold:
-        """Return the first times at which all of `needs` are free together for `runtime` seconds.
-
-        The search covers `within` seconds from `start` (default: now), and returns at most `limit` times. Raises
-        RequestRefused, RcmSilent."""
+        """Return the first times at which all of `needs` are free together for `runtime` seconds. The search covers
+        `within` seconds from `start` (default: now), and returns at most `limit` times. Raises RequestRefused,
+        RcmSilent."""
         check_seconds("runtime", runtime)
         return await self.ask(
             FindSlots(

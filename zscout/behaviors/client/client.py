@@ -51,9 +51,8 @@ TOLD_WITHIN = 1.0
 
 
 class Client:
-    """A program's connection to the mesh.
-
-    Open it with `async with Client.connect(...) as client`, or `await Client.connect(...)` and `close` it."""
+    """A program's connection to the mesh. Open it with `async with Client.connect(...) as client`, or `await
+    Client.connect(...)` and `close` it."""
 
     def __init__(self, mesh: Mesh, fleet: Fleet) -> None:
         self.mesh, self.fleet = mesh, fleet
@@ -73,11 +72,10 @@ class Client:
     def connect(
         cls, name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None
     ) -> Connecting[Self]:
-        """Join the mesh: await the result, or use it with `async with`.
-
-        `name` must be unique on this host; the default is random. `fleet` defaults to the fleet file named by
-        $ZSCOUT_FLEET, else to the default fleet. `host` defaults to $ZSCOUT_HOST, else to the name of this
-        machine; in a secured fleet, to the name in the certificate. Raises MeshError, BadInput."""
+        """Join the mesh: await the result, or use it with `async with`. `name` must be unique on this host; the default
+        is random. `fleet` defaults to the fleet file named by $ZSCOUT_FLEET, else to the default fleet. `host` defaults
+        to $ZSCOUT_HOST, else to the name of this machine; in a secured fleet, to the name in the certificate. Raises
+        MeshError, BadInput."""
         return Connecting(cls._connect(name, fleet, host))
 
     @classmethod
@@ -116,10 +114,8 @@ class Client:
         return self._rcm.leader
 
     async def see_rcm(self, seconds: float = LOOK_FOR_RCM, takeover: float = LOOK_FOR_TAKEOVER) -> None:
-        """Return as soon as a leader is visible.
-
-        Raises NoRcm if none appears within `seconds`, or within `takeover` seconds if a node is visible that may
-        lead."""
+        """Return as soon as a leader is visible. Raises NoRcm if none appears within `seconds`, or within `takeover`
+        seconds if a node is visible that may lead."""
         if self.leader is not None:
             return
         seen, candidates = asyncio.Event(), set[Token]()
@@ -170,22 +166,20 @@ class Client:
         The result is passed to the other methods. Its `state` is `queued`, `running` or `ended`; it has a `reason`, and
         while it runs a `grant` and its `rcs`.
 
-        Once granted, the hold is protected for `min_runtime` seconds (default: the fleet's, 60), and continues
-        until a request of equal or higher priority waits for one of its devices. With `keep=False` it ends after
-        `min_runtime`.
+        Once granted, the hold is protected for `min_runtime` seconds (default: the fleet's, 60), and continues until a
+        request of equal or higher priority waits for one of its devices. With `keep=False` it ends after `min_runtime`.
 
-        `needs` maps each need to its parameters: `{"robot/scout33": {}}`. A need is a device, or a pattern that
-        any one matching device satisfies: `framegrabber/*`, and `framegrabber/*#2` for one more.
+        `needs` maps each need to its parameters: `{"robot/scout33": {}}`. A need is a device, or a pattern that any one
+        matching device satisfies: `framegrabber/*`, and `framegrabber/*#2` for one more.
 
         - `estimate`: the returned request has an estimated start.
-        - `direct`: the program also reaches its devices past zscout; `zscout.hold(direct=True)` handles what
-          follows.
+        - `direct`: the program also reaches its devices past zscout; `zscout.hold(direct=True)` handles what follows.
         - `comment`: shown to other people.
         - `wait_for_device`: wait for an unknown device instead of raising (default: `waits_for_devices`).
-        - `booking`: the id of a booking to take up. The request has its needs and priority
-          (`BookingsClient.terms`), and waits for its next date.
-        - `continues`: the name of this client's request whose hold this one replaces. It must hold less, at a
-          lower priority. If all its devices pass over in one step, they are not made safe in between.
+        - `booking`: the id of a booking to take up. The request has its needs and priority (`BookingsClient.terms`),
+          and waits for its next date.
+        - `continues`: the name of this client's request whose hold this one replaces. It must hold less, at a lower
+          priority. If all its devices pass over in one step, they are not made safe in between.
 
         If another client is handing over a request of this name and these needs, that request is returned.
 
@@ -226,12 +220,11 @@ class Client:
         await self._store.changed(arc)
 
     async def granted(self, arc: OpenArc, *, confirmed: bool = False) -> Grant | None:
-        """Wait until the request `arc` is granted. Return None if it ended instead.
-
-        Its devices are asked at the same time whether they know of the grant. If one does not confirm it within a
-        second, the grant is withdrawn and the request waits again. With `confirmed`, and for a direct request,
-        return only when all devices have confirmed the grant, which they do once they are ready. Raises
-        CommandRefused if a device refuses it for a reason that does not pass with time."""
+        """Wait until the request `arc` is granted. Return None if it ended instead. Its devices are asked at the same
+        time whether they know of the grant. If one does not confirm it within a second, the grant is withdrawn and the
+        request waits again. With `confirmed`, and for a direct request, return only when all devices have confirmed the
+        grant, which they do once they are ready. Raises CommandRefused if a device refuses it for a reason that does
+        not pass with time."""
         while True:
             await self._store.resumed.wait()
             if not arc.open:
@@ -267,9 +260,8 @@ class Client:
     async def state(
         self, arc: str | None = None, *, forecast: bool = False, timeout: float = QUERY_TIMEOUT
     ) -> RcmState | None:
-        """Return the leader's state: what is held and what waits. None if no leader answered in `timeout` seconds.
-
-        With `arc`, the state includes the history of that request; with `forecast`, the estimated starts."""
+        """Return the leader's state: what is held and what waits. None if no leader answered in `timeout` seconds. With
+        `arc`, the state includes the history of that request; with `forecast`, the estimated starts."""
         asked = messages.StateAsk(arc=arc, forecast=forecast)
         reply = await self.mesh.ask_one(self.mesh.keys.rcm_state, asked, RcmState, timeout=timeout)
         return reply.message if reply is not None else None
@@ -284,9 +276,8 @@ class Client:
         keep: bool = True,
         wait_for_device: bool | None = None,
     ) -> Foresight | None:
-        """Return what a request would lead to, without making it. None if no leader answered.
-
-        Takes what `request` takes. Raises RequestRefused."""
+        """Return what a request would lead to, without making it. None if no leader answered. Takes what `request`
+        takes. Raises RequestRefused."""
         seconds = self._protected(min_runtime)
         waits, wanted = self._waits(wait_for_device), amounts(needs)
         asked = messages.Foresee(
@@ -301,9 +292,7 @@ class Client:
     async def command(
         self, rc: str, grant: Grant, do: Mapping[str, Any], *, ttl: float = 1.0, timeout: float = 2.0
     ) -> Done:
-        """Have the device `rc` carry out a command under `grant`, and return its answer: `result` is what it
-        returned.
-
+        """Have the device `rc` carry out a command under `grant`, and return its answer: `result` is what it returned.
         A device that does not know of the grant yet, or is not ready yet, has `ttl` seconds to become so. Waits
         `timeout` seconds for the answer. Raises CommandRefused."""
         began = self.mesh.now()

@@ -35,15 +35,7 @@ class ClientInternals(MovableClient):
         self.supervisor = Supervisor(f"client {mesh.me}", self._failed)
         super().__init__(mesh, fleet, self.supervisor)
         self.store, self.rcm, self._on_notice = self._store, self._rcm, on_notice
-        self.confirmations = Confirmations(
-            mesh,
-            fleet,
-            self.store,
-            self.rcm,
-            self.supervisor,
-            command,
-            lambda arc: self.supervisor.spawn(self.ask_again(arc)),
-        )
+        self.confirmations = Confirmations(mesh, fleet, self.store, self.rcm, self.supervisor, command, self._ask_soon)
         self.leaving: asyncio.Task[None] | None = None
         self.instance = ""
         """Of its token."""
@@ -77,6 +69,9 @@ class ClientInternals(MovableClient):
         # All that was dropped together is asked for with one token.
         if arc.outcome == "client_lost" and self.mesh.now() - self._shown > RENEW_TOKEN:
             self._renew_token()
+        self._ask_soon(arc)
+
+    def _ask_soon(self, arc: OpenArc) -> None:
         self.supervisor.spawn(self.ask_again(arc))
 
     async def close(self) -> None:
@@ -142,9 +137,8 @@ class ClientInternals(MovableClient):
         return self.confirmations.direct(grant)
 
     async def end(self, arc: OpenArc) -> None:
-        """Gives back a hold, or leaves the queue: once the client is no longer paused, if that was not handed
-        over then. The program of a direct one is gone by then. Tried a few times; the RCM sees our token die
-        otherwise."""
+        """Gives back a hold, or leaves the queue: once the client is no longer paused, if that was not handed over
+        then. The program of a direct one is gone by then. Tried a few times; the RCM sees our token die otherwise."""
         await self._may_end.wait()
         if self.leaving is not None:
             return

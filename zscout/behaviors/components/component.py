@@ -122,9 +122,8 @@ class BadKind(Exception):
 
 
 def installed_kinds() -> dict[str, str]:
-    """Where each kind is: its name, and `module:class`. Reads the metadata of all packages: some 10 ms.
-
-    A kind that two packages bring, in different places, is none: which one is meant nobody knows."""
+    """Where each kind is: its name, and `module:class`. Reads the metadata of all packages: some 10 ms. A kind that two
+    packages bring, in different places, is none: which one is meant nobody knows."""
     found: dict[str, set[str]] = {}
     for entry in metadata.entry_points(group=GROUP):
         with suppress(BadName):
