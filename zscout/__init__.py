@@ -1,11 +1,11 @@
-"""zscout: all the devices a program asked for, or none, over a Zenoh mesh.
+"""zscout: a program gets all the devices that it requests, or none, over a Zenoh mesh.
 
     import zscout
     with zscout.connect() as lab, lab.hold("survey", {"robot/scout33": {}}) as held:
         ...
 
-For asyncio see `zscout.Client`, `zscout.hold` and `zscout.holds`; for what nodes can start and move,
-`zscout.Component`. Everything is imported when it is used.
+With asyncio, use `zscout.Client`, `zscout.hold` and `zscout.holds`. Nodes start and move a `zscout.Component`.
+Each name is imported at its first use.
 """
 
 from __future__ import annotations
@@ -26,50 +26,23 @@ if TYPE_CHECKING:
     from zscout.config.strict import BadInput
     from zscout.mesh import MeshError
 
-_HOME = {
-    "BadInput": "zscout.config.strict",
-    "BlockingHeld": "zscout.behaviors.client.blocking",
-    "BookingsClient": "zscout.behaviors.client.bookings",
-    "Client": "zscout.behaviors.client.client",
-    "CommandRefused": "zscout.behaviors.client.client",
-    "Component": "zscout.behaviors.components.component",
-    "ComponentContext": "zscout.behaviors.components.component",
-    "Fleet": "zscout.config.fleet",
-    "Held": "zscout.behaviors.client.arc",
-    "Lab": "zscout.behaviors.client.blocking",
-    "MeshError": "zscout.mesh",
-    "NoRcm": "zscout.behaviors.client.client",
-    "RequestRefused": "zscout.behaviors.client.client",
-    "Revoked": "zscout.behaviors.client.arc",
-    "Stage": "zscout.behaviors.components.component",
-    "connect": "zscout.behaviors.client.blocking",
-    "hold": "zscout.behaviors.client.arc",
-    "holds": "zscout.behaviors.client.arc",
-    "load_fleet": "zscout.config.fleet",
+_NAMES = {
+    "zscout.behaviors.client.arc": "Held Revoked hold holds",
+    "zscout.behaviors.client.blocking": "BlockingHeld Lab connect",
+    "zscout.behaviors.client.bookings": "BookingsClient",
+    "zscout.behaviors.client.client": "Client CommandRefused NoRcm RequestRefused",
+    "zscout.behaviors.components.component": "Component ComponentContext Stage",
+    "zscout.config.fleet": "Fleet load_fleet",
+    "zscout.config.strict": "BadInput",
+    "zscout.mesh": "MeshError",
 }
+_HOME = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = [
-    "BadInput",
-    "BlockingHeld",
-    "BookingsClient",
-    "Client",
-    "CommandRefused",
-    "Component",
-    "ComponentContext",
-    "Fleet",
-    "Held",
-    "Lab",
-    "MeshError",
-    "NoRcm",
-    "RequestRefused",
-    "Revoked",
-    "Stage",
-    "__version__",
-    "connect",
-    "hold",
-    "holds",
-    "load_fleet",
-]
+    "BadInput", "BlockingHeld", "BookingsClient", "Client", "CommandRefused", "Component", "ComponentContext",
+    "Fleet", "Held", "Lab", "MeshError", "NoRcm", "RequestRefused", "Revoked",
+    "Stage", "__version__", "connect", "hold", "holds", "load_fleet",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -121,7 +121,7 @@ class Worker(Component):
                                 await client.command(rc, grant, {"name": "echo", "value": self.done})
                         await asyncio.sleep(RANDOM.get().uniform(STEP, 1.0))
                 # What is being handed over may come back.
-                if arc.open or client.paused:
+                if arc.open or client.internals.paused:
                     await client.end(arc)
                 del deeds.busy[_here().name]
         except (RequestRefused, CommandRefused) as refused:
@@ -165,7 +165,7 @@ class SimulatedComponent(ComponentProcess):
             return told
 
         async def connect(name: str, *, fleet: Fleet, host: str) -> Client:
-            client = Client(mesh, fleet).start()
+            client = Client.on(mesh, fleet)
             self.processes.watch(self._name, client)
             return client
 

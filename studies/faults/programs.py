@@ -133,7 +133,7 @@ class Work:
             await asyncio.sleep(rng.uniform(0.05, self.pause))
 
     async def _use(self, client: Client, held: Held, times: int) -> None:
-        direct = client.direct_hold(held.grant)
+        direct = client.internals.direct_hold(held.grant)
         if direct is None or self.touched is None:
             await self._body(held, times)
             return

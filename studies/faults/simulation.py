@@ -501,7 +501,7 @@ class Simulation:
         self.broken(f"a service failed: {error!r}")
 
     async def _client(self, name: str, mesh: MemoryMesh) -> None:
-        client = self.programs[name] = Client(mesh, self.fleet).start()
+        client = self.programs[name] = Client.on(mesh, self.fleet)
         # A leader that has just begun may know nothing of an RC that is down.
         client.waits_for_devices = True
         busy = self.busy[name] = set()
@@ -524,12 +524,12 @@ class Simulation:
             self.booked.news(arc, self._leading_hosts())
             grant, since, rcs = began.get(arc.id, (None, 0.0, []))
             self.promises.told(
-                name, arc, client.term, touched=self.excuses.felt(since, name, *rcs, *arc.rcs, *arc.needs)
+                name, arc, client.internals.term, touched=self.excuses.felt(since, name, *rcs, *arc.rcs, *arc.needs)
             )
             if arc.grant is not None and arc.grant != grant:
                 began[arc.id] = arc.grant, self.loop.now - START, arc.rcs
 
-        client.watch(told)
+        client.internals.watch(told)
 
     # Faults
 

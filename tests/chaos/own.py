@@ -27,7 +27,7 @@ class Worker:
         self._believed: dict[str, Grant | None] = {}
         self._ids: dict[str, str] = {}
         """By ARC: the id under which it was told of last."""
-        client.watch(self._told)
+        client.internals.watch(self._told)
 
     def _told(self, arc: OpenArc) -> None:
         if (known_as := self._ids.setdefault(arc.name, arc.id)) != arc.id:

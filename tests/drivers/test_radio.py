@@ -116,9 +116,9 @@ async def test_what_a_radio_and_a_channel_carry_and_how_a_radio_is_lost(tmp_path
         # Handed over, the robot goes on driving: no safe state between, and only the heir is obeyed.
         heir, since = await lab.client(), len(line.heard)
         await obeyed(client, "robot/r1", grant, TURN)
-        client.pause()
-        heir.expect(client.open_requests())
-        await client.hand_over_all(heir.mesh.me)
+        client.internals.pause()
+        heir.internals.expect(client.internals.open_requests())
+        await client.internals.hand_over_all(heir.mesh.me)
         inherited = await heir.request("hide", GANG, min_runtime=600)
         under = await heir.granted(inherited)
         assert under is not None
@@ -126,7 +126,7 @@ async def test_what_a_radio_and_a_channel_carry_and_how_a_radio_is_lost(tmp_path
         await line.until(lambda packets: any(isinstance(p, DrivePacket) and p.left == 1 for p in packets), since=since)
         assert not is_in(HaltPacket)(line.packets[since:])
         assert await answer(obeyed(client, "robot/r1", grant, TURN)) == "ended"
-        client.resume()
+        client.internals.resume()
         await heir.end(inherited)
 
         send, _ = await held(client, "send", {"video/ch1": {}})

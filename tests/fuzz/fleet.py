@@ -198,7 +198,7 @@ class Fleet:
             process.main = process.run(asyncio.create_task, self._node(mesh, rcs))
         for name in ("victim", "asker"):
             process, mesh = self.open_process(f"desk/{name}")
-            self.clients[name] = process.run(lambda mesh: Client(mesh, self.fleet).start(), mesh)
+            self.clients[name] = process.run(lambda mesh: Client.on(mesh, self.fleet), mesh)
         if recording is not None:
             process, mesh = self.open_process("desk/recorder")
             process.main = process.run(asyncio.create_task, self._record(mesh, recording))
@@ -287,7 +287,7 @@ class Fleet:
             self.held.grant,
             self.held.place,
             {name: (rc.holds.term, rc.health, list(rc.holds.held)) for name, rc in sorted(self.rcs.items())},
-            [client.term for client in self.clients.values()],
+            [client.internals.term for client in self.clients.values()],
             sorted(self.running),
         )
 
@@ -423,7 +423,7 @@ class Script:
         self.base = f"zscout/{fleet.fleet.name}/"
 
     def names(self) -> Names:
-        known = {client.term for client in self.fleet.clients.values()} | {
+        known = {client.internals.term for client in self.fleet.clients.values()} | {
             one.rcm.term for one in self.fleet.leaders if one.rcm is not None
         }
         highest = max(known)

@@ -76,7 +76,7 @@ def test_a_node_serves_on_after_a_burst_of_what_is_no_message(tmp_path: Path) ->
                     assert used(node.pid) - memory < 60_000_000
                     assert len(lab.log("n")) - log < 300_000
                     after = await lab.state(client, lambda _: True)
-                    assert (after.term, client.term) == (before.term, before.term)
+                    assert (after.term, client.internals.term) == (before.term, before.term)
                     assert held.active
                     assert standing(held) == first
                     assert (await held.command("robot/b", {"name": "echo", "value": 7}, ttl=TTL)).result == 7

@@ -29,9 +29,9 @@ def me(client: Client) -> Sender:
 
 async def settle_down(old: Client, new: Client, names: Sequence[str]) -> dict[str, OpenArc]:
     """Moves all of `old` to `new`, which asks for it by `names`."""
-    old.pause()
-    new.expect(old.open_requests())
-    await old.hand_over_all(me(new))
+    old.internals.pause()
+    new.internals.expect(old.internals.open_requests())
+    await old.internals.hand_over_all(me(new))
     return await claimed(new, names)
 
 

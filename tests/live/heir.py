@@ -19,9 +19,9 @@ from zscout.messages import OpenRequest
 async def heir(name: str) -> None:
     async with await Client.connect(name, host="test") as client:
         line = await asyncio.to_thread(sys.stdin.readline)
-        client.expect(msgspec.json.decode(line, type=list[OpenRequest]))
+        client.internals.expect(msgspec.json.decode(line, type=list[OpenRequest]))
         print("ready", flush=True)
-        await client.expected_came.wait()
+        await client.internals.expected_came.wait()
         arcs = await claimed(client, list(NEEDS))
         grants = {name: await client.granted(arcs[name]) for name in ("drive", "talk")}
         print(msgspec.json.encode(grants).decode(), flush=True)

@@ -64,7 +64,7 @@ class Holder:
         self.grant: Grant | None = None
         self.tasks: set[asyncio.Task[None]] = set()
         self.beats = 0
-        client.watch(self._told)
+        client.internals.watch(self._told)
 
     def _told(self, arc: OpenArc) -> None:
         """A new word of the RCM: `queued`, `running` or `ended`."""

@@ -232,7 +232,7 @@ class Target:
             case RestoreComponent(requests=requests, state=state):
                 self.count = json.loads(state)["count"]
                 if self.component is not None:
-                    self.component.expect(requests)
+                    self.component.internals.expect(requests)
                 request.answer(self.view("standby"))
             case ActivateComponent():
                 self.activated.set()
@@ -254,7 +254,7 @@ class Target:
     async def leave(self) -> None:
         for client in (self.node, self.component):
             if client is not None:
-                await client.leave()
+                await client.internals.leave()
 
 
 @pytest.mark.slow

@@ -127,7 +127,7 @@ async def test_a_client_does_not_fall_for_forged_notices(lab: Lab) -> None:
             assert (kind, answer["code"]) == ("err", "malformed")
             answer = await asyncio.to_thread(stranger.ask, requests, {})
             assert [told["id"] for told in answer["requests"]] == [held.arc.id]
-            assert client.term.counter < 100
+            assert client.internals.term.counter < 100
             assert held.active
             assert (await held.command("robot/a", {"name": "echo", "value": 1}, ttl=TTL)).result == 1
     finally:

@@ -130,15 +130,15 @@ async def test_all_goes_over_in_one_step_and_nobody_gets_in_between(
     radio.calls.clear()
     record = Record(other, since=stands.seq)
 
-    old.pause()
-    told = old.open_requests()
-    new.expect(told)
+    old.internals.pause()
+    told = old.internals.open_requests()
+    new.internals.expect(told)
     # Who asks too early is given what is expected, as soon as it comes.
     early = asyncio.create_task(new.request("drive", NEEDS["drive"], min_runtime=1))
     await asyncio.sleep(0)
-    assert not new.expected_came.is_set()
-    await old.hand_over_all(me(new))
-    await asyncio.wait_for(new.expected_came.wait(), HANG)
+    assert not new.internals.expected_came.is_set()
+    await old.internals.hand_over_all(me(new))
+    await asyncio.wait_for(new.internals.expected_came.wait(), HANG)
     drive = await early
     after = {"drive": drive} | await claimed(new, ["talk", "later"])
 
@@ -167,12 +167,12 @@ async def test_all_goes_over_in_one_step_and_nobody_gets_in_between(
     assert (robot.calls, radio.calls) == (["begin drive"], ["begin talk"])
 
     # The old client leaves: that touches nobody. What waited is next, at its old place.
-    await old.leave()
+    await old.internals.leave()
     await lab.living(new, "client", lambda hosts: len(hosts) == 2)
     await new.end(drive)
     await until(lambda: after["later"].state == "running")
     assert rival.state == "queued"
-    assert new.open_requests()[0].arc == "talk"
+    assert new.internals.open_requests()[0].arc == "talk"
 
 
 async def test_back_and_forth_without_end(lab: Lab, stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -193,7 +193,7 @@ async def test_back_and_forth_without_end(lab: Lab, stand: Stand, monkeypatch: p
     for _ in range(ROUNDS):
         arcs = await settle_down(here, there, list(NEEDS))
         seen.append(arcs["drive"].grant)
-        here.resume()
+        here.internals.resume()
         here, there = there, here
     assert None not in seen
     assert seen == sorted(set(seen), key=seen.index)
@@ -214,22 +214,22 @@ async def test_bodies_go_on_after_a_hand_over_that_was_refused(lab: Lab) -> None
     body = Body(client, "drive", "robot/x")
     await body.entered()
     await body.beats_on(0)
-    client.pause()
+    client.internals.pause()
     with pytest.raises(RequestRefused, match="no/body is not on the mesh") as refused:
-        await client.hand_over_all(Sender("no", "body"))
+        await client.internals.hand_over_all(Sender("no", "body"))
     assert refused.value.code == "unknown_client"
-    client.resume()
+    client.internals.resume()
     await body.beats_on(body.beats[-1])
     # What happens to a hold while the client is paused is told when it is not any more.
-    client.pause()
+    client.internals.pause()
     taker, _ = await running(other, "operator", "robot/x", priority=9)
     # It has been told so.
-    await until(lambda: not client.open_requests() or client.open_requests()[0].grant is None)
+    await until(lambda: not client.internals.open_requests() or client.internals.open_requests()[0].grant is None)
     await asyncio.sleep(0.1)
     interrupted = not body.task.done() and body.task.cancelling()
     assert not interrupted
-    assert client.open_requests()[0].grant is None
-    client.resume()
+    assert client.internals.open_requests()[0].grant is None
+    client.internals.resume()
     await asyncio.wait({body.task}, timeout=HANG)
     assert re.search(r"preempted by \S+@\S+ \(.+\), priority 9$", str(body.task.exception()))
     await other.end(taker)
@@ -254,13 +254,13 @@ async def test_what_was_handed_to_one_who_died_is_taken_back(lab: Lab, monkeypat
     later = await old.request("later", NEEDS["later"], min_runtime=600)
     rival = await other.request("rival", {"robot/x": {}}, min_runtime=600)
     places, ids = (entered[0].arc.place, later.place), (entered[0].arc.id, later.id)
-    old.pause()
-    new.expect(old.open_requests())
-    await old.hand_over_all(me(new))
+    old.internals.pause()
+    new.internals.expect(old.internals.open_requests())
+    await old.internals.hand_over_all(me(new))
     assert (entered[0].arc.state, later.state, len(entered)) == ("moved", "moved", 1)
     assert not entered[0].active
-    await new.leave()
-    old.take_back()
+    await new.internals.leave()
+    old.internals.take_back()
     await until(lambda: rival.state == "running" or len(entered) == 2)
     # Where the rival was quicker, the places decide once it ends.
     await other.end(rival)
@@ -283,18 +283,18 @@ async def test_after_an_unknown_outcome_all_is_the_old_client_s_again(
     arcs = await claimed(old, list(NEEDS))
     places, ids = [arc.place for arc in arcs.values()], [arc.id for arc in arcs.values()]
     grant = arcs["drive"].grant
-    old.pause()
-    new.expect(old.open_requests())
+    old.internals.pause()
+    new.internals.expect(old.internals.open_requests())
     if done:
         for arc in arcs.values():
             await old.hand_over(arc, me(new))
     with pytest.raises(RequestRefused) as refused:
-        await old.hand_over_all(me(new))
+        await old.internals.hand_over_all(me(new))
     assert refused.value.code == "unknown"
-    await new.leave()
+    await new.internals.leave()
     await lab.living(old, "client", lambda hosts: len(hosts) == 1)
-    old.take_back()
-    old.resume()
+    old.internals.take_back()
+    old.internals.resume()
     await until(lambda: not done or not {arc.id for arc in arcs.values()} & set(ids))
     # What was asked without waiting for an answer may have been done as well: then it is asked for anew.
     await lab.state(
@@ -320,18 +320,18 @@ async def test_what_comes_and_nobody_wants_or_does_not_come(lab: Lab, monkeypatc
     old, new = await lab.client("old"), await lab.client("new")
     await lab.ready(old, "robot/x", "radio/f")
     arcs = await claimed(old, ["drive"])
-    old.pause()
-    new.expect([*old.open_requests(), *(await ghost())])
-    await old.hand_over_all(me(new))
+    old.internals.pause()
+    new.internals.expect([*old.internals.open_requests(), *(await ghost())])
+    await old.internals.hand_over_all(me(new))
     # It was wanted by nobody: given back. What did not come is asked for.
     await lab.state(new, lambda state: not state.holds and not state.queue)
     asked = await new.request("talk", NEEDS["talk"], min_runtime=600)
     assert (asked.id, asked.state) == ("ghost", "running")
     assert arcs["drive"].state == "moved"
     with pytest.raises(ValueError, match="is open here already"):
-        new.expect(new.open_requests())
+        new.internals.expect(new.internals.open_requests())
     with pytest.raises(RuntimeError, match="pause"):
-        await new.hand_over_all(me(old))
+        await new.internals.hand_over_all(me(old))
 
 
 ENCODER = msgspec.json.Encoder(decimal_format="number")
@@ -365,7 +365,7 @@ async def test_the_leader_dies_around_a_hand_over(tmp_path: Path) -> None:
         assert await answer(new.command("robot/x", grant, ECHO)) == "done"
 
         # Right before it, and again in the middle: it ends at one of both.
-        old.resume()
+        old.internals.resume()
         await lab.candidates(old, "c")
         lab.signal("b", signal.SIGKILL)
         back = await settle_down(new, old, list(NEEDS))
@@ -388,9 +388,9 @@ async def test_the_leader_dies_in_a_hand_over(tmp_path: Path, delay: float) -> N
         lab.node("b")
         await lab.candidates(old, "b")
         before = await claimed(old, list(NEEDS))
-        old.pause()
-        new.expect(old.open_requests())
-        moving_ = asyncio.create_task(old.hand_over_all(me(new)))
+        old.internals.pause()
+        new.internals.expect(old.internals.open_requests())
+        moving_ = asyncio.create_task(old.internals.hand_over_all(me(new)))
         await asyncio.sleep(delay)
         lab.signal("a", signal.SIGKILL)
         await moving_
@@ -421,11 +421,11 @@ async def test_the_old_process_dies_right_after_it(lab: Lab) -> None:
     try:
         assert heir.stdin is not None
         assert heir.stdout is not None
-        old.pause()
-        heir.stdin.write(ENCODER.encode(old.open_requests()) + b"\n")
+        old.internals.pause()
+        heir.stdin.write(ENCODER.encode(old.internals.open_requests()) + b"\n")
         assert await asyncio.wait_for(heir.stdout.readline(), HANG) == b"ready\n"
-        await old.hand_over_all(Sender("test", "new"))
-        await old.leave()
+        await old.internals.hand_over_all(Sender("test", "new"))
+        await old.internals.leave()
         line = await asyncio.wait_for(heir.stdout.readline(), HANG)
         told = msgspec.json.decode(line, type=dict[str, Grant])
         watcher = await lab.client("watcher")

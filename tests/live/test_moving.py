@@ -35,7 +35,7 @@ class Rival:
         self.client, self.arc = client, arc
         self.states: set[str] = {arc.state}
         self.holders: list[tuple[str, ...]] = []
-        client.watch(lambda arc: self.states.add(arc.state))
+        client.internals.watch(lambda arc: self.states.add(arc.state))
         client.mesh.subscribe(client.mesh.keys.grants, Grants, self._on_grants)
         client.mesh.subscribe(client.mesh.keys.rc_state(RC), RcState, self._on_state)
 

@@ -182,7 +182,7 @@ class Teleop:
 
     async def run(self) -> None:
         """Takes, drives and gives back, until it is cancelled. Then the robot is given back, too."""
-        self.client.watch(self._on_notice)
+        self.client.internals.watch(self._on_notice)
         while True:
             await self._wanted.wait()
             self._set_state("waiting", "for the RCM")

@@ -22,6 +22,7 @@ from typing import Final
 from zscout.config.devices import CommandRc, Words
 from zscout.drivers.driver import Driver, RcHandle
 from zscout.drivers.instances import InstanceState
+from zscout.drivers.own import own
 from zscout.mesh.supervision import done_within
 from zscout.messages import Figures, Holder, Parameter
 from zscout.types import SECOND
@@ -88,7 +89,7 @@ class CommandDriver(Driver):
         self._start_seconds = 0.0
 
     async def open(self, rc: RcHandle) -> None:
-        self._rc = rc
+        self._rc = own(rc)
         rc.supervisor.spawn(self._keep_well())
         if not await done_within(OPENING, self._looked.wait()):
             self._lose(self._unsure or "its health is not known yet")

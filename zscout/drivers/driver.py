@@ -1,185 +1,144 @@
-"""What a driver does for its device, and what its RC gives it. `resource_controller.py` has that RC.
+"""The interface between a driver and its device's resource controller (`resource_controller.py`).
 
-All that the author of a driver needs can be imported from here; docs/how-to/write-a-driver.md tells how."""
+Authors of drivers import everything from here: see docs/how-to/write-a-driver.md."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any, ClassVar, Final, Protocol, Self
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 from msgspec import Struct
 
-from zscout.drivers.holds import HoldTable
-from zscout.drivers.instances import Instances
-from zscout.keyexpr import Role, Sender, Token
-from zscout.mesh import Declaration, Mesh, Refused, Supervisor
-from zscout.messages import Amounts, Figures, Holder, Parameter, ProposedHolder
-from zscout.types import SECOND, Grant, Ns
+from zscout.keyexpr import Sender
+from zscout.mesh import Refused, Supervisor
+from zscout.messages import Amounts, Figures, FrameHead, Holder, Parameter, ProposedHolder
+from zscout.types import Grant, Ns
 
-__all__ = ["Driver", "Figures", "Holder", "Parameter", "ProposedHolder", "RcDirectory", "RcHandle", "Refused"]
+if TYPE_CHECKING:
+    from zscout.mesh.frames import FramePublisher
 
-NODE: Final = "node"
-"""The client name of a node."""
-DEPARTED_RC_GRACE: Final[Ns] = 10 * SECOND
-"""A node that ends sends its last command for an RC after the token of that RC has gone."""
+__all__ = ["Driver", "Figures", "FrameHead", "Holder", "Parameter", "ProposedHolder", "RcHandle", "Refused", "Sender"]
 
 
 class RcHandle(Protocol):
-    """The RC as its driver sees it."""
+    """A driver's view of its device on the mesh: the argument of `Driver.open`."""
 
-    mesh: Mesh
     name: str
-    holds: HoldTable
-    instances: Instances
-    """Whether this one serves, or stands by for another host's."""
-    directory: RcDirectory | None
-    """Only of a driver that relays."""
-    supervisor: Supervisor
-    """Of tasks, timers and handlers of the driver: closed before `safe` and `close` at the end. What fails
-    there fails the RC."""
+    """The device's name: `kind/name`."""
     health: str
-    """`ok`, or in words why the device can't carry a holder."""
+    """`ok`, or why the device can't serve a holder, in one line."""
+    supervisor: Supervisor
+    """Runs the driver's tasks (`spawn`) and timers (`call_later`). They are stopped before the last `safe` and `close`.
+    If one raises, the device is lost."""
+
+    def now(self) -> Ns:
+        """The time in ns by this host's clock, which counts from its start and continues while it is suspended."""
+
+    def holders(self) -> list[Holder]:
+        """The current holders of the device."""
 
     def fail(self, why: str) -> None:
-        """The device can't carry its holders any longer: their holds end, the RC counts as lost."""
+        """Report that the device can't serve its holders: their holds end, and the device is lost. `why`: one line
+        for people."""
 
     def recover(self) -> None:
-        """The device works again."""
+        """Report that the device works again."""
 
     def rules_changed(self) -> None:
-        """The driver votes by other rules from now on: earlier votes are void."""
+        """Make earlier votes void, because the driver votes by other rules from now on."""
 
     def used(self, grant: Grant) -> None:
-        """The device has just done something under a hold, beside its commands, which are counted without this: it
-        published a picture, say. From any one thread."""
+        """Count a use of the device under a hold, such as a published picture. Commands are counted without this
+        call. Can be called from any one thread."""
+
+    def frame_publisher(self) -> FramePublisher:
+        """Return a publisher of the device's pictures: `put(FrameHead(...), jpeg)`. Close it in the driver's
+        `close`."""
 
 
 class NoOptions(Struct, frozen=True):
-    """Of a driver that is told nothing."""
+    """The options of a driver without options."""
 
 
 class Driver:
-    """What a device does. The defaults are those of an exclusive device without commands of its own.
-
-    Everything runs in the node's event loop, one call at a time; nothing may block."""
+    """Base class of drivers: one instance for each device. Its defaults are those of an exclusive device without
+    commands. All methods run in the node's event loop, one call at a time, and must not block."""
 
     Options: ClassVar[type] = NoOptions
-    """What its table in the node file holds besides what every RC has: a msgspec struct or a dataclass. A key that is
-    not in it, a wrong type and a missing value end the node before it begins, in one line."""
+    """A msgspec struct or a dataclass: the keys of its table in the node file, besides those of every device. For an
+    unknown key, a wrong type or a missing value the node exits with one line."""
     sharable = False
-    """Whether it takes several holders, by its vote."""
+    """True if several holders can share the device, subject to `vote`."""
     relays = False
-    """Whether, besides a holder's client, the nodes of other RCs of its gang may command under the grant: a
-    robot's does so at its radio."""
+    """True if nodes with other devices of the same hold may command the device under its grant. A radio is commanded by
+    the node of a robot, for example."""
     activation: float = 0.0
-    """Seconds after a grant until the device has its full use, like a camera that warms up."""
+    """Seconds after a grant until the device is fully usable, such as the warm-up time of a camera."""
 
     def __init__(self, options: Any = None) -> None:
-        """`options`, of the type `Options`. Raise ValueError, with one line that says what to mend, for bad ones; the
-        device itself is opened in `open`."""
+        """Keep `options`, an instance of `Options`. Raise ValueError with one line if they are bad. Open the device
+        in `open`, not here."""
         self.options = options
 
     @classmethod
     def configured(cls, options: Any) -> Self:
-        """The driver of a device that has these `Options`."""
+        """Return the driver of a device with these `Options`."""
         return cls(options)
 
     async def open(self, rc: RcHandle) -> None:
-        """The RC is about to be offered. A device that is not there is no error: call `rc.fail`, go on
-        trying, and `rc.recover`."""
+        """Called before the device is offered. If the device is not there, do not raise: call `rc.fail`, keep
+        trying, and call `rc.recover`."""
 
     async def close(self) -> None:
-        """The RC has left the mesh, and `safe` has been called."""
+        """Called when the device has left the mesh, after `safe`."""
 
     async def begin(self, holder: Holder) -> None:
-        """Somebody begins to hold the device. What takes longer than an instant is spawned: see `begins_for`."""
+        """A hold begins. Spawn what takes time, and return its duration from `begins_for`."""
 
     def begins_for(self) -> float:
-        """Seconds, at most, that what `begin` has spawned still takes. Until 0 its holder does not enter, and what it
-        commands, other than `stop` and `halt`, is refused as `settling`."""
+        """Seconds, at most, until the device is ready for the hold that began. Until 0 the holder waits, and
+        commands other than `stop` and `halt` are refused as `settling`."""
         return 0.0
 
     async def carry_on(self, before: Holder, after: Holder) -> None:
-        """What `before` held goes on in `after`, with no safe state between: in another client, or in another ARC of
-        the same one. Unless a driver has it otherwise, `after` begins; a sharable one that keeps something for each
-        holder lets go of what it has for `before`, unless both have one place."""
+        """The hold `before` continues as `after`, without a safe state in between: in another client, or in another
+        request of the same client. Calls `begin(after)` by default. A sharable driver that keeps state for each holder
+        drops the state of `before`, unless both have the same `place`."""
         await self.begin(after)
 
     async def end(self, holder: Holder) -> None:
-        """Somebody ceases to hold the device; `safe` follows if nobody else does. Not called for a hold that goes
-        on in another."""
+        """A hold ends. `safe` follows if it was the last one. Not called for a hold that continues as another."""
 
     async def safe(self) -> None:
-        """Nobody holds the device any more: motors stopped, transmitter off. Must not raise."""
+        """The last hold has ended: stop motors, switch transmitters off. Must not raise."""
 
     async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
-        """Carries out `do` and returns what is answered. Raises Refused for what can't be done.
-
-        Returns a Future where the answer takes its time: what comes next does not wait for it."""
+        """Carry out the command `do` and return its result. Raise Refused if it can't be done. Return a Future if the
+        result takes time: other calls do not wait for it."""
         raise Refused("unknown_command", f"this device does not know {str(do.get('name'))[:64]!r}")
 
     async def command_without_grant(self, sender: Sender, do: Mapping[str, Any]) -> Any:
-        """Carries out what needs no hold. Raises Refused, by default always."""
+        """Carry out a command that needs no hold. Raises Refused by default."""
         raise Refused("no_grant", "this RC does nothing without a grant; ask the RCM for it")
 
     def vote(self, holders: list[ProposedHolder]) -> str:
-        """Why a sharable device can't carry these holders; empty if it can, and any subset of them."""
+        """Return why a sharable device can't serve these holders together, or an empty string if it can serve them
+        and any subset of them."""
         return ""
 
     def parameters(self) -> list[Parameter] | None:
-        """The bandwidth parameters that it knows: who asks for another one, or for more than the bound of one, is
-        refused at once. None: it does not say, and votes on whatever comes."""
+        """The parameters of the device. Requests with other parameters, or beyond a bound, are refused at once.
+        None: any parameter, subject to `vote`."""
         return None
 
     def capacity(self) -> Amounts:
-        """Bounds to show to people, by bandwidth parameter."""
+        """Upper bounds for people to see, by parameter."""
         return {}
 
     def figures(self) -> Figures:
-        """Rates, drops, latency and the like, by name; published when they change, once a second at most."""
+        """Rates, drops, latencies and the like, by name; published on change, at most once a second."""
         return {}
 
     def usable_cold(self, do: Mapping[str, Any]) -> bool:
-        """Whether this command can be carried out while the device still warms up."""
+        """Return True if the command `do` works while the device still warms up."""
         return False
-
-
-class RcDirectory:
-    """Which host offers which RC, by the liveliness tokens, from `watch` on: its node may act for an RC, and
-    no other."""
-
-    def __init__(self, mesh: Mesh, on_change: Callable[[], object] = lambda: None) -> None:
-        self._mesh = mesh
-        self._tokens: dict[str, set[Token]] = {}
-        self._recent: dict[tuple[str, str], Ns] = {}
-        """(host, RC): until when its node may still act for it."""
-        self._on_change = on_change
-
-    def watch(self) -> Declaration:
-        return self._mesh.watch(self._mesh.keys.alive_any(Role.RC), self.on_token)
-
-    def on_token(self, token: Token, alive: bool) -> None:
-        if alive:
-            self._tokens.setdefault(token.name, set()).add(token)
-        else:
-            living = self._tokens.get(token.name, set())
-            living.discard(token)
-            if not living:
-                self._tokens.pop(token.name, None)
-            now = self._mesh.now()
-            self._recent = {key: until for key, until in self._recent.items() if until > now}
-            self._recent[token.host, token.name] = now + DEPARTED_RC_GRACE
-        self._on_change()
-
-    def hosts(self, rc: str) -> set[str]:
-        """The hosts that offer this RC now: one, unless two nodes are at odds."""
-        return {token.host for token in self._tokens.get(rc, ())}
-
-    def is_node_of_gang(self, sender: Sender, holder: Holder, but: str) -> bool:
-        """Whether `sender` is the node of an RC of this holder's gang, `but` aside."""
-        return sender.client == NODE and any(sender.host in self.hosts(rc) for rc in holder.rcs if rc != but)
-
-    def is_node_of(self, sender: Sender, rc: str) -> bool:
-        """Whether `sender` is the node that offers this RC, or did so until a moment ago."""
-        offered = sender.host in self.hosts(rc) or self._recent.get((sender.host, rc), 0) > self._mesh.now()
-        return sender.client == NODE and offered

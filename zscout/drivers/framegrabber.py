@@ -95,7 +95,7 @@ class FramegrabberDriver(Driver):
 
     async def open(self, rc: RcHandle) -> None:
         self._rc = rc
-        self._publisher = rc.mesh.frame_publisher(rc.mesh.keys.frame(rc.name))
+        self._publisher = rc.frame_publisher()
         self._publisher.follow(lambda _watched: self._close_unless_needed())
         await self._try_sources()
 

@@ -85,7 +85,7 @@ class VideoDriver(Driver):
                 transmitting.append(holder)
         if len(transmitting) < 2:
             return ""
-        now = {holder.id for holder in self._holders()}
+        now = {holder.id for holder in self._rc.holders()}
         already = sorted(holder.arc for holder in transmitting if holder.id in now)
         if already:
             return f"{' and '.join(already)} transmits on it already; two would spoil each other"
@@ -99,9 +99,6 @@ class VideoDriver(Driver):
         return [Parameter("transmitters", bound=Decimal(1), default=Decimal(1))]
 
     def figures(self) -> Figures:
-        held = self._holders()
+        held = self._rc.holders()
         silent = sum(holder.params.get("transmitters") == 0 for holder in held)
         return {"transmitters": float(len(held) - silent), "listeners": float(silent)}
-
-    def _holders(self) -> list[Holder]:
-        return [held.holder for held in self._rc.holds.held.values()]

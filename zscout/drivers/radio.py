@@ -17,6 +17,7 @@ from zscout.config.devices import RadioRc
 from zscout.drivers.airtime import Share, default_rate, line_rate, objection, room, share_of
 from zscout.drivers.commands import RadioHalt, RadioStop, radio_command
 from zscout.drivers.driver import Driver, RcHandle
+from zscout.drivers.own import own
 from zscout.drivers.packets import MAX_PACKET, HaltPacket, StopPacket, encode
 from zscout.drivers.serial_line import CLOSE_TIMEOUT, DEPTH, SerialLine
 from zscout.drivers.transmit_queue import TransmitQueue
@@ -66,7 +67,7 @@ class RadioDriver(Driver):
         return cls(options.port, baud=options.baud, bound=options.bound / SECOND)
 
     async def open(self, rc: RcHandle) -> None:
-        self._rc = rc
+        self._rc = own(rc)
         # Of its own: halts still go out after the RC has closed that of its other work.
         self._supervisor = Supervisor(f"the line of {rc.name}", rc.supervisor.fail)
         self._line = SerialLine(self._port, self._baud, up=self._line_up, down=self._line_down, wrote=self._line_wrote)
@@ -107,10 +108,10 @@ class RadioDriver(Driver):
         ]
 
     async def begin(self, holder: Holder) -> None:
-        self._air.join(holder.place, self._share_of(holder), self._rc.mesh.now())
+        self._air.join(holder.place, self._share_of(holder), self._rc.now())
 
     async def carry_on(self, before: Holder, after: Holder) -> None:
-        self._air.pass_on(before.place, after.place, self._share_of(after), self._rc.mesh.now())
+        self._air.pass_on(before.place, after.place, self._share_of(after), self._rc.now())
 
     def _share_of(self, holder: Holder) -> Share:
         try:
@@ -142,7 +143,7 @@ class RadioDriver(Driver):
             raise Refused("down", self._down)
         if isinstance(order, RadioStop | RadioHalt):
             return self._send_urgent(order)
-        after = self._air.offer(holder.place, holder.grant, order, self._rc.mesh.now())
+        after = self._air.offer(holder.place, holder.grant, order, self._rc.now())
         self._pump()
         return {"after": after / SECOND}
 
@@ -170,7 +171,7 @@ class RadioDriver(Driver):
         halts = isinstance(order, RadioHalt)
         self._counts["halts"] += halts
         kind = HaltPacket if halts else StopPacket
-        after = self._air.send_urgent(order.robot, kind, self._rc.mesh.now())
+        after = self._air.send_urgent(order.robot, kind, self._rc.now())
         self._pump()
         return {"after": after / SECOND}
 
@@ -183,7 +184,7 @@ class RadioDriver(Driver):
         if self._down:
             return
         while self._outstanding < DEPTH:
-            outgoing = self._air.next(self._rc.mesh.now(), self._is_in_force)
+            outgoing = self._air.next(self._rc.now(), self._is_in_force)
             if outgoing is None:
                 break
             data = encode(outgoing.packet)
@@ -194,15 +195,15 @@ class RadioDriver(Driver):
                 self._waits.append(outgoing.sent_by - outgoing.entered)
         if not self._air.urgent:
             self._quiet.set()
-        at = self._air.wake(self._rc.mesh.now())
+        at = self._air.wake(self._rc.now())
         if at is not None and self._outstanding < DEPTH:
-            delay = min(max(0.0, (at - self._rc.mesh.now()) / SECOND), LONGEST_SLEEP)
+            delay = min(max(0.0, (at - self._rc.now()) / SECOND), LONGEST_SLEEP)
             self._timer = self._supervisor.call_later(delay, self._pump)
 
     def _is_in_force(self, grant: Grant) -> bool:
         """Whether the hold of a packet is in force at the moment when it goes out."""
         held, holds = self._rc.holds.held.get(grant), self._rc.holds
-        return held is not None and holds.check(grant, held.holder.client, self._rc.mesh.now()) is None
+        return held is not None and holds.check(grant, held.holder.client, self._rc.now()) is None
 
     def _line_up(self) -> None:
         self._down, self._outstanding = "", 0

@@ -10,17 +10,18 @@ import logging
 import math
 from collections.abc import Awaitable, Callable, Collection
 from contextlib import suppress
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from msgspec import structs
 
 from zscout import messages, trace
 from zscout.config import devices
 from zscout.drivers.confirm_server import CommandQuery, ConfirmServer
-from zscout.drivers.driver import Driver, RcDirectory
+from zscout.drivers.driver import Driver
 from zscout.drivers.holds import HoldChange, HoldTable
 from zscout.drivers.instances import Instances, InstanceState
 from zscout.drivers.last_holder import LastHolder
+from zscout.drivers.own import RcDirectory
 from zscout.drivers.repeated import CommandMemory
 from zscout.drivers.use import UseCounter
 from zscout.drivers.work_queue import COMMANDS_PER_HOST, WorkQueue
@@ -30,6 +31,9 @@ from zscout.mesh.renewal import UNHEARD
 from zscout.mesh.supervision import StallWatch
 from zscout.mesh.terms import LastTerms
 from zscout.types import NO_TERM, SECOND, VERSION, Grant, Ns, Term
+
+if TYPE_CHECKING:
+    from zscout.mesh.frames import FramePublisher
 
 log = logging.getLogger(__name__)
 
@@ -196,6 +200,15 @@ class ResourceController:
 
     # For the driver: see RcHandle
 
+    def now(self) -> Ns:
+        return self.mesh.now()
+
+    def holders(self) -> list[messages.Holder]:
+        return self.holds.holders(self.mesh.now())
+
+    def frame_publisher(self) -> FramePublisher:
+        return self.mesh.frame_publisher(self.mesh.keys.frame(self.name))
+
     def rules_changed(self) -> None:
         self.rules += 1
         self.publish()
@@ -286,7 +299,7 @@ class ResourceController:
             term=self.holds.term,
             # An RCM takes what one that knows all does not name for lost.
             seq=0 if self._missed else self.holds.seq,
-            holders=self.holds.holders(self.mesh.now()),
+            holders=self.holders(),
             ended=ended,
             health=self.health,
             rules=self.rules,

@@ -17,8 +17,9 @@ import msgspec
 
 from zscout.config.devices import RobotRc
 from zscout.drivers import commands
-from zscout.drivers.driver import Driver, RcDirectory, RcHandle
+from zscout.drivers.driver import Driver, RcHandle
 from zscout.drivers.instances import InstanceState
+from zscout.drivers.own import RcDirectory, own
 from zscout.mesh import Declaration, Refused, Reply
 from zscout.mesh.supervision import done_within
 from zscout.messages import Command, Done, Figures, Holder, Parameter, RcState
@@ -93,6 +94,7 @@ class RobotDriver(Driver):
         )
 
     async def open(self, rc: RcHandle) -> None:
+        rc = own(rc)
         self._rc, self._mesh = rc, rc.mesh
         rc.fail(f"{self._radio} has not taken its halt yet")
         self._directory = RcDirectory(rc.mesh, self._on_directory_change)

@@ -132,7 +132,7 @@ class MemoryFleet:
     def client(self, name: str = "test") -> Client:
         """Return the client of this name on host `desk`; the first call starts it."""
         if name not in self._clients:
-            client = self._clients[name] = Client(self.mesh(DESK, name), self.config).start()
+            client = self._clients[name] = Client.on(self.mesh(DESK, name), self.config)
             self._stack.push_async_callback(client.close)
         return self._clients[name]
 

@@ -52,7 +52,7 @@ class SmallFleet:
         return candidate
 
     def client(self, name: str) -> Client:
-        client = Client(self.mesh("h", name), self.fleet).start()
+        client = Client.on(self.mesh("h", name), self.fleet)
         self.clients.append(client)
         return client
 
@@ -97,8 +97,8 @@ def transport_of(mesh: Mesh) -> MemoryTransport:
 
 
 def begin_move(old: Client, new: Client) -> None:
-    old.pause()
-    new.expect(old.open_requests())
+    old.internals.pause()
+    new.internals.expect(old.internals.open_requests())
 
 
 @asynccontextmanager

@@ -39,7 +39,7 @@ async def test_a_queued_request_that_the_next_leader_refuses_ends(monkeypatch: p
         assert waits.outcome == "lost"
         assert waits.reason == "the RCM refuses it: priority must lie between -4 and 4"
         assert await two.granted(waits) is None
-        assert two.open_requests() == []
+        assert two.internals.open_requests() == []
 
 
 async def test_holds_and_places_outlive_a_change_of_leader() -> None:
@@ -47,9 +47,9 @@ async def test_holds_and_places_outlive_a_change_of_leader() -> None:
         fleet.candidate("h1")
         async with hold(one, "first", {RC: {}}, min_runtime=60) as held:
             waits = [await client.request("next", {RC: {}}, min_runtime=60) for client in (two, three)]
-            places, term = [arc.place for arc in waits], one.term
+            places, term = [arc.place for arc in waits], one.internals.term
             await fleet.lose_leader()
-            await until(lambda: one.leader == "h1" and all(c.term > term for c in (one, two, three)))
+            await until(lambda: one.leader == "h1" and all(c.internals.term > term for c in (one, two, three)))
             assert held.active
             assert (await held.command(RC, ECHO)).result == 7
             # Each asks again, and keeps its place.
@@ -74,7 +74,7 @@ async def test_who_shows_a_new_leader_that_it_lives_is_not_dropped_though_its_to
                 before.on_token(client, token, True)
         async with hold(one, "first", {RC: {}}, min_runtime=600) as held:
             outcomes: list[str | None] = []
-            one.watch(lambda arc: outcomes.append(arc.outcome))
+            one.internals.watch(lambda arc: outcomes.append(arc.outcome))
             await fleet.lose_leader()
             await until(lambda: watch.leader == "h1")
             await until(lambda: transport_of(next_leader) is not before, within=10)
@@ -97,12 +97,12 @@ async def test_without_an_rcm_a_hold_ends_after_its_lease_and_is_asked_again() -
 async def test_an_rcm_far_above_is_followed_once_no_other_is_heard() -> None:
     """As where the fleet had to go above a forged term while this client was cut off."""
     async with small_fleet("one") as (fleet, (one,)):
-        await until(lambda: one.term.counter)
+        await until(lambda: one.internals.term.counter)
         await fleet.candidates.pop("h0").stop()
         candidate = fleet.candidates["h1"] = Candidate(fleet.mesh("h1", "node"), FLEET)
         candidate.known = far = Term(10**9, "far")
         candidate.start()
-        await until(lambda: one.term > far, within=FLEET.timing.hold_lease / SECOND + 3)
+        await until(lambda: one.internals.term > far, within=FLEET.timing.hold_lease / SECOND + 3)
         await held(one, "first")
 
 

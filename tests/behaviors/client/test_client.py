@@ -52,7 +52,7 @@ async def test_a_timer_that_goes_off_early_ends_a_hold_without_an_error() -> Non
     async with small_fleet("one") as (fleet, _):
         mesh, loop = fleet.mesh("h", "slow"), asyncio.get_running_loop()
         mesh.now = lambda: round((START + (loop.time() - START) * 0.999) * SECOND)
-        slow = Client(mesh, FLEET).start()
+        slow = Client.on(mesh, FLEET)
         fleet.clients.append(slow)
         async with hold(slow, "first", {RC: {}}, min_runtime=2, keep=False) as held:
             fleet.network.link(fleet.leader(), mesh).loss = 1.0  # it does not hear that its hold is over
@@ -100,7 +100,7 @@ async def test_a_bad_request_is_refused_and_forgotten() -> None:
     async with small_fleet("one") as (_, (one,)):
         with pytest.raises(RequestRefused) as refused:
             await one.request("bad", {RC: {}}, priority=10**9)
-        assert (refused.value.code, one.open_requests()) == ("bad_request", [])
+        assert (refused.value.code, one.internals.open_requests()) == ("bad_request", [])
 
 
 async def test_a_request_that_is_cancelled_before_its_answer_is_withdrawn() -> None:

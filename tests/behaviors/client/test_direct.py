@@ -27,7 +27,7 @@ async def enter(client: Client, name: str, *rcs: str, **how: Any) -> tuple[OpenA
     arc = await client.request(name, {rc: {} for rc in rcs or (RC,)}, **how)
     grant = await client.granted(arc)
     assert grant is not None
-    hold = client.direct_hold(grant)
+    hold = client.internals.direct_hold(grant)
     assert hold is not None
     return arc, hold
 
@@ -61,7 +61,7 @@ async def test_a_direct_hold_is_confirmed_again_and_may_be_relied_on_for_a_hold_
 async def test_a_hold_that_is_not_direct_has_nothing_of_this() -> None:
     async with small_fleet("one") as (fleet, (one,)):
         _, grant = await held(one, "first")
-        assert one.direct_hold(grant) is None
+        assert one.internals.direct_hold(grant) is None
         await asyncio.sleep(5)
         assert not fleet.rcs[0].holds.may_be_direct(one.mesh.now())
 

@@ -139,7 +139,7 @@ async def test_a_client_that_hears_nothing_ends_its_body_after_the_hold_lease() 
 async def test_a_leader_that_begins_as_a_body_clears_up_after_its_time_does_not_queue_it_again() -> None:
     async with small_fleet("one") as (fleet, (one,)):
         told: list[str] = []
-        one.watch(lambda arc: told.append(arc.state))
+        one.internals.watch(lambda arc: told.append(arc.state))
         body, _ = await parking(one, min_runtime=3, keep=False)
         await asyncio.sleep(2.5)
         await fleet.candidates.pop("h0").stop()

@@ -58,7 +58,7 @@ async def test_all_goes_on_in_another_client_though_its_rc_hears_of_it_late() ->
         waits = await rival.request("rival", {RC: {}}, min_runtime=1)
         holders: list[str] = []
         states: list[str] = [waits.state]
-        rival.watch(lambda arc: states.append(arc.state))
+        rival.internals.watch(lambda arc: states.append(arc.state))
         rival.mesh.subscribe(
             rival.mesh.keys.grants,
             Grants,
@@ -67,10 +67,10 @@ async def test_all_goes_on_in_another_client_though_its_rc_hears_of_it_late() ->
         fleet.network.link(fleet.leader(), fleet.devices).delay = 0.05
         for source, target in [(old, new), (new, old)] * 3:
             begin_move(source, target)
-            await source.hand_over_all(target.mesh.me)
+            await source.internals.hand_over_all(target.mesh.me)
             _, grant = await held(target, "tally", min_runtime=3600)
             assert (await target.command(RC, grant, ECHO)).result == 7
-            source.resume()
+            source.internals.resume()
         await asyncio.sleep(10)
         assert (set(states), set(holders)) == ({"queued"}, {"tally"})
 
@@ -85,7 +85,7 @@ async def test_a_hand_over_that_dies_with_the_leader_once_it_is_answered_is_made
             fleet.network.link(leader, other).loss = 1.0
         answers: list[str] = []
         fleet.network.link(leader, old.mesh).trace = lambda _source, _target, kind, _: answers.append(kind)
-        moving = asyncio.create_task(old.hand_over_all(new.mesh.me))
+        moving = asyncio.create_task(old.internals.hand_over_all(new.mesh.me))
         await until(lambda: "reply" in answers)
         await fleet.lose_leader()
         await moving
@@ -100,8 +100,8 @@ async def test_what_a_new_leader_does_not_know_to_be_held_yet_is_handed_over_as_
         begin_move(old, new)
         await succeed(next_leader, fleet, old)
         states: dict[str, list[str]] = {"runs": [], "waits": []}
-        new.watch(lambda arc: states[arc.name].append(arc.state))
-        await old.hand_over_all(new.mesh.me)
+        new.internals.watch(lambda arc: states[arc.name].append(arc.state))
+        await old.internals.hand_over_all(new.mesh.me)
         await both_go_on(new, grant, places)
         assert {name: {*told} for name, told in states.items()} == {"runs": {"running"}, "waits": {"queued"}}
         assert await fleet.holders() == ["runs"]
@@ -118,7 +118,7 @@ async def test_what_rcs_hold_for_the_new_client_is_handed_over_though_the_new_le
         await asyncio.sleep(1.5)
         for other in (old.mesh, new.mesh, next_leader):
             fleet.network.link(leader, other).loss = 1.0
-        moving = asyncio.create_task(old.hand_over_all(new.mesh.me))
+        moving = asyncio.create_task(old.internals.hand_over_all(new.mesh.me))
         await until(lambda: [held.holder.client for held in fleet.rcs[0].holds.held.values()] == ["h/new"])
         await succeed(next_leader, fleet, old)
         await moving
@@ -135,9 +135,9 @@ async def test_a_promise_that_is_made_as_a_hand_over_is_answered_counts() -> Non
         begin_move(old, new)
         fleet.network.link(new.mesh, old.mesh).delay = 0.2
         moved: list[Term] = []
-        old.watch(lambda arc: moved.append(arc.last[0]) if arc.state == "moved" else None)
-        moving = asyncio.create_task(old.hand_over_all(new.mesh.me))
-        await until(new.open_requests)
+        old.internals.watch(lambda arc: moved.append(arc.last[0]) if arc.state == "moved" else None)
+        moving = asyncio.create_task(old.internals.hand_over_all(new.mesh.me))
+        await until(new.internals.open_requests)
         candidate, promised = fleet.mesh("h1", "node"), Term(2, "f" * 12)
         ask = candidate.keys.requests(old.mesh.me)
         reply = await candidate.ask_one(ask, RcAsk(promise=promised), ClientRequests, timeout=1)
@@ -158,11 +158,11 @@ async def test_what_an_rcm_that_was_replaced_has_handed_over_is_awaited_once_mor
         for other in (leader, fleet.devices, new.mesh, rival.mesh):
             fleet.network.cut(other, next_leader)
             fleet.network.cut(next_leader, other)
-        await until(lambda: old.term.counter == 2)
-        moving = asyncio.create_task(old.hand_over_all(new.mesh.me))
+        await until(lambda: old.internals.term.counter == 2)
+        moving = asyncio.create_task(old.internals.hand_over_all(new.mesh.me))
         moved = await new.request("waits", {RC: {}}, min_runtime=3600)
         told: list[tuple[str, int]] = []
-        new.watch(lambda arc: told.append((arc.state, arc.last[0].counter)))
+        new.internals.watch(lambda arc: told.append((arc.state, arc.last[0].counter)))
         granting = asyncio.create_task(new.granted(moved))
         fleet.network.link(old.mesh, next_leader).delay = 0.2
         fleet.network.heal()
@@ -183,9 +183,9 @@ async def test_what_is_awaited_once_more_is_handed_on() -> None:
         arc._came = arc.last[0]
         told = Notice(arc.id, arc.name, "h/one", "ended", Term(arc.last[0].counter + 1, "later"), 1)
         one._store.take(arc, replace(told, outcome="handed_over"))
-        assert (arc.state, one.open_requests()) == ("awaited", [])
+        assert (arc.state, one.internals.open_requests()) == ("awaited", [])
         begin_move(one, two)
-        moving = asyncio.create_task(one.hand_over_all(two.mesh.me))
+        moving = asyncio.create_task(one.internals.hand_over_all(two.mesh.me))
         moved = await two.request("work", {"robot/z": {}}, min_runtime=3600)
         await moving
         assert (moved.id, moved.place) == before
@@ -205,7 +205,7 @@ async def test_what_lost_its_rcm_as_it_is_handed_over_is_handed_over_all_the_sam
         link.loss = 1.0
         await until(lambda: arc.state == "asking")
         link.loss = 0.0
-        await old.hand_over_all(new.mesh.me)
+        await old.internals.hand_over_all(new.mesh.me)
         after = await new.request("runs", {RC: {}}, min_runtime=3600)
         assert (after.id, after.place) == before
 
@@ -216,7 +216,7 @@ async def test_what_the_new_client_does_not_hear_of_is_asked_for_as_what_it_was(
         grant, places = await runs_and_waits(old)
         begin_move(old, new)
         fleet.network.disturb({"notice": Disturbance(lost=1.0), "requests": Disturbance(lost=1.0)})
-        await old.hand_over_all(new.mesh.me)
+        await old.internals.hand_over_all(new.mesh.me)
         await both_go_on(new, grant, places)
         assert await fleet.holders() == ["runs"]
 
@@ -228,9 +228,9 @@ async def test_what_was_given_up_while_its_hand_over_was_undecided_is_not_taken_
         fleet.network.disturb({"notice": Disturbance(lost=1.0)})
         ending = asyncio.create_task(old.end(runs))
         with pytest.raises(RequestRefused, match="no RCM told"):
-            await old.hand_over_all(new.mesh.me)
+            await old.internals.hand_over_all(new.mesh.me)
         fleet.network.kill(new.mesh)
-        old.take_back()
+        old.internals.take_back()
         await ending
         await asyncio.sleep(1)
-        assert (await fleet.holders(), old.open_requests()) == ([], [])
+        assert (await fleet.holders(), old.internals.open_requests()) == ([], [])

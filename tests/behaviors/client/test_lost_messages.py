@@ -97,7 +97,7 @@ async def test_a_hold_goes_on_under_a_leader_that_does_not_know_who_listens_to_i
         fleet.network.link(listening, next_leader).hidden = {*hidden}
         await fleet.lose_leader()
         states: list[str] = []
-        one.watch(lambda arc: states.append(arc.state))
+        one.internals.watch(lambda arc: states.append(arc.state))
         await until(lambda: one.leader == "h1")
         await asyncio.sleep(10)
         assert (arc.grant, {*states}) == (grant, {"running"})
@@ -116,7 +116,7 @@ async def test_a_leader_that_is_asked_by_whom_it_does_not_see_joins_the_mesh_ane
         await until(lambda: leader._transport.current is not before)
         await asyncio.sleep(FLEET.mesh.lease + 1)
         outcomes: list[str | None] = []
-        one.watch(lambda arc: outcomes.append(arc.outcome))
+        one.internals.watch(lambda arc: outcomes.append(arc.outcome))
         await asyncio.sleep(10)
         assert arc.state == "running"
         assert "client_lost" not in outcomes

@@ -78,7 +78,7 @@ async def test_where_the_rcm_refuses_the_hand_over_the_other_one_is_stopped() ->
         with pytest.raises(NotMoved, match="refused the hand-over"):
             await carried_out(client)
         assert ordered[-1] == "StopComponent"
-        assert (client.paused, arc.state, arc.grant) == (False, "running", grant)
+        assert (client.internals.paused, arc.state, arc.grant) == (False, "running", grant)
         token.close()
 
 

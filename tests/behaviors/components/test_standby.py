@@ -39,7 +39,7 @@ async def test_what_is_handed_to_it_has_it_run_only_once_its_predecessor_is_not_
     async with small_fleet("c.1") as (fleet, (old,)):
 
         async def connect(name: str, **_: object) -> Client:
-            client = Client(fleet.mesh("g", name), FLEET).start()
+            client = Client.on(fleet.mesh("g", name), FLEET)
             fleet.clients.append(client)
             return client
 
@@ -53,10 +53,10 @@ async def test_what_is_handed_to_it_has_it_run_only_once_its_predecessor_is_not_
         standby = ComponentLifecycle(ComponentJob(start, COUNTER, "g", FLEET, "tag"), report, connect)
         story = asyncio.create_task(standby.run())
         await until(lambda: phases() == ["standby"])
-        old.pause()
-        standby.order(Order(1, RestoreComponent("c", 2, b'{"count": 7}', old.open_requests())))
+        old.internals.pause()
+        standby.order(Order(1, RestoreComponent("c", 2, b'{"count": 7}', old.internals.open_requests())))
         await until(lambda: OrderAnswer(1) in reports)
-        await old.hand_over_all(Sender("g", "c.2"))
+        await old.internals.hand_over_all(Sender("g", "c.2"))
         if token is None:
             await asyncio.sleep(0.9 * FLEET.mesh.lease)
             token = old.mesh.alive(predecessor)

@@ -59,10 +59,10 @@ class Robot:
 
 async def moved(robot: Robot, old: Client, new: Client, between: Callable[[], Any] | None = None) -> Robot:
     """The same robot in another program. `between`: what comes before that one begins."""
-    old.pause()
+    old.internals.pause()
     state = robot.behavior.checkpoint()
-    new.expect(old.open_requests())
-    await old.hand_over_all(new.mesh.me)
+    new.internals.expect(old.internals.open_requests())
+    await old.internals.hand_over_all(new.mesh.me)
     if between is not None:
         await between()
     await old.close()

@@ -117,11 +117,11 @@ async def test_what_warms_up_is_its_own_again_where_a_move_has_failed() -> None:
         await asyncio.sleep(1)
         assert await fleet.arcs("z-warm") == ["running"]
         begin_move(client, new)
-        await client.hand_over_all(new.mesh.me)
+        await client.internals.hand_over_all(new.mesh.me)
         # By now all of it is somebody else's, who does not come to anything.
         await asyncio.sleep(2)
         await new.close()
-        client.take_back()
+        client.internals.take_back()
         await asyncio.sleep(0.5)
         await over(watching)
         assert await fleet.arcs("z-warm") == []
@@ -133,7 +133,7 @@ async def test_a_camera_warms_up_after_a_move_too() -> None:
         watching = watches(old)
         await until(lambda: [arc for arc in old._store.open if arc.start is not None])
         begin_move(old, new)
-        await old.hand_over_all(new.mesh.me)
+        await old.internals.hand_over_all(new.mesh.me)
         await old.close()
         await over(watching)
         watching = watches(new)

@@ -31,7 +31,7 @@ def report(fleet: FakeFleet, host: str, load: float) -> list[object]:
 
 @asynccontextmanager
 async def looking(fleet: FakeFleet) -> AsyncIterator[FleetView]:
-    async with Client(fleet.mesh("here", "status-1"), fleet.fleet).start() as client:
+    async with Client.on(fleet.mesh("here", "status-1"), fleet.fleet) as client:
         with FleetView(client) as view:
             yield view
 

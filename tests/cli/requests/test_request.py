@@ -109,7 +109,7 @@ def test_an_estimate_that_ticks_down_prints_nothing_and_asks_for_nothing(fleet: 
         async with await Noting.connect("noting", fleet=fleet.lab.fleet, host="test") as client:
             client.looks = []
             with Report("next", client, as_json=False, stream=out) as report:
-                client.watch(report.news)
+                client.internals.watch(report.news)
                 arc = await client.request("next", {"robot/a": {}}, estimate=True)
                 telling = asyncio.ensure_future(report.follow_wait())
                 await until(lambda: bool(out.getvalue()))

@@ -1,29 +1,12 @@
-"""An ARC in a few lines: a context manager that waits for the grant and ends its body when it is over.
+"""Holds as context managers: `hold` for one, `holds` for one after the other.
 
     async with Client.connect() as client:
-        async with hold(client, "survey", {"robot/scout33": {}}) as held:
-            await held.command("robot/scout33", {"name": "echo", "value": 1})
+        async for attempt in holds(client, "survey", {"robot/scout33": {}}):
+            async with attempt as held:
+                await held.command("robot/scout33", {"name": "echo", "value": 1})
 
-A hold is protected for its minimum runtime (the fleet's, 60 s), and goes on until somebody of equal or higher
-priority waits for what it holds; with `keep=False` it ends when its minimum runtime is over. The body is cancelled when
-the hold is taken away before that (`Revoked` comes out of the `async with`), and when its time is over (nothing comes
-out, and `held.completed` is true). `holds` asks again, and goes again when it is granted again:
-
-    async for attempt in holds(client, "survey", {"robot/scout33": {}}):
-        async with attempt as held:
-            ...
-
-A need may be a pattern, which any one RC meets: with `{"framegrabber/*": {}}` as needs,
-`held.rc("framegrabber/*")` is the one that was given, and `held.command("framegrabber/*", ...)` goes to it.
-
-The body begins at the grant. Whether its RCs know of it is seen to beside: one that does not confirm it within a second
-ends the body, and what is commanded meanwhile waits at the RC for as long as its `ttl`. A body that needs its devices
-ready from the first line on says `confirmed=True`, or awaits `held.confirmed()`.
-
-A body that touches devices past their RCs says `direct=True`. It begins when all have confirmed. When its hold ends it
-is cancelled, and its `finally` and `except CancelledError` run to their end, in at most nine tenths of what its RCs
-settle; the next holder waits for that.
-"""
+The body begins at the grant. Its devices confirm the grant meanwhile; if one does not within a second, the body is
+cancelled. A command that reaches a device before that waits there for at most its `ttl`."""
 
 from __future__ import annotations
 
@@ -45,7 +28,8 @@ log = logging.getLogger(__name__)
 
 
 class Revoked(Exception):
-    """The hold was taken away; `outcome` is the protocol's word, the message the reason."""
+    """The hold was taken away, or its time is over. `outcome` is one of the outcomes of the protocol, such as
+    `preempted`; `by` names the request that took it; the message is the reason."""
 
     def __init__(self, arc: OpenArc, ending: HoldEnd | None = None) -> None:
         ending = ending or arc.ending or HoldEnd(arc.outcome or "lost", arc.reason, arc.by)
@@ -55,21 +39,20 @@ class Revoked(Exception):
 
 
 class Held:
-    """A hold in force, inside the body."""
+    """A hold, inside the body of `async with hold(...)`."""
 
     def __init__(self, client: Client, arc: OpenArc, grant: Grant) -> None:
         self._client = client
         self.arc = arc
         self.grant = grant
         self.rcs: list[str] = list(arc.rcs)
-        """All that it holds, sorted."""
+        """The devices that it holds, sorted."""
         self.bound: dict[str, str] = dict(arc.bound)
-        """By each pattern of the needs: the RC that meets it."""
+        """For each pattern of the needs, the device that satisfies it."""
 
     def rc(self, need: str) -> str:
-        """The RC that meets a need: `held.rc("framegrabber/*")`; an RC that is held meets its own name.
-
-        Raises KeyError for what was not asked for."""
+        """Return the device that satisfies a need: `held.rc("framegrabber/*")`. Raises KeyError for a need that was not
+        requested."""
         rc = self.bound.get(need, need)
         if rc not in self.rcs:
             asked = ", ".join(sorted(self.arc.needs))
@@ -77,48 +60,50 @@ class Held:
         return rc
 
     def now(self) -> Ns:
-        """The time by this host's clock."""
+        """The time in ns by this host's clock, which counts from its start."""
         return self._client.mesh.now()
 
     @property
     def active(self) -> bool:
-        """Whether the hold is still in force, as far as this client knows."""
+        """True while the hold is in force, as far as this client knows."""
         return self.arc.grant == self.grant
 
     @property
     def remaining(self) -> float:
-        """Seconds of the minimum runtime that are left."""
+        """Seconds left of the minimum runtime."""
         return (self.arc.end - self.now()) / SECOND
 
     @property
     def completed(self) -> bool:
-        """Whether the hold is over because it had its time: its minimum runtime, and with `keep` somebody waited."""
+        """True if the hold ended after its minimum runtime, not before."""
         if self.active:
             return not self.arc.keep and self.remaining <= 0 and not self.settling
         return self.arc.outcome == "completed"
 
     @property
     def settling(self) -> bool:
-        """Whether some of its RCs still settle. If that lasts until its time is over, it is asked for once more."""
+        """True while some devices are not ready yet. If none of the time is left when they are, the request is
+        repeated."""
         return self.arc.settling == self.grant
 
     async def confirmed(self) -> bool:
-        """Waits until all RCs have confirmed this hold, which they do once they have settled. False: it is over."""
-        return self.active and await self._client.confirmed(self.arc) and self.active
+        """Wait until all devices have confirmed the hold, which they do once they are ready. False if the hold
+        ended."""
+        return self.active and await self._client.internals.confirmed(self.arc) and self.active
 
     async def command(self, need: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Done:
-        """Has one of the held RCs do something: the one of this name, or that meets this pattern.
-
-        Raises CommandRefused, and KeyError for a pattern that was not asked for."""
+        """Have a held device carry out a command, and return its answer: `result` is what the device returned. `need`:
+        the name of the device, or the pattern that it satisfies. A device that is not ready has `ttl` seconds. Raises
+        CommandRefused, and KeyError for a pattern that was not requested."""
         rc = self.rc(need) if is_pattern(need) else need
         return await self._client.command(rc, self.grant, do, ttl=ttl)
 
     async def resumed(self) -> None:
-        """Waits while the client is paused: what becomes of the hold meanwhile counts from then on."""
-        await self._client.resumed()
+        """Wait while the program is being moved to another host. Returns at once otherwise."""
+        await self._client.internals.resumed()
 
     async def over(self) -> None:
-        """Waits until the hold is over; for bodies that work elsewhere."""
+        """Wait until the hold is over: for bodies whose work runs elsewhere."""
         # A timer may go off a little before its time by this host's clock.
         while self.active and not self.completed:
             with suppress(TimeoutError):
@@ -185,7 +170,7 @@ class Attempt:
     async def __aenter__(self) -> Held:
         held, body = await self.granted(), asyncio.current_task()
         assert body is not None  # noqa: S101 - this is a coroutine
-        direct, self._cancelled = self._client.direct_hold(held.grant), 0
+        direct, self._cancelled = self._client.internals.direct_hold(held.grant), 0
         self._entered = held, body, asyncio.create_task(self._interrupt_when_over(held, body, direct)), direct
         return held
 
@@ -197,7 +182,7 @@ class Attempt:
             direct.end()
             if held.active:
                 # By our clock it had its time. An RCM that takes the lead as it clears up would queue it again.
-                self._client.expire(held.arc)
+                self._client.internals.expire(held.arc)
             await asyncio.sleep(max(0, direct.gone_by - held.now()) / SECOND)
             log.warning(
                 "%s clears up for too long after its hold, and is interrupted: the next holder begins", held.arc.name
@@ -222,7 +207,7 @@ class Attempt:
             # What somebody released is not to be had again.
             by_hand = arc.why is not None and arc.why.code == "released"
             self._anew = self._again and interrupted and arc.keep and not by_hand
-            self._client.complete(arc)
+            self._client.internals.complete(arc)
             return interrupted
         # Whose body was interrupted is over for it, though a new RCM may have found that it stands all the same.
         if not interrupted and (held.active or kind is not None):
@@ -260,11 +245,20 @@ def hold(
     wait_for_device: bool | None = None,
     booking: str = "",
 ) -> Attempt:
-    """An ARC as an async context manager; see the module's text. `min_runtime` in seconds, by default the fleet's;
-    `confirmed`: it is entered when all RCs have confirmed the grant; the `comment` is shown to others;
-    `wait_for_device` and `booking` as `Client.request` has them.
+    """Hold devices for the body of an `async with`, which gives a `Held`.
 
-    Entering raises TimeoutError where it was not granted within `timeout` seconds: it is cancelled then."""
+    Entering waits for the grant. The body is cancelled when the hold ends: after its minimum runtime the `async with`
+    then ends normally and `held.completed` is true; before it, the `async with` raises Revoked.
+
+    Takes what `Client.request` takes, and:
+
+    - `confirmed`: enter when all devices have confirmed the grant, instead of at the grant.
+    - `direct`: the body also reaches its devices past zscout. It is entered when all devices have confirmed the grant.
+      When the hold ends, `finally` and `except CancelledError` have nine tenths of the devices' `settle` to clean up;
+      the next holder waits for that.
+    - `timeout`: seconds to wait for the grant. Entering raises TimeoutError after that, and the request is cancelled.
+
+    Entering also raises RequestRefused and Revoked."""
     ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device, booking)
     return Attempt(client, ask, timeout=timeout, confirmed=confirmed)
 
@@ -285,8 +279,9 @@ async def holds(
     estimate: bool = False,
     continues: str = "",
 ) -> AsyncIterator[Attempt]:
-    """The same, entered again whenever it was ended for others and is granted again, until a body ends by itself, or
-    without `keep` has had its time. `estimate` and `continues` as `Client.request` has them."""
+    """Hold devices again and again: yields a `hold` to enter, and another whenever that ended for other requests. Ends
+    after a body that ended by itself, and with `keep=False` after the minimum runtime. `estimate` and `continues` are
+    those of `Client.request`."""
     ask = _ask(name, needs, priority, min_runtime, keep, direct, comment, wait_for_device, booking)
     ask |= {"estimate": estimate, "continues": continues}
     attempt = Attempt(client, ask, again=True, confirmed=confirmed)

@@ -3,12 +3,8 @@
     with zscout.connect() as lab, lab.hold("survey", {"robot/scout33": {}}) as held:
         held.command("robot/scout33", {"name": "echo", "value": 1})
 
-When the hold is taken away, or its time is over, `Revoked` is raised in the body, whatever that is doing: in a
-`time.sleep`, a read or a wait for another hold as well. That is done by a signal (`interruption.py`), so only where the
-body runs in the main thread, and not before a call of a C library returns that does not mind signals. In other threads,
-and with `interrupt=False`, a body looks at `held.active`, waits with `held.wait(...)` or lets `held.check()` raise. An
-RC obeys nothing under a hold that is over, whatever the body does.
-"""
+At the end of the hold a signal (`interruption.py`) raises `Revoked` in the body: only in the main thread, and not while
+a call of a C library ignores signals. Devices obey nothing under a hold that is over, whatever the body does."""
 
 from __future__ import annotations
 
@@ -35,15 +31,13 @@ T = TypeVar("T")
 
 log = logging.getLogger(__name__)
 
-LOOK_FOR_RCM: Final = 3.0
-"""Seconds in which a mesh that has an RCM shows it."""
 CLOSED: Final = "this lab is closed; zscout.connect() gives a new one"
 LAST_STEPS: Final = 1.0
 """Seconds in which what still runs in the loop hears that its lab is closed."""
 
 
 class BlockingHeld:
-    """A hold in force, as a plain object."""
+    """A hold, inside the body of `with lab.hold(...)`."""
 
     def __init__(self, lab: Lab, held: Held) -> None:
         self._lab, self._held = lab, held
@@ -51,31 +45,32 @@ class BlockingHeld:
 
     @property
     def grant(self) -> Grant:
+        """The number under which the devices know the hold."""
         return self._held.grant
 
     @property
     def active(self) -> bool:
-        """Whether the hold is still in force, as far as this client knows."""
+        """True while the hold is in force, as far as this client knows."""
         return self._held.active and not self._held.completed
 
     @property
     def completed(self) -> bool:
-        """Whether the hold is over because it had its time: its minimum runtime, and with `keep` somebody waited."""
+        """True if the hold ended after its minimum runtime, not before."""
         return self._held.completed
 
     @property
     def remaining(self) -> float:
-        """Seconds of the minimum runtime that are left: in these only a higher priority takes it."""
+        """Seconds left of the minimum runtime, in which only a higher priority preempts the hold."""
         return self._held.remaining
 
     def check(self) -> None:
-        """Raises Revoked once the hold is over."""
+        """Raise Revoked once the hold is over."""
         if not self.active:
             self._body.told = True
             raise self._revoked()
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Waits until the hold is over, at most `timeout` seconds. True: it is over, and nothing is raised for it."""
+        """Wait until the hold is over, at most `timeout` seconds. Return True if it is; nothing is raised then."""
         self._body.waits = True
         try:
             over = self._lab.run(self._over_within(timeout))
@@ -86,16 +81,18 @@ class BlockingHeld:
 
     @property
     def rcs(self) -> list[str]:
-        """All that it holds, sorted."""
+        """All devices that it holds, sorted."""
         return list(self._held.rcs)
 
     def rc(self, need: str) -> str:
-        """The RC that meets a need, as `arc.Held.rc` has it. Raises KeyError."""
+        """Return the device that satisfies a need: `held.rc("framegrabber/*")`. Raises KeyError for a need that was not
+        requested."""
         return self._held.rc(need)
 
     def command(self, need: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Any:
-        """Has one of the held RCs do something and returns its result: the one of this name, or that meets
-        this pattern. Raises CommandRefused, and KeyError for a pattern that was not asked for."""
+        """Have a held device carry out a command, and return its result. `need`: the name of the device, or the pattern
+        that it satisfies. A device that is not ready has `ttl` seconds. Raises CommandRefused, and KeyError for a
+        pattern that was not requested."""
         return self._lab.run(self._held.command(need, do, ttl=ttl)).result
 
     async def _over_within(self, timeout: float | None) -> bool:
@@ -152,14 +149,14 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
 
     async def _granted(self) -> Held:
         self._entering = asyncio.current_task()
-        await self._lab.client.see_rcm(LOOK_FOR_RCM)
+        await self._lab.client.see_rcm()
         return await self._attempt.granted()
 
     async def _watch_over(self, held: BlockingHeld) -> None:
         self._watch = asyncio.create_task(self._interrupt_when_over(held))
 
     async def _interrupt_when_over(self, held: BlockingHeld) -> None:
-        direct = self._lab.client.direct_hold(held.grant)
+        direct = self._lab.client.internals.direct_hold(held.grant)
         await held._held.over()
         await held._body.interrupt()
         if direct is not None:
@@ -177,17 +174,18 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
             # It was interrupted, and withdraws what it asked for.
             await asyncio.wait([self._entering])
         arc, client = self._attempt.arc, self._lab.client
-        if self._held is not None and (direct := client.direct_hold(self._held.grant)) is not None:
+        if self._held is not None and (direct := client.internals.direct_hold(self._held.grant)) is not None:
             direct.returned()
         if arc is not None and arc.open:
             if self._held is not None and self._held.completed:
-                client.complete(arc)
+                client.internals.complete(arc)
             else:
                 await client.end(arc)
 
 
 class Lab:
-    """A client whose event loop runs in a thread of its own."""
+    """A program's connection to the mesh, for code without asyncio. Close it, or use it with `with`. `client` is the
+    `zscout.Client` behind it, whose event loop runs in a thread of its own."""
 
     def __init__(self, name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None) -> None:
         self._loop = uvloop.new_event_loop()
@@ -210,10 +208,11 @@ class Lab:
     @property
     def closed(self) -> bool:
         # No thread: this is a fork of the process that has it.
+        """True once it was closed. Also true in a fork of the process."""
         return self._stopped or not self._thread.is_alive()
 
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
-        """What the coroutine returns, which runs in the loop of the client. Raises RuntimeError where that is closed,
+        """Run a coroutine in the client's event loop, and return its result. Raises RuntimeError if the lab is closed,
         or is closed meanwhile by another thread."""
         with self._asking:
             if closed := self.closed:
@@ -232,7 +231,7 @@ class Lab:
 
     @uninterrupted
     def close(self) -> None:
-        """Gives back everything and leaves the mesh."""
+        """Give back everything held or requested, and leave the mesh."""
         if not self.closed:
             try:
                 self.run(self.client.close())
@@ -255,25 +254,26 @@ class Lab:
         wait_for_device: bool | None = None,
         booking: str = "",
     ) -> AbstractContextManager[BlockingHeld, None]:
-        """When entered it waits for all of `needs`, at most `timeout` seconds; when left it gives them back. Others
-        are shown the `comment`.
+        """Hold devices for the body of a `with`, which gives a `BlockingHeld`.
 
-        The hold is protected for `min_runtime` seconds (default: the fleet's, 60), and goes on until somebody of equal
-        or higher priority waits for what it holds; with `keep=False` it ends when they are over. Then, or when it is
-        taken away before, `Revoked` is raised in a body in the main thread, unless `interrupt` is false: its `outcome`
-        is `completed` where it had its time.
+        Entering waits for all of `needs`, at most `timeout` seconds; leaving gives them back. The hold is protected for
+        `min_runtime` seconds (default: the fleet's, 60), and continues until a request of equal or higher priority
+        waits for one of its devices. With `keep=False` it ends after `min_runtime`.
 
-        With `confirmed` it is entered when all RCs have confirmed the grant: until then one may be made ready yet, and
-        a command to it waits for as long as its `ttl`.
+        When the hold ends, Revoked is raised in a body in the main thread, whatever it is doing; its `outcome` is
+        `completed` after the minimum runtime. In other threads, and with `interrupt=False`, call `held.check()` or
+        `held.wait()`.
 
-        A body that touches devices past their RCs says `direct`: they settle until it has been left, in at most nine
-        tenths of their `settle`; the next holder waits for that, and Revoked is raised once more in who takes longer.
+        - `confirmed`: enter when all devices have confirmed the grant, instead of at the grant.
+        - `direct`: the body also reaches its devices past zscout. After the end of the hold it has nine tenths of the
+          devices' `settle` to clean up, then Revoked is raised once more; the next holder waits for that.
+        - `comment`: shown to other people.
+        - `wait_for_device`: wait for an unknown device instead of raising RequestRefused.
+        - `booking`: the id of a booking to take up. The request has its needs and priority, and waits for its next
+          date.
 
-        What can never start is refused; with `wait_for_device`, not for a need that nobody knows. With a `booking`, by
-        its id, it takes that up, whose needs and priority it has, and waits for its next date.
-
-        Entering raises TimeoutError, RequestRefused, Revoked where others ended the request, and NoRcm where none is
-        seen within 3 s. Leaving raises Revoked where the hold was taken away and the body has not been told."""
+        Entering raises TimeoutError, RequestRefused, Revoked if somebody ended the request, and NoRcm if no leader is
+        visible within 3 s. Leaving raises Revoked if the hold was taken away and the body was not interrupted."""
         how: dict[str, Any] = {"priority": priority, "min_runtime": min_runtime, "keep": keep, "timeout": timeout}
         how |= {"comment": comment, "direct": direct, "confirmed": confirmed, "wait_for_device": wait_for_device}
         how["booking"] = booking
@@ -299,5 +299,7 @@ class Lab:
 
 
 def connect(name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None) -> Lab:
-    """Joins the mesh from a plain script. Raises MeshError, BadInput."""
+    """Join the mesh, for code without asyncio. `name` must be unique on this host; the default is random. `fleet`
+    defaults to the fleet file named by $ZSCOUT_FLEET, else to the default fleet. `host` defaults to the name of this
+    machine. Raises MeshError, BadInput."""
     return Lab(name, fleet=fleet, host=host)

@@ -54,19 +54,18 @@ M = TypeVar("M", bound=Message)
 
 
 class RcmSilent(RequestRefused):
-    """No RCM answered: what was asked may be done or not."""
+    """No leader answered; the operation may or may not have been done."""
 
 
 class BookingsClient:
-    """The bookings of a fleet, as the program of a client knows them. `timeout`: seconds within which some RCM
-    answers."""
+    """The bookings of a fleet, read and changed through `client`. `timeout`: seconds to wait for a leader's answer."""
 
     def __init__(self, client: Client, *, timeout: float = TIMEOUT) -> None:
         self._client, self._mesh, self._timeout = client, client.mesh, timeout
 
     async def list(self, *, owner: str | None = None, rc: str | None = None) -> BookingsTold:
-        """All that are not over, or those of a host or person, or that may have one RC; with the fleet's time. Raises
-        RcmSilent, RequestRefused."""
+        """Return the bookings that are not over, all or those of `owner` (a host or a person) or that may use the
+        device `rc`, and the fleet's time. Raises RequestRefused; RcmSilent if no leader answers."""
         question, silent = BookingsAsk(owner=owner, rc=rc), "does not tell of bookings; it may be older than these"
         return await self._until_told(self._mesh.keys.rcm_bookings, question, BookingsTold, ANSWER, silent)
 
@@ -84,15 +83,19 @@ class BookingsClient:
         maintenance: bool = False,
         comment: str = "",
     ) -> BookingView:
-        """Books all of `needs` together, from `start` on for `runtime` seconds. Returns when a second host has it.
+        """Book all of `needs` together, from `start` on for `runtime` seconds. Return when a second host has stored
+        the booking.
 
-        It lapses when nobody has taken it up `patience` seconds after its date (default: 15 min, or its whole time if
-        that is less). `every` so many days it comes again, at the same hour in the zone of `start`, which is a
-        `ZoneInfo` then, until `until`, a year from now at most. With `maintenance`, which takes an operator, nobody is
-        to hold any of them then. It is taken up by a request with its `terms`.
+        The booking lapses `patience` seconds after its start if no request has taken it up (default: 15 min, or
+        its whole time if that is shorter). A request takes it up with its `terms`.
 
-        Raises RequestRefused, whose `code` is `not_free` where something is in the way, RcmSilent, and ValueError for
-        what is no date or no span of time."""
+        - `every`: repeat it every so many days, at the same hour in the zone of `start`, whose zone must be a
+          `ZoneInfo`.
+        - `until`: repeat it no later than this, at most a year from now.
+        - `maintenance`: keep the devices free of holders. Needs the rights of an operator.
+
+        Raises RequestRefused, with `code` `not_free` if a device is taken; RcmSilent if no leader answers;
+        ValueError for a bad date or span of time."""
         check_seconds("runtime", runtime)
         zone = _zone(start, every)
         if patience is None:
@@ -117,8 +120,8 @@ class BookingsClient:
         )
 
     async def unbook(self, booking: str, start: datetime | int | None = None) -> BookingView:
-        """Gives up the booking of this id, or of one that is repeated the date that begins at `start`. Who has taken it
-        up goes on. Raises RequestRefused, RcmSilent."""
+        """Cancel the booking with this id, or only the date of its series that begins at `start`. A request that has
+        taken it up continues. Raises RequestRefused, RcmSilent."""
         at = _whole_second(start) if isinstance(start, datetime) else start
         return await self.ask(Unbook(booking, at, self._client.who), BookingView)
 
@@ -132,8 +135,9 @@ class BookingsClient:
         priority: int = 0,
         limit: int = 5,
     ) -> SlotsTold:
-        """The first times at which all of `needs` could be booked together for `runtime` seconds, within so many
-        seconds from `start` (default: from now) on. Raises RequestRefused, RcmSilent."""
+        """Return the first times at which all of `needs` are free together for `runtime` seconds. The search covers
+        `within` seconds from `start` (default: now), and returns at most `limit` times. Raises RequestRefused,
+        RcmSilent."""
         check_seconds("runtime", runtime)
         return await self.ask(
             FindSlots(
@@ -151,7 +155,8 @@ class BookingsClient:
 
     @staticmethod
     def terms(booking: BookingView) -> dict[str, Any]:
-        """How a request takes it up: `zscout.hold(client, "survey", **bookings.terms(booking))`."""
+        """Return the arguments with which a request takes up a booking: `zscout.hold(client, "survey",
+        **bookings.terms(booking))`."""
         return {
             "needs": booking.needs,
             "priority": booking.priority,
@@ -160,7 +165,7 @@ class BookingsClient:
         }
 
     async def ask(self, operation: Operation, kind: type[M]) -> M:
-        """An operation, which is idempotent by its id. Raises RequestRefused, RcmSilent."""
+        """Send an operation until a leader answers; its id makes it idempotent. Raises RequestRefused, RcmSilent."""
         keys, me = self._mesh.keys, self._mesh.me
         if keys.closed and (why := self._client.fleet.access.refusal(me.host, "book", USERS)):
             raise RequestRefused(Problem("not_allowed", why))

@@ -7,7 +7,7 @@ import itertools
 import logging
 import os
 import socket
-from collections.abc import Callable, Coroutine, Generator, Mapping
+from collections.abc import Coroutine, Generator, Mapping
 from contextlib import ExitStack, closing
 from decimal import Decimal
 from typing import Any, Final, Generic, Self, TypeVar
@@ -15,10 +15,9 @@ from typing import Any, Final, Generic, Self, TypeVar
 from msgspec.structs import replace
 
 from zscout import messages
-from zscout.behaviors.client.confirmation import NOT_DONE, NOT_HELD, Confirmations
-from zscout.behaviors.client.direct import DirectHold
-from zscout.behaviors.client.handover import MovableClient
+from zscout.behaviors.client.confirmation import NOT_DONE, NOT_HELD
 from zscout.behaviors.client.identity import checked_comment, this_program
+from zscout.behaviors.client.internals import ClientInternals
 from zscout.behaviors.client.rcm_link import QUERY_TIMEOUT, TRY_AGAIN
 from zscout.behaviors.client.request import (
     CommandRefused,
@@ -32,11 +31,11 @@ from zscout.behaviors.client.request import (
 from zscout.config.certificates import read_certificates
 from zscout.config.fleet import FLEET_VARIABLE, Fleet, beside, fleet_from_env
 from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_name
-from zscout.mesh import Declaration, Mesh, ZenohMesh
+from zscout.mesh import Mesh, ZenohMesh
 from zscout.mesh.exchange import naming_versions
-from zscout.mesh.supervision import Supervisor, done_within
+from zscout.mesh.supervision import done_within
 from zscout.messages import Done, Foresight, Notice, Problem, RcmState, Who
-from zscout.types import SECOND, Grant, Ns, Term
+from zscout.types import SECOND, Grant
 
 __all__ = ["QUERY_TIMEOUT", "TRY_AGAIN", "Client", "CommandRefused", "NoRcm", "RequestRefused"]
 
@@ -47,51 +46,36 @@ LOOK_FOR_RCM: Final = 3.0
 LOOK_FOR_TAKEOVER: Final = 5.0
 """The same where a candidate is seen."""
 MAX_NAMED: Final = 5
-LAST_WORD: Final = 0.5
-"""Seconds at most for which a client that closes tells RCs that its programs are gone."""
 TOLD_WITHIN = 1.0
 """Seconds within which a notice says so too; else the RC is believed."""
-RENEW_TOKEN: Final[Ns] = SECOND // 2
-"""A client that is dropped again after its token was renewed renews it no sooner."""
 
 
-class Client(MovableClient):
-    """One program on the mesh. Open with `async with Client.connect(...) as client`, or `await
+class Client:
+    """A program's connection to the mesh. Open it with `async with Client.connect(...) as client`, or `await
     Client.connect(...)` and `close` it."""
 
     def __init__(self, mesh: Mesh, fleet: Fleet) -> None:
-        super().__init__(mesh, fleet, Supervisor(f"client {mesh.me}", self._failed))
+        self.mesh, self.fleet = mesh, fleet
+        # For zscout's own modules; may change without notice.
+        self.internals = own = ClientInternals(mesh, fleet, self._command, self._on_notice)
+        self._store, self._rcm, self._supervisor = own.store, own.rcm, own.supervisor
+        self._confirmations = own.confirmations
         self.who: Who | None = None
-        """Who asks, as others are told; `connect` fills it in."""
-        self._leaving: asyncio.Task[None] | None = None
-        self._declared: list[Declaration] = []
-        self._token: Declaration | None = None
-        self._instance = ""
-        """Of its token."""
+        """User, host and command, shown to other people. `connect` sets it."""
+        self.waits_for_devices = False
+        """Default of the argument `wait_for_device`."""
         self._commanded = itertools.count(1)
-        self._shown: Ns = 0
-        """When the present token was declared."""
         self._denied: set[Grant] = set()
         """Grants that an RC says are over, and no notice yet."""
-        self._confirmations = Confirmations(
-            mesh,
-            fleet,
-            self._store,
-            self._rcm,
-            self._supervisor,
-            self._command,
-            lambda arc: self._supervisor.spawn(self._ask_again(arc)),
-        )
-        self.waits_for_devices = False
-        """Whether its requests wait for what nobody knows, instead of being refused, if they do not say."""
 
     @classmethod
     def connect(
         cls, name: str | None = None, *, fleet: Fleet | None = None, host: str | None = None
     ) -> Connecting[Self]:
-        """Joins the mesh: await the result, or enter it. `name` must be the only one of this host; the default is.
-
-        Without a `fleet`, the one that ZSCOUT_FLEET names, or the default. Raises MeshError, BadInput."""
+        """Join the mesh: await the result, or use it with `async with`. `name` must be unique on this host; the default
+        is random. `fleet` defaults to the fleet file named by $ZSCOUT_FLEET, else to the default fleet. `host` defaults
+        to $ZSCOUT_HOST, else to the name of this machine; in a secured fleet, to the name in the certificate. Raises
+        MeshError, BadInput."""
         return Connecting(cls._connect(name, fleet, host))
 
     @classmethod
@@ -103,9 +87,16 @@ class Client(MovableClient):
             host = host or read_certificates(fleet.security).name
         host = host or os.environ.get("ZSCOUT_HOST") or machine
         me = Sender(check_name(host, "host"), check_name(name or f"client-{new_instance()}", "client"))
-        client = cls(await ZenohMesh.open(replace(fleet, mesh=beside(fleet.mesh)), me), fleet)
+        client = cls.on(await ZenohMesh.open(replace(fleet, mesh=beside(fleet.mesh)), me), fleet)
         client.who = this_program(host if fleet.security is None else machine)
-        return client.start()
+        return client
+
+    @classmethod
+    def on(cls, mesh: Mesh, fleet: Fleet) -> Self:
+        """Return a client on an open mesh, which it closes: for tests, on a `zscout.testing.MemoryMesh`."""
+        client = cls(mesh, fleet)
+        client.internals.start()
+        return client
 
     async def __aenter__(self) -> Self:
         return self
@@ -113,83 +104,18 @@ class Client(MovableClient):
     async def __aexit__(self, *exc: object) -> None:
         await self.close()
 
-    def start(self) -> Self:
-        """Declares on the mesh what a client has; `connect` does so."""
-        keys, mesh = self.mesh.keys, self.mesh
-        self._declared = [mesh.subscribe(keys.notice(mesh.me), Notice, self._on_notice), *self._rcm.start()]
-        mesh.watch_links()
-        self._store.ask_again = self._on_dropped
-        self._renew_token()
-        self._supervisor.spawn(self._rcm.keep_asking())
-        self._supervisor.spawn(self._rcm.watch_lease())
-        return self
-
-    def _renew_token(self) -> None:
-        """Shows that this client lives, by a token that nobody can have taken for gone."""
-        mesh = self.mesh
-        self._instance = new_instance()
-        token = mesh.alive(Token(mesh.me.host, Role.CLIENT, mesh.me.client, self._instance))
-        if self._token is not None:
-            self._token.close()
-        self._token, self._shown = token, mesh.now()
-
-    def _on_dropped(self, arc: OpenArc) -> None:
-        # All that was dropped together is asked for with one token.
-        if arc.outcome == "client_lost" and self.mesh.now() - self._shown > RENEW_TOKEN:
-            self._renew_token()
-        self._supervisor.spawn(self._ask_again(arc))
-
     async def close(self) -> None:
-        """Gives back everything and leaves the mesh."""
-        try:
-            if self._leaving is None:
-                self._store.resumed.set()
-                self._may_end.set()
-                await self._supervisor.close()
-                await asyncio.gather(*(self.end(arc) for arc in self._store.open))
-                if telling := self._confirmations.telling:
-                    await asyncio.wait(telling, timeout=LAST_WORD)
-        finally:
-            await self.leave()
-
-    async def leave(self) -> None:
-        """Leaves the mesh without ending anything or giving it back: for who has handed over all. What is
-        still this client's goes when the RCM sees that its token has gone."""
-        self._leaving = self._leaving or asyncio.create_task(self._leave())
-        # Its token must go even if the caller is cancelled.
-        await asyncio.shield(self._leaving)
-
-    async def _leave(self) -> None:
-        self._may_end.set()
-        try:
-            await self._supervisor.close()
-        finally:
-            for telling in self._confirmations.telling:
-                telling.cancel()
-            for declared in (*filter(None, [self._token]), *reversed(self._declared)):
-                declared.close()
-            await self.mesh.close()
-
-    def _failed(self, error: Exception) -> None:
-        """A task of this client failed: its holds end here, and at the RCM when its token has gone."""
-        for arc in self._store.open:
-            arc.finish("lost", f"this client failed: {error!r}", self.mesh.now())
-            self._store.notify(arc)
-        self._leaving = self._leaving or asyncio.create_task(self._leave())
-
-    @property
-    def term(self) -> Term:
-        """The highest term received or promised; what is of an older one is ignored."""
-        return self._rcm.term
+        """Give back everything held or requested, and leave the mesh."""
+        await self.internals.close()
 
     @property
     def leader(self) -> str | None:
-        """The host whose node leads, or None where no RCM is seen."""
+        """The host of the leading node; None while no leader is visible."""
         return self._rcm.leader
 
     async def see_rcm(self, seconds: float = LOOK_FOR_RCM, takeover: float = LOOK_FOR_TAKEOVER) -> None:
-        """Returns as soon as an RCM is seen. Raises NoRcm where none is within `seconds`, or within `takeover` where a
-        candidate is seen, which may be about to take the lead."""
+        """Return as soon as a leader is visible. Raises NoRcm if none appears within `seconds`, or within `takeover`
+        seconds if a node is visible that may lead."""
         if self.leader is not None:
             return
         seen, candidates = asyncio.Event(), set[Token]()
@@ -235,25 +161,32 @@ class Client(MovableClient):
         booking: str = "",
         continues: str = "",
     ) -> OpenArc:
-        """Asks for an ARC and returns when the RCM has answered, for as long as that takes.
+        """Request devices, and return when the leader has answered, however long that takes.
 
-        Once granted it is protected for `min_runtime` seconds (default: the fleet's, 60), and held until somebody of
-        equal or higher priority waits for what it holds; without `keep`, it ends when they are over.
+        The result is passed to the other methods. Its `state` is `queued`, `running` or `ended`; it has a `reason`, and
+        while it runs a `grant` and its `rcs`.
 
-        A need names an RC, or is a pattern that any one RC meets: `framegrabber/*`; `framegrabber/*#2` is one
-        more. With `estimate` its notices say when it will start. `direct`: its program touches devices past their RCs;
-        see `direct_hold`. The `comment` is shown to others. What can never start is refused at once: a parameter that
-        its RC does not know, more of one than that ever carries, and, unless it is to `wait_for_device` (default:
-        `waits_for_devices`), a need that nobody knows. With a `booking`, by its id, it takes that up, whose needs and
-        priority it has (`BookingsClient.terms`), and waits for its next date. It `continues` this client's ARC of that
-        name, which holds less at a lower priority: where it takes over all RCs of that one in one step, their devices
-        are not made safe in between. Raises RequestRefused where the request can't be taken as it is, ValueError for
-        too long a comment.
+        Once granted, the hold is protected for `min_runtime` seconds (default: the fleet's, 60), and continues until a
+        request of equal or higher priority waits for one of its devices. With `keep=False` it ends after `min_runtime`.
 
-        An ARC of this name and these needs that another client hands over is returned instead, as it is."""
+        `needs` maps each need to its parameters: `{"robot/scout33": {}}`. A need is a device, or a pattern that any one
+        matching device satisfies: `framegrabber/*`, and `framegrabber/*#2` for one more.
+
+        - `estimate`: the returned request has an estimated start.
+        - `direct`: the program also reaches its devices past zscout; `zscout.hold(direct=True)` handles what follows.
+        - `comment`: shown to other people.
+        - `wait_for_device`: wait for an unknown device instead of raising (default: `waits_for_devices`).
+        - `booking`: the id of a booking to take up. The request has its needs and priority (`BookingsClient.terms`),
+          and waits for its next date.
+        - `continues`: the name of this client's request whose hold this one replaces. It must hold less, at a lower
+          priority. If all its devices pass over in one step, they are not made safe in between.
+
+        If another client is handing over a request of this name and these needs, that request is returned.
+
+        Raises RequestRefused if the request can never be granted as it is, ValueError if the comment is too long."""
         wanted = amounts(needs)
         who = replace(self.who or Who(), comment=checked_comment(comment)) if comment else self.who
-        arc = await self._claim(check_name(name, "arc"), wanted)
+        arc = await self.internals.claim(check_name(name, "arc"), wanted)
         if arc is None:
             seconds, now = self._protected(min_runtime), self.mesh.now()
             arc = OpenArc(new_instance(), name, wanted, priority, seconds, keep, estimate, direct, since=now)
@@ -283,17 +216,15 @@ class Client(MovableClient):
         return self.waits_for_devices if wait_for_device is None else wait_for_device
 
     async def changed(self, arc: OpenArc) -> None:
-        """Waits until there is news of `arc`."""
+        """Wait for the next change of the request `arc`."""
         await self._store.changed(arc)
 
     async def granted(self, arc: OpenArc, *, confirmed: bool = False) -> Grant | None:
-        """Waits until `arc` is granted; None if it ended instead. Its RCs are asked beside whether they know of it, and
-        if not, it is taken away again: `arc` has no grant then, and waits for another one.
-
-        With `confirmed`, and for a direct request, it waits until all RCs have confirmed it, which they do once they
-        have settled; raises CommandRefused where one refuses it for a reason that waiting does not mend.
-
-        Nothing is entered while the client is paused, nor is what it hands over reported as ended."""
+        """Wait until the request `arc` is granted. Return None if it ended instead. Its devices are asked at the same
+        time whether they know of the grant. If one does not confirm it within a second, the grant is withdrawn and the
+        request waits again. With `confirmed`, and for a direct request, return only when all devices have confirmed the
+        grant, which they do once they are ready. Raises CommandRefused if a device refuses it for a reason that does
+        not pass with time."""
         while True:
             await self._store.resumed.wait()
             if not arc.open:
@@ -312,62 +243,25 @@ class Client(MovableClient):
                 await self.end(arc)
                 raise confirmation.refused
 
-    async def confirmed(self, arc: OpenArc) -> bool:
-        """Waits until all RCs of the present grant have confirmed it. False: they do not, or it is over."""
-        if (grant := arc.grant) is None:
-            return False
-        confirmation = self._confirmations.begin(arc, grant)
-        await confirmation.over()
-        return arc.grant == grant and confirmation.all
-
-    def direct_hold(self, grant: Grant) -> DirectHold | None:
-        """For who runs the program of a direct request: how long its hold may be relied on, and what is to be told when
-        the program is gone. None where the request was not direct, or that has been told."""
-        return self._confirmations.direct(grant)
-
     async def end(self, arc: OpenArc) -> None:
-        """Gives back a hold, or leaves the queue: once the client is no longer paused, if that was not handed
-        over then. The program of a direct one is gone by then. Tried a few times; the RCM sees our token die
-        otherwise."""
-        await self._may_end.wait()
-        if self._leaving is not None:
-            return
-        if arc.state == "moved":
-            self._store.forget(arc)
-            return
-        self._confirmations.program_is_gone(arc)
-        await self._rcm.end(arc)
-
-    def complete(self, arc: OpenArc) -> None:
-        """An ARC has had its time by this host's clock, and its body has returned; RCs and RCM end it by theirs."""
-        self._confirmations.program_is_gone(arc)
-        self.expire(arc)
-
-    def expire(self, arc: OpenArc) -> None:
-        """An ARC has had its time by this host's clock: it is not asked for any more, though a direct body may clear
-        up yet."""
-        arc.finish("completed", "its minimum runtime is over", self.mesh.now())
-        self._store.notify(arc)
-        self._store.forget(arc)
+        """Give back a hold, or take a request out of the queue. Return when the leader has answered, or after a few
+        tries."""
+        await self.internals.end(arc)
 
     async def hand_over(self, arc: OpenArc, to: Sender) -> None:
-        """Lets one ARC, queued or running, go on in another client. Raises RequestRefused."""
+        """Pass one request, queued or running, to the client `to`. Raises RequestRefused."""
         reply = await self._rcm.query(messages.HandOver(id=arc.id, to=str(to)))
         if reply is None or reply.message is None:
             unknown = Problem("unknown", "the RCM did not answer; ask how the ARC stands")
             raise RequestRefused(reply.problem or unknown if reply is not None else unknown)
-
-    def watch(self, watcher: Callable[[OpenArc], None]) -> None:
-        """Calls `watcher(arc)` whenever there is news of any of this client's requests."""
-        self._store.watchers.append(watcher)
 
     # Operators' questions
 
     async def state(
         self, arc: str | None = None, *, forecast: bool = False, timeout: float = QUERY_TIMEOUT
     ) -> RcmState | None:
-        """The RCM's state, with the history of `arc` if one is named, and with a `forecast` of when those who
-        wait will start; None if no RCM answered."""
+        """Return the leader's state: what is held and what waits. None if no leader answered in `timeout` seconds. With
+        `arc`, the state includes the history of that request; with `forecast`, the estimated starts."""
         asked = messages.StateAsk(arc=arc, forecast=forecast)
         reply = await self.mesh.ask_one(self.mesh.keys.rcm_state, asked, RcmState, timeout=timeout)
         return reply.message if reply is not None else None
@@ -382,7 +276,8 @@ class Client(MovableClient):
         keep: bool = True,
         wait_for_device: bool | None = None,
     ) -> Foresight | None:
-        """What would come of a request, without making it; None if no RCM answered. Raises RequestRefused."""
+        """Return what a request would lead to, without making it. None if no leader answered. Takes what `request`
+        takes. Raises RequestRefused."""
         seconds = self._protected(min_runtime)
         waits, wanted = self._waits(wait_for_device), amounts(needs)
         asked = messages.Foresee(
@@ -397,8 +292,9 @@ class Client(MovableClient):
     async def command(
         self, rc: str, grant: Grant, do: Mapping[str, Any], *, ttl: float = 1.0, timeout: float = 2.0
     ) -> Done:
-        """Has an RC do something under `grant`. An RC that may not know of it yet, or settles, has `ttl` seconds to
-        confirm it. Raises CommandRefused."""
+        """Have the device `rc` carry out a command under `grant`, and return its answer: `result` is what it returned.
+        A device that does not know of the grant yet, or is not ready yet, has `ttl` seconds to become so. Waits
+        `timeout` seconds for the answer. Raises CommandRefused."""
         began = self.mesh.now()
         try:
             return await self._command(rc, grant, do, ttl=ttl, timeout=timeout)
@@ -415,7 +311,7 @@ class Client(MovableClient):
         self, rc: str, grant: Grant, do: Mapping[str, Any], *, ttl: float = 1.0, timeout: float = 2.0
     ) -> Done:
         key = self.mesh.keys.command(rc, self.mesh.me)
-        id_ = f"{self._instance}-{next(self._commanded)}"
+        id_ = f"{self.internals.instance}-{next(self._commanded)}"
         command = messages.Command(grant=grant, do=dict(do), ttl=ttl, id=id_)
         reply = await self.mesh.ask_one(key, command, Done, timeout=timeout)
         if reply is None:
@@ -435,14 +331,14 @@ class Client(MovableClient):
         if arc.grant == grant and arc.id in self._store.arcs and self._store.resumed.is_set():
             arc.lose(reason, self.mesh.now())
             self._store.notify(arc)
-            self._supervisor.spawn(self._ask_again(arc))
+            self._supervisor.spawn(self.internals.ask_again(arc))
 
     def _on_notice(self, _key: str, notice: Notice) -> None:
         if not self._rcm.accept(notice.term):
             return
         if (arc := self._store.arcs.get(notice.id)) is not None:
             self._store.take(arc, notice)
-        elif not self._take_moving(notice) and notice.id not in self._store.withdrawn:
+        elif not self.internals.take_moving(notice) and notice.id not in self._store.withdrawn:
             # What nobody here asked for, or what was over here before an RCM that took the lead heard of it.
             if notice.state == "running":
                 self._supervisor.spawn(self._rcm.give_back(messages.Release(id=notice.id)))

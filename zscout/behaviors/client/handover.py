@@ -73,7 +73,7 @@ class MovableClient:
         self._unclaimed |= arcs
         self.expected_came.clear()
 
-    def _take_moving(self, notice: Notice) -> bool:
+    def take_moving(self, notice: Notice) -> bool:
         """Applies a notice of what is expected, or was handed over. False if it is of neither."""
         if (arc := self._store.expected.get(notice.id)) is not None:
             if arc.take_first(notice, self.mesh.now()):
@@ -91,7 +91,7 @@ class MovableClient:
             return True
         return False
 
-    async def _claim(self, name: str, needs: dict[str, Amounts]) -> OpenArc | None:
+    async def claim(self, name: str, needs: dict[str, Amounts]) -> OpenArc | None:
         """The ARC of this name and these needs that is expected, once it has come; None if there is none."""
         unclaimed = self._unclaimed.values()
         arc = next((arc for arc in unclaimed if (arc.name, arc.needs) == (name, needs)), None)
@@ -121,7 +121,7 @@ class MovableClient:
     async def _await_again(self, arc: OpenArc) -> None:
         await self._come(arc)
         if arc.open:
-            await self._ask_again(arc)
+            await self.ask_again(arc)
 
     async def _give_back_unwanted(self, arc: OpenArc) -> None:
         await asyncio.sleep(CLAIM_TIMEOUT)
@@ -158,9 +158,9 @@ class MovableClient:
         self._may_end.set()
         self._store.resumed.set()
         for arc in self._store.open:
-            self._supervisor.spawn(self._ask_again(arc))
+            self._supervisor.spawn(self.ask_again(arc))
 
-    async def _ask_again(self, arc: OpenArc) -> None:
+    async def ask_again(self, arc: OpenArc) -> None:
         """An acknowledged request is asked once; what was lost or taken back until there is an answer."""
         try:
             if arc.state != "asking":

@@ -20,7 +20,7 @@ Needs = Mapping[str, Mapping[str, Any]]
 
 
 class RequestRefused(Exception):
-    """The RCM will not take this request as it is; the message says why, `code` is the protocol's."""
+    """The request was refused. The message is the reason; `code` is one of the codes of the protocol."""
 
     def __init__(self, problem: Problem) -> None:
         super().__init__(problem.message)
@@ -28,18 +28,19 @@ class RequestRefused(Exception):
 
 
 class NoRcm(Exception):
-    """No RCM is on the mesh; the message says what to look at."""
+    """No leader is on the mesh; the message says what to check."""
 
 
 class CommandRefused(Exception):
-    """An RC did not obey; `code` is the protocol's, or `unknown` where no answer came."""
+    """A device refused a command. `rc` names it, `code` is one of the codes of the protocol, or `unknown` if no
+    answer came."""
 
     def __init__(self, rc: str, problem: Problem) -> None:
         super().__init__(f"{rc}: {problem.message}")
         self.rc, self.problem = rc, problem
         self.code, self.message = problem.code, problem.message
         self.left = problem.left
-        """With `settling`: the seconds for which the RC may go on to settle."""
+        """With `code` `settling`: seconds, at most, until the device is ready."""
 
 
 class HoldEnd(NamedTuple):

@@ -23,22 +23,22 @@ BAD_PARAMS: Final = 78
 
 
 class Component:
-    """Base of all components. It is made in the process that runs it, before that process is on the mesh."""
+    """Base class of components. An instance is made in the process that runs it, before that process joins the mesh."""
 
     def __init__(self, params: dict[str, Any]) -> None:
-        """`params` are the spec's. Raise ValueError, with one line that says what to mend, for bad ones: then it is
-        given up, with that line. What is found later ends with `sys.exit(BAD_PARAMS)`."""
+        """`params` are those of the component. Raise ValueError with one line if they are bad: the component is then
+        given up with that line. For problems found later, exit with `sys.exit(BAD_PARAMS)`."""
 
     async def run(self, context: ComponentContext) -> None:
-        """Does the work. Cancelled when the component is to end: let `async with` give back its ARCs."""
+        """Do the work. Cancelled to end the component; `async with` then gives back its devices."""
         raise NotImplementedError(f"{type(self).__name__} has no run(); write one")
 
     def checkpoint(self) -> bytes:
-        """Its state, MAX_CHECKPOINT bytes at most. Called while `run` is held at a safe point."""
+        """Return the state, at most MAX_CHECKPOINT bytes (4 MB). Called while `run` is held at a safe point."""
         raise NotImplementedError
 
     def restore(self, state: bytes) -> None:
-        """Takes in what `checkpoint` gave in another process. Called before `run`."""
+        """Take over the state that `checkpoint` returned in another process. Called before `run`."""
         raise NotImplementedError
 
 
@@ -49,19 +49,20 @@ def is_movable(component: Component) -> bool:
 
 
 class ComponentContext:
-    """What a component runs with: its client on the mesh, its name and its incarnation."""
+    """A component's surroundings: its client on the mesh, its name and its incarnation."""
 
     def __init__(self, client: Client, component: str, incarnation: int, gate: SafePointGate) -> None:
         self.client = client
+        """A connected `zscout.Client`."""
         self.component = component
+        """The component's name."""
         self.incarnation = incarnation
-        """Which start of it this is."""
+        """The number of this start of the component."""
         self._gate = gate
 
     async def safe_point(self) -> None:
-        """Says: my state is whole here, I may be checkpointed or moved. Call it often; it costs next to
-        nothing, and gives the event loop a turn. What else the component does must not touch its state
-        while this has not returned."""
+        """Allow a checkpoint or a move here, where the state is complete. Call it often: it takes next to no time.
+        Until it returns, no other task of the component may change the state."""
         await self._gate.come()
 
 
@@ -121,9 +122,8 @@ class BadKind(Exception):
 
 
 def installed_kinds() -> dict[str, str]:
-    """Where each kind is: its name, and `module:class`. Reads the metadata of all packages: some 10 ms.
-
-    A kind that two packages bring, in different places, is none: which one is meant nobody knows."""
+    """Where each kind is: its name, and `module:class`. Reads the metadata of all packages: some 10 ms. A kind that two
+    packages bring, in different places, is none: which one is meant nobody knows."""
     found: dict[str, set[str]] = {}
     for entry in metadata.entry_points(group=GROUP):
         with suppress(BadName):

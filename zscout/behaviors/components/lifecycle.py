@@ -97,7 +97,7 @@ class ComponentLifecycle:
             # run() stays where it is: to unwind it would give up what another one holds now.
             ends = self._away or EndReport("moved")
             if self._client is not None:
-                await self._client.leave()
+                await self._client.internals.leave()
             return ends
         left.cancel()
         try:
@@ -273,14 +273,14 @@ class ComponentLifecycle:
             self.end(EndReport("failed", words))
             raise NotMoved("start_failed", words) from None
         try:
-            client.expect(handed.requests)
+            client.internals.expect(handed.requests)
         except (BadName, ValueError) as error:
             raise NotMoved("bad_request", _words(error, named=False)) from None
         self._restored.set()
         await self._report(OrderAnswer(number))
 
     async def _see_handed(self, client: Client) -> None:
-        await client.expected_came.wait()
+        await client.internals.expected_came.wait()
         await self._alone.wait()
         # After a partition the link to the older one may come back a little later than that to the RCM.
         while await done_within(client.fleet.mesh.lease, self._accompanied.wait()):

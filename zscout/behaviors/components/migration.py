@@ -72,18 +72,18 @@ class OutgoingMove:
         if not await self._gate.hold(self._patience):
             raise NotMoved("not_safe", f"it came to no safe point within {self._patience:g} s")
         began, self.began = self._client.mesh.now(), True
-        self._client.pause()
+        self._client.internals.pause()
         try:
             await self._hand_over()
         except BaseException:
             # What was not handed over goes on; what was taken back is asked anew already.
-            self._client.resume()
+            self._client.internals.resume()
             self._gate.release()
             raise
         return (self._client.mesh.now() - began) / SECOND
 
     async def _hand_over(self) -> None:
-        state, requests = state_of(self._component), self._client.open_requests()
+        state, requests = state_of(self._component), self._client.internals.open_requests()
         await self._give(state, requests)
         if not self._gate.holds:
             raise NotMoved("move_failed", "it left its safe point: a hold of it ended just then")
@@ -95,7 +95,7 @@ class OutgoingMove:
             return
         words = f"incarnation {self.incarnation} on {self.to} ended; its ARCs are asked anew here"
         try:
-            await self._client.hand_over_all(Sender(self.to, f"{self._name}.{self.incarnation}"))
+            await self._client.internals.hand_over_all(Sender(self.to, f"{self._name}.{self.incarnation}"))
         except RequestRefused as refused:
             if refused.code != "unknown":
                 words = f"the RCM refused the hand-over: {refused}"
@@ -104,7 +104,7 @@ class OutgoingMove:
         else:
             going_on = await self._confirmed()
         if not going_on:
-            self._client.take_back()
+            self._client.internals.take_back()
             raise NotMoved("move_failed", words)
 
     async def _give(self, state: bytes, requests: list[OpenRequest]) -> None:

@@ -15,7 +15,7 @@ from zscout.behaviors.client.client import RequestRefused
 from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
 from zscout.behaviors.sensor_net.net import Effect, SensorNet, StopRobot
 from zscout.behaviors.tree import Behavior, BehaviorContext, CarriedClock
-from zscout.drivers.driver import RcDirectory
+from zscout.drivers.own import RcDirectory
 from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor, done_within, supervised
 from zscout.messages import MAX_COMPONENT_NAME, BehaviorSaid, ComponentSpec, Placement, Placements

@@ -123,7 +123,7 @@ async def carry_out(client: Client, wanted: HoldOptions) -> int:
     stream = sys.stderr if wanted.command else sys.stdout
     client.who = wanted.asked_by(client.who)
     with Report(wanted.name, client, as_json=wanted.as_json, stream=stream) as report:
-        client.watch(report.news)
+        client.internals.watch(report.news)
         arc: OpenArc | None = None
         while True:
             try:
@@ -229,7 +229,7 @@ def _never_suspended(report: Report) -> Iterator[None]:
 
 async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) -> int | None:
     """Runs the command until it ends (its code), or until the hold is over and it has been ended (None)."""
-    direct, program = client.direct_hold(held.grant), wanted.command[0]
+    direct, program = client.internals.direct_hold(held.grant), wanted.command[0]
     until = direct.sure_until if direct is not None else None
     command = RunningCommand(wanted.command, environment(held, client), _grace(wanted, report, direct), until)
 

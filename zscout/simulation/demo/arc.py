@@ -76,7 +76,7 @@ async def behave(spec: ArcSpec, signal: asyncio.Event) -> None:
                 answered = True
                 report("answered", arc.reason)
 
-        client.watch(on_state)
+        client.internals.watch(on_state)
         needs: dict[str, dict[str, Decimal]] = {rc: {} for rc in spec.needs}
         how: dict[str, Any] = {"priority": spec.priority, "min_runtime": spec.min_runtime, "keep": False}
         asking = holds(client, spec.arc, needs, **how)

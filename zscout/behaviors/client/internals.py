@@ -1,0 +1,161 @@
+"""What zscout's own modules do with a client, beside what programs do with it: `Client.internals`.
+
+Its time on the mesh, from its token on; how it moves (`handover.py`); and what becomes of a hold whose body is run by
+`arc.py`, `blocking.py` or a command."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import Final
+
+from zscout.behaviors.client.confirmation import Confirmations
+from zscout.behaviors.client.direct import CommandSender, DirectHold
+from zscout.behaviors.client.handover import MovableClient
+from zscout.behaviors.client.request import OpenArc
+from zscout.config.fleet import Fleet
+from zscout.keyexpr import Role, Token, new_instance
+from zscout.mesh import Declaration, Mesh
+from zscout.mesh.supervision import Supervisor
+from zscout.messages import Notice
+from zscout.types import SECOND, Grant, Ns, Term
+
+LAST_WORD: Final = 0.5
+"""Seconds at most for which a client that closes tells RCs that its programs are gone."""
+RENEW_TOKEN: Final[Ns] = SECOND // 2
+"""A client that is dropped again after its token was renewed renews it no sooner."""
+
+
+class ClientInternals(MovableClient):
+    """Of one client. `command` sends a command once; `on_notice` is given each notice of the RCM."""
+
+    def __init__(
+        self, mesh: Mesh, fleet: Fleet, command: CommandSender, on_notice: Callable[[str, Notice], None]
+    ) -> None:
+        self.supervisor = Supervisor(f"client {mesh.me}", self._failed)
+        super().__init__(mesh, fleet, self.supervisor)
+        self.store, self.rcm, self._on_notice = self._store, self._rcm, on_notice
+        self.confirmations = Confirmations(mesh, fleet, self.store, self.rcm, self.supervisor, command, self._ask_soon)
+        self.leaving: asyncio.Task[None] | None = None
+        self.instance = ""
+        """Of its token."""
+        self._declared: list[Declaration] = []
+        self._token: Declaration | None = None
+        self._shown: Ns = 0
+        """When the present token was declared."""
+
+    # On the mesh
+
+    def start(self) -> None:
+        """Declares on the mesh what a client has."""
+        keys, mesh = self.mesh.keys, self.mesh
+        self._declared = [mesh.subscribe(keys.notice(mesh.me), Notice, self._on_notice), *self.rcm.start()]
+        mesh.watch_links()
+        self.store.ask_again = self._on_dropped
+        self._renew_token()
+        self.supervisor.spawn(self.rcm.keep_asking())
+        self.supervisor.spawn(self.rcm.watch_lease())
+
+    def _renew_token(self) -> None:
+        """Shows that this client lives, by a token that nobody can have taken for gone."""
+        mesh = self.mesh
+        self.instance = new_instance()
+        token = mesh.alive(Token(mesh.me.host, Role.CLIENT, mesh.me.client, self.instance))
+        if self._token is not None:
+            self._token.close()
+        self._token, self._shown = token, mesh.now()
+
+    def _on_dropped(self, arc: OpenArc) -> None:
+        # All that was dropped together is asked for with one token.
+        if arc.outcome == "client_lost" and self.mesh.now() - self._shown > RENEW_TOKEN:
+            self._renew_token()
+        self._ask_soon(arc)
+
+    def _ask_soon(self, arc: OpenArc) -> None:
+        self.supervisor.spawn(self.ask_again(arc))
+
+    async def close(self) -> None:
+        """Gives back everything and leaves the mesh."""
+        try:
+            if self.leaving is None:
+                self.store.resumed.set()
+                self._may_end.set()
+                await self.supervisor.close()
+                await asyncio.gather(*(self.end(arc) for arc in self.store.open))
+                if telling := self.confirmations.telling:
+                    await asyncio.wait(telling, timeout=LAST_WORD)
+        finally:
+            await self.leave()
+
+    async def leave(self) -> None:
+        """Leaves the mesh without ending anything or giving it back: for who has handed over all. What is
+        still this client's goes when the RCM sees that its token has gone."""
+        self.leaving = self.leaving or asyncio.create_task(self._leave())
+        # Its token must go even if the caller is cancelled.
+        await asyncio.shield(self.leaving)
+
+    async def _leave(self) -> None:
+        self._may_end.set()
+        try:
+            await self.supervisor.close()
+        finally:
+            for telling in self.confirmations.telling:
+                telling.cancel()
+            for declared in (*filter(None, [self._token]), *reversed(self._declared)):
+                declared.close()
+            await self.mesh.close()
+
+    def _failed(self, error: Exception) -> None:
+        """A task of this client failed: its holds end here, and at the RCM when its token has gone."""
+        for arc in self.store.open:
+            arc.finish("lost", f"this client failed: {error!r}", self.mesh.now())
+            self.store.notify(arc)
+        self.leaving = self.leaving or asyncio.create_task(self._leave())
+
+    @property
+    def term(self) -> Term:
+        """The highest term received or promised; what is of an older one is ignored."""
+        return self.rcm.term
+
+    # Its holds
+
+    def watch(self, watcher: Callable[[OpenArc], None]) -> None:
+        """Calls `watcher(arc)` whenever there is news of any of this client's requests."""
+        self.store.watchers.append(watcher)
+
+    async def confirmed(self, arc: OpenArc) -> bool:
+        """Waits until all RCs of the present grant have confirmed it. False: they do not, or it is over."""
+        if (grant := arc.grant) is None:
+            return False
+        confirmation = self.confirmations.begin(arc, grant)
+        await confirmation.over()
+        return arc.grant == grant and confirmation.all
+
+    def direct_hold(self, grant: Grant) -> DirectHold | None:
+        """For who runs the program of a direct request: how long its hold may be relied on, and what is to be told when
+        the program is gone. None where the request was not direct, or that has been told."""
+        return self.confirmations.direct(grant)
+
+    async def end(self, arc: OpenArc) -> None:
+        """Gives back a hold, or leaves the queue: once the client is no longer paused, if that was not handed over
+        then. The program of a direct one is gone by then. Tried a few times; the RCM sees our token die otherwise."""
+        await self._may_end.wait()
+        if self.leaving is not None:
+            return
+        if arc.state == "moved":
+            self.store.forget(arc)
+            return
+        self.confirmations.program_is_gone(arc)
+        await self.rcm.end(arc)
+
+    def complete(self, arc: OpenArc) -> None:
+        """An ARC has had its time by this host's clock, and its body has returned; RCs and RCM end it by theirs."""
+        self.confirmations.program_is_gone(arc)
+        self.expire(arc)
+
+    def expire(self, arc: OpenArc) -> None:
+        """An ARC has had its time by this host's clock: it is not asked for any more, though a direct body may clear
+        up yet."""
+        arc.finish("completed", "its minimum runtime is over", self.mesh.now())
+        self.store.notify(arc)
+        self.store.forget(arc)
