@@ -17,17 +17,17 @@ docs/how-to/test-your-code.md shows more."""
 from __future__ import annotations
 
 from zscout.testing.device import FakeDevice
-from zscout.testing.fleet import MemoryFleet, ComponentRun, until
+from zscout.testing.fleet import ComponentRun, MemoryFleet, until
 from zscout.testing.memory import MemoryMesh, MemoryNetwork
 from zscout.testing.virtual_time import Deadlock, in_virtual_time, run
 
 __all__ = [
+    "ComponentRun",
     "Deadlock",
     "FakeDevice",
     "MemoryFleet",
     "MemoryMesh",
     "MemoryNetwork",
-    "ComponentRun",
     "in_virtual_time",
     "run",
     "until",
