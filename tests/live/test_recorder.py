@@ -102,7 +102,7 @@ def presence(path: Path) -> list[str]:
 
 def words(path: Path, arc: str) -> list[str]:
     """The states of an ARC, one after the other, without their details."""
-    return [state for state, _ in groupby(text.split(" · ")[0] for (text,) in lane(path, f"/arc/{arc}"))]
+    return [state for state, _ in groupby(text.split(" · ")[0] for (text,) in lane(path, f"/requests/{arc}"))]
 
 
 async def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
@@ -140,23 +140,23 @@ async def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
         await recorded(runs, lambda path: {"node b is gone", "robot/b is gone from b"} <= {*presence(path)})
         await ended(lab, "a")
     path = the_file(tmp_path / "runs")
-    robot = lane(path, "/rc/robot/a")
+    robot = lane(path, "/devices/robot/a")
     # Between two holders it may be free for a moment: votes of the radio may be asked again.
     assert [held for (held,) in robot if held] == ["survey", "operator" + MARK, "survey"]
     assert robot[0] == robot[-1] == [""]
-    assert [held for held, _ in groupby(lane(path, "/rc/robot/b"))][:4] == [[""], ["survey"], ["later"], [""]]
-    radio = lane(path, "/rc/radio/a")
+    assert [held for held, _ in groupby(lane(path, "/devices/robot/b"))][:4] == [[""], ["survey"], ["later"], [""]]
+    radio = lane(path, "/devices/radio/a")
     assert ["survey", "listen"] in radio
     assert radio[-1] == ["", ""]
-    assert colours(path, "/rc/robot/**")["/rc/robot/a"]["operator" + MARK] == OPERATOR
+    assert colours(path, "/devices/robot/**")["/devices/robot/a"]["operator" + MARK] == OPERATOR
 
     assert words(path, "survey")[-4:] == ["running", "preempted", "running", "done"]
     assert words(path, "listen")[-2:] == ["running", "done"]
     assert words(path, "later") == ["waiting", "running", "done"]
     assert words(path, "operator") == ["running", "done"]
-    waiting = next(text for (text,) in lane(path, "/arc/later") if text.startswith("waiting"))
+    waiting = next(text for (text,) in lane(path, "/requests/later") if text.startswith("waiting"))
     assert re.fullmatch(r"waiting · for survey \([^\s@]+@\S+\): robot/b", waiting)
-    assert any(", priority 1" in text for (text,) in lane(path, "/arc/survey") if text.startswith("preempted"))
+    assert any(", priority 1" in text for (text,) in lane(path, "/requests/survey") if text.startswith("preempted"))
 
     owner = r" of [^\s@]+@\S+"
     assert any(re.fullmatch(rf"survey{owner} runs on .*", text) for text in events(path))
@@ -202,16 +202,16 @@ async def test_a_recorder_starts_in_the_middle_and_outlives_the_leader(tmp_path:
         await client.end(second)
         await lab.state(client, lambda state: not state.holds)
         ends = [["waiter"], [""]], [[""]]
-        await recorded(runs, lambda path: (lane(path, "/rc/robot/b")[-2:], lane(path, "/rc/robot/c")[-1:]) == ends)
+        await recorded(runs, lambda path: (lane(path, "/devices/robot/b")[-2:], lane(path, "/devices/robot/c")[-1:]) == ends)
         # The node is shot: its recorder finishes the file all the same, as its input closes.
         lab.nodes["c"].kill()
         await until(lambda: finished(the_file(tmp_path / "runs")))
     path = the_file(tmp_path / "runs")
-    twins = {lane(path, f"/rc/robot/{rc}")[0][0]: rc for rc in "bc"}
+    twins = {lane(path, f"/devices/robot/{rc}")[0][0]: rc for rc in "bc"}
     assert set(twins) == {"twin", "twin.2"}
     label = {rc: name for name, rc in twins.items()}
-    assert lane(path, "/rc/robot/b") == [[label["b"]], ["waiter"], [""]]
-    assert lane(path, "/rc/robot/c") == [[label["c"]], [""]]
+    assert lane(path, "/devices/robot/b") == [[label["b"]], ["waiter"], [""]]
+    assert lane(path, "/devices/robot/c") == [[label["c"]], [""]]
     assert words(path, "waiter") == ["waiting", "running", "done"]
     told = events(path)
     # Two hosts tell of a change of leaders, so either may be heard first.
@@ -252,7 +252,7 @@ async def test_what_ends_while_no_rcm_is_there_is_seen_from_the_devices(tmp_path
         async with asyncio.timeout(HANG):
             await over.wait()
         subscription.close()
-        await recorded(runs, lambda path: lane(path, "/rc/robot/b")[:3] == [[""], ["survey"], [""]])
+        await recorded(runs, lambda path: lane(path, "/devices/robot/b")[:3] == [[""], ["survey"], [""]])
         await ended(lab, "b")
 
 
@@ -362,7 +362,7 @@ async def test_a_recorder_that_comes_late_has_what_a_journal_kept(tmp_path: Path
         assert process.stdin is not None
         process.stdin.close()
         assert await asyncio.to_thread(process.wait, HANG) == 0
-    shown = [state for (state,) in lane(the_file(runs), "/rc/robot/a") if state]
+    shown = [state for (state,) in lane(the_file(runs), "/devices/robot/a") if state]
     assert shown == (["survey (journal)", "film (journal)"] if past else []) + ["film"]
     RrdReader(the_file(runs)).store()
 
@@ -416,7 +416,7 @@ async def test_parts_follow_one_another_and_the_oldest_make_room(tmp_path: Path)
     told: list[str] = []
     for number, path in enumerate(parts()):
         RrdReader(path).store()  # it has its footer: it was written anew
-        states = [held for (held,) in lane(path, "/rc/robot/a")]
+        states = [held for (held,) in lane(path, "/devices/robot/a")]
         assert number == 0 or states[0] == told[-1]
         told += states
     assert [held for held, _ in groupby(told)] == ["", "survey", ""]

@@ -113,8 +113,8 @@ def test_the_page_is_served_with_the_recording_and_ctrl_c_ends_all(recording: Pa
 def shows_table_2(path: Path) -> bool:
     with suppress(ValueError, RuntimeError, OSError, KeyError, IndexError), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the file is still being written
-        shown = lanes(path, "/rc/**")
-        return {rc: second_by_second(shown[f"/rc/{rc}"]) for rc in RCS} == TABLE2
+        shown = lanes(path, "/devices/**")
+        return {rc: second_by_second(shown[f"/devices/{rc}"]) for rc in RCS} == TABLE2
     return False
 
 
@@ -154,7 +154,7 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
         with suppress(ValueError, RuntimeError, OSError, KeyError, IndexError), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             (file,) = (tmp_path / "out").glob("*.rrd")
-            return [state for lane in lanes(file, "/rc/**").values() for _, states in lane for state in states]
+            return [state for lane in lanes(file, "/devices/**").values() for _, states in lane for state in states]
         return []
 
     def has_past() -> bool:
@@ -187,7 +187,7 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
                 assert not listens(stream)
             (file,) = (tmp_path / "out").glob("*.rrd")
             assert f"Recording to {file}\n" in (tmp_path / "view.out").read_text()
-            (lane,) = lanes(file, "/rc/**").values()
+            (lane,) = lanes(file, "/devices/**").values()
             assert [states for _, states in lane][-2:] == [["survey"], [""]]
 
     asyncio.run(story())

@@ -35,8 +35,8 @@ def test_a_minute_of_robots_at_a_glance(path: Path, tmp_path: Path) -> None:
         views = client.get_state().views
     assert [report for view in views for report in view.reports] == []
     assert {view.name for view in views} == {
-        "Who holds each resource",
-        "What each ARC is doing",
+        "Who holds each device",
+        "What each request is doing",
         "What each behavior is doing",
         "Load average (1 min) per host",
         f"Floor   {FLOOR_WORDS}",

@@ -56,8 +56,8 @@ async def test_it_reads_the_state_and_follows_what_is_published(path: Path) -> N
         await asyncio.sleep(1)
         rcm.mesh.put(rcm.mesh.keys.grants, grants(2))
         await asyncio.sleep(1)
-    assert [state for _, state in lanes(path, "/rc/**")[f"/rc/{SCOUT33}"]] == [["hide"], [""]]
-    doing = [state[0] for _, state in lanes(path, "/arc/**")["/arc/hide"]]
+    assert [state for _, state in lanes(path, "/devices/**")[f"/devices/{SCOUT33}"]] == [["hide"], [""]]
+    doing = [state[0] for _, state in lanes(path, "/requests/**")["/requests/hide"]]
     assert doing == ["waiting · robot/scout33 is held by drive", "running · priority 1 · min 5 s"]
     assert "hide runs on robot/scout33" in events(path)
 
@@ -76,13 +76,13 @@ async def test_bars_say_who_is_in_the_way_and_events_nothing_of_comings_and_goin
         queue.append(WaitView("a1", "hide", str(me), 1, PLACE, {SCOUT33: {}}, Decimal(5), 0.0, REASON, why=why))
         rcm.mesh.put(rcm.mesh.keys.notice(me), notice)
         await asyncio.sleep(1)
-        assert list(timeline.layout(live=False).contended) == [f"/rc/{SCOUT33}"]
+        assert list(timeline.layout(live=False).contended) == [f"/devices/{SCOUT33}"]
         for token in tokens:
             token.close()
         await asyncio.sleep(1)
-        assert list(timeline.layout(live=False).absent) == [f"/rc/{SCOUT33}"]
-    assert [state for _, (state,) in lanes(path, "/arc/hide")["/arc/hide"]] == [f"waiting · for drive: {SCOUT33}"]
-    assert [state for _, (state,) in lanes(path, f"/rc/{SCOUT33}")[f"/rc/{SCOUT33}"]] == ["", "not there"]
+        assert list(timeline.layout(live=False).absent) == [f"/devices/{SCOUT33}"]
+    assert [state for _, (state,) in lanes(path, "/requests/hide")["/requests/hide"]] == [f"waiting · for drive: {SCOUT33}"]
+    assert [state for _, (state,) in lanes(path, f"/devices/{SCOUT33}")[f"/devices/{SCOUT33}"]] == ["", "not there"]
     assert events(path) == ["anvil leads", f"hide {REASON}"]
     assert [text for _, _, (text,) in rows(path, "/presence", "TextLog:text")] == [
         "node cart is there",
@@ -111,9 +111,9 @@ async def test_a_bar_names_first_who_holds_what_would_do(path: Path) -> None:
     async with recording(path, ears(network), rcm.mesh):
         pass
     blocked = f"for hide (root@cart), survey (alice@dray): {SCOUT33}; one of framegrabber/fg1, fg2 and 1 more"
-    assert {entity: [text for _, (text,) in lane] for entity, lane in lanes(path, "/arc/**").items()} == {
-        "/arc/watch": [f"waiting · {blocked}"],
-        "/arc/film": ["waiting · votes are out"],
+    assert {entity: [text for _, (text,) in lane] for entity, lane in lanes(path, "/requests/**").items()} == {
+        "/requests/watch": [f"waiting · {blocked}"],
+        "/requests/film": ["waiting · votes are out"],
     }
     assert events(path) == ["anvil leads", f"watch waits {blocked}", "film waits: votes are out"]
 
@@ -125,7 +125,7 @@ async def test_at_its_end_it_reads_what_was_published_and_missed(path: Path) -> 
     rcm = Leader(network, lambda: RcmState(TERM, len(holds), "anvil", holds))
     async with recording(path, ears(network), rcm.mesh):
         holds.append(view)
-    assert [state for _, state in lanes(path, "/rc/**")[f"/rc/{SCOUT33}"]] == [["hide"]]
+    assert [state for _, state in lanes(path, "/devices/**")[f"/devices/{SCOUT33}"]] == [["hide"]]
 
 
 async def test_a_part_that_raises_is_logged_and_ends_it(

@@ -172,8 +172,8 @@ def test_the_paper_s_example_in_the_viewer(tmp_path: Path) -> None:
 
     assert [report for view in state.views for report in view.reports] == []
     assert {view.name for view in state.views} == {
-        "Who holds each resource",
-        "What each ARC is doing",
+        "Who holds each device",
+        "What each request is doing",
         "Load average (1 min) per host",
         "Events",
         "Who comes and goes",
@@ -295,8 +295,8 @@ def written(path: Path) -> bool | None:
     """True once all of Table 2 is in the file that is still open."""
     with suppress(ValueError, RuntimeError, OSError, KeyError), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        shown = lanes(path, "/rc/**")
-        done = lanes(path, "/arc/**")
-        if len(done) == 5 and {rc: second_by_second(shown[f"/rc/{rc}"]) for rc in RCS} == TABLE2:
+        shown = lanes(path, "/devices/**")
+        done = lanes(path, "/requests/**")
+        if len(done) == 5 and {rc: second_by_second(shown[f"/devices/{rc}"]) for rc in RCS} == TABLE2:
             return True
     return None

@@ -183,7 +183,7 @@ def _shaped(shape: Callable[..., rr.AsComponents], fields: dict[str, Any]) -> rr
 
 
 class HolderRow(NamedTuple):
-    """An ARC that holds an RC; `operator` if its priority is an operator's; and the robots of its gang."""
+    """A request that holds a device; `operator` if its priority is an operator's; and the robots of its gang."""
 
     arc: str
     operator: bool = False
@@ -204,13 +204,21 @@ class Lanes:
     """The lanes in one folder, at most `limit`; `others` ends the note that there are more.
 
     `colours`: distinct texts of one lane that keep their colour; past it, the one longest unused loses it.
-    `depth`: parts of a name, with `/` between, that have parts of the entity of their own."""
+    `depth`: parts of a name, with `/` between, that have parts of the entity of their own. `slots`: rows of one lane."""
 
     def __init__(
-        self, drawing: Drawing, folder: str, limit: int, others: str, *, colours: int = 256, depth: int = 4
+        self,
+        drawing: Drawing,
+        folder: str,
+        limit: int,
+        others: str,
+        *,
+        colours: int = 256,
+        depth: int = 4,
+        slots: int = MAX_SLOTS,
     ) -> None:
         self._drawing, self._folder, self._limit, self._others = drawing, folder, limit, others
-        self._colours, self._depth = colours, depth
+        self._colours, self._depth, self._slots = colours, depth, slots
         self._lanes: dict[str, _Lane] = {}
         """By entity: names that differ may be cleaned to the same."""
 
@@ -243,7 +251,7 @@ class Lanes:
         lane = self._lane(at, entity)
         if lane is None:
             return
-        rows = [shown.get(row, (row, OTHER)) for row in _seat(lane, (name for name in shown if name))]
+        rows = [shown.get(row, (row, OTHER)) for row in _seat(lane, (name for name in shown if name), self._slots)]
         self._configure(entity, lane, rows)
         lane.rows = len(rows)
         self._drawing.show(at, entity, rr.StateChange, state=[text for text, _ in rows])
@@ -283,11 +291,11 @@ class Lanes:
         return known != colour
 
 
-def _seat(lane: _Lane, names: Iterable[str]) -> list[str]:
+def _seat(lane: _Lane, names: Iterable[str], most: int) -> list[str]:
     """Names by row. What stays keeps its row, so that no bar jumps; no row is taken away."""
     wanted = dict.fromkeys(names)
-    crowded = len(wanted) > MAX_SLOTS
-    rows = MAX_SLOTS - 1 if crowded else MAX_SLOTS
+    crowded = len(wanted) > most
+    rows = most - 1 if crowded else most
     slots = [name if name in wanted and row < rows else "" for row, name in enumerate(lane.slots)]
     for name in (name for name in wanted if name not in slots):
         if "" in slots[:rows]:
