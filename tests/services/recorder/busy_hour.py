@@ -18,7 +18,7 @@ from zscout.messages import (
     Revocation,
     Who,
 )
-from zscout.scheduling.model import ArcRequest, Dropped, Effect, Granted, HoldEnded, Outcome, Queued
+from zscout.scheduling.model import ArcRequest, Dropped, Effect, Granted, HoldEnded, Queued
 from zscout.services.rcm.registry import reason_info
 from zscout.services.recorder.request_tracker import RequestTracker
 from zscout.services.recorder.timeline import Timeline
@@ -47,7 +47,7 @@ TERM: Final = Term(1, "anvil")
 
 def requests() -> dict[str, tuple[int, ArcRequest, Who]]:
     """By ARC: when it asks, what, and who."""
-    chance = random.Random(7)
+    chance = random.Random(7)  # noqa: S311
     found: dict[str, tuple[int, ArcRequest, Who]] = {}
 
     def ask(at: int, name: str, user: str, needs: tuple[str, ...], priority: int, runtime: int, command: str) -> None:
@@ -55,7 +55,13 @@ def requests() -> dict[str, tuple[int, ArcRequest, Who]]:
         who = Who(user, host, command)
         arc = f"{host}/request-{len(found)}/a1"
         request = ArcRequest(
-            arc, f"{host}/request-{len(found)}", {rc: {} for rc in needs}, priority, runtime * SECOND, label=name, who=who
+            arc,
+            f"{host}/request-{len(found)}",
+            {rc: {} for rc in needs},
+            priority,
+            runtime * SECOND,
+            label=name,
+            who=who,
         )
         found[arc] = at, request, who
 
@@ -93,7 +99,7 @@ def play(timeline: Timeline, until: int = HOUR) -> RequestTracker:
         while ticked < at:
             for number, host in enumerate(("anvil", "basil", "crucible")):
                 busy = sum(bool(holders) for holders in holds.values())
-                timeline.hosts.load(ticked, host, 0.2 + 0.1 * busy * (number + 1) / 2 + 0.1 * random.random(), 0.4)
+                timeline.hosts.load(ticked, host, 0.2 + 0.1 * busy * (number + 1) / 2, 0.4)
             ticked += 5
             timeline.regroup(ticked)
         touched, revoked = set[str](), list[Revocation]()
@@ -108,16 +114,31 @@ def play(timeline: Timeline, until: int = HOUR) -> RequestTracker:
                     info = reason_info(effect.reason, now)
                     revoked.append(
                         Revocation(
-                            "a1", request.name, request.client, grants.pop(arc), list(effect.rcs), effect.outcome.value,
-                            str(effect.reason), by, info,
+                            "a1",
+                            request.name,
+                            request.client,
+                            grants.pop(arc),
+                            list(effect.rcs),
+                            effect.outcome.value,
+                            str(effect.reason),
+                            by,
+                            info,
                         )
                     )
                 case Granted(arc=arc, rcs=rcs):
                     _, request, who = asked[arc]
                     grants[arc] = Grant(TERM, len(grants) + 1000 * step + seq + 1)
                     holder = Holder(
-                        "a1", request.name, request.client, grants[arc], Place(TERM, 1), list(rcs),
-                        Decimal(request.min_runtime // SECOND), 5.0, request.priority, who=who,
+                        "a1",
+                        request.name,
+                        request.client,
+                        grants[arc],
+                        Place(TERM, 1),
+                        list(rcs),
+                        Decimal(request.min_runtime // SECOND),
+                        5.0,
+                        request.priority,
+                        who=who,
                     )
                     for rc in rcs:
                         holds[rc][arc] = holder

@@ -109,10 +109,10 @@ class Layout(msgspec.Struct, frozen=True):
     slides with the newest data and shows the last minute. `wall`: whether the timeline has wall-clock times. `rc_rows`,
     `arc_rows` and `host_rows` are the rows expected in the upper panes, which share the height accordingly. Without
     components `host_rows` is 0. `waiting_rows` are those of the requests that wait, in a pane of their own; 0: no such
-    pane. `banner`: whether there is a text above all. `contended` and `absent` are rows by entity of RCs that several want, and of those that
-    are not there: past ONE_PANE panes of their own, above the other RCs and below them. `ahead`: rows of the charts of what is
-    booked; 0: none. `past`: seconds before the begin of which journals told, 0: none; `only_past` are entities of RCs
-    of which nothing else is known."""
+    pane. `banner`: a text above all panes. `contended` and `absent` are rows by entity of devices that several want,
+    and of those that are not there: past ONE_PANE rows they have panes of their own, above the other devices and below
+    them. `ahead`: rows of the charts of what is booked; 0: none. `past`: seconds before the begin
+    that the journals know, 0: none; `only_past` are entities of devices of which nothing else is known."""
 
     span: tuple[float, float] | None = None
     wall: bool = False

@@ -38,7 +38,6 @@ GRID: Final = 0x3A3F4AFF
 NOW: Final = 0xF4F6FAFF
 STATES: Final[dict[str, int]] = {
     "waiting": 0x6E5A20FF,
-    "waiting again": OPERATOR,
     "running": 0x2A7A46FF,
     "preempted": OPERATOR,
     "done": 0x2A2A31FF,

@@ -117,8 +117,12 @@ class Drawing:
             if entity in self._shown:
                 self.erase(at, entity)
         elif self._shown.get(entity) != (shape, fields):
-            self._shown[entity] = shape, fields
-            self.log(at, entity, _shaped(shape, fields))
+            self.show_again(at, entity, shape, **fields)
+
+    def show_again(self, at: float, entity: str, shape: Callable[..., rr.AsComponents], **fields: Any) -> None:
+        """The same, though nothing may have changed."""
+        self._shown[entity] = shape, fields
+        self.log(at, entity, _shaped(shape, fields))
 
     def erase(self, at: float, entity: str) -> None:
         """What the entity shows ends, and so does a curve: no line goes on to its next point."""
@@ -204,7 +208,8 @@ class Lanes:
     """The lanes in one folder, at most `limit`; `others` ends the note that there are more.
 
     `colours`: distinct texts of one lane that keep their colour; past it, the one longest unused loses it.
-    `depth`: parts of a name, with `/` between, that have parts of the entity of their own. `slots`: rows of one lane."""
+    `depth`: parts of a name, with `/` between, that have parts of the entity of their own. `slots`: rows of a lane at
+    most."""
 
     def __init__(
         self,

@@ -71,7 +71,9 @@ class RequestTracker:
         self._labels: set[str] = set()
         self._rcs = timeline.robots.holds
         self._absent: dict[str, str] = {}
-        """What is said of RCs that are not there: they had holders, or could have had."""
+        """Words for devices that are not there: they had holders, or could have had."""
+        self.offered: dict[str, set[str]] = {}
+        """By device the hosts that offer it, as this recorder sees by token."""
 
     def grants(self, at: float, grants: Grants) -> bool:
         """What the RCM publishes; returns whether something before it was missed."""
@@ -108,7 +110,9 @@ class RequestTracker:
         if (state.term, state.seq) < (self.term, self.seq):
             return False
         self.term, self.seq = state.term, state.seq
-        holders: dict[str, list[HoldView]] = {rc: [] for rc in (*(view.rc for view in state.rcs), *self._rcs)}
+        holders: dict[str, list[HoldView]] = {
+            rc: [] for rc in (*(view.rc for view in state.rcs if view.present), *self._rcs)
+        }
         open_now = {(hold.client, hold.id) for hold in state.holds}
         open_now |= {(wait.client, wait.id) for wait in state.queue}
         for hold in state.holds:
@@ -135,8 +139,21 @@ class RequestTracker:
             self._show(at, rc, held)
         return True
 
+    @property
+    def in_doubt(self) -> bool:
+        """True if the leader's last state and the tokens seen here differ on which devices are there."""
+        return any((rc in self._absent) == (rc in self.offered) for rc in self._rcs)
+
+    def offer(self, rc: str, host: str, alive: bool) -> bool:
+        """A host offers a device from now on, or no longer; returns whether the device has come or gone with that."""
+        before = rc in self.offered
+        (self.offered.setdefault(rc, set()).add if alive else self.offered.get(rc, set()).discard)(host)
+        if not self.offered.get(rc):
+            self.offered.pop(rc, None)
+        return before != (rc in self.offered)
+
     def rc(self, at: float, rc: str, alive: bool) -> None:
-        """An RC has come or gone. One that is not known yet is free."""
+        """A device has come or gone. One that is not known yet is free."""
         was = self._absent.pop(rc, None)
         if not alive and rc in self._rcs:
             self._absent[rc] = "not there"

@@ -27,15 +27,7 @@ from zscout.services.recorder.blueprint import (
 )
 from zscout.services.recorder.bookings import BookingTracker
 from zscout.services.recorder.colours import ABSENT, OPERATOR, OTHER, PALETTE, STATES, faded
-from zscout.services.recorder.drawing import (
-    MAX_EVENT,
-    Drawing,
-    HolderRow,
-    Lanes,
-    clean_text,
-    disconnect,
-    with_detail,
-)
+from zscout.services.recorder.drawing import MAX_EVENT, Drawing, HolderRow, Lanes, clean_text, disconnect, with_detail
 from zscout.services.recorder.finish import Job, finish
 from zscout.services.recorder.hosts import HostTracker
 from zscout.services.recorder.past import PastBar, PastLane
@@ -260,7 +252,11 @@ class Timeline(Drawing):
         if state in ("done", ""):
             del self._open_colours[arc]
         text = with_detail(state, detail)
-        colour = OPERATOR if operator and state == "running" else STATES.get(state, OTHER)
+        colour = (
+            OPERATOR
+            if operator and state == "running"
+            else STATES.get("preempted" if state == "waiting again" else state, OTHER)
+        )
         name, _, person = arc.removesuffix(")").partition(" (")
         self._arc_lanes.show(at, f"{person}/{name}" if person else arc, {text: (text, colour)})
         if state in WAITING:
