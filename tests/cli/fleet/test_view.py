@@ -25,7 +25,7 @@ from tests.cli.tools import COMMAND, zscout_here
 from tests.hang import HANG
 from tests.live.lab import Lab
 from tests.ports import free_port
-from tests.services.recorder.paper_run import RCS, RERUN, TABLE2, lanes, play_table1, second_by_second
+from tests.services.recorder.paper_run import PERSON, RCS, RERUN, TABLE2, lanes, play_table1, second_by_second
 from zscout.cli.fleet import view as module
 from zscout.keyexpr import Role
 from zscout.messages import Recorded
@@ -158,7 +158,7 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
         return []
 
     def has_past() -> bool:
-        return "before (journal)" in shown()
+        return f"before{PERSON} (journal)" in shown()
 
     async def story() -> None:
         async with Lab(tmp_path) as lab:
@@ -175,9 +175,9 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
                     await recorded.wait()
                 arc = await client.request("survey", {"robot/a": {}}, min_runtime=600)
                 # It has no link to who leads yet, perhaps.
-                await asyncio.to_thread(until, lambda: shown()[-1:] == ["survey"], "the hold is not shown")
+                await asyncio.to_thread(until, lambda: shown()[-1:] == [f"survey{PERSON}"], "the hold is not shown")
                 await client.end(arc)
-                await asyncio.to_thread(until, lambda: shown()[-2:] == ["survey", ""], "its end is not shown")
+                await asyncio.to_thread(until, lambda: shown()[-2:] == [f"survey{PERSON}", ""], "its end is not shown")
                 await asyncio.to_thread(until, has_past, "nothing is shown of the past")
                 children = descendants(process)
                 assert len(children) == 2
@@ -188,7 +188,7 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
             (file,) = (tmp_path / "out").glob("*.rrd")
             assert f"Recording to {file}\n" in (tmp_path / "view.out").read_text()
             (lane,) = lanes(file, "/devices/**").values()
-            assert [states for _, states in lane][-2:] == [["survey"], [""]]
+            assert [states for _, states in lane][-2:] == [[f"survey{PERSON}"], [""]]
 
     asyncio.run(story())
 

@@ -15,8 +15,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import rerun as rr
 
+from zscout.messages import Who
 from zscout.services.recorder.blueprint import TIME, WALL_TIME
 from zscout.services.recorder.colours import OPERATOR, OTHER, PALE
+from zscout.types import clean
 
 MAX_SECONDS: Final = 9e9
 """Rerun counts nanoseconds in 64 bits."""
@@ -27,6 +29,8 @@ MAX_SLOTS: Final = 8
 MAX_STATE: Final = 120
 MAX_EVENT: Final = 500
 """Characters."""
+COMPONENT: Final = "component "
+"""Begins the command of a request that a component made: no person stands behind it."""
 # Latin, Greek and Cyrillic letters, dashes, quotation marks, arrows. The viewer's font lacks others, and the
 # viewer ends where it is to draw what its font lacks.
 _UNKNOWN: Final = re.compile(
@@ -317,6 +321,13 @@ def clean_path(folder: str, name: str, depth: int = 4) -> str:
     """The entity of something with this name, which may have up to `depth` parts with `/` between."""
     parts = (re.sub(r"[^A-Za-z0-9_.-]", "_", part)[:64] for part in name.split("/")[:depth])
     return f"/{folder}/{'/'.join(part or '_' for part in parts)}"
+
+
+def with_person(name: str, who: Who | None) -> str:
+    """A request as people know it: `survey (alice)`."""
+    if who is None or not who.user or who.command.startswith(COMPONENT):
+        return name
+    return f"{name} ({clean(who.user)})"
 
 
 def with_detail(word: str, detail: str) -> str:

@@ -17,11 +17,10 @@ from zscout.messages import (
     ReasonParty,
     Revocation,
     WaitView,
-    Who,
     absurd,
 )
 from zscout.scheduling.reason import ReasonCode, ended, named, short_names, waits
-from zscout.services.recorder.drawing import HolderRow
+from zscout.services.recorder.drawing import HolderRow, with_person
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import NO_TERM, Grant, Term, clean
 
@@ -29,9 +28,6 @@ MAX_OPEN: Final = 20_000
 """Requests followed at one time."""
 MAX_RCS: Final = 10_000
 MAX_HOLDERS: Final = 1_024
-
-COMPONENT: Final = "component "
-"""Begins the command of a request that a component made: no person stands behind it."""
 
 Key = tuple[str, str]
 """Client and id of a request."""
@@ -238,10 +234,10 @@ class RequestTracker:
         """The request, followed from now on; None where too many are open."""
         request = self._requests.get(key)
         if request is None and len(self._requests) < MAX_OPEN:
-            label, number = _with_person(view.arc, view.who), 1
+            label, number = with_person(view.arc, view.who), 1
             while label in self._labels:
                 number += 1
-                label = _with_person(f"{view.arc}.{number}", view.who)
+                label = with_person(f"{view.arc}.{number}", view.who)
             self._labels.add(label)
             request = self._requests[key] = _Request(label)
         if request is not None:
@@ -273,7 +269,7 @@ class RequestTracker:
 
     def _label(self, view: Holder | HoldView | ReasonParty) -> str:
         request = self._requests.get((view.client, view.id))
-        return request.label if request is not None else _with_person(view.arc, view.who)
+        return request.label if request is not None else with_person(view.arc, view.who)
 
     def _show(self, at: float, rc: str, holders: Sequence[Holder | HoldView]) -> None:
         if rc not in self._rcs and len(self._rcs) >= MAX_RCS:
@@ -288,13 +284,6 @@ class RequestTracker:
 
     def _draw(self, at: float, rc: str) -> None:
         self.timeline.holders(at, rc, list(self._rcs[rc].values()), self._absent.get(rc, ""))
-
-
-def _with_person(name: str, who: Who | None) -> str:
-    """`survey (alice)`."""
-    if who is None or not who.user or who.command.startswith(COMPONENT):
-        return name
-    return f"{name} ({clean(who.user)})"
 
 
 def _rcs_of(hold: Holder | HoldView) -> Iterable[str]:
