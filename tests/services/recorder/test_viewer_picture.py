@@ -35,7 +35,7 @@ from tests.services.recorder.paper_run import (
     second_by_second,
 )
 from zscout.messages import BookedDate, BookingsTold, BookingView
-from zscout.services.recorder.blueprint import AHEAD, LIVE_WINDOW, MARGIN, TIME
+from zscout.services.recorder.blueprint import AHEAD, LIVE_WINDOW, MARGIN, ONE_PANE, TIME
 from zscout.services.recorder.colours import ABSENT, ALERT, LINES, MAINTENANCE, OPERATOR, PALETTE, STATES
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import Timeline
@@ -208,6 +208,8 @@ def test_what_several_want_stands_above_and_what_is_not_there_below(tmp_path: Pa
         timeline.holders(0, "robot/a", [], "ws1 is gone")
         timeline.holders(0, "robot/b", [HolderRow("survey")])
         timeline.holders(0, "robot/c", [HolderRow("drive", operator=True)])
+        for number in range(ONE_PANE):
+            timeline.holders(0, f"robot/free{number}", [])
         timeline.contended(1, ["robot/c"])
         timeline.arc(1, "film", "waiting", "for drive: robot/c")
         timeline.event(SECONDS, "the end")
