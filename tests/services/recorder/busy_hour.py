@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from decimal import Decimal
-from typing import Final
+from typing import Any, Final, Literal
 
 from zscout.messages import (
     BookedDate,
@@ -70,7 +70,7 @@ def requests() -> dict[str, tuple[int, ArcRequest, Who]]:
         name = chance.choice(list(KINDS))
         user = chance.choice(list(PEOPLE))
         ask(at, name, user, KINDS[name], chance.choice((1, 1, 1, 2)), chance.randint(50, 260), f"sh -c ./{name}.sh")
-        at += chance.randint(20, 100)
+        at += chance.randint(45, 115)
     for at, runtime, rc in OPERATORS:
         ask(at, "drive", "bob", (rc,), 10, runtime, "zscout drive")
     return found
@@ -85,7 +85,7 @@ def play(timeline: Timeline, until: int = HOUR) -> RequestTracker:
     tracker.state(0, RcmState(TERM, 0, "anvil", rcs=[RcView(rc, True, False) for rc in DEVICES]))
     ticked = 0
 
-    def notice(now: Ns, arc: str, state: str, **more: object) -> None:
+    def notice(now: Ns, arc: str, state: Literal["queued", "ended"], **more: Any) -> None:
         nonlocal step
         step += 1
         _, request, who = asked[arc]
@@ -167,7 +167,7 @@ def play(timeline: Timeline, until: int = HOUR) -> RequestTracker:
 def booked(now: int, end: int) -> BookingsTold:
     """What is booked, as the leader reports it, in the day from the end of the hour on."""
 
-    def one(name: str, owner: str, rcs: tuple[str, ...], start: float, hours: float, **date: str) -> BookingView:
+    def one(name: str, owner: str, rcs: tuple[str, ...], start: float, hours: float, **date: Any) -> BookingView:
         begin = end + round(start * HOUR)
         dates = [BookedDate(begin, begin + round(hours * HOUR), "open", **date)]
         return BookingView(
