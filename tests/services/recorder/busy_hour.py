@@ -70,7 +70,7 @@ def requests() -> dict[str, tuple[int, ArcRequest, Who]]:
         name = chance.choice(list(KINDS))
         user = chance.choice(list(PEOPLE))
         ask(at, name, user, KINDS[name], chance.choice((1, 1, 1, 2)), chance.randint(50, 260), f"sh -c ./{name}.sh")
-        at += chance.randint(45, 115)
+        at += chance.randint(35, 110)
     for at, runtime, rc in OPERATORS:
         ask(at, "drive", "bob", (rc,), 10, runtime, "zscout drive")
     return found
@@ -91,17 +91,21 @@ def play(timeline: Timeline, until: int = HOUR) -> RequestTracker:
         _, request, who = asked[arc]
         tracker.notice(now / SECOND, Notice("a1", request.name, request.client, state, TERM, step, who=who, **more))
 
-    def watch(now: Ns, _core: object, effects: list[Effect]) -> None:
-        nonlocal seq, ticked
-        at = now / SECOND
-        if at > until:
-            return
+    def tick(at: float) -> None:
+        nonlocal ticked
         while ticked < at:
             for number, host in enumerate(("anvil", "basil", "crucible")):
                 busy = sum(bool(holders) for holders in holds.values())
                 timeline.hosts.load(ticked, host, 0.2 + 0.1 * busy * (number + 1) / 2, 0.4)
             ticked += 5
             timeline.regroup(ticked)
+
+    def watch(now: Ns, _core: object, effects: list[Effect]) -> None:
+        nonlocal seq
+        at = now / SECOND
+        if at > until:
+            return
+        tick(at)
         touched, revoked = set[str](), list[Revocation]()
         for effect in effects:
             match effect:
@@ -161,6 +165,7 @@ def play(timeline: Timeline, until: int = HOUR) -> RequestTracker:
         tuple(Arrival(at * SECOND, request) for at, request, _ in asked.values()),
     )
     replay(workload, watch)
+    tick(until)
     return tracker
 
 
