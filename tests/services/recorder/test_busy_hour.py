@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,12 +22,12 @@ def test_after_an_hour_those_who_wait_come_first_and_eight_devices_have_room(pat
         timeline.bookings.told(0, busy_hour.booked(0, busy_hour.HOUR))
         busy_hour.play(timeline)
         layout = timeline.layout(live=True)
-        waiting, devices, booked = blueprint(layout).root_container.contents[0].contents
-        shares = blueprint(layout).root_container.contents[0].row_shares
+        panes: Any = next(iter(blueprint(layout).root_container.contents))
+    waiting, devices, booked = panes.contents
     assert [view.name for view in waiting.contents] == ["Who waits, and for whom", "What each request is doing"]
     assert devices.name == "Who holds each device"
     assert booked.contents[0].name.startswith("Booked")
-    assert sum(shares) <= HEIGHT
+    assert sum(panes.row_shares) <= HEIGHT
     texts = {
         text
         for content in ("/who/**", "/devices/**")
@@ -34,6 +35,6 @@ def test_after_an_hour_those_who_wait_come_first_and_eight_devices_have_room(pat
         for _, row in lane
         for text in row
     }
-    assert "pick (alice)" in texts
+    assert "burn-in (alice)" in texts
     assert any(" waits again for " in text for text in texts)
     assert not any("sh -c" in text for text in texts)

@@ -47,7 +47,7 @@ def test_a_picture_that_is_old_says_so(path: Path) -> None:
 
 
 def test_an_old_picture_is_a_whole_one_in_the_next_file_too(path: Path, tmp_path: Path) -> None:
-    """The viewer shows an opacity without a picture as bad data."""
+    """An opacity alone has no picture there."""
     picture = jpeg(0, "scout33", None)
     with Timeline("lab", path=path) as timeline:
         timeline.robots.frame(1, CAMERA, head(1), picture)

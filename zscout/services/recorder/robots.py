@@ -261,8 +261,7 @@ class RobotTracker:
         self._write(at, seen, words, PALE)
 
     def _draw_picture(self, at: float, seen: _Camera, jpeg: bytes, opacity: float) -> None:
-        """Logs the whole picture at each change: to the viewer, an opacity whose picture is in an earlier file is bad
-        data."""
+        """Logs the whole picture at each change: a file, or a viewer that comes late, may lack the one before."""
         seen.jpeg = jpeg
         self._drawing.show_again(
             at, seen.entity, rr.EncodedImage, contents=jpeg, media_type="image/jpeg", opacity=opacity
