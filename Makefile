@@ -6,7 +6,7 @@ READY := $(VENV)/.ready
 PEERS := .venv-peers
 PEERS_READY := $(PEERS)/.ready
 
-.PHONY: help setup demo test test-all docs lint bench bench-peers model install-check chaos soak lock clean
+.PHONY: help setup demo test test-all docs pictures lint bench bench-peers model install-check chaos soak lock clean
 
 help:
 	@echo "make demo   four robots in a simulated building hide and watch, on a live mesh"
@@ -15,6 +15,7 @@ help:
 	@echo "make docs   the documentation as a site, in site/"
 	@echo "make lint   formatting, linting, strict types, the rooms' contracts, links of the docs"
 	@echo "make install-check   the wheel in clean environments, by pip, pipx and uv, and the light installation"
+	@echo "make pictures   the pictures of README and docs; needs a Vulkan driver"
 	@echo "make bench  latencies as ratios to a bare Zenoh query"
 	@echo "make model  what the model checker TLC says of the models in formal/; needs a Java runtime"
 	@echo "make chaos  20 minutes of faults in a real fleet, held against docs/promises.md; needs root, network namespaces, iproute2"
@@ -43,6 +44,9 @@ test-all: $(READY)
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 	@echo "site/index.html"
+
+pictures: $(READY)
+	$(BIN)/python docs/pictures.py
 
 # Strict: a link or anchor that leads nowhere fails it.
 lint: $(READY) docs

@@ -32,6 +32,8 @@ STUDIES: Final[dict[str, Study]] = {
     "watching": Study("watching:main", "How many passers-by does the motion detector report?", "20 min"),
     "cdnet": Study("cdnet:main", "How does the motion detector compare with MOG2 and KNN on CDnet 2014?", "1 min"),
     "faults": Study("faults.commands:faults", "Are all promises kept under faults, in virtual time?", "3 min"),
+    "overlap": Study("overlap:main", "Do two programs ever run at one exclusive device?", "10 min, root"),
+    "sites": Study("sites:main", "Is nothing lost when the relay between two sites fails?", "15 min, root"),
     "guards": Study("suite:guards", "Which guards of the protocol does the quick tier of tests notice?", "30 min"),
     "coverage": Study("suite:coverage", "What do slow tests alone reach?", "40 min"),
     "booking-cost": Study("booking_cost:main", "What does a booking cost beside a bare query?", "1 min"),
@@ -63,8 +65,7 @@ def main(arguments: Sequence[str]) -> int:
         code = run_command(lambda: run.main(rest, program, standalone_mode=False))
         return code if isinstance(code, int) else 0
     sys.argv = [program, *rest]
-    run()
-    return 0
+    return run() or 0
 
 
 if __name__ == "__main__":

@@ -23,14 +23,14 @@ from zscout.terminal import print_line, print_table
 
 VARIABLE: Final = "ZSCOUT_WITHOUT"
 IN_PROCESS: Final = (
-    "tests/behaviors",
+    "tests/studies/faults",
+    "tests/services/rcm",
+    "tests/services/bookings",
+    "tests/behaviors/client",
     "tests/drivers",
-    "tests/mesh",
     "tests/scheduling",
-    "tests/services",
-    "tests/studies",
 )
-"""Folders whose tests run services in their own process, where a guard can be taken out."""
+"""Folders whose tests run guarded code in their own process, where a guard can be taken out."""
 ROOMS: Final = ("scheduling", "services", "drivers", "behaviors")
 SUMMED: Final = ("covered_lines", "num_statements", "covered_branches", "num_branches")
 """Of the summary of a file in a report of coverage.py."""

@@ -154,6 +154,7 @@ def test_a_file_is_checked_with_its_drivers_and_nothing_begins(tmp_path: Path) -
     assert f'{file}: rc[0].driver (robot/a): no driver "exclusiv" is installed here' in done.stderr
 
 
+@pytest.mark.live
 def test_an_rc_that_another_process_of_its_host_offers_is_refused_and_free_when_that_has_ended(node: Node) -> None:
     program = (
         "import sys\n"

@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from itertools import zip_longest
+from operator import gt
 from typing import IO, TYPE_CHECKING, Any, Final, Self
 
 import msgspec
@@ -22,13 +23,19 @@ from zscout.types import clean as clean
 from zscout.types import span as span
 
 if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
+    from rich.console import Console, Group, RenderableType
     from rich.live import Live
 
-NARROW: Final = 110
-"""Columns of a terminal below which tables leave out what matters least."""
+GAP: Final = 2
+"""Spaces between two columns."""
+INDENT: Final = 3
+"""Spaces before a line that stands beneath a row."""
 CUT: Final = 0.3
-"""Of a terminal's width: what a column has at most whose texts are cut short."""
+"""Part of a terminal's width that a column keeps whose texts are shortened."""
+LISTED: Final = 0.4
+"""Part of a terminal's width that a column of lists or sentences should have before others are given up for it."""
+WHOLE, ITEMS, WORDS = "(?!)", "\n", r"\n| (?!\()(?![^()]*\))"
+"""Where a cell may be broken: nowhere, between its items, between words that are not in parentheses."""
 NEAR: Final = 120.0
 """Seconds from now within which a time of day is told with its seconds."""
 MAX_CLOCK: Final = 1e9
@@ -84,20 +91,29 @@ def many(count: int, what: str) -> str:
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
+Line = tuple[str, str]
+"""One line at a terminal, and Rich's style for it."""
+
+
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows of texts, made safe to print where they are. `styles` has Rich's style for each row, `spare` the
-    columns that a narrow terminal omits, `cut` those whose texts are cut short at a terminal."""
+    """Rows of texts, made safe to print where they are. A newline in a cell stands for a space; a cell that has some is
+    broken over lines only there, any other at spaces.
+
+    `styles` has Rich's style for each row. `spare` names the columns that a narrow terminal gives up, first things
+    first: those that are also in `beneath` get lines of their own below each row, the others are left out. Texts in the
+    columns `cut` are shortened before others are broken."""
 
     title: str
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
     styles: Sequence[str] = ()
-    spare: Collection[str] = ()
+    spare: Sequence[str] = ()
     cut: Collection[str] = ()
+    beneath: Collection[str] = ()
 
     def lines(self) -> list[str]:
-        """Without colours: two spaces between columns."""
+        """Without colours, as wide as the texts are: two spaces between columns."""
         table = [self.columns, *([clean(cell) for cell in row] for row in self.rows)]
         widths = [max(map(len, column)) for column in zip(*table, strict=True)]
         lines = [
@@ -105,39 +121,110 @@ class Table:
         ]
         return [self.title, *lines] if self.title else lines
 
-    def picture(self, most: int | None = None) -> RenderableType:
-        """For a terminal, no more than `most` rows."""
-        from rich.table import Table
-        from rich.text import Text
+    def fitted(self, width: int, most: int | None = None) -> list[Line]:
+        """For a terminal of this width, no more than `most` rows."""
+        safe = [["\n".join(map(clean, cell.split("\n"))) for cell in row] for row in self.rows[:most]]
+        texts = [list(column) for column in zip(self.columns, *safe, strict=True)]
+        kept, below, widths = self._layout(texts, width)
+        lines = [(self.title, "bold cyan")] if self.title else []
+        styles = ["bold" if self.title else "bold cyan", *self.styles[: len(safe)]]
+        for number, style in enumerate([*styles, *[""] * (1 + len(safe) - len(styles))]):
+            cells = [
+                wrapped(texts[at][number], wide)
+                if self.columns[at] not in self.cut
+                else [shortened(clean(texts[at][number]), wide)]
+                for at, wide in zip(kept, widths, strict=True)
+            ]
+            for parts in zip_longest(*cells, fillvalue=""):
+                padded = (part + " " * (wide - _wide(part)) for part, wide in zip(parts, widths, strict=True))
+                lines.append((shortened((" " * GAP).join(padded).rstrip(), width), style))
+            for text in (texts[at][number] for at in below if number and texts[at][number]):
+                lines += [(" " * INDENT + line, f"{style} dim") for line in wrapped(text, max(1, width - INDENT))]
+        return lines
 
-        table = Table(
-            title=self.title or None,
-            title_justify="left",
-            title_style="bold cyan",
-            header_style="bold",
-            box=None,
-            padding=(0, 2, 0, 0),
-        )
-        narrow = console().width < NARROW
-        kept = [at for at, name in enumerate(self.columns) if not (narrow and name in self.spare)]
-        for at in kept:
-            name = self.columns[at]
-            # A name or key that is cut short can't be copied.
-            if name in self.cut:
-                table.add_column(name, overflow="ellipsis", no_wrap=True, max_width=round(CUT * console().width))
-            else:
-                table.add_column(name, overflow="fold")
-        for row, style in zip_longest(self.rows[:most], self.styles[:most], fillvalue=""):
-            table.add_row(*(Text(clean(row[at])) for at in kept), style=style)
-        return table
+    def _layout(self, texts: list[list[str]], width: int) -> tuple[list[int], list[int], list[int]]:
+        """The columns that stay beside each other, those that move beneath them, and the widths of the former."""
+        names, share = self.columns, round(LISTED * width)
+        whole = [_longest(column, WHOLE) for column in texts]
+        least = [
+            _longest(column, ITEMS if name in self.beneath else WORDS)
+            for name, column in zip(names, texts, strict=True)
+        ]
+        limits = [round(CUT * width) if name in self.cut else width for name in names]
+
+        def fits(kept: Sequence[int], listed: int) -> bool:
+            """`listed`: the width that columns should have at least which may move beneath."""
+            shares = (max(least[at], listed if names[at] in self.beneath else share) for at in kept)
+            return (
+                sum(min(whole[at], limits[at], wide) + GAP for at, wide in zip(kept, shares, strict=True)) - GAP
+                <= width
+            )
+
+        kept = [at for at, name in enumerate(names) if name not in self.beneath or any(texts[at][1:])]
+        left_out: list[int] = []
+        below: list[int] = []
+        for name in self.spare:
+            at = names.index(name)
+            if at in kept and not fits(kept, 0 if name in self.beneath else share):
+                kept.remove(at)
+                (below if name in self.beneath else left_out).append(at)
+        # Columns that have moved beneath may have made room.
+        while left_out and fits([*kept, left_out[-1]], share):
+            kept = sorted([*kept, left_out.pop()])
+        widths = [whole[at] for at in kept]
+        for floors in (whole, least, [1] * len(names)):
+            floor = [min(limits[at], floors[at]) for at in kept]
+            while sum(widths) + GAP * (len(kept) - 1) > width and any(map(gt, widths, floor)):
+                # The widest gives way, as far as it may.
+                widths[max(range(len(kept)), key=lambda at: (widths[at] > floor[at], widths[at]))] -= 1
+        return kept, below, widths
 
     def print(self) -> None:
         """Coloured at a terminal, aligned plain lines elsewhere."""
         if at_terminal():
-            console().print(self.picture())
+            console().print(picture(self.fitted(console().width)))
         else:
             for line in self.lines():
                 print_line(line)
+
+
+def _wide(text: str) -> int:
+    """Columns of a terminal that a text takes."""
+    from rich.cells import cell_len
+
+    return cell_len(text)
+
+
+def _longest(texts: Sequence[str], breaks: str) -> int:
+    return max(_wide(part.replace("\n", " ")) for text in texts for part in re.split(breaks, text))
+
+
+def shortened(text: str, width: int) -> str:
+    from rich.cells import set_cell_size
+
+    return text if _wide(text) <= width else set_cell_size(text, width - 1).rstrip() + "…"
+
+
+def wrapped(text: str, width: int) -> list[str]:
+    """On lines of this width, broken at newlines if there are some, otherwise at spaces, within parentheses only where
+    nothing else will do. Words that are too long are shortened."""
+    lines = [""]
+    for part in re.split(ITEMS if "\n" in text else WORDS, text):
+        for word in [part] if _wide(part) <= width else part.split(" "):
+            joined = f"{lines[-1]} {word}" if lines[-1] else shortened(word, width)
+            if _wide(joined) <= width:
+                lines[-1] = joined
+            else:
+                lines.append(shortened(word, width))
+    return lines
+
+
+def picture(lines: Sequence[Line]) -> Group:
+    """For Rich: lines that fit the terminal."""
+    from rich.console import Group
+    from rich.text import Text
+
+    return Group(*(Text(text, style=style, no_wrap=True, overflow="crop") for text, style in lines))
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], *, title: str = "") -> None:

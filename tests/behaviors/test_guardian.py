@@ -89,8 +89,7 @@ def test_a_deadline_that_is_renewed_is_not_due() -> None:
     assert ending.due(20)
     ending.begin(20)
     ending.renew(90)  # too late: it was told to end
-    assert ending.next() == 23
-    assert [ending.kills(at) for at in (22, 23)] == [False, True]
+    assert (ending.next(), [ending.kills(at) for at in (22, 23)]) == (23, [False, True])
 
 
 def test_the_grace_begins_at_the_deadline_though_nobody_was_awake_then() -> None:
@@ -164,14 +163,13 @@ def test_who_may_not_wait_kills_at_once(tmp_path: Path) -> None:
 
 @pytest.mark.live
 def test_it_is_ended_at_the_deadline_that_was_given_last_though_the_client_says_nothing(tmp_path: Path) -> None:
-    script = "trap '' TERM; echo ready; while :; do sleep 0.02; done"
-    begin = now()
+    script, begin = "trap '' TERM; echo ready; while :; do sleep 0.02; done", now()
     with guarded(*shell(tmp_path, script), grace=0.2, until=begin + round(HANG * SECOND)) as command:
         command.out.readline()
         begin = now()
-        command.say(f"until {begin + SECOND}")
+        command.say(f"until {begin + SECOND // 2}")
         assert command.hears_rest()[1:] == ["ending deadline", "exited -9", "gone"]
-        assert now() - begin >= 1.2 * SECOND
+        assert now() - begin >= 0.7 * SECOND
 
 
 @pytest.mark.live

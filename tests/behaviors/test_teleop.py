@@ -15,8 +15,7 @@ WAYS: tuple[Way, ...] = ("forward", "back", "left", "right")
 
 def test_a_key_held_down_drives_without_a_gap_and_stops_after_it_is_let_go() -> None:
     """As terminals do it: the press, nothing for half a second, then 30 repetitions a second."""
-    pilot = Pilot(0.5)
-    came = [0.0] + [0.5 + number / 30 for number in range(30)]
+    pilot, came = Pilot(0.5), [0.0] + [0.5 + number / 30 for number in range(30)]
     for step in range(400):
         now = step / 100
         while came and came[0] <= now:

@@ -9,8 +9,9 @@ import pytest
 
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.sensor_net.scout import BAD_FOR, QUIET, Alerts, Blindness
-from zscout.behaviors.tree import MAX_CHILDREN, MAX_DEPTH, Behavior, BehaviorContext
+from zscout.behaviors.tree import MAX_CHILDREN, MAX_DEPTH, Behavior, BehaviorContext, CarriedClock
 from zscout.messages import BehaviorSaid
+from zscout.types import SECOND
 
 
 class Count(Behavior):
@@ -117,6 +118,14 @@ def test_trees_have_bounds() -> None:
         deep.add(Count("too-deep"))
 
 
+def test_a_clock_goes_on_at_another_host_where_it_was() -> None:
+    here, there = CarriedClock(), CarriedClock()
+    readings = [here.read(at * SECOND, 2.0) for at in (1000, 1003)]
+    there.seconds = here.seconds
+    readings += [there.read(at * SECOND, 2.0) for at in (5, 6)]
+    assert readings == [0.0, 6.0, 6.0, 8.0]
+
+
 # Whose fault it is that there is no picture
 
 
@@ -153,10 +162,8 @@ def test_a_picture_that_comes_and_goes_is_no_fault() -> None:
 
 
 def test_an_alert_for_each_event() -> None:
-    alerts = Alerts()
-    moves = {1.0, 1.1, 1.0 + QUIET, 8.0}
+    alerts, moves = Alerts(), {1.0, 1.1, 1.0 + QUIET, 8.0}
     words = [alerts.see(at, at in moves) for at in (0.5, 1.0, 1.1, 2.0, 1.0 + QUIET, 5.5, 8.0)]
     assert words == ["", "start", "", "", "", "end", "start"]
     alerts.rest()
-    assert alerts.see(8.1, True) == "start"
-    assert alerts.count == 3
+    assert (alerts.see(8.1, True), alerts.count) == ("start", 3)

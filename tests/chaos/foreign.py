@@ -28,19 +28,18 @@ os.environ["ZENOH_RUNTIME"] = (
 import zenoh
 
 from tests.chaos.work import CAPACITY, CLIENT, JOBS, PULSE, Json, draw, now, rcs_of, say
+from tests.live.plain_client import GREATER_CONNECTS, TRY_AGAIN, answers, encoding
 
 SECOND = 1_000_000_000
 HOLD_LEASE = 3 * SECOND
 LEASE_MS = 1000
 STALL = SECOND // 4
 QUERY_TIMEOUT = 1.0
-TRY_AGAIN = ("busy", "not_leading", "internal", "queue_full")
 AGAIN = ("not_yet", "stale", "busy", "unknown")
 NOT_MINE = ("ended", "free", "not_holder", "wrong_client")
 MAX_COUNTER, MAX_JUMP = 2**52, 1_000_000
 REMEMBERED = 256
 PATIENCE, REJOIN = 2 * SECOND, 10 * SECOND
-GREATER_CONNECTS = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
 
 Term = tuple[int, str]
 Grant = tuple[Term, int]
@@ -200,34 +199,13 @@ class Peer:
 
     def get(self, key: str, schema: str, message: Json, timeout: float = QUERY_TIMEOUT) -> list[tuple[bool, Json]]:
         """All answers, as (whether it is none of a problem, payload). None at all means unknown."""
-        replies = self.session.get(
-            f"{self.base}/{key}",
-            payload=json.dumps(message),
-            encoding=encoding(schema),
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=timeout,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.INTERACTIVE_HIGH,
-            express=True,
-        )
-        found = []
-        for reply in replies:
-            if reply.ok is not None:
-                found.append((True, json.loads(reply.ok.payload.to_bytes())))
-            elif reply.err is not None and reply.err.payload.to_bytes() != b"Timeout":
-                found.append((False, json.loads(reply.err.payload.to_bytes())))
-        return found
+        return answers(self.session, f"{self.base}/{key}", schema, message, timeout)
 
     def serve(self, key: str, answer: Callable[[zenoh.Query], Json], schema: str) -> None:
         def on_query(query: zenoh.Query) -> None:
             respond(query, f"{self.base}/{key}", answer, schema)
 
         self.queryable(key, on_query)
-
-
-def encoding(schema: str) -> zenoh.Encoding:
-    return zenoh.Encoding.APPLICATION_JSON.with_schema(f"zscout.{schema}.v1")
 
 
 def payload_of(query: zenoh.Query) -> Json:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Coroutine, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from click.testing import CliRunner
 
@@ -27,6 +28,23 @@ def patient_timing(hold_lease: float | None = None) -> str:
     two."""
     lease = 3 * PATIENT if hold_lease is None else hold_lease
     return f"[timing]\nhold_lease = {lease}\nrebuild = {PATIENT / 5}\nvote_timeout = 2"
+
+
+def in_lab(**options: Any) -> Callable[[Callable[[Lab], Coroutine[Any, Any, None]]], Callable[[Path], None]]:
+    """Makes a test of what happens in a `Lab` of these options, in the test's own folder."""
+
+    def decorate(story: Callable[[Lab], Coroutine[Any, Any, None]]) -> Callable[[Path], None]:
+        async def run(folder: Path) -> None:
+            async with Lab(folder, **options) as lab:
+                await story(lab)
+
+        def test(tmp_path: Path) -> None:
+            asyncio.run(run(tmp_path))
+
+        test.__name__, test.__doc__ = story.__name__, story.__doc__
+        return test
+
+    return decorate
 
 
 class CliFleet:
@@ -56,7 +74,7 @@ class CliFleet:
     ) -> subprocess.CompletedProcess[str]:
         """Runs a command again until what came of it is so. One that asks for devices has a process of its own: signals
         are for it, and its children write to its streams. All others run here: a process takes 0.3 s to begin."""
-        if {"request", "take"} & {*args}:
+        if {"request", "take"} & {*args} and "--dry-run" not in args:
             return tools.zscout_until(condition, *args, env=self.lab.env, stdin=stdin)
         began = time.monotonic()
         while True:

@@ -1,25 +1,17 @@
-"""Examples in --help: each parses, and names only files and commands that are there."""
+"""Examples in --help: each parses."""
 
 from __future__ import annotations
 
-import re
+import itertools
 import shlex
-import shutil
 from collections.abc import Iterator
-from itertools import pairwise
-from pathlib import Path
 
 import click
-import pytest
 
-import zscout
 from zscout import node
 from zscout.cli.main import COMMANDS, main
 
 OPERATORS = {"|", "&&", "&", ";"}
-OUTPUTS = {"--out", "--record", "--rrd", "--node"}
-FILE = re.compile(r"^\.{0,2}/|\.(toml|rrd|py|sh|avi|mp4|txt|json|fish)$")
-PACKAGE = Path(zscout.__file__).parent
 
 
 def commands(command: click.Command, *path: str) -> Iterator[tuple[tuple[str, ...], click.Command]]:
@@ -55,14 +47,6 @@ def examples() -> dict[str, list[list[str]]]:
 EXAMPLES = examples()
 
 
-def outputs(words: list[str]) -> list[str]:
-    return [word for before, word in pairwise(words) if before in OUTPUTS or before == ">"]
-
-
-MADE = {word for programs in EXAMPLES.values() for words in programs for word in outputs(words)}
-"""Files that some example writes."""
-
-
 def parse(command: click.Command, name: str, args: list[str], parent: click.Context | None = None) -> None:
     try:
         context = command.make_context(name, list(args), parent=parent)
@@ -74,24 +58,9 @@ def parse(command: click.Command, name: str, args: list[str], parent: click.Cont
         parse(sub, sub_name or "", sub_args, context)
 
 
-def test_all_commands_are_walked() -> None:
+def test_every_command_has_an_example_that_parses() -> None:
     assert {line.split()[1] for line in EXAMPLES if line.startswith("zscout ")} >= COMMANDS.keys()
     assert "zscout-node" in EXAMPLES
-    assert MADE, "some write files"
-
-
-@pytest.mark.parametrize("line", list(EXAMPLES))
-def test_an_example_parses_and_names_what_is_there(line: str) -> None:
-    for program, *words in EXAMPLES[line]:
-        made = outputs(words)
+    for program, *words in itertools.chain.from_iterable(EXAMPLES.values()):
         args = words[: words.index(">")] if ">" in words else words
         parse(node.main if program == "zscout-node" else main, program, args)
-        if "--" in args:
-            name = args[args.index("--") + 1]
-            assert shutil.which(name) is not None, f"there is no command {name}"
-        for word in words:
-            path = word.rpartition("=")[2]
-            if path not in made and FILE.search(path) and not path.startswith("/dev/"):
-                assert path in MADE or any(PACKAGE.rglob(path)), (
-                    f"no {path} comes with zscout, and no example writes one"
-                )

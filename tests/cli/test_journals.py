@@ -6,37 +6,12 @@ import sys
 
 import pytest
 
-from tests.cli.tools import zscout_here
 from tests.services.journal.kit import past
 from zscout.cli import journals
 from zscout.config.strict import BadInput
 from zscout.messages import UNHEARD, History, JournalGap, ReasonParty, Who
 from zscout.services.journal.asking import Told
 from zscout.services.journal.merging import Span
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        ("history --since soon", '--since: "soon" is no time; write a number of seconds'),
-        ("history --since 2999-01-01", "is in the future"),
-        ("history --since 1h --until 2h", "--since: it is not before --until"),
-        ("history --rc robot", "write kind/name, like robot/scout33"),
-        ("history --user ''", "is no name"),
-        ("history --group arms", '--group: "arms" is no group of the fleet file that has members; it has none'),
-        ("history --limit 0", "0 is not in the range"),
-        ("history --json --csv", "--json and --csv: write one of them"),
-        ("usage --by weekday", "'weekday' is not one of"),
-        ("usage --by group", "the fleet file has no [groups]"),
-        ("usage --until 30d", "--since: it is not before --until"),
-    ],
-)
-def test_bad_input_is_one_line(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert zscout_here(*(word if word != "''" else "" for word in words.split())) == 2
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert said in told.err
-    assert told.err.count("\n") == 1
 
 
 def test_times_ago_are_durations_or_dates() -> None:

@@ -10,14 +10,12 @@ import sys
 from decimal import Decimal
 from pathlib import Path
 
-import click
 import pytest
-from click.testing import CliRunner
 
 from tests.cli import tools
 from tests.hang import HANG
 from tests.live.lab import Lab
-from zscout.cli.main import COMMANDS, main
+from zscout.cli.main import COMMANDS
 from zscout.cli.requests.options import gather_needs, parse_duration, parse_need
 from zscout.config.strict import BadInput
 from zscout.terminal import Table, span
@@ -29,6 +27,7 @@ def zscout(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
     return tools.zscout(*args, env=os.environ | env)
 
 
+@pytest.mark.live
 def test_help_loads_nothing_heavy_and_lists_all() -> None:
     script = (
         "import sys; from zscout.cli.main import main\n"
@@ -38,54 +37,6 @@ def test_help_loads_nothing_heavy_and_lists_all() -> None:
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=HANG)
     assert (done.returncode, done.stderr) == (0, "")
     assert all(f"\n  {name} " in done.stdout for name in COMMANDS)
-
-
-@pytest.mark.parametrize("name", list(COMMANDS))
-def test_every_command_is_there_and_its_help_has_examples(name: str) -> None:
-    command = main.get_command(click.Context(main), name)
-    assert command is not None
-    assert command.name == name
-    assert command.help is not None
-    assert "Example" in command.help
-
-
-def test_an_unknown_command_is_one_line_with_a_hint() -> None:
-    done = zscout("requst")
-    assert done.returncode == 2
-    assert done.stderr == "zscout: there is no command 'requst'; did you mean request? (see zscout --help)\n"
-
-
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        (["request"], "Missing argument 'NEED...'"),
-        (["request", "robot/a", "--"], "no command follows the --"),
-        (["request", "robot/a", "--priority", "high"], "'high' is not a whole number"),
-        (["request", "robot"], "need \"robot\": RC 'robot' is not valid: write kind/name"),
-        (["request", "robot/a", "robot/a"], "robot/a is named twice"),
-        (["request", "robot/a", "--again"], "--again runs a command again"),
-        (["request", "robot/a", "--min-runtime", "0"], "--min-runtime must be positive"),
-        (["request", "robot/a", "sleep", "5"], "a command goes after --"),
-        (["request", "robot/a:rate"], "rate has no number; write parameter=number"),
-        (["cancel"], "Missing argument 'ARC'"),
-        (["cancel", ""], '"" names no ARC; zscout status lists them'),
-    ],
-)
-def test_bad_input_is_one_line_and_2(args: list[str], words: str) -> None:
-    done = CliRunner().invoke(main, args)
-    assert (done.exit_code, done.stdout) == (2, "")
-    assert done.stderr.count("\n") == 1
-    assert done.stderr.startswith("zscout")
-    assert words in done.stderr
-
-
-def test_a_fleet_file_that_is_not_there_is_named() -> None:
-    done = zscout("--fleet", "nowhere.toml", "cancel", "x")
-    assert done.returncode == 2
-    assert done.stderr == "zscout: nowhere.toml: there is no such file; check the path\n"
-    named = zscout("cancel", "x", ZSCOUT_FLEET="nowhere.toml")
-    assert named.returncode == 2
-    assert "named by $ZSCOUT_FLEET" in named.stderr
 
 
 @pytest.mark.live
@@ -98,6 +49,7 @@ def test_a_mesh_without_an_rcm_is_3(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.live
 def test_a_closed_pipe_is_quiet() -> None:
     read, write = os.pipe()
     os.close(read)
@@ -107,6 +59,7 @@ def test_a_closed_pipe_is_quiet() -> None:
     assert (process.returncode, errors) == (1, "")
 
 
+@pytest.mark.live
 @pytest.mark.parametrize(("command", "code"), [("completion fish", 1), ("completion no-such-shell", 2), ("--help", 1)])
 def test_a_terminal_that_is_gone_is_quiet(command: str, code: int) -> None:
     """As where a terminal window is closed and SIGHUP is ignored: all that is written to it fails with EIO."""
@@ -121,6 +74,7 @@ def test_a_terminal_that_is_gone_is_quiet(command: str, code: int) -> None:
     os.close(theirs)
 
 
+@pytest.mark.live
 @pytest.mark.parametrize(("command", "code"), [("--help", 0), ("replay nowhere.toml", 2)])
 @pytest.mark.parametrize("closed", [">&-", "2>&-"])
 def test_a_closed_stream_is_no_error(command: str, code: int, closed: str) -> None:
@@ -129,6 +83,7 @@ def test_a_closed_stream_is_no_error(command: str, code: int, closed: str) -> No
     assert (done.returncode, "Traceback" in done.stdout + done.stderr) == (code, False), done.stderr
 
 
+@pytest.mark.live
 def test_a_full_disk_is_told_in_one_line() -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
@@ -137,6 +92,7 @@ def test_a_full_disk_is_told_in_one_line() -> None:
     assert (done.returncode, done.stderr) == (1, "zscout: No space left on device; free some\n")
 
 
+@pytest.mark.live
 def test_completion_knows_the_commands_without_loading_them() -> None:
     script = zscout("completion", "bash")
     assert script.returncode == 0
@@ -156,6 +112,7 @@ def test_completion_knows_the_commands_without_loading_them() -> None:
     assert "write one of bash, zsh, fish" in unknown.stderr
 
 
+@pytest.mark.live
 def test_bash_completes_at_tab(tmp_path: Path) -> None:
     """A real bash at a terminal, with `zscout` on its path and the script read."""
     here = tmp_path / "zscout"
@@ -179,14 +136,6 @@ def test_bash_completes_at_tab(tmp_path: Path) -> None:
         # An interactive shell does not heed SIGTERM.
         terminal.press("\x15exit\n")
         assert terminal.code() == 0
-
-
-@pytest.mark.parametrize(
-    ("text", "seconds"),
-    [("5", "5"), ("1.5", "1.5"), (".5", "0.5"), ("300ms", "0.3"), ("2m", "120"), ("1h", "3600"), ("7s", "7")],
-)
-def test_durations(text: str, seconds: str) -> None:
-    assert parse_duration(text, "--timeout") == Decimal(seconds)
 
 
 @pytest.mark.parametrize("text", ["", "5x", "-1", "1e3", "nan", "1_0", "٣", "5 s", "mm", "0", "1ss", "99999999h"])

@@ -75,30 +75,30 @@ ALICE = Who("alice", "", "survey.py", "night\x1b run")
         (
             hold(keep=False, remaining=1800, who=ALICE),
             0,
-            "alice@ws1 (survey.py), priority 1, since 13:52 (10 min), until 14:33 (30 min) at the latest: night  run",
+            "survey (alice@ws1), priority 1, since 13:52 (10 min), until 14:33 (30 min) at the latest: night  run",
         ),
         (
             hold(keep=True, remaining=1800),
             1,
-            "ws1/c1 (survey), priority 1, since 13:52 (10 min), until 14:33 (30 min) at the latest",
+            "survey (ws1/c1), priority 1, since 13:52 (10 min), until 14:33 (30 min) at the latest",
         ),
         (
             hold(keep=True, remaining=1800),
             0,
             (
-                "ws1/c1 (survey), priority 1, since 13:52 (10 min), until 14:33 (30 min) at least, "
+                "survey (ws1/c1), priority 1, since 13:52 (10 min), until 14:33 (30 min) at least, "
                 "and kept for as long as it wants"
             ),
         ),
         (
             hold(keep=True, remaining=-5),
             0,
-            "ws1/c1 (survey), priority 1, since 13:52 (10 min), kept for as long as it wants",
+            "survey (ws1/c1), priority 1, since 13:52 (10 min), kept for as long as it wants",
         ),
         (
             hold(keep=True, remaining=-5),
             2,
-            "ws1/c1 (survey), priority 1, since 13:52 (10 min), its minimum runtime is over",
+            "survey (ws1/c1), priority 1, since 13:52 (10 min), its minimum runtime is over",
         ),
     ],
 )
@@ -111,11 +111,11 @@ def test_a_reason_is_told_with_times_of_day_where_the_rcm_gave_durations() -> No
     why = ReasonInfo("held", ["framegrabber/fg1"], [party], count=1)
     assert whose(party) == "alice@ws1 (survey.py)"
     assert reason_text("in words", why, age=30) == (
-        "waits for alice@ws1 (survey.py): framegrabber/fg1, until 14:33 at the latest"
+        "waits for survey (alice@ws1): framegrabber/fg1, until 14:33 at the latest"
     )
     # An RCM that tells less, or more than is known here.
     assert reason_text("in words", None) == "in words"
     assert reason_text("in words", ReasonInfo("another", ["robot/a"])) == "in words"
     assert reason_text("in words", ReasonInfo("held", ["robot/a", "robot/b"], [party])) == (
-        "waits for alice@ws1 (survey.py): robot/a, until 14:34 at the latest"
+        "waits for survey (alice@ws1): robot/a, until 14:34 at the latest"
     )

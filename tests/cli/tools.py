@@ -80,6 +80,16 @@ def named(name: str) -> str:
     return by(f"zscout request --name {name}")
 
 
+def held_by(name: str) -> str:
+    """The request of `zscout request --name NAME`, and its person."""
+    return f"{name} ({by('').partition(' ')[0]})"
+
+
+def mine(name: str) -> str:
+    """A request of a client in this process, and its person."""
+    return f"{name} ({ours().partition(' ')[0]})"
+
+
 def ours() -> str:
     """Whose those of clients in this process are."""
     who = this_program("test")

@@ -33,6 +33,14 @@ def _number(default: str, low: str, high: str, below: str, above: str) -> Key:
     return Key(default, (low, high), (below, above, '"one"', "nan" if "." in default else "1.5"))
 
 
+def _served(port: str) -> dict[str, Key]:
+    return {
+        "bind": Key('"127.0.0.1"', ('"::1"', '"localhost"\nport = 9'), ('"0.0.0.0"', '"anvil"')),
+        "port": _number(port, "1", "65_535", "0", "65_536"),
+        "allow_remote": Key("false", ('true\nbind = "0.0.0.0"',), TRUTH),
+    }
+
+
 TRUTH: Final = ('"yes"', "1")
 ROLES: Final = ("viewer", "client", "operator", "manager", "relay")
 NAMES: Final = ('"a/b"', '""', "5")
@@ -128,23 +136,13 @@ NODE: Final[Mapping[str, Mapping[str, Key]]] = {
     },
     "recorder": {
         "path": Key('"runs"', ('"elsewhere"', '"/var/runs"'), ('""', "1")),
-        "bind": Key('"127.0.0.1"', ('"::1"', '"localhost"\nport = 9'), ('"0.0.0.0"', '"anvil"')),
-        "port": _number("9876", "1", "65_535", "0", "65_536"),
-        "allow_remote": Key("false", ('true\nbind = "0.0.0.0"',), TRUTH),
+        **_served("9876"),
         "frames": _number("2.0", "0", "30", "-1", "31"),
         "limit": _number("5000", "300", "1_000_000", "299", "1_000_001"),
         "past": _number("86400.0", "0", "2_678_400", "-1", "2_678_401"),
     },
-    "metrics": {
-        "bind": Key('"127.0.0.1"', ('"::1"', '"localhost"\nport = 9'), ('"0.0.0.0"', '"anvil"')),
-        "port": _number("9464", "1", "65_535", "0", "65_536"),
-        "allow_remote": Key("false", ('true\nbind = "0.0.0.0"',), TRUTH),
-    },
-    "calendar": {
-        "bind": Key('"127.0.0.1"', ('"::1"', '"localhost"\nport = 9'), ('"0.0.0.0"', '"anvil"')),
-        "port": _number("9465", "1", "65_535", "0", "65_536"),
-        "allow_remote": Key("false", ('true\nbind = "0.0.0.0"',), TRUTH),
-    },
+    "metrics": _served("9464"),
+    "calendar": _served("9465"),
     "notify": {
         "urls": Key("[]", ('["json://localhost"]',), ('"json://localhost"', '["none://a:secret@b"]', '["a:secret@b"]')),
         "events": Key(
@@ -169,15 +167,16 @@ NODE: Final[Mapping[str, Mapping[str, Key]]] = {
 }
 CHANNELS: Final = '{ "video/ch1" = 1 }'
 SOURCES: Final = '{ "video/ch1" = "/dev/video0" }'
+ACTIVATION: Final = _number("0.0", "0.5", "3600", "-1", "3601")
 SETTLE: Final = _number("5.0", "0.5", "60", "0.4", "61")
 RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
-    "exclusive": ('name = "robot/a"', {"activation": _number("0.0", "0.5", "3600", "-1", "3601"), "settle": SETTLE}),
+    "exclusive": ('name = "robot/a"', {"activation": ACTIVATION, "settle": SETTLE}),
     "capacity": (
         'name = "radio/a"\ncapacity = { rate = 10 }',
         {
             "capacity": Key(None, ("{ rate = 0.1, width = 2 }",), ("{}", "{ rate = -1 }", '{ "a b" = 1 }', "10")),
             "settle": SETTLE,
-            "activation": _number("0.0", "0.5", "3600", "-1", "3601"),
+            "activation": ACTIVATION,
         },
     ),
     "command": (
@@ -191,7 +190,7 @@ RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
             "every": _number("10.0", "0.5", "3600", "0.4", "3601"),
             "timeout": _number("5.0", "0.1", "600", "0.09", "601"),
             "settle": SETTLE,
-            "activation": _number("0.0", "0.5", "3600", "-1", "3601"),
+            "activation": ACTIVATION,
         },
     ),
     "radio": (

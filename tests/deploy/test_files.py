@@ -56,6 +56,7 @@ def instructions() -> list[tuple[str, str]]:
     return [(line.split(maxsplit=1)[0], line.split(maxsplit=1)[1]) for line in whole if line.strip()]
 
 
+@pytest.mark.live
 def test_the_container_file_says_what_can_be_done() -> None:
     """No builder's word: there may be none here, nor the image that it begins with."""
     found = instructions()

@@ -13,6 +13,7 @@ import pytest
 from tests.deploy.machine import PROJECT
 from tests.hang import HANG
 
+pytestmark = pytest.mark.live
 SCRIPTS = ("deploy/install-host", "deploy/renew-certificate", "deploy/zscout", "tests/deploy/machine.sh", ".ci/run")
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from tests.cli.cli_fleet import in_lab
 from tests.deploy.notify_socket import NotifySocket
 from tests.hang import HANG
 from tests.live.lab import Lab
@@ -39,6 +40,7 @@ async def until_stopped(pid: int) -> None:
             await asyncio.sleep(0.01)
 
 
+@pytest.mark.slow
 def test_a_node_says_that_it_is_ready_that_it_lives_and_that_it_ends(tmp_path: Path) -> None:
     told, control = tmp_path / "told", NotifySocket(str(tmp_path / "control"))
 
@@ -76,41 +78,35 @@ def test_a_node_says_that_it_is_ready_that_it_lives_and_that_it_ends(tmp_path: P
         asyncio.run(story())
 
 
-def test_a_node_that_can_not_begin_says_why(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            with NotifySocket(str(tmp_path / "notify")) as heard:
-                node = start(lab, heard, "anvil", "[components]\nmax = 0\n")
-                assert "components.max: is 0; write a whole number" in (await heard.until("STOPPING"))["STATUS"]
-                assert await asyncio.to_thread(node.wait, HANG) == 2
-                assert all("READY" not in message for message in heard.heard)
-
-    asyncio.run(story())
+@in_lab()
+async def test_a_node_that_can_not_begin_says_why(lab: Lab) -> None:
+    with NotifySocket(str(lab.folder / "notify")) as heard:
+        node = start(lab, heard, "anvil", "[components]\nmax = 0\n")
+        assert "components.max: is 0; write a whole number" in (await heard.until("STOPPING"))["STATUS"]
+        assert await asyncio.to_thread(node.wait, HANG) == 2
+        assert all("READY" not in message for message in heard.heard)
 
 
-def test_hangup_reads_the_files_again_and_never_ends_the_node(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            with NotifySocket(str(tmp_path / "notify")) as heard:
-                node = start(lab, heard, "anvil", "[components]\nmax = 3\n")
-                await heard.until("READY")
-                file = tmp_path / "anvil.toml"
-                for old, new, said in (
-                    ("max = 3", "max = 4", "SIGHUP: took components.max"),
-                    ("max = 4", "max = 0", "the settings of before stay"),
-                    ("max = 0", "max = 4", "SIGHUP: the files say what they said"),
-                    ("robot/a", "robot/b", "SIGHUP: restart this node to take rc.robot/a, rc.robot/b"),
-                ):
-                    file.write_text(file.read_text().replace(old, new))
-                    node.send_signal(signal.SIGHUP)
-                    await heard.until("RELOADING")
-                    assert said in (await heard.until("READY"))["STATUS"]
-                    await lab.logged("anvil", said)
-                # In its last moments too.
-                node.terminate()
-                while node.poll() is None:
-                    node.send_signal(signal.SIGHUP)
-                    await asyncio.sleep(0)
-                assert node.returncode == 0
-
-    asyncio.run(story())
+@in_lab()
+async def test_hangup_reads_the_files_again_and_never_ends_the_node(lab: Lab) -> None:
+    with NotifySocket(str(lab.folder / "notify")) as heard:
+        node = start(lab, heard, "anvil", "[components]\nmax = 3\n")
+        await heard.until("READY")
+        file = lab.folder / "anvil.toml"
+        for old, new, said in (
+            ("max = 3", "max = 4", "SIGHUP: took components.max"),
+            ("max = 4", "max = 0", "the settings of before stay"),
+            ("max = 0", "max = 4", "SIGHUP: the files say what they said"),
+            ("robot/a", "robot/b", "SIGHUP: restart this node to take rc.robot/a, rc.robot/b"),
+        ):
+            file.write_text(file.read_text().replace(old, new))
+            node.send_signal(signal.SIGHUP)
+            await heard.until("RELOADING")
+            assert said in (await heard.until("READY"))["STATUS"]
+            await lab.logged("anvil", said)
+        # In its last moments too.
+        node.terminate()
+        while node.poll() is None:
+            node.send_signal(signal.SIGHUP)
+            await asyncio.sleep(0)
+        assert node.returncode == 0

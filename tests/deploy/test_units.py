@@ -64,6 +64,7 @@ health = ["sh", "-c", "test -z \\"$NOTIFY_SOCKET\\""]
 """What a node does all at once: pictures, commands, components, a recording."""
 
 
+@pytest.mark.live
 @ANALYZE
 def test_systemd_finds_nothing_wrong_with_the_units(tmp_path: Path) -> None:
     for unit in (PROJECT / "deploy" / "systemd").iterdir():
@@ -76,6 +77,7 @@ def test_systemd_finds_nothing_wrong_with_the_units(tmp_path: Path) -> None:
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
 
 
+@pytest.mark.live
 @ANALYZE
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.stem)
 def test_a_unit_is_closed_to_what_it_does_not_need(unit: Path) -> None:
@@ -113,6 +115,7 @@ def machine(lab: Lab, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mach
         yield machine
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_a_node_does_all_that_it_does_as_its_unit_has_it(machine: Machine, lab: Lab, tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
@@ -155,6 +158,7 @@ def test_a_node_does_all_that_it_does_as_its_unit_has_it(machine: Machine, lab: 
     assert machine.path("/var/lib/zscout/safe").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_reload_goes_on_and_a_bad_file_is_told(machine: Machine) -> None:
     machine.write("/etc/zscout/node.toml", SMALL)
@@ -167,6 +171,7 @@ def test_reload_goes_on_and_a_bad_file_is_told(machine: Machine) -> None:
     machine.until("zscout-node", ActiveState="active", SubState="running", NRestarts="0", **pid)
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_a_frozen_node_is_started_anew_and_one_with_a_bad_file_is_not(machine: Machine) -> None:
     drop_in = "[Service]\nWatchdogSec=8\nTimeoutAbortSec=1\nExecStopPost=sh -c 'echo ended: $SERVICE_RESULT'\n"
@@ -189,6 +194,7 @@ def test_a_frozen_node_is_started_anew_and_one_with_a_bad_file_is_not(machine: M
     machine.until("zscout-node", ActiveState="inactive", Result="success", ExecMainStatus="0")
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_a_certificate_that_ends_soon_is_among_what_failed(machine: Machine, tmp_path: Path) -> None:
     machine.run("systemctl", "start", "zscout-cert-renew")  # a host of a plain mesh has none
@@ -209,6 +215,7 @@ def test_a_certificate_that_ends_soon_is_among_what_failed(machine: Machine, tmp
     assert "ends soon: renew it" in machine.log()
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_the_sample_relay_joins_two_sites_as_its_unit_has_it(machine: Machine, tmp_path: Path) -> None:
     endpoint = f"tls/127.0.0.1:{free_port()}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
+from typing import Any, Self
 
 from tests.hang import HANG
 from tests.live.lab import Lab
@@ -78,8 +78,7 @@ class Post:
     async def says(self, host: str, client: str, rc: str, do: dict[str, Any], grant: Grant | None) -> str:
         """The code of what an RC answers to this sender, or `done`."""
         mesh = await self.mesh(host, client)
-        key = mesh.keys.command(rc, mesh.me)
-        code = "unknown"
+        key, code = mesh.keys.command(rc, mesh.me), "unknown"
         async with asyncio.timeout(HANG):
             while code in LATE:  # a new session takes a moment to find the others
                 reply = await mesh.ask_one(key, Command(do=do, grant=grant), Done, timeout=1)
@@ -87,7 +86,7 @@ class Post:
                     code = "done" if reply.problem is None else reply.problem.code
         return code
 
-    async def __aenter__(self) -> Post:
+    async def __aenter__(self) -> Self:
         self.stall.start()
         return self
 

@@ -13,7 +13,7 @@ from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import IncomingQuery, Mesh
 from zscout.mesh.supervision import StallWatch
-from zscout.messages import Command, Done, Grants, Holder, HoldView, RcmState, StateAsk
+from zscout.messages import Amounts, Command, Done, Grants, Holder, HoldView, RcAsk, RcmState, RcState, StateAsk
 from zscout.testing.memory import MemoryNetwork
 from zscout.types import Grant, Place, Term
 
@@ -51,16 +51,7 @@ class Device(Driver):
 
 
 def holder(number: int, arc: str = "one", client: str = "h/client") -> Holder:
-    return Holder(
-        id=arc,
-        arc=arc,
-        client=client,
-        grant=Grant(TERM, number),
-        place=Place(TERM, number),
-        rcs=["robot/x"],
-        min_runtime=Decimal(60),
-        remaining=60.0,
-    )
+    return Holder(arc, arc, client, Grant(TERM, number), Place(TERM, number), ["robot/x"], Decimal(60), 60.0)
 
 
 class Rcm:
@@ -86,18 +77,26 @@ class Rcm:
         self._publisher.put(Grants(term=TERM, seq=self.seq, prev=self.seq - 1, every=0.5, rcs={rc: list(holders)}))
 
     def view(self, number: int) -> HoldView:
-        return HoldView(
-            id="one",
-            arc="one",
-            client="h/client",
-            priority=0,
-            grant=Grant(TERM, number),
-            place=Place(TERM, 1),
-            needs={"robot/x": {}},
-            min_runtime=Decimal(60),
-            held=0,
-            remaining=60,
-        )
+        needs: dict[str, Amounts] = {"robot/x": {}}
+        return HoldView("one", "one", "h/client", 0, Grant(TERM, number), Place(TERM, 1), needs, Decimal(60), 0, 60)
+
+
+def grant(number: int) -> Grant:
+    return Grant(TERM, number)
+
+
+async def rc_state(mesh: Mesh) -> RcState:
+    reply = await mesh.ask_one(mesh.keys.rc_state("robot/x"), RcAsk(), RcState, timeout=5)
+    assert reply is not None
+    assert reply.message is not None
+    return reply.message
+
+
+def states_published(mesh: Mesh) -> list[RcState]:
+    """All that RCs publish from now on."""
+    states: list[RcState] = []
+    mesh.subscribe(mesh.keys.rc_state_any, RcState, lambda _key, state: states.append(state))
+    return states
 
 
 async def answer(mesh: Mesh, grant: Grant | None, do: Mapping[str, Any] = ECHO, *, ttl: float = 5.0) -> str:

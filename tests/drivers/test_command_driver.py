@@ -23,7 +23,7 @@ from zscout.mesh import Supervisor
 from zscout.messages import Parameter
 from zscout.types import SECOND
 
-pytestmark = [pytest.mark.live, pytest.mark.usefixtures("real_time")]
+pytestmark = [pytest.mark.live, pytest.mark.real_time]
 
 TELL = 'echo "$ZSCOUT_DO" >> told; '
 
@@ -117,6 +117,11 @@ async def play(
         await rc.supervisor.close()
 
 
+async def over(driver: CommandDriver) -> None:
+    await driver.end(holder(1))
+    await driver.safe()
+
+
 async def test_each_is_run_in_its_turn_and_told_what_it_is_about() -> None:
     start = TELL + 'echo "$ZSCOUT_RC $ZSCOUT_ARC $ZSCOUT_CLIENT $ZSCOUT_PARAMETERS" > about'
     async with play(start=start, stop=TELL, safe=TELL) as (driver, rc):
@@ -128,9 +133,7 @@ async def test_each_is_run_in_its_turn_and_told_what_it_is_about() -> None:
         await driver.safe()
         assert told() == ["safe", "start", "stop", "safe"]
         assert told("about") == ["psu/bench", "survey", "h/client", "{}"]
-        assert driver.figures()["starts"] == 1
-        assert driver.figures()["failures"] == 0
-        assert rc.said == []
+        assert (driver.figures()["starts"], driver.figures()["failures"], rc.said) == (1, 0, [])
 
 
 async def test_a_start_that_has_ended_begins_no_longer() -> None:
@@ -172,8 +175,7 @@ async def test_a_start_that_fails_loses_the_device_with_its_last_line_until_it_w
         await rc.until("start ended with exit code 3: no such [2J power")
         await driver._look()
         assert "ok" not in rc.said
-        await driver.end(holder(1))
-        await driver.safe()
+        await over(driver)
         await rc.until("ok")
 
 
@@ -190,8 +192,7 @@ async def test_health_is_looked_at_and_it_comes_back_by_itself() -> None:
         await driver.begin(holder(1))
         put("ill", "no answer\n")
         await rc.until("health ended with exit code 1: no answer")
-        await driver.end(holder(1))
-        await driver.safe()
+        await over(driver)
         put("ill")
         await rc.until("ok")
 
@@ -243,8 +244,7 @@ async def test_of_what_is_written_the_end_is_kept() -> None:
     reader.feed_eof()
     tail = command_driver.OutputTail(reader)
     await tail.drain()
-    assert tail.said == ": last"
-    assert len(tail._kept) == command_driver.KEPT_OUTPUT
+    assert (tail.said, len(tail._kept)) == (": last", command_driver.KEPT_OUTPUT)
 
 
 async def test_a_program_that_is_not_there_is_the_reason() -> None:
@@ -262,11 +262,8 @@ async def test_a_start_that_goes_on_holds_up_nobody_and_ends_with_its_hold() -> 
         await until(lambda: bool(told("pids")))
         assert 0 < driver.begins_for() <= HANG
         assert rc.said == []
-        await driver.end(holder(1))
-        await driver.safe()
-        assert driver.begins_for() == 0
-        assert told() == ["safe", "stop", "safe"]
-        assert rc.said == []
+        await over(driver)
+        assert (driver.begins_for(), told(), rc.said) == (0, ["safe", "stop", "safe"], [])
 
 
 async def test_a_safe_state_that_its_rc_does_not_wait_for_is_made_later() -> None:
@@ -306,6 +303,5 @@ async def test_one_that_stands_by_from_now_on_ends_its_own_hold_in_order() -> No
         await driver.begin(holder(1))
         await until(lambda: told() == ["safe", "start"])
         rc.instances.state = InstanceState.STANDS_BY
-        await driver.end(holder(1))
-        await driver.safe()
+        await over(driver)
         assert told() == ["safe", "start", "stop", "safe"]

@@ -33,8 +33,7 @@ def test_a_pace_admits_no_more_than_its_rate_and_little_less(source: float) -> N
 
 
 def test_uneven_pictures_at_the_very_rate_are_all_admitted() -> None:
-    pace = pace_of(10)
-    rng = np.random.default_rng(1)
+    pace, rng = pace_of(10), np.random.default_rng(1)
     jitter = rng.uniform(-0.02, 0.02, 600)
     assert all(pace.admits(1, ns(n / 10 + late)) for n, late in enumerate(jitter))
 
@@ -115,11 +114,8 @@ def test_the_gang_settles_the_source(
     assert bool(reason) == (tuned is None)
 
 
-@pytest.mark.parametrize(
-    ("rate", "quality", "sources"),
-    [(0.0, 80, {"": "0"}), (float("nan"), 80, {"": "0"}), (float("inf"), 80, {"": "0"}), (10.0, 0, {"": "0"}),
-     (10.0, 101, {"": "0"}), (10.0, 80, {})],
-)  # fmt: skip
-def test_a_framegrabber_that_can_not_be(rate: float, quality: int, sources: dict[str, str]) -> None:
-    with pytest.raises(ValueError, match="a framegrabber has a source"):
-        FramegrabberDriver(sources, rate=rate, quality=quality)
+def test_a_framegrabber_that_can_not_be() -> None:
+    rates = [(rate, 80, {"": "0"}) for rate in (0.0, float("nan"), float("inf"))]
+    for rate, quality, sources in (*rates, (10.0, 0, {"": "0"}), (10.0, 101, {"": "0"}), (10.0, 80, dict[str, str]())):
+        with pytest.raises(ValueError, match="a framegrabber has a source"):
+            FramegrabberDriver(sources, rate=rate, quality=quality)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from decimal import Decimal
 from typing import Any
 
@@ -24,32 +24,13 @@ SAME_COUNTER = Term(5, "n")
 def holder(
     seq: int, client: str = "h/one", *, term: Term = TERM, remaining: float = 60, keep: bool = False, place: int = 0
 ) -> Holder:
-    return Holder(
-        id=f"id{seq}",
-        arc=f"arc{seq}",
-        client=client,
-        grant=Grant(term, seq),
-        place=Place(TERM, place or seq),
-        rcs=[RC],
-        min_runtime=Decimal(60),
-        remaining=remaining,
-        keep=keep,
-    )
+    at, time = Place(TERM, place or seq), Decimal(60)
+    return Holder(f"id{seq}", f"arc{seq}", client, Grant(term, seq), at, [RC], time, remaining, keep=keep)
 
 
 def view(seq: int, client: str = "h/one", *, rc: str = RC, term: Term = TERM, remaining: float = 60) -> HoldView:
-    return HoldView(
-        id=f"id{seq}",
-        arc=f"arc{seq}",
-        client=client,
-        priority=0,
-        grant=Grant(term, seq),
-        place=Place(TERM, seq),
-        needs={rc: {"rate": Decimal(2)}},
-        min_runtime=Decimal(60),
-        held=0,
-        remaining=remaining,
-    )
+    at, needs = Place(TERM, seq), {rc: {"rate": Decimal(2)}}
+    return HoldView(f"id{seq}", f"arc{seq}", client, 0, Grant(term, seq), at, needs, Decimal(60), 0, remaining)
 
 
 def said(
@@ -58,13 +39,9 @@ def said(
     prev: int | None = None,
     term: Term = TERM,
     touches: bool = True,
-    revoked: Holder | None = None,
+    revoked: Sequence[Holder] = (),
 ) -> Grants:
-    words = []
-    if revoked is not None:
-        words = [
-            Revocation(revoked.id, revoked.arc, revoked.client, revoked.grant, [RC], "preempted", "by an operator")
-        ]
+    words = [Revocation(r.id, r.arc, r.client, r.grant, [RC], "preempted", "by an operator") for r in revoked]
     rcs = {RC: list(holders)} if touches else {"robot/other": []}
     return Grants(term=term, seq=seq, prev=seq - 1 if prev is None else prev, every=0.5, rcs=rcs, revoked=words)
 
@@ -120,8 +97,7 @@ def test_hear(heard: Grants, now_holds: list[int], announce: bool, reread: bool)
     assert (grants(rc), change.announce, change.reread) == (now_holds, announce, reread)
     began = {held.grant.seq for held in change.began}
     stopped = {held.grant.seq for held in change.removed}
-    assert {2} - stopped | began == set(now_holds)
-    assert bool(change) == bool(began or stopped)
+    assert ({2} - stopped | began, bool(change)) == (set(now_holds), bool(began or stopped))
     assert change.stayed == (2 in now_holds and bool(change))
 
 
@@ -229,8 +205,7 @@ def test_who_has_heard_of_nobody_promises_much_but_not_everything() -> None:
 
 
 def test_who_heard_no_rcm_for_the_hold_lease_or_must_follow_the_fleet_believes_a_far_jump() -> None:
-    far = Term(10**9, "x")
-    rc = holding(HELD)
+    far, rc = Term(10**9, "x"), holding(HELD)
     assert not rc.promise(far, NOW + LEASE - 1)
     assert rc.promise(far, NOW + LEASE)
     rc = holding(HELD)
@@ -319,7 +294,7 @@ def test_a_command_is_judged_by_the_time_at_which_it_is_carried_out() -> None:
 
 
 def test_the_reason_given_with_a_revocation_is_what_a_late_command_is_told() -> None:
-    rc = holding(HELD, said(3, TWO, revoked=ONE))
+    rc = holding(HELD, said(3, TWO, revoked=[ONE]))
     refusal = rc.check(ONE.grant, "h/one", NOW)
     assert refusal is not None
     assert refusal.message.endswith("preempted: by an operator")
@@ -373,8 +348,7 @@ def test_of_two_holds_of_one_name_one_goes_on_and_one_is_over() -> None:
 
 def test_a_grant_that_a_snapshot_names_is_not_refused_before_its_publication_comes() -> None:
     """A confirmation may overtake the publication: the snapshot read for it must not decide against it."""
-    rc = holding(HELD)
-    handed_over = Grant(TERM, 3)
+    rc, handed_over = holding(HELD), Grant(TERM, 3)
     codes = []
     for step in (
         lambda: None,

@@ -34,12 +34,19 @@ class Recorded(ExclusiveDriver):
         self.told.append("safe")
 
 
-async def offer(fleet: FakeFleet, host: str) -> ResourceController:
-    mesh = fleet.mesh(host)
-    lease = fleet.fleet.timing.hold_lease / SECOND
+async def offer(fleet: FakeFleet, host: str, mesh: MemoryMesh | None = None) -> ResourceController:
+    mesh, lease = mesh or fleet.mesh(host), fleet.fleet.timing.hold_lease / SECOND
     rc = ResourceController(mesh, RC, Recorded(), hold_lease=lease, stall=StallWatch(mesh.now).start())
     await rc.start()
     return rc
+
+
+async def offered() -> tuple[FakeFleet, ResourceController, FakeClient]:
+    """The RC at h2, which the RCM knows."""
+    fleet = FakeFleet()
+    rcm, first, client = fleet.rcm(), await offer(fleet, "h2"), fleet.client("one")
+    await until(lambda: rcm.core.status().rcs)
+    return fleet, first, client
 
 
 def told(rc: ResourceController) -> list[str]:
@@ -49,8 +56,7 @@ def told(rc: ResourceController) -> list[str]:
 
 async def confirms(client: FakeClient, grant: Grant) -> list[Any]:
     """All that answer a confirmation, as a code, or as nothing."""
-    mesh = client.mesh
-    command = Command(grant=grant, do={"name": "confirm"})
+    mesh, command = client.mesh, Command(grant=grant, do={"name": "confirm"})
     replies = await mesh.ask(mesh.keys.command(RC, mesh.me), command, Done, timeout=1)
     return [reply.problem and reply.problem.code for reply in replies]
 
@@ -63,14 +69,10 @@ def kill(fleet: FakeFleet, rc: ResourceController) -> None:
 
 
 async def test_who_finds_another_instance_stands_by_and_serves_when_its_holds_are_surely_over() -> None:
-    fleet = FakeFleet()
-    rcm = fleet.rcm()
-    first = await offer(fleet, "h2")
+    fleet, first, client = await offered()
     second = await offer(fleet, "h1")
     assert [one.instances.state for one in (first, second)] == [InstanceState.SERVES, InstanceState.STANDS_BY]
     assert second._rc_state([]).duplicate_of == "robot/a at h2"
-    client = fleet.client("one")
-    await until(lambda: rcm.core.status().rcs)
     answer = await client.ask("tally", RC)
     assert await confirms(client, grant_of(answer)) == [None]
     assert (told(first), told(second)) == (["begin tally"], [])
@@ -86,11 +88,8 @@ async def test_who_finds_another_instance_stands_by_and_serves_when_its_holds_ar
 
 
 async def test_who_leaves_in_order_is_followed_at_once() -> None:
-    fleet = FakeFleet()
-    fleet.rcm()
-    first = await offer(fleet, "h2")
+    fleet, first, client = await offered()
     second = await offer(fleet, "h1")
-    client = fleet.client("one")
     await client.ask("tally", RC)
     await until(lambda: told(first))
     stopped = fleet.watcher.now()
@@ -101,16 +100,11 @@ async def test_who_leaves_in_order_is_followed_at_once() -> None:
 
 
 async def test_of_two_that_did_not_see_each_other_the_one_that_was_taken_in_first_goes_on() -> None:
-    fleet = FakeFleet()
-    rcm = fleet.rcm()
-    first = await offer(fleet, "h2")
-    client = fleet.client("one")
-    await until(lambda: rcm.core.status().rcs)
+    fleet, first, client = await offered()
     answer = await client.ask("tally", RC)
     apart = fleet.mesh("h1")
     fleet.network.isolate(apart)
-    second = ResourceController(apart, RC, Recorded(), hold_lease=3.0, stall=StallWatch(apart.now).start())
-    await second.start()
+    second = await offer(fleet, "h1", apart)
     assert second.instances.state is InstanceState.SERVES
     fleet.network.heal()
     await until(lambda: second.instances.state is InstanceState.STANDS_BY)
@@ -131,8 +125,7 @@ async def test_what_another_half_was_granted_ends_though_the_instance_that_is_me
     for one, two in product((apart, other), (first.mesh, rcm.mesh)):
         fleet.network.cut(one, two)
         fleet.network.cut(two, one)
-    second = ResourceController(apart, RC, Recorded(), hold_lease=3.0, stall=StallWatch(apart.now).start())
-    await second.start()
+    second = await offer(fleet, "h1", apart)
     held = Holder("tally", "tally", "other/one", Grant(term, 1), Place(term, 1), [RC], Decimal(60), 50.0)
     other.put(other.keys.grants, Grants(term, 1, 1, 0.5, {RC: [held]}, []))
     await until(lambda: told(second))
@@ -163,18 +156,13 @@ async def test_after_a_change_of_rcm_the_one_with_the_hold_is_meant() -> None:
     second.instances.take(second.instance)  # as though it had not heard
     await candidates[1].stop()
     await until(lambda: second.instances.state is InstanceState.STANDS_BY)
-    assert await confirms(client, grant_of(answer)) == [None]
-    assert told(second) == []
+    assert (await confirms(client, grant_of(answer)), told(second)) == ([None], [])
     assert told(first) == ["begin tally"]
     await candidates[0].stop()
 
 
 async def test_a_new_instance_on_the_same_host_follows_at_once_and_the_hold_ends() -> None:
-    fleet = FakeFleet()
-    rcm = fleet.rcm()
-    first = await offer(fleet, "h2")
-    client = fleet.client("one")
-    await until(lambda: rcm.core.status().rcs)
+    fleet, first, client = await offered()
     before = grant_of(await client.ask("tally", RC))
     fleet.network.freeze(first.mesh)
     first.supervisor.cancel()

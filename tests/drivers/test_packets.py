@@ -55,8 +55,7 @@ def test_packets_survive_being_cut_anywhere(sent: list[Packet], cuts: list[int])
         got += decoder.feed(data[:cut])
         data = data[cut:]
     got += decoder.feed(data)
-    assert got == sent
-    assert decoder.spoiled == 0
+    assert (got, decoder.spoiled) == (sent, 0)
 
 
 @given(packets, noise, noise)
@@ -89,14 +88,9 @@ def test_any_bytes_are_taken_and_little_is_kept(pieces: list[bytes]) -> None:
 @pytest.mark.parametrize(
     ("kind", "arguments"),
     [
-        (StopPacket, (-1, 0)),
-        (StopPacket, (MAX_ROBOT + 1, 0)),
-        (StopPacket, (1, 256)),
-        (CameraPacket, (1, 0, -1)),
-        (CameraPacket, (1, 0, MAX_CHANNEL + 1)),
-        (DrivePacket, (1, 0, 1.01, 0, 1)),
-        (DrivePacket, (1, 0, 0, float("nan"), 1)),
-        (DrivePacket, (1, 0, 0, 0, 0)),
+        *((StopPacket, said) for said in ((-1, 0), (MAX_ROBOT + 1, 0), (1, 256))),
+        *((CameraPacket, (1, 0, channel)) for channel in (-1, MAX_CHANNEL + 1)),
+        *((DrivePacket, (1, 0, *said)) for said in ((1.01, 0, 1), (0, float("nan"), 1), (0, 0, 0))),
         (DrivePacket, (1, 0, 0, 0, MAX_LASTS + 0.01)),
     ],
 )

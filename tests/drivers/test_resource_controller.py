@@ -11,39 +11,60 @@ from typing import Any, cast
 import pytest
 from msgspec.structs import replace
 
-from tests.drivers.rcs import ECHO, LEASE, TERM, Device, Rcm, answer, close, holder, started
+from tests.drivers.rcs import (
+    ECHO,
+    LEASE,
+    TERM,
+    Device,
+    Rcm,
+    answer,
+    close,
+    grant,
+    holder,
+    rc_state,
+    started,
+    states_published,
+)
 from tests.hang import HANG
 from tests.mesh.kit import until
-from zscout.drivers.confirm_server import CommandQuery
+from zscout.drivers.confirm_server import CommandQuery, ConfirmServer
 from zscout.drivers.holds import HoldChange
 from zscout.drivers.repeated import MAX_HOSTS, MAX_PER_HOST, MAX_WAITING, CommandMemory
 from zscout.drivers.resource_controller import SAY_AGAIN, ResourceController
 from zscout.drivers.work_queue import COMMANDS_PER_HOST, EARLY_PER_HOST, WorkQueue
 from zscout.keyexpr import Role, Sender
 from zscout.mesh import IncomingQuery, Mesh, Refused
-from zscout.messages import Command, Done, Grants, Holder, Malformed, RcAsk, RcmState, RcState
+from zscout.messages import (
+    Command,
+    Confirm,
+    Confirmed,
+    Done,
+    Grants,
+    Holder,
+    Malformed,
+    Problem,
+    RcAsk,
+    RcmState,
+    RcState,
+)
 from zscout.testing.link import Disturbance
 from zscout.testing.memory import MemoryMesh, MemoryNetwork
-from zscout.types import SECOND, Grant
+from zscout.types import SECOND, Grant, Term
 
 
 @asynccontextmanager
-async def play() -> AsyncIterator[tuple[Rcm, ResourceController, Device, Mesh]]:
+async def play(kind: type[Device] = Device, **how: Any) -> AsyncIterator[tuple[Rcm, ResourceController, Device, Mesh]]:
     """An RCM, an RC that `one` holds under grant 1, and its client `h/client`."""
     network = MemoryNetwork()
-    rcm, device = Rcm(network), Device()
+    rcm, device = Rcm(network), kind()
     client = network.open("f", Sender("h", "client"))
-    rc = await started(network, device)
+    rc = await started(network, device, **how)
     rcm.publish(holder(1))
     await until(lambda: device.calls == ["begin one"])
     try:
         yield rcm, rc, device, client
     finally:
         await close(rc, rcm.mesh, client)
-
-
-def grant(number: int) -> Grant:
-    return Grant(TERM, number)
 
 
 async def test_the_safe_state_waits_for_no_command_though_the_rcm_hangs() -> None:
@@ -74,9 +95,6 @@ async def test_what_goes_on_in_another_hold_is_neither_ended_nor_made_safe(kind:
     rcm, device = Rcm(network), kind()
     client = network.open("f", Sender("h", "client"))
 
-    async def told(count: int) -> None:
-        await until(lambda: len(device.calls) >= count)
-
     rc = await started(network, device)
     warm, turn = holder(1, "warm"), replace(holder(2, "turn"), continues="warm")
     moved = replace(turn, client="h/other", grant=grant(3))
@@ -86,9 +104,8 @@ async def test_what_goes_on_in_another_hold_is_neither_ended_nor_made_safe(kind:
     expected = ["begin warm", *begins, "end turn", "safe", "begin last"]
     for one, calls in (warm, 1), (turn, 2), (moved, 3), (holder(4, "last", "h/other"), 6):
         rcm.publish(one)
-        await told(calls)
-    assert device.calls == expected
-    assert await answer(client, turn.grant) == "ended"
+        await until(lambda: len(device.calls) >= calls)  # noqa: B023 - awaited here
+    assert (device.calls, await answer(client, turn.grant)) == (expected, "ended")
     await close(rc, rcm.mesh, client)
 
 
@@ -100,17 +117,12 @@ async def test_a_hold_that_was_held_back_begins_in_the_one_that_continues_it() -
             await asyncio.sleep(1)
             await super().safe()
 
-    network = MemoryNetwork()
-    rcm, device = Rcm(network), Slow()
-    rc = await started(network, device, settle=2.0)
-    rcm.publish(holder(1))
-    await until(lambda: device.calls)
-    rcm.publish(holder(2, "warm"))
-    await asyncio.sleep(0.5)
-    rcm.publish(replace(holder(3, "turn"), continues="warm"))
-    await until(lambda: len(device.calls) >= 4)
-    assert device.calls == ["begin one", "end one", "safe", "begin turn"]
-    await close(rc, rcm.mesh)
+    async with play(Slow, settle=2.0) as (rcm, _rc, device, _client):
+        rcm.publish(holder(2, "warm"))
+        await asyncio.sleep(0.5)
+        rcm.publish(replace(holder(3, "turn"), continues="warm"))
+        await until(lambda: len(device.calls) >= 4)
+        assert device.calls == ["begin one", "end one", "safe", "begin turn"]
 
 
 async def test_the_safe_state_goes_before_commands_that_wait() -> None:
@@ -120,8 +132,7 @@ async def test_the_safe_state_goes_before_commands_that_wait() -> None:
         waiting = [asyncio.create_task(answer(client, grant(1))) for _ in range(5)]
         await asyncio.sleep(0.1)
         rcm.publish(holder(2, "two"))
-        assert await slow == "done"
-        assert {await task for task in waiting} == {"ended"}
+        assert (await slow, {await task for task in waiting}) == ("done", {"ended"})
         assert device.calls == ["begin one", "slow", "end one", "safe", "begin two"]
 
 
@@ -201,8 +212,7 @@ async def test_a_hold_ends_when_no_rcm_was_heard_for_the_lease() -> None:
         await until(lambda: device.calls[-1] == "safe")
         assert abs(rcm.mesh.now() - begun - LEASE * SECOND) < 0.1 * SECOND
         await until(lambda: ended == ["lease"])
-        assert await answer(client, grant(1)) == "ended"
-        assert rc.health == "ok"
+        assert (await answer(client, grant(1)), rc.health) == ("ended", "ok")
 
 
 @pytest.mark.parametrize("where", ["begin two", "safe"])
@@ -221,26 +231,21 @@ async def test_a_driver_that_raises_fails_its_rc_which_recovers(where: str) -> N
 async def test_an_rc_that_fails_leaves_the_mesh_with_its_device_safe_and_tells_its_owner(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    network = MemoryNetwork()
-    rcm, device, failures = Rcm(network), Device(), list[Exception]()
-    tokens: dict[str, bool] = {}
-    key = rcm.mesh.keys.alive_any(Role.RC)
-    watch = rcm.mesh.watch(key, lambda token, alive: tokens.update({token.name: alive}))
-    rc = await started(network, device, on_failure=failures.append)
-    rcm.publish(holder(1))
-    await until(lambda: device.calls == ["begin one"] and tokens == {"robot/x": True})
+    failures, tokens = list[Exception](), dict[str, bool]()
 
     def fault(*_args: object, **_how: object) -> None:
         raise KeyError("a fault of ours")
 
-    monkeypatch.setattr(rc.holds, "apply_grants", fault)
-    rcm.publish()
-    await until(lambda: device.calls[-1] == "safe")
-    assert [type(error) for error in failures] == [KeyError]
-    assert "its resource controller failed" in rc.health
-    await until(lambda: tokens == {"robot/x": False})
-    watch.close()
-    await close(rc, rcm.mesh)
+    async with play(on_failure=failures.append) as (rcm, rc, device, client):
+        watch = client.watch(client.keys.alive_any(Role.RC), lambda token, alive: tokens.update({token.name: alive}))
+        await until(lambda: tokens == {"robot/x": True})
+        monkeypatch.setattr(rc.holds, "apply_grants", fault)
+        rcm.publish()
+        await until(lambda: device.calls[-1] == "safe")
+        assert [type(error) for error in failures] == [KeyError]
+        assert "its resource controller failed" in rc.health
+        await until(lambda: tokens == {"robot/x": False})
+        watch.close()
     assert device.calls.count("safe") == 1
 
 
@@ -261,8 +266,7 @@ async def test_a_command_under_a_grant_that_was_missed_waits_until_that_was_read
 async def test_an_rc_that_has_missed_something_does_not_say_that_it_knows_all() -> None:
     """Its RCM would take a hold for lost of which it has yet to read."""
     async with play() as (rcm, rc, _device, client):
-        states: list[RcState] = []
-        client.subscribe(client.keys.rc_state_any, RcState, lambda _key, state: states.append(state))
+        states = states_published(client)
         rcm.hangs = True
         rcm.seq += 1
         rcm.publish(rc="robot/y")
@@ -296,8 +300,7 @@ async def test_figures_are_published_when_they_change() -> None:
 
 async def test_how_long_it_was_used_is_told_within_a_second_of_the_end() -> None:
     async with play() as (rcm, _rc, device, client):
-        states: list[RcState] = []
-        client.subscribe(client.keys.rc_state_any, RcState, lambda _key, state: states.append(state))
+        states = states_published(client)
         assert await answer(client, grant(1), {"name": "confirm"}) == "done"
         await asyncio.sleep(0.2)
         assert await answer(client, grant(1), {"name": "slow", "seconds": 0.5}) == "done"
@@ -315,10 +318,8 @@ async def test_how_long_it_was_used_is_told_within_a_second_of_the_end() -> None
         assert states == []
         rcm.publish(holder(2, "two"))
         await until(lambda: states, within=1.1)
-        assert [(use.grant, use.seconds) for use in states[0].used] == [
-            (grant(1), pytest.approx(1.5, abs=0.01)),
-            (grant(2), 0.0),
-        ]
+        uses = [(use.grant, use.seconds) for use in states[0].used]
+        assert uses == [(grant(1), pytest.approx(1.5, abs=0.01)), (grant(2), 0.0)]
         await asyncio.sleep(1.9)
         assert len(states) == 1
 
@@ -336,27 +337,18 @@ async def test_a_command_that_takes_its_time_counts_once_it_is_carried_out() -> 
 
             return asyncio.ensure_future(take())
 
-    network = MemoryNetwork()
-    rcm, client = Rcm(network), network.open("f", Sender("h", "client"))
-    rc = await started(network, Slow())
-    rcm.publish(holder(1))
-    await until(lambda: rc.holds.held)
-
-    async def used() -> float:
-        reply = await client.ask_one(client.keys.rc_state("robot/x"), RcAsk(), RcState, timeout=5)
-        assert reply is not None
-        assert reply.message is not None
-        (use,) = reply.message.used
+    async def used(client: Mesh) -> float:
+        (use,) = (await rc_state(client)).used
         return use.seconds
 
-    assert await answer(client, grant(1), {"name": "fail", "seconds": 1}) == "failed"
-    assert await used() == 0.0
-    long = asyncio.create_task(answer(client, grant(1), {"name": "do", "seconds": 1}))
-    assert await answer(client, grant(1), {"name": "do", "seconds": 0.5}) == "done"
-    assert await used() == pytest.approx(0.5, abs=0.01)
-    assert await long == "done"
-    assert await used() == pytest.approx(1.0, abs=0.01)
-    await close(rc, rcm.mesh, client)
+    async with play(Slow) as (_rcm, _rc, _device, client):
+        assert await answer(client, grant(1), {"name": "fail", "seconds": 1}) == "failed"
+        assert await used(client) == 0.0
+        long = asyncio.create_task(answer(client, grant(1), {"name": "do", "seconds": 1}))
+        assert await answer(client, grant(1), {"name": "do", "seconds": 0.5}) == "done"
+        assert await used(client) == pytest.approx(0.5, abs=0.01)
+        assert await long == "done"
+        assert await used(client) == pytest.approx(1.0, abs=0.01)
 
 
 async def test_who_missed_that_an_rc_works_again_hears_it_later() -> None:
@@ -378,13 +370,10 @@ async def test_who_missed_that_an_rc_works_again_hears_it_later() -> None:
 
 async def test_a_publication_of_an_older_term_is_answered_by_the_state() -> None:
     async with play() as (_rcm, _rc, _device, client):
-        states: list[RcState] = []
-        client.subscribe(client.keys.rc_state_any, RcState, lambda _key, state: states.append(state))
-        old = type(TERM)(1, "old")
+        states, old = states_published(client), type(TERM)(1, "old")
         client.publisher(client.keys.grants, Grants).put(Grants(term=old, seq=9, prev=8, every=0.5))
         await until(lambda: bool(states))
-        assert states[0].term == TERM
-        assert await answer(client, grant(1), dict(ECHO)) == "done"
+        assert (states[0].term, await answer(client, grant(1), dict(ECHO))) == (TERM, "done")
 
 
 @pytest.mark.parametrize(
@@ -452,23 +441,16 @@ def test_what_was_set_aside_comes_back_before_other_commands_in_its_order() -> N
     assert queue.put_command(query("late"), "host")
     assert queue.commands == 4
     queue.resume(lambda command: cast("str", command) != "two")
-    assert queue.drop_early() == [query("two")]
-    assert queue.commands == 3
+    assert (queue.drop_early(), queue.commands) == ([query("two")], 3)
     assert drained(queue, 3) == ["one", "three", "late"]
 
 
-def test_one_host_can_not_fill_what_is_set_aside() -> None:
-    queue = WorkQueue()
-    assert all(queue.set_aside(query(str(number)), "stranger") for number in range(EARLY_PER_HOST))
-    assert not queue.set_aside(query("more"), "stranger")
-    assert queue.set_aside(query("mine"), "host")
-
-
-def test_one_host_can_not_fill_the_queue() -> None:
-    queue = WorkQueue()
-    assert all(queue.put_command(query(str(number)), "stranger") for number in range(COMMANDS_PER_HOST))
-    assert not queue.put_command(query("more"), "stranger")
-    assert queue.put_command(query("mine"), "host")
+@pytest.mark.parametrize("take", ["set_aside", "put_command"])
+def test_one_host_can_not_fill_the_queue_or_what_is_set_aside(take: str) -> None:
+    put, limit = getattr(WorkQueue(), take), EARLY_PER_HOST if take == "set_aside" else COMMANDS_PER_HOST
+    assert all(put(query(str(number)), "stranger") for number in range(limit))
+    assert not put(query("more"), "stranger")
+    assert put(query("mine"), "host")
 
 
 def test_who_waits_is_woken() -> None:
@@ -491,13 +473,8 @@ async def test_figures_that_are_no_numbers_are_left_out() -> None:
         def figures(self) -> dict[str, float]:
             return {"good": 1.5, "nan": float("nan"), "endless": float("inf")}
 
-    network = MemoryNetwork()
-    asker, rc = network.open("f", Sender("h", "asker")), await started(network, Odd())
-    reply = await asker.ask_one(asker.keys.rc_state("robot/x"), RcAsk(), RcState, timeout=1)
-    assert reply is not None
-    assert reply.message is not None
-    assert reply.message.figures == {"good": 1.5}
-    await close(rc, asker)
+    async with play(Odd) as (*_, client):
+        assert (await rc_state(client)).figures == {"good": 1.5}
 
 
 async def test_what_its_driver_declares_amiss_is_told_before_anybody_is_offered_it() -> None:
@@ -507,3 +484,42 @@ async def test_what_its_driver_declares_amiss_is_told_before_anybody_is_offered_
 
     with pytest.raises(Malformed):
         await started(MemoryNetwork(), Amiss())
+
+
+# One question to all RCs of a process, and to two processes of one host
+
+GRANT = Grant(Term(1, "a"), 2)
+BUSY = Refused("busy", "ask again")
+
+
+async def test_each_rc_answers_for_itself_and_nothing_is_said_of_others() -> None:
+    network = MemoryNetwork()
+    server, other = (ConfirmServer(network.open("f", Sender("bench", name))) for name in ("node", "drivers"))
+    client = network.open("f", Sender("desk", "one"))
+    asked: list[CommandQuery] = []
+
+    def refuse(_: CommandQuery) -> None:
+        raise BUSY
+
+    for rc, take in (("robot/a", asked.append), ("robot/b", asked.append), ("robot/c", refuse)):
+        server.serve(rc, take)
+    gone = server.serve("robot/gone", asked.append)
+    gone.close()
+    other.serve("radio/r", lambda query: query.answer(Done(warming=2.0)))
+    rcs = ["robot/a", "robot/b", "robot/a", "robot/c", "robot/gone", "robot/foreign", "radio/r"]
+    key = client.keys.confirm("bench", client.me)
+    asking = asyncio.create_task(client.ask(key, Confirm(GRANT, rcs, ttl=0.5), Confirmed, timeout=1))
+    await asyncio.sleep(0.1)
+    for query in asked:
+        assert (query.message.grant, query.message.do, query.message.ttl) == (GRANT, {"name": "confirm"}, 0.5)
+        assert client.keys.sender_of(query.key) == client.me
+    first, second = asked
+    second.refuse(Problem("settling", "it settles", left=1.0))
+    await asyncio.sleep(0.1)
+    assert not asking.done()
+    first.answer(Done(settle=5.0))
+    first.answer(Done(settle=9.0))
+    replies = [reply.message for reply in await asking]
+    assert Confirmed({"radio/r": Done(warming=2.0)}) in replies
+    settles = {"robot/b": Problem("settling", "it settles", left=1.0), "robot/c": BUSY.problem}
+    assert Confirmed({"robot/a": Done(settle=5.0)}, settles) in replies

@@ -19,7 +19,7 @@ from tests.live.bench import until
 from zscout.drivers.packets import DrivePacket, HaltPacket, encode
 from zscout.drivers.serial_line import DEPTH, SerialLine
 
-pytestmark = pytest.mark.usefixtures("real_time")
+pytestmark = pytest.mark.real_time
 
 
 class Ear:
@@ -117,8 +117,7 @@ async def test_a_second_program_is_refused_and_has_its_turn_later(tmp_path: Path
 
 async def test_a_line_that_takes_nothing_is_told_of_and_its_backlog_thrown_away(tmp_path: Path) -> None:
     async with live(tmp_path / "tty", reads=False) as (pty, ear, line):
-        block = encode(DrivePacket(1, 1, 1, 1, 0.5)) * 400
-        sent = 0
+        block, sent = encode(DrivePacket(1, 1, 1, 1, 0.5)) * 400, 0
         while len(ear.told) == 1 and sent < 100:
             written = ear.wrote
             if line.write(block):
@@ -164,8 +163,7 @@ async def test_a_radio_on_another_machine(tmp_path: Path) -> None:
         writer.close()
 
     server = await asyncio.start_server(served, "127.0.0.1", 0)
-    port = server.sockets[0].getsockname()[1]
-    ear = Ear()
+    port, ear = server.sockets[0].getsockname()[1], Ear()
     line = opened(f"socket://127.0.0.1:{port}", ear)
     await ear.until(lambda: ear.told == ["up"])
     line.write(encode(HaltPacket(9, 9)))

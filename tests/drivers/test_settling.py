@@ -11,24 +11,33 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
-from tests.drivers.rcs import ECHO, LEASE, TERM, Device, Rcm, answer, close, holder, started
+from tests.drivers.rcs import (
+    ECHO,
+    LEASE,
+    TERM,
+    Device,
+    Rcm,
+    answer,
+    close,
+    grant,
+    holder,
+    rc_state,
+    started,
+    states_published,
+)
 from tests.mesh.kit import until
 from zscout.drivers.last_holder import LastHolder, LastHolderFile, UnknownLastHolder
 from zscout.drivers.resource_controller import SETTLE, ResourceController
 from zscout.keyexpr import Sender
 from zscout.mesh import Mesh
-from zscout.messages import Command, Done, Grants, Holder, Problem, RcAsk, RcState, Revocation
+from zscout.messages import Command, Done, Grants, Holder, Problem, Revocation
 from zscout.testing.memory import MemoryNetwork
-from zscout.types import SECOND, Grant
+from zscout.types import SECOND
 
 CONFIRM: Mapping[str, Any] = {"name": "confirm"}
 LEAVING: Mapping[str, Any] = {"name": "leaving"}
 LEFT: Mapping[str, Any] = {"name": "left"}
 NEXT = "next"
-
-
-def grant(number: int) -> Grant:
-    return Grant(TERM, number)
 
 
 def direct(number: int, arc: str = "one", client: str = "h/client") -> Holder:
@@ -46,6 +55,14 @@ class Place:
         self.network, self.rcm, self.rc, self.device = network, rcm, rc, device
         self.client = network.open("f", Sender("h", "client"))
         self.other = network.open("f", Sender("h", "other"))
+        self.begin_heartbeat()
+
+    def begin_heartbeat(self) -> None:
+        self.heartbeat = asyncio.create_task(self._keep_alive())
+
+    async def close(self) -> None:
+        self.heartbeat.cancel()
+        await close(self.rc, self.rcm.mesh, self.client, self.other)
 
     def next_holder(self, number: int = 2, **how: Any) -> None:
         self.rcm.publish(replace(holder(number, NEXT, "h/other"), **how))
@@ -72,7 +89,7 @@ class Place:
         assert word == "done"
         return (self.rc.mesh.now() - began) / SECOND
 
-    async def keep_alive(self) -> None:
+    async def _keep_alive(self) -> None:
         """An RCM goes on to publish that nothing has changed."""
         while True:
             seq = self.rcm.seq
@@ -81,39 +98,34 @@ class Place:
 
 
 @asynccontextmanager
-async def play(first: Holder | None = None, **how: Any) -> AsyncIterator[Place]:
+async def play(first: Holder | None = None, *, confirmed: bool = True, **how: Any) -> AsyncIterator[Place]:
     network = MemoryNetwork()
     rcm, device = Rcm(network), how.pop("device", None) or Device()
-    rc = await started(network, device, **how)
-    place = Place(network, rcm, rc, device)
-    heartbeat = asyncio.create_task(place.keep_alive())
+    place = Place(network, rcm, await started(network, device, **how), device)
     rcm.publish(first or direct(1))
-    await until(lambda: rc.holds.held)
+    await until(lambda: place.rc.holds.held)
+    assert not confirmed or await place.word(place.client, 1) == "done"
     try:
         yield place
     finally:
-        heartbeat.cancel()
-        await close(rc, rcm.mesh, place.client, place.other)
+        await place.close()
 
 
 async def test_the_next_holder_waits_until_the_program_of_a_direct_hold_has_left() -> None:
     async with play() as at:
-        assert await at.word(at.client, 1) == "done"
         at.next_holder()
         refused = await at.refusal(2)
         assert refused.code == "settling"
         assert refused.left == pytest.approx(LEASE + SETTLE, abs=0.1)
         assert await at.word(at.other, 2, ECHO) == "settling"
         assert at.device.calls == ["begin one", "end one", "safe"]
-        assert await at.word(at.client, 1, LEFT) == "done"
-        assert await at.word(at.other, 2) == "done"
+        assert (await at.word(at.client, 1, LEFT), await at.word(at.other, 2)) == ("done", "done")
         # What the program did to the device past its RC since is undone before the next holder begins.
         assert at.device.calls == ["begin one", "end one", "safe", "safe", "begin next"]
 
 
 async def test_it_settles_for_settle_from_leaving_on() -> None:
     async with play() as at:
-        assert await at.word(at.client, 1) == "done"
         at.next_holder()
         await asyncio.sleep(1)
         assert await at.word(at.client, 1, LEAVING) == "done"
@@ -122,7 +134,6 @@ async def test_it_settles_for_settle_from_leaving_on() -> None:
 
 async def test_who_says_nothing_has_a_hold_lease_and_settle_from_its_last_confirmation_on() -> None:
     async with play() as at:
-        assert await at.word(at.client, 1) == "done"
         await asyncio.sleep(20)
         assert await at.word(at.client, 1) == "done"
         await asyncio.sleep(2)
@@ -132,7 +143,6 @@ async def test_who_says_nothing_has_a_hold_lease_and_settle_from_its_last_confir
 
 async def test_the_word_may_come_before_the_end_is_heard() -> None:
     async with play() as at:
-        assert await at.word(at.client, 1) == "done"
         assert await at.word(at.client, 1, LEAVING) == "done"
         await asyncio.sleep(1)
         at.next_holder()
@@ -141,13 +151,11 @@ async def test_the_word_may_come_before_the_end_is_heard() -> None:
 
 async def test_left_before_the_end_settles_nothing_unless_it_is_confirmed_again() -> None:
     async with play() as at:
-        assert await at.word(at.client, 1) == "done"
         assert await at.word(at.client, 1, LEFT) == "done"
         at.next_holder()
         assert await at.settled_after() < 0.1
         at.rcm.publish(direct(3))
-        assert await at.word(at.client, 3) == "done"
-        assert await at.word(at.client, 3, LEFT) == "done"
+        assert (await at.word(at.client, 3), await at.word(at.client, 3, LEFT)) == ("done", "done")
         assert await at.word(at.client, 3) == "done"
         at.next_holder(4)
         assert await at.settled_after(4) > LEASE
@@ -155,7 +163,6 @@ async def test_left_before_the_end_settles_nothing_unless_it_is_confirmed_again(
 
 async def test_nobody_else_says_that_a_program_has_left() -> None:
     async with play() as at:
-        assert await at.word(at.client, 1) == "done"
         assert await at.word(at.other, 1, LEFT) == "wrong_client"
         at.next_holder()
         assert await at.word(at.other, 1, LEFT) == "ended"
@@ -165,7 +172,6 @@ async def test_nobody_else_says_that_a_program_has_left() -> None:
 @pytest.mark.parametrize("released", ["with the next grant", "alone", "after its time"])
 async def test_what_its_own_client_gives_back_does_not_settle(released: str) -> None:
     async with play() as at:
-        assert await at.word(at.client, 1) == "done"
         following = [holder(2, NEXT, "h/other")] if released == "with the next grant" else []
         if released == "after its time":
             at.next_holder()
@@ -187,7 +193,6 @@ async def test_what_its_own_client_gives_back_does_not_settle(released: str) -> 
 )
 async def test_any_other_end_settles(end: Callable[[Place], object], first: Holder) -> None:
     async with play(first) as at:
-        assert await at.word(at.client, 1) == "done"
         end(at)
         await until(lambda: grant(1) not in at.rc.holds.held)
         at.rc.recover()
@@ -196,30 +201,23 @@ async def test_any_other_end_settles(end: Callable[[Place], object], first: Hold
 
 
 async def test_an_end_for_want_of_an_rcm_settles() -> None:
-    network = MemoryNetwork()
-    rcm, device = Rcm(network), Device()
-    rc = await started(network, device)
-    at = Place(network, rcm, rc, device)
-    rcm.publish(direct(1))
-    assert await at.word(at.client, 1) == "done"
-    await until(lambda: not rc.holds.held)
-    heartbeat = asyncio.create_task(at.keep_alive())
-    at.next_holder()
-    # It confirmed it a hold lease ago.
-    assert await at.settled_after() == pytest.approx(SETTLE, abs=0.2)
-    heartbeat.cancel()
-    await close(rc, rcm.mesh, at.client, at.other)
+    async with play() as at:
+        at.heartbeat.cancel()
+        await until(lambda: not at.rc.holds.held)
+        at.begin_heartbeat()
+        at.next_holder()
+        # It confirmed it a hold lease ago.
+        assert await at.settled_after() == pytest.approx(SETTLE, abs=0.2)
 
 
 async def test_a_hold_that_was_never_confirmed_has_no_program() -> None:
-    async with play() as at:
+    async with play(confirmed=False) as at:
         at.next_holder()
         assert await at.settled_after() < 0.1
 
 
 async def test_a_hold_that_is_not_direct_does_not_settle() -> None:
     async with play(holder(1)) as at:
-        assert await at.word(at.client, 1) == "done"
         at.next_holder()
         assert await at.settled_after() < 0.1
         assert at.device.calls == ["begin one", "end one", "safe", "begin next"]
@@ -227,13 +225,11 @@ async def test_a_hold_that_is_not_direct_does_not_settle() -> None:
 
 async def test_a_hand_over_does_not_settle_and_who_took_over_does() -> None:
     async with play() as at:
-        assert await at.word(at.client, 1) == "done"
         at.rcm.publish(replace(direct(2, client="h/other"), place=direct(1).place))
         assert await at.settled_after() < 0.1
         at.rcm.publish(holder(3, NEXT, "h/client"))
         assert await at.word(at.client, 3) == "settling"
-        assert await at.word(at.other, 2, LEFT) == "done"
-        assert await at.word(at.client, 3) == "done"
+        assert (await at.word(at.other, 2, LEFT), await at.word(at.client, 3)) == ("done", "done")
         assert at.device.calls == ["begin one", "begin one", "end one", "safe", "safe", "begin next"]
 
 
@@ -242,30 +238,25 @@ class Shared(Device):
 
 
 async def test_who_held_before_goes_on_and_only_who_began_after_waits() -> None:
-    async with play(device=Shared()) as at:
+    async with play(device=Shared(), confirmed=False) as at:
         at.rcm.publish(direct(1), holder(2, "two", "h/other"))
         assert await at.word(at.client, 1) == "done"
         at.rcm.publish(holder(2, "two", "h/other"), holder(3, NEXT, "h/client"))
-        assert await at.word(at.other, 2) == "done"
-        assert await at.word(at.other, 2, ECHO) == "done"
+        assert (await at.word(at.other, 2), await at.word(at.other, 2, ECHO)) == ("done", "done")
         assert await at.word(at.client, 3) == "settling"
-        assert await at.word(at.client, 1, LEFT) == "done"
-        assert await at.word(at.client, 3) == "done"
+        assert (await at.word(at.client, 1, LEFT), await at.word(at.client, 3)) == ("done", "done")
         assert "safe" not in at.device.calls
 
 
 @pytest.mark.parametrize("name", ["stop", "halt"])
 async def test_stop_and_halt_are_never_held_back(name: str) -> None:
     async with play() as at:
-        assert await at.word(at.client, 1) == "done"
         at.next_holder()
-        assert await at.word(at.other, 2, {"name": name}) == "done"
-        assert at.device.calls[-1] == name
+        assert (await at.word(at.other, 2, {"name": name}), at.device.calls[-1]) == ("done", name)
 
 
 async def test_a_next_holder_whose_time_is_over_by_then_is_left_out_at_the_device() -> None:
     async with play() as at:
-        assert await at.word(at.client, 1) == "done"
         at.next_holder(remaining=2.0)
         await until(lambda: grant(2) in at.rc.holds.held)
         await until(lambda: not at.rc.holds.held)
@@ -288,7 +279,7 @@ class Oven(Device):
 
 
 async def test_whom_a_device_begins_for_does_not_enter_before_it_has_begun() -> None:
-    async with play(device=Oven()) as at:
+    async with play(device=Oven(), confirmed=False) as at:
         at.next_holder()
         await until(lambda: "begin next" in at.device.calls)
         refused = await at.refusal(2)
@@ -321,13 +312,11 @@ class Arm(Device):
 
 
 async def test_a_device_that_parks_itself_takes_its_time_before_the_next_holder() -> None:
-    async with play(holder(1), device=Arm(2.0)) as at:
+    async with play(holder(1), device=Arm(2.0), confirmed=False) as at:
         at.next_holder()
         began = at.rc.mesh.now()
         refused = await at.refusal(2)
-        assert refused.code == "settling"
-        assert refused.left is not None
-        assert 3 < refused.left <= SETTLE
+        assert (refused.code, 3 < (refused.left or 0) <= SETTLE) == ("settling", True)
         assert await at.word(at.other, 2, {"name": "stop"}) == "done"
         assert await at.settled_after() == pytest.approx(2, abs=0.2)
         # It warms up from then on.
@@ -339,7 +328,7 @@ async def test_a_device_that_parks_itself_takes_its_time_before_the_next_holder(
 
 
 async def test_holds_end_while_a_device_parks_itself() -> None:
-    async with play(holder(1), device=Arm(2.0)) as at:
+    async with play(holder(1), device=Arm(2.0), confirmed=False) as at:
         at.next_holder()
         assert await at.word(at.other, 2) == "settling"
         at.rcm.publish(holder(3, "third", "h/other"))
@@ -349,7 +338,7 @@ async def test_holds_end_while_a_device_parks_itself() -> None:
 
 
 async def test_a_device_that_is_not_safe_within_settle_counts_as_lost() -> None:
-    async with play(holder(1), device=Arm(600.0)) as at:
+    async with play(holder(1), device=Arm(600.0), confirmed=False) as at:
         at.next_holder()
         await until(lambda: at.rc.health != "ok")
         assert f"not safe after {SETTLE:g} s" in at.rc.health
@@ -365,7 +354,6 @@ async def restarted(last: Callable[[], LastHolder]) -> AsyncIterator[Place]:
     network = MemoryNetwork()
     rcm, device = Rcm(network), Device()
     at = Place(network, rcm, await started(network, device, last_holder=last()), device)
-    heartbeat = asyncio.create_task(at.keep_alive())
     yield at
     network.kill(at.rc.mesh)
     at.rc.stall.stop()
@@ -374,8 +362,7 @@ async def restarted(last: Callable[[], LastHolder]) -> AsyncIterator[Place]:
     at.next_holder(7)
     await until(lambda: grant(7) in at.rc.holds.held)
     yield at
-    heartbeat.cancel()
-    await close(at.rc, rcm.mesh, at.client, at.other)
+    await at.close()
 
 
 async def test_an_rc_that_starts_anew_settles_where_its_last_holder_may_have_been_direct(tmp_path: Path) -> None:
@@ -414,7 +401,7 @@ async def test_an_rc_that_can_keep_nothing_settles_after_each_start() -> None:
 async def test_a_direct_hold_that_can_not_be_noted_is_not_confirmed(tmp_path: Path) -> None:
     (tmp_path / "direct").write_text("in the way of a folder")
 
-    async with play(last_holder=LastHolderFile(tmp_path, "robot/x")) as at:
+    async with play(last_holder=LastHolderFile(tmp_path, "robot/x"), confirmed=False) as at:
         assert await at.word(at.client, 1) == "failed"
         at.rcm.publish(holder(2))
         assert await at.word(at.client, 2) == "done"
@@ -424,42 +411,28 @@ async def test_a_direct_hold_that_can_not_be_noted_is_not_confirmed(tmp_path: Pa
 async def test_an_rc_that_ends_while_a_program_may_touch_its_device_leaves_it_to_no_other_at_once(
     first: Holder, leaving: bool
 ) -> None:
-    network, said = MemoryNetwork(), list[RcState]()
-    rcm, device = Rcm(network), Device()
-    rc = await started(network, device)
-    at = Place(network, rcm, rc, device)
-    at.client.subscribe(at.client.keys.rc_state("robot/x"), RcState, lambda _, state: said.append(state))
-    rcm.publish(first)
-    assert await at.word(at.client, 1) == "done"
-    await rc.stop()
-    await until(lambda: bool(said))
-    assert (said[-1].leaving, said[-1].settle) == (leaving, SETTLE)
-    await close(rc, rcm.mesh, at.client, at.other)
+    async with play(first) as at:
+        said = states_published(at.client)
+        await at.rc.stop()
+        await until(lambda: bool(said))
+        assert (said[-1].leaving, said[-1].settle) == (leaving, SETTLE)
 
 
 async def test_a_direct_hold_is_used_from_when_it_could_begin() -> None:
     """While a program of before may touch the device, nobody else does."""
     async with play() as place:
-        assert await place.word(place.client, 1) == "done"
         await asyncio.sleep(5)
         place.next_holder(direct=True)
         waited = await place.settled_after()
         await asyncio.sleep(4)
-        key = place.client.keys.rc_state("robot/x")
-        reply = await place.client.ask_one(key, RcAsk(), RcState, timeout=5)
-        assert reply is not None
-        assert reply.message is not None
-        first, second = reply.message.used
+        first, second = (await rc_state(place.client)).used
         assert first.seconds == pytest.approx(5, abs=0.1)
         assert waited > 1
         assert second.seconds == pytest.approx(4, abs=0.1)
 
 
 async def test_a_direct_hold_that_was_handed_over_is_used_by_its_new_client() -> None:
-    async with play() as place:
+    async with play(confirmed=False) as place:
         place.rcm.publish(replace(direct(2, client="h/other"), place=direct(1).place))
         await asyncio.sleep(2)
-        reply = await place.client.ask_one(place.client.keys.rc_state("robot/x"), RcAsk(), RcState, timeout=5)
-        assert reply is not None
-        assert reply.message is not None
-        assert [use.seconds for use in reply.message.used][1:] == [pytest.approx(2, abs=0.1)]
+        assert [use.seconds for use in (await rc_state(place.client)).used][1:] == [pytest.approx(2, abs=0.1)]

@@ -91,8 +91,7 @@ def test_what_is_over_is_told_for_a_while_and_not_without_bound() -> None:
         use.hold_began(grant(number))
         use.hold_ended(grant(number), at(number))
     last = 2 * MAX_ENDED - 1
-    assert [*told(use, last - 1)][-1] == last
-    assert len(told(use, last)) == TOLD_FOR // SECOND + 1
+    assert ([*told(use, last - 1)][-1], len(told(use, last))) == (last, TOLD_FOR // SECOND + 1)
     assert told(use, last + TOLD_FOR / SECOND + 1) == {}
     for number in range(1_000):
         use.hold_began(grant(number))

@@ -20,7 +20,7 @@ from zscout import messages
 from zscout.behaviors.client.arc import Held, hold
 from zscout.keyexpr import Role
 
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 ABSURD = ((10**12, "f"), (2**52 - 1, "f"), (2**60, "f"), (-1, ""))
 """Terms that nobody believes who hears an RCM."""

@@ -60,9 +60,16 @@ def serves_on(some: Sequence[Deed], *, elections: int = 0, recording: Path | Non
     assert not errors, "\n".join([*errors, "after", *done])
 
 
-@cases(50)
+@cases(15)
 @given(deeds(60), st.integers(0, 1))
 def test_a_fleet_serves_on_whatever_a_stranger_says(some: list[Deed], elections: int) -> None:
+    serves_on(some, elections=elections)
+
+
+@pytest.mark.slow
+@cases(50)
+@given(deeds(60), st.integers(0, 1))
+def test_a_fleet_serves_on_whatever_a_stranger_says_in_more_cases(some: list[Deed], elections: int) -> None:
     serves_on(some, elections=elections)
 
 
@@ -72,7 +79,7 @@ def test_a_recorder_goes_on_whatever_it_hears(tmp_path: Path, some: list[Deed]) 
     serves_on(some, recording=tmp_path / "run.rrd")
 
 
-@cases(20)
+@cases(12)
 @given(deeds(60))
 def test_what_is_no_message_does_nothing(some: list[Deed]) -> None:
     async def story(fleet: Fleet) -> tuple[object, object, list[str]]:

@@ -88,9 +88,13 @@ class Stand:
 
 async def running(client: Client, name: str, *rcs: str, **how: Any) -> tuple[OpenArc, Grant]:
     arc = await client.request(name, {rc: {} for rc in rcs}, **({"min_runtime": 600} | how))
-    grant = await client.granted(arc, confirmed=True)
+    return arc, await granted(client, arc, confirmed=True)
+
+
+async def granted(client: Client, arc: OpenArc, **how: bool) -> Grant:
+    grant = await client.granted(arc, **how)
     assert grant is not None
-    return arc, grant
+    return grant
 
 
 async def answer(command: Awaitable[Done]) -> str:
@@ -100,6 +104,11 @@ async def answer(command: Awaitable[Done]) -> str:
     except CommandRefused as refused:
         return refused.code
     return "done"
+
+
+def ended(arc: OpenArc) -> str:
+    """How its last hold did."""
+    return arc.ending.outcome if arc.ending is not None else ""
 
 
 async def comes_to(arc: OpenArc, state: str, reason: str = "") -> None:

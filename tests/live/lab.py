@@ -9,10 +9,9 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import psutil
 
@@ -24,10 +23,12 @@ from zscout.behaviors.client.client import Client
 from zscout.config.fleet import Fleet, load_fleet
 from zscout.config.scheduling_policy import StrategyName
 from zscout.keyexpr import Role, Token, new_instance
-from zscout.mesh import clock
+from zscout.mesh import Reply, clock
 from zscout.messages import Done, RcAsk, RcmState, RcState
 from zscout.types import Grant, Ns
 
+T = TypeVar("T")
+R = TypeVar("R")
 PATIENT = 10.0
 """Seconds of leases where none is to end: on a busy machine a process may not run for a second or two."""
 VOTE_TIMEOUT = 2.0
@@ -38,6 +39,28 @@ NO_RCM = 3
 """The exit code of a command that saw none."""
 TTL = 60.0
 """Seconds, as long as a command can be good."""
+
+
+async def awaited(ask: Callable[[], Awaitable[T]], so: Callable[[T], object], besides: Callable[[], str] = str) -> T:
+    """The answer, as soon as it is so. Fails after HANG seconds, with the last one and what is known besides."""
+    seen: T | None = None
+    try:
+        async with asyncio.timeout(HANG):
+            while True:
+                seen = await ask()
+                if so(seen):
+                    return seen
+                await asyncio.sleep(0.02)
+    except TimeoutError:
+        raise AssertionError(f"waited in vain; last {seen}\n{besides()}") from None
+
+
+async def answered(ask: Callable[[], Awaitable[Reply[R] | None]]) -> R:
+    """The first message that is answered: a link may come later."""
+    reply = await awaited(ask, lambda reply: reply is not None and reply.message is not None)
+    assert reply is not None
+    assert reply.message is not None
+    return reply.message
 
 
 class PatientClient(Client):
@@ -126,11 +149,7 @@ class Lab:
     async def zscout(self, *args: object, env: Mapping[str, str] | None = None) -> subprocess.CompletedProcess[str]:
         """Runs a command to its end; anew where it saw no RCM in the few seconds for which it looks, as a node that
         does not run then has no link to it: it has done nothing."""
-        async with asyncio.timeout(HANG):
-            while True:
-                done = await zscout_soon(*args, env=env or self.env)
-                if done.returncode != NO_RCM:
-                    return done
+        return await awaited(lambda: zscout_soon(*args, env=env or self.env), lambda done: done.returncode != NO_RCM)
 
     def log(self, host: str) -> str:
         return (self.folder / f"{host}.log").read_text()
@@ -178,12 +197,10 @@ class Lab:
 
     async def living(self, client: Client, role: str, until: Callable[[list[str]], bool]) -> None:
         """Waits until the hosts that have a token of this role are as they should be."""
-        async with asyncio.timeout(HANG):
-            while True:
-                tokens = await client.mesh.living(client.mesh.keys.alive_any(role), timeout=1)
-                if until([token.host for token in tokens]):
-                    return
-                await asyncio.sleep(0.02)
+        key = client.mesh.keys.alive_any(role)
+        await awaited(
+            lambda: client.mesh.living(key, timeout=1), lambda tokens: until([token.host for token in tokens])
+        )
 
     async def holder(self, name: str) -> HolderProcess:
         """Starts a client process (`tests/live/holder.py`) and waits until it is on the mesh."""
@@ -207,36 +224,25 @@ class Lab:
 
     async def rc(self, client: Client, name: str) -> RcState:
         """An RC's own word about itself."""
-        async with asyncio.timeout(HANG):
-            while True:
-                reply = await client.mesh.ask_one(client.mesh.keys.rc_state(name), RcAsk(), RcState, timeout=PATIENT)
-                if reply is not None and reply.message is not None:
-                    return reply.message
-                await asyncio.sleep(0.02)
+        key = client.mesh.keys.rc_state(name)
+        return await answered(lambda: client.mesh.ask_one(key, RcAsk(), RcState, timeout=PATIENT))
 
     async def held_by(self, client: Client, name: str, *arcs: str) -> None:
         """Waits until an RC names exactly these ARCs as its holders: it may hear of them after the client."""
-        held: list[str] | None = None
-        try:
-            async with asyncio.timeout(HANG):
-                while held != sorted(arcs):
-                    held = sorted(holder.arc for holder in (await self.rc(client, name)).holders)
-        except TimeoutError:
-            raise AssertionError(f"{name} is held by {held}, not by {sorted(arcs)}") from None
+        wanted = sorted(arcs)
+        await awaited(
+            lambda: self.rc(client, name), lambda state: sorted(holder.arc for holder in state.holders) == wanted
+        )
 
     async def state(self, client: Client, until: Callable[[RcmState], bool]) -> RcmState:
         """The RCM's state as soon as `until` holds of it; fails after HANG seconds."""
-        seen: RcmState | None = None
-        try:
-            async with asyncio.timeout(HANG):
-                while True:
-                    seen = await client.state() or seen
-                    if seen is not None and until(seen):
-                        return seen
-                    await asyncio.sleep(0.02)
-        except TimeoutError:
-            logs = "\n".join(f"--- {host}\n{self.log(host)}" for host in self.nodes)
-            raise AssertionError(f"waited in vain; last seen {seen}\n{logs}") from None
+
+        def logs() -> str:
+            return "\n".join(f"--- {host}\n{self.log(host)}" for host in self.nodes)
+
+        seen = await awaited(client.state, lambda state: state is not None and until(state), logs)
+        assert seen is not None
+        return seen
 
     async def ready(self, client: Client, *rcs: str) -> RcmState:
         """Waits until somebody leads and all these RCs are there, for the RCM and for `client`."""
@@ -249,9 +255,7 @@ class Lab:
         confirmation.CONFIRM_TIMEOUT = CONFIRM_TIMEOUT
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc: object) -> None:
         confirmation.CONFIRM_TIMEOUT = self._confirm_timeout
         for holder in self.holders:
             holder.kill()

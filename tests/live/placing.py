@@ -14,7 +14,7 @@ from typing import Any, Self, TypeVar
 import msgspec
 
 from tests.hang import HANG
-from tests.live.lab import CONFIRM_TIMEOUT, Lab
+from tests.live.lab import CONFIRM_TIMEOUT, Lab, answered, awaited
 from zscout.behaviors.client import confirmation
 from zscout.behaviors.client.arc import Held, Revoked, holds
 from zscout.behaviors.client.client import Client, CommandRefused
@@ -85,26 +85,19 @@ class Placing:
 
     async def until(self, component: str, holds: Callable[[Placement], bool]) -> Placement:
         """The placement, as soon as `holds` is true of it."""
-        seen: Placement | None = None
-        try:
-            async with asyncio.timeout(HANG):
-                while True:
-                    listed = await self.get(ListPlacements(component), Placements)
-                    seen = next(iter(listed.components), None)
-                    if seen is not None and holds(seen):
-                        return seen
-                    await asyncio.sleep(0.02)
-        except TimeoutError:
-            raise AssertionError(f"waited in vain; last seen {seen}") from None
+        listed = await awaited(
+            lambda: self.get(ListPlacements(component), Placements),
+            lambda listed: bool(listed.components) and holds(listed.components[0]),
+        )
+        return listed.components[0]
 
     async def hosts(self, count: int) -> None:
         """Waits until the balancer ranks so many hosts."""
-        async with asyncio.timeout(HANG):
-            while True:
-                reply = await self.client.mesh.ask_one(self.client.mesh.keys.rank, RankAsk(), HostRanking, timeout=1)
-                if reply is not None and reply.message is not None and len(reply.message.hosts) == count:
-                    return
-                await asyncio.sleep(0.05)
+        mesh = self.client.mesh
+        await awaited(
+            lambda: answered(lambda: mesh.ask_one(mesh.keys.rank, RankAsk(), HostRanking, timeout=1)),
+            lambda ranking: len(ranking.hosts) == count,
+        )
 
     async def views(self, component: str, *hosts: str) -> list[ComponentView]:
         """What these hosts tell of a component."""
@@ -223,6 +216,16 @@ class Stepper(Component):
         self._step("restore")
         self.count = json.loads(state)
         (self.folder / "restored").touch()
+
+
+async def three(lab: Lab, *rcs: str) -> Placing:
+    """Starts h0, h1 and h2, and waits until all report, and these RCs of others are there."""
+    for host in ("h0", "h1", "h2"):
+        lab.node(host)
+    placing = Placing(await lab.client())
+    await lab.ready(placing.client, *rcs)
+    await placing.hosts(3)
+    return placing
 
 
 def register(lab: Lab) -> None:

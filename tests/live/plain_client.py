@@ -46,6 +46,30 @@ def encoding(schema: str) -> zenoh.Encoding:
     return zenoh.Encoding.APPLICATION_JSON.with_schema(f"zscout.{schema}.v1")
 
 
+def answers(
+    session: zenoh.Session, key: str, schema: str, message: Json, timeout: float = QUERY_TIMEOUT
+) -> list[tuple[bool, Json]]:
+    """All answers on `key`, as (whether it is one, payload). None at all means "unknown"."""
+    replies = session.get(
+        key,
+        payload=json.dumps(message),
+        encoding=encoding(schema),
+        target=zenoh.QueryTarget.ALL,
+        consolidation=zenoh.ConsolidationMode.NONE,
+        timeout=timeout,
+        congestion_control=zenoh.CongestionControl.BLOCK,
+        priority=zenoh.Priority.INTERACTIVE_HIGH,
+        express=True,
+    )
+    found = []
+    for reply in replies:
+        if reply.ok is not None:
+            found.append((True, json.loads(reply.ok.payload.to_bytes())))
+        elif reply.err is not None and reply.err.payload.to_bytes() != b"Timeout":
+            found.append((False, json.loads(reply.err.payload.to_bytes())))
+    return found
+
+
 def term_of(value: Any) -> tuple[int, str]:
     counter, rcm = value
     return (int(counter), str(rcm))
@@ -182,29 +206,8 @@ class PlainClient:
 
     # What is asked
 
-    def get(self, key: str, schema: str, message: Json) -> list[tuple[bool, Json]]:
-        """All answers on `key`, as (whether it is one, payload). None at all means "unknown"."""
-        replies = self.session.get(
-            key,
-            payload=json.dumps(message),
-            encoding=encoding(schema),
-            target=zenoh.QueryTarget.ALL,
-            consolidation=zenoh.ConsolidationMode.NONE,
-            timeout=QUERY_TIMEOUT,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            priority=zenoh.Priority.INTERACTIVE_HIGH,
-            express=True,
-        )
-        found = []
-        for reply in replies:
-            if reply.ok is not None:
-                found.append((True, json.loads(reply.ok.payload.to_bytes())))
-            elif reply.err is not None and reply.err.payload.to_bytes() != b"Timeout":
-                found.append((False, json.loads(reply.err.payload.to_bytes())))
-        return found
-
     def schedule(self, schema: str, message: Json) -> list[tuple[bool, Json]]:
-        replies = self.get(f"{self.base}/rcm/schedule/{self.host}/{self.name}", schema, message)
+        replies = answers(self.session, f"{self.base}/rcm/schedule/{self.host}/{self.name}", schema, message)
         for good, answer in replies:
             if good:
                 self.take(answer)
@@ -255,7 +258,7 @@ class PlainClient:
 
     def command(self, rc: str, grant: Any, action: Json) -> Json:
         key = f"{self.base}/rc/{rc}/command/{self.host}/{self.name}"
-        replies = self.get(key, "Command", {"grant": grant, "do": action, "ttl": 30.0})
+        replies = answers(self.session, key, "Command", {"grant": grant, "do": action, "ttl": 30.0})
         return replies[0][1] if replies else {"code": "unknown", "message": "no answer"}
 
     def end(self, op: str, request_id: str) -> None:

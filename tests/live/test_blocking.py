@@ -55,28 +55,37 @@ def rest_of(process: subprocess.Popen[str]) -> list[str]:
     return lines
 
 
+def holding(body: str, *, how: str = "", told: str = "revoked.outcome") -> str:
+    """A script that holds robot/a, does `body` under that, and says what it is `told` where its hold is revoked."""
+    return f"""
+with zscout.connect() as lab:
+    try:
+        with lab.hold("survey", {{"robot/a": {{}}}}{how}) as held:
+            say("entered")
+{textwrap.indent(body, 12 * " ")}
+    except zscout.Revoked as revoked:
+        say({told})
+"""
+
+
 def take(fleet: CliFleet, rc: str, *options: str) -> None:
     done = fleet.zscout("request", rc, "--name", "taker", *options, "--", "true")
     assert done.returncode == 0, done.stderr
 
 
+def preempted(fleet: CliFleet, text: str, rc: str = "robot/a") -> list[str]:
+    """What a script says from when its hold is preempted."""
+    process = script(fleet.lab, text)
+    read_until(process, "entered")
+    take(fleet, rc, "--priority", "5")
+    return rest_of(process)
+
+
 @pytest.mark.slow
 def test_a_direct_body_clears_up_before_the_next_program_begins(fleet: CliFleet, tmp_path: Path) -> None:
     told = tmp_path / "told"
-    text = f"""
-        with zscout.connect() as lab:
-            try:
-                with lab.hold("survey", {{"robot/a": {{}}}}, direct=True):
-                    say("entered")
-                    try:
-                        time.sleep(LONGER)
-                    finally:
-                        time.sleep(1)
-                        open({str(told)!r}, "a").write("left\\n")
-            except zscout.Revoked as revoked:
-                say(revoked.outcome)
-    """
-    survey = script(fleet.lab, text)
+    clears_up = f'time.sleep(1)\n    open({str(told)!r}, "a").write("left\\n")'
+    survey = script(fleet.lab, holding(f"try:\n    time.sleep(LONGER)\nfinally:\n    {clears_up}", how=", direct=True"))
     read_until(survey, "entered")
     done = fleet.zscout("request", "robot/a", "--priority", "5", "--", "sh", "-c", f"echo next >> {told}")
     assert done.returncode == 0, done.stderr
@@ -86,22 +95,9 @@ def test_a_direct_body_clears_up_before_the_next_program_begins(fleet: CliFleet,
 
 @pytest.mark.slow
 def test_a_direct_body_that_clears_up_for_too_long_is_interrupted_once_more(fleet: CliFleet) -> None:
-    text = """
-        with zscout.connect() as lab:
-            try:
-                with lab.hold("survey", {"robot/a": {}}, direct=True):
-                    say("entered")
-                    try:
-                        time.sleep(LONGER)
-                    finally:
-                        time.sleep(LONGER)
-            except zscout.Revoked as revoked:
-                say(revoked.outcome, isinstance(revoked.__context__, zscout.Revoked))
-    """
-    survey = script(fleet.lab, text)
-    read_until(survey, "entered")
-    take(fleet, "robot/a", "--priority", "5")
-    assert rest_of(survey) == ["preempted True"]
+    body = "try:\n    time.sleep(LONGER)\nfinally:\n    time.sleep(LONGER)"
+    told = "revoked.outcome, isinstance(revoked.__context__, zscout.Revoked)"
+    assert preempted(fleet, holding(body, how=", direct=True", told=told)) == ["preempted True"]
 
 
 def test_a_sleep_is_interrupted_when_the_hold_is_preempted(fleet: CliFleet) -> None:
@@ -126,18 +122,10 @@ def test_a_sleep_is_interrupted_when_the_hold_is_preempted(fleet: CliFleet) -> N
     assert fleet.idle("robot/a")
 
 
-@pytest.mark.parametrize(("how", "waits"), [("min_runtime=3", True), ("min_runtime=3, keep=False", False)])
+@pytest.mark.parametrize(("how", "waits"), [("min_runtime=1", True), ("min_runtime=2, keep=False", False)])
 def test_a_body_whose_time_is_over_is_interrupted(fleet: CliFleet, how: str, *, waits: bool) -> None:
-    text = f"""
-        with zscout.connect() as lab:
-            try:
-                with lab.hold("survey", {{"robot/a": {{}}}}, {how}) as held:
-                    say("entered")
-                    threading.Event().wait(LONGER)
-            except zscout.Revoked as revoked:
-                say(revoked.outcome, held.completed, "|", revoked)
-    """
-    survey = script(fleet.lab, text)
+    told = 'revoked.outcome, held.completed, "|", revoked'
+    survey = script(fleet.lab, holding("threading.Event().wait(LONGER)", how=f", {how}", told=told))
     read_until(survey, "entered")
     if waits:
         take(fleet, "robot/a")
@@ -157,10 +145,7 @@ def test_the_end_of_an_inner_hold_leaves_the_outer_one(fleet: CliFleet) -> None:
                 say("inner", revoked.outcome, outer.active)
             say(outer.command("robot/a", {"name": "echo", "value": 5}, ttl=60))
     """
-    nested = script(fleet.lab, text)
-    read_until(nested, "entered")
-    take(fleet, "robot/b", "--priority", "5")
-    assert rest_of(nested) == ["inner preempted True", "5"]
+    assert preempted(fleet, text, "robot/b") == ["inner preempted True", "5"]
     assert fleet.idle("robot/a", "robot/b")
 
 
@@ -256,41 +241,17 @@ def test_where_nothing_interrupts_a_body_looks_itself(fleet: CliFleet, where: st
             else:
                 body(False)
     """
-    survey = script(fleet.lab, text)
-    read_until(survey, "entered")
-    take(fleet, "robot/a", "--priority", "5")
-    assert rest_of(survey) == ["True False", "told preempted"]
+    assert preempted(fleet, text) == ["True False", "told preempted"]
 
 
 def test_a_wait_for_the_end_is_told_by_its_answer_and_by_nothing_else(fleet: CliFleet) -> None:
-    text = """
-        with zscout.connect() as lab, lab.hold("survey", {"robot/a": {}}) as held:
-            say("entered")
-            say(held.wait())
-            time.sleep(0.5)  # the signal is sent every 0.1 s
-            say("in peace")
-    """
-    survey = script(fleet.lab, text)
-    read_until(survey, "entered")
-    take(fleet, "robot/a", "--priority", "5")
-    assert rest_of(survey) == ["True", "in peace"]
+    # The signal is sent every 0.1 s.
+    assert preempted(fleet, holding('say(held.wait())\ntime.sleep(0.5)\nsay("in peace")')) == ["True", "in peace"]
 
 
 def test_who_was_not_told_is_told_at_the_end(fleet: CliFleet) -> None:
-    text = """
-        with zscout.connect() as lab:
-            try:
-                with lab.hold("survey", {"robot/a": {}}, interrupt=False) as held:
-                    say("entered")
-                    while held.active:
-                        time.sleep(0.01)
-            except zscout.Revoked as revoked:
-                say("told", revoked.outcome)
-    """
-    survey = script(fleet.lab, text)
-    read_until(survey, "entered")
-    take(fleet, "robot/a", "--priority", "5")
-    assert rest_of(survey) == ["told preempted"]
+    body = "while held.active:\n    time.sleep(0.01)"
+    assert preempted(fleet, holding(body, how=", interrupt=False")) == ["preempted"]
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.hang import HANG
-from tests.live.lab import Lab
+from tests.live.lab import Lab, awaited
 from zscout.behaviors.client.arc import hold
 from zscout.behaviors.client.bookings import BookingsClient
 from zscout.behaviors.client.client import Client
@@ -33,12 +33,11 @@ def in_seconds(seconds: float) -> datetime:
 
 async def listed(bookings: BookingsClient, until: Callable[[dict[str, BookingView]], bool]) -> dict[str, BookingView]:
     """What is booked, by name, as soon as it is so."""
-    async with asyncio.timeout(HANG):
-        while True:
-            found = {one.name: one for one in (await bookings.list()).bookings}
-            if until(found):
-                return found
-            await asyncio.sleep(0.05)
+
+    async def found() -> dict[str, BookingView]:
+        return {one.name: one for one in (await bookings.list()).bookings}
+
+    return await awaited(found, until)
 
 
 async def fleet_of_two(lab: Lab) -> tuple[Client, BookingsClient]:

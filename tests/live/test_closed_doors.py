@@ -11,20 +11,22 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import pytest
 import zenoh
 
 from tests.hang import HANG
-from tests.live.closed import DAY, ClosedLab, make_authority
+from tests.live.closed import DAY, ClosedLab, make_authority, raw_session
 from tests.mesh.kit import until
+from zscout.config.certificate_authority import CertificateAuthority
 from zscout.config.certificates import read_certificates
 from zscout.keyexpr import ACCESS, Keys, Sender
 from zscout.mesh import ZenohMesh, zenoh_mesh
 from zscout.mesh.zenoh_mesh import Security, zenoh_config
 
 pytestmark = pytest.mark.live
+
 DOCUMENT: Final = (Path(__file__).parents[2] / "docs" / "protocol.md").read_text()
 
 
@@ -69,7 +71,10 @@ class Inside:
         await until(lambda: mesh.links() >= len(self.meshes) - 1, within=HANG)
         return mesh
 
-    async def close(self) -> None:
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *exc: object) -> None:
         for mesh in self.meshes:
             await mesh.close()
 
@@ -100,8 +105,7 @@ def has_seen(session: zenoh.Session) -> list[str]:
 
 @pytest.mark.parametrize("name", ["plain TCP", "no certificate", "another CA's", "expired"])
 async def test_an_intruder_has_no_link_no_token_and_no_key(lab: ClosedLab, name: str) -> None:
-    inside = Inside(lab)
-    try:
+    async with Inside(lab) as inside:
         # Whoever joins makes the links: one member joins before the intruder, one after.
         await inside.join("anvil")
         with bare(lab, **intruders(lab)[name]) as intruder:
@@ -111,8 +115,6 @@ async def test_an_intruder_has_no_link_no_token_and_no_key(lab: ClosedLab, name:
             # Either end may tell later than the other.
             await until(lambda: {one.links() for one in inside.meshes} == {1}, within=HANG)
             assert mesh.links() == 1
-    finally:
-        await inside.close()
 
 
 def without(settings: dict[str, Any], path: str) -> dict[str, Any]:
@@ -140,14 +142,11 @@ async def test_each_setting_keeps_somebody_out(
 ) -> None:
     closed = zenoh_mesh._closed
     monkeypatch.setattr(zenoh_mesh, "_closed", lambda security: without(closed(security), setting))
-    inside = Inside(lab)
-    try:
+    async with Inside(lab) as inside:
         await inside.join("anvil")
         with bare(lab, **intruders(lab)[name]) as intruder:
             await inside.join("bench")
             await until(lambda: linked(intruder), within=HANG)
-    finally:
-        await inside.close()
 
 
 # Roles
@@ -303,3 +302,87 @@ def test_each_role_may_send_what_the_table_says(tmp_path: Path, name: str) -> No
 def test_every_key_stands_in_the_table() -> None:
     table = {re.sub(r"<kind>/<name>", "{rc}", re.sub("<host>|<client>", "*", key)) for key, _ in rows()}
     assert table == {re.sub(r"\{(by|at)\}", "*", row.key) for row in ACCESS}
+
+
+def now() -> datetime:
+    return datetime.now(UTC)
+
+
+@pytest.fixture
+def ca(tmp_path: Path) -> CertificateAuthority:
+    return make_authority(tmp_path / "ca")
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as stack:
+        yield stack
+
+
+def session(stack: ExitStack, folder: Path, **more: Any) -> zenoh.Session:
+    """One with the certificate in this folder, and these settings besides; `__` stands for `/`."""
+    settings = {
+        "mode": "peer",
+        "adminspace/enabled": True,
+        "scouting/multicast/enabled": False,
+        "transport/link/protocols": ["tls"],
+        "transport/link/tls": tls(folder) | {"close_link_on_expiration": False},
+    }
+    return stack.enter_context(raw_session(settings | {key.replace("__", "/"): value for key, value in more.items()}))
+
+
+def listening(stack: ExitStack, folder: Path) -> tuple[zenoh.Session, str]:
+    """One that listens, and where."""
+    one = session(stack, folder, listen__endpoints=["tls/127.0.0.1:0"])
+    (reply,) = one.get(f"@/{one.zid()}/peer")
+    assert reply.ok is not None
+    (locator,) = json.loads(reply.ok.payload.to_string())["locators"]
+    return one, locator
+
+
+def dial(stack: ExitStack, folder: Path, locator: str) -> zenoh.Session:
+    """One that tries once to make a link. Raises ZError where that is refused."""
+    once = {"connect__timeout_ms": 0, "connect__exit_on_failure": True}
+    return session(stack, folder, listen__endpoints=[], connect__endpoints=[locator], **once)
+
+
+def await_(true: Callable[[], object]) -> None:
+    deadline = time.monotonic() + HANG
+    while not true():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.01)
+
+
+def names(one: zenoh.Session) -> set[str]:
+    """The common names of those whom it has links with."""
+    return {str(link.auth_identifier) for link in one.info.links()}
+
+
+def test_what_is_renewed_in_place_is_used_for_the_next_link(
+    ca: CertificateAuthority, stack: ExitStack, tmp_path: Path
+) -> None:
+    ca.issue("anvil", tmp_path / "anvil", DAY, now())
+    ca.issue("ada", tmp_path / "ada", DAY, now() - 2 * DAY)
+    anvil, locator = listening(stack, tmp_path / "anvil")
+    with pytest.raises(zenoh.ZError):
+        dial(stack, tmp_path / "ada", locator)
+    # It goes on trying.
+    retry = {"period_init_ms": 20, "period_max_ms": 50, "period_increase_factor": 1.0}
+    session(stack, tmp_path / "ada", listen__endpoints=[], connect__endpoints=[locator], connect__retry=retry)
+    assert not anvil.info.links()
+    ca.renew(tmp_path / "ada", DAY, now())
+    await_(lambda: names(anvil) == {"ada"})
+
+
+def test_of_two_cas_in_one_file_either_is_trusted(ca: CertificateAuthority, stack: ExitStack, tmp_path: Path) -> None:
+    new = make_authority(tmp_path / "new-ca")
+    with (ca.folder / "ca.pem").open("a") as file:
+        file.write((new.folder / "ca.pem").read_text())
+    CertificateAuthority.read(ca.folder, now()).issue("anvil", tmp_path / "anvil", DAY, now())
+    new.issue("ada", tmp_path / "ada", DAY, now())
+    anvil, locator = listening(stack, tmp_path / "anvil")
+    with pytest.raises(zenoh.ZError):
+        dial(stack, tmp_path / "ada", locator)  # trusts the new one alone
+    (tmp_path / "ada" / "ca.pem").write_text((ca.folder / "ca.pem").read_text())
+    ada = dial(stack, tmp_path / "ada", locator)
+    await_(lambda: (names(anvil), names(ada)) == ({"ada"}, {"anvil"}))

@@ -22,6 +22,7 @@ timeout = 100
 """
 
 
+@pytest.mark.slow
 async def test_a_slow_start_is_waited_for_and_told_of(tmp_path: Path, lab: Lab) -> None:
     told = tmp_path / "told"
     lab.node("small", extra=TABLE % {"told": told})

@@ -287,6 +287,7 @@ async def test_who_sees_a_higher_incarnation_ends_itself(lab: ComponentLab) -> N
     }
 
 
+@pytest.mark.slow
 async def test_one_that_does_not_reach_a_device_takes_over_no_hold_of_it(lab: ComponentLab) -> None:
     """It would have to give back at once what it was handed over, to whoever waits for it."""
     lab.node("a", "robot/x")

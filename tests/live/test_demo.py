@@ -10,7 +10,7 @@ import socket
 import subprocess
 import sys
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import groupby
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
@@ -213,20 +213,15 @@ def enter_twice(seen: Observed) -> None:
     seen.left("arc1", at(13))
 
 
-def publish_late(seen: Observed) -> None:
-    for rc, changes in seen.changes.items():
-        seen.changes[rc] = [(since + SECOND // 2 if since == at(5) else since, arcs) for since, arcs in changes]
+def move(seen: Observed, rcs: Sequence[str], by: Ns) -> None:
+    """What was published of second 5."""
+    for rc in rcs:
+        seen.changes[rc] = [(since + by if since == at(5) else since, arcs) for since, arcs in seen.changes[rc]]
 
 
 def enter_late(seen: Observed) -> None:
     for body in seen.bodies:
         body.begin += SECOND // 2 if body.arc == "arc4" else 0
-
-
-def publish_alone(seen: Observed) -> None:
-    """For an instant the next holder has one of its two RCs."""
-    changes = seen.changes["robot/scout33"]
-    seen.changes["robot/scout33"] = [(since + 1 if since == at(5) else since, arcs) for since, arcs in changes]
 
 
 def hold_before(seen: Observed) -> None:
@@ -240,9 +235,10 @@ def hold_before(seen: Observed) -> None:
         (lambda _: None, set(), True),
         (lose_a_body, {(rc, s) for rc in RCS for s in (11, 12, 13) if rc != "framegrabber/fgrab2"}, False),
         (enter_twice, {("robot/scout33", 12)}, False),
-        (publish_late, {(rc, 5) for rc in RCS}, True),
+        (lambda seen: move(seen, RCS, SECOND // 2), {(rc, 5) for rc in RCS}, True),
         (enter_late, {(rc, 11) for rc in RCS if rc != "framegrabber/fgrab2"}, True),
-        (publish_alone, set(), False),
+        # For an instant the next holder has one of its two RCs.
+        (lambda seen: move(seen, ["robot/scout33"], 1), set(), False),
         (hold_before, {("framegrabber/fgrab2", s) for s in range(5)}, False),
     ],
 )

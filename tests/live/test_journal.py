@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
 import csv
 import io
 import json
 import signal
 import sqlite3
-import subprocess
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -17,8 +15,8 @@ from typing import Any
 import pytest
 
 from tests.cli.tools import zscout_soon
-from tests.hang import HANG
-from tests.live.lab import PATIENT, Lab
+from tests.live.bench import granted
+from tests.live.lab import PATIENT, Lab, awaited
 from zscout.keyexpr import Role
 from zscout.messages import Grants
 from zscout.services.journal.store import FILE
@@ -29,15 +27,11 @@ pytestmark = pytest.mark.live
 
 async def told(lab: Lab, until: Callable[[dict[str, Any]], object], *args: str) -> dict[str, Any]:
     """What `zscout history --json` tells as soon as it is so."""
-    last: subprocess.CompletedProcess[str] | None = None
-    try:
-        async with asyncio.timeout(HANG):
-            while True:
-                last = await lab.zscout("history", "--json", *args)
-                if last.returncode == 0 and until(found := json.loads(last.stdout)):
-                    return dict(found)
-    except TimeoutError:
-        raise AssertionError(f"waited in vain; last {last}") from None
+    done = await awaited(
+        lambda: lab.zscout("history", "--json", *args),
+        lambda done: done.returncode == 0 and until(json.loads(done.stdout)),
+    )
+    return dict(json.loads(done.stdout))
 
 
 def file_of(lab: Lab, host: str) -> Path:
@@ -46,15 +40,12 @@ def file_of(lab: Lab, host: str) -> Path:
 
 async def committed(lab: Lab, host: str, *holds: tuple[str, str]) -> None:
     """Waits until one host's own journal has these holds, as (ARC, outcome): what the fleet tells may be another's."""
-    found: list[tuple[str, str]] = []
-    try:
-        async with asyncio.timeout(HANG):
-            while not set(holds) <= set(found):
-                with closing(sqlite3.connect(f"{file_of(lab, host).as_uri()}?mode=ro", uri=True)) as db:
-                    found = db.execute("SELECT arc, outcome FROM holds").fetchall()
-                await asyncio.sleep(0.05)
-    except TimeoutError:
-        raise AssertionError(f"{host} has {found}") from None
+
+    async def found() -> set[tuple[str, str]]:
+        with closing(sqlite3.connect(f"{file_of(lab, host).as_uri()}?mode=ro", uri=True)) as db:
+            return set(db.execute("SELECT arc, outcome FROM holds").fetchall())
+
+    await awaited(found, set(holds).issubset)
 
 
 @pytest.mark.slow
@@ -69,10 +60,9 @@ async def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> 
         await lab.held_by(client, "robot/b", "survey")
         take = await client.request("take", {"robot/b": {}}, priority=10, min_runtime=600)
         await lab.held_by(client, "robot/b", "take")
-        granted = await client.granted(take)
-        assert granted is not None
+        grant = await granted(client, take)
         for _ in range(20):
-            await client.command("robot/b", granted, {"name": "echo"})
+            await client.command("robot/b", grant, {"name": "echo"})
         both = {"anvil", "bellows"}
         first = await told(
             lab,
@@ -92,7 +82,7 @@ async def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> 
         await lab.living(client, Role.RCM, lambda hosts: hosts == ["bellows"])
         await client.end(take)
         await lab.held_by(client, "robot/b", "survey")
-        (last,) = [use.seconds for use in (await lab.rc(client, "robot/b")).used if use.grant == granted]
+        (last,) = [use.seconds for use in (await lab.rc(client, "robot/b")).used if use.grant == grant]
         # What it said while they stood may have been less.
         later = await told(
             lab,

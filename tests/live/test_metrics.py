@@ -18,8 +18,8 @@ from typing import Any
 import pytest
 
 from tests.hang import HANG
-from tests.live.bench import comes_to
-from tests.live.lab import Lab
+from tests.live.bench import comes_to, granted
+from tests.live.lab import Lab, awaited
 from tests.ports import free_port
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import CommandRefused, RequestRefused
@@ -78,17 +78,12 @@ class PrometheusServer:
 
     async def until(self, query: str, labels: dict[str, str], least: float) -> float:
         """Waits until the query has such a result, of at least so much."""
-        seen: list[dict[str, Any]] = []
-        try:
-            async with asyncio.timeout(HANG):
-                while True:
-                    seen = await self.ask(query)
-                    for one in seen:
-                        if labels.items() <= one["metric"].items() and float(one["value"][1]) >= least:
-                            return float(one["value"][1])
-                    await asyncio.sleep(0.1)
-        except TimeoutError:
-            raise AssertionError(f"{query}: {seen}") from None
+
+        async def found() -> list[float]:
+            results = [one for one in await self.ask(query) if labels.items() <= one["metric"].items()]
+            return [float(one["value"][1]) for one in results if float(one["value"][1]) >= least]
+
+        return (await awaited(found, bool))[0]
 
     def stop(self) -> None:
         self._process.kill()
@@ -108,8 +103,7 @@ async def measured(folder: Path) -> AsyncIterator[tuple[Lab, Client, int]]:
         ]
         while second.start is None:
             await client.changed(second)
-        grant = await client.granted(first, confirmed=True)
-        assert grant is not None
+        grant = await granted(client, first, confirmed=True)
         await client.command("robot/a", grant, {"name": "echo", "value": 1})
         await client.end(first)
         with pytest.raises(CommandRefused):
@@ -149,6 +143,7 @@ async def test_a_node_shows_what_it_knows(tmp_path: Path) -> None:
         assert re.search(f"^{line}$", text, re.MULTILINE), f"{line}\n{text}"
 
 
+@pytest.mark.slow
 @without
 async def test_prometheus_scrapes_it_and_answers_from_that(tmp_path: Path) -> None:
     async with measured(tmp_path) as (_, client, port):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import signal
-import statistics
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import pytest
 from tests.hang import HANG
 from tests.live.bench import until
 from tests.live.lab import Lab
-from tests.live.placing import LONGEST, Placing, WitnessRc, register
+from tests.live.placing import LONGEST, Placing, WitnessRc, register, three
 from tests.thorough import times
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import OpenArc
@@ -60,36 +60,25 @@ async def rival_of(lab: Lab) -> Rival:
 async def test_a_component_that_moves_keeps_its_count_and_its_hold(tmp_path: Path) -> None:
     async with Lab(tmp_path, candidates=["h0"]) as lab, WitnessRc(lab, RC) as rc:
         register(lab)
-        for host in ("h0", "h1", "h2"):
-            lab.node(host)
-        client = await lab.client()
-        placing = Placing(client)
-        await lab.ready(client, RC)
-        await placing.hosts(3)
+        placing = await three(lab, RC)
         placed = await placing.place(ARC, "tally", {"rc": RC, "period": 0.005}, hosts=["h1", "h2"])
         assert placed.state == "running"
         # It may be seen to run before its node has told what it can.
         await placing.until(ARC, lambda one: one.movable)
         await rc.witness.more()
         rival = await rival_of(lab)
-        dead, grants = [], set[Grant]()
+        grants = set[Grant]()
         for number in range(MOVES):
             to = "h1" if placed.host == "h2" else "h2"
             placed = await placing.get(MigrateComponent(ARC, to, wait=LONGEST), Placement)
             assert (placed.state, placed.host, placed.moves) == ("running", to, number + 1), placed
             assert placed.dead is not None
-            dead.append(placed.dead)
             await rc.witness.more()
-            grants.update(holder.grant for holder in (await lab.rc(client, RC)).holders)
+            grants.update(holder.grant for holder in (await lab.rc(placing.client, RC)).holders)
         rival.check()
         rc.witness.check()
         assert len(grants) == MOVES
         assert rc.witness.released == 0
-        worst = max(dead)
-        print(
-            f"\n{MOVES} moves, {len(rc.witness.counts)} counts; dead time median "
-            f"{1000 * statistics.median(dead):.1f} ms, longest {1000 * worst:.1f} ms"
-        )
 
 
 # Each step at which the target may die: how the move is held there.
@@ -106,18 +95,6 @@ def test_the_target_dies_and_it_lives_in_exactly_one_place(tmp_path: Path) -> No
     asyncio.run(_target_dies(tmp_path, "component", STEPS))
 
 
-async def appears(path: Path) -> None:
-    async with asyncio.timeout(HANG):
-        while True:
-            if there(path):
-                return
-            await asyncio.sleep(0.002)
-
-
-def there(path: Path) -> bool:
-    return path.exists()
-
-
 def let_go(folder: Path) -> None:
     """Holds up nothing any more."""
     for held in folder.glob("hold-*"):
@@ -127,12 +104,7 @@ def let_go(folder: Path) -> None:
 async def _target_dies(folder: Path, victim: str, steps: Sequence[str]) -> None:
     async with Lab(folder, candidates=["h0"]) as lab, WitnessRc(lab, RC) as rc:
         register(lab)
-        for host in ("h0", "h1", "h2"):
-            lab.node(host)
-        client = await lab.client()
-        placing = Placing(client)
-        await lab.ready(client, RC)
-        await placing.hosts(3)
+        placing = await three(lab, RC)
         for step in steps:
             made = folder / step.replace(" ", "-")
             made.mkdir()
@@ -141,7 +113,7 @@ async def _target_dies(folder: Path, victim: str, steps: Sequence[str]) -> None:
             except Exception as error:
                 raise AssertionError(f"{victim} killed, {step}: {error!r}") from error
             await placing.get(EndComponent(ARC, wait=LONGEST), Placement)
-            await lab.held_by(client, RC)
+            await lab.held_by(placing.client, RC)
 
 
 async def _dies_at(step: str, folder: Path, lab: Lab, placing: Placing, rc: WitnessRc, victim: str) -> None:
@@ -187,19 +159,12 @@ async def kill(lab: Lab, host: str, victim: str) -> None:
     await asyncio.to_thread(psutil.wait_procs, children, HANG)
 
 
-async def at_starting(lab: Lab, placing: Placing, folder: Path, target: str) -> None:
-    (folder / "hold-init").touch()
-    await appears(folder / "at-init")
+async def held_at(step: str, lab: Lab, placing: Placing, folder: Path, target: str) -> None:
+    (folder / f"hold-{step}").touch()
+    await until((folder / f"at-{step}").exists)
 
 
-async def at_standing_by(lab: Lab, placing: Placing, folder: Path, target: str) -> None:
-    (folder / "hold-checkpoint").touch()
-    await appears(folder / "at-checkpoint")
-
-
-async def at_restoring(lab: Lab, placing: Placing, folder: Path, target: str) -> None:
-    (folder / "hold-restore").touch()
-    await appears(folder / "at-restore")
+at_restoring = functools.partial(held_at, "restore")
 
 
 async def at_restored(lab: Lab, placing: Placing, folder: Path, target: str) -> None:
@@ -207,7 +172,7 @@ async def at_restored(lab: Lab, placing: Placing, folder: Path, target: str) -> 
     await at_restoring(lab, placing, folder, target)
     lab.signal("h0", signal.SIGSTOP)
     (folder / "hold-restore").unlink()
-    await appears(folder / "restored")
+    await until((folder / "restored").exists)
     asyncio.get_running_loop().call_later(0.3, lab.signal, "h0", signal.SIGCONT)
 
 
@@ -224,7 +189,7 @@ async def at_handed_over(lab: Lab, placing: Placing, folder: Path, target: str) 
     await at_restoring(lab, placing, folder, target)
     lab.signal("h0", signal.SIGSTOP)
     (folder / "hold-restore").unlink()
-    await appears(folder / "restored")
+    await until((folder / "restored").exists)
     # Nothing shows that its node, and the source's, have heard so: they may not have run meanwhile.
     await asyncio.sleep(2)
     for child in psutil.Process(lab.nodes[target].pid).children(recursive=True):
@@ -240,8 +205,8 @@ async def at_running(lab: Lab, placing: Placing, folder: Path, target: str) -> N
 
 
 MOVE_TO: dict[str, Callable[[Lab, Placing, Path, str], Awaitable[None]]] = {
-    "starting": at_starting,
-    "standing by": at_standing_by,
+    "starting": functools.partial(held_at, "init"),
+    "standing by": functools.partial(held_at, "checkpoint"),
     "restoring": at_restoring,
     "restored": at_restored,
     "handed over": at_handed_over,

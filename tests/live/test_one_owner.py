@@ -16,6 +16,7 @@ import pytest
 from tests.chaos.net import Net, NoNamespaces, Processes, check
 from tests.cli.fleet.test_status import section
 from tests.hang import HANG
+from tests.live.bench import granted
 from tests.live.lab import TTL, Lab
 from zscout import trace
 from zscout.behaviors.client.client import Client
@@ -46,8 +47,7 @@ async def test_the_one_that_is_not_named_obeys_nothing_and_says_so(tmp_path: Pat
         lab.node("ws1", RC, extra="candidate = false")
         await lab.logged("ws1", "robot/arm stands by: duplicate of robot/arm at ws2")
         arc = await client.request("work", {RC: {}}, min_runtime=600)
-        grant = await client.granted(arc, confirmed=True)
-        assert grant is not None
+        grant = await granted(client, arc, confirmed=True)
         assert [await answers(client, grant) for _ in range(20)] == [[1]] * 20
 
         await lab.state(client, lambda state: [view.duplicates for view in state.rcs] == [["ws1"]])

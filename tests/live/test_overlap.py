@@ -11,15 +11,15 @@ from pathlib import Path
 
 import pytest
 
+from studies.overlap import Programs
 from tests.cli.cli_fleet import CliFleet, fleet_of
 from tests.cli.tools import end, read_until
 from tests.hang import HANG
-from tests.live.overlap import Programs
 from tests.thorough import times
 
 pytestmark = pytest.mark.live
 
-ROUNDS = times(3)
+ROUNDS = times(2)
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +62,7 @@ def test_a_preempted_program_that_ignores_sigterm_is_gone_before_the_next_one_be
     end(former)
 
 
+@pytest.mark.slow
 def test_the_guardian_of_a_client_that_was_killed_tells_that_its_program_is_gone(tmp_path: Path) -> None:
     """Without its word the next one would wait for the hold lease."""
     with fleet_of(tmp_path, "robot/x", hold_lease=2 * HANG) as fleet:
@@ -74,6 +75,7 @@ def test_the_guardian_of_a_client_that_was_killed_tells_that_its_program_is_gone
         end(following)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "strike", [lambda process: process.kill(), lambda process: process.send_signal(signal.SIGSTOP)], ids=["-9", "STOP"]
 )

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.hang import HANG
-from tests.live.bench import Bench, Stand, comes_to, running
+from tests.live.bench import Bench, Stand, comes_to, ended, granted, running
 from tests.live.lab import TTL, Lab
 from tests.live.stranger import Stranger, beside_a_node, command, good_ask
 from tests.live.test_protocol import PlainProcess
@@ -62,8 +62,7 @@ async def test_each_gets_a_free_one_and_who_waits_the_first_that_is_given_back(l
             "two": (two.rcs, {ANY: two.rc(ANY)}),
         }
         await other.end(second)
-        given = await third.granted(late)
-        assert given is not None
+        given = await granted(third, late)
         three = Held(third, late, given)
         assert three.rc(ANY) == two.rc(ANY)
         assert await echo(three, ANY) == ANY
@@ -104,18 +103,15 @@ async def test_a_hold_keeps_its_rcs_over_a_change_of_rcm_and_gets_another_after_
             async with asyncio.timeout(HANG):
                 while arc.grant in (None, grant):
                     await client.changed(arc)
-            again = await client.granted(arc)
-            assert again is not None
+            again = await granted(client, arc)
             found = Held(client, arc, again)
             assert (found.rc(ANY), held.rc(ANY)) == ("framegrabber/f1", "framegrabber/f3")
             assert await echo(found, ANY) == ANY
-            assert arc.ending is not None
-            assert arc.ending.outcome == "lost"
+            assert ended(arc) == "lost"
 
             await client.end(blockers[1])
             await client.end(arc)
-            both = await client.granted(waiting)
-            assert both is not None
+            await granted(client, waiting)
             assert sorted(waiting.bound) == [ANY, MORE]
             assert sorted(waiting.bound.values()) == waiting.rcs == BOTH
 

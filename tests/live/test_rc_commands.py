@@ -1,22 +1,28 @@
-"""What an RC obeys, live: every refusal, failing drivers, and the end of holds that nobody ends."""
+"""What an RC obeys, live: refusals, failing drivers, what it missed, and one that died while the lead was taken."""
 
 from __future__ import annotations
 
 import asyncio
 import signal
 from collections.abc import Coroutine
+from decimal import Decimal
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.hang import HANG
-from tests.live.bench import ECHO, Bench, SharedBench, Stand, answer, running, until
+from tests.live.bench import ECHO, Bench, SharedBench, Stand, answer, granted, running, until
 from tests.live.lab import Lab
+from zscout.drivers import resource_controller
 from zscout.drivers.resource_controller import MAX_TTL
 from zscout.drivers.work_queue import COMMANDS_PER_HOST
-from zscout.mesh import clock
-from zscout.messages import Done
-from zscout.types import SECOND, Grant
+from zscout.keyexpr import Role, Sender, Token
+from zscout.mesh import IncomingQuery, ZenohMesh, clock
+from zscout.messages import Done, Grants, HoldView, RcmState, RcState, StateAsk
+from zscout.services.rcm.rcm import Rcm
+from zscout.services.rcm.recovery import RecoveredState
+from zscout.types import SECOND, Grant, Place, Term
 
 pytestmark = pytest.mark.live
 
@@ -123,8 +129,7 @@ async def test_a_failing_device_ends_the_whole_gang_which_waits_for_it(lab: Lab,
     await lab.state(client, lambda state: not state.holds and len(state.queue) == 1)
     bench.broken = False
     rc.recover()
-    again = await client.granted(arc)
-    assert again is not None
+    again = await granted(client, arc)
     assert again > grant
     assert arc.place == place
 
@@ -148,3 +153,81 @@ async def test_one_of_two_holders_ends_and_the_device_serves_the_other(lab: Lab,
     assert await answer(client.command("radio/bench", second, ECHO)) == "ended"
     assert await answer(client.command("radio/bench", first, ECHO)) == "done"
     assert bench.calls == ["begin first", "begin second"]
+
+
+TERM = Term(1, "test")
+
+
+def view(client: str, seq: int) -> HoldView:
+    return HoldView(
+        id="one",
+        arc="one",
+        client=client,
+        priority=0,
+        grant=Grant(TERM, seq),
+        place=Place(TERM, 1),
+        needs={"robot/x": {}},
+        min_runtime=Decimal(60),
+        held=0,
+        remaining=60,
+    )
+
+
+def said(seq: int, prev: int) -> Grants:
+    return Grants(term=TERM, seq=seq, prev=prev, every=0.5, rcs={"robot/other": []})
+
+
+async def test_a_snapshot_that_was_overtaken_is_read_again(
+    lab: Lab, stand: Stand, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(resource_controller, "REREAD_TIMEOUT", HANG)
+    client = await lab.client()
+    mesh, keys = client.mesh, client.mesh.keys
+    waiting: list[IncomingQuery[StateAsk]] = []
+    seq = 3
+
+    def on_asked(request: IncomingQuery[StateAsk]) -> None:
+        if not waiting:
+            # The first answer is held back until more has been published.
+            waiting.append(request)
+        else:
+            request.answer(RcmState(TERM, seq, "test", [view(str(mesh.me), 5)]))
+
+    rc = await stand.rc("robot/x", Bench())
+    mesh.serve(keys.rcm_state, StateAsk, on_asked)
+    publisher = mesh.publisher(keys.grants, Grants)
+    mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, TERM.rcm))
+    while rc.holds.seq != 3:
+        publisher.put(said(3, 0))
+        await asyncio.sleep(0.02)
+    await until(lambda: bool(waiting))
+    # Its new term made it read; the grant with number 5 is published and gets lost, 7 arrives.
+    seq = 7
+    publisher.put(said(7, 6))
+    await until(lambda: rc.holds.seq == 7)
+    waiting[0].answer(RcmState(TERM, 3, "test"))
+    await until(lambda: set(rc.holds.held) == {Grant(TERM, 5)})
+    assert await answer(client.command("robot/x", Grant(TERM, 5), ECHO)) == "done"
+
+
+@pytest.mark.slow
+async def test_an_rc_that_died_while_the_lead_was_taken_is_lost_within_a_lease(tmp_path: Path) -> None:
+    async with Lab(tmp_path, lease=4) as lab, Stand(lab) as stand:
+        rc = await stand.rc("robot/real", Bench())
+        client = await lab.client()
+        leader = await ZenohMesh.open(lab.fleet, Sender("leader", "node"))
+        rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _term, _rc: None, lambda _: None)
+        try:
+            # Both answered when they were asked; then one of them died, and nobody saw its token go.
+            ghost = RcState(rc="robot/ghost", host="h", instance="gone", sharable=False)
+            real = await lab.rc(client, "robot/real")
+            rcm.start(RecoveredState(rcs={"robot/real": real, "robot/ghost": ghost}))
+            _, grant = await running(client, "real", "robot/real")
+            lost = await client.request("ghost", {"robot/ghost": {}}, min_runtime=600, wait_for_device=True)
+            await until(lambda: lost.reason == "robot/ghost is lost: h is gone")
+            assert lost.state == "queued"
+            assert await answer(client.command("robot/real", grant, ECHO)) == "done"
+            assert set(rc.holds.held) == {grant}
+        finally:
+            rcm.stop()
+            await leader.close()

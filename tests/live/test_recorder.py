@@ -22,6 +22,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from tests.hang import HANG
+from tests.live import bench
 from tests.live.lab import Lab
 from tests.ports import free_port
 from tests.services.recorder.paper_run import PERSON, USER, colours, events, lanes, rows
@@ -38,6 +39,7 @@ from zscout.types import SECOND
 pytestmark = pytest.mark.live
 
 MARK = " (operator)"
+until = bench.until
 
 
 def recorder(folder: str = "runs") -> str:
@@ -52,15 +54,6 @@ async def recording(lab: Lab) -> None:
     async with asyncio.timeout(HANG):
         await there.wait()
     watch.close()
-
-
-async def until(ask: Callable[[], bool]) -> None:
-    """Waits for what no event tells of."""
-    async with asyncio.timeout(HANG):
-        while True:
-            if ask():
-                return
-            await asyncio.sleep(0.05)
 
 
 async def recorded(folder: Path, ask: Callable[[Path], bool]) -> None:
@@ -104,6 +97,7 @@ def words(path: Path, arc: str) -> list[str]:
     return [state for state, _ in groupby(text.split(" · ")[0] for (text,) in lane(path, f"/requests/{USER}/{arc}"))]
 
 
+@pytest.mark.slow
 async def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     async with Lab(tmp_path) as lab:
@@ -180,6 +174,7 @@ async def test_a_takeover_is_recorded_as_it_happened(tmp_path: Path) -> None:
     assert all(0 <= cpu <= 1 for _, _, (cpu,) in rows(path, "/cpu/**", "Scalars:scalars"))
 
 
+@pytest.mark.slow
 async def test_a_recorder_starts_in_the_middle_and_outlives_the_leader(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     async with Lab(tmp_path, candidates=["a", "b"]) as lab:
@@ -233,6 +228,7 @@ def finished(path: Path) -> bool:
     return False
 
 
+@pytest.mark.slow
 async def test_what_ends_while_no_rcm_is_there_is_seen_from_the_devices(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     async with Lab(tmp_path, lease=4.0, candidates=["a"]) as lab:
@@ -257,6 +253,7 @@ async def test_what_ends_while_no_rcm_is_there_is_seen_from_the_devices(tmp_path
         await ended(lab, "b")
 
 
+@pytest.mark.slow
 async def test_a_recorder_that_dies_is_started_again(tmp_path: Path, lab: Lab) -> None:
     node = lab.node("a", "robot/a", extra=recorder())
     client = await lab.client("crew")
@@ -299,7 +296,16 @@ def run_recorder(lab: Lab, job: bytes, *program: str) -> subprocess.Popen[bytes]
     return process
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, None])
+async def at_its_end(process: subprocess.Popen[bytes]) -> None:
+    """Ends it as its node does, by closing its input."""
+    assert process.stdin is not None
+    process.stdin.close()
+    assert await asyncio.to_thread(process.wait, HANG) == 0
+
+
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, *(pytest.param(number, marks=pytest.mark.slow) for number in (signal.SIGINT, None))]
+)
 async def test_the_program_says_where_it_records_and_ends_in_order(
     tmp_path: Path, lab: Lab, number: signal.Signals | None
 ) -> None:
@@ -320,6 +326,7 @@ async def test_the_program_says_where_it_records_and_ends_in_order(
     assert Path(told.file) == the_file(tmp_path / "new" / "runs")
 
 
+@pytest.mark.slow
 async def test_bad_settings_are_one_line_and_code_2(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     async with Lab(tmp_path) as lab:
@@ -343,6 +350,7 @@ async def test_bad_settings_are_one_line_and_code_2(tmp_path: Path) -> None:
     assert list((tmp_path / "runs").iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("past", [3_600 * SECOND, 0])
 async def test_a_recorder_that_comes_late_has_what_a_journal_kept(tmp_path: Path, past: int) -> None:
     runs = tmp_path / "runs"
@@ -360,9 +368,7 @@ async def test_a_recorder_that_comes_late_has_what_a_journal_kept(tmp_path: Path
             await recorded(runs, lambda path: any("before this recording" in text for text in events(path)))
         await client.end(film)
         await lab.state(client, lambda state: not state.holds)
-        assert process.stdin is not None
-        process.stdin.close()
-        assert await asyncio.to_thread(process.wait, HANG) == 0
+        await at_its_end(process)
     shown = [state for (state,) in lane(the_file(runs), "/devices/robot/a") if state]
     assert shown == (["survey (journal)", "film (journal)"] if past else []) + ["film"]
     RrdReader(the_file(runs)).store()
@@ -374,6 +380,7 @@ IN_A_HURRY = (
 """The recorder, with parts of seconds."""
 
 
+@pytest.mark.slow
 async def test_parts_follow_one_another_and_the_oldest_make_room(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     runs.mkdir()
@@ -408,9 +415,7 @@ async def test_parts_follow_one_another_and_the_oldest_make_room(tmp_path: Path)
         await client.end(arc)
         await lab.state(client, lambda state: not state.holds)
         written = parts()
-        assert process.stdin is not None
-        process.stdin.close()
-        assert await asyncio.to_thread(process.wait, HANG) == 0
+        await at_its_end(process)
         assert [path.exists() for path in (*old, newer)] == [False, False, True, True]
         assert set(written) <= set(parts())
 

@@ -15,11 +15,11 @@ from typing import Any, get_args
 import msgspec
 import pytest
 
+from studies.sites import ALL, GATE, SITES, Fault, Sites
 from tests.chaos.net import NoNamespaces, check, ip
 from tests.cli.tools import COMMAND
 from tests.hang import HANG
 from tests.live.lab import PATIENT
-from tests.live.sites import ALL, GATE, SITES, Fault, Sites
 from zscout.config.certificate_authority import CertificateAuthority
 from zscout.messages import RcmState
 from zscout.types import SECOND, Grant

@@ -22,10 +22,10 @@ from tests.cli.fleet.test_status import section
 from tests.cli.tools import COMMAND
 from tests.hang import HANG
 from tests.live import message_samples
-from tests.live.bench import comes_to, running, until
+from tests.live.bench import comes_to, ended, granted, running, until
 from tests.live.crew import Crew, Stand
 from tests.live.former import MixedLab, environment, unpack
-from tests.live.lab import PATIENT, HolderProcess
+from tests.live.lab import PATIENT, HolderProcess, awaited
 from tests.live.placing import LONGEST, Placing
 from zscout import messages
 from zscout.behaviors.client.placer_client import PlacerClient
@@ -91,8 +91,7 @@ async def test_a_gang_over_nodes_of_both_versions(tmp_path: Path, former: Path, 
         second = await client.request("second", needs, min_runtime=600)
         assert (second.state, second.ahead) == ("queued", 0)
         await old.order("end")
-        grant = await client.granted(second, confirmed=True)
-        assert grant is not None
+        grant = await granted(client, second, confirmed=True)
         for rc in rcs:
             assert (await client.command(rc, grant, ECHO)).result == ECHO["value"]
 
@@ -100,8 +99,7 @@ async def test_a_gang_over_nodes_of_both_versions(tmp_path: Path, former: Path, 
         await enters(old, "boss", {"robot/a": {}}, priority=9)
         await lab.state(client, lambda state: [one.arc for one in state.queue] == ["second"])
         await comes_to(second, "queued")
-        assert second.ending is not None
-        assert second.ending.outcome == "preempted"
+        assert ended(second) == "preempted"
         old.kill()
         assert await client.granted(second) is not None
         await lab.held_by(client, "radio/b", "second")
@@ -210,9 +208,8 @@ def of_the_next_version(monkeypatch: pytest.MonkeyPatch) -> None:
 
 async def refusal(ask: Callable[[], Awaitable[Reply[Any] | None]]) -> messages.Problem:
     """Of the answer, which comes: a node that stands still for a second has not given it yet."""
-    async with asyncio.timeout(HANG):
-        while (reply := await ask()) is None:  # noqa: ASYNC110 - asked each time
-            await asyncio.sleep(0.02)
+    reply = await awaited(ask, lambda reply: reply is not None)
+    assert reply is not None
     assert reply.problem is not None
     return reply.problem
 
@@ -262,9 +259,7 @@ async def test_status_names_who_runs_which_version_where_they_differ(tmp_path: P
         await lab.ready(client, "robot/a", "robot/b")
         words = f"they differ: older than 0.2.0 on b; version {VERSION} on a; this zscout is {VERSION}"
         # The link of a command that has just come to one of the nodes may be too young for what that one tells.
-        async with asyncio.timeout(HANG):
-            while words not in (mixed := await lab.zscout("status")).stdout:
-                pass
+        mixed = await awaited(lambda: lab.zscout("status"), lambda done: words in done.stdout)
         assert section(mixed.stdout, "Warnings") == [["versions", words]]
         shown = json.loads((await lab.zscout("status", "--json")).stdout)
         assert shown["version"] == VERSION

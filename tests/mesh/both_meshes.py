@@ -78,6 +78,7 @@ class World:
 
 
 class Zenoh(World):
+    real_time = True
     _ports: list[int]
     lease = 10.0
     """Seconds: the process of all of them may stand still for some."""

@@ -6,10 +6,7 @@ from contextlib import AsyncExitStack
 
 import pytest
 
-from tests.mesh.async_tests import pytest_pyfunc_call, real_time, stack
 from tests.mesh.both_meshes import Memory, World, Zenoh
-
-__all__ = ["pytest_pyfunc_call", "real_time", "stack"]
 
 
 @pytest.fixture(params=[Memory, Zenoh])

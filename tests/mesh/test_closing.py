@@ -110,7 +110,6 @@ async def test_nothing_is_handled_after_the_mesh_is_closed(world: World) -> None
     await a.close()
     b.put(NEWS, Ping())
     late = b.alive(token("b"))
-    assert await b.ask(ASK, Ping(), Pong, timeout=LONG) == []
-    assert handled == []
+    assert (await b.ask(ASK, Ping(), Pong, timeout=LONG), handled) == ([], [])
     a.put(NEWS, Ping())
     late.close()

@@ -13,7 +13,7 @@ from zscout.mesh.exchange import Backlog, Refused
 from zscout.mesh.session import BURST, Inbox
 
 
-@pytest.mark.usefixtures("real_time")
+@pytest.mark.real_time
 async def test_items_of_several_threads_are_handled_in_the_order_of_each() -> None:
     box = Inbox(asyncio.get_running_loop())
     handled: list[tuple[int, int]] = []

@@ -31,8 +31,7 @@ async def test_publications_arrive_in_order(world: World) -> None:
         publisher.put(Ping(number))
         b.put(NEWS, Ping(number + 1))
     await until(lambda: len(heard) == 100 and len(own) == 100)
-    assert heard == [(NEWS, number) for number in range(100)]
-    assert own == list(range(100))
+    assert (heard, own) == ([(NEWS, number) for number in range(100)], list(range(100)))
     publisher.close()
 
 
@@ -56,8 +55,7 @@ async def test_a_peer_that_does_not_read_for_less_than_the_lease_misses_nothing(
 
     a._transport.subscriber(NEWS, on_sample)
     await world.declared()
-    sending = asyncio.create_task(asyncio.to_thread(send))
-    before = 0
+    sending, before = asyncio.create_task(asyncio.to_thread(send)), 0
     while sent == 0 or sent != before:  # until it stands still
         before = sent
         await asyncio.sleep(0.5)
@@ -152,8 +150,7 @@ async def test_publications_beyond_a_full_queue_are_counted_as_missed(world: Wor
         b.put(NEWS, Ping(number))
     await world.occupied(lambda: subscription.missed == 7)
     await until(lambda: heard)
-    assert heard == [0, 1, 2]
-    assert subscription.missed == 7
+    assert (heard, subscription.missed) == ([0, 1, 2], 7)
 
 
 async def test_poll_latest_keeps_the_latest(world: World) -> None:

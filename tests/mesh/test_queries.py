@@ -78,8 +78,7 @@ async def test_a_query_may_be_answered_later_and_once(world: World) -> None:
     kept[0].answer(Pong(kept[0].message.number))
     kept[0].answer(Pong(99))
     kept[0].refuse(messages.Problem("late", "late"))
-    assert [reply.message for reply in await asking] == [Pong(3)]
-    assert kept[0].key == ASK
+    assert ([reply.message for reply in await asking], kept[0].key) == ([Pong(3)], ASK)
 
 
 async def test_a_query_is_over_when_the_process_that_keeps_it_leaves(world: World) -> None:
@@ -128,8 +127,7 @@ async def test_a_malformed_query_never_reaches_its_handler(world: World, kind: t
     ((reply, ok),) = collector.replies
     problem: messages.Problem = messages.decode(reply, messages.Problem)
     assert not ok
-    assert problem.code == "malformed"
-    assert handled == []
+    assert (problem.code, handled) == ("malformed", [])
 
 
 async def test_a_query_without_a_message_is_an_empty_one(world: World) -> None:
@@ -171,8 +169,7 @@ async def test_queries_beyond_a_full_queue_are_refused_as_busy(world: World) -> 
     await world.occupied(lambda: len(a._inbox.items) == 16)  # a problem and an end each
     await until(lambda: len(outcomes) == 10)
     codes = [reply.problem.code for reply in outcomes if reply.problem]  # type: ignore[attr-defined]
-    assert codes == ["busy"] * 8
-    assert await answer(a, Ping(1)) == (ASK, Pong(1, "b"))
+    assert (codes, await answer(a, Ping(1))) == (["busy"] * 8, (ASK, Pong(1, "b")))
     assert (tally.answered, tally.refused()) == (3, {"busy": 8})
 
 

@@ -23,7 +23,7 @@ from zscout.mesh.zenoh_mesh import ZenohTransport, _relinking, increasing_id, ze
 _PORT = re.compile(r":(\d+)(?:[?#].*)?$")
 
 pytestmark = [
-    pytest.mark.usefixtures("real_time"),
+    pytest.mark.real_time,
     pytest.mark.skipif(
         len(socket.if_nameindex()) < 2, reason="there is no network but loopback, and peers tell of no address there"
     ),

@@ -35,8 +35,7 @@ def test_who_takes_ever_new_keys_fills_neither_log_nor_memory(caplog: pytest.Log
     sparse = SparseLog(log, lambda: now)
     for number in range(1_000):
         sparse.warning(f"{number}" + "x" * 100_000, "odd")
-    assert len(caplog.records) == MAX_KEYS + 1
-    assert len(sparse._said) == MAX_KEYS + 1
+    assert (len(caplog.records), len(sparse._said)) == (MAX_KEYS + 1, MAX_KEYS + 1)
     assert max(len(key) for _, key in sparse._said) <= 200
     # Those that are long silent make room.
     now = 100 * SECOND
@@ -57,8 +56,7 @@ async def test_malformed_answers_and_publications_and_bad_names_are_logged_so(ca
 
     here.subscribe(keys.grants, Grants, on_grants)
     watched = here.watch(keys.alive_any(), lambda *_: None)
-    publisher = transport.publisher(keys.grants, Grants, Quality.CONTROL)
-    tokens = []
+    publisher, tokens = transport.publisher(keys.grants, Grants, Quality.CONTROL), []
     for number in range(50):
         publisher.put(b"?")
         other.put(keys.grants, Grants((1, "x"), number, number, 0.5))  # type: ignore[arg-type]

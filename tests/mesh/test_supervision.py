@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack
 
 import pytest
 import uvloop
@@ -15,7 +14,9 @@ from tests.hang import HANG
 from zscout.keyexpr import BadName
 from zscout.mesh import supervision
 from zscout.mesh.exchange import Refused
-from zscout.mesh.supervision import Supervisor, done_within
+from zscout.mesh.supervision import AFTERMATH, StallWatch, Supervisor, done_within, supervised
+from zscout.testing.virtual_time import VirtualTimeLoop
+from zscout.types import SECOND, Ns
 
 
 class Owner:
@@ -29,14 +30,11 @@ class Owner:
         self.failed.set()
 
 
-@asynccontextmanager
-async def owned() -> AsyncIterator[Owner]:
+@pytest.fixture
+def owner(stack: AsyncExitStack) -> Owner:
     owner = Owner()
-    try:
-        async with asyncio.timeout(HANG):
-            yield owner
-    finally:
-        await owner.supervisor.close()
+    stack.push_async_callback(owner.supervisor.close)
+    return owner
 
 
 async def forever() -> None:
@@ -68,17 +66,18 @@ def test_a_task_that_raises_is_logged_once_fails_its_owner_once_and_ends_its_sib
     runner: asyncio.Runner, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def story() -> None:
-        async with owned() as owner:
-            sibling = owner.supervisor.spawn(forever())
-            timer = owner.supervisor.call_later(60, fail)
-            owner.supervisor.spawn(explode(), "exploder")
-            await owner.failed.wait()
-            with pytest.raises(asyncio.CancelledError):
-                await sibling
-            assert timer.cancelled()
-            assert [str(error) for error in owner.failures] == ["boom"]
-            assert owner.supervisor.error is owner.failures[0]
-            assert not owner.supervisor.active
+        owner = Owner()
+        sibling = owner.supervisor.spawn(forever())
+        timer = owner.supervisor.call_later(60, fail)
+        owner.supervisor.spawn(explode(), "exploder")
+        await owner.failed.wait()
+        with pytest.raises(asyncio.CancelledError):
+            await sibling
+        assert timer.cancelled()
+        assert [str(error) for error in owner.failures] == ["boom"]
+        assert owner.supervisor.error is owner.failures[0]
+        assert not owner.supervisor.active
+        await owner.supervisor.close()
 
     with runner:
         runner.run(story())
@@ -88,39 +87,42 @@ def test_a_task_that_raises_is_logged_once_fails_its_owner_once_and_ends_its_sib
     assert has_traceback(record, "in explode")
 
 
-async def test_two_that_fail_together_fail_the_owner_once_and_are_both_logged(caplog: pytest.LogCaptureFixture) -> None:
-    async with owned() as owner:
-        owner.supervisor.spawn(explode("first"))
-        owner.supervisor.spawn(explode("second"))
-        await owner.failed.wait()
-        await owner.supervisor.close()
-        assert [str(error) for error in owner.failures] == ["first"]
+async def test_two_that_fail_together_fail_the_owner_once_and_are_both_logged(
+    owner: Owner, caplog: pytest.LogCaptureFixture
+) -> None:
+    owner.supervisor.spawn(explode("first"))
+    owner.supervisor.spawn(explode("second"))
+    await owner.failed.wait()
+    await owner.supervisor.close()
+    assert [str(error) for error in owner.failures] == ["first"]
     assert [str(record.exc_info[1]) for record in errors(caplog) if record.exc_info] == ["first", "second"]
 
 
-async def test_an_error_that_is_awaited_in_a_sibling_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
-    async with owned() as owner:
-        task = owner.supervisor.spawn(explode())
+async def test_an_error_that_is_awaited_in_a_sibling_is_logged_once(
+    owner: Owner, caplog: pytest.LogCaptureFixture
+) -> None:
+    task = owner.supervisor.spawn(explode())
 
-        async def wait() -> None:
-            await asyncio.wait([task])
-            task.result()
+    async def wait() -> None:
+        await asyncio.wait([task])
+        task.result()
 
-        waiter = owner.supervisor.spawn(wait())
-        with pytest.raises((ValueError, asyncio.CancelledError)):
-            await waiter
-        assert len(owner.failures) == 1
-    assert len(errors(caplog)) == 1
+    waiter = owner.supervisor.spawn(wait())
+    with pytest.raises((ValueError, asyncio.CancelledError)):
+        await waiter
+    await owner.supervisor.close()
+    assert (len(owner.failures), len(errors(caplog))) == (1, 1)
 
 
 def test_a_timer_that_raises_fails_the_owner(runner: asyncio.Runner, caplog: pytest.LogCaptureFixture) -> None:
     async def story() -> None:
-        async with owned() as owner:
-            sibling = owner.supervisor.spawn(forever())
-            owner.supervisor.call_later(0.001, fail)
-            await owner.failed.wait()
-            with pytest.raises(asyncio.CancelledError):
-                await sibling
+        owner = Owner()
+        sibling = owner.supervisor.spawn(forever())
+        owner.supervisor.call_later(0.001, fail)
+        await owner.failed.wait()
+        with pytest.raises(asyncio.CancelledError):
+            await sibling
+        await owner.supervisor.close()
 
     with runner:
         runner.run(story())
@@ -128,35 +130,32 @@ def test_a_timer_that_raises_fails_the_owner(runner: asyncio.Runner, caplog: pyt
     assert has_traceback(record, "in fail")
 
 
-async def test_a_handler_that_raises_fails_the_owner_and_is_not_called_again() -> None:
-    async with owned() as owner:
-        calls: list[int] = []
+async def test_a_handler_that_raises_fails_the_owner_and_is_not_called_again(owner: Owner) -> None:
+    calls: list[int] = []
 
-        def handle(value: int) -> None:
-            calls.append(value)
-            fail()
+    def handle(value: int) -> None:
+        calls.append(value)
+        fail()
 
-        guarded = owner.supervisor.guard(handle)
-        with pytest.raises(Refused) as refused:
-            guarded(1)
-        assert refused.value.problem.code == "internal"
-        guarded(2)
-        assert calls == [1]
-        assert [str(error) for error in owner.failures] == ["boom"]
+    guarded = owner.supervisor.guard(handle)
+    with pytest.raises(Refused) as refused:
+        guarded(1)
+    assert refused.value.problem.code == "internal"
+    guarded(2)
+    assert (calls, [str(error) for error in owner.failures]) == ([1], ["boom"])
 
 
 @pytest.mark.parametrize("answer", [Refused("busy", "ask again"), BadName("no name")])
-async def test_a_handler_that_refuses_has_not_failed(answer: Exception) -> None:
-    async with owned() as owner:
+async def test_a_handler_that_refuses_has_not_failed(owner: Owner, answer: Exception) -> None:
 
-        def refuse() -> None:
-            raise answer
+    def refuse() -> None:
+        raise answer
 
-        with pytest.raises(type(answer)) as raised:
-            owner.supervisor.guard(refuse)()
-        assert raised.value is answer
-        assert owner.failures == []
-        assert owner.supervisor.active
+    with pytest.raises(type(answer)) as raised:
+        owner.supervisor.guard(refuse)()
+    assert raised.value is answer
+    assert owner.failures == []
+    assert owner.supervisor.active
 
 
 async def test_an_owner_that_fails_to_handle_a_failure_is_logged_and_its_tasks_end(
@@ -175,108 +174,105 @@ async def test_an_owner_that_fails_to_handle_a_failure_is_logged_and_its_tasks_e
     assert has_traceback(errors(caplog)[1], "in on_failure")
 
 
-async def test_a_task_that_ends_or_is_cancelled_by_itself_has_not_failed(caplog: pytest.LogCaptureFixture) -> None:
-    async with owned() as owner:
-        other = owner.supervisor.spawn(forever())
-        one = owner.supervisor.spawn(forever())
-        await owner.supervisor.spawn(asyncio.sleep(0, result=None))
-        one.cancel()
-        await asyncio.wait([one])
-        assert owner.failures == []
-        assert not other.done()
+async def test_a_task_that_ends_or_is_cancelled_by_itself_has_not_failed(
+    owner: Owner, caplog: pytest.LogCaptureFixture
+) -> None:
+    other, one = owner.supervisor.spawn(forever()), owner.supervisor.spawn(forever())
+    await owner.supervisor.spawn(asyncio.sleep(0, result=None))
+    one.cancel()
+    await asyncio.wait([one])
+    assert owner.failures == []
+    assert not other.done()
+    await owner.supervisor.close()
     assert not errors(caplog)
 
 
-async def test_close_awaits_all_and_nothing_starts_afterwards() -> None:
-    async with owned() as owner:
-        ended: list[str] = []
+async def test_close_awaits_all_and_nothing_starts_afterwards(owner: Owner) -> None:
+    ended: list[str] = []
 
-        async def work() -> None:
-            try:
-                await forever()
-            finally:
-                await asyncio.sleep(0.01)
-                ended.append("work")
+    async def work() -> None:
+        try:
+            await forever()
+        finally:
+            await asyncio.sleep(0.01)
+            ended.append("work")
 
-        owner.supervisor.spawn(work())
-        await asyncio.sleep(0)
-        await owner.supervisor.close()
-        assert ended == ["work"]
-        late = owner.supervisor.spawn(work())
-        with pytest.raises(asyncio.CancelledError):
-            await late
-        assert owner.supervisor.call_later(0, fail).cancelled()
-        owner.supervisor.guard(fail)()
-        assert ended == ["work"]
-        assert owner.failures == []
+    owner.supervisor.spawn(work())
+    await asyncio.sleep(0)
+    await owner.supervisor.close()
+    assert ended == ["work"]
+    late = owner.supervisor.spawn(work())
+    with pytest.raises(asyncio.CancelledError):
+        await late
+    assert owner.supervisor.call_later(0, fail).cancelled()
+    owner.supervisor.guard(fail)()
+    assert (ended, owner.failures) == (["work"], [])
 
 
-async def test_close_is_bounded(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+async def test_close_is_bounded(
+    owner: Owner, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     monkeypatch.setattr(supervision, "CLOSE_TIMEOUT", 0.05)
 
-    async with owned() as owner:
-        release = asyncio.Event()
+    release = asyncio.Event()
 
-        async def stubborn() -> None:
-            while not release.is_set():
-                try:
-                    await release.wait()
-                except asyncio.CancelledError:
-                    continue
+    async def stubborn() -> None:
+        while not release.is_set():
+            try:
+                await release.wait()
+            except asyncio.CancelledError:
+                continue
 
-        task = owner.supervisor.spawn(stubborn(), "stubborn")
-        await asyncio.sleep(0)
-        await owner.supervisor.close()
-        assert not task.done()
-        release.set()
-        await task
+    task = owner.supervisor.spawn(stubborn(), "stubborn")
+    await asyncio.sleep(0)
+    await owner.supervisor.close()
+    assert not task.done()
+    release.set()
+    await task
     (record,) = errors(caplog)
     assert record.getMessage() == "owner: stubborn did not end within 0.05 s of its cancellation"
 
 
-async def test_a_task_may_close_its_own_supervisor() -> None:
-    async with owned() as owner:
-        sibling = owner.supervisor.spawn(forever())
+async def test_a_task_may_close_its_own_supervisor(owner: Owner) -> None:
+    sibling = owner.supervisor.spawn(forever())
 
-        async def end() -> str:
+    async def end() -> str:
+        await owner.supervisor.close()
+        return "closed"
+
+    assert await owner.supervisor.spawn(end()) == "closed"
+    assert sibling.cancelled()
+
+
+async def test_an_owner_that_is_cancelled_while_it_closes_has_cancelled_its_tasks(owner: Owner) -> None:
+    cancelled, release = asyncio.Event(), asyncio.Event()
+
+    async def slow() -> None:
+        try:
+            await forever()
+        finally:
+            cancelled.set()
+            await release.wait()
+
+    task = owner.supervisor.spawn(slow())
+
+    async def own() -> None:
+        try:
+            await forever()
+        finally:
             await owner.supervisor.close()
-            return "closed"
 
-        assert await owner.supervisor.spawn(end()) == "closed"
-        assert sibling.cancelled()
-
-
-async def test_an_owner_that_is_cancelled_while_it_closes_has_cancelled_its_tasks() -> None:
-    async with owned() as owner:
-        cancelled = asyncio.Event()
-        release = asyncio.Event()
-
-        async def slow() -> None:
-            try:
-                await forever()
-            finally:
-                cancelled.set()
-                await release.wait()
-
-        task = owner.supervisor.spawn(slow())
-
-        async def own() -> None:
-            try:
-                await forever()
-            finally:
-                await owner.supervisor.close()
-
-        owning = asyncio.create_task(own())
-        await asyncio.sleep(0)
-        owning.cancel()
-        await cancelled.wait()
-        owning.cancel()
-        await asyncio.wait([owning])
-        assert owning.cancelled()
-        assert not task.done()
-        release.set()
-        await asyncio.wait([task])
-        assert task.cancelled()
+    owning = asyncio.create_task(own())
+    await asyncio.sleep(0)
+    owning.cancel()
+    await cancelled.wait()
+    owning.cancel()
+    await asyncio.wait([owning])
+    assert owning.cancelled()
+    assert not task.done()
+    release.set()
+    await asyncio.wait([task])
+    assert task.cancelled()
 
 
 async def test_done_within_tells_its_own_timeout_from_the_work_s() -> None:
@@ -287,3 +283,75 @@ async def test_done_within_tells_its_own_timeout_from_the_work_s() -> None:
     assert await done_within(1, asyncio.sleep(0.5))
     with pytest.raises(TimeoutError, match="of the work"):
         await done_within(1, work())
+
+
+async def test_what_fails_beside_a_body_fails_the_body() -> None:
+    async def broken() -> None:
+        await asyncio.sleep(1)
+        raise RuntimeError("broken")
+
+    async def body() -> None:
+        async with supervised("tree") as supervisor:
+            supervisor.spawn(broken())
+            await asyncio.sleep(3600)
+
+    with pytest.raises(RuntimeError, match="broken"):
+        await body()
+
+
+async def test_a_body_that_is_cancelled_from_outside_stays_so() -> None:
+    async def body(ended: list[str]) -> None:
+        async def work() -> None:
+            try:
+                await asyncio.sleep(3600)
+            finally:
+                ended.append("work")
+
+        async with supervised("tree") as supervisor:
+            supervisor.spawn(work())
+            await asyncio.sleep(3600)
+
+    ended: list[str] = []
+    task = asyncio.create_task(body(ended))
+    await asyncio.sleep(1)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert ended == ["work"]
+
+
+# A process that stood still
+
+
+def _loop() -> VirtualTimeLoop:
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualTimeLoop)
+    return loop
+
+
+def _now() -> Ns:
+    return round(_loop().time() * SECOND)
+
+
+async def test_a_stall_is_measured_and_soon_over() -> None:
+    watch = StallWatch(_now).start()
+    await asyncio.sleep(10.05)
+    assert not watch.fresh()
+    assert watch.waited_through(_now()) == 0
+    _loop().jump(3.0)  # nothing runs meanwhile
+    assert watch.fresh()
+    arrived = _now()
+    assert watch.waited_through(arrived) == pytest.approx(2.8 * SECOND, rel=0.001)
+    await asyncio.sleep(AFTERMATH / SECOND + 0.01)
+    assert not watch.fresh()
+    assert watch.waited_through(_now()) == 0
+    assert watch.waited_through(arrived) > 0
+    watch.stop()
+
+
+async def test_a_short_delay_is_no_stall() -> None:
+    watch = StallWatch(_now).start()
+    await asyncio.sleep(1)
+    _loop().jump(0.35)
+    assert not watch.fresh()
+    watch.stop()

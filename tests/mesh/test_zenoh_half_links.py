@@ -80,8 +80,7 @@ def stack() -> Iterator[ExitStack]:
 def test_what_was_declared_stays_unknown_where_one_end_alone_lost_the_link(stack: ExitStack) -> None:
     ports = {"a": free_port(), "b": free_port()}
     own = {name: f"tcp/{HOST}:{port}" for name, port in ports.items()}
-    a = _open(stack, [own["a"]], [])
-    relay = _Relay(stack, ports["a"])
+    a, relay = _open(stack, [own["a"]], []), _Relay(stack, ports["a"])
     b = _open(stack, [own["b"]], [relay.endpoint])
     first = _token(b, "alive/b")
     _until(lambda: _tokens(a) == ["alive/b"])

@@ -299,11 +299,5 @@ def told_of(host: Host, component: ComponentId) -> ComponentsListed:
 
 def seen_of(host: Host, proc: Proc) -> ComponentView:
     return ComponentView(
-        component=proc.component,
-        incarnation=proc.incarnation,
-        host=host.name,
-        spec=proc.spec,
-        phase=proc.phase,
-        movable=True,
-        ended=proc.ended,
+        proc.component, proc.incarnation, host.name, proc.spec, proc.phase, movable=True, ended=proc.ended
     )

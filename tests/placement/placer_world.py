@@ -12,16 +12,9 @@ from functools import partial
 from random import Random
 
 from tests.placement.placer_hosts import Host, Hosts, Say, seen_of, told_of
+from tests.placement.test_balancer import report
 from zscout.config.fleet import PlacementPolicy
-from zscout.messages import (
-    Incarnation,
-    ListComponents,
-    LoadReport,
-    MoveComponent,
-    Placement,
-    StartComponent,
-    StopComponent,
-)
+from zscout.messages import Incarnation, ListComponents, MoveComponent, Placement, StartComponent, StopComponent
 from zscout.placement.balancer import Balancer
 from zscout.placement.events import (
     ComponentChanged,
@@ -92,18 +85,7 @@ class World(Hosts):
 
     def _report_now(self, host: Host) -> None:
         load = float(sum(one.lives for one in host.procs.values()))
-        self.balancer.reported(
-            self.now,
-            LoadReport(
-                host=host.name,
-                number=next(self._reports),
-                cores=4.0,
-                load_average=(load, load, load),
-                cpu=0.5,
-                memory_available=10**10,
-                memory_total=10**11,
-            ),
-        )
+        self.balancer.reported(self.now, report(host.name, next(self._reports), load, cores=4.0, cpu=0.5))
 
     # The placer
 

@@ -175,11 +175,8 @@ def test_what_nobody_would_send_does_no_harm() -> None:
 
 
 def nonsense(rng: Random) -> PlacerEvent:
-    name, host, spec = (
-        rng.choice("ab"),
-        rng.choice(["h0", "h1", "h2", "h9"]),
-        ComponentSpec("job", restart=rng.choice(RESTARTS)),
-    )
+    name, host = rng.choice("ab"), rng.choice(["h0", "h1", "h2", "h9"])
+    spec = ComponentSpec("job", restart=rng.choice(RESTARTS))
     number = rng.choice([1001, 1002, 1003, 2001, 10**15])
     lives = {"phase": rng.choice(["running", "starting", "standby"])}
     over = {"phase": "ended", "ended": rng.choice(["completed", "failed", "moved", "superseded", "stopped"])}
@@ -187,14 +184,8 @@ def nonsense(rng: Random) -> PlacerEvent:
     result = rng.choice(["ok", "ok", "refused", "failed", "unknown"])
     moved = rng.choice(["moved", "refused", "unknown"])
     state = rng.choice(["waiting", "starting", "running", "moving", "backing_off", "stopping", "ended"])
-    record = Placement(
-        name,
-        spec,
-        state,  # type: ignore[arg-type]
-        number,
-        rng.choice([host, None]),
-        wanted=rng.random() < 0.5,
-    )
+    wanted = rng.random() < 0.5
+    record = Placement(name, spec, state, number, rng.choice([host, None]), wanted=wanted)  # type: ignore[arg-type]
     events: list[PlacerEvent] = [
         PlaceComponent(name, spec),
         EndComponent(name),

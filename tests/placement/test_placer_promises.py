@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from random import Random
 
 import pytest
@@ -10,6 +11,7 @@ from msgspec.structs import replace
 
 from tests.placement.placer_hosts import STANDS_BY
 from tests.placement.placer_world import RULES, World
+from tests.scheduling.seeds import in_parts
 from tests.thorough import times
 from zscout.messages import (
     ComponentSpec,
@@ -24,22 +26,12 @@ from zscout.types import SECOND, HostName
 
 NAMES = ("a", "b", "c", "d")
 OPS = (
-    *["time"] * 10,
-    *["move"] * 6,
-    *["place"] * 2,
-    *["crash"] * 2,
-    "stop",
-    "complete",
-    "drain",
-    *["uncordon"] * 3,
-    *["dies", "is cut off", "freezes"],
-    *["is back"] * 3,
-    "leader",
-)
+    *["time"] * 10, *["move"] * 6, *["place"] * 2, *["crash"] * 2, "stop", "complete", "drain", *["uncordon"] * 3,
+    *["dies", "is cut off", "freezes"], *["is back"] * 3, "leader",
+)  # fmt: skip
 POLICIES: tuple[Restart, ...] = ("never", *("on_failure", "always") * 3)
 SETTLING = 60 * SECOND
 """Longer than any back-off, grace, look or time to stand by."""
-SEEDS = times(400)
 TRIES = 1_000
 """Starts in a row, in runs that are to give nothing up."""
 FINAL = {"running", "waiting", "ended", "given_up"}
@@ -159,9 +151,9 @@ def run(seed: int) -> World:
     return chaos.world
 
 
-@pytest.mark.parametrize("part", range(10))
-def test_whatever_happens_one_incarnation_of_each_component_runs_in_the_end(part: int) -> None:
-    for seed in range(part, SEEDS, 10):
+@pytest.mark.parametrize("seeds", in_parts(range(times(400)), quick=100, size=300))
+def test_whatever_happens_one_incarnation_of_each_component_runs_in_the_end(seeds: Sequence[int]) -> None:
+    for seed in seeds:
         try:
             run(seed)
         except Exception as error:

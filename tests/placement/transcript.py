@@ -19,28 +19,17 @@ seen HOST      lost HOST                its node, without a report
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from random import Random
 from typing import Any
 
+from msgspec.structs import replace
+
+from tests.placement.test_balancer import report
 from tests.transcripts import ns, seconds, settings
+from zscout import messages
 from zscout.config.fleet import PlacementPolicy
-from zscout.messages import (
-    ComponentSpec,
-    ComponentView,
-    DrainHost,
-    EndComponent,
-    ListComponents,
-    LoadReport,
-    MigrateComponent,
-    MoveComponent,
-    PlaceComponent,
-    Placement,
-    StartComponent,
-    StopComponent,
-    UncordonHost,
-)
 from zscout.placement.balancer import Balancer
 from zscout.placement.events import (
     ComponentChanged,
@@ -80,7 +69,7 @@ class PlacerPlayer:
 
     def __post_init__(self) -> None:
         self.placer = Placer(self.balancer, 1)
-        self.specs: dict[str, ComponentSpec] = {}
+        self.specs: dict[str, messages.ComponentSpec] = {}
 
     def batch(self, line: str) -> list[str]:
         events: list[PlacerEvent] = []
@@ -136,22 +125,12 @@ class PlacerPlayer:
 
     def report(self, host: HostName) -> None:
         known = self.reports[host]
-        load = float(known.get("load", 0))
         memory = int(known.get("memory", 4_000)) * MEGABYTE
-        self.balancer.reported(
-            self.now,
-            LoadReport(
-                host=host,
-                number=self.number,
-                cores=float(known.get("cores", 1)),
-                load_average=(load, load, load),
-                cpu=0.0,
-                memory_available=memory,
-                memory_total=2 * memory,
-                speed=float(known.get("speed", 1)),
-                labels=tuple(_names(known.get("labels"))),
-            ),
+        figures = {key: float(known.get(key, 1)) for key in ("cores", "speed")}
+        told = report(
+            host, self.number, float(known.get("load", 0)), labels=tuple(_names(known.get("labels"))), **figures
         )
+        self.balancer.reported(self.now, replace(told, memory_available=memory, memory_total=2 * memory))
 
     def event(self, verb: str, words: Sequence[str]) -> PlacerEvent | None:
         match verb, *words:
@@ -170,49 +149,45 @@ class PlacerPlayer:
                 return None
             case "place", name, *options:
                 self.specs[name] = _spec(options)
-                return PlaceComponent(name, self.specs[name])
-            case "end", name:
-                return EndComponent(name)
-            case "move", name, *to:
-                return MigrateComponent(name, to[0] if to else None)
-            case "drain", host:
-                return DrainHost(host)
-            case "uncordon", host:
-                return UncordonHost(host)
+                return messages.PlaceComponent(name, self.specs[name])
             case "start", name, incarnation, host, result, *rest:
                 return _start_answered(name, int(incarnation), host, result, rest)
             case "stop", name, incarnation, host, "done" | "said" | "unknown" as result:
                 return StopAnswered(name, int(incarnation), host, done=result != "unknown")
             case "moved", name, incarnation, host, result, *rest:
                 return _move_answered(name, int(incarnation), host, result, rest)
-            case "appeared", name, incarnation, host:
-                return TokenAppeared(name, int(incarnation), host)
-            case "vanished", name, incarnation, host:
-                return TokenVanished(name, int(incarnation), host)
             case "told", host, *rest:
                 only = next((word[5:] for word in rest if word.startswith("only=")), None)
                 kinds = next((frozenset(_names(word[6:])) for word in rest if word.startswith("kinds=")), None)
                 told = [self.seen(host, word) for word in rest if not word.startswith(("only=", "kinds="))]
                 return ComponentsListed(host, tuple(told), only, kinds)
-            case "seen", host:
-                return HostJoined(host)
             case "lost", host:
                 self.reports.pop(host, None)
                 return HostLost(host)
             case ("tick",):
                 return None
-            case _:
-                raise ValueError(f"no such command: {' '.join([verb, *words])}")
+        others: dict[str, Callable[..., PlacerEvent]] = {
+            "end": messages.EndComponent,
+            "move": lambda name, to=None: messages.MigrateComponent(name, to),
+            "drain": messages.DrainHost,
+            "uncordon": messages.UncordonHost,
+            "appeared": lambda name, incarnation, host: TokenAppeared(name, int(incarnation), host),
+            "vanished": lambda name, incarnation, host: TokenVanished(name, int(incarnation), host),
+            "seen": HostJoined,
+        }
+        if verb not in others:
+            raise ValueError(f"no such command: {' '.join([verb, *words])}")
+        return others[verb](*words)
 
-    def seen(self, host: HostName, word: str) -> ComponentView:
+    def seen(self, host: HostName, word: str) -> messages.ComponentView:
         name, incarnation, phase, *rest = word.split(":")
         lives = phase in {"starting", "standby", "running"}
         movable = "movable" in rest
-        return ComponentView(
+        return messages.ComponentView(
             component=name,
             incarnation=int(incarnation),
             host=host,
-            spec=self.specs.get(name, ComponentSpec("job")),
+            spec=self.specs.get(name, messages.ComponentSpec("job")),
             phase=phase if lives else "ended",  # type: ignore[arg-type]
             movable=movable,
             ended=None if lives or phase == "lost" else phase,  # type: ignore[arg-type]
@@ -222,13 +197,13 @@ class PlacerPlayer:
 
     def print(self, effect: PlacerEffect) -> str:
         match effect:
-            case HostCommand(host, StartComponent(component, incarnation, _, standby)):
+            case HostCommand(host, messages.StartComponent(component, incarnation, _, standby)):
                 return f"start {component} {incarnation} on {host}" + (" to stand by" if standby else "")
-            case HostCommand(host, StopComponent(component, incarnation)):
+            case HostCommand(host, messages.StopComponent(component, incarnation)):
                 return f"stop {component} {incarnation} on {host}"
-            case HostCommand(host, MoveComponent(component, incarnation, to, to_incarnation)):
+            case HostCommand(host, messages.MoveComponent(component, incarnation, to, to_incarnation)):
                 return f"move {component} {incarnation} on {host} to {to_incarnation} on {to}"
-            case HostCommand(host, ListComponents(component)):
+            case HostCommand(host, messages.ListComponents(component)):
                 return f"look at {host} for {component}"
             case ComponentChanged(component, placement):
                 return f"forgotten {component}" if placement is None else _print(placement)
@@ -240,7 +215,7 @@ class PlacerPlayer:
                 raise AssertionError(effect)
 
 
-def _print(record: Placement) -> str:
+def _print(record: messages.Placement) -> str:
     words = [f"{record.component}: {record.state}"]
     words += [f"on {record.host}"] if record.host else []
     words += [f"to {record.to}"] if record.to else []
@@ -277,9 +252,9 @@ def _move_answered(name: str, incarnation: int, host: str, result: str, rest: li
     return MoveAnswered(name, incarnation, host, result, " ".join(words), dead)  # type: ignore[arg-type]
 
 
-def _spec(options: list[str]) -> ComponentSpec:
+def _spec(options: list[str]) -> messages.ComponentSpec:
     known = settings(options, "kind", "restart", "hosts", "labels", "memory", "policy", "metric", "n")
-    return ComponentSpec(
+    return messages.ComponentSpec(
         kind=known.get("kind", "job"),
         restart=known.get("restart", "on_failure"),
         metric=known.get("metric", "composite"),

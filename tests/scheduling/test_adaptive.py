@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import random
 from collections import Counter
+from itertools import islice
 
 import pytest
 from hypothesis import given, settings
@@ -12,13 +13,13 @@ from hypothesis import given, settings
 from tests.scheduling.invariants import Ledger, check_settled
 from tests.scheduling.test_optimal import arc, proposed
 from tests.scheduling.validate import validate
-from tests.scheduling.workloads import workloads
-from tests.services.recorder.paper_run import RCS, TABLE1
+from tests.scheduling.workloads import voter, workloads
+from tests.services.recorder.paper_run import table1
 from tests.thorough import times
 from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling.adaptive import MAX_SLICES, SLICE, Adaptive, steps_for
-from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
+from zscout.scheduling.forecast import play_instant
 from zscout.scheduling.model import (
     ArcRequest,
     Cancelled,
@@ -39,7 +40,7 @@ from zscout.scheduling.model import (
 from zscout.scheduling.priority import Priority
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.simulation.replay import replay
-from zscout.simulation.workload import Arrival, Workload, WorkloadRc
+from zscout.simulation.workload import Workload
 from zscout.types import SECOND, Ns
 
 MANY_PASSES = 500
@@ -69,15 +70,18 @@ def wants_more(now: Ns, effects: list[Effect]) -> bool:
 
 def instant(core: Core, now: Ns, workload: Workload, events: list[Event]) -> None:
     """One instant to its end: votes are answered, and passes asked for are given."""
-    rcs = {rc.name: rc.capacity for rc in workload.rcs}
-    for _ in range(MANY_PASSES):
-        effects = core.handle(now, *events)
-        events = [Vote(one.proposal, not excess(rcs[one.rc], one.holders.items())) for one in proposed(effects)]
-        if not events:
-            if not wants_more(now, effects):
-                return
-            events = [Tick()]
-    raise AssertionError("the instant never ends")
+    passes = play_instant(core, now, events, voter(workload))
+    assert sum(1 for _ in islice(passes, MANY_PASSES)) < MANY_PASSES, "the instant never ends"
+
+
+def searched(core: Core, *events: Event) -> list[Effect]:
+    """All effects of an instant in which no RC votes."""
+    passes = islice(play_instant(core, 0, events or [Tick()], unasked), MANY_PASSES)
+    return [effect for effects in passes for effect in effects]
+
+
+def unasked(question: Propose) -> Vote:
+    raise AssertionError(question)
 
 
 def in_use(core: Core, now: Ns) -> Counter[int]:
@@ -101,14 +105,7 @@ def test_the_papers_experiment_is_decided_as_by_optimal(seeds: range) -> None:
 
 
 def test_table_1_is_served_as_by_priority() -> None:
-    workload = Workload(
-        tuple(WorkloadRc(rc) for rc in RCS),
-        tuple(
-            Arrival(at * SECOND, ArcRequest(arc, "host/a", {rc: {} for rc in needs}, level, runtime * SECOND))
-            for arc, at, level, runtime, needs in TABLE1
-        ),
-    )
-    adaptive, first = (replay(workload, strategy=strategy) for strategy in (Adaptive(), Priority()))
+    adaptive, first = (replay(table1(), strategy=strategy) for strategy in (Adaptive(), Priority()))
     starts = {(hold.arc, hold.outcome): hold.start for hold in first.holds}
     assert all(hold.start <= starts[hold.arc, hold.outcome] for hold in adaptive.holds)
     assert [hold for hold in adaptive.holds if hold.arc == "arc4"] == [
@@ -117,7 +114,7 @@ def test_table_1_is_served_as_by_priority() -> None:
     assert adaptive.unserved == first.unserved == ()
 
 
-@settings(max_examples=times(50))
+@settings(max_examples=times(40))
 @given(workloads())
 def test_promises_hold_in_replay(workload: Workload) -> None:
     strategy = Adaptive()
@@ -132,7 +129,7 @@ def test_promises_hold_in_replay(workload: Workload) -> None:
     assert not ledger.open
 
 
-@settings(max_examples=times(50))
+@settings(max_examples=times(40))
 @given(workloads())
 def test_no_instant_ends_with_less_than_priority_would_give(workload: Workload) -> None:
     core = Core(Adaptive())
@@ -218,11 +215,7 @@ def test_an_arc_that_ends_during_the_search_is_not_started() -> None:
     core.handle(0, *map(Requested, experiment(2, 300, 600)))
     core.handle(0, Tick())
     core.handle(0, *(Cancelled(f"a{number}") for number in range(0, 600, 2)))
-    effects = core.handle(0, Tick())
-    for _ in range(MANY_PASSES):
-        if not wants_more(0, effects):
-            break
-        effects = core.handle(0, Tick())
+    searched(core)
     validate(core)
     assert core._state.running
     assert all(int(one[1:]) % 2 for one in core._state.running)
@@ -266,11 +259,7 @@ def test_a_veto_brings_the_next_best() -> None:
 def test_the_outcome_is_the_same_every_time() -> None:
     def run() -> list[Effect]:
         core = free(100)
-        told = core.handle(0, *map(Requested, experiment(5, 100, 200)))
-        effects = told
-        while wants_more(0, effects):
-            effects = core.handle(0, Tick())
-            told += effects
+        told = searched(core, *map(Requested, experiment(5, 100, 200)))
         return [effect for effect in told if isinstance(effect, (Granted, HoldEnded, Propose))]
 
     assert run() == run()

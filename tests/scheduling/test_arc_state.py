@@ -21,13 +21,13 @@ def arc_in(state: ArcState) -> Arc:
     return arc
 
 
-@pytest.mark.parametrize(("before", "after"), list(itertools.product(ArcState, ArcState)))
-def test_a_move_that_is_not_in_the_table_raises(before: ArcState, after: ArcState) -> None:
-    arc = arc_in(before)
-    if after in TRANSITIONS[before]:
-        arc.move_to(after)
-        assert arc.state is after
-    else:
+def test_a_move_that_is_not_in_the_table_raises() -> None:
+    for before, after in itertools.product(ArcState, ArcState):
+        arc = arc_in(before)
+        if after in TRANSITIONS[before]:
+            arc.move_to(after)
+            assert arc.state is after
+            continue
         with pytest.raises(ValueError, match=f"ARC a is {before} and can't become {after}"):
             arc.move_to(after)
         assert arc.state is before

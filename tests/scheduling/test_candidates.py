@@ -6,8 +6,10 @@ import random
 from collections import Counter
 
 import pytest
+from msgspec import structs
 
 from tests.scheduling.test_patterns import workload as with_patterns
+from tests.scheduling.test_waiting import changed
 from tests.scheduling.test_waiting import workload as with_one_priority
 from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy, StrategyName
@@ -17,7 +19,7 @@ from zscout.scheduling.state import Actions, SchedulerState, Strategy
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.scheduling.votes import Votes
 from zscout.simulation.replay import replay
-from zscout.simulation.workload import Arrival, Workload
+from zscout.simulation.workload import Workload
 from zscout.types import SECOND, Ns
 
 
@@ -68,14 +70,7 @@ def mixed(seed: int) -> Workload:
     """Priorities, kept holds, radios, and in every second one patterns."""
     draw = random.Random(seed)  # noqa: S311
     work = with_patterns(seed) if seed % 2 else with_one_priority(seed)
-    arrivals = []
-    for one in work.arrivals:
-        asked = one.request
-        kept, rank = draw.random() < 0.2, draw.randint(1, 4)
-        arrivals.append(
-            Arrival(one.at, ArcRequest(asked.arc, asked.client, asked.needs, rank, asked.min_runtime, keep=kept))
-        )
-    return Workload(work.rcs, tuple(arrivals))
+    return changed(work, lambda one: structs.replace(one, keep=draw.random() < 0.2, priority=draw.randint(1, 4)))
 
 
 @pytest.mark.parametrize("strategy", ["priority", "optimal", "adaptive"])

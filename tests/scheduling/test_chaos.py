@@ -41,18 +41,8 @@ from zscout.types import NO_TERM, SECOND, ArcId, ClientId, Ns, RcName, Term
 OPS = (
     # The first, asked most often, make the core busy; the others disturb it.
     *["ask", "answer", "overdue", "time"] * 3,
-    "release",
-    "cancel",
-    "rc lost",
-    "rc back",
-    "rules",
-    "rc ends",
-    "unconfirmed",
-    "reachable",
-    "client lost",
-    "hand over",
-    "hand over all",
-    "takeover",
+    *["release", "cancel", "rc lost", "rc back", "rules", "rc ends", "unconfirmed", "reachable"],
+    *["client lost", "hand over", "hand over all", "takeover"],
 )
 MAX_SETTLING_STEPS = 400
 """Far more than twelve ARCs of at most five seconds ever need; who is not served by then hangs."""
@@ -91,13 +81,10 @@ class Chaos:
         effects = self.core.handle(self.now, *events)
         self.ledger.take(self.now, self.core, effects)
         for effect in effects:
-            match effect:
-                case Propose():
-                    self.waiting.append(effect)
-                case WakeAt(at=at):
-                    self.wake = at
-                case _:
-                    pass
+            if isinstance(effect, Propose):
+                self.waiting.append(effect)
+            elif isinstance(effect, WakeAt):
+                self.wake = effect.at
 
     def vote(self, question: Propose) -> Vote:
         reason = excess(self.ledger.capacity[question.rc], question.holders.items())

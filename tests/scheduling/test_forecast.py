@@ -2,46 +2,23 @@
 
 from __future__ import annotations
 
+from itertools import chain
+
 from hypothesis import given, settings
 
-from tests.scheduling.workloads import workloads
+from tests.scheduling.workloads import voter, workloads
 from tests.thorough import times
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.booking import Booked, Booking
-from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
-from zscout.scheduling.forecast import forecast
-from zscout.scheduling.model import (
-    ArcRequest,
-    Effect,
-    Event,
-    Granted,
-    HoldEnded,
-    Outcome,
-    Propose,
-    RcJoined,
-    Requested,
-    Tick,
-    Vote,
-)
+from zscout.scheduling.forecast import forecast, play_instant
+from zscout.scheduling.model import ArcRequest, Event, Granted, HoldEnded, Outcome, RcJoined, Requested, Tick
 from zscout.simulation.workload import Workload
 from zscout.types import SECOND, ArcId, Ns
 
 
 def request(arc: str, *rcs: str, priority: int = 0, seconds: int = 1, keep: bool = False) -> ArcRequest:
     return ArcRequest(arc, "test/" + arc, {rc: {} for rc in rcs}, priority, seconds * SECOND, keep)
-
-
-def test_a_queue_is_foretold_in_its_order() -> None:
-    core = Core()
-    core.handle(0, RcJoined("robot/a", sharable=False))
-    core.handle(0, Requested(request("first", "robot/a", seconds=5)))
-    core.handle(1 * SECOND, Requested(request("long", "robot/a", seconds=4)))
-    core.handle(2 * SECOND, Requested(request("short", "robot/a", seconds=3)))
-    core.handle(2 * SECOND, Requested(request("never", "robot/b")))
-    foretold = forecast(core, 3 * SECOND)
-    assert foretold.starts == {"short": 5 * SECOND, "long": 8 * SECOND}
-    assert not foretold.preempts
 
 
 def test_a_newcomer_is_told_whom_it_would_preempt_and_the_core_is_not_touched() -> None:
@@ -70,25 +47,14 @@ def test_a_kept_hold_is_foretold_to_yield_after_its_time() -> None:
 def test_what_is_foretold_comes(workload: Workload) -> None:
     """After the last arrival, the forecast's starts are those of the run itself."""
     core, wake = Core(), 0
-    capacity = {rc.name: rc.capacity for rc in workload.rcs if rc.sharable}
     starts: dict[ArcId, Ns] = {}
 
     def step(now: Ns, *events: Event) -> None:
-        batch: list[Event] = list(events)
-        while batch:
-            votes: list[Event] = []
-            effects: list[Effect] = core.handle(now, *batch)
-            for effect in effects:
-                match effect:
-                    case Granted(arc=arc, start=start):
-                        starts.setdefault(arc, start)
-                    case Propose(proposal=proposal, rc=rc, holders=holders):
-                        votes.append(Vote(proposal, not excess(capacity[rc], holders.items())))
-                    case HoldEnded(outcome=outcome):
-                        assert outcome in (Outcome.COMPLETED, Outcome.PREEMPTED)
-                    case _:
-                        pass
-            batch = votes
+        for effect in chain.from_iterable(play_instant(core, now, events, voter(workload))):
+            if isinstance(effect, Granted):
+                starts.setdefault(effect.arc, effect.start)
+            elif isinstance(effect, HoldEnded):
+                assert effect.outcome in (Outcome.COMPLETED, Outcome.PREEMPTED)
 
     step(0, *(RcJoined(rc.name, rc.sharable) for rc in workload.rcs))
     for arrival in sorted(workload.arrivals, key=lambda arrival: arrival.at):

@@ -49,8 +49,7 @@ def test_one_arc_that_two_clients_tell_of_is_one_again_after_the_hand_over() -> 
     shared = Place(Term(1, "old"), 7)
     for old_runs, new_runs in ((False, False), (True, False), (False, True), (True, True)):
         core = core_with("robot/a" if old_runs else "robot/b", sharable=["radio/0"])
-        standing = []
-        waiting = []
+        standing, waiting = [], []
         for arc, runs, seq in (("old/x", old_runs, 1), ("new/x", new_runs, 2)):
             wanted = request(arc, "radio/0" if runs else "robot/absent")
             if runs:

@@ -7,16 +7,15 @@ from fractions import Fraction
 from hypothesis import given, settings
 
 from tests.scheduling.exhaustive import best_set
-from tests.scheduling.invariants import Ledger
-from tests.scheduling.workloads import workloads
+from tests.scheduling.workloads import voter, workloads
 from tests.thorough import times
 from zscout.scheduling import optimal
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
+from zscout.scheduling.forecast import play_instant
 from zscout.scheduling.model import (
     ArcRequest,
     Effect,
-    Event,
     Granted,
     HoldEnded,
     Outcome,
@@ -28,7 +27,6 @@ from zscout.scheduling.model import (
     VoteOverdue,
 )
 from zscout.scheduling.packing import PackingItem
-from zscout.simulation.replay import replay
 from zscout.simulation.workload import Workload, WorkloadRc
 from zscout.types import SECOND, ArcId
 
@@ -93,14 +91,6 @@ def test_one_question_settles_a_set_that_an_rc_accepts() -> None:
     assert [len(one.holders) for one in proposed(effects)] == [8]
 
 
-@settings(max_examples=times(60))
-@given(workloads())
-def test_promises_hold_in_replay(workload: Workload) -> None:
-    ledger = Ledger(workload.rcs, [arrival.request for arrival in workload.arrivals])
-    replay(workload, ledger.take, strategy=optimal.Optimal())
-    assert not ledger.open
-
-
 @settings(max_examples=times(35))
 @given(workloads(keep=False))
 def test_free_rcs_are_shared_out_as_by_trying_all(workload: Workload) -> None:
@@ -112,12 +102,8 @@ def test_free_rcs_are_shared_out_as_by_trying_all(workload: Workload) -> None:
     able = [one for one in requests if one.needs.keys() <= there.keys()]
     core = Core(optimal.Optimal())
     core.handle(0, *(RcJoined(rc.name, rc.sharable) for rc in workload.rcs))
-    batch: list[Event] = [Requested(request) for request in requests]
-    while batch:
-        effects = core.handle(0, *batch)
-        batch = [
-            Vote(one.proposal, not excess(there[one.rc].capacity, one.holders.items())) for one in proposed(effects)
-        ]
+    for _ in play_instant(core, 0, map(Requested, requests), voter(workload)):
+        pass
     assert core._state.running.keys() == {able[one].arc for one in expected(able, there)}
 
 

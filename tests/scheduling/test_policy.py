@@ -5,17 +5,16 @@ from __future__ import annotations
 import random
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 
 import pytest
 from msgspec import structs
 
 from tests.scheduling.invariants import Ledger
-from tests.scheduling.test_waiting import workload
+from tests.scheduling.test_waiting import changed, workload
 from tests.scheduling.validate import validate
+from tests.scheduling.workloads import voter
 from tests.thorough import times
 from zscout.config.scheduling_policy import RcQuota, SchedulingPolicy, StrategyName
-from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import play_instant
 from zscout.scheduling.model import (
@@ -27,13 +26,11 @@ from zscout.scheduling.model import (
     HoldEnded,
     LeadTaken,
     Outcome,
-    Propose,
     RcJoined,
     RecoveredHold,
     Released,
     Requested,
     Tick,
-    Vote,
     WakeAt,
 )
 from zscout.scheduling.strategies import STRATEGIES
@@ -101,32 +98,20 @@ def test_what_an_operator_leaves_is_not_taken_for_another(strategy: StrategyName
 
 
 def test_protection_outlives_the_rcm() -> None:
-    core = Core(policy=SchedulingPolicy(preempt="after_min_runtime"))
-    term, old = Term(2, "rcm/b"), Term(1, "rcm/a")
-    stands = RecoveredHold(request("low", "robot/a"), Place(old, 1), Grant(old, 1), 0, 10 * SECOND)
-    core.handle(SECOND, RcJoined("robot/a", sharable=False), LeadTaken(term, (stands,)))
+    core, _ = inherited(SchedulingPolicy(preempt="after_min_runtime"), SECOND, request("low", "robot/a"))
     core.handle(2 * SECOND, Requested(request("high", "robot/a", priority=5)))
     assert running(core) == {"low"}
 
 
 @pytest.mark.parametrize("strategy", ALL)
-@pytest.mark.parametrize("seed", range(times(20)))
-def test_nobody_is_ever_preempted_in_a_protected_fleet(strategy: StrategyName, seed: int) -> None:
-    draw = random.Random(seed)  # noqa: S311
-    work = _with_priorities(workload(seed), draw, highest=9)
-    ledger = Ledger(work.rcs, [one.request for one in work.arrivals])
-
-    def watch(now: Ns, core: Core, effects: list[Effect]) -> None:
-        ledger.take(now, core, effects)
-
-    played = replay(
-        work,
-        watch,
-        strategy=STRATEGIES[strategy](),
-        policy=SchedulingPolicy(preempt="after_min_runtime", patience=PATIENCE),
-    )
-    assert not played.unserved
-    assert {hold.outcome for hold in played.holds} == {Outcome.COMPLETED}
+def test_nobody_is_ever_preempted_in_a_protected_fleet(strategy: StrategyName) -> None:
+    policy = SchedulingPolicy(preempt="after_min_runtime", patience=PATIENCE)
+    for seed in range(times(20)):
+        work = _with_priorities(workload(seed), random.Random(seed), highest=9)  # noqa: S311
+        ledger = Ledger(work.rcs, [one.request for one in work.arrivals])
+        played = replay(work, ledger.take, strategy=STRATEGIES[strategy](), policy=policy)
+        assert not played.unserved, seed
+        assert {hold.outcome for hold in played.holds} == {Outcome.COMPLETED}, seed
 
 
 def test_a_low_priority_starves_unless_the_fleet_promises_all() -> None:
@@ -136,7 +121,7 @@ def test_a_low_priority_starves_unless_the_fleet_promises_all() -> None:
         rc = f"robot/{'ab'[number % 2]}"
         arrivals.append(Arrival(2 * number * SECOND, request(f"n{number:02}", rc, priority=2, seconds=4)))
     arrivals.sort(key=lambda one: one.at)
-    work = Workload(replay_rcs("robot/a", "robot/b"), tuple(arrivals))
+    work = Workload((WorkloadRc("robot/a"), WorkloadRc("robot/b")), tuple(arrivals))
 
     def start(policy: SchedulingPolicy) -> Ns:
         played = replay(work, strategy=STRATEGIES["adaptive"](), policy=policy)
@@ -147,17 +132,13 @@ def test_a_low_priority_starves_unless_the_fleet_promises_all() -> None:
     assert start(SchedulingPolicy(patience=PATIENCE, promise="all")) == 6 * SECOND
 
 
-@pytest.mark.parametrize("seed", range(times(50)))
-def test_promise_all_keeps_the_other_promises(seed: int) -> None:
-    draw = random.Random(seed)  # noqa: S311
-    work = _with_priorities(workload(seed), draw, highest=12)
-    ledger = Ledger(work.rcs, [one.request for one in work.arrivals])
-
-    def watch(now: Ns, core: Core, effects: list[Effect]) -> None:
-        ledger.take(now, core, effects)
-
-    policy = SchedulingPolicy(patience=PATIENCE, promise="all", max_running_per_host=draw.choice([None, 1, 2]))
-    assert not replay(work, watch, strategy=STRATEGIES["adaptive"](), policy=policy).unserved
+def test_promise_all_keeps_the_other_promises() -> None:
+    for seed in range(times(50)):
+        draw = random.Random(seed)  # noqa: S311
+        work = _with_priorities(workload(seed), draw, highest=12)
+        ledger = Ledger(work.rcs, [one.request for one in work.arrivals])
+        policy = SchedulingPolicy(patience=PATIENCE, promise="all", max_running_per_host=draw.choice([None, 1, 2]))
+        assert not replay(work, ledger.take, strategy=STRATEGIES["adaptive"](), policy=policy).unserved, seed
 
 
 @pytest.mark.parametrize("strategy", ALL)
@@ -240,52 +221,32 @@ def test_a_pattern_is_met_by_no_rc_that_its_owner_may_not_hold(strategy: Strateg
 
 
 @pytest.mark.parametrize("strategy", ALL)
-@pytest.mark.parametrize("seed", range(times(20)))
-def test_no_group_ever_holds_more_rcs_than_its_quota(strategy: StrategyName, seed: int) -> None:
+@pytest.mark.parametrize("of", ["rcs of two hosts", "arcs of each host"])
+def test_nobody_ever_has_more_than_the_quota(strategy: StrategyName, of: str) -> None:
+    for seed in range(times(20)):
+        check_quota(strategy, seed, rcs=of == "rcs of two hosts")
+
+
+def check_quota(strategy: StrategyName, seed: int, *, rcs: bool) -> None:
     draw = random.Random(seed)  # noqa: S311
-    arrivals = tuple(
-        Arrival(one.at, _of_host(one.request, f"h{draw.randint(1, 3)}")) for one in workload(seed).arrivals
-    )
-    work = Workload(workload(seed).rcs, arrivals)
-    owners = {one.request.arc: one.request.client.partition("/")[0] for one in arrivals}
-    most = max(len(one.request.needs) for one in arrivals) + 1
+    work = changed(workload(seed), lambda one: structs.replace(one, client=f"h{draw.randint(1, 3)}/c"))
+    owners = {one.request.arc: one.request.client.partition("/")[0] for one in work.arrivals}
+    most = max(len(one.request.needs) for one in work.arrivals) + 1
     held: Counter[str] = Counter()
 
     def watch(now: Ns, core: Core, effects: list[Effect]) -> None:
         validate(core)
         for effect in effects:
             if isinstance(effect, Granted):
-                held[owners[effect.arc]] += len(effect.rcs)
-                assert held["h1"] + held["h2"] <= most
+                held[owners[effect.arc]] += len(effect.rcs) if rcs else 1
+                assert held["h1"] + held["h2"] <= most if rcs else max(held.values()) <= 2, seed
             elif isinstance(effect, HoldEnded):
-                held[owners[effect.arc]] -= len(effect.rcs)
-
-    policy = SchedulingPolicy(rc_quotas=_shared_quota(most, "h1", "h2"), patience=PATIENCE)
-    assert not replay(work, watch, strategy=STRATEGIES[strategy](), policy=policy).unserved
-
-
-@pytest.mark.parametrize("strategy", ALL)
-@pytest.mark.parametrize("seed", range(times(20)))
-def test_no_host_ever_has_more_than_its_quota(strategy: StrategyName, seed: int) -> None:
-    draw = random.Random(seed)  # noqa: S311
-    arrivals = tuple(
-        Arrival(one.at, _of_host(one.request, f"h{draw.randint(1, 3)}")) for one in workload(seed).arrivals
-    )
-    work = Workload(workload(seed).rcs, arrivals)
-    owners = {one.request.arc: one.request.client.partition("/")[0] for one in arrivals}
-    counts: Counter[str] = Counter()
-
-    def watch(now: Ns, core: Core, effects: list[Effect]) -> None:
-        validate(core)
-        for effect in effects:
-            if isinstance(effect, Granted):
-                counts[owners[effect.arc]] += 1
-                assert counts[owners[effect.arc]] <= 2
-            elif isinstance(effect, HoldEnded):
-                counts[owners[effect.arc]] -= 1
+                held[owners[effect.arc]] -= len(effect.rcs) if rcs else 1
 
     policy = SchedulingPolicy(max_running_per_host=2, patience=PATIENCE)
-    assert not replay(work, watch, strategy=STRATEGIES[strategy](), policy=policy).unserved
+    if rcs:
+        policy = SchedulingPolicy(rc_quotas=_shared_quota(most, "h1", "h2"), patience=PATIENCE)
+    assert not replay(work, watch, strategy=STRATEGIES[strategy](), policy=policy).unserved, seed
 
 
 def limited(strategy: StrategyName, *rcs: str, seconds: int = 20) -> Core:
@@ -319,32 +280,38 @@ def test_nobody_is_given_more_than_the_longest_time(strategy: StrategyName) -> N
     assert running(core) == {"next"}
 
 
+def inherited(policy: SchedulingPolicy, now: Ns, wanted: ArcRequest, start: Ns = 0) -> tuple[Core, list[Effect]]:
+    """A core that takes the lead now, where this holds since `start`; and what comes of that."""
+    core, old = Core(policy=policy), Term(1, "rcm/a")
+    stands = RecoveredHold(wanted, Place(old, 1), Grant(old, 1), start, start + wanted.min_runtime)
+    return core, core.handle(now, RcJoined("robot/a", sharable=False), LeadTaken(Term(2, "rcm/b"), (stands,)))
+
+
 def test_the_longest_time_is_counted_from_the_beginning_of_the_hold_whoever_leads_and_has_it() -> None:
-    core = Core(policy=SchedulingPolicy(max_runtime=20 * SECOND))
-    term, old = Term(2, "rcm/b"), Term(1, "rcm/a")
     kept = structs.replace(request("kept", "robot/a"), keep=True)
-    stands = RecoveredHold(kept, Place(old, 1), Grant(old, 1), 5 * SECOND, 15 * SECOND)
-    core.handle(16 * SECOND, RcJoined("robot/a", sharable=False), LeadTaken(term, (stands,)))
+    core, _ = inherited(SchedulingPolicy(max_runtime=20 * SECOND), 16 * SECOND, kept, 5 * SECOND)
     core.handle(17 * SECOND, HandedOver("kept", "h/other", "moved"))
     assert not ended(core.handle(25 * SECOND - 1, Tick()))
     assert ended(core.handle(25 * SECOND, Tick())) == [("moved", Outcome.COMPLETED, "limit", False)]
 
 
 def test_a_hold_that_is_too_long_already_ends_with_the_first_who_says_so() -> None:
-    core = Core(policy=SchedulingPolicy(max_runtime=20 * SECOND))
-    term, old = Term(2, "rcm/b"), Term(1, "rcm/a")
-    stands = RecoveredHold(request("long", "robot/a", seconds=60), Place(old, 1), Grant(old, 1), 0, 60 * SECOND)
-    effects = core.handle(30 * SECOND, RcJoined("robot/a", sharable=False), LeadTaken(term, (stands,)))
+    policy = SchedulingPolicy(max_runtime=20 * SECOND)
+    _, effects = inherited(policy, 30 * SECOND, request("long", "robot/a", seconds=60))
     assert ended(effects) == [("long", Outcome.COMPLETED, "limit", False)]
 
 
 @pytest.mark.parametrize("strategy", ALL)
-@pytest.mark.parametrize("seed", range(times(20)))
-def test_no_hold_is_ever_longer_than_the_longest_time(strategy: StrategyName, seed: int) -> None:
-    work = workload(seed, kept=0.5)
-    longest = 2 * SECOND
-    arrivals = tuple(replace(one, request=_shorter(one.request, longest)) for one in work.arrivals)
-    ledger = Ledger(work.rcs, [one.request for one in arrivals])
+def test_no_hold_is_ever_longer_than_the_longest_time(strategy: StrategyName) -> None:
+    for seed in range(times(20)):
+        check_longest(strategy, seed, longest=2 * SECOND)
+
+
+def check_longest(strategy: StrategyName, seed: int, longest: Ns) -> None:
+    work = changed(
+        workload(seed, kept=0.5), lambda one: structs.replace(one, min_runtime=min(one.min_runtime, longest))
+    )
+    ledger = Ledger(work.rcs, [one.request for one in work.arrivals])
     since: dict[str, Ns] = {}
     reached = 0
 
@@ -355,61 +322,30 @@ def test_no_hold_is_ever_longer_than_the_longest_time(strategy: StrategyName, se
             if isinstance(effect, Granted):
                 since[effect.arc] = now
             elif isinstance(effect, HoldEnded):
-                assert now - since.pop(effect.arc) <= longest
+                assert now - since.pop(effect.arc) <= longest, seed
                 reached += effect.reason.code == "limit"
-        assert all(now - start < longest for start in since.values())
+        assert all(now - start < longest for start in since.values()), seed
 
     # As the RCM does, it looks again when the core says so.
     core = Core(STRATEGIES[strategy](), SchedulingPolicy(patience=PATIENCE, max_runtime=longest))
-    play(core, Workload(work.rcs, arrivals), watch)
-    assert reached
-    assert not core._state.queued
-
-
-def _shorter(one: ArcRequest, longest: Ns) -> ArcRequest:
-    return structs.replace(one, min_runtime=min(one.min_runtime, longest))
+    play(core, work, watch)
+    assert reached, seed
+    assert not core._state.queued, seed
 
 
 def play(core: Core, work: Workload, watch: Callable[[Ns, Core, list[Effect]], None]) -> None:
     """A workload to its end, by the wakes of the core alone."""
-    capacity = {rc.name: rc.capacity for rc in work.rcs if rc.sharable}
-
-    def vote(asked: Propose) -> Vote:
-        return Vote(asked.proposal, accept=not excess(capacity[asked.rc], asked.holders.items()))
-
-    def step(now: Ns, events: list[Event]) -> None:
-        for effects in play_instant(core, now, events, vote):
-            watch(now, core, effects)
-
-    step(0, [RcJoined(rc.name, rc.sharable) for rc in work.rcs])
-    left = sorted(work.arrivals, key=lambda one: one.at)
-    while left or core._state.running:
-        at = min([*(one.at for one in left[:1]), *([core._wake] if core._wake is not None else [])])
-        events: list[Event] = [Requested(one.request) for one in left if one.at == at]
+    events: list[Event] = [RcJoined(rc.name, rc.sharable) for rc in work.rcs]
+    left, at = sorted(work.arrivals, key=lambda one: one.at), 0
+    while events:
+        for effects in play_instant(core, at, events, voter(work)):
+            watch(at, core, effects)
+        at = min([*(one.at for one in left[:1]), *([core._wake] if core._wake is not None else [])], default=at)
+        events = [Requested(one.request) for one in left if one.at == at]
         left = [one for one in left if one.at > at]
-        step(at, events or [Tick()])
-
-
-def replay_rcs(*names: str) -> tuple[WorkloadRc, ...]:
-    return tuple(map(WorkloadRc, names))
-
-
-def _of_host(one: ArcRequest, host: str) -> ArcRequest:
-    return ArcRequest(one.arc, f"{host}/c", one.needs, one.priority, one.min_runtime)
+        if not events and core._state.running:
+            events = [Tick()]
 
 
 def _with_priorities(work: Workload, draw: random.Random, highest: int) -> Workload:
-    arrivals = (
-        Arrival(
-            at.at,
-            ArcRequest(
-                at.request.arc,
-                at.request.client,
-                at.request.needs,
-                draw.randint(highest - 3, highest),
-                at.request.min_runtime,
-            ),
-        )
-        for at in work.arrivals
-    )
-    return Workload(work.rcs, tuple(arrivals))
+    return changed(work, lambda one: structs.replace(one, priority=draw.randint(highest - 3, highest)))

@@ -4,30 +4,20 @@ from __future__ import annotations
 
 from random import Random
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.scheduling import oracle
 from tests.scheduling.invariants import Ledger, check_settled
-from tests.scheduling.workloads import workloads
+from tests.scheduling.workloads import voter, workloads
+from tests.services.recorder.paper_run import TABLE2, table1
 from tests.thorough import times
-from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import (
-    Effect,
-    Event,
-    Granted,
-    HoldEnded,
-    Propose,
-    RcJoined,
-    Released,
-    Requested,
-    Tick,
-    Vote,
-)
+from zscout.scheduling.model import Effect, Event, Granted, HoldEnded, Propose, RcJoined, Released, Requested, Tick
 from zscout.simulation.replay import HoldRecord, Replay, replay
 from zscout.simulation.workload import Workload
-from zscout.types import ArcId, Ns
+from zscout.types import SECOND, ArcId, Ns
 
 
 class SlowPlayer:
@@ -71,23 +61,32 @@ class SlowPlayer:
 
     def deliver(self, now: Ns, *, everything: bool) -> None:
         while self.out and (everything or self.order.random() < 0.5):
-            question = self.out.pop(self.order.randrange(len(self.out)))
-            reason = excess(self.ledger.capacity[question.rc], question.holders.items())
-            self.send(now, Vote(question.proposal, accept=not reason, reason=reason))
+            self.send(now, voter(self.workload)(self.out.pop(self.order.randrange(len(self.out)))))
 
     def send(self, now: Ns, *events: Event) -> None:
         effects = self.core.handle(now, *events)
         self.ledger.take(now, self.core, effects)
         for effect in effects:
-            match effect:
-                case Propose():
-                    self.out.append(effect)
-                case Granted(arc=arc):
-                    self.open[arc] = effect
-                case HoldEnded(arc=arc, outcome=outcome, rcs=rcs):
-                    self.holds.append(HoldRecord(arc, self.open.pop(arc).start, now, outcome, rcs))
-                case _:
-                    pass
+            if isinstance(effect, Propose):
+                self.out.append(effect)
+            elif isinstance(effect, Granted):
+                self.open[effect.arc] = effect
+            elif isinstance(effect, HoldEnded):
+                start = self.open.pop(effect.arc).start
+                self.holds.append(HoldRecord(effect.arc, start, now, effect.outcome, effect.rcs))
+
+
+@pytest.mark.essential
+def test_table_1_of_the_paper_gives_its_table_2() -> None:
+    holds = replay(table1()).holds
+    shown = {
+        rc: " ".join(
+            "".join(hold.arc[3:] for hold in holds if rc in hold.rcs and hold.start <= at * SECOND < hold.end) or "-"
+            for at in range(18)
+        )
+        for rc in TABLE2
+    }
+    assert shown == TABLE2
 
 
 @settings(max_examples=times(80))

@@ -68,14 +68,6 @@ def held(*rcs: tuple[str, Party, str], number: int = 0) -> Reason:
             ),
         ),
         (
-            held(("robot/a", TAKE, ""), ("fg/0", SURVEY, "fg/*"), ("fg/1", FOREIGN, "fg/*")),
-            (
-                "waits for bob@ws2 (zscout take): robot/a; for one of fg/0 (held by alice@ws1 (survey.py)), "
-                "1 (held by ws3/plain (mapping))"
-            ),
-            None,
-        ),
-        (
             held(("fg/0", TAKE, "fg/*"), ("fg/1", TAKE, "fg/*"), number=9),
             "waits for one of fg/0 (held by bob@ws2 (zscout take)), 1 (held by bob@ws2 (zscout take)) and 7 more",
             None,
@@ -113,9 +105,7 @@ def test_who_blocks_whom_comes_first_and_choices_are_named_as_such(
 
 def test_to_whom_it_was_lost_and_why_is_told_once() -> None:
     preempted = Reason(ReasonCode.PREEMPTED, by=(TAKE,))
-    assert ended("preempted", str(preempted)) == (
-        "preempted by bob@ws2 (zscout take), priority 10: the gripper is stuck"
-    )
+    assert ended("preempted", str(preempted)) == "preempted by bob@ws2 (zscout take), priority 10: the gripper is stuck"
     displaced = Reason(ReasonCode.DISPLACED, by=(TAKE,))
     assert ended("completed", str(displaced)) == (
         "completed: its minimum runtime is over and bob@ws2 (zscout take), priority 10, needs its RCs: "

@@ -20,6 +20,7 @@ is `kind/name`, with parameters `kind/name{rate=5 width=0.1}`; a TERM is `COUNTE
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import TYPE_CHECKING, cast
@@ -28,36 +29,9 @@ from tests.scheduling.validate import validate
 from tests.transcripts import ns, seconds, settings
 from zscout.config.scheduling_policy import DEFAULT, FairShares
 from zscout.keyexpr import is_pattern
+from zscout.scheduling import model
 from zscout.scheduling.booking import Booked, Booking, BookingChanged, BookingThreatened, Redated, Unbooked
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import (
-    Adopted,
-    ArcRequest,
-    Cancelled,
-    ClientLost,
-    Dropped,
-    Effect,
-    Event,
-    Granted,
-    HandedOver,
-    HoldEnded,
-    LeadTaken,
-    PlaceShown,
-    Propose,
-    Queued,
-    RcJoined,
-    RcLost,
-    RcReported,
-    Reachable,
-    RecoveredHold,
-    Released,
-    Requested,
-    Tick,
-    Unconfirmed,
-    Vote,
-    VoteOverdue,
-    WakeAt,
-)
 from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import Grant, Ns, Params, Place, Term
@@ -74,11 +48,11 @@ class CorePlayer:
 
     core: Core = field(default_factory=Core)
     now: Ns = 0
-    standing: list[RecoveredHold] = field(default_factory=list)
-    waiting: list[Requested] = field(default_factory=list)
+    standing: list[model.RecoveredHold] = field(default_factory=list)
+    waiting: list[model.Requested] = field(default_factory=list)
 
     def batch(self, line: str) -> list[str]:
-        events: list[Event] = []
+        events: list[model.Event] = []
         for command in line.split(";"):
             words = command.split(maxsplit=2)
             if words[0] == "at":
@@ -91,7 +65,7 @@ class CorePlayer:
         if not events:
             return []
         decided = self.core.handle(self.now, *events)
-        wakes = [one for one in decided if isinstance(one, WakeAt)]
+        wakes = [one for one in decided if isinstance(one, model.WakeAt)]
         effects = [*(one for one in decided if one not in wakes), *self.core.tell_reasons(), *wakes]
         validate(self.core)
         return [_print(effect) for effect in effects] or ["nothing"]
@@ -107,78 +81,63 @@ class CorePlayer:
         lines += [f"unknown {rc.name}: {', '.join(sorted(holders))}" for rc, holders in told.unknown]
         return lines or ["none"]
 
-    def event(self, verb: str, rest: str) -> Event | None:
+    def event(self, verb: str, rest: str) -> model.Event | None:
         first, _, second = rest.partition(" ")
+        words = second.split()
         match verb:
             case "ask":
                 request, options = _request(rest)
-                return Requested(request, _place(options["place"]) if "place" in options else None)
+                return model.Requested(request, _place(options["place"]) if "place" in options else None)
             case "standing":
                 self.standing.append(_held(rest))
                 return None
-            case "adopt":
-                return Adopted(_held(rest))
-            case "place":
-                return PlaceShown(first, _place(second))
-            case "unconfirmed":
-                grant, rcs = second.split()
-                return Unconfirmed(first, Grant(*_place(grant)), tuple(rcs.split(",")))
-            case "reachable":
-                return Reachable(first)
             case "waiting":
                 request, options = _request(rest)
-                self.waiting.append(Requested(request, _place(options["place"])))
+                self.waiting.append(model.Requested(request, _place(options["place"])))
                 return None
             case "lead":
-                lead = LeadTaken(_term(first), tuple(self.standing), tuple(self.waiting))
+                lead = model.LeadTaken(_term(first), tuple(self.standing), tuple(self.waiting))
                 self.standing, self.waiting = [], []
                 return lead
-            case "join":
-                return RcJoined(first, sharable=_flag(second, "sharable"))
-            case "leave":
-                return RcLost(first, second) if second else RcLost(first)
-            case "lost":
-                return ClientLost(first)
-            case "cancel":
-                return Cancelled(first)
-            case "release":
-                return Released(first)
-            case "handover":
-                client, renamed = second.split()
-                return HandedOver(first, client, renamed)
             case "vote":
                 answer, _, reason = second.partition(" ")
-                return Vote(int(first), accept=_choice(answer, yes="yes", no="no"), reason=reason)
-            case "overdue":
-                return VoteOverdue(int(first))
-            case "rules":
-                return RcReported(first, rules_changed=True)
-            case "ended":
-                return RcReported(first, ended=tuple(second.split(",")))
-            case "book":
-                return Booked(_booking(rest, self.now)[0], tentative="tentative" in rest.split())
-            case "redate":
-                return Redated(first, ns(second))
-            case "unbook":
-                return Unbooked(first, at_present=_flag(second, "now"))
+                return model.Vote(int(first), accept=_choice(answer, yes="yes", no="no"), reason=reason)
             case "strategy":
-                options = settings(second.split(), "patience", "half_life")
+                options = settings(words, "patience", "half_life")
                 patience = ns(options["patience"]) if "patience" in options else DEFAULT.patience
                 fair = FairShares(ns(options["half_life"])) if "half_life" in options else None
                 policy = replace(DEFAULT, patience=patience, fair_shares=fair)
                 self.core = Core(STRATEGIES[cast("StrategyName", first)](), policy)
                 return None
-            case "tick":
-                return Tick()
-            case _:
-                raise ValueError(f"no such command: {verb}")
+        others: dict[str, Callable[[], model.Event]] = {
+            "adopt": lambda: model.Adopted(_held(rest)),
+            "place": lambda: model.PlaceShown(first, _place(second)),
+            "unconfirmed": lambda: model.Unconfirmed(first, Grant(*_place(words[0])), tuple(words[1].split(","))),
+            "reachable": lambda: model.Reachable(first),
+            "join": lambda: model.RcJoined(first, sharable=_flag(second, "sharable")),
+            "leave": lambda: model.RcLost(first, second) if second else model.RcLost(first),
+            "lost": lambda: model.ClientLost(first),
+            "cancel": lambda: model.Cancelled(first),
+            "release": lambda: model.Released(first),
+            "handover": lambda: model.HandedOver(first, *words),
+            "overdue": lambda: model.VoteOverdue(int(first)),
+            "rules": lambda: model.RcReported(first, rules_changed=True),
+            "ended": lambda: model.RcReported(first, ended=tuple(second.split(","))),
+            "book": lambda: Booked(_booking(rest, self.now)[0], tentative="tentative" in rest.split()),
+            "redate": lambda: Redated(first, ns(second)),
+            "unbook": lambda: Unbooked(first, at_present=_flag(second, "now")),
+            "tick": model.Tick,
+        }
+        if verb not in others:
+            raise ValueError(f"no such command: {verb}")
+        return others[verb]()
 
 
-def _held(text: str) -> RecoveredHold:
+def _held(text: str) -> model.RecoveredHold:
     request, options = _request(text)
     start = ns(options["start"])
     grant, place = Grant(*_place(options["grant"])), _place(options["place"])
-    return RecoveredHold(request, place, grant, start, start + request.min_runtime)
+    return model.RecoveredHold(request, place, grant, start, start + request.min_runtime)
 
 
 def _booking(text: str, now: Ns) -> tuple[Booking, dict[str, str]]:
@@ -200,7 +159,7 @@ def _booking(text: str, now: Ns) -> tuple[Booking, dict[str, str]]:
     return booking, options
 
 
-def _request(text: str) -> tuple[ArcRequest, dict[str, str]]:
+def _request(text: str) -> tuple[model.ArcRequest, dict[str, str]]:
     """`ARC NEED,... key=value ... [keep]`."""
     braces = re.compile(r"\{[^}]*\}")
     # Parameters hold spaces; take them out of the way of the split.
@@ -215,21 +174,9 @@ def _request(text: str) -> tuple[ArcRequest, dict[str, str]]:
         pairs = (pair.split("=") for pair in (match[2] or "").split())
         wanted[match[1]] = {key: Fraction(value) for key, value in pairs}
     words = (word for word in rest if word not in {"keep", "maintenance", "bookings", "tentative"})
-    known = (
-        "priority",
-        "runtime",
-        "client",
-        "place",
-        "grant",
-        "start",
-        "booking",
-        "patience",
-        "since",
-        "bound",
-        "until",
-    )
-    options = settings(words, *known)
-    request = ArcRequest(
+    known = "priority runtime client place grant start booking patience since bound until"
+    options = settings(words, *known.split())
+    request = model.ArcRequest(
         arc=arc,
         client=options.get("client", "host/" + arc),
         needs=wanted,
@@ -263,26 +210,26 @@ def _choice(word: str, *, yes: str, no: str) -> bool:
     return word == yes
 
 
-def _print(effect: Effect) -> str:
+def _print(effect: model.Effect) -> str:
     match effect:
-        case Propose(proposal=number, rc=rc, holders=holders):
+        case model.Propose(proposal=number, rc=rc, holders=holders):
             return f"propose {number} {rc}: " + ", ".join(arc + _share(holders[arc]) for arc in holders)
-        case Granted(arc=arc, client=client, grant=grant, rcs=rcs, start=start, end=end):
+        case model.Granted(arc=arc, client=client, grant=grant, rcs=rcs, start=start, end=end):
             span = f"from {seconds(start)} " + ("on" if end is None else f"to {seconds(end)}")
             return f"grant {arc} to {client} ({_grant(grant)}): {', '.join(rcs)} {span}"
-        case HoldEnded(arc=arc, grant=grant, outcome=outcome, reason=reason, requeued=requeued, by=by):
+        case model.HoldEnded(arc=arc, grant=grant, outcome=outcome, reason=reason, requeued=requeued, by=by):
             took = f" by {by}" if by is not None else ""
             tail = "; queued again" if requeued else ""
             return f"revoke {arc} ({_grant(grant)}) {outcome.value}{took}: {_told(reason)}{tail}"
-        case Queued(arc=arc, reason=reason, settled=settled):
+        case model.Queued(arc=arc, reason=reason, settled=settled):
             return f"queued {arc}: {_told(reason)}" + ("" if settled else " (not settled)")
-        case Dropped(arc=arc, outcome=outcome, reason=reason):
+        case model.Dropped(arc=arc, outcome=outcome, reason=reason):
             return f"dropped {arc} {outcome.value}: {reason}"
         case BookingChanged(booking=booking, state=state, arc=arc):
             return f"booking {booking} {state.value}" + (f" by {arc}" if arc is not None else "")
         case BookingThreatened(booking=booking, reason=reason):
             return f"booking {booking} " + ("in danger no more" if reason is None else f"in danger: {_told(reason)}")
-        case WakeAt(at=at):
+        case model.WakeAt(at=at):
             return "wake " + ("never" if at is None else f"at {seconds(at)}")
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from fractions import Fraction
 
 from hypothesis import strategies as st
 
-from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.capacity import excess
+from zscout.scheduling.model import ArcRequest, Propose, Vote
 from zscout.simulation.workload import Arrival, Workload, WorkloadRc
 from zscout.types import SECOND, Params, RcName
 
@@ -25,6 +27,17 @@ params: st.SearchStrategy[Params] = st.one_of(
 capacity: st.SearchStrategy[Params] = st.one_of(
     st.fixed_dictionaries({"rate": _capacities}), st.dictionaries(st.sampled_from(PARAMETERS), _capacities, max_size=2)
 )
+
+
+def voter(workload: Workload) -> Callable[[Propose], Vote]:
+    """How the RCs of a workload vote: by their own sums."""
+    capacities = {rc.name: rc.capacity for rc in workload.rcs}
+
+    def vote(asked: Propose) -> Vote:
+        reason = excess(capacities[asked.rc], asked.holders.items())
+        return Vote(asked.proposal, accept=not reason, reason=reason)
+
+    return vote
 
 
 @st.composite

@@ -38,3 +38,9 @@ class MemoryFleet:
 
     def mesh(self, host: str, client: str = "node") -> MemoryMesh:
         return self.network.open("test", Sender(host, client))
+
+    def cut(self, one: Mesh, *others: Mesh) -> None:
+        """Both ways."""
+        for other in others:
+            self.network.cut(one, other)
+            self.network.cut(other, one)

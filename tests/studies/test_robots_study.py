@@ -65,14 +65,6 @@ def test_a_spread_is_of_values_that_were_there(values: list[float], expected: Qu
     assert quantiles_of(values) == expected
 
 
-def test_nothing_has_no_spread() -> None:
-    assert all(math.isnan(one) for one in vars_of(quantiles_of([])))
-
-
-def vars_of(spread: Quantiles) -> list[float]:
-    return [spread.low, spread.median, spread.high]
-
-
 def outcomes(*placed: float | None, **more: Any) -> Outcomes:
     names = [f"scout{number}" for number in range(len(placed))]
     truths = {name: True for name, at in zip(names, placed, strict=True) if at is not None}

@@ -1,11 +1,9 @@
-"""The commands: what `click` knows of each, and what they print where no mesh is needed."""
+"""The commands: what `click` knows of each, and how one is run here."""
 
 from __future__ import annotations
 
 import io
-import json
 import os
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from decimal import Decimal
@@ -80,66 +78,6 @@ def _param(param: click.Parameter) -> dict[str, Any]:
     return {key: value for key, value in shown.items() if value is not None and value is not False and value != ""}
 
 
-# What is printed
-
-BAD_FILES: Final = {
-    "bad.toml": "[fleet]\nnam = 1\n",
-    "workload.toml": '[[rc]]\nname = "robot/a"\n[[arc]]\nname = "x"\nat = 0\npriority = 1\n'
-    'min_runtime = 1\n[arc.needs]\n"robot/a" = {}\n[[arc]]\nname = "y"\nat = 0\npriority = 1\n'
-    'min_runtime = 2\n[arc.needs]\n"robot/b" = {}\n',
-    "twice.toml": '[[arc]]\nname = "x"\nat = 0\npriority = 1\nmin_runtime = 1\n[arc.needs]\n',
-    "not.rrd": "no recording",
-    "node.toml": '[[rc]]\nname = "robot/a"\ndriver = "robot"\n',
-    "run.sh": "true\n",
-}
-CALLS: Final = (
-    "", "--version", "nonsense", "reqest robot/a", "--fleet none.toml status", "--fleet bad.toml status", "request",
-    "request robot", "request robot/a robot/a", "request robot/a:rate", "request robot/a:rate=x",
-    "request robot/a:rate=1,rate=2", "request robot/*#0", "request robot/*:rate=1 robot/*:rate=2",
-    "request robot/a --min-runtime never", "request robot/a --min-runtime 0", "request robot/a --timeout -1",
-    "request robot/a --priority 1.5", "request robot/a --name a/b", "request robot/a -- no-such-command-anywhere",
-    "request robot/a -- ./run.sh", "request true -- true", "take", "take robot/a:=", "take robot/a --min-runtime 0",
-    "drive", "drive radio/rf0", "drive robot/a --speed 9", "watch", "watch --source none.avi",
-    "watch --source none.avi --limit 0", "release", "cancel", "cancel \x07", "status --once", "why", "start",
-    "start a/b", "start counter --set x", "start counter --host a/b", "start counter --memory much",
-    "start counter --restart seldom", "stop", "stop a/b", "components a/b", "logs", "logs a/b", "migrate",
-    "migrate counter --to a/b", "drain", "drain a/b", "uncordon", "uncordon a/b", "keys --all --json",
-    "cert ca --days 0", "cert issue anvil", "cert issue a/b", "cert renew none", "cert show", "cert show none",
-    "view none.rrd", "view not.rrd", "view --bind somewhere", "view --port 0", "replay", "replay none.toml",
-    "replay bad.toml", "replay twice.toml", "replay workload.toml", "replay workload.toml --json",
-    "replay workload.toml --strategy best", "replay workload.toml --rrd picture.png", "simulate --list",
-    "simulate nowhere", "simulate office --http x:y", "simulate office --speed 0", "demo nothing",
-    "demo table1 --out picture.png", "demo placement --policy best", "demo robots --building nowhere",
-    "completion bash", "completion tcsh", "node none.toml", "node bad.toml", "node node.toml", "node --log-level loud",
-    "node --check node.toml",
-)  # fmt: skip
-"""Words after `zscout` (or, after `node`, those of `zscout-node`), parted by spaces."""
-
-
-def calls() -> dict[str, Any]:
-    """Of each call of `CALLS` its exit code, and what it prints: JSON as it is, and else in how many lines. Help and
-    the words of errors are no surface."""
-    programs = scripts()
-    found: dict[str, Any] = {}
-    with tempfile.TemporaryDirectory() as folder, plain(), _inside(folder):
-        for name, text in BAD_FILES.items():
-            Path(name).write_text(text)
-        for words in CALLS:
-            name, _, rest = words.partition(" ")
-            program, args = ("zscout-node", rest) if name == "node" else ("zscout", words)
-            told = printed(program, programs[program], args.split())
-            found[f"{program} {args}".rstrip()] = {name: _printed(value) for name, value in told.items()}
-    return found
-
-
-def _printed(told: Any) -> Any:
-    if not isinstance(told, list):
-        return told
-    if told[0].startswith("{"):
-        return [json.loads(line) for line in told]
-    return "a line" if len(told) == 1 else "lines"
-
-
 def printed(program: str, command: click.Command, args: list[str]) -> dict[str, Any]:
     out, err = io.StringIO(), io.StringIO()
     code: object = None
@@ -159,13 +97,3 @@ def plain(**more: str) -> Iterator[None]:
     clean |= {"COLUMNS": str(WIDTH), "SHELL": "/bin/sh"}
     with patch.dict(os.environ, clean | more, clear=True):
         yield
-
-
-@contextmanager
-def _inside(folder: str) -> Iterator[None]:
-    before = Path.cwd()
-    os.chdir(folder)
-    try:
-        yield
-    finally:
-        os.chdir(before)

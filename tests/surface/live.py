@@ -4,7 +4,7 @@
     python -m tests.surface.live --record  writes `live.json` from ten runs
 
 A field is recorded with its values where these are the same in each run, numbers and random names aside. What
-not every run has may be missing. Of the texts for people each line that every run has is wanted.
+not every run has may be missing. What commands print for people is not recorded.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any, Final, Self
 
+from tests.cli.tools import end
 from tests.hang import HANG
 from tests.ports import free_port
 from tests.surface.commands import plain, printed, scripts
@@ -33,7 +34,6 @@ from tests.surface.tree import PROJECT
 RECORDED: Final = Path(__file__).with_name("live.json")
 RUNS: Final = 10
 SECTION: Final = "live"
-PEOPLE: Final = ", for people"
 
 Shape = dict[str, set[str]]
 """Values or types by the path of a field."""
@@ -88,10 +88,8 @@ class Story:
         waiter.until("waits")
         for words in ("status", "why waiter", "why holder", "request robot/a --dry-run"):
             self.call(*words.split())
-            self.look(*words.split())
         # A command that has just joined hears of one host after the other.
         self.call("keys", until=_whole)
-        self.look("keys", until=_whole)
         taker = self._ask("taker", "take", "robot/a", "--yes", "--json")
         taker.until("granted")
         holder.end(self)
@@ -107,7 +105,6 @@ class Story:
         self.call("components", "--kinds")
         self.call("start", "counter", "--host", "anvil", "--host", "bellows")
         host = self.call("components", until=_measured)["components"][0]["host"]
-        self.look("components")
         other = ({"anvil", "bellows"} - {host}).pop()
         self.call("migrate", "counter", "--to", other)
         self.call("drain", other)
@@ -131,7 +128,7 @@ class Story:
             text=True,
             cwd=self.folder,
         )
-        self._stack.callback(_end, process)
+        self._stack.callback(end, process)
         return process
 
     def _ask(self, name: str, command: str, *words: str) -> Program:
@@ -163,11 +160,6 @@ class Story:
         # Which host is drained may differ.
         self.note(words[0] if words[0] in ("drain", "uncordon", "migrate") else " ".join(words), [found], code)
         return found
-
-    def look(self, *words: str, until: Callable[[str], bool] = _anything) -> None:
-        """Notes the lines that a command prints for people."""
-        lines = self._say(*words, until=until)[1].splitlines()
-        self.shown[f"{' '.join(words)}{PEOPLE}"] = {masked(" ".join(line.split())): set() for line in lines}
 
     def note(self, name: str, printed: Sequence[Any], code: int) -> None:
         shape = self.shown.setdefault(name, {"exit code": {str(code)}})
@@ -201,15 +193,6 @@ class Program:
         """Reads what comes until it ends."""
         self._lines += map(json.loads, self._out)
         story.note(self._name, self._lines, self._process.wait(HANG))
-
-
-def _end(process: subprocess.Popen[str]) -> None:
-    process.terminate()
-    try:
-        process.wait(10)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
 
 
 def _reported(state: Any) -> set[str]:
@@ -267,7 +250,7 @@ def _merged(shapes: Sequence[Shape]) -> Iterator[tuple[str, Any]]:
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Shape]) -> list[Difference]:
-    """What is not as it was. Another line for people is none: what they say may depend on the moment."""
+    """What is not as it was."""
     found: list[Difference] = []
     for name in sorted(before.keys() | now.keys()):
         was, shape = before.get(name, {}), now.get(name, {})
@@ -275,8 +258,7 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Shape]) -> list[Dif
             where = SEPARATOR.join((SECTION, name, path))
             values = sorted(shape[path]) if path in shape else None
             if path not in was:
-                if not name.endswith(PEOPLE):
-                    found.append(Difference(where, None, values))
+                found.append(Difference(where, None, values))
             elif values is None:
                 if was[path].get("always", True):
                     found.append(Difference(where, was[path].get("values", "anything"), None))

@@ -16,7 +16,7 @@ from tests.surface.compare import SEPARATOR
 
 RECORDED: Final = Path(__file__).with_name("surface.json")
 SECTIONS: Final[Mapping[str, Callable[[], Any]]] = {
-    "commands": commands.commands, "what commands print": commands.calls, "exit codes": interfaces.exit_codes,
+    "commands": commands.commands, "exit codes": interfaces.exit_codes,
     "environment variables": interfaces.variables, "files": files.files, "components": interfaces.components,
     "python": interfaces.python, "keys": interfaces.keys, "messages": interfaces.wire,
 }  # fmt: skip

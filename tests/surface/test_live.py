@@ -1,4 +1,4 @@
-"""What commands print on a mesh has the fields, and says the words, that were recorded."""
+"""What commands print on a mesh has the fields that were recorded."""
 
 from __future__ import annotations
 

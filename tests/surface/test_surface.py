@@ -26,10 +26,7 @@ def differences(section: str) -> list[Difference]:
     ]
 
 
-@pytest.mark.parametrize(
-    "section",
-    [pytest.param(name, marks=[pytest.mark.live] if name == "what commands print" else []) for name in SECTIONS],
-)
+@pytest.mark.parametrize("section", SECTIONS)
 def test_what_is_seen_is_what_was_recorded(section: str) -> None:
     found = [str(one) for one in differences(section)]
     assert not found, "mend it, or if it is meant run `python -m tests.surface.record`:\n" + "\n".join(found)

@@ -1,14 +1,19 @@
-"""The network in memory fails to order: what is delayed, lost, cut off or frozen, and what returns."""
+"""The network in memory fails to order: what is delayed, lost, cut off or frozen, and what returns. And virtual time
+jumps when nothing is left to do, and never past what is under way."""
 
 from __future__ import annotations
 
 import asyncio
+import time
+
+import pytest
 
 from tests.mesh.kit import run, until
 from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import IncomingQuery
 from zscout.messages import Message
 from zscout.testing.memory import MemoryMesh, MemoryNetwork
+from zscout.testing.virtual_time import START, Deadlock
 from zscout.types import SECOND
 
 ASK, NEWS = "test/ask", "test/news"
@@ -86,8 +91,7 @@ def test_losses_are_those_of_the_seed() -> None:
 async def test_a_query_that_is_lost_is_over_at_its_timeout() -> None:
     pair = await linked()
     pair.network.link(pair.a, pair.b).loss = 1.0
-    assert await pair.ask(timeout=2) == ([], 2.0)
-    assert pair.served == []
+    assert (await pair.ask(timeout=2), pair.served) == (([], 2.0), [])
 
 
 async def test_what_is_cut_for_less_than_the_lease_arrives_late() -> None:
@@ -99,24 +103,18 @@ async def test_what_is_cut_for_less_than_the_lease_arrives_late() -> None:
     assert pair.heard == []
     assert pair.served == [2]  # the other direction works
     pair.network.heal()
-    assert await asking == ([2], 0.9)
-    assert pair.heard == [1]
-    assert pair.lives == [True]
+    assert (await asking, pair.heard, pair.lives) == (([2], 0.9), [1], [True])
 
 
 async def test_a_link_that_is_cut_for_a_lease_is_given_up_until_it_is_healed() -> None:
     pair = await linked()
     pair.network.cut(pair.b, pair.a)
     pair.b.put(NEWS, Ping(1))
-    assert await pair.ask(2) == ([], 1.0)
-    assert pair.lives == [True, False]
-    assert pair.a.links() == 0
+    assert (await pair.ask(2), pair.lives, pair.a.links()) == (([], 1.0), [True, False], 0)
     assert await pair.ask(3) == ([], 0)
     pair.network.heal()
     await until(lambda: pair.lives == [True, False, True])
-    assert await pair.ask(4) == ([4], 0.0)
-    assert pair.served == [2, 4]
-    assert pair.heard == []
+    assert (await pair.ask(4), pair.served, pair.heard) == (([4], 0.0), [2, 4], [])
     pair.b.put(NEWS, Ping(5))
     await until(lambda: pair.heard == [5])
 
@@ -134,8 +132,7 @@ async def test_isolated_is_cut_from_all() -> None:
 async def test_a_server_frozen_for_less_than_its_lease_carries_out_what_waited() -> None:
     pair = await linked()
     pair.network.freeze(pair.b)
-    assert await pair.ask(1, timeout=0.5) == ([], 0.5)
-    assert pair.served == []
+    assert (await pair.ask(1, timeout=0.5), pair.served) == (([], 0.5), [])
     pair.network.thaw(pair.b)
     await until(lambda: pair.served == [1])
     assert pair.lives == [True]
@@ -154,8 +151,7 @@ async def test_one_frozen_for_longer_is_given_up_and_returns() -> None:
     pair.network.thaw(pair.b)
     await until(lambda: pair.lives == [True, True, False, True])
     await until(lambda: len(seen) == 4)
-    assert seen[2:] == [("a", False), ("a", True)]
-    assert (await pair.ask(2))[0] == [2]
+    assert (seen[2:], (await pair.ask(2))[0]) == ([("a", False), ("a", True)], [2])
     token.close()
 
 
@@ -179,10 +175,8 @@ async def test_of_what_one_that_is_killed_sent_last_a_beginning_arrives() -> Non
         asking = asyncio.create_task(pair.ask(3))
         await asyncio.sleep(0)
         pair.network.kill(pair.b)
-        assert await asking == ([], 0.0)
-        assert pair.lives == [True, False]
-        assert pair.heard == [0, 1, 2][: len(pair.heard)]
-        assert pair.served == []
+        assert (await asking, pair.lives) == (([], 0.0), [True, False])
+        assert (pair.heard, pair.served) == ([0, 1, 2][: len(pair.heard)], [])
         arrived.add(len(pair.heard))
         pair.b.put(NEWS, Ping(4))
         await asyncio.sleep(1)
@@ -231,5 +225,54 @@ def test_the_same_seed_makes_the_same_run() -> None:
         return events
 
     first, again = run(trace()), run(trace())
-    assert len(first) == 36
-    assert first == again
+    assert (len(first), first) == (36, again)
+
+
+# Virtual time
+
+
+def test_hours_pass_at_once_and_in_order() -> None:
+    async def story() -> list[tuple[str, float]]:
+        loop = asyncio.get_running_loop()
+        seen: list[tuple[str, float]] = []
+
+        async def sleeper(name: str, delay: float) -> None:
+            await asyncio.sleep(delay)
+            seen.append((name, loop.time() - START))
+
+        async with asyncio.TaskGroup() as tasks:
+            tasks.create_task(sleeper("late", 7_200))
+            tasks.create_task(sleeper("early", 3_600.5))
+            tasks.create_task(sleeper("day", 100_000))
+        return seen
+
+    before, seen = time.monotonic(), run(story())
+    assert time.monotonic() - before < 60
+    assert seen == [("early", 3_600.5), ("late", 7_200), ("day", 100_000)]
+
+
+def test_a_timeout_comes_at_its_time() -> None:
+    async def story() -> float:
+        loop = asyncio.get_running_loop()
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.25):
+                await asyncio.Event().wait()
+        return loop.time()
+
+    assert run(story()) == START + 0.25
+
+
+def test_time_stands_still_while_a_thread_works() -> None:
+    async def story() -> float:
+        loop = asyncio.get_running_loop()
+        timer = loop.call_later(1, lambda: None)
+        await asyncio.to_thread(time.sleep, 0.02)
+        timer.cancel()
+        return loop.time()
+
+    assert run(story()) == START
+
+
+def test_waiting_for_nothing_is_an_error_rather_than_a_hang() -> None:
+    with pytest.raises(Deadlock):
+        run(asyncio.Event().wait())

@@ -1,4 +1,4 @@
-"""What is to be said of a device, or of a certificate, in words."""
+"""Remarks on a device or a certificate, in words."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from zscout.terminal import clock, span
 
 
 def ending(name: str, left: float) -> str:
-    """That the certificate of this machine or person ends in so many seconds."""
+    """A warning that the certificate of this machine or person ends in `left` seconds."""
     return f"the certificate of {name} " + (f"ends in {span(left)}" if left > 0 else f"has ended {span(-left)} ago")
 
 
 def absence(view: RcView) -> str:
-    """Why it is not there, as far as that is known."""
+    """Why the device is absent, if that is known."""
     if view.present or not view.reason:
         return ""
     return view.reason if view.gone is None else f"{view.reason} since {clock(-view.gone)}"
 
 
 def remarks(view: RcView) -> Iterator[str]:
-    """Why it is not there, and which other hosts offer it, or did so."""
+    """Why the device is absent, and which other hosts offer it or did so."""
     if words := absence(view):
         yield words
     for host in view.duplicates:
         yield f"at {host}: duplicate of {view.rc} at {view.host}"
     for host, ago in view.unseen.items():
-        yield f"its other host {host} is not seen since {clock(-ago)}"
+        yield f"its other host {host} was last seen at {clock(-ago)}"

@@ -231,4 +231,4 @@ def holds_table(title: str, told: Told, holds: Sequence[PastHold], *, proven: bo
             {"preempted": "red", "lost": "red", "client_lost": "red"}.get(hold.outcome, "" if hold.ended else "bold")
         )
     columns = ("BEGAN", "HELD", "ARC", "WHO", "PRIORITY", "WAITED", "END", "RCS")
-    return Table(title, columns, rows, styles, spare={"PRIORITY", "WAITED"}, cut={"END"})
+    return Table(title, columns, rows, styles, spare=("PRIORITY", "WAITED"), cut={"END"})

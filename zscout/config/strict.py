@@ -17,6 +17,7 @@ import tomllib
 from collections.abc import Iterable, Mapping
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
@@ -160,10 +161,17 @@ def parse_toml(text: str, source: str, type: type[T]) -> T:  # noqa: A002 - msgs
 
 def convert(data: object, type: type[T], where: Where) -> T:  # noqa: A002 - msgspec's word
     """What TOML or JSON gave, as a struct or dataclass. Raises BadInput, TypeError for a type that is none of these."""
+    kind: Any = type
     try:
-        return msgspec.convert(_checked(inspect.type_info(type), data, where), type)
+        return msgspec.convert(_checked(_type_info(kind), data, where), type)
     except msgspec.ValidationError as error:  # what only msgspec knows of, as other bounds than `key` gives
         raise where.bad(str(error), "mend it") from None
+
+
+@cache
+def _type_info(type: Any) -> inspect.Type:  # noqa: A002 - msgspec's word
+    # Some 10 ms for a type, and a node file converts each of its `[[rc]]` tables.
+    return inspect.type_info(type)
 
 
 def check_name(value: str, where: Where) -> None:

@@ -14,10 +14,11 @@ from zscout.config.fleet import Fleet, default_fleet
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
+from zscout.mesh import Mesh
 from zscout.mesh.supervision import StallWatch
 from zscout.messages import RcmState
 from zscout.services.rcm.candidate import Candidate
-from zscout.testing.memory import MemoryMesh, MemoryNetwork
+from zscout.testing.memory import MemoryMesh, MemoryNetwork, MemoryTransport
 from zscout.types import SECOND, Grant
 
 RC, OTHER = "robot/x", "robot/y"
@@ -86,6 +87,13 @@ async def held(client: Client, name: str, **how: Any) -> tuple[OpenArc, Grant]:
     grant = await client.granted(arc)
     assert grant is not None
     return arc, grant
+
+
+def transport_of(mesh: Mesh) -> MemoryTransport:
+    assert isinstance(mesh, MemoryMesh)
+    transport = mesh._transport.current
+    assert isinstance(transport, MemoryTransport)
+    return transport
 
 
 def begin_move(old: Client, new: Client) -> None:

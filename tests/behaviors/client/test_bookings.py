@@ -86,8 +86,7 @@ async def test_a_refusal_is_raised_at_once_and_silence_after_the_time_given() ->
     with pytest.raises(RequestRefused, match="booked by bob") as refused:
         await BookingsClient(leader.client).slots(NEEDS, 60, 3600)
     assert (refused.value.code, len(leader.asked)) == ("not_free", 1)
-    silent = Leader(lambda _: None)
-    began = asyncio.get_running_loop().time()
+    silent, began = Leader(lambda _: None), asyncio.get_running_loop().time()
     with pytest.raises(RcmSilent, match="it may be done or not"):
         await BookingsClient(silent.client, timeout=12.0).unbook("x")
     assert len(set(map(id, silent.asked))) >= 2
@@ -159,8 +158,7 @@ async def test_what_a_program_has_taken_up_it_has_at_its_date_though_the_leader_
         assert 0 <= told.time - booking.start < 1
         [dates] = [view.dates for view in told.bookings]
         assert [(date.state, date.arc) for date in dates][:2] == [("taken", f"h/one/{mine.id}"), ("open", None)]
-        assert mine.booking == f"{booking.id}@{booking.start}"
-        assert long.state == "queued"
+        assert (mine.booking, long.state) == (f"{booking.id}@{booking.start}", "queued")
         # At its end it yields to who waits, and what asks for the booking anew has its next date.
         assert await two.granted(long) is not None
         assert 30 <= (await bookings.list()).time - booking.start < 32

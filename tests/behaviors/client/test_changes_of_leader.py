@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, SmallFleet, held, small_fleet
+from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, SmallFleet, held, small_fleet, transport_of
 from tests.mesh.kit import until
 from zscout.behaviors.client.arc import hold
 from zscout.behaviors.client.client import Client
@@ -19,7 +19,6 @@ from zscout.messages import Ask, Notice
 from zscout.services.rcm import request_handler
 from zscout.services.rcm.candidate import Candidate
 from zscout.testing.link import Disturbance
-from zscout.testing.memory import MemoryMesh, MemoryTransport
 from zscout.types import SECOND, Place, Term
 
 
@@ -64,10 +63,7 @@ async def test_who_shows_a_new_leader_that_it_lives_is_not_dropped_though_its_to
     """As where links came back without all declarations while another led, and nobody noticed."""
     async with small_fleet("watch", "one") as (fleet, (watch, one)):
         next_leader = fleet.candidate("h1").mesh
-        assert isinstance(next_leader, MemoryMesh)
-        before, client = (mesh._transport.current for mesh in (next_leader, one.mesh))
-        assert isinstance(before, MemoryTransport)
-        assert isinstance(client, MemoryTransport)
+        before, client = transport_of(next_leader), transport_of(one.mesh)
         await asyncio.sleep(0.1)
         link = fleet.network.link(one.mesh, next_leader)
         hidden = f"/{Role.CLIENT}/one/", f"/{missing}"
@@ -81,7 +77,7 @@ async def test_who_shows_a_new_leader_that_it_lives_is_not_dropped_though_its_to
             one.watch(lambda arc: outcomes.append(arc.outcome))
             await fleet.lose_leader()
             await until(lambda: watch.leader == "h1")
-            await until(lambda: next_leader._transport.current is not before, within=10)
+            await until(lambda: transport_of(next_leader) is not before, within=10)
             await asyncio.sleep(10)
             assert held.active
             assert "client_lost" not in outcomes

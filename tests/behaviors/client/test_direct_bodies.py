@@ -4,6 +4,7 @@ is taken away, and that the next holder waits for it."""
 from __future__ import annotations
 
 import asyncio
+from typing import Any
 
 import pytest
 
@@ -22,9 +23,9 @@ def direct_of(client: Client) -> list[DirectHold]:
     return list(client._confirmations._direct.values())
 
 
-async def park(client: Client, said: list[str]) -> None:
+async def park(client: Client, said: list[str], **how: Any) -> None:
     """A direct body that parks its device when its hold is over."""
-    async with hold(client, "low", {RC: {}}, min_runtime=60, direct=True):
+    async with hold(client, "low", {RC: {}}, **({"min_runtime": 60, "direct": True} | how)):
         said.append("low in")
         try:
             await asyncio.sleep(3600)
@@ -36,11 +37,17 @@ async def park(client: Client, said: list[str]) -> None:
             said.append("low parked")
 
 
+async def parking(client: Client, **how: Any) -> tuple[asyncio.Task[None], list[str]]:
+    """Such a body at work, and what it says."""
+    said: list[str] = []
+    body = asyncio.create_task(park(client, said, **how))
+    await until(lambda: said)
+    return body, said
+
+
 async def test_the_next_holder_waits_until_a_preempted_body_has_cleared_up() -> None:
     async with small_fleet("low", "high") as (_, (low, high)):
-        said: list[str] = []
-        body = asyncio.create_task(park(low, said))
-        await until(lambda: said)
+        body, said = await parking(low)
         asked = high.mesh.now()
         async with hold(high, "high", {RC: {}}, priority=5, min_runtime=60, confirmed=True):
             said.append("high in")
@@ -78,19 +85,7 @@ async def test_a_body_that_clears_up_for_too_long_is_interrupted_before_the_next
 
 async def test_a_body_that_has_had_its_time_clears_up_before_the_next_one_begins() -> None:
     async with small_fleet("low", "high") as (_, (low, high)):
-        said: list[str] = []
-
-        async def first() -> None:
-            async with hold(low, "low", {RC: {}}, min_runtime=2, direct=True):
-                said.append("low in")
-                try:
-                    await asyncio.sleep(3600)
-                finally:
-                    await asyncio.sleep(PARKS)
-                    said.append("low parked")
-
-        body = asyncio.create_task(first())
-        await until(lambda: said)
+        body, said = await parking(low, min_runtime=2)
         async with hold(high, "high", {RC: {}}, min_runtime=60, confirmed=True):
             said.append("high in")
         await body
@@ -121,9 +116,7 @@ async def test_a_body_that_is_entered_again_has_left_before() -> None:
 
 async def test_a_body_that_is_cancelled_from_outside_while_it_clears_up_ends_so() -> None:
     async with small_fleet("low", "high") as (_, (low, high)):
-        said: list[str] = []
-        body = asyncio.create_task(park(low, said))
-        await until(lambda: said)
+        body, _said = await parking(low)
         taker = await high.request("high", {RC: {}}, priority=5, min_runtime=60)
         await until(lambda: direct_of(low) and all(one.over for one in direct_of(low)))
         await asyncio.sleep(PARKS / 4)
@@ -135,9 +128,7 @@ async def test_a_body_that_is_cancelled_from_outside_while_it_clears_up_ends_so(
 
 async def test_a_client_that_hears_nothing_ends_its_body_after_the_hold_lease() -> None:
     async with small_fleet("low") as (fleet, (low,)):
-        said: list[str] = []
-        body = asyncio.create_task(park(low, said))
-        await until(lambda: said)
+        body, said = await parking(low)
         fleet.network.link(fleet.devices, low.mesh).loss = 1.0  # the RC's alone: the RCM goes on
         cut = low.mesh.now()
         await until(lambda: "low parked" in said)
@@ -148,24 +139,14 @@ async def test_a_client_that_hears_nothing_ends_its_body_after_the_hold_lease() 
 async def test_a_leader_that_begins_as_a_body_clears_up_after_its_time_does_not_queue_it_again() -> None:
     async with small_fleet("one") as (fleet, (one,)):
         told: list[str] = []
-        one.watch(lambda arc: told.append(f"{arc.state} {arc.outcome}"))
-
-        async def body() -> None:
-            async with hold(one, "work", {RC: {}}, min_runtime=3, keep=False, direct=True):
-                try:
-                    await asyncio.sleep(3600)
-                finally:
-                    await asyncio.sleep(PARKS)
-
-        task = asyncio.create_task(body())
-        await until(lambda: "running None" in told)
+        one.watch(lambda arc: told.append(arc.state))
+        body, _ = await parking(one, min_runtime=3, keep=False)
         await asyncio.sleep(2.5)
         await fleet.candidates.pop("h0").stop()
         await asyncio.sleep(1)
         fleet.candidate("h1")
         await until(lambda: one.leader == "h1")
-        assert not task.done()
-        await task
+        assert not body.done()
+        await body
         state = await fleet.state()
-        assert (state.queue, state.holds) == ([], [])
-        assert [one for one in told if one.startswith("queued")] == []
+        assert (state.queue, state.holds, "queued" in told) == ([], [], False)

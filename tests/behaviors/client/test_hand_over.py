@@ -48,8 +48,7 @@ async def both_go_on(new: Client, grant: Grant, places: list[tuple[str, Place | 
     granted = await new.granted(runs)
     assert granted is not None
     assert granted > grant
-    assert (await new.command(RC, granted, ECHO)).result == 7
-    assert waits.state == "queued"
+    assert ((await new.command(RC, granted, ECHO)).result, waits.state) == (7, "queued")
 
 
 async def test_all_goes_on_in_another_client_though_its_rc_hears_of_it_late() -> None:

@@ -7,13 +7,12 @@ import logging
 
 import pytest
 
-from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, held, small_fleet
+from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, held, small_fleet, transport_of
 from tests.mesh.kit import until
 from zscout.behaviors.client.confirmation import CONFIRM_TIMEOUT
 from zscout.behaviors.client.request import CommandRefused
 from zscout.scheduling.model import HOLD_BACK
 from zscout.testing.link import Disturbance
-from zscout.testing.memory import MemoryMesh, MemoryTransport
 from zscout.types import SECOND
 
 
@@ -90,14 +89,10 @@ async def test_a_client_that_hears_no_publication_of_an_rcm_that_it_sees_joins_t
 async def test_a_hold_goes_on_under_a_leader_that_does_not_know_who_listens_to_it(whose: str) -> None:
     """Links came back without the subscription of what RCMs publish, long before this one led."""
     async with small_fleet("one") as (fleet, (one,)):
-        arc = await one.request("first", {RC: {}}, min_runtime=600)
-        grant = await one.granted(arc)
+        arc, grant = await held(one, "first")
         next_leader = await fleet.standby()
         listening = one.mesh if whose == "client" else fleet.devices
-        assert isinstance(listening, MemoryMesh)
-        transport = listening._transport.current
-        assert isinstance(transport, MemoryTransport)
-        hidden = [known for known in transport.subscribers.all if known[0] == listening.keys.grants]
+        hidden = [known for known in transport_of(listening).subscribers.all if known[0] == listening.keys.grants]
         assert hidden
         fleet.network.link(listening, next_leader).hidden = {*hidden}
         await fleet.lose_leader()
@@ -113,11 +108,8 @@ async def test_a_leader_that_is_asked_by_whom_it_does_not_see_joins_the_mesh_ane
     hears what is published."""
     async with small_fleet("one", "two") as (fleet, (one, _)):
         arc, _ = await held(one, "first")
-        leader, asking = fleet.leader(), one.mesh
-        assert isinstance(asking, MemoryMesh)
-        before, client = leader._transport.current, asking._transport.current
-        assert isinstance(before, MemoryTransport)
-        assert isinstance(client, MemoryTransport)
+        leader = fleet.leader()
+        before, client = transport_of(leader), transport_of(one.mesh)
         heard = [known for known in client.subscribers.all if known[0] == one.mesh.keys.grants]
         fleet.network.link(one.mesh, leader).hidden = {*client.declarations()} - {*heard}
         before.disconnected(client)

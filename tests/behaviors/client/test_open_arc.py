@@ -89,8 +89,7 @@ def test_words_of_the_rcm(words: list[Notice], state: str, grant: Grant | None, 
     for number, word in enumerate(words):
         known.take(word, NOW + number)
     assert (known.state, known.grant, known.ending) == (state, grant, ending)
-    assert known.open_request(NOW).grant == grant
-    assert known.place == Place(TERM, 1)
+    assert (known.open_request(NOW).grant, known.place) == (grant, Place(TERM, 1))
 
 
 def test_what_meets_a_pattern_is_what_the_newest_hold_says() -> None:
@@ -213,8 +212,7 @@ def test_what_moved_and_is_taken_back_keeps_its_place_and_its_wait(held: bool) -
 
 
 async def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_later() -> None:
-    store = RequestStore(lambda: NOW)
-    known = arc()
+    store, known = RequestStore(lambda: NOW), arc()
     store.add(known)
     store.take(known, RUNS)
     store.resumed.clear()
@@ -254,8 +252,7 @@ async def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_f
 async def test_what_its_rc_does_not_confirm_is_asked_for_again_at_its_place(
     answers: list[str | None], told: Any
 ) -> None:
-    client = Client(mesh(lambda: NOW), default_fleet())
-    known = arc("robot/a")
+    client, known = Client(mesh(lambda: NOW), default_fleet()), arc("robot/a")
     client._store.add(known)
     known.take(runs({}), NOW)
     ended, asked = list[OpenArc](), list[Any]()

@@ -47,12 +47,10 @@ async def test_a_request_is_repeated_while_the_placer_can_not_answer_and_not_whe
 
     placer = FakePlacer(answer)
     client = PlacerClient(placer.client)
-    assert await client.place("counter", JOB) == RUNNING
-    assert len(placer.operations) == 3
+    assert (await client.place("counter", JOB), len(placer.operations)) == (RUNNING, 3)
     with pytest.raises(RequestRefused, match="no") as refused:
         await client.place("counter", JOB)
-    assert refused.value.code == "exists"
-    assert len(placer.operations) == 4
+    assert (refused.value.code, len(placer.operations)) == ("exists", 4)
 
 
 async def test_an_answer_is_waited_for_as_long_as_the_operation_may_wait() -> None:
@@ -63,8 +61,7 @@ async def test_an_answer_is_waited_for_as_long_as_the_operation_may_wait() -> No
 
 
 async def test_a_placer_that_never_answers_is_given_up_after_the_patience() -> None:
-    placer = FakePlacer(lambda _: None)
-    loop = asyncio.get_running_loop()
+    placer, loop = FakePlacer(lambda _: None), asyncio.get_running_loop()
     before = loop.time()
     with pytest.raises(PlacerSilent, match="of fleet test did not answer for 15 s; see zscout status"):
         await PlacerClient(placer.client, timeout=15.0).request(ListPlacements(), Placements)
@@ -91,8 +88,7 @@ async def test_it_follows_what_is_published_and_nothing_of_an_earlier_term() -> 
     placer = FakePlacer(lambda query: query.answer(Placements(Term(2, "rcm"), [RUNNING], ["b"])))
     with PlacerClient(placer.client) as client:
         await client.refresh()
-        assert client.placements == {"counter": RUNNING}
-        assert client.cordoned == {"b"}
+        assert (client.placements, client.cordoned) == ({"counter": RUNNING}, frozenset("b"))
         other = Placement("other", JOB, "waiting")
         placer.publisher.put(Placements(Term(1, "rcm"), [], [], ["counter"]))
         placer.publisher.put(Placements(Term(2, "rcm"), [other]))

@@ -7,7 +7,7 @@ import asyncio
 import pytest
 from msgspec.structs import replace
 
-from tests.behaviors.client.small_fleet import RC, small_fleet
+from tests.behaviors.client.small_fleet import held, small_fleet
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.components.component import SafePointGate
 from zscout.behaviors.components.migration import RESTORE_TIMEOUT, NotMoved, OutgoingMove
@@ -31,6 +31,16 @@ from zscout.types import SECOND
 STANDS_BY = ComponentView("c", 2, "b", ComponentSpec("counter"), "standby")
 
 
+async def carried_out(client: Client) -> None:
+    """The move of "c" to b, which comes to safe points."""
+    gate = SafePointGate()
+    moving = asyncio.ensure_future(OutgoingMove(client, Counter({}), gate, MoveComponent("c", 1, "b", 2)).carry_out())
+    while not moving.done():
+        await gate.come()
+        await asyncio.sleep(0.01)
+    await moving
+
+
 async def test_a_node_that_is_not_linked_yet_is_asked_again() -> None:
     network = MemoryNetwork()
     client = Client(network.open("f", Sender("a", "c.1")), default_fleet())
@@ -51,9 +61,8 @@ async def test_a_node_that_is_not_linked_yet_is_asked_again() -> None:
 async def test_where_the_rcm_refuses_the_hand_over_the_other_one_is_stopped() -> None:
     """An RCM that was replaced may have carried it out: both would act."""
     async with small_fleet("c.1") as (fleet, (client,)):
-        arc = await client.request("work", {RC: {}}, min_runtime=3600)
-        grant = await client.granted(arc)
-        node, gate = fleet.mesh("b", "node"), SafePointGate()
+        arc, grant = await held(client, "work", min_runtime=3600)
+        node = fleet.mesh("b", "node")
         ordered: list[str] = []
 
         def answer(query: IncomingQuery[ComponentOperation]) -> None:
@@ -66,14 +75,8 @@ async def test_where_the_rcm_refuses_the_hand_over_the_other_one_is_stopped() ->
 
         node.serve(node.keys.component("b", node.me), ComponentOperation, answer)
         token = node.alive(Token("b", Role.NODE, "node", "i"))
-        moving = asyncio.ensure_future(
-            OutgoingMove(client, Counter({}), gate, MoveComponent("c", 1, "b", 2)).carry_out()
-        )
-        while not moving.done():
-            await gate.come()
-            await asyncio.sleep(0.01)
         with pytest.raises(NotMoved, match="refused the hand-over"):
-            await moving
+            await carried_out(client)
         assert ordered[-1] == "StopComponent"
         assert (client.paused, arc.state, arc.grant) == (False, "running", grant)
         token.close()
@@ -88,15 +91,9 @@ async def test_a_node_that_was_there_and_is_gone_is_not_waited_for() -> None:
     key = node.keys.component("b", node.me)
     node.serve(key, ComponentOperation, lambda _: dies.append(asyncio.ensure_future(node.close())))
     await asyncio.sleep(1)
-    gate = SafePointGate()
-    move = OutgoingMove(client, Counter({}), gate, MoveComponent("c", 1, "b", 2))
     began = client.mesh.now()
-    moving = asyncio.ensure_future(move.carry_out())
-    while not moving.done():
-        await gate.come()
-        await asyncio.sleep(0.01)
     with pytest.raises(NotMoved, match="b did not answer"):
-        await moving
+        await carried_out(client)
     assert dies
     assert (client.mesh.now() - began) / SECOND < 4
     token.close()
@@ -105,8 +102,7 @@ async def test_a_node_that_was_there_and_is_gone_is_not_waited_for() -> None:
 @pytest.mark.parametrize("lease", [1.0, 3.0])
 async def test_a_successor_counts_as_gone_once_it_was_not_seen_for_longer_than_it_waits_itself(lease: float) -> None:
     """Behind a partition it runs a lease after it lost sight of this one, which is to go on after it."""
-    network = MemoryNetwork()
-    fleet = default_fleet()
+    network, fleet = MemoryNetwork(), default_fleet()
     client = Client(network.open("f", Sender("a", "c.1")), replace(fleet, mesh=replace(fleet.mesh, lease=lease)))
     token = network.open("f", Sender("b", "node")).alive(Token("b", Role.NODE, "node", "i"))
     move = OutgoingMove(client, Counter({}), SafePointGate(), MoveComponent("c", 1, "b", 2))

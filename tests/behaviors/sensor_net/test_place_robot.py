@@ -85,8 +85,7 @@ async def test_who_is_driven_away_as_he_moves_looks_whether_he_is_still_hidden(t
 
         robot = await moved(robot, old, new, drive)
         await asyncio.sleep(25)
-        assert await fleet.arcs("z-watch") == ["running"]
-        assert robot.scout.hider._robot.phase == phase
+        assert (await fleet.arcs("z-watch"), robot.scout.hider._robot.phase) == (["running"], phase)
         await robot.stop()
 
 

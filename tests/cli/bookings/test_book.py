@@ -9,7 +9,6 @@ from zoneinfo import ZoneInfo
 
 import pytest
 
-from tests.cli.tools import zscout_here
 from zscout.cli.bookings.book import Asked
 from zscout.cli.dates import parse_date
 from zscout.config.strict import BadInput
@@ -58,62 +57,8 @@ def test_what_can_not_be_is_refused(at: str, every: int | None, until: str | Non
         asked(at, every, until)
 
 
-def test_hours_that_a_day_has_not_or_twice_are_told() -> None:
-    assert asked("2026-12-01 14:00").remarks() == []
-    [note] = asked("2027-03-28 02:30").remarks()
-    assert note.endswith("03:30 is taken")
-    summer = datetime(2026, 10, 20, 12, 0, tzinfo=BERLIN).timestamp()
-    twice, never = asked("2026-10-21 02:30", 1, now=summer).remarks()
-    assert twice.startswith("2026-10-25 02:30 comes twice in Europe/Berlin")
-    assert never.startswith("2027-03-28 02:30 does not exist")
-
-
 def test_a_year_of_days_is_told_in_a_moment() -> None:
     # In the time that this process ran.
     began = time.process_time()
     asked("2026-12-01 14:00", 1).remarks()
     assert time.process_time() - began < 2
-
-
-AT = ("--for", "1h", "--at", "tue 14:00")
-
-
-@pytest.mark.parametrize(
-    ("args", "why"),
-    [
-        (("book", "robot/a", "--for", "1h"), "Missing option '--at'"),
-        (("book", *AT), "Missing argument 'NEED...'"),
-        (("book", "robot/a", "--for", "1h", "--at", "tue"), '--at: "tue" has no time of day; write "tue 14:00"'),
-        (("book", "robot/a", "--for", "soon", "--at", "9:00"), '--for: "soon" is not a duration'),
-        (("book", "robot/a", "--for", "1h", "--at", "9999-12-31 23:59"), "is more than a year ahead; write an earlier"),
-        (("book", "robot/a", "--for", "1h", "--at", "0001-01-01"), "is long past; write a later one"),
-        (("book", "robot", *AT), 'need "robot": '),
-        (("book", "robot/a", *AT, "--until", "2026-12-24"), "--until is the end of what is repeated"),
-        (("book", "robot/a", *AT, "--every", "month"), '--every: "month" is not from 1 to 366 days'),
-        (("book", "robot/a", *AT, "--patience", "2h"), "--patience: it is over after 1 h"),
-        (("book", "robot/a", *AT, "--zone", "Berlin"), "did you mean Europe/Berlin?"),
-        (("book", "robot/a", "robot/a", *AT), "robot/a is named twice"),
-        (("book", "robot/a", *AT, "--name", "a b"), "--name"),
-        (("maintain", "robot/*", *AT), "robot/* may be any one RC; name those"),
-        (("maintain", "robot/a", "robot/a", *AT), "an RC is named twice"),
-        (("slots", "robot/a", "--for", "1h", "--within", "500d"), "--within: 500 d is not from 1.0 s to 366 d; write"),
-        (("slots", "robot/a", "--for", "1h", "--limit", "0"), "--limit"),
-        (("unbook", "x" * 65), "names no booking"),
-        (("unbook", "x", "--date", "someday"), "--date: "),
-        (("request",), "Missing argument 'NEED...'"),
-        (("request", "--booking", "x", "--min-runtime", "5"), "--min-runtime is not for --booking"),
-        (("request", "--booking", "x", "--release-after", "5"), "--release-after is not for --booking"),
-        (("request", "--booking", "x", "--dry-run"), "--dry-run is not for --booking"),
-        (("take",), "Missing argument 'NEED...'"),
-    ],
-)
-def test_bad_input_is_one_line_and_code_2(
-    args: tuple[str, ...], why: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TZ", "Europe/Berlin")
-    code = zscout_here(*args)
-    said = capsys.readouterr()
-    assert (code, said.out) == (2, "")
-    assert why in said.err
-    assert "after --" not in said.err
-    assert said.err.count("\n") == 1

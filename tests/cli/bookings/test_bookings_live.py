@@ -47,6 +47,7 @@ def told(fleet: CliFleet, *args: str) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.slow
 def test_booked_listed_found_taken_up_and_given_up(fleet: CliFleet) -> None:
     needs = ("robot/a", "framegrabber/*", "radio/rf0:command_rate=5")
     made = said(fleet, "book", *needs, "--for", "2h", "--at", "in 3h", "--name", "survey", "--comment", "visitors")
@@ -97,7 +98,7 @@ def test_booked_listed_found_taken_up_and_given_up(fleet: CliFleet) -> None:
 
 
 def test_at_its_date_it_is_held_and_the_command_runs(fleet: CliFleet) -> None:
-    said(fleet, "book", "robot/b", "--for", "1m", "--at", "in 3s", "--name", "soon")
+    said(fleet, "book", "robot/b", "--for", "1m", "--at", "in 2s", "--name", "soon")
     done = fleet.zscout("request", "--booking", "soon", "--json", "--", "sh", "-c", "exit 7")
     assert done.returncode == 7, done
     events = [json.loads(line) for line in done.stderr.splitlines()]
@@ -134,6 +135,7 @@ def test_a_plain_script_books_and_takes_up(fleet: CliFleet) -> None:
         assert not lab.run(bookings.list(owner="test")).bookings
 
 
+@pytest.mark.slow
 def test_what_is_repeated_is_given_up_date_by_date(fleet: CliFleet) -> None:
     made = said(fleet, "book", "robot/c", "--for", "1h", "--at", "tomorrow 9:00", "--every", "day", "--until", "in 4d")
     assert re.search(r"^c \(", made)

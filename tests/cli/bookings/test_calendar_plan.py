@@ -14,6 +14,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from msgspec import structs
 
+from tests.thorough import times
 from zscout.cli.bookings.calendar import parse_needs
 from zscout.cli.bookings.calendar_file import read_calendar
 from zscout.cli.bookings.calendar_plan import ImportOptions, ImportPlan, Pairs, Wanted, plan_import
@@ -285,7 +286,6 @@ def _record(view: BookingView) -> BookingRecord:
 
 
 @given(st.lists(views(), min_size=1, max_size=3, unique_by=lambda view: view.id))
-@settings(deadline=None)
 def test_what_is_exported_is_booked_at_the_same_dates(told: list[BookingView]) -> None:
     found = plan_import(read_calendar(calendar_text("lab", told), "a"), OTHER, NOW)
     booked = sorted((at, one.book.runtime) for one in found.wanted if one.book is not None for at in left(one))
@@ -310,7 +310,7 @@ def test_what_is_exported_is_booked_at_the_same_dates(told: list[BookingView]) -
     st.sampled_from(["", ";COUNT=40", ";UNTIL=20270820T000000Z"]),
     st.lists(st.integers(0, 120), min_size=1, max_size=12),
 )
-@settings(deadline=None)
+@settings(max_examples=times(30))
 def test_imported_again_and_again_each_date_is_booked_once(rule: str, end: str, pauses: list[int]) -> None:
     """Some days after another; and always for at least half a year, less a day."""
     event = f"DTSTART;TZID=Europe/Berlin:20261105T090000\nDURATION:PT1H\nRRULE:FREQ={rule}{end}"

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from click.testing import CliRunner
 
 from zscout.cli.components.logs import last
 from zscout.cli.components.placing import standing, tail_of, unknown
 from zscout.cli.components.start import gather_params, parse_size
-from zscout.cli.main import main
 from zscout.config.strict import BadInput
 from zscout.messages import ComponentSpec, Placement
 
@@ -52,42 +50,6 @@ def test_bad_parameters(given: str | None, settings: list[str], words: str) -> N
     with pytest.raises(BadInput) as error:
         gather_params(given, settings)
     assert words in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        (["start"], "Missing argument 'KIND'"),
-        (["start", "a/b"], "kind 'a/b' is not valid"),
-        (["start", "counter", "--name", "a b"], "--name 'a b' is not valid"),
-        (["start", "counter", "--name", ""], "--name '' is not valid"),
-        (["start", "k" * 49], "has more than 48 characters; give a shorter --name"),
-        (["start", "counter", "--host", "a*"], "--host 'a*' is not valid"),
-        (["start", "counter", "--label", "a/b"], "--label 'a/b' is not valid"),
-        (["start", "counter", "--memory", "much"], '--memory: "much" is no size'),
-        (["start", "counter", "--memory-limit", "-5"], '--memory-limit: "-5" is no size'),
-        (["start", "counter", "--cpu-limit", "nan"], '--cpu-limit: "nan" is no number of cores'),
-        (["start", "counter", "--cpu-limit", "0"], '--cpu-limit: "0" is no number of cores'),
-        (["start", "counter", "--restart", "maybe"], "'maybe' is not one of"),
-        (["start", "counter", "--timeout", "soon"], '--timeout: "soon" is not a duration'),
-        (["start", "counter", *[f"--label=l{n}" for n in range(33)]], "33 labels; at most 32"),
-        (["start", "counter", *[f"--host=h{n}" for n in range(257)]], "257 hosts; name at most 256"),
-        (["stop"], "Missing argument 'NAME...'"),
-        (["stop", "a/b"], "component 'a/b' is not valid"),
-        (["logs", "*"], "zscout components lists them"),
-        (["logs", "counter", "--lines", "-1"], "-1 is not in the range"),
-        (["migrate", "counter", "--to", "a/b"], "--to 'a/b' is not valid"),
-        (["drain", "*"], "host '*' is not valid"),
-        (["uncordon", ""], "host '' is not valid"),
-        (["components", "--kinds", "--watch"], "leave NAME and --watch out"),
-        (["components", "a b"], "component 'a b' is not valid"),
-    ],
-)
-def test_bad_input_is_one_line_and_2(args: list[str], words: str) -> None:
-    done = CliRunner().invoke(main, args)
-    assert (done.exit_code, done.stdout) == (2, "")
-    assert done.stderr.count("\n") == 1
-    assert words in done.stderr
 
 
 def test_how_a_component_stands_in_words() -> None:

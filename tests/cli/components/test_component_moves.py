@@ -105,6 +105,7 @@ def told(done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.slow
 def test_migrating_keeps_the_count_and_followed_output_goes_along(fleet: CliFleet) -> None:
     here = start(fleet, "wanderer", "--set", "period=0.02", "--set", "rc=robot/a")
     there = OTHER[here]
@@ -138,6 +139,7 @@ def test_migrating_keeps_the_count_and_followed_output_goes_along(fleet: CliFlee
     assert counts[-1] == kept[-1]
 
 
+@pytest.mark.essential
 def test_the_example_of_the_docs_moves_with_its_hold(fleet: CliFleet) -> None:
     done = fleet.zscout("start", "survey", "--set", "robot=robot/a", "--json")
     assert done.returncode == 0, done.stderr
@@ -153,6 +155,7 @@ def test_the_example_of_the_docs_moves_with_its_hold(fleet: CliFleet) -> None:
     assert fleet.idle("robot/a")
 
 
+@pytest.mark.slow
 def test_what_can_not_be_migrated_is_one_line(fleet: CliFleet) -> None:
     here = start(fleet, "stayer")
     assert fleet.zscout("migrate", "stayer", "--to", here).stdout == f"stayer is on {here} already\n"
@@ -174,6 +177,7 @@ def test_what_can_not_be_migrated_is_one_line(fleet: CliFleet) -> None:
     assert ended.stderr.startswith("zscout: stayer was not moved: ")
 
 
+@pytest.mark.slow
 def test_drain_empties_a_host_and_names_what_stays(fleet: CliFleet) -> None:
     hosts = {name: start(fleet, name, "--host", "anvil", "--host", "bellows") for name in ("one", "two")}
     pinned = start(fleet, "pinned", "--host", hosts["one"])
@@ -215,6 +219,7 @@ def numbers(output: str) -> list[int]:
     return [int(line) for line in output.splitlines() if line.isdecimal()]
 
 
+@pytest.mark.slow
 def test_logs_of_what_runs_and_of_what_has_ended(fleet: CliFleet) -> None:
     here = start(fleet, "speaker", "--set", "period=0.01")
     follower = follow(fleet, "speaker", "--lines", "0")
@@ -238,6 +243,7 @@ def test_logs_of_what_runs_and_of_what_has_ended(fleet: CliFleet) -> None:
     assert nobody.stderr.startswith('zscout: no component "nobody" is known; ')
 
 
+@pytest.mark.slow
 def test_followed_output_begins_when_the_component_does(fleet: CliFleet) -> None:
     begun = fleet.zscout("start", "counter", "--name", "later", "--host", "clamp", "--no-wait")
     assert begun.returncode == 0, begun.stderr
@@ -256,6 +262,7 @@ def test_followed_output_begins_when_the_component_does(fleet: CliFleet) -> None
         clamp.wait(HANG)
 
 
+@pytest.mark.slow
 def test_followed_output_goes_over_when_a_host_dies(fleet: CliFleet) -> None:
     clamp = fleet.lab.node("clamp")
     # From now on it is known to the balancer.

@@ -41,6 +41,7 @@ def listed(fleet: CliFleet, *args: str) -> list[dict[str, Any]]:
     return found
 
 
+@pytest.mark.slow
 def test_start_list_and_stop(fleet: CliFleet) -> None:
     started = fleet.zscout("start", "counter", "--set", "period=0.1", "--set", "rc=robot/a")
     assert (started.returncode, started.stderr) == (0, "")
@@ -141,6 +142,7 @@ def test_what_is_done_soon_is_no_failure(fleet: CliFleet) -> None:
     assert followed.stderr.startswith("-- brief has ended")
 
 
+@pytest.mark.slow
 def test_waiting_for_a_host_says_why_and_stays_placed(fleet: CliFleet) -> None:
     late = fleet.zscout("start", "counter", "--name", "picky", "--label", "gpu", "--timeout", "6")
     assert late.returncode == 1
@@ -159,6 +161,7 @@ def test_waiting_for_a_host_says_why_and_stays_placed(fleet: CliFleet) -> None:
     assert fleet.zscout("stop", "picky").returncode == 0
 
 
+@pytest.mark.slow
 def test_at_a_terminal_one_line_goes_along(fleet: CliFleet) -> None:
     with fleet.terminal("start", "counter", "--name", "shown", "--label", "gpu") as terminal:
         terminal.until("shown waits for a host: ")
@@ -184,6 +187,7 @@ def test_kinds(fleet: CliFleet) -> None:
     assert {"counter", "spin"} <= set(host["kinds"])
 
 
+@pytest.mark.slow
 def test_status_names_components_and_cordoned_hosts(fleet: CliFleet) -> None:
     assert fleet.zscout("start", "still", "--name", "seen").returncode == 0
     moved = fleet.zscout("migrate", "seen")
@@ -207,6 +211,7 @@ def test_status_names_components_and_cordoned_hosts(fleet: CliFleet) -> None:
     assert fleet.zscout("stop", "seen").returncode == 0
 
 
+@pytest.mark.slow
 def test_tab_offers_components_hosts_and_kinds(fleet: CliFleet) -> None:
     assert fleet.zscout("start", "counter", "--name", "offered").returncode == 0
 

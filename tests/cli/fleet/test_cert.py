@@ -162,6 +162,7 @@ def test_show_prints_a_line_for_each_and_takes_the_folder_that_the_environment_n
     assert "trusts zscout CA " in lines[2]
 
 
+@pytest.mark.live
 def test_show_is_a_table_at_a_terminal(tmp_path: Path) -> None:
     zscout_here("cert", "ca")
     zscout_here("cert", "issue", "anvil")

@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import json
 import subprocess
-from pathlib import Path
 
 import pytest
 
+from tests.cli.cli_fleet import in_lab
 from tests.cli.tools import Terminal, zscout_soon, zscout_soon_until
 from tests.hang import HANG
 from tests.live.lab import Lab
@@ -30,91 +30,83 @@ from zscout.messages import (
 pytestmark = pytest.mark.live
 
 
-def test_what_is_listed_lives_and_answers(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("anvil", "robot/a", "radio/rf0:rate=10")
-            client = await lab.client("program")
-            state = await lab.ready(client, "robot/a", "radio/rf0")
-            everybody = {
-                ("anvil", "node", "node"), ("anvil", "candidate", "node"), ("anvil", "rcm", "node"),
-                ("anvil", "load", "node"), ("anvil", "rc", "robot/a"), ("anvil", "rc", "radio/rf0"),
-                ("test", "client", "program"), ("anvil", "session", "node"), ("test", "session", "program"),
-            }  # fmt: skip
+@in_lab()
+async def test_what_is_listed_lives_and_answers(lab: Lab) -> None:
+    lab.node("anvil", "robot/a", "radio/rf0:rate=10")
+    client = await lab.client("program")
+    state = await lab.ready(client, "robot/a", "radio/rf0")
+    everybody = {
+        ("anvil", "node", "node"), ("anvil", "candidate", "node"), ("anvil", "rcm", "node"),
+        ("anvil", "load", "node"), ("anvil", "rc", "robot/a"), ("anvil", "rc", "radio/rf0"),
+        ("test", "client", "program"), ("anvil", "session", "node"), ("test", "session", "program"),
+    }  # fmt: skip
 
-            def all_seen(done: subprocess.CompletedProcess[str]) -> bool:
-                alive = json.loads(done.stdout)["alive"] if done.returncode == 0 else []
-                seen = {(one["host"], one["role"], one["name"]): one["keys"] for one in alive}
-                # That one RC does not vote is known from the RCM.
-                known = {len(keys) for (_, role, _), keys in seen.items() if role == "rc"} == {4, 5}
-                return seen.keys() == everybody and known
+    def all_seen(done: subprocess.CompletedProcess[str]) -> bool:
+        alive = json.loads(done.stdout)["alive"] if done.returncode == 0 else []
+        seen = {(one["host"], one["role"], one["name"]): one["keys"] for one in alive}
+        # That one RC does not vote is known from the RCM.
+        known = {len(keys) for (_, role, _), keys in seen.items() if role == "rc"} == {4, 5}
+        return seen.keys() == everybody and known
 
-            shown = json.loads((await zscout_soon_until(all_seen, "keys", "--json", env=lab.env)).stdout)
-            base = f"zscout/{lab.fleet.name}"
-            assert (shown["fleet"], shown["base"]) == (lab.fleet.name, base)
-            assert shown["links"] >= 1
-            alive = {(one["host"], one["role"], one["name"]): one for one in shown["alive"]}
-            assert alive.keys() == everybody
-            rcm = alive["anvil", "rcm", "node"]
-            assert rcm["token"] == f"{base}/alive/anvil/rcm/node/{state.term.rcm}"
-            queries = [key["key"] for key in rcm["keys"] if key["how"] == "query"]
-            assert queries[:2] == [f"{base}/rcm/schedule/*/*", f"{base}/rcm/state"]
-            assert await client.mesh.ask_one(queries[1], StateAsk(), RcmState, timeout=HANG) is not None
-            assert queries[2:] == [f"{base}/rcm/bookings", f"{base}/balancer/rank", f"{base}/placer/component/*/*"]
-            placer = queries[4].replace("*/*", str(client.mesh.me))
-            assert await client.mesh.ask_one(queries[2], BookingsAsk(), BookingsTold, timeout=HANG) is not None
-            assert await client.mesh.ask_one(queries[3], RankAsk(), HostRanking, timeout=HANG) is not None
-            assert await client.mesh.ask_one(placer, ListPlacements(), Placements, timeout=HANG) is not None
-            (host,) = [key["key"] for key in alive["anvil", "node", "node"]["keys"]]
-            assert await client.mesh.ask_one(host, ListComponents(), ComponentList, timeout=HANG) is not None
-            for rc in ("robot/a", "radio/rf0"):
-                served = {key["key"] for key in alive["anvil", "rc", rc]["keys"] if key["how"] == "query"}
-                assert (f"{base}/rc/{rc}/vote" in served) == (rc == "radio/rf0")
-                key = f"{base}/rc/{rc}/state"
-                assert key in served
-                assert await client.mesh.ask_one(key, RcAsk(), RcState, timeout=HANG) is not None
+    shown = json.loads((await zscout_soon_until(all_seen, "keys", "--json", env=lab.env)).stdout)
+    base = f"zscout/{lab.fleet.name}"
+    assert (shown["fleet"], shown["base"]) == (lab.fleet.name, base)
+    assert shown["links"] >= 1
+    alive = {(one["host"], one["role"], one["name"]): one for one in shown["alive"]}
+    assert alive.keys() == everybody
+    rcm = alive["anvil", "rcm", "node"]
+    assert rcm["token"] == f"{base}/alive/anvil/rcm/node/{state.term.rcm}"
+    queries = [key["key"] for key in rcm["keys"] if key["how"] == "query"]
+    assert queries[:2] == [f"{base}/rcm/schedule/*/*", f"{base}/rcm/state"]
+    assert await client.mesh.ask_one(queries[1], StateAsk(), RcmState, timeout=HANG) is not None
+    assert queries[2:] == [f"{base}/rcm/bookings", f"{base}/balancer/rank", f"{base}/placer/component/*/*"]
+    placer = queries[4].replace("*/*", str(client.mesh.me))
+    assert await client.mesh.ask_one(queries[2], BookingsAsk(), BookingsTold, timeout=HANG) is not None
+    assert await client.mesh.ask_one(queries[3], RankAsk(), HostRanking, timeout=HANG) is not None
+    assert await client.mesh.ask_one(placer, ListPlacements(), Placements, timeout=HANG) is not None
+    (host,) = [key["key"] for key in alive["anvil", "node", "node"]["keys"]]
+    assert await client.mesh.ask_one(host, ListComponents(), ComponentList, timeout=HANG) is not None
+    for rc in ("robot/a", "radio/rf0"):
+        served = {key["key"] for key in alive["anvil", "rc", rc]["keys"] if key["how"] == "query"}
+        assert (f"{base}/rc/{rc}/vote" in served) == (rc == "radio/rf0")
+        key = f"{base}/rc/{rc}/state"
+        assert key in served
+        assert await client.mesh.ask_one(key, RcAsk(), RcState, timeout=HANG) is not None
 
-            def the_same(done: subprocess.CompletedProcess[str]) -> bool:
-                lines = [line.split() for line in done.stdout.splitlines()[3:]]
-                listed = {(host, role, name, how, f"{base}/{key}") for host, role, name, how, key, *_ in lines}
-                return {line for line in listed if line[3] != "-"} == {
-                    (*who, key["how"], key["key"]) for who, one in alive.items() for key in one["keys"]
-                }
+    def the_same(done: subprocess.CompletedProcess[str]) -> bool:
+        lines = [line.split() for line in done.stdout.splitlines()[3:]]
+        listed = {(host, role, name, how, f"{base}/{key}") for host, role, name, how, key, *_ in lines}
+        return {line for line in listed if line[3] != "-"} == {
+            (*who, key["how"], key["key"]) for who, one in alive.items() for key in one["keys"]
+        }
 
-            plain = await zscout_soon_until(the_same, "keys", env=lab.env)
-            assert plain.returncode == 0
-
-    asyncio.run(story())
+    plain = await zscout_soon_until(the_same, "keys", env=lab.env)
+    assert plain.returncode == 0
 
 
-def test_at_a_narrow_terminal_every_key_can_be_copied(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            lab.node("anvil", "robot/a-rather-long-name-for-a-robot")
-            client = await lab.client("program")
-            await lab.ready(client, "robot/a-rather-long-name-for-a-robot")
-            keys = ""
-            async with asyncio.timeout(HANG):
-                # It lists what its session sees in a second or two.
-                while "rc/robot/a-rather-long-name-for-a-robot/command/*/*" not in keys:
-                    with Terminal("keys", env=lab.env, columns=80) as terminal:
-                        if await asyncio.to_thread(terminal.code):
-                            continue
-                    lines = terminal.text.splitlines()[1:]
-                    assert max(map(len, lines)) <= 80
-                    assert "…" not in terminal.text
-                    begin = next(line for line in lines if line.startswith("HOST")).index("KEY")
-                    keys = "".join(line[begin:].strip() for line in lines if "HOST" not in line)
-
-    asyncio.run(story())
+@in_lab()
+async def test_at_a_narrow_terminal_every_key_can_be_copied(lab: Lab) -> None:
+    lab.node("anvil", "robot/a-rather-long-name-for-a-robot")
+    client = await lab.client("program")
+    await lab.ready(client, "robot/a-rather-long-name-for-a-robot")
+    keys = ""
+    async with asyncio.timeout(HANG):
+        # It lists what its session sees in a second or two.
+        while "rc/robot/a-rather-long-name-for-a-robot/command/*/*" not in keys:
+            with Terminal("keys", env=lab.env, columns=80) as terminal:
+                if await asyncio.to_thread(terminal.code):
+                    continue
+            lines = terminal.text.splitlines()[1:]
+            assert max(map(len, lines)) <= 80
+            assert "…" not in terminal.text
+            begin = next(line for line in lines if line.startswith("HOST")).index("KEY")
+            keys = "".join(line[begin:].strip() for line in lines if "HOST" not in line)
 
 
-def test_where_nobody_is_it_says_so(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            shown = await zscout_soon("keys", env=lab.env)
-            assert (shown.returncode, shown.stdout) == (3, "")
-            assert "no other program either" in shown.stderr
-            assert len(shown.stderr.splitlines()) == 1
-
-    asyncio.run(story())
+@pytest.mark.slow
+@in_lab()
+async def test_where_nobody_is_it_says_so(lab: Lab) -> None:
+    shown = await zscout_soon("keys", env=lab.env)
+    assert (shown.returncode, shown.stdout) == (3, "")
+    assert "no other program either" in shown.stderr
+    assert len(shown.stderr.splitlines()) == 1

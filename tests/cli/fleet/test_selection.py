@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from decimal import Decimal
+from typing import Any
 
 from zscout.cli.fleet.fleet_view import Host
 from zscout.cli.fleet.selection import Selection
@@ -12,33 +13,17 @@ from zscout.types import Grant, Place, Term
 HOMES = {"robot/a": "anvil", "robot/b": "bellows", "fg/1": "bellows"}
 
 
+def fields(arc: str, client: str, rcs: tuple[str, ...]) -> dict[str, Any]:
+    told = {"arc": arc, "id": f"id-{arc}", "client": client, "needs": {rc: {} for rc in rcs}, "priority": 0}
+    return told | {"min_runtime": Decimal(60), "place": Place(Term(1, "r"), 1)}
+
+
 def hold(arc: str, client: str, *rcs: str) -> HoldView:
-    return HoldView(
-        arc=arc,
-        id=f"id-{arc}",
-        client=client,
-        needs={rc: {} for rc in rcs},
-        priority=0,
-        min_runtime=Decimal(60),
-        held=1.0,
-        remaining=59.0,
-        grant=Grant(Term(1, "r"), 1),
-        place=Place(Term(1, "r"), 1),
-    )
+    return HoldView(**fields(arc, client, rcs), held=1.0, remaining=59.0, grant=Grant(Term(1, "r"), 1))
 
 
 def wait(arc: str, client: str, *rcs: str) -> WaitView:
-    return WaitView(
-        arc=arc,
-        id=f"id-{arc}",
-        client=client,
-        needs={rc: {} for rc in rcs},
-        priority=0,
-        min_runtime=Decimal(60),
-        waited=1.0,
-        reason="",
-        place=Place(Term(1, "r"), 1),
-    )
+    return WaitView(**fields(arc, client, rcs), waited=1.0, reason="")
 
 
 STATE = RcmState(
@@ -93,4 +78,4 @@ def test_a_name_that_nothing_has() -> None:
     assert Selection(["robot/a", "anvil"], STATE, HOMES, {"anvil": Host()}).missing() is None
     missing = Selection(["robot/a", "survy"], STATE, HOMES, {"anvil": Host()}).missing()
     assert missing is not None
-    assert 'no RC, ARC or host "survy" is known; did you mean survey?' in str(missing)
+    assert 'no device, request or host "survy" is known; did you mean survey?' in str(missing)

@@ -10,10 +10,10 @@ def test_the_group_that_goes_first_stands_first() -> None:
     assert [one["group"] for one in found] == ["arms", "bob", "legs"]
     assert shares_table(found).lines() == [
         "Shares",
-        "GROUP  RC-SECONDS  PART    WEIGHT",
-        "arms   1,500       75.0 %  10",
-        "bob    200         10.0 %  1",
-        "legs   300         15.0 %  1",
+        "GROUP  DEVICE-SECONDS  PART    WEIGHT",
+        "arms   1,500           75.0 %  10",
+        "bob    200             10.0 %  1",
+        "legs   300             15.0 %  1",
     ]
 
 

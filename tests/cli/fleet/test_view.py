@@ -21,6 +21,7 @@ from urllib.parse import parse_qs, urlsplit
 import psutil
 import pytest
 
+from tests.cli.cli_fleet import in_lab
 from tests.cli.tools import COMMAND, zscout_here
 from tests.hang import HANG
 from tests.live.lab import Lab
@@ -86,6 +87,7 @@ def descendants(process: subprocess.Popen[bytes]) -> list[psutil.Process]:
     return psutil.Process(process.pid).children(recursive=True)
 
 
+@pytest.mark.live
 def test_the_page_is_served_with_the_recording_and_ctrl_c_ends_all(recording: Path, tmp_path: Path) -> None:
     with viewing(tmp_path, recording, "--web") as process:
         url, stream = page(tmp_path, process)
@@ -118,6 +120,7 @@ def shows_table_2(path: Path) -> bool:
     return False
 
 
+@pytest.mark.live
 def test_as_json_it_says_once_where_all_is(recording: Path, tmp_path: Path) -> None:
     with viewing(tmp_path, recording, "--web", "--json") as process:
         said = said_as_json(tmp_path, process)
@@ -137,6 +140,7 @@ def said_as_json(folder: Path, process: subprocess.Popen[bytes]) -> dict[str, An
     return said
 
 
+@pytest.mark.live
 def test_the_viewer_does_not_outlive_a_command_that_is_killed(recording: Path, tmp_path: Path) -> None:
     with viewing(tmp_path, recording, "--web") as process:
         _, stream = page(tmp_path, process)
@@ -147,6 +151,7 @@ def test_the_viewer_does_not_outlive_a_command_that_is_killed(recording: Path, t
         assert not listens(stream)
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: Path) -> None:
     def shown() -> list[str]:
@@ -193,29 +198,27 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
     asyncio.run(story())
 
 
+@pytest.mark.slow
 @pytest.mark.live
-def test_where_a_node_of_this_host_records_its_recording_is_shown(tmp_path: Path) -> None:
-    async def story() -> None:
-        async with Lab(tmp_path) as lab:
-            port = free_port()
-            lab.node("anvil", "robot/a", extra=f'[recorder]\npath = "runs"\nport = {port}')
-            client = await lab.client("program")
-            await lab.ready(client, "robot/a")
-            await lab.living(client, Role.RECORDER, lambda hosts: hosts == ["anvil"])
-            options = ("--web", "--json", "--out", tmp_path / "out", "--past", "1h")
-            with viewing(tmp_path, *options, env=lab.env) as process:
-                said = await asyncio.to_thread(said_as_json, tmp_path, process)
-                assert said["live"] == f"rerun+http://127.0.0.1:{port}/proxy"
-                assert [Path(said["file"])] == list((tmp_path / "runs").glob("*.rrd"))
-                assert "--past: a node records" in (tmp_path / "view.log").read_text()
-                # No second recorder was started.
-                assert [child.name() for child in descendants(process)] == ["rerun"]
-                assert not (tmp_path / "out").exists()
-                process.send_signal(signal.SIGINT)
-                assert await asyncio.to_thread(process.wait, HANG) == 130
-            assert listens(said["live"])
-
-    asyncio.run(story())
+@in_lab()
+async def test_where_a_node_of_this_host_records_its_recording_is_shown(lab: Lab) -> None:
+    port = free_port()
+    lab.node("anvil", "robot/a", extra=f'[recorder]\npath = "runs"\nport = {port}')
+    client = await lab.client("program")
+    await lab.ready(client, "robot/a")
+    await lab.living(client, Role.RECORDER, lambda hosts: hosts == ["anvil"])
+    options = ("--web", "--json", "--out", lab.folder / "out", "--past", "1h")
+    with viewing(lab.folder, *options, env=lab.env) as process:
+        said = await asyncio.to_thread(said_as_json, lab.folder, process)
+        assert said["live"] == f"rerun+http://127.0.0.1:{port}/proxy"
+        assert [Path(said["file"])] == list((lab.folder / "runs").glob("*.rrd"))
+        assert "--past: a node records" in (lab.folder / "view.log").read_text()
+        # No second recorder was started.
+        assert [child.name() for child in descendants(process)] == ["rerun"]
+        assert not (lab.folder / "out").exists()
+        process.send_signal(signal.SIGINT)
+        assert await asyncio.to_thread(process.wait, HANG) == 130
+    assert listens(said["live"])
 
 
 def test_a_recording_of_another_host_is_not_taken_for_one_of_this_host(tmp_path: Path) -> None:
@@ -238,6 +241,7 @@ def test_a_recording_of_another_host_is_not_taken_for_one_of_this_host(tmp_path:
     assert reached() is None
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_a_live_view_as_json(tmp_path: Path) -> None:
     lab = Lab(tmp_path)
@@ -265,6 +269,7 @@ def test_without_a_display_it_names_web(
         assert "--web" in line
 
 
+@pytest.mark.live
 def test_a_display_that_does_not_answer_is_one_line(recording: Path, tmp_path: Path) -> None:
     env = {key: value for key, value in os.environ.items() if key != "WAYLAND_DISPLAY"}
     with viewing(tmp_path, recording, env=env | {"DISPLAY": "127.0.0.1:4711"}) as process:
@@ -297,6 +302,8 @@ def test_what_can_t_be_opened_or_served_is_one_line_and_code_2(
             assert words in line
 
 
+@pytest.mark.live
+@pytest.mark.slow
 def test_a_live_stream_on_a_taken_port_is_one_line_and_code_2(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import subprocess
 import sys
 import termios
 from collections.abc import Callable
@@ -162,12 +161,3 @@ def test_json_lines_tell_each_state_once(capsys: pytest.CaptureFixture[str]) -> 
     assert all(line["robot"] == "robot/r1" for line in lines)
     assert lines[1]["why"] == "robot/r1 is held"
     assert lines[3]["takeover"] == 0.04
-
-
-@pytest.mark.parametrize("robot", ["r1", "robot/r1"])
-def test_without_a_terminal_nothing_is_driven(robot: str) -> None:
-    done = subprocess.run(
-        [ZSCOUT, "drive", robot], stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 2
-    assert done.stderr.startswith("zscout: zscout drive reads keys: run it at a terminal")

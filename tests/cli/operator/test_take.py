@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import COMMAND, Terminal, by, course, end, events, named, out_of, read_until
+from tests.cli.tools import COMMAND, Terminal, by, course, end, events, held_by, named, out_of, read_until
 from tests.hang import HANG
 
 pytestmark = pytest.mark.live
@@ -52,6 +52,7 @@ def test_anything_but_a_yes_takes_nothing(fleet: CliFleet, answer: str) -> None:
     end(survey)
 
 
+@pytest.mark.slow
 def test_without_a_terminal_it_needs_yes(fleet: CliFleet) -> None:
     survey = fleet.holder("survey", "robot/a")
     refused = fleet.zscout("take", "robot/a", stdin="y\n")
@@ -108,9 +109,9 @@ def test_who_shares_may_stay_and_equals_are_waited_for(fleet: CliFleet) -> None:
 def test_a_take_that_must_wait_says_so_and_then_holds(fleet: CliFleet) -> None:
     peer = fleet.holder("peer", "robot/b", "--priority", "10")
     taker, lines = fleet.begun(
-        f"operator waits for {named('peer')}: robot/b, until ", "take", "robot/b", "--name", "operator", "--", "true"
+        f"operator waits for {held_by('peer')}: robot/b, until ", "take", "robot/b", "--name", "operator", "--", "true"
     )
-    assert any(f"operator waits for {named('peer')}, priority 10, " in line for line in lines)
+    assert any(f"operator waits for {held_by('peer')}, priority 10, " in line for line in lines)
     end(peer)
     read_until(taker, "operator holds robot/b")
     assert taker.wait(HANG) == 0

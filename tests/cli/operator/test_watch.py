@@ -12,14 +12,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from rerun.chunk import RrdReader
 
 from tests.behaviors.perception.scenes import Scene, box_of, overlap
 from tests.cli.tools import COMMAND, Terminal, end, zscout_here
 from tests.drivers.mjpeg import MjpegServer, jpeg
 from tests.hang import HANG
-from zscout.cli.operator.watch import watch as command
 
 RATE = 10.0
 COMES, GOES = 5.0, 7.0
@@ -133,6 +131,8 @@ def camera() -> Iterator[MjpegServer]:
         yield server
 
 
+@pytest.mark.live
+@pytest.mark.slow
 def test_a_camera_that_breaks_off_is_opened_again_and_ctrl_c_ends_with_a_summary(camera: MjpegServer) -> None:
     process = subprocess.Popen(
         [*COMMAND, "watch", "--source", camera.url, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -161,6 +161,8 @@ def test_a_camera_that_breaks_off_is_opened_again_and_ctrl_c_ends_with_a_summary
     assert camera.accepted >= 2
 
 
+@pytest.mark.live
+@pytest.mark.slow
 def test_ctrl_c_does_not_wait_for_a_camera_that_is_silent(camera: MjpegServer) -> None:
     camera.mode = "stall"
     process = subprocess.Popen([*COMMAND, "watch", "--source", camera.url], stdout=subprocess.PIPE, text=True)
@@ -175,15 +177,10 @@ def test_ctrl_c_does_not_wait_for_a_camera_that_is_silent(camera: MjpegServer) -
         end(process)
 
 
+@pytest.mark.live
 def test_at_a_terminal_there_is_a_live_line(video: Path) -> None:
     with Terminal("watch", "--source", video) as terminal:
         terminal.until("motion for")
         terminal.until("9.9 s watched, 100 pictures; 1 event")
         assert terminal.code() == 0
         assert "\x1b[" in terminal.raw
-
-
-def test_help_has_examples() -> None:
-    shown = CliRunner().invoke(command, ["--help"]).output
-    assert "zscout watch --source /dev/video0" in shown
-    assert "--json" in shown

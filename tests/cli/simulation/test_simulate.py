@@ -67,6 +67,7 @@ def simulating(*args: object, env: dict[str, str] | None = None) -> Iterator[tup
         process.stdout.close()
 
 
+@pytest.mark.live
 def test_it_serves_what_it_tells_and_leaves_nothing_behind(closet: Path, tmp_path: Path) -> None:
     link, file = tmp_path / "radio0", tmp_path / "lab.toml"
     how = ("--radio", link, "--node", file, "--speed", 2, "--baud", 1200, "--channels", 2, "--framegrabbers", 3)
@@ -108,6 +109,7 @@ def test_it_ends_by_itself_and_says_how_it_was(closet: Path, capfd: pytest.Captu
     assert "0 packets heard, 0 lost" in said[-1]
 
 
+@pytest.mark.live
 def test_at_a_terminal_a_line_tells_how_it_goes(closet: Path) -> None:
     with Terminal("simulate", closet, "--speed", 2) as terminal:
         terminal.until("scout33")
@@ -116,6 +118,7 @@ def test_at_a_terminal_a_line_tells_how_it_goes(closet: Path) -> None:
         assert terminal.code() == 130
 
 
+@pytest.mark.live
 def test_the_mesh_hears_who_is_where(closet: Path, tmp_path: Path) -> None:
     async def run() -> None:
         async with Lab(tmp_path) as lab:
@@ -167,29 +170,6 @@ def test_the_building_in_the_docs_is_one(tmp_path: Path) -> None:
 
 def test_a_building_is_drawn_by_its_seed() -> None:
     assert plan_named("random:3") != plan_named("random:4")
-
-
-@pytest.mark.parametrize(
-    ("args", "words"),
-    [
-        ((), "which building? name one of living_room, office, random:SEED, or a file"),
-        (("castle",), 'there is no building "castle"; name one of living_room, office'),
-        (("castle.toml",), "castle.toml"),
-        (("random:x",), "write random: and a number"),
-        (("living_room", "--http", "nowhere"), "write HOST:PORT, as in"),
-        (("living_room", "--http", "127.0.0.1:99999"), "write HOST:PORT, as in"),
-        (("living_room", "--radio", "/dev/null"), "/dev/null: is there already; give another name"),
-        (("living_room", "--node", "/no/such/folder/lab.toml"), "can't be written"),
-    ],
-)
-def test_what_cannot_be_served_is_said_in_one_line(
-    args: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert zscout_here("simulate", *args) == 2
-    said = capsys.readouterr()
-    assert words in said.err
-    assert said.err.count("\n") == 1
-    assert said.out == ""
 
 
 def test_a_port_in_use_is_said_so(closet: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from tests.behaviors.components.kit import ROOT
@@ -171,11 +170,9 @@ class RobotLab(Lab):
         await self._stack.enter_async_context(self.building)
         return await super().__aenter__()
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc: object) -> None:
         # The robots are halted while the building still listens.
-        await super().__aexit__(kind, error, trace)
+        await super().__aexit__(*exc)
         await self._stack.aclose()
 
 

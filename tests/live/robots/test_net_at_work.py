@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.hang import HANG
+from tests.live.lab import awaited
 from tests.live.placing import Placing
 from tests.live.robots.lab import RobotLab, comes_true
 from zscout.behaviors.components.sensor_net import PlaceSensorNetComponent
@@ -38,12 +38,10 @@ FIRST = "place_sensor_net-scout33"
 
 async def ended(placing: Placing, host: str) -> None:
     """Waits until no component is left there."""
-    async with asyncio.timeout(HANG):
-        while True:
-            listed = await placing.get(ListComponents(), ComponentList, host)
-            if all(view.phase == "ended" for view in listed.components):
-                return
-            await asyncio.sleep(0.02)
+    await awaited(
+        lambda: placing.get(ListComponents(), ComponentList, host),
+        lambda listed: all(view.phase == "ended" for view in listed.components),
+    )
 
 
 async def test_a_net_at_work(tmp_path: Path) -> None:

@@ -33,7 +33,8 @@ def booking(id: str, start: int, **more: object) -> BookingView:  # noqa: A002 -
 
 def fleet() -> list[BookingView]:
     """One of each kind."""
-    first = at(2026, 12, 1, 13)
+    first, once = at(2026, 12, 1, 13), at(2026, 12, 3, 9)
+    bound = {"framegrabber/*": "framegrabber/f1", "framegrabber/*#2": "framegrabber/f2"}
     needs = {"robot/arm1": {}, "radio/rf0": {"command_rate": Decimal("5.0")}, "framegrabber/*": {}}
     dates = [
         BookedDate(first, first + 7200, "open", {"framegrabber/*": "framegrabber/f1"}),
@@ -53,17 +54,10 @@ def fleet() -> list[BookingView]:
         ),
         booking(
             "once",
-            at(2026, 12, 3, 9),
+            once,
             owner="bellows",
-            needs={"framegrabber/*": {}, "framegrabber/*#2": {}},
-            dates=[
-                BookedDate(
-                    at(2026, 12, 3, 9),
-                    at(2026, 12, 3, 10),
-                    "open",
-                    {"framegrabber/*": "framegrabber/f1", "framegrabber/*#2": "framegrabber/f2"},
-                )
-            ],
+            needs={pattern: {} for pattern in bound},
+            dates=[BookedDate(once, once + 3600, "open", bound)],
             runtime=Decimal("3600.5"),
         ),
         booking("service", at(2026, 12, 4, 6), maintenance=True, runtime=Decimal(2 * 86_400), name="grease"),

@@ -20,7 +20,10 @@ from zscout.messages import BookingRecord, BookingView
 from zscout.services.bookings.calendar_text import calendar_text
 from zscout.services.bookings.dates import dates
 
-pytestmark = pytest.mark.skipif(shutil.which("khal") is None, reason="khal is missing: install the package khal")
+pytestmark = [
+    pytest.mark.live,
+    pytest.mark.skipif(shutil.which("khal") is None, reason="khal is missing: install the package khal"),
+]
 
 CONFIG = """
 [calendars]

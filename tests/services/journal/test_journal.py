@@ -79,17 +79,17 @@ class Told:
         return history
 
 
-async def telling(folder: Path, *hosts: str, rcs: Sequence[str] = ("robot/a",)) -> tuple[Told, *tuple[FakeRc, ...]]:
+async def telling(folder: Path, *hosts: str, rcs: Sequence[str] = ("robot/a",)) -> tuple[Told, list[FakeRc]]:
     """Candidates with journals, the first of which leads, and RCs that it counts as there."""
     told = Told(folder, *hosts)
     found = [told.fleet.rc(rc) for rc in rcs]
     await until(lambda: told.candidates[hosts[0]].rcm)
     await told.fleet.joined(*found)
-    return told, *found
+    return told, found
 
 
 async def test_each_candidate_keeps_who_held_what_and_who_took_it(tmp_path: Path) -> None:
-    told, rc = await telling(tmp_path, "x", "y")
+    told, (rc,) = await telling(tmp_path, "x", "y")
     one, two = told.fleet.client("one"), told.fleet.client("two", "ws2")
     await one.ask("survey", "robot/a", seconds=600, who=Who("alice", "ws1", "./survey.py"))
     await asyncio.sleep(10)
@@ -117,7 +117,7 @@ async def test_each_candidate_keeps_who_held_what_and_who_took_it(tmp_path: Path
 
 
 async def test_a_takeover_loses_nothing_and_a_restart_is_a_gap(tmp_path: Path) -> None:
-    told, *_ = await telling(tmp_path, "x", "y", rcs=["robot/a", "robot/b"])
+    told, _ = await telling(tmp_path, "x", "y", rcs=["robot/a", "robot/b"])
     one = told.fleet.client("one")
     one.open = [
         open_request(await one.ask(arc, need, seconds=600)) for arc, need in (("kept", "robot/a"), ("ends", "robot/b"))
@@ -146,7 +146,7 @@ async def test_a_takeover_loses_nothing_and_a_restart_is_a_gap(tmp_path: Path) -
 
 
 async def test_what_was_heard_is_on_disk_when_a_node_stops(tmp_path: Path) -> None:
-    told, *_ = await telling(tmp_path, "x")
+    told, _ = await telling(tmp_path, "x")
     one = told.fleet.client("one")
     await one.ask("short", "robot/a", seconds=600)
     await one.do(Release("short"))
@@ -198,7 +198,7 @@ async def test_how_long_a_hold_was_used_from_its_commands_to_its_account(tmp_pat
 
 
 async def test_only_an_rc_tells_of_its_own_use_and_only_ends_wake_the_disk(tmp_path: Path) -> None:
-    told, rc, other = await telling(tmp_path, "x", rcs=["robot/a", "robot/b"])
+    told, (rc, other) = await telling(tmp_path, "x", rcs=["robot/a", "robot/b"])
     client = told.fleet.client("one")
     grant = grant_of(await client.ask("survey", "robot/a", "robot/b", seconds=600))
     await told.tells(lambda found: found.holds)
@@ -226,11 +226,9 @@ async def test_only_an_rc_tells_of_its_own_use_and_only_ends_wake_the_disk(tmp_p
     await told.close()
 
 
-async def test_no_flood_of_words_on_use_takes_room_without_bound(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_no_flood_of_words_on_use_takes_unbounded_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(journal_module, "MAX_USES", 20)
-    told, rc = await telling(tmp_path, "x")
+    told, (rc,) = await telling(tmp_path, "x")
     client = told.fleet.client("one")
     grant = grant_of(await client.ask("survey", "robot/a", seconds=600))
     await told.tells(lambda found: found.holds)
@@ -282,11 +280,9 @@ async def test_more_than_can_be_kept_is_a_gap(tmp_path: Path, monkeypatch: pytes
     await told.close()
 
 
-async def test_a_disk_that_fails_stops_nothing_and_is_told_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_failing_disk_stops_nothing_and_is_told_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "x" / FILE).mkdir(parents=True)
-    told, *_ = await telling(tmp_path, "x")
+    told, _ = await telling(tmp_path, "x")
     client = told.fleet.client("one")
     await client.ask("survey", "robot/a", seconds=600)
     await asyncio.sleep(120)

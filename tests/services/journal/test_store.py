@@ -59,17 +59,8 @@ def arcs(store: JournalStore, now: float = NOW, **asked: object) -> list[int]:
 def test_a_hold_is_kept_whole(tmp_path: Path) -> None:
     store = opened(tmp_path)
     by = ReasonParty("id-take", "take", "desk/two", 10, Who("bob"))
-    whole = past(
-        1,
-        NOW - 20,
-        NOW - 10,
-        "preempted",
-        reason="taken",
-        by=by,
-        priority=5,
-        waited=2.5,
-        who=Who("alice", "ws1", "./x"),
-    )
+    how = {"reason": "taken", "by": by, "priority": 5, "waited": 2.5, "who": Who("alice", "ws1", "./x")}
+    whole = past(1, NOW - 20, NOW - 10, "preempted", **how)
     commit(store, HoldSeen(whole), HoldOver(whole))
     answer = store.answer("anvil", HistoryAsk(), NOW)
     assert answer.holds == [whole]
@@ -189,9 +180,9 @@ def test_what_is_too_old_is_forgotten(tmp_path: Path) -> None:
 
 
 def test_the_file_stays_within_its_size(tmp_path: Path) -> None:
-    limit = 1_000_000
+    limit = 700_000
     store = opened(tmp_path, max_size=limit)
-    for burst in range(30):
+    for burst in range(20):
         at = NOW + burst
         commit(
             store,
@@ -201,8 +192,8 @@ def test_the_file_stays_within_its_size(tmp_path: Path) -> None:
         assert store.size() < 1.2 * limit
     assert store.size() <= limit
     assert (tmp_path / FILE).stat().st_size < 1.5 * limit
-    found = store.answer("anvil", HistoryAsk(), NOW + 30)
-    assert found.holds[0].grant.seq == 14_999
+    found = store.answer("anvil", HistoryAsk(), NOW + 20)
+    assert found.holds[0].grant.seq == 9_999
     assert found.since is not None
     assert found.since > NOW
     for _ in range(3):

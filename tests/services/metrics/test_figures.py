@@ -77,9 +77,7 @@ def test_use_counts_what_runs_and_goes_on_growing() -> None:
 
     def use(at: float) -> list[object]:
         found = figures.samples(round(at * SECOND), leading=True)
-        return [
-            found[name][rc,] for name in ("zscout_held_seconds_total", "zscout_holds") for rc in ("robot/a", "radio/r")
-        ]
+        return [found[of][rc,] for of in ("zscout_held_seconds_total", "zscout_holds") for rc in ("robot/a", "radio/r")]
 
     assert use(15) == [5, 8, 1, 2]
     figures.on_over(over(first, 20, Outcome.PREEMPTED))
@@ -104,13 +102,8 @@ def test_labels_have_bounds() -> None:
 
 def test_codes_of_refusals_have_bounds() -> None:
     tally = Tally()
-    for code in (
-        "busy",
-        "busy",
-        "Not a code",
-        "x" * 33,
-        *(f"code_{chr(97 + n // 26)}{chr(97 + n % 26)}" for n in range(90)),
-    ):
+    many = [f"code_{chr(97 + n // 26)}{chr(97 + n % 26)}" for n in range(90)]
+    for code in ("busy", "busy", "Not a code", "x" * 33, *many):
         tally.refuse(code)
     found = tally.refused()
     assert found["busy"] == 2

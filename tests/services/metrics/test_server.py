@@ -16,7 +16,7 @@ from zscout.services.metrics.figures import FAMILIES, Histogram, Samples
 from zscout.services.metrics.server import MetricsServer
 from zscout.services.plain_http import MAX_CONNECTIONS, MAX_HEAD
 
-REAL_TIME = True
+pytestmark = pytest.mark.real_time
 
 
 def everything() -> Samples:

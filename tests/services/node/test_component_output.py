@@ -10,7 +10,7 @@ import pytest
 from zscout.messages import MAX_TAIL
 from zscout.services.node.component_output import BURST, RATE, OutputReader, OutputRing
 
-REAL_TIME = True
+pytestmark = pytest.mark.real_time
 
 
 def test_the_last_bytes_are_kept_with_their_places() -> None:

@@ -18,7 +18,7 @@ from tests.behaviors.components.kit import ROOT, gone
 from tests.hang import HANG
 from zscout.behaviors.components import channel
 from zscout.behaviors.components.channel import EndReport, Order
-from zscout.config.fleet import default_fleet
+from zscout.config.fleet import Fleet, default_fleet
 from zscout.keyexpr import new_instance
 from zscout.mesh import Refused, Supervisor
 from zscout.messages import ComponentSpec, StartComponent, StopComponent
@@ -26,38 +26,36 @@ from zscout.services.node.component_process import ComponentProcess
 from zscout.services.node.limits import ControlGroups
 from zscout.types import SECOND
 
-REAL_TIME = True
-pytestmark = pytest.mark.live
+pytestmark = [pytest.mark.live, pytest.mark.real_time]
+
+
+ODD = "tests.behaviors.components.odd:"
+
+
+def made(
+    folder: Path,
+    spec: ComponentSpec,
+    code: str,
+    fleet: Fleet | None = None,
+    on_end: Callable[[ComponentProcess], None] = lambda _: None,
+) -> ComponentProcess:
+    start, groups = StartComponent("c", 1, spec), ControlGroups(folder)
+    return ComponentProcess("h", fleet or default_fleet(), time.monotonic_ns, groups, start, code, on_end)
 
 
 def play(
-    folder: Path,
-    kind: str,
-    params: dict[str, Any],
-    story: Callable[[ComponentProcess], Awaitable[None]],
-    *,
-    memory_limit: int = 0,
-    cpu_limit: float = 0,
+    folder: Path, kind: str, params: dict[str, Any], story: Callable[[ComponentProcess], Awaitable[None]], **limits: Any
 ) -> ComponentProcess:
     """Runs a kind of `odd.py` as a process on a host without control groups; returns how it ended."""
     fleet = default_fleet()
     mesh = msgspec.structs.replace(fleet.mesh, multicast=False)
     rules = msgspec.structs.replace(fleet, name=f"test-{new_instance()}", mesh=mesh)
-    spec = ComponentSpec(kind, params, memory_limit=memory_limit, cpu_limit=cpu_limit)
+    spec = ComponentSpec(kind, params, **limits)
     ends: list[ComponentProcess] = []
     failures: list[Exception] = []
 
     async def run() -> ComponentProcess:
-        start = StartComponent("c", 1, spec)
-        process = ComponentProcess(
-            "h",
-            rules,
-            time.monotonic_ns,
-            ControlGroups(folder),
-            start,
-            f"tests.behaviors.components.odd:{kind}",
-            ends.append,
-        )
+        process = made(folder, spec, ODD + kind, rules, ends.append)
         process.begin(Supervisor("test", failures.append))
         async with asyncio.timeout(HANG):
             await process.settled.wait()
@@ -116,16 +114,7 @@ def test_who_ends_before_it_has_answered_is_not_waited_for(tmp_path: Path) -> No
 
 async def test_who_is_stopped_before_it_is_ready_ends(tmp_path: Path) -> None:
     fleet = default_fleet()
-    start = StartComponent("c", 1, ComponentSpec("Never"))
-    process = ComponentProcess(
-        "h",
-        fleet,
-        time.monotonic_ns,
-        ControlGroups(tmp_path),
-        start,
-        "tests.behaviors.components.odd:Never",
-        lambda _: None,
-    )
+    process = made(tmp_path, ComponentSpec("Never"), ODD + "Never")
     failures: list[Exception] = []
     process.begin(Supervisor("test", failures.append))
     began = asyncio.get_running_loop().time()
@@ -136,10 +125,7 @@ async def test_who_is_stopped_before_it_is_ready_ends(tmp_path: Path) -> None:
 
 
 async def test_the_last_word_of_who_has_left_counts_though_an_order_to_it_fails(tmp_path: Path) -> None:
-    start, last = StartComponent("c", 1, ComponentSpec("counter")), EndReport("moved")
-    process = ComponentProcess(
-        "h", default_fleet(), time.monotonic_ns, ControlGroups(tmp_path), start, "x:y", lambda _: None
-    )
+    last, process = EndReport("moved"), made(tmp_path, ComponentSpec("counter"), "x:y")
     process._supervisor = Supervisor("test", lambda _: None)
     ours, theirs = socket.socketpair()
     code = (

@@ -27,6 +27,10 @@ def group(folder: Path, of: str, files: Mapping[str, str]) -> Cgroup:
     return Cgroup(folder / "sys", folder / "of")
 
 
+def v1_cpu(quota: int, of: str = "") -> dict[str, str]:
+    return {f"cpu/{of}cpu.cfs_quota_us": f"{quota}\n", f"cpu/{of}cpu.cfs_period_us": "100000\n"}
+
+
 CORES: dict[str, tuple[str, dict[str, str], float | None]] = {
     "v2": ("0::/", {"cpu.max": "150000 100000\n"}, 1.5),
     "v2, no limit": ("0::/", {"cpu.max": "max 100000\n"}, None),
@@ -40,18 +44,11 @@ CORES: dict[str, tuple[str, dict[str, str], float | None]] = {
     "v2, the way is the host's": ("0::/host/only", {"cpu.max": "100000 100000"}, 1.0),
     "v2, the way leads out": ("0::/../x", {"cpu.max": "100000 100000", "x/cpu.max": "1 100000"}, 1.0),
     "v2 beside v1": ("4:cpu:/\n0::/a", {"unified/a/cpu.max": "100000 100000"}, 1.0),
-    "v1": ("1:cpu:/", {"cpu/cpu.cfs_quota_us": "250000\n", "cpu/cpu.cfs_period_us": "100000\n"}, 2.5),
-    "v1, no limit": ("1:cpu:/", {"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000"}, None),
+    "v1": ("1:cpu:/", v1_cpu(250_000), 2.5),
+    "v1, no limit": ("1:cpu:/", v1_cpu(-1), None),
     "v1, nested": (
         "3:cpu,cpuacct:/a/b\n1:name=systemd:/x",
-        {
-            "cpu/cpu.cfs_quota_us": "-1",
-            "cpu/cpu.cfs_period_us": "100000",
-            "cpu/a/cpu.cfs_quota_us": "75000",
-            "cpu/a/cpu.cfs_period_us": "100000",
-            "cpu/a/b/cpu.cfs_quota_us": "90000",
-            "cpu/a/b/cpu.cfs_period_us": "100000",
-        },
+        v1_cpu(-1) | v1_cpu(75_000, "a/") | v1_cpu(90_000, "a/b/"),
         0.75,
     ),
     "nothing there": ("0::/", {}, None),
@@ -68,62 +65,35 @@ def test_cores_of_a_container(tmp_path: Path, of: str, files: dict[str, str], ex
     assert group(tmp_path, of, files).cores() == expected
 
 
+def v2_memory(limit: object, used: object, stat: str = "", of: str = "") -> dict[str, str]:
+    files = {f"{of}memory.max": f"{limit}\n", f"{of}memory.current": f"{used}\n"}
+    return files | ({f"{of}memory.stat": stat} if stat else {})
+
+
+def v1_memory(limit: object, used: object, of: str = "") -> dict[str, str]:
+    return {f"memory/{of}memory.limit_in_bytes": f"{limit}", f"memory/{of}memory.usage_in_bytes": f"{used}"}
+
+
+DROPPED = f"anon 5\ninactive_file {GB}\nactive_file 7\n"
+V1_STAT = {"memory/memory.stat": f"inactive_file 1\ntotal_inactive_file {GB // 2}\n"}
 MEMORY: dict[str, tuple[str, dict[str, str], HostMemory | None]] = {
-    "v2": ("0::/", {"memory.max": f"{4 * GB}\n", "memory.current": f"{GB}\n"}, HostMemory(3 * GB, 4 * GB)),
-    "v2, no limit": ("0::/", {"memory.max": "max\n", "memory.current": f"{GB}"}, None),
-    "v2, files that can be dropped": (
-        "0::/",
-        {
-            "memory.max": f"{4 * GB}",
-            "memory.current": f"{3 * GB}",
-            "memory.stat": f"anon 5\ninactive_file {GB}\nactive_file 7\n",
-        },
-        HostMemory(2 * GB, 4 * GB),
-    ),
+    "v2": ("0::/", v2_memory(4 * GB, GB), HostMemory(3 * GB, 4 * GB)),
+    "v2, no limit": ("0::/", v2_memory("max", GB), None),
+    "v2, files that can be dropped": ("0::/", v2_memory(4 * GB, 3 * GB, DROPPED), HostMemory(2 * GB, 4 * GB)),
     "v2, the wider one is fuller": (
         "0::/a",
-        {
-            "memory.max": f"{8 * GB}",
-            "memory.current": f"{7 * GB}",
-            "a/memory.max": f"{4 * GB}",
-            "a/memory.current": f"{GB}",
-        },
+        v2_memory(8 * GB, 7 * GB) | v2_memory(4 * GB, GB, of="a/"),
         HostMemory(GB, 4 * GB),
     ),
-    "v2, over the limit": ("0::/", {"memory.max": f"{GB}", "memory.current": f"{2 * GB}"}, HostMemory(0, GB)),
-    "v2, a stat that can't be": (
-        "0::/",
-        {"memory.max": f"{GB}", "memory.current": f"{GB}", "memory.stat": f"inactive_file {9 * GB}"},
-        HostMemory(GB, GB),
-    ),
-    "v1": (
-        "4:memory:/",
-        {
-            "memory/memory.limit_in_bytes": f"{2 * GB}",
-            "memory/memory.usage_in_bytes": f"{GB}",
-            "memory/memory.stat": f"inactive_file 1\ntotal_inactive_file {GB // 2}\n",
-        },
-        HostMemory(3 * GB // 2, 2 * GB),
-    ),
-    "v1, no limit": (
-        "4:memory:/",
-        {"memory/memory.limit_in_bytes": NO_V1_LIMIT, "memory/memory.usage_in_bytes": f"{GB}"},
-        None,
-    ),
-    "v1, nested": (
-        "4:memory:/a/b",
-        {
-            "memory/memory.limit_in_bytes": NO_V1_LIMIT,
-            "memory/memory.usage_in_bytes": f"{GB}",
-            "memory/a/b/memory.limit_in_bytes": f"{2 * GB}",
-            "memory/a/b/memory.usage_in_bytes": f"{GB}",
-        },
-        HostMemory(GB, 2 * GB),
-    ),
+    "v2, over the limit": ("0::/", v2_memory(GB, 2 * GB), HostMemory(0, GB)),
+    "v2, a stat that can't be": ("0::/", v2_memory(GB, GB, f"inactive_file {9 * GB}"), HostMemory(GB, GB)),
+    "v1": ("4:memory:/", v1_memory(2 * GB, GB) | V1_STAT, HostMemory(3 * GB // 2, 2 * GB)),
+    "v1, no limit": ("4:memory:/", v1_memory(NO_V1_LIMIT, GB), None),
+    "v1, nested": ("4:memory:/a/b", v1_memory(NO_V1_LIMIT, GB) | v1_memory(2 * GB, GB, "a/b/"), HostMemory(GB, 2 * GB)),
     "nothing there": ("", {}, None),
     "nobody tells of the use": ("0::/", {"memory.max": f"{GB}"}, None),
-    "garbage": ("0::/", {"memory.max": "much", "memory.current": "1"}, None),
-    "less than nothing": ("0::/", {"memory.max": "-1", "memory.current": "1"}, None),
+    "garbage": ("0::/", v2_memory("much", 1), None),
+    "less than nothing": ("0::/", v2_memory(-1, 1), None),
 }
 
 

@@ -30,6 +30,7 @@ def waiting() -> Iterator[subprocess.Popen[bytes]]:
     process.communicate()
 
 
+@pytest.mark.live
 @real
 def test_who_uses_more_than_the_limit_is_killed_and_it_is_known_why(waiting: subprocess.Popen[bytes]) -> None:
     group = ControlGroups().group("test.1", memory=100 * MEGABYTE, cpu=0)
@@ -46,6 +47,7 @@ def test_who_uses_more_than_the_limit_is_killed_and_it_is_known_why(waiting: sub
     assert [folder for folder in folders if folder.exists()] == []
 
 
+@pytest.mark.live
 @real
 def test_who_stays_below_it_is_left_alone_and_a_group_closes_on_who_is_in_it(waiting: subprocess.Popen[bytes]) -> None:
     group = ControlGroups().group("test.2", memory=400 * MEGABYTE, cpu=1.5)
@@ -64,6 +66,7 @@ def test_who_stays_below_it_is_left_alone_and_a_group_closes_on_who_is_in_it(wai
     assert [folder for folder in folders if folder.exists()] == []
 
 
+@pytest.mark.live
 @real
 def test_a_process_gets_the_share_of_a_core_that_it_may_have() -> None:
     group = ControlGroups().group("test.3", memory=0, cpu=0.25)
@@ -79,6 +82,7 @@ def test_a_process_gets_the_share_of_a_core_that_it_may_have() -> None:
     assert 0.1 < float(used) < 0.75
 
 
+@pytest.mark.live
 @real
 def test_what_a_killed_node_left_is_swept_away_and_what_lives_stays() -> None:
     dead = subprocess.Popen(["true"])
@@ -154,6 +158,7 @@ def test_a_group_of_v2_without_a_controller_sets_no_limit(tmp_path: Path) -> Non
     assert (group.memory_set, group.cpu_set) == (False, False)
 
 
+@pytest.mark.live
 def test_memory_is_limited_by_the_process_itself_where_no_group_does_it() -> None:
     code = (
         "from zscout.behaviors.components.processes import limit_allocations\n"
@@ -166,6 +171,7 @@ def test_memory_is_limited_by_the_process_itself_where_no_group_does_it() -> Non
     assert done.stdout == "refused\n"
 
 
+@pytest.mark.live
 def test_a_family_is_killed_whatever_groups_it_is_in() -> None:
     tag = f"t-{os.getpid()}-1"  # no other suite's on this machine
     code = (

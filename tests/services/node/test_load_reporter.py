@@ -41,21 +41,13 @@ class Proc:
     at: float = 100.0
 
     def process(
-        self,
-        pid: int,
-        parent: int,
-        *,
-        cpu: float = 0.0,
-        waited_for: float = 0.0,
-        pages: int = 1,
-        state: str = "S",
-        name: str = "python",
+        self, pid: int, parent: int, cpu: float = 0, reaped: float = 0, pages: int = 1, state: str = "S", of: str = "a"
     ) -> None:
-        """`cpu` in seconds, `waited_for` that of children that have ended."""
-        mine, theirs = round(cpu / TICK), round(waited_for / TICK)
+        """Of a program: `cpu` in seconds, `reaped` that of children that have ended and were waited for."""
+        mine, theirs = round(cpu / TICK), round(reaped / TICK)
         start = round(90 / TICK)
         times = f"{mine} 0 {theirs} 0 20 0 1 0 {start}"
-        stat = f"{pid} ({name}) {state} {parent} 1 1 0 -1 0 0 0 0 0 {times} 9 {pages} 7"
+        stat = f"{pid} ({of}) {state} {parent} 1 1 0 -1 0 0 0 0 0 {times} 9 {pages} 7"
         (self.folder / str(pid)).mkdir(exist_ok=True)
         (self.folder / str(pid) / "stat").write_text(stat + " 0" * 20)
 
@@ -78,7 +70,7 @@ def proc(tmp_path: Path) -> Proc:
 
 def test_a_tree_is_summed_up_and_nothing_else(proc: Proc) -> None:
     proc.process(10, 1, cpu=1.0, pages=10)
-    proc.process(11, 10, cpu=2.0, pages=20, name="a) S 1 (b c")
+    proc.process(11, 10, cpu=2.0, pages=20, of="a) S 1 (b c")
     proc.process(12, 11, cpu=2.0, pages=30)
     proc.process(20, 1, cpu=50.0, pages=500)
     (use,) = proc.meter(10).measure()
@@ -93,7 +85,7 @@ def test_cpu_is_that_since_the_last_look_with_children_that_ended_meanwhile(proc
     meter.measure()
     proc.at += 2
     (proc.folder / "11" / "stat").unlink()
-    proc.process(10, 1, cpu=1.5, waited_for=3.5)
+    proc.process(10, 1, cpu=1.5, reaped=3.5)
     (use,) = meter.measure()
     assert (use.cpu, use.processes) == (0.5, 1)
     # A child that found another parent takes its time with it; that is no use below nothing.
@@ -139,18 +131,6 @@ def test_there_is_a_limit_to_components(proc: Proc) -> None:
     listed = [RunningComponent(f"c{i}", "camera", 1, 10) for i in range(messages.MAX_COMPONENTS + 5)]
     meter = UseMeter(lambda: listed, proc=proc.folder, now=lambda: proc.at)
     assert len(meter.measure()) == messages.MAX_COMPONENTS
-
-
-@pytest.fixture
-def started() -> Iterator[list[subprocess.Popen[str]]]:
-    """Processes that are gone afterwards, with their children."""
-    processes: list[subprocess.Popen[str]] = []
-    yield processes
-    for process in processes:
-        for child in psutil.Process(process.pid).children(recursive=True):
-            child.kill()
-        process.kill()
-        process.communicate()
 
 
 def start(processes: list[subprocess.Popen[str]], program: str, core: int | None = None) -> int:
@@ -204,6 +184,7 @@ def compute(pid: int, seconds: float) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.live
 def test_a_real_tree_is_what_psutil_says(started: list[subprocess.Popen[str]]) -> None:
     pid = start(started, PARENT)
     meter = UseMeter(lambda: [RunningComponent("one", "spinner", 3, pid)])
@@ -220,6 +201,7 @@ def test_a_real_tree_is_what_psutil_says(started: list[subprocess.Popen[str]]) -
     assert (use.component, use.kind, use.incarnation) == ("one", "spinner", 3)
 
 
+@pytest.mark.live
 @pytest.mark.skipif(not Path("/proc/self/schedstat").exists(), reason="the system does not tell")
 def test_two_that_share_a_core_have_at_most_half_of_it(started: list[subprocess.Popen[str]]) -> None:
     pid = start(started, PAIR, core=min(os.sched_getaffinity(0)))
@@ -233,6 +215,7 @@ def test_two_that_share_a_core_have_at_most_half_of_it(started: list[subprocess.
     assert 0 < use.served < 0.6
 
 
+@pytest.mark.live
 def test_the_report_of_this_host_is_all_that_the_balancer_knows(started: list[subprocess.Popen[str]]) -> None:
     pid = start(started, PARENT)
     gauge = Gauge("anvil", ("gpu", "arm64"), lambda: [RunningComponent("anvil/one", "spinner", 2, pid)])

@@ -64,9 +64,7 @@ def test_what_somebody_takes_is_given_to_it_once(files: Files) -> None:
     assert given == [4]
 
 
-def test_what_nobody_takes_waits_for_a_restart_and_is_named_until_then(
-    files: Files, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_nobody_takes_waits_for_a_restart_and_is_told(files: Files, caplog: pytest.LogCaptureFixture) -> None:
     files.reload.takes("components", lambda _node: None)
     node = NODE.replace("max = 3", "max = 4").replace("robot/a", "robot/b")
     fleet = FLEET.replace("1.5", "2.0") + 'bellows = ["robot/c"]\n[limits]\nmax_runtime = 60\n'

@@ -58,11 +58,11 @@ def test_a_child_that_ended_is_counted_once_before_and_after_it_is_waited_for(pr
     assert meter.measure().cores == 0.5
     proc.at += 1
     (proc.folder / "11" / "stat").unlink()
-    proc.process(10, 1, cpu=1.25, waited_for=100.5)
+    proc.process(10, 1, cpu=1.25, reaped=100.5)
     assert meter.measure().cores == 0.25
     # Time that comes from nowhere is no more than the processors could give.
     proc.at += 1
-    proc.process(10, 1, cpu=1.25, waited_for=900.0)
+    proc.process(10, 1, cpu=1.25, reaped=900.0)
     assert meter.measure().cores == os.cpu_count()
     proc.at += 1
     proc.process(10, 1, cpu=1.25)
@@ -118,30 +118,24 @@ def test_averages_fade_as_the_kernels_do() -> None:
     assert faded(averages, 0.0, 3_600.0)[0] < 1e-9
 
 
-def test_a_real_tree_reports_itself_alone() -> None:
-    processes: list[subprocess.Popen[str]] = []
-    try:
-        pid = start(processes, PARENT)
-        cores = Bounds(pid)
-        with cores.look():
-            gauge = Gauge("anvil", load=TreeLoad(pid))
-        compute(pid, 0.6)
-        with cores.look():
-            report = gauge.report()
-        assert cores.least <= report.cpu * report.cores / 100 <= cores.most
-        assert report.load_average[0] > 0
-        tree = [psutil.Process(pid), *psutil.Process(pid).children()]
-        memory = sum(one.memory_info().rss for one in tree)
-        assert report.memory_total - report.memory_available == pytest.approx(memory, rel=0.05)
-    finally:
-        for process in processes:
-            for child in psutil.Process(process.pid).children(recursive=True):
-                child.kill()
-            process.kill()
-            process.communicate()
+@pytest.mark.live
+def test_a_real_tree_reports_itself_alone(started: list[subprocess.Popen[str]]) -> None:
+    pid = start(started, PARENT)
+    cores = Bounds(pid)
+    with cores.look():
+        gauge = Gauge("anvil", load=TreeLoad(pid))
+    compute(pid, 0.6)
+    with cores.look():
+        report = gauge.report()
+    assert cores.least <= report.cpu * report.cores / 100 <= cores.most
+    assert report.load_average[0] > 0
+    tree = [psutil.Process(pid), *psutil.Process(pid).children()]
+    memory = sum(one.memory_info().rss for one in tree)
+    assert report.memory_total - report.memory_available == pytest.approx(memory, rel=0.05)
 
 
 @pytest.mark.live
+@pytest.mark.slow
 def test_of_two_nodes_on_a_machine_each_reports_its_own(tmp_path: Path) -> None:
     asyncio.run(_each_its_own(tmp_path))
 

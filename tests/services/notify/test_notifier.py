@@ -22,7 +22,7 @@ from zscout.services.notify.notices import Notification
 from zscout.services.notify.notifier import QUEUE, Notifier
 from zscout.types import SECOND
 
-REAL_TIME = True
+pytestmark = [pytest.mark.live, pytest.mark.real_time]
 
 WHERE = Where("anvil.toml", ("notify",))
 NEWS = Notification("preempted", "ada", "a title", "a body")
@@ -37,6 +37,7 @@ def started(made: Notifier) -> Notifier:
     return made
 
 
+@pytest.mark.slow
 async def test_it_arrives_as_text_at_the_urls_and_at_the_user_concerned() -> None:
     with Receiver() as lab, Receiver() as ada, Receiver() as bob:
         table = NotifyTable((lab.url,), ("yours_now",), {"ada": (ada.url,), "bob": (bob.url,)}, after=SECOND)
@@ -77,6 +78,7 @@ async def test_what_is_refused_is_tried_again() -> None:
         assert lab.asked == 3
 
 
+@pytest.mark.slow
 async def test_who_can_not_be_reached_is_logged_once_without_its_url_and_holds_up_nobody(
     caplog: pytest.LogCaptureFixture,
 ) -> None:

@@ -153,14 +153,8 @@ class PlacerFleet(MemoryFleet):
         return self.place(inherited)
 
     def place(self, inherited: Inherited | None = None) -> ComponentPlacer:
-        placer = ComponentPlacer(
-            self.leader,
-            default_fleet(),
-            Term(1, "rcm"),
-            self.balancer,
-            inherited or Inherited(()),
-            self.failures.append,
-        )
+        kept, term = inherited or Inherited(()), Term(1, "rcm")
+        placer = ComponentPlacer(self.leader, default_fleet(), term, self.balancer, kept, self.failures.append)
         placer.start()
         return placer
 
@@ -169,3 +163,14 @@ class PlacerFleet(MemoryFleet):
         keys = self.watcher.keys
         key = keys.rank if isinstance(operation, RankAsk) else keys.placer(self.watcher.me)
         return await answer(self.watcher, key, operation, kind, timeout)
+
+
+async def placing(*hosts: str) -> PlacerFleet:
+    """With a placer, once all hosts have reported."""
+    fleet = PlacerFleet(*hosts)
+    await fleet.lead()
+    return fleet
+
+
+def fail(*_: Any, **__: Any) -> None:
+    raise RuntimeError("a fault of the core")

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
 
 import pytest
 
 from tests.mesh.kit import until
 from tests.services.kit import Refusal
-from tests.services.placement.kit import JOB, PlacerFleet
+from tests.services.placement.kit import JOB, PlacerFleet, fail, placing
 from zscout.messages import (
     ComponentSpec,
     DrainHost,
@@ -28,8 +27,7 @@ from zscout.services.placement import component_placer, request_handler
 
 
 async def test_a_component_is_placed_moved_and_stopped_and_each_change_is_published() -> None:
-    fleet = PlacerFleet("a", "b")
-    placer = await fleet.lead()
+    fleet = await placing("a", "b")
     placed = await fleet.ask(PlaceComponent("counter", JOB), Placement)
     assert (placed.state, placed.incarnation) == ("running", 1001)
     source = fleet.nodes[placed.host or ""]
@@ -45,13 +43,11 @@ async def test_a_component_is_placed_moved_and_stopped_and_each_change_is_publis
     assert fleet.states("counter") == ["starting", "running", "moving", "running", "stopping", "ended"]
     listed = await fleet.ask(ListPlacements(), Placements)
     assert [one.component for one in listed.components] == ["counter"]
-    placer.stop()
     assert fleet.failures == []
 
 
 async def test_what_ends_is_started_again_and_what_a_lost_host_had_is_started_elsewhere() -> None:
-    fleet = PlacerFleet("a", "b")
-    placer = await fleet.lead()
+    fleet = await placing("a", "b")
     placed = await fleet.ask(PlaceComponent("counter", JOB), Placement)
     fleet.nodes[placed.host or ""].end("counter", placed.incarnation, "failed", "it broke")
     await until(lambda: fleet.published[-1].state == "running" and fleet.published[-1].restarts == 1)
@@ -59,14 +55,13 @@ async def test_what_ends_is_started_again_and_what_a_lost_host_had_is_started_el
     fleet.network.kill(fleet.nodes[again.host or ""].mesh)
     await until(lambda: fleet.published[-1].state == "running" and fleet.published[-1].host != again.host)
     assert fleet.published[-1].incarnation > again.incarnation
-    placer.stop()
 
 
 async def test_requests_wait_until_all_nodes_have_listed_what_runs_there_and_a_bad_one_is_refused_at_once() -> None:
     fleet = PlacerFleet("a", "b")
     fleet.nodes["b"].silent = True
     fleet.nodes["a"].run("counter", 7)
-    placer = await fleet.lead()
+    await fleet.lead()
     loop = asyncio.get_running_loop()
     asked_at = loop.time()
     early = asyncio.create_task(fleet.ask(PlaceComponent("counter", JOB), Placement))
@@ -80,13 +75,12 @@ async def test_requests_wait_until_all_nodes_have_listed_what_runs_there_and_a_b
     assert loop.time() >= asked_at + component_placer.BEGIN - 0.1
     lists = [one for one in fleet.nodes["b"].commands if isinstance(one, ListComponents)]
     assert len(lists) > 1
-    placer.stop()
 
 
 async def test_a_request_is_answered_with_how_it_stands_when_its_wait_is_over() -> None:
     fleet = PlacerFleet("a")
     fleet.nodes["a"].refuses["StopComponent"] = "busy"
-    placer = await fleet.lead()
+    await fleet.lead()
     loop = asyncio.get_running_loop()
     await fleet.ask(PlaceComponent("counter", JOB), Placement)
     before = loop.time()
@@ -95,12 +89,10 @@ async def test_a_request_is_answered_with_how_it_stands_when_its_wait_is_over() 
     assert 3.0 <= loop.time() - before < 3.1
     fleet.nodes["a"].refuses.clear()
     assert (await fleet.ask(EndComponent("counter"), Placement)).state == "ended"
-    placer.stop()
 
 
 async def test_what_the_core_refuses_is_answered_with_its_code() -> None:
-    fleet = PlacerFleet("a")
-    placer = await fleet.lead()
+    fleet = await placing("a")
     await fleet.ask(PlaceComponent("counter", JOB), Placement)
     for operation, code in (
         (PlaceComponent("counter", ComponentSpec("other")), "exists"),
@@ -111,12 +103,10 @@ async def test_what_the_core_refuses_is_answered_with_its_code() -> None:
         with pytest.raises(Refusal) as refusal:
             await fleet.ask(operation, Placement)
         assert refusal.value.code == code
-    placer.stop()
 
 
 async def test_a_drained_host_is_emptied_and_used_again_when_it_is_uncordoned() -> None:
-    fleet = PlacerFleet("a", "b")
-    placer = await fleet.lead()
+    fleet = await placing("a", "b")
     placed = await fleet.ask(PlaceComponent("counter", JOB), Placement)
     host = placed.host or ""
     answer = await fleet.ask(DrainHost(host), Placements)
@@ -124,18 +114,15 @@ async def test_a_drained_host_is_emptied_and_used_again_when_it_is_uncordoned() 
     await until(lambda: fleet.nodes[host].running == [] and fleet.published[-1].state == "running")
     assert fleet.published[-1].host != host
     assert (await fleet.ask(UncordonHost(host), Placements)).cordoned == []
-    placer.stop()
 
 
 async def test_a_move_that_the_component_refuses_is_refused_and_it_stays() -> None:
-    fleet = PlacerFleet("a", "b")
-    placer = await fleet.lead()
+    fleet = await placing("a", "b")
     placed = await fleet.ask(PlaceComponent("counter", JOB), Placement)
     fleet.nodes[placed.host or ""].refuses["MoveComponent"] = "not_safe"
     with pytest.raises(Refusal, match=r"move_failed: it did not move to .*: not_safe here"):
         await fleet.ask(MigrateComponent("counter"), Placement)
     assert fleet.nodes[placed.host or ""].running == ["counter"]
-    placer.stop()
 
 
 async def test_too_many_requests_are_refused_as_busy(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,53 +144,39 @@ async def test_too_many_requests_are_refused_as_busy(monkeypatch: pytest.MonkeyP
 async def test_a_core_that_raises_fails_the_placer_once_and_it_does_nothing_more(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    fleet = PlacerFleet("a")
-    placer = await fleet.lead()
+    fleet = await placing("a")
     await fleet.ask(PlaceComponent("counter", JOB), Placement)
-
-    def handle(*_: Any) -> None:
-        raise RuntimeError("a fault of the core")
-
-    monkeypatch.setattr(Placer, "handle", handle)
+    monkeypatch.setattr(Placer, "handle", fail)
     with pytest.raises(Refusal, match="internal"):
         await fleet.ask(PlaceComponent("other", JOB), Placement)
     fleet.nodes["a"].end("counter", 1001)
     await asyncio.sleep(30)
     assert [str(error) for error in fleet.failures] == ["a fault of the core"]
     assert "the component placer failed" in caplog.text
-    placer.stop()
 
 
 async def test_an_answer_that_makes_the_core_raise_fails_the_placer(monkeypatch: pytest.MonkeyPatch) -> None:
-    fleet = PlacerFleet("a")
-    placer = await fleet.lead()
-
-    def enter(*_: Any) -> None:
-        raise ValueError("counter: from running to starting")
-
+    fleet = await placing("a")
     await fleet.ask(ListPlacements(), Placements)
-    monkeypatch.setattr("zscout.placement.lifecycle.Lifecycle.start_answered", enter)
+    monkeypatch.setattr("zscout.placement.lifecycle.Lifecycle.start_answered", fail)
     await fleet.ask(PlaceComponent("counter", JOB), Placement)
     await until(lambda: fleet.failures)
-    assert [str(error) for error in fleet.failures] == ["counter: from running to starting"]
-    placer.stop()
+    assert [str(error) for error in fleet.failures] == ["a fault of the core"]
 
 
 async def test_what_no_host_can_start_is_given_up_with_the_hosts_reasons() -> None:
     fleet = PlacerFleet("a", "b")
     for node in fleet.nodes.values():
         node.refuses["StartComponent"] = "unknown_kind"
-    placer = await fleet.lead()
+    await fleet.lead()
     given_up = await fleet.ask(PlaceComponent("counter", JOB), Placement)
     assert given_up.state == "given_up"
     assert "a refused it: unknown_kind here" in given_up.reason
     assert "b refused it: unknown_kind here" in given_up.reason
-    placer.stop()
 
 
 async def test_a_start_without_an_answer_is_repeated_under_the_same_incarnation() -> None:
-    fleet = PlacerFleet("a")
-    placer = await fleet.lead()
+    fleet = await placing("a")
     await fleet.ask(ListPlacements(), Placements)
     node = fleet.nodes["a"]
     node.silent = True
@@ -215,5 +188,4 @@ async def test_a_start_without_an_answer_is_repeated_under_the_same_incarnation(
     starts = [one for one in node.commands if isinstance(one, StartComponent)]
     assert len(starts) > 1
     assert {one.incarnation for one in starts} == {1001}
-    placer.stop()
     assert fleet.failures == []

@@ -14,7 +14,7 @@ from zscout.services.placement.ledger import PlacementLedger
 
 async def test_a_ledger_that_comes_late_catches_up_and_keeps_what_it_has_when_its_candidate_stands_again() -> None:
     fleet = PlacerFleet("a", "b")
-    placer = await fleet.lead()
+    await fleet.lead()
     leads = fleet.leader.alive(Token("leader", Role.RCM, "rcm", "i1"))
     await fleet.ask(PlaceComponent("first", JOB), Placement)
     await fleet.ask(DrainHost("b"), Placements)
@@ -37,7 +37,6 @@ async def test_a_ledger_that_comes_late_catches_up_and_keeps_what_it_has_when_it
     await until(lambda: sorted(one.restarts for one in ledger.inherited().components) == [0, 1])
     ledger.stop()
     leads.close()
-    placer.stop()
     assert fleet.failures == []
 
 
@@ -54,9 +53,7 @@ async def test_the_next_placer_carries_on_what_was_published() -> None:
     await until(lambda: len(fleet.balancer.core.reports) == 1)
     [survivor] = fleet.nodes.values()
     survivor.report()
-    heir = fleet.place(ledger.inherited())
+    fleet.place(ledger.inherited())
     await until(lambda: fleet.published[-1].state == "running" and fleet.published[-1].host != placed.host)
     assert fleet.published[-1].component == "counter"
-    heir.stop()
-    ledger.stop()
     assert fleet.failures == []

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
 
 import pytest
 
 from tests.mesh.kit import until
 from tests.services.kit import Refusal
-from tests.services.placement.kit import PlacerFleet
+from tests.services.placement.kit import PlacerFleet, fail
 from tests.services.rcm.kit import FakeFleet
 from zscout.keyexpr import Role, Token
 from zscout.messages import HostRanking, RankAsk
@@ -17,15 +16,14 @@ from zscout.placement.balancer import Balancer
 from zscout.services.placement.load_balancer import READ_EVERY, LoadBalancer
 
 
-async def balancing(*hosts: str) -> tuple[PlacerFleet, LoadBalancer]:
-    fleet = PlacerFleet(*hosts)
-    placer = await fleet.lead()
-    placer.stop()
+async def balancing() -> tuple[PlacerFleet, LoadBalancer]:
+    fleet = PlacerFleet("a", "b")
+    (await fleet.lead()).stop()
     return fleet, fleet.balancer
 
 
 async def test_hosts_are_ranked_by_their_reports() -> None:
-    fleet, balancer = await balancing("a", "b")
+    fleet, _ = await balancing()
     fleet.nodes["a"].report(3.0)
     fleet.nodes["b"].report(1.0, labels=("gpu",))
     await asyncio.sleep(2 * READ_EVERY)
@@ -36,12 +34,11 @@ async def test_hosts_are_ranked_by_their_reports() -> None:
     assert ranking.left_out == {"a": "it has no label gpu"}
     with pytest.raises(Refusal, match="bad_name"):
         await fleet.ask(RankAsk(hosts=["no host"]), HostRanking)
-    balancer.stop()
     assert fleet.failures == []
 
 
 async def test_the_reports_are_told_with_their_age_where_they_are_asked_for() -> None:
-    fleet, balancer = await balancing("a", "b")
+    fleet, _ = await balancing()
     fleet.nodes["a"].report(3.0)
     await asyncio.sleep(2 * READ_EVERY)
     assert (await fleet.ask(RankAsk(), HostRanking)).reports is None
@@ -55,38 +52,31 @@ async def test_the_reports_are_told_with_their_age_where_they_are_asked_for() ->
     (known,) = some
     assert known.report.host == "a"
     assert 1.0 <= known.age <= 1.0 + 3 * READ_EVERY
-    balancer.stop()
 
 
 async def test_a_report_is_believed_of_the_host_in_whose_key_it_stands() -> None:
-    fleet, balancer = await balancing("a", "b")
+    fleet, balancer = await balancing()
     number = balancer.core.reports["a"][1].number
     fleet.nodes["a"].report(of="b")
     fleet.nodes["a"].report(-1.0)
     await asyncio.sleep(2 * READ_EVERY)
     assert balancer.core.reports["a"][1].number == number
     assert balancer.core.reports["b"][1].host == "b"
-    balancer.stop()
     assert fleet.failures == []
 
 
 async def test_a_report_from_before_its_host_was_lost_does_not_bring_it_back() -> None:
-    fleet, balancer = await balancing("a", "b")
+    fleet, balancer = await balancing()
     fleet.nodes["a"].report()
     fleet.network.kill(fleet.nodes["a"].mesh)
     await until(lambda: "a" not in balancer.core.reports)
     await asyncio.sleep(2 * READ_EVERY)
     assert list(balancer.core.reports) == ["b"]
-    balancer.stop()
 
 
 @pytest.mark.parametrize("method", ["reported", "rank", "lost"])
 async def test_a_core_that_raises_fails_the_balancer_once(method: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    fleet, balancer = await balancing("a", "b")
-
-    def fail(*_: Any, **__: Any) -> None:
-        raise RuntimeError("a fault of the core")
-
+    fleet, _ = await balancing()
     monkeypatch.setattr(Balancer, method, fail)
     if method == "rank":
         with pytest.raises(Refusal, match="internal"):
@@ -96,7 +86,6 @@ async def test_a_core_that_raises_fails_the_balancer_once(method: str, monkeypat
         fleet.nodes["b"].report()
         await asyncio.sleep(2 * READ_EVERY)
     assert [str(error) for error in fleet.failures] == ["a fault of the core"]
-    balancer.stop()
 
 
 @pytest.mark.parametrize("method", ["zscout.placement.balancer.Balancer.rank", "zscout.placement.placer.Placer.handle"])
@@ -108,10 +97,6 @@ async def test_a_candidate_whose_balancer_or_placer_fails_steps_down_and_leads_a
     await until(lambda: candidate.rcm)
     assert candidate.rcm is not None
     term = candidate.rcm.term
-
-    def fail(*_: Any, **__: Any) -> None:
-        raise RuntimeError("a fault of the core")
-
     with monkeypatch.context() as patched:
         patched.setattr(method, fail)
         keys = fleet.watcher.keys
@@ -122,4 +107,3 @@ async def test_a_candidate_whose_balancer_or_placer_fails_steps_down_and_leads_a
     await until(lambda: candidate.rcm)
     assert candidate.rcm is not None
     assert candidate.rcm.term > term
-    await candidate.stop()

@@ -104,10 +104,10 @@ async def led(fleet: BookedFleet, *hosts: str) -> list[Candidate]:
     return candidates
 
 
-async def booked(*hosts: str) -> tuple[BookedFleet, *tuple[Candidate, ...]]:
+async def booked(*hosts: str) -> tuple[BookedFleet, list[Candidate]]:
     """A fleet that all these hosts may lead, and one does."""
     fleet = BookedFleet(*hosts)
-    return fleet, *await led(fleet, *hosts)
+    return fleet, await led(fleet, *hosts)
 
 
 def dangers_at(candidate: Candidate) -> list[BookedDanger]:

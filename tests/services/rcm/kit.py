@@ -29,6 +29,8 @@ from zscout.messages import (
     RcAsk,
     RcmState,
     RcState,
+    RcView,
+    Revocation,
     StateAsk,
 )
 from zscout.services.rcm.candidate import Candidate
@@ -161,10 +163,8 @@ def request(
     arc: str, *needs: str, priority: int = 0, seconds: float = 60, place: Place | None = None, **more: Any
 ) -> Ask:
     """An Ask whose id is the ARC's name; needs as `radio/rf0:5`, with a command rate."""
-    split = [need.partition(":") for need in needs]
-    rates: dict[str, dict[str, Decimal]] = {
-        rc: {"command_rate": Decimal(rate)} if rate else {} for rc, _, rate in split
-    }
+    told = [need.partition(":") for need in needs]
+    rates: dict[str, dict[str, Decimal]] = {rc: {"command_rate": Decimal(rate)} if rate else {} for rc, _, rate in told}
     return Ask(arc, arc, rates, priority, Decimal(str(seconds)), place=place, **more)
 
 
@@ -178,6 +178,10 @@ class FakeFleet(MemoryFleet):
         self.published: list[Grants] = []
         self.newer: list[Term] = []
         self.watcher.subscribe(self.watcher.keys.grants, Grants, self._on_grants)
+
+    @property
+    def revoked(self) -> list[Revocation]:
+        return [revoked for grants in self.published for revoked in grants.revoked]
 
     def _on_grants(self, _key: str, grants: Grants) -> None:
         if grants.rcs or grants.revoked:
@@ -218,13 +222,28 @@ class FakeFleet(MemoryFleet):
                 await asyncio.sleep(0.001)
 
 
-async def fleet_of(*rcs: str) -> tuple[FakeFleet, *tuple[FakeRc, ...]]:
+async def fleet_of(*rcs: str) -> tuple[FakeFleet, list[FakeRc]]:
     """A fleet whose leader counts these RCs as there."""
     fleet = FakeFleet()
     fleet.rcm()
     found = [fleet.rc(rc) for rc in rcs]
     await fleet.joined(*found)
-    return fleet, *found
+    return fleet, found
+
+
+async def sees(mesh: MemoryMesh, rc: str, **wanted: Any) -> RcView:
+    """Waits until the leader that is seen from here says so of the RC."""
+    view: RcView | None = None
+    try:
+        async with asyncio.timeout(60):
+            while view is None or any(getattr(view, name) != value for name, value in wanted.items()):
+                await asyncio.sleep(0.05)
+                reply = await mesh.ask_one(mesh.keys.rcm_state, StateAsk(), RcmState, timeout=1)
+                views = reply.message.rcs if reply is not None and reply.message is not None else []
+                view = next((view for view in views if view.rc == rc), None)
+    except TimeoutError:
+        raise AssertionError(f"waited in vain for {wanted}; last {view}") from None
+    return view
 
 
 def grant_of(notice: Notice) -> Grant:

@@ -16,7 +16,7 @@ from zscout.types import Place, Term
 
 
 async def test_a_booking_is_kept_by_another_candidate_and_taken_up_at_its_date() -> None:
-    fleet, *_ = await booked("x", "y")
+    fleet, _ = await booked("x", "y")
     client, other = fleet.client("one"), fleet.client("two")
     made = await do(client, book("b", "robot/a", "robot/*", at=50), BookingView)
     assert states(made) == ["open"]
@@ -38,7 +38,7 @@ async def test_a_booking_is_kept_by_another_candidate_and_taken_up_at_its_date()
 
 
 async def test_slots_are_the_times_between_bookings() -> None:
-    fleet, *_ = await booked("x")
+    fleet, _ = await booked("x")
     client = fleet.client("one")
     await do(client, book("b", "robot/a", at=50), BookingView)
     await do(client, book("c", "robot/b", at=250), BookingView)
@@ -60,7 +60,7 @@ async def test_slots_are_the_times_between_bookings() -> None:
 
 
 async def test_a_date_that_is_not_repeated_is_kept_free_however_far_ahead() -> None:
-    fleet, *_ = await booked("x")
+    fleet, _ = await booked("x")
     client = fleet.client("one")
     far = 300 * 86_400
     await do(client, book("b", "robot/a", at=far), BookingView)
@@ -73,7 +73,7 @@ async def test_a_date_that_is_not_repeated_is_kept_free_however_far_ahead() -> N
 
 
 async def test_slots_go_by_what_was_asked_for_and_tell_what_is_likely() -> None:
-    fleet, *_ = await booked("x")
+    fleet, _ = await booked("x")
     client, other = fleet.client("one"), fleet.client("two")
     asked = FindSlots("s", request("s", "robot/a").needs, 0, Decimal(60), within=1_000)
     for number in range(4):
@@ -87,7 +87,7 @@ async def test_slots_go_by_what_was_asked_for_and_tell_what_is_likely() -> None:
 
 
 async def test_votes_decide_about_a_sharable_rc() -> None:
-    fleet, *_ = await booked("x")
+    fleet, _ = await booked("x")
     radio = fleet.rc("radio/rf0", accept=True)
     await fleet.joined(radio)
     client = fleet.client("one")
@@ -103,7 +103,7 @@ async def test_votes_decide_about_a_sharable_rc() -> None:
 
 
 async def test_a_booking_outlives_its_leader_and_its_taker_goes_on() -> None:
-    fleet, leader, heir = await booked("x", "y")
+    fleet, (leader, heir) = await booked("x", "y")
     client = fleet.client("one")
     await do(client, book("b", "robot/a", at=50, every=1, until=round(NOON + 86_400 * 3 + 50)), BookingView)
     waits = await client.ask("mine", "robot/a", seconds=100, booking="b")
@@ -123,7 +123,7 @@ async def test_a_booking_outlives_its_leader_and_its_taker_goes_on() -> None:
 
 
 async def test_two_halves_book_the_same_and_the_earlier_of_the_higher_priority_stands() -> None:
-    fleet, x, y = await booked("x", "y")
+    fleet, (x, y) = await booked("x", "y")
     assert x.rcm is not None
     here, there = fleet.client("here", "x"), fleet.client("there", "y")
     await do(here, book("both", "robot/b", at=900), BookingView)
@@ -158,7 +158,7 @@ async def test_two_halves_book_the_same_and_the_earlier_of_the_higher_priority_s
 
 
 async def test_who_took_up_a_date_that_is_in_conflict_waits_for_it_and_has_it_once_it_stands() -> None:
-    fleet, _, y = await booked("x", "y")
+    fleet, (_, y) = await booked("x", "y")
     here, there = fleet.client("here", "x"), fleet.client("there", "y")
     fleet.part("y")
     await until(lambda: y.rcm)
@@ -200,7 +200,7 @@ async def test_who_took_up_a_date_that_its_leader_does_not_know_yet_waits_for_it
 
 
 async def test_what_is_no_booking_is_refused_in_one_line() -> None:
-    fleet, *_ = await booked("x")
+    fleet, _ = await booked("x")
     client = fleet.client("one")
     good = book("b", "robot/a", at=50)
     for wrong, code in [
@@ -238,7 +238,7 @@ async def test_other_strategies_keep_no_bookings() -> None:
 
 
 async def test_maintenance_goes_before_what_is_booked_and_both_are_told() -> None:
-    fleet, *_ = await booked("x")
+    fleet, _ = await booked("x")
     client = fleet.client("one")
     await do(client, book("b", "robot/a", at=300), BookingView)
     drain = await do(client, book("m", "robot/a", "robot/b", at=200, seconds=200, maintenance=True), BookingView)
@@ -260,7 +260,7 @@ async def test_maintenance_goes_before_what_is_booked_and_both_are_told() -> Non
 
 
 async def test_the_danger_of_maintenance_that_is_given_up_is_over() -> None:
-    fleet, leader, *_ = await booked("x", "y")
+    fleet, (leader, *_) = await booked("x", "y")
     dangers = dangers_at(leader)
     client = fleet.client("one", "desk")
     await do(client, book("b", "robot/a", at=500, priority=1), BookingView)
@@ -275,7 +275,7 @@ async def test_the_danger_of_maintenance_that_is_given_up_is_over() -> None:
 
 
 async def test_what_is_repeated_is_kept_from_the_instant_that_a_date_is_within_60_days() -> None:
-    fleet, *_ = await booked("x", "y")
+    fleet, _ = await booked("x", "y")
     await do(fleet.client("one"), book("b", "robot/a", at=500, every=1, until=round(NOON) + 300 * 86_400), BookingView)
     await asyncio.sleep(NOON + 499 - fleet.time())
     assert (await fleet.bookings())["b"].dates[-1].start == NOON + 59 * 86_400 + 500
@@ -285,7 +285,7 @@ async def test_what_is_repeated_is_kept_from_the_instant_that_a_date_is_within_6
 
 
 async def test_a_booking_is_in_danger_while_what_it_needs_is_away() -> None:
-    fleet, leader = await booked("x")
+    fleet, (leader,) = await booked("x")
     dangers = dangers_at(leader)
     far = fleet.rc("robot/far")
     await fleet.joined(far)
@@ -307,7 +307,7 @@ async def test_a_booking_is_in_danger_while_what_it_needs_is_away() -> None:
 
 
 async def test_of_all_dates_of_a_booking_a_danger_is_told_once_and_the_next_dates_first() -> None:
-    fleet, leader = await booked("x")
+    fleet, (leader,) = await booked("x")
     dangers = dangers_at(leader)
     far = fleet.rc("robot/far")
     await fleet.joined(far)
@@ -326,7 +326,7 @@ async def test_of_all_dates_of_a_booking_a_danger_is_told_once_and_the_next_date
 
 
 async def test_a_date_in_conflict_is_not_voted_on_again_and_again() -> None:
-    fleet, _, y = await booked("x", "y")
+    fleet, (_, y) = await booked("x", "y")
     radio = fleet.rc("radio/rf0")
     await fleet.joined(radio)
     here, there = fleet.client("here", "x"), fleet.client("there", "y")
@@ -345,7 +345,7 @@ async def test_a_date_in_conflict_is_not_voted_on_again_and_again() -> None:
 
 
 async def test_a_date_by_pattern_goes_to_another_shared_rc_once_that_has_voted() -> None:
-    fleet, _, y = await booked("x", "y")
+    fleet, (_, y) = await booked("x", "y")
     here, there = fleet.client("here", "x"), fleet.client("there", "y")
     first = fleet.rc("radio/rf0")
     await fleet.joined(first)

@@ -161,9 +161,7 @@ def test_a_listener_that_fails_ends_the_telling_and_nothing_else(caplog: pytest.
     for second, event in enumerate([*events, Requested(asked("one", "robot/a")), Released("h/c/one")]):
         digest.take(second * SECOND, [event], core.handle(second * SECOND, event))
     assert heard.over == []
-    assert [record.message for record in caplog.records] == [
-        "holds are neither counted nor told of any more in this term"
-    ]
+    assert [one.message for one in caplog.records] == ["holds are neither counted nor told of any more in this term"]
 
 
 async def test_an_rcm_tells_its_listeners_once_all_others_have_their_answers() -> None:
@@ -201,4 +199,3 @@ async def test_refusals_are_counted_by_code() -> None:
     with pytest.raises(Exception, match="unknown_client"):
         await client.do(HandOver("first", "desk/nobody"))
     assert candidate.tally.refused() == {"bad_request": 3, "unknown_client": 1}
-    await candidate.stop()

@@ -131,7 +131,7 @@ async def test_the_leader_refuses_what_it_knows_only_to_who_asks_for_that() -> N
 
 
 async def test_a_device_that_went_is_waited_for() -> None:
-    fleet, rc = await fleet_of("robot/arm1")
+    fleet, (rc,) = await fleet_of("robot/arm1")
     client = fleet.client("one")
     await asyncio.sleep(fleet.fleet.timing.hold_lease / SECOND)
     fleet.network.kill(rc.mesh)

@@ -56,9 +56,7 @@ def failed(now: Ns) -> Sight:
         ),
         pytest.param([candidate("z", alive=False)], START, START + SETTLE, id="somebody unknown left: no matter"),
         pytest.param([came("x")], LATER, LATER + SILENCE, id="a leader: until it is silent for too long"),
-        pytest.param(
-            [came("x"), heard("x", LATER + SECOND)], LATER, LATER + SECOND + SILENCE, id="it goes on speaking"
-        ),
+        pytest.param([came("x"), heard("x", LATER + SECOND)], LATER, LATER + SECOND + SILENCE, id="it still speaks"),
         pytest.param([heard("x", LATER)], LATER, START + SETTLE, id="words of one without a token count not"),
         pytest.param([came("x"), went("x", LATER + 5)], LATER + 5, LATER + 5, id="it died: at once"),
         pytest.param(
@@ -67,9 +65,7 @@ def failed(now: Ns) -> Sight:
             START + 5,
             id="it died before this one had settled: who saw a leader is on the mesh",
         ),
-        pytest.param(
-            [candidate("a"), came("x"), went("x", LATER)], LATER, LATER + TURN, id="it died: the better first"
-        ),
+        pytest.param([candidate("a"), came("x"), went("x", LATER)], LATER, LATER + TURN, id="it died: a better first"),
         pytest.param([went("x", LATER)], LATER, START + SETTLE, id="a death of one never seen"),
         pytest.param(
             [came("x"), came("y", LATER + SECOND), went("x", LATER + 2 * SECOND)],
@@ -229,9 +225,7 @@ def test_who_waited_alone_once_does_so_anew_after_a_leader_was_seen() -> None:
         pytest.param([], False, id="nothing"),
         pytest.param([lambda seen: seen.stood_still(LATER)], True, id="it stood still"),
         pytest.param([lambda seen: seen.candidate("c", alive=False, now=LATER)], True, id="it lost another host"),
-        pytest.param(
-            [lambda seen: seen.candidate("a", alive=False, now=LATER)], False, id="the leader's host has gone"
-        ),
+        pytest.param([lambda seen: seen.candidate("a", alive=False, now=LATER)], False, id="the leader's host went"),
         pytest.param(
             [
                 lambda seen: seen.candidate("c", alive=False, now=START),

@@ -29,7 +29,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 
 async def test_notices_say_when_it_will_start_to_who_wants_to_know(made: list[float]) -> None:
-    fleet, *_ = await fleet_of("robot/a")
+    fleet, _ = await fleet_of("robot/a")
     holder, client, silent = fleet.client("holder"), fleet.client("client"), fleet.client("silent")
     await holder.ask("first", "robot/a", seconds=100)
     assert (await silent.ask("silent", "robot/a", seconds=20)).starts_in is None
@@ -52,7 +52,7 @@ async def test_notices_say_when_it_will_start_to_who_wants_to_know(made: list[fl
 
 
 async def test_many_who_wait_and_who_ask_for_the_state_share_forecasts(made: list[float]) -> None:
-    fleet, *_ = await fleet_of("robot/a")
+    fleet, _ = await fleet_of("robot/a")
     clients = [fleet.client(f"c{number}") for number in range(20)]
     await clients[0].ask("a0", "robot/a", seconds=1000)
     await asyncio.gather(*(client.ask("next", "robot/a", seconds=10, estimate=True) for client in clients[1:]))

@@ -4,45 +4,20 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from tests.mesh.kit import run, until
-from tests.services.rcm.kit import FakeFleet
+from tests.services.rcm.kit import FakeFleet, sees
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.instances import InstanceState
 from zscout.drivers.resource_controller import ResourceController
 from zscout.mesh.supervision import StallWatch
-from zscout.messages import RcmState, RcView, StateAsk
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.inventory import FILE
-from zscout.testing.memory import MemoryMesh
 from zscout.types import SECOND
 
 RC = "robot/a"
-
-
-async def view_of(mesh: MemoryMesh, rc: str = RC) -> RcView | None:
-    """What the leader that is seen from here says of an RC."""
-    reply = await mesh.ask_one(mesh.keys.rcm_state, StateAsk(), RcmState, timeout=1)
-    if reply is None or reply.message is None:
-        return None
-    return next((view for view in reply.message.rcs if view.rc == rc), None)
-
-
-async def sees(mesh: MemoryMesh, **wanted: Any) -> RcView:
-    """Waits until the leader that is seen from here says so of the RC."""
-    view: RcView | None = None
-    try:
-        async with asyncio.timeout(30):
-            while True:
-                view = await view_of(mesh)
-                if view is not None and all(getattr(view, name) == value for name, value in wanted.items()):
-                    return view
-                await asyncio.sleep(0.05)
-    except TimeoutError:
-        raise AssertionError(f"waited in vain for {wanted}; last {view}") from None
 
 
 async def test_the_next_leader_knows_what_went_while_another_led() -> None:
@@ -59,11 +34,10 @@ async def test_the_next_leader_knows_what_went_while_another_led() -> None:
     for dies, leads in ((first, heir), (heir, late)):
         fleet.network.kill(dies.mesh)
         await until(lambda leads=leads: leads.rcm)  # type: ignore[misc]
-        view = await sees(fleet.watcher, present=False)
+        view = await sees(fleet.watcher, RC, present=False)
         assert (view.host, view.reason) == ("devices", "devices is gone")
         assert view.gone is not None
         assert 60 < view.gone < 80
-    await late.stop()
 
 
 async def test_it_is_kept_over_a_restart_of_the_only_candidate(tmp_path: Path) -> None:
@@ -77,14 +51,11 @@ async def test_it_is_kept_over_a_restart_of_the_only_candidate(tmp_path: Path) -
     fleet.network.kill(candidate.mesh)
     anew = fleet.candidate("x", tmp_path)
     await until(lambda: anew.rcm)
-    view = await sees(fleet.watcher, present=False)
+    view = await sees(fleet.watcher, RC, present=False)
     assert (view.host, view.reason) == ("devices", "devices is gone")
-    await anew.stop()
 
 
-async def test_a_file_that_is_none_is_not_used_and_written_anew(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_a_file_that_is_none_is_replaced(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / FILE).write_text('{"written": "now"')
     fleet = FakeFleet()
     candidate = fleet.candidate("x", tmp_path)
@@ -106,7 +77,7 @@ async def test_a_device_that_is_lost_from_the_beginning_says_why() -> None:
     fleet = FakeFleet()
     fleet.rcm()
     rc = fleet.rc(RC, health="/dev/video9 can't be opened")
-    view = await sees(fleet.watcher, reason="/dev/video9 can't be opened")
+    view = await sees(fleet.watcher, RC, reason="/dev/video9 can't be opened")
     assert (view.present, view.host, view.gone) == (False, "devices", None)
     client = fleet.client("one")
     answer = await client.ask("look", RC)
@@ -143,16 +114,15 @@ async def test_two_owners_through_a_partition_and_a_merge() -> None:
     fleet = FakeFleet("ws1", "ws2")
     one, two = Station(fleet, "ws1"), Station(fleet, "ws2")
     await one.start()
-    await sees(one.mesh, host="ws1", present=True)
+    await sees(one.mesh, RC, host="ws1", present=True)
     await two.start()
-    await sees(one.mesh, host="ws1", duplicates=["ws2"], unseen={})
+    await sees(one.mesh, RC, host="ws1", duplicates=["ws2"], unseen={})
     assert (one.serves, two.serves) == (True, False)
     assert two.rc.instances.duplicate_of == "robot/a at ws1"
 
-    for ends in ((one.mesh, two.mesh), (two.mesh, one.mesh)):
-        fleet.network.cut(*ends)
-    here = await sees(one.mesh, host="ws1", present=True, duplicates=[])
-    there = await sees(two.mesh, host="ws2", present=True, duplicates=[])
+    fleet.cut(one.mesh, two.mesh)
+    here = await sees(one.mesh, RC, host="ws1", present=True, duplicates=[])
+    there = await sees(two.mesh, RC, host="ws2", present=True, duplicates=[])
     assert (list(here.unseen), list(there.unseen)) == (["ws2"], ["ws1"])
     assert (one.serves, two.serves) == (True, True)
 
@@ -162,7 +132,7 @@ async def test_two_owners_through_a_partition_and_a_merge() -> None:
     assert fleet.watcher.now() - healed < fleet.fleet.timing.hold_lease
     served, other = (one, two) if one.serves else (two, one)
     named, stands_by = served.mesh.me.host, other.mesh.me.host
-    view = await sees(served.mesh, host=named, present=True, duplicates=[stands_by], unseen={})
+    view = await sees(served.mesh, RC, host=named, present=True, duplicates=[stands_by], unseen={})
     assert view.reason == ""
     assert other.rc.instances.duplicate_of == f"robot/a at {named}"
     await asyncio.sleep(5)
@@ -170,7 +140,7 @@ async def test_two_owners_through_a_partition_and_a_merge() -> None:
 
     # One that is stopped in order is no other owner that nobody sees.
     await other.rc.stop()
-    await sees(served.mesh, host=named, duplicates=[], unseen={})
+    await sees(served.mesh, RC, host=named, duplicates=[], unseen={})
 
 
 def test_of_two_that_hold_nothing_the_one_at_home_is_meant_by_a_new_leader() -> None:
@@ -188,7 +158,7 @@ def test_of_two_that_hold_nothing_the_one_at_home_is_meant_by_a_new_leader() -> 
             rc.instances.take(rc.instance)  # as though it had not seen the other one
         candidate = fleet.candidate("x")
         await until(lambda: candidate.rcm)
-        view = await sees(fleet.watcher, present=True)
+        view = await sees(fleet.watcher, RC, present=True)
         await candidate.stop()
         return view.host
 

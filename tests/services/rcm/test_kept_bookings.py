@@ -20,7 +20,7 @@ from zscout.types import Place, Term
 
 
 async def test_a_fleet_restarted_whole_reads_its_bookings() -> None:
-    fleet, *both = await booked("x", "y")
+    fleet, both = await booked("x", "y")
     client = fleet.client("one")
     await do(client, book("b", "robot/a", at=500), BookingView)
     await do(client, book("gone", "robot/b", at=500), BookingView)
@@ -67,7 +67,7 @@ async def test_what_is_long_over_is_forgotten_by_all_who_keep_bookings() -> None
 
 
 async def test_a_keeper_that_was_busy_is_told_before_long() -> None:
-    fleet, *_, last = await booked("x", "y", "z")
+    fleet, (*_, last) = await booked("x", "y", "z")
     client = fleet.client("one")
     last._keeper._waiting = MAX_SAVING
     await do(client, book("b", "robot/a", at=500), BookingView)
@@ -79,7 +79,7 @@ async def test_a_keeper_that_was_busy_is_told_before_long() -> None:
 
 
 async def test_a_host_that_has_no_room_for_a_booking_does_not_keep_it() -> None:
-    fleet, _, other = await booked("x", "y")
+    fleet, (_, other) = await booked("x", "y")
     client = fleet.client("one")
     await do(client, book("b", "robot/a", at=500), BookingView)
     other._keeper.records.size = MAX_BYTES
@@ -92,7 +92,7 @@ async def test_a_host_that_has_no_room_for_a_booking_does_not_keep_it() -> None:
 
 
 async def test_what_becomes_of_one_booking_is_not_told_of_another() -> None:
-    fleet, leader, other = await booked("x", "y")
+    fleet, (leader, other) = await booked("x", "y")
     await do(fleet.client("one"), book("b", "robot/a", at=500), BookingView)
     (known,) = other._keeper.records
     other._keeper.records.size = MAX_BYTES
@@ -112,7 +112,7 @@ async def test_what_becomes_of_one_booking_is_not_told_of_another() -> None:
 
 
 async def test_a_booking_that_one_leader_could_not_keep_stands_where_another_one_has_it() -> None:
-    fleet, _, y = await booked("x", "y")
+    fleet, (_, y) = await booked("x", "y")
     here, there = fleet.client("here", "x"), fleet.client("there", "y")
     fleet.part("y")
     await until(lambda: y.rcm)
@@ -129,7 +129,7 @@ async def test_a_booking_that_one_leader_could_not_keep_stands_where_another_one
 
 
 async def test_who_took_up_a_booking_that_this_leader_can_not_keep_waits_for_its_date() -> None:
-    fleet, *_ = await booked("x")
+    fleet, _ = await booked("x")
     fleet.disks["x"].broken = True
     client = fleet.client("one")
     # Another leader has made it, and is gone; what its program had asked that one arrives here late.
@@ -156,7 +156,7 @@ def forget_how_to_ask(fleet: BookedFleet, host: str) -> None:
 
 
 async def test_a_keeper_that_nobody_asks_joins_the_mesh_anew() -> None:
-    fleet, *_ = await booked("x", "y")
+    fleet, _ = await booked("x", "y")
     client = fleet.client("one", "x")
     await asyncio.sleep(1)
     forget_how_to_ask(fleet, "y")
@@ -169,7 +169,7 @@ async def test_a_keeper_that_nobody_asks_joins_the_mesh_anew() -> None:
 
 
 async def test_a_keeper_that_can_not_lead_and_that_nobody_asks_joins_the_mesh_anew() -> None:
-    fleet, *_ = await booked("x", "y")
+    fleet, _ = await booked("x", "y")
     mesh, disk = fleet.mesh("far"), fleet.disks.setdefault("far", Disk())
     far = BookingKeeper(mesh, disk, candidate=False, wall=fleet.time)
     far.start(Supervisor("far", lambda error: pytest.fail(str(error))))

@@ -158,13 +158,7 @@ def test_a_journal_tells_of_what_it_heard_from_beginning_to_end(tmp_path: Path) 
     store.open()
     whole = past(1, 10.0, 12.0, "released")
     later = past(2, 11.0, 20.0, "preempted")
-    changes: list[Change] = [
-        HoldSeen(whole),
-        HoldSeen(later),
-        HoldSeen(past(3, 12.0)),
-        HoldOver(later),
-        HoldOver(whole),
-    ]
+    changes: list[Change] = [HoldSeen(whole), HoldSeen(later), HoldSeen(past(3, 12)), HoldOver(later), HoldOver(whole)]
     store.commit([*changes, HoldOver(past(4, 13.0, 14.0, "released", late=True))], 5.0, 30.0, 30.0)
     assert [hold.grant.seq for hold in store.latest(5)] == [1, 2]
     assert [hold.grant.seq for hold in store.latest(1)] == [2]

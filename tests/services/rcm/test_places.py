@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine
 from decimal import Decimal
-from typing import Any
 
 import pytest
 
-from tests.mesh.kit import run, until
+from tests.mesh.kit import until
 from tests.services.kit import answer
 from tests.services.rcm.kit import FakeFleet, Refusal, request
 from zscout.behaviors.client.request import OpenArc
@@ -42,11 +40,8 @@ def test_who_handed_it_over_and_who_has_it_may_both_claim_it() -> None:
     of.bind(place, "desk/one/q1", 0)
     of.bind(place, "cart/two/q1", 0)
     of.end("desk/one/q1", 0, MINUTE)
-    assert [of.may_claim(place, who, "x", None, seen=True) for who in ("desk/one", "cart/two", "h/c")] == [
-        True,
-        True,
-        False,
-    ]
+    claims = [of.may_claim(place, client, "x", None, seen=True) for client in ("desk/one", "cart/two", "h/c")]
+    assert claims == [True, True, False]
 
 
 def test_a_place_goes_with_its_arc_and_may_be_kept_for_a_while() -> None:
@@ -125,22 +120,17 @@ def test_a_seal_proves_a_place_to_every_leader() -> None:
 # At a leader
 
 
-def play(story: Callable[[FakeFleet, Candidate, Notice], Coroutine[Any, Any, None]], key: bytes | None = None) -> None:
-    """A fleet with one robot that somebody has; desk/one waits at the first place behind, and desk/two at the second.
-    The story is told of the first."""
-
-    async def main() -> None:
-        fleet = FakeFleet("h1")
-        fleet.rc("robot/a")
-        candidate = fleet.candidate("h1", places_key=key)
-        await until(lambda: candidate.rcm and candidate.rcm.core.status().rcs)
-        await fleet.client("holder").ask("first", "robot/a")
-        first = await fleet.client("one").ask("q1", "robot/a")
-        await fleet.client("two").ask("q2", "robot/a")
-        await story(fleet, candidate, first)
-        await candidate.stop()
-
-    run(main())
+async def waiting(key: bytes | None = None) -> tuple[FakeFleet, Candidate, Notice]:
+    """A fleet with one robot that somebody has; desk/one waits at the first place behind, of which it is told, and
+    desk/two at the second."""
+    fleet = FakeFleet("h1")
+    fleet.rc("robot/a")
+    candidate = fleet.candidate("h1", places_key=key)
+    await until(lambda: candidate.rcm and candidate.rcm.core.status().rcs)
+    await fleet.client("holder").ask("first", "robot/a")
+    first = await fleet.client("one").ask("q1", "robot/a")
+    await fleet.client("two").ask("q2", "robot/a")
+    return fleet, candidate, first
 
 
 def places_of(candidate: Candidate, client: str) -> list[Place | None]:
@@ -149,45 +139,39 @@ def places_of(candidate: Candidate, client: str) -> list[Place | None]:
     return [core.place_of(arc) for arc in core.arcs_of(client)]
 
 
-def test_a_stranger_that_shows_anothers_place_has_none_for_that() -> None:
-    async def story(fleet: FakeFleet, candidate: Candidate, first: Notice) -> None:
-        thief = fleet.client("thief")
-        stolen = await thief.ask("q9", "robot/a", place=first.place)
-        assert (stolen.state, stolen.ahead) == ("queued", 2)
-        assert (await thief.ask("q9", "robot/a", place=first.place)).place == stolen.place
-        assert places_of(candidate, "desk/one") == [first.place] != [stolen.place]
-
-    play(story)
+async def test_a_stranger_that_shows_anothers_place_has_none_for_that() -> None:
+    fleet, candidate, first = await waiting()
+    thief = fleet.client("thief")
+    stolen = await thief.ask("q9", "robot/a", place=first.place)
+    assert (stolen.state, stolen.ahead) == ("queued", 2)
+    assert (await thief.ask("q9", "robot/a", place=first.place)).place == stolen.place
+    assert places_of(candidate, "desk/one") == [first.place] != [stolen.place]
 
 
-def test_who_asks_under_a_new_id_has_its_place_and_no_second_arc() -> None:
-    async def story(_: FakeFleet, candidate: Candidate, first: Notice) -> None:
-        assert candidate.rcm is not None
-        key = candidate.mesh.keys.schedule(client_of("desk/one"))
-        asked = request("anew", "robot/a", place=first.place, was=first.id)
-        told = await answer(candidate.mesh, key, asked, Notice)
-        assert (told.place, told.ahead) == (first.place, 0)
-        assert candidate.rcm.core.arcs_of("desk/one") == ["desk/one/anew"]
-
-    play(story)
+async def test_who_asks_under_a_new_id_has_its_place_and_no_second_arc() -> None:
+    _, candidate, first = await waiting()
+    assert candidate.rcm is not None
+    key = candidate.mesh.keys.schedule(client_of("desk/one"))
+    asked = request("anew", "robot/a", place=first.place, was=first.id)
+    told = await answer(candidate.mesh, key, asked, Notice)
+    assert (told.place, told.ahead) == (first.place, 0)
+    assert candidate.rcm.core.arcs_of("desk/one") == ["desk/one/anew"]
 
 
 @pytest.mark.parametrize("sealed", [True, False])
-def test_at_the_next_leader_a_seal_tells_whose_a_place_is(sealed: bool) -> None:
+async def test_at_the_next_leader_a_seal_tells_whose_a_place_is(sealed: bool) -> None:
     """Without one, who lists it is believed."""
 
-    async def story(fleet: FakeFleet, candidate: Candidate, first: Notice) -> None:
-        assert candidate.rcm is not None
-        assert (first.seal is not None) == sealed
-        thief, before = fleet.client("thief"), candidate.rcm.term
-        listed = OpenRequest("x", "arc", {"robot/a": {}}, 0, Decimal(60), place=first.place, seal=first.seal)
-        thief.open = [listed]
-        with pytest.raises(Refusal, match="old_term"):
-            await thief.ask("y", "robot/a", term=Term(before.counter + 5, "mad"))
-        await until(lambda: candidate.rcm and candidate.rcm.term > before)
-        assert (places_of(candidate, "desk/thief") == [first.place]) != sealed
-
-    play(story, KEY if sealed else None)
+    fleet, candidate, first = await waiting(KEY if sealed else None)
+    assert candidate.rcm is not None
+    assert (first.seal is not None) == sealed
+    thief, before = fleet.client("thief"), candidate.rcm.term
+    listed = OpenRequest("x", "arc", {"robot/a": {}}, 0, Decimal(60), place=first.place, seal=first.seal)
+    thief.open = [listed]
+    with pytest.raises(Refusal, match="old_term"):
+        await thief.ask("y", "robot/a", term=Term(before.counter + 5, "mad"))
+    await until(lambda: candidate.rcm and candidate.rcm.term > before)
+    assert (places_of(candidate, "desk/thief") == [first.place]) != sealed
 
 
 def test_a_client_shows_its_place_and_seal_and_the_id_it_had_them_under() -> None:

@@ -17,7 +17,7 @@ from zscout.types import SECOND, Grant, Place, Term
 
 
 async def test_a_grant_is_published_and_the_loser_told_while_its_answer_is_on_the_way() -> None:
-    fleet, robot = await fleet_of("robot/a")
+    fleet, (robot,) = await fleet_of("robot/a")
     survey, operator = fleet.client("survey"), fleet.client("operator")
     first = await survey.ask("survey", "robot/a")
     fleet.log.clear()
@@ -46,7 +46,7 @@ async def test_a_grant_is_published_and_the_loser_told_while_its_answer_is_on_th
 
 
 async def test_who_missed_how_its_hold_ended_is_told_when_it_asks_again() -> None:
-    fleet, *_ = await fleet_of("robot/a")
+    fleet, _ = await fleet_of("robot/a")
     survey, operator = fleet.client("survey"), fleet.client("operator")
     held = grant_of(await survey.ask("survey", "robot/a"))
     await operator.ask("drive", "robot/a", priority=10)
@@ -80,7 +80,7 @@ async def test_what_arrives_in_one_burst_is_one_instant_and_ends_come_first() ->
 
 
 async def test_asking_again_tells_how_it_stands_and_what_ended_is_remembered() -> None:
-    fleet, *_ = await fleet_of("robot/a")
+    fleet, _ = await fleet_of("robot/a")
     client = fleet.client("one")
     first = await client.ask("first", "robot/a", seconds=2)
     assert grant_of(await client.ask("first", "robot/a", seconds=2)) == first.grant
@@ -144,7 +144,7 @@ async def test_an_rc_that_comes_is_granted_and_one_that_goes_ends_the_whole_gang
 
 
 async def test_what_an_rc_reports_is_set_right() -> None:
-    fleet, robot = await fleet_of("robot/a")
+    fleet, (robot,) = await fleet_of("robot/a")
     client = fleet.client("one")
     grant = grant_of(await client.ask("first", "robot/a"))
     (holder,) = robot.holders
@@ -169,7 +169,7 @@ async def test_what_an_rc_reports_is_set_right() -> None:
 
 
 async def test_a_client_that_is_gone_leaves_nothing() -> None:
-    fleet, robot = await fleet_of("robot/a")
+    fleet, (robot,) = await fleet_of("robot/a")
     gone, heir = fleet.client("gone"), fleet.client("heir")
     await gone.ask("first", "robot/a")
     await gone.ask("second", "robot/a")
@@ -222,7 +222,7 @@ async def test_a_client_that_goes_in_the_burst_of_its_request_leaves_nothing(goe
 
 
 async def test_a_hand_over_is_one_publication_and_can_be_repeated() -> None:
-    fleet, *robots = await fleet_of("robot/a", "robot/b")
+    fleet, robots = await fleet_of("robot/a", "robot/b")
     old, new, rival = fleet.client("old"), fleet.client("new"), fleet.client("rival")
     first = await old.ask("first", "robot/a", seconds=600)
     await rival.ask("rival", "robot/b")
@@ -263,14 +263,11 @@ async def test_a_hold_that_is_adopted_and_displaced_in_one_instant_is_told_as_it
     held = RecoveredHold(kept, Place(before, 1), Grant(before, 3), at - 5 * SECOND, at - 4 * SECOND)
     rcm._receive(RcJoined("robot/a", sharable=False), Adopted(held))
     await until(lambda: one.notices)
-    assert [(told.state, told.outcome, told.grant) for told in one.notices] == [
-        ("ended", "completed", Grant(before, 3))
-    ]
-    rcm.stop()
+    assert [(it.state, it.outcome, it.grant) for it in one.notices] == [("ended", "completed", Grant(before, 3))]
 
 
 async def test_who_waited_is_told_of_its_grant_before_the_rcs_are() -> None:
-    fleet, *_ = await fleet_of("robot/a")
+    fleet, _ = await fleet_of("robot/a")
     holder, waiter = fleet.client("holder"), fleet.client("waiter")
     await holder.ask("first", "robot/a")
     await waiter.ask("next", "robot/a")
@@ -284,7 +281,7 @@ async def test_who_waited_is_told_of_its_grant_before_the_rcs_are() -> None:
 
 
 async def test_who_is_preempted_and_granted_in_one_instant_is_told_in_that_order() -> None:
-    fleet, *_ = await fleet_of("robot/a", "robot/b")
+    fleet, _ = await fleet_of("robot/a", "robot/b")
     client, operator = fleet.client("any"), fleet.client("operator")
     first = (await client.ask("any", "robot/*")).rcs
     await operator.ask("drive", *first, priority=10)
@@ -298,7 +295,7 @@ async def test_who_is_preempted_and_granted_in_one_instant_is_told_in_that_order
 
 async def test_rcs_settle_unless_the_client_says_that_its_program_is_gone() -> None:
     """One that started anew under its name gives back what it knows nothing of: a program of that may run yet."""
-    fleet, *_ = await fleet_of("robot/a")
+    fleet, _ = await fleet_of("robot/a")
     client = fleet.client("one")
     for arc, left in (("first", False), ("second", True)):
         await client.ask(arc, "robot/a", direct=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from decimal import Decimal
 from fractions import Fraction
+from typing import Any
 
 import pytest
 
@@ -22,31 +23,10 @@ GANG = ("robot/a", "radio/b")
 
 
 def hold(
-    rcs: tuple[str, ...] = GANG,
-    *,
-    seq: int = 5,
-    term: Term = TERM,
-    client: str = "h/one",
-    name: str = "gang",
-    remaining: float = 10,
-    params: dict[str, Decimal] | None = None,
-    runtime: str = "60",
-    bound: dict[str, str] | None = None,
+    rcs: tuple[str, ...] = GANG, seq: int = 5, term: Term = TERM, name: str = "gang", remaining: float = 10, **more: Any
 ) -> Holder:
-    return Holder(
-        id=f"{name}-id",
-        arc=name,
-        client=client,
-        grant=Grant(term, seq),
-        place=PLACE,
-        rcs=list(rcs),
-        min_runtime=Decimal(runtime),
-        remaining=remaining,
-        priority=3,
-        keep=True,
-        params=params or {},
-        bound=bound or {},
-    )
+    fields: dict[str, Any] = {"client": "h/one", "min_runtime": Decimal(60), "priority": 3, "keep": True} | more
+    return Holder(f"{name}-id", name, grant=Grant(term, seq), place=PLACE, rcs=list(rcs), remaining=remaining, **fields)
 
 
 def rc(name: str, *holders: Holder, health: str = "ok") -> RcState:
@@ -55,26 +35,10 @@ def rc(name: str, *holders: Holder, health: str = "ok") -> RcState:
 
 
 def asked(
-    name: str = "gang",
-    *,
-    place: Place | None = PLACE,
-    grant: Grant | None = None,
-    needs: tuple[str, ...] = GANG,
-    rate: str = "2.5",
-    runtime: str = "60",
-    waited: float = 0.0,
+    name: str = "gang", needs: tuple[str, ...] = GANG, rate: str = "2.5", runtime: str = "60", **more: Any
 ) -> OpenRequest:
-    return OpenRequest(
-        id=f"{name}-id",
-        arc=name,
-        needs={rc: {"rate": Decimal(rate)} if rc.startswith("radio") else {} for rc in needs},
-        priority=3,
-        min_runtime=Decimal(runtime),
-        keep=True,
-        place=place,
-        waited=waited,
-        grant=grant,
-    )
+    wanted = {rc: {"rate": Decimal(rate)} if rc.startswith("radio") else {} for rc in needs}
+    return OpenRequest(f"{name}-id", name, wanted, 3, Decimal(runtime), keep=True, **({"place": PLACE} | more))
 
 
 def client(*requests: OpenRequest, name: str = "h/one") -> ClientRequests:
@@ -85,13 +49,23 @@ BOTH = [rc("robot/a", hold()), rc("radio/b", hold(params={"rate": Decimal("2.5")
 RUNS = client(asked(grant=Grant(TERM, 5)))
 
 
+ALONE = ("robot/a",)
+TWO_GRANTS = [rc("robot/a", hold(seq=1)), rc("radio/b", hold(seq=1), hold(term=OLD, seq=9))]
+WAITING = [
+    client(asked("third", place=Place(TERM, 1)), asked("second", place=Place(OLD, 9)), name="h/z"),
+    client(asked("first", place=Place(OLD, 8)), name="h/y"),
+]
+NONSENSE = [client(asked(runtime="0"), asked("good"), asked("bad name")), client(name="no client")]
+HALF_NONSENSE = rc("robot/a", hold(ALONE, client="nobody"), hold(ALONE, name="good"))
+
+
 def summary(found: RecoveredState) -> tuple[list[str], list[str]]:
     """The names of what stands and what waits."""
     return [held.request.name for held in found.holds], [one.request.name for one in found.waiting]
 
 
 @pytest.mark.parametrize(
-    ("states", "clients", "recovered_holds", "waiting"),
+    ("states", "clients", "holds", "waiting"),
     [
         pytest.param([], [], [], [], id="nothing"),
         pytest.param(BOTH, [RUNS], ["gang"], [], id="a gang that is all there"),
@@ -100,61 +74,23 @@ def summary(found: RecoveredState) -> tuple[list[str], list[str]]:
         pytest.param([BOTH[0], rc("radio/b")], [RUNS], [], ["gang"], id="an RC is there and does not hold it"),
         pytest.param([BOTH[0], rc("radio/b")], [], [], ["gang"], id="the same, and its client is late"),
         pytest.param([BOTH[0], rc("radio/b", hold(seq=4))], [RUNS], [], ["gang"], id="half under an older grant"),
-        pytest.param(
-            [rc("robot/a", hold(seq=1)), rc("radio/b", hold(seq=1), hold(term=OLD, seq=9))],
-            [RUNS],
-            ["gang"],
-            [],
-            id="of two grants of one ARC the newer counts, if it is whole",
-        ),
-        pytest.param(
-            [rc("robot/a"), rc("radio/b")], [RUNS], [], ["gang"], id="no RC holds what its client believes in"
-        ),
+        pytest.param(TWO_GRANTS, [RUNS], ["gang"], [], id="of two grants of one ARC the newer counts, if it is whole"),
+        pytest.param([rc("robot/a"), rc("radio/b")], [RUNS], [], ["gang"], id="no RC holds what its client tells of"),
         pytest.param([], [RUNS], [], ["gang"], id="no RC answers at all"),
         pytest.param(BOTH, [client()], [], [], id="its client has given it up: nobody wants it"),
-        pytest.param(
-            BOTH,
-            [client(asked("other", place=None), name="h/one")],
-            [],
-            [],
-            id="its client has given it up and wants something else, which it asks for",
-        ),
+        pytest.param(BOTH, [client(asked("other", place=None))], [], [], id="its client gave it up and wants another"),
         pytest.param(BOTH, [client(name="h/two")], ["gang"], [], id="another client has nothing to say about it"),
         pytest.param([], [client(asked(place=None))], [], [], id="never answered: it will be asked again"),
-        pytest.param(
-            BOTH,
-            [
-                RUNS,
-                client(asked("third", place=Place(TERM, 1)), asked("second", place=Place(OLD, 9)), name="h/z"),
-                client(asked("first", place=Place(OLD, 8)), name="h/y"),
-            ],
-            ["gang"],
-            ["first", "second", "third"],
-            id="those who wait, by place",
-        ),
+        pytest.param(BOTH, [RUNS, *WAITING], ["gang"], ["first", "second", "third"], id="those who wait, by place"),
         pytest.param([], [client(asked(runtime="-1"))], [], [], id="nonsense from a client"),
-        pytest.param(
-            [],
-            [client(asked(runtime="0"), asked("good"), asked("bad name")), client(name="no client")],
-            [],
-            ["good"],
-            id="nonsense from a client spoils nothing else",
-        ),
-        pytest.param([rc("robot/a", hold(("robot/a",), runtime="NaN"))], [], [], [], id="nonsense from an RC"),
-        pytest.param(
-            [rc("robot/a", hold(("robot/a",), client="nobody"), hold(("robot/a",), name="good"))],
-            [],
-            ["good"],
-            [],
-            id="nonsense from an RC spoils nothing else",
-        ),
+        pytest.param([], NONSENSE, [], ["good"], id="nonsense from a client spoils nothing else"),
+        pytest.param([rc("robot/a", hold(ALONE, min_runtime=Decimal("NaN")))], [], [], [], id="nonsense from an RC"),
+        pytest.param([HALF_NONSENSE], [], ["good"], [], id="nonsense from an RC spoils nothing else"),
     ],
 )
-def test_recover(
-    states: list[RcState], clients: list[ClientRequests], recovered_holds: list[str], waiting: list[str]
-) -> None:
+def test_recover(states: list[RcState], clients: list[ClientRequests], holds: list[str], waiting: list[str]) -> None:
     found = recover(states, clients, NOW)
-    assert summary(found) == (recovered_holds, waiting)
+    assert summary(found) == (holds, waiting)
     assert found.rcs == {state.rc: state for state in states}
 
 
@@ -190,11 +126,7 @@ def bound_hold(bound: dict[str, str] = BOUND, params: dict[str, Decimal] | None 
     return hold(THREE, params=params, bound=bound)
 
 
-BY_PATTERN = [
-    rc("robot/a", bound_hold()),
-    rc("radio/b", bound_hold(params=RATE)),
-    rc("radio/c", bound_hold(params=RATE)),
-]
+BY_PATTERN = [rc(name, bound_hold(params=RATE if name.startswith("radio") else {})) for name in THREE]
 ASKED = client(asked(grant=Grant(TERM, 5), needs=tuple(BOUND)))
 
 
@@ -226,11 +158,8 @@ def test_patterns_and_what_meets_them_are_restored(states: list[RcState], client
 
 
 def test_an_rc_that_read_of_its_hold_in_a_snapshot_passes_on_its_binding() -> None:
-    view = HoldView(
-        id="gang-id", arc="gang", client="h/one", priority=3, grant=Grant(TERM, 5), place=PLACE,
-        needs={"robot/a": {}}, min_runtime=Decimal(60), held=50.0, remaining=10.0,
-        bound={"robot/*": "robot/a"},
-    )  # fmt: skip
+    grant, needs, bound = Grant(TERM, 5), {"robot/a": dict[str, Decimal]()}, {"robot/*": "robot/a"}
+    view = HoldView("gang-id", "gang", "h/one", 3, grant, PLACE, needs, Decimal(60), 50, 10, bound=bound)
     holding = HoldTable("robot/a", hold_lease=3 * SECOND)
     holding.apply_snapshot(RcmState(TERM, 5, "h", [view]), NOW)
     (held,) = recover([rc("robot/a", *holding.holders(NOW))], [], NOW).holds

@@ -19,7 +19,7 @@ BOB = Who("bob", "ws2", "zscout take", "the gripper is stuck")
 
 
 async def test_who_preempts_and_why_is_told_to_whom_it_preempts() -> None:
-    fleet, robot = await fleet_of("robot/a")
+    fleet, (robot,) = await fleet_of("robot/a")
     survey, operator = fleet.client("survey"), fleet.client("operator")
     await survey.ask("survey", "robot/a", who=ALICE)
     assert [holder.who for holder in robot.holders] == [ALICE]
@@ -47,7 +47,7 @@ async def test_who_preempts_and_why_is_told_to_whom_it_preempts() -> None:
 
 async def test_until_when_it_waits_at_the_latest_is_a_duration() -> None:
     """Of whom it outranks or equals the end of the minimum runtime; of a kept hold of higher rank nothing is known."""
-    fleet, *_ = await fleet_of("robot/a", "robot/b", "robot/c")
+    fleet, _ = await fleet_of("robot/a", "robot/b", "robot/c")
     client = fleet.client("one")
     await client.ask("equal", "robot/a", seconds=60, keep=True)
     await client.ask("higher", "robot/b", seconds=60, priority=5)
@@ -87,7 +87,7 @@ async def test_all_choices_of_a_pattern_are_named() -> None:
 
 
 async def test_who_is_unknown_is_named_by_client_and_arc_and_who_cancels_by_name() -> None:
-    fleet, *_ = await fleet_of("robot/a")
+    fleet, _ = await fleet_of("robot/a")
     plain, operator = fleet.client("plain"), fleet.client("operator")
     await plain.ask("survey", "robot/a")
     answer = await operator.ask("late", "robot/a")
@@ -101,7 +101,7 @@ async def test_who_is_unknown_is_named_by_client_and_arc_and_who_cancels_by_name
 
 
 async def test_it_goes_on_elsewhere_under_the_same_user_on_the_new_host() -> None:
-    fleet, robot = await fleet_of("robot/a")
+    fleet, (robot,) = await fleet_of("robot/a")
     old, new = fleet.client("old"), fleet.client("new")
     await old.ask("counter", "robot/a", who=ALICE)
     await old.do(HandOver("counter", new.name))
@@ -130,7 +130,7 @@ async def test_the_next_leader_knows_it_from_the_rcs_and_from_the_clients() -> N
 
 
 async def test_a_forecast_names_whom_it_would_preempt() -> None:
-    fleet, *_ = await fleet_of("robot/a")
+    fleet, _ = await fleet_of("robot/a")
     client = fleet.client("one")
     await client.ask("survey", "robot/a", who=ALICE)
     foreseen = await do(client, Foresee("x", "x", {"robot/a": {}}, 5, Decimal(1)), Foresight)
@@ -140,7 +140,7 @@ async def test_a_forecast_names_whom_it_would_preempt() -> None:
 
 @pytest.mark.parametrize("who", [Who("u" * 65), Who(host="h" * 65), Who(command="c" * 65), Who(comment="c" * 201)])
 async def test_what_is_too_long_to_be_shown_is_refused(who: Who) -> None:
-    fleet, *_ = await fleet_of("robot/a")
+    fleet, _ = await fleet_of("robot/a")
     with pytest.raises(Refusal, match=r"malformed: not a valid operation: .*length <= "):
         await fleet.client("one").ask("survey", "robot/a", who=who)
     assert not (await fleet.state()).holds

@@ -24,14 +24,8 @@ USE: Final = {"counter": (0.3, 80e6), "mapper": (1.1, 900e6), "watch": (0.5, 260
 
 def placement(name: str, state: str, host: str | None, incarnation: int, **more: object) -> Placement:
     """As JSON brings it: nothing is taken that a real message could not hold."""
-    told = {
-        "component": name,
-        "spec": {"kind": name.split("-")[0]},
-        "state": state,
-        "host": host,
-        "incarnation": incarnation,
-    }
-    return msgspec.convert(told | more, Placement)
+    told = {"component": name, "spec": {"kind": name.split("-")[0]}, "state": state, "host": host}
+    return msgspec.convert(told | {"incarnation": incarnation} | more, Placement)
 
 
 def story() -> list[tuple[float, Placements]]:
@@ -75,14 +69,14 @@ def story() -> list[tuple[float, Placements]]:
     return says
 
 
-def play(timeline: Timeline) -> None:
-    """The hour, as the recorder would write it."""
+def play(timeline: Timeline, every: int = REPORT_EVERY) -> None:
+    """The hour, as the recorder would write it. `every`: seconds between reports of a host."""
     written = timeline.hosts
     written.placements(0, Placements(TERM), set())
     says = story()
     runs: dict[str, str] = {}
     loads = dict.fromkeys(HOSTS, 0.2)
-    for at in range(0, HOUR + 1, REPORT_EVERY):
+    for at in range(0, HOUR + 1, every):
         while says and says[0][0] <= at:
             moment, told = says.pop(0)
             written.placements(moment, told)

@@ -62,8 +62,7 @@ OPERATOR: Final = (30.0, 44.0, "scout34")
 WAYS: Final[dict[str, tuple[tuple[float, float, float], ...]]] = {
     "scout33": ((0, 2.6, 0.6), (3, 2.6, 0.6), (8, 1.6, 2.0), (13, 0.8, 2.9)),
     "scout34": (
-        (0, 3.6, 0.7),
-        (5, 3.6, 0.7),
+        *((second, 3.6, 0.7) for second in (0, 5)),
         (13, 4.1, 2.2),
         (17, 3.9, 2.0),
         (30, 4.4, 2.9),
@@ -116,24 +115,21 @@ def jpeg(at: float, robot: str, box: tuple[int, int, int, int] | None) -> bytes:
 
 def play(timeline: Timeline, until: int = SECONDS) -> None:
     """The run, as the recorder would write it; its first `until` seconds."""
-    tracker = timeline.robots
     grants: dict[tuple[int, float], Grant] = {}
     happens: list[tuple[float, Any]] = []
     for robot, turns in TURNS.items():
-        happens.append((0.0, lambda at, robot=robot: wait(tracker, timeline, at, robot, "for its turn")))
+        happens.append((0.0, lambda at, robot=robot: wait(timeline, at, robot, "for its turn")))
         for number, turn in enumerate(turns):
             grants[turn[2], turn[0]] = Grant(Term(1, "rcm"), len(grants) + 1)
-            happens += _turn(
-                tracker, timeline, robot, "watch" if number and robot == "scout33" else "hide", turn, grants
-            )
+            happens += _turn(timeline, robot, "watch" if number and robot == "scout33" else "hide", turn, grants)
     begin, end, robot = OPERATOR
     grants[2, begin] = Grant(Term(1, "rcm"), 99)
 
     def stop(at: float) -> None:
-        _free(tracker, timeline, at, "drive", robot, 2)
+        _free(timeline, at, "drive", robot, 2)
 
     happens += [
-        (begin, lambda at: _hold(tracker, timeline, at, "drive", robot, 2, grants[2, begin], operator=True)),
+        (begin, lambda at: _hold(timeline, at, "drive", robot, 2, grants[2, begin], operator=True)),
         (end, stop),
     ]
     # What ends at one moment goes before what begins.
@@ -143,49 +139,49 @@ def play(timeline: Timeline, until: int = SECONDS) -> None:
         while happens and happens[0][0] <= at:
             moment, what = happens.pop(0)
             what(moment)
-        _building(tracker, at, tenth)
+        _building(timeline, at, tenth)
         if tenth % 5 == 0:
-            _frames(tracker, at, grants)
+            _frames(timeline, at, grants)
         if tenth % 10 == 0:
-            _second(tracker, timeline, at)
-        tracker.tick(at)
+            _second(timeline, at)
+        timeline.robots.tick(at)
 
 
-def wait(tracker: RobotTracker, timeline: Timeline, at: float, robot: str, why: str) -> None:
-    said(tracker, at, f"{robot}/hide", "wait", why, robot)
+def wait(timeline: Timeline, at: float, robot: str, why: str) -> None:
+    said(timeline, at, f"{robot}/hide", "wait", why, robot)
     timeline.arc(at, f"{robot}-hide", "waiting", "framegrabber/* is held by scout33-hide and scout34-hide")
 
 
-def said(tracker: RobotTracker, at: float, path: str, doing: str, detail: str, robot: str, **more: Any) -> None:
+def said(timeline: Timeline, at: float, path: str, doing: str, detail: str, robot: str, **more: Any) -> None:
     fields = {"path": f"place_sensor_net/{path}", "doing": doing, "detail": detail, "robot": f"robot/{robot}"}
-    tracker.behavior(at, NET, told(BehaviorSaid, **fields, **more))
+    timeline.robots.behavior(at, NET, told(BehaviorSaid, **fields, **more))
 
 
 def _turn(
-    tracker: RobotTracker, timeline: Timeline, robot: str, task: str, turn: Turn, grants: dict[tuple[int, float], Grant]
+    timeline: Timeline, robot: str, task: str, turn: Turn, grants: dict[tuple[int, float], Grant]
 ) -> list[tuple[float, Any]]:
     """What happens in one turn, by second."""
     begin, end, camera, steps = turn
     path, arc = f"{robot}/{task}", f"{robot}-{task}"
 
     def start(at: float) -> None:
-        _hold(tracker, timeline, at, arc, robot, camera, grants[camera, begin])
+        _hold(timeline, at, arc, robot, camera, grants[camera, begin])
 
     def step(doing: str, detail: str) -> Any:
         more: dict[str, Any] = {"camera": f"framegrabber/fgrab{camera}"} if task == "watch" else {}
         if doing == "alert":
             more |= {"alert": True, "boxes": [[88, 30, 26, 44]]}
-        return lambda at: said(tracker, at, path, doing, detail, robot, **more)
+        return lambda at: said(timeline, at, path, doing, detail, robot, **more)
 
     def stop(at: float) -> None:
-        _free(tracker, timeline, at, arc, robot, camera)
+        _free(timeline, at, arc, robot, camera)
         if (robot, end) == (OPERATOR[2], OPERATOR[0]):
             timeline.arc(at, arc, "preempted", "by drive (priority 10) on robot/scout34")
             timeline.event(at, f"{arc} is preempted by drive (priority 10) on robot/{robot}, and waits again", "WARN")
-            said(tracker, at, path, "wait", "the hold is over", robot)
+            said(timeline, at, path, "wait", "the hold is over", robot)
         else:
             timeline.arc(at, arc, "done")
-            said(tracker, at, path, "", "", robot)
+            said(timeline, at, path, "", "", robot)
 
     return [(begin, start), *((begin + after, step(doing, detail)) for after, doing, detail in steps), (end, stop)]
 
@@ -198,19 +194,11 @@ _RADIO: dict[str, HolderRow] = {}
 
 
 def _hold(
-    tracker: RobotTracker,
-    timeline: Timeline,
-    at: float,
-    arc: str,
-    robot: str,
-    camera: int,
-    grant: Grant,
-    *,
-    operator: bool = False,
+    timeline: Timeline, at: float, arc: str, robot: str, camera: int, grant: Grant, *, operator: bool = False
 ) -> None:
     holder = HolderRow(arc, operator, (f"robot/{robot}",))
     for rc in _rcs(robot, camera):
-        tracker.holds[rc] = {grant: holder}
+        timeline.robots.holds[rc] = {grant: holder}
         timeline.holders(at, rc, [holder])
     _RADIO[arc] = holder
     timeline.holders(at, "radio/rf0", list(_RADIO.values()))
@@ -218,9 +206,9 @@ def _hold(
     timeline.event(at, f"{arc} runs on {', '.join(sorted((*_rcs(robot, camera), 'radio/rf0')))}")
 
 
-def _free(tracker: RobotTracker, timeline: Timeline, at: float, arc: str, robot: str, camera: int) -> None:
+def _free(timeline: Timeline, at: float, arc: str, robot: str, camera: int) -> None:
     for rc in _rcs(robot, camera):
-        tracker.holds[rc] = {}
+        timeline.robots.holds[rc] = {}
         timeline.holders(at, rc, [])
     _RADIO.pop(arc, None)
     timeline.holders(at, "radio/rf0", list(_RADIO.values()))
@@ -228,7 +216,7 @@ def _free(tracker: RobotTracker, timeline: Timeline, at: float, arc: str, robot:
         timeline.arc(at, arc, "done")
 
 
-def _building(tracker: RobotTracker, at: float, tenth: int) -> None:
+def _building(timeline: Timeline, at: float, tenth: int) -> None:
     if tenth % 2:
         return
     robots = []
@@ -241,10 +229,10 @@ def _building(tracker: RobotTracker, at: float, tenth: int) -> None:
     begin, end = PERSON
     there = begin <= at < end
     people = [{"name": "walker", "x": 5.6 - 0.6 * (at - begin), "y": 1.2}] if there else []
-    tracker.floor.poses(at, BUILDING, told(BuildingPoses, time=at * 2, speed=2.0, robots=robots, people=people))
-    if tracker.floor.wants_plan(at) is not None:
+    timeline.robots.floor.poses(at, BUILDING, told(BuildingPoses, time=at * 2, speed=2.0, robots=robots, people=people))
+    if timeline.robots.floor.wants_plan(at) is not None:
         plan = BuildingPlan("living_room", WIDTH, DEPTH, png())
-        tracker.floor.plan(at, BUILDING, msgspec.json.decode(msgspec.json.encode(plan), type=BuildingPlan))
+        timeline.robots.floor.plan(at, BUILDING, msgspec.json.decode(msgspec.json.encode(plan), type=BuildingPlan))
 
 
 def _on(way: tuple[tuple[float, float, float], ...], at: float) -> tuple[float, float, float]:
@@ -261,7 +249,7 @@ def _on(way: tuple[tuple[float, float, float], ...], at: float) -> tuple[float, 
     return last[1], last[2], heading + math.pi
 
 
-def _frames(tracker: RobotTracker, at: float, grants: dict[tuple[int, float], Grant]) -> None:
+def _frames(timeline: Timeline, at: float, grants: dict[tuple[int, float], Grant]) -> None:
     for camera in (1, 2):
         turn = [
             (robot, begin)
@@ -271,30 +259,24 @@ def _frames(tracker: RobotTracker, at: float, grants: dict[tuple[int, float], Gr
         ]
         name = f"framegrabber/fgrab{camera}"
         if not turn:
-            tracker.no_frame(at, name)
+            timeline.robots.no_frame(at, name)
             continue
         robot, begin = turn[0]
         somebody = (88, 30, 26, 44) if robot == "scout33" and 35 <= at < 38 else None
         grant = grants[camera, begin]
         head = told(FrameHead, number=round(at * 10), time=at, width=160, height=120, grant=grant)
-        tracker.frame(at, name, head, jpeg(at, robot, somebody))
+        timeline.robots.frame(at, name, head, jpeg(at, robot, somebody))
 
 
-def _second(tracker: RobotTracker, timeline: Timeline, at: float) -> None:
+def _second(timeline: Timeline, at: float) -> None:
     for number, host in enumerate(("anvil", "basil", "crucible")):
         timeline.hosts.load(at, host, 0.4 + 0.3 * number + 0.2 * math.sin(at / 9 + number), 0.3)
     for robot in ROBOTS:
         figures = {"commands": 5 + math.sin(at / 5 + ord(robot[-1])), "latency_ms": 20 + 4 * math.sin(at)}
-        tracker.state(
-            at, told(RcState, rc=f"robot/{robot}", host="cart", instance="i", sharable=False, figures=figures)
-        )
-    if at == 50:
-        tracker.state(
-            at,
-            told(
-                RcState, rc="robot/scout36", host="cart", instance="i", sharable=False, health="radio/rf0 is not there"
-            ),
-        )
+        state = {"rc": f"robot/{robot}", "host": "cart", "instance": "i", "sharable": False}
+        timeline.robots.state(at, told(RcState, **state, figures=figures))
+        if at == 50 and robot == "scout36":
+            timeline.robots.state(at, told(RcState, **state, health="radio/rf0 is not there"))
 
 
 def record(path: Path, until: int = SECONDS) -> None:

@@ -30,15 +30,16 @@ def chunks(path: Path) -> int:
     return len(RrdReader(path).stream().to_chunks())
 
 
+@pytest.mark.parametrize(("until", "fewer"), [(5, 2), pytest.param(60, 8, marks=pytest.mark.slow)])
 def test_a_recording_that_is_over_has_few_chunks_and_all_that_was_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, until: int, fewer: int
 ) -> None:
-    record(tmp_path / "finished.rrd")
+    record(tmp_path / "finished.rrd", until)
     monkeypatch.setattr(module, "finish", lambda *_: None)
     monkeypatch.setattr(module, "FILE_TICK", 0.0)
-    record(tmp_path / "written.rrd")
+    record(tmp_path / "written.rrd", until)
     finished, written = ((tmp_path / f"{name}.rrd") for name in ("finished", "written"))
-    assert 8 * chunks(finished) < chunks(written)
+    assert fewer * chunks(finished) < chunks(written)
     assert finished.stat().st_size < written.stat().st_size
     for content in ("/devices/**", "/requests/**", "/behavior/**"):
         assert lanes(finished, content) == lanes(written, content)
@@ -53,21 +54,23 @@ def _pictures(path: Path, content: str) -> list[float]:
     return sorted(at for _, at, _ in rows(path, content, "EncodedImage:blob"))
 
 
-def test_of_old_pictures_one_a_second_stays(path: Path) -> None:
-    picture = jpeg(0, "scout33", None)
-    end = WHOLE + 60
+def test_of_old_pictures_one_a_second_stays(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    picture, whole, end = jpeg(0, "scout33", None), 30.0, 90
+    monkeypatch.setattr(module, "finish", lambda path, layout: finish(path, layout, whole=whole))
     with Timeline("lab", path=path) as timeline:
-        for quarter in range(round(end) * 4 + 1):
+        for quarter in range(end * 4 + 1):
             timeline.robots.frame(quarter / 4, CAMERA, head(quarter), picture)
             timeline.event(quarter / 4, f"event {quarter}")
     shown = _pictures(path, "/camera/**")
-    old = [at for at in shown if at < end - WHOLE]
+    old = [at for at in shown if at < end - whole]
     assert [later - at for at, later in pairwise(old)] == [APART] * (len(old) - 1)
-    assert len(old) == 60
-    assert len(shown) - len(old) == WHOLE * 4 + 1
+    assert len(old) == end - whole
+    assert len(shown) - len(old) == whole * 4 + 1
     assert len(events(path)) == end * 4 + 1
 
 
+@pytest.mark.live
+@pytest.mark.slow
 def test_a_process_of_its_own_thins_what_is_over_and_says_what_it_can_t(tmp_path: Path) -> None:
     first, picture = tmp_path / "first.rrd", jpeg(0, "scout33", None)
     with Timeline("lab", path=first) as timeline:

@@ -42,27 +42,15 @@ def test_holds_are_shown_at_their_times_and_none_of_what_was_recorded() -> None:
         past(4, ZERO, None, arc="recorded"),
         past(5, -10, 0.0, arc="long ago"),
     ]
-    assert shown(*holds) == {
-        "robot/a": [
-            (0, [SURVEY]),
-            (100, [PastBar("drive", operator=True)]),
-            (200, [None]),
-            (900, [SURVEY]),
-            (ZERO, [None]),
-        ]
-    }
+    drive = PastBar("drive", operator=True)
+    assert shown(*holds) == {"robot/a": [(0, [SURVEY]), (100, [drive]), (200, [None]), (900, [SURVEY]), (ZERO, [None])]}
 
 
 def test_several_holders_keep_their_rows() -> None:
     holds = [past(1, 10, 30, arc="a"), past(2, 20, 50, arc="b"), past(3, 30, 40, arc="c")]
     a, b, c = (PastBar(name) for name in "abc")
-    assert shown(*holds)["robot/a"] == [
-        (10, [a, None]),
-        (20, [a, b]),
-        (30, [c, b]),
-        (40, [None, b]),
-        (50, [None, None]),
-    ]
+    lane = shown(*holds)["robot/a"]
+    assert lane == [(10, [a, None]), (20, [a, b]), (30, [c, b]), (40, [None, b]), (50, [None, None])]
     crowd = [past(number, 10, 30, arc=f"arc{number}") for number in range(MAX_SLOTS + 3)]
     assert [len(bars) for _, bars in shown(*crowd)["robot/a"]] == [MAX_SLOTS, MAX_SLOTS]
 
@@ -122,13 +110,8 @@ def test_the_past_is_drawn_paler_and_makes_the_run_no_longer(path: Path) -> None
     timeline.past(600, {"robot/late": [(-1, [SURVEY])]})
     assert layout.only_past == ("/devices/robot/gone",)
     assert (layout.past, layout.span) == (600.0, (0.5, 9.0))
-    assert lanes(path, "/devices/robot/a")["/devices/robot/a"] == [
-        (-500, ["survey (journal)"]),
-        (-400, ["not known"]),
-        (-300, ["drive (operator) (journal)"]),
-        (0, [""]),
-        (0.5, ["survey"]),
-    ]
+    before = [(-500, ["survey (journal)"]), (-400, ["not known"]), (-300, ["drive (operator) (journal)"])]
+    assert lanes(path, "/devices/robot/a")["/devices/robot/a"] == [*before, (0, [""]), (0.5, ["survey"])]
     assert colours(path, "/devices/robot/a")["/devices/robot/a"] == {
         "survey": PALETTE[0],
         "survey (journal)": faded(PALETTE[0], PAST_PART),
@@ -152,7 +135,7 @@ def test_only_the_first_file_has_the_past(tmp_path: Path) -> None:
 
 
 async def test_a_recorder_that_comes_late_shows_what_journals_tell(path: Path, tmp_path: Path) -> None:
-    told, *_ = await telling(tmp_path, "x", "y", rcs=["robot/a", "robot/b"])
+    told, _ = await telling(tmp_path, "x", "y", rcs=["robot/a", "robot/b"])
     fleet = told.fleet
     one, two = fleet.client("one"), fleet.client("two")
     await one.ask("survey", "robot/a", seconds=6_000)

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-from PIL import Image
+import pytest
 
 from studies.placement.plots import record
 from studies.placement.study import SCENARIOS, study
 from studies.recording import COLOURS
 from tests.services.recorder.placed_hour import play
-from tests.services.recorder.test_viewer_picture import DIMMED, WIDTH, Rgb, rgb, settled_picture, viewer
+from tests.services.recorder.test_viewer_picture import DIMMED, WIDTH, look, pixels, rgb
 from zscout.messages import Placements
 from zscout.services.recorder.blueprint import MARK_WORDS
 from zscout.services.recorder.colours import FAILED, LINES, MARKS, PALETTE
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import POLICIES, Term
+
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 HEIGHT = 900
 PANES = 0.62
@@ -24,20 +25,12 @@ STUDY = 0.74
 """Part of the width that the panes at the left have."""
 
 
-def pixels(picture: Image.Image, colour: Rgb) -> list[tuple[int, int]]:
-    """Where this colour is: x and y."""
-    off = np.abs(np.asarray(picture, np.int16) - np.array(colour, np.int16)).max(axis=2)
-    return [(int(x), int(y)) for y, x in np.argwhere(off <= 3)]
-
-
 def test_an_hour_of_placements_at_a_glance(path: Path, tmp_path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         play(timeline)
-    with viewer(path, tmp_path, panes=8, height=HEIGHT) as client:
-        picture = settled_picture(client, tmp_path / "picture.png")
-        views = client.get_state().views
-    assert [report for view in views for report in view.reports] == []
-    assert {view.name for view in views} >= {"What runs on each host", f"Load average (1 min) per host   {MARK_WORDS}"}
+    picture, state = look(path, tmp_path, panes=8, height=HEIGHT)
+    names = {view.name for view in state.views}
+    assert names >= {"What runs on each host", f"Load average (1 min) per host   {MARK_WORDS}"}
     left = picture.crop((0, 0, round(WIDTH * PANES), HEIGHT))
     # The lanes of the six components, the first of them an ARC's colour too.
     for colour in PALETTE[:6]:
@@ -63,19 +56,13 @@ def test_words_that_the_viewer_can_t_draw_do_not_end_it(path: Path, tmp_path: Pa
         timeline.hosts.load(0, words, 1.0)
         tracker = timeline.hosts
         tracker.placements(0, Placements(Term(1, words)))
-    with viewer(path, tmp_path) as client:
-        settled_picture(client, tmp_path / "picture.png")
-        assert [report for view in client.get_state().views for report in view.reports] == []
+    look(path, tmp_path)
 
 
 def test_the_study_s_plots_show_all_and_compare(path: Path, tmp_path: Path) -> None:
     report, outcomes = study([1])
     record(path, report, outcomes)
-    panes = len(SCENARIOS) * len(POLICIES) + 1
-    with viewer(path, tmp_path, panes=panes, height=HEIGHT) as client:
-        picture = settled_picture(client, tmp_path / "picture.png")
-        assert [report for view in client.get_state().views for report in view.reports] == []
-
+    picture, _ = look(path, tmp_path, panes=len(SCENARIOS) * len(POLICIES) + 1, height=HEIGHT)
     # The plots of the tab that is open: least_loaded at the upper left, pending at the lower right.
     middle, across = round(WIDTH * STUDY / 2), (95 + 870) // 2
     one_host = picture.crop((0, 95, middle, across - 30))

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
+import pytest
 from PIL import Image
 
 from tests.services.recorder.robot_run import BUILDING, GRANT, head, jpeg, png, poses, record, say
-from tests.services.recorder.test_viewer_picture import DIMMED, WIDTH, Rgb, rgb, settled_picture, viewer
+from tests.services.recorder.test_viewer_picture import DIMMED, WIDTH, look, pixels, rgb
 from zscout.messages import BuildingPlan, RcState
 from zscout.services.recorder.blueprint import FLOOR_WORDS
 from zscout.services.recorder.colours import ALERT, DOING, HIDDEN, IN_THE_OPEN, OPERATOR, PERSON
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import Timeline
+
+pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 HEIGHT = 900
 PANES = 0.57
@@ -22,19 +24,10 @@ FLOOR, CAMERAS = (65, 410), (440, 620)
 """From and to which row of pixels these panes reach."""
 
 
-def pixels(picture: Image.Image, colour: Rgb, off: int = 3) -> list[tuple[int, int]]:
-    """Where a colour is that is at most `off` from this one: x and y."""
-    far = np.abs(np.asarray(picture, np.int16) - np.array(colour, np.int16)).max(axis=2)
-    return [(int(x), int(y)) for y, x in np.argwhere(far <= off)]
-
-
 def test_a_minute_of_robots_at_a_glance(path: Path, tmp_path: Path) -> None:
     record(path, until=37)
-    with viewer(path, tmp_path, panes=10, height=HEIGHT) as client:
-        picture = settled_picture(client, tmp_path / "picture.png")
-        views = client.get_state().views
-    assert [report for view in views for report in view.reports] == []
-    assert {view.name for view in views} == {
+    picture, state = look(path, tmp_path, panes=10, height=HEIGHT)
+    assert {view.name for view in state.views} == {
         "Who holds each device",
         "What each request is doing",
         "What each behavior is doing",
@@ -98,6 +91,4 @@ def test_garbled_pictures_and_words_do_not_end_the_viewer(path: Path, tmp_path: 
         timeline.flush(10)
         live.write_bytes(path.read_bytes())
     # Seven cameras on two pages, and each of the other panes.
-    with viewer(live, tmp_path, panes=7 + 8, height=HEIGHT) as client:
-        settled_picture(client, tmp_path / "picture.png")
-        assert [report for view in client.get_state().views for report in view.reports] == []
+    look(live, tmp_path, panes=7 + 8, height=HEIGHT)

@@ -16,14 +16,14 @@ from zscout.behaviors.client.arc import hold
 from zscout.config.fleet import default_fleet
 from zscout.config.node import RecorderConfig, load_node
 from zscout.config.strict import BadInput
-from zscout.keyexpr import Role, Sender, Token
+from zscout.keyexpr import Sender
 from zscout.mesh import ZenohMesh
 from zscout.messages import BehaviorSaid, BuildingPlan, BuildingPoses, FrameHead, Placed, PlanAsk
 from zscout.services.recorder.process import RecorderJob, decode_job, encode_job
 from zscout.services.recorder.recorder import Recorder
 from zscout.services.recorder.timeline import Timeline
 
-REAL_TIME = True
+pytestmark = pytest.mark.real_time
 
 
 def test_how_many_pictures_a_recorder_takes_is_set_in_the_node_file(tmp_path: Path) -> None:
@@ -42,40 +42,7 @@ def test_how_many_pictures_a_recorder_takes_is_set_in_the_node_file(tmp_path: Pa
 
 
 @pytest.mark.live
-async def test_who_takes_no_pictures_does_not_look(tmp_path: Path) -> None:
-    """And who takes them looks only while the framegrabber is there."""
-    async with Lab(tmp_path) as lab:
-        speaker = (await lab.client("speaker")).mesh
-        watched: asyncio.Queue[bool] = asyncio.Queue()
-        publisher = speaker.frame_publisher(speaker.keys.frame(CAMERA))
-        publisher.follow(watched.put_nowait)
-        here = Sender("here", "ears")
-        async with await ZenohMesh.open(lab.fleet, here) as ears:
-            with Timeline("lab", path=tmp_path / "run.rrd") as timeline:
-                heard, offered, stop = asyncio.Event(), asyncio.Event(), asyncio.Event()
-                timeline.robots.behavior = lambda *_: heard.set()  # type: ignore[method-assign]
-                timeline.presence = lambda _, text, *level: offered.set() if CAMERA in text else None  # type: ignore[method-assign]
-                recorders = [asyncio.create_task(Recorder(ears, lab.fleet, timeline, 0).run(stop))]
-                token = speaker.alive(Token("cart", Role.RC, CAMERA, "i1"))
-                # What blind has asked for so far is known to the speaker once a question of it is.
-                said = speaker.publisher(speaker.keys.behavior(speaker.me), BehaviorSaid)
-                async with asyncio.timeout(HANG):
-                    await offered.wait()
-                    while not heard.is_set():
-                        said.put(BehaviorSaid("net", "search"))
-                        await asyncio.sleep(0.02)
-                    assert not publisher.watched
-                    assert watched.empty()
-                    recorders.append(asyncio.create_task(Recorder(ears, lab.fleet, timeline, 20).run(stop)))
-                    assert await watched.get()
-                    token.close()
-                    assert not await watched.get()
-                    stop.set()
-                    await asyncio.gather(*recorders)
-        publisher.close()
-
-
-@pytest.mark.live
+@pytest.mark.slow
 async def test_a_recorder_sees_what_robots_do(path: Path, tmp_path: Path) -> None:
     """The RCs are a real node's; what framegrabber, building and behavior say, their holder says.
 

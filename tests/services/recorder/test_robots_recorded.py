@@ -17,6 +17,7 @@ from zscout.services.recorder.colours import DOING, HIDDEN, IN_THE_OPEN, OPERATO
 from zscout.services.recorder.timeline import Timeline
 
 
+@pytest.mark.slow
 def test_a_minute_reads_as_it_was(path: Path) -> None:
     record(path)
     shown = lanes(path, "/behavior/**")

@@ -9,8 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.mesh.kit import until
 from tests.services.recorder.kit import ears, recording
 from tests.services.recorder.paper_run import SCOUT33, events, lanes, rows
+from tests.services.recorder.robot_run import CAMERA
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
 from zscout.messages import (
@@ -228,6 +230,25 @@ async def test_at_its_end_it_reads_what_was_published_and_missed(path: Path) -> 
     async with recording(path, ears(network), rcm.mesh):
         holds.append(view)
     assert [state for _, state in lanes(path, "/devices/**")[f"/devices/{SCOUT33}"]] == [["hide"]]
+
+
+async def test_who_takes_no_pictures_does_not_look(path: Path, tmp_path: Path) -> None:
+    """And who takes them looks only while the framegrabber is there."""
+    network, watched = MemoryNetwork(), list[bool]()
+    speaker = Leader(network).mesh
+    publisher = speaker.frame_publisher(speaker.keys.frame(CAMERA))
+    publisher.follow(watched.append)
+    token = speaker.alive(Token("cart", Role.RC, CAMERA, "i1"))
+    async with recording(path, ears(network), speaker, frames=0):
+        await asyncio.sleep(10)
+        assert watched == []
+        async with recording(
+            tmp_path / "other.rrd", network.open("lab", Sender("cook", "recorder")), speaker, frames=20
+        ):
+            await until(lambda: watched == [True])
+            token.close()
+            await until(lambda: watched == [True, False])
+    publisher.close()
 
 
 async def test_a_part_that_raises_is_logged_and_ends_it(

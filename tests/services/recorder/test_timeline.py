@@ -37,47 +37,38 @@ from zscout.services.recorder.drawing import CURVE_TICK, Drawing, HolderRow
 from zscout.services.recorder.timeline import OPERATOR_MARK, Timeline, TimelineError
 
 
-def test_table_1_recorded_reads_as_table_2(path: Path) -> None:
+@pytest.fixture(scope="module")
+def table1(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("table1") / "run.rrd"
     with Timeline("lab", path=path) as timeline:
         play_table1(timeline)
-    shown = lanes(path, "/devices/**")
+    return path
+
+
+def test_table_1_recorded_reads_as_table_2(table1: Path) -> None:
+    shown = lanes(table1, "/devices/**")
     assert {rc: second_by_second(shown[f"/devices/{rc}"]) for rc in RCS} == TABLE2
-    assert shown[f"/devices/{SCOUT33}"] == [
-        (0.0, ["arc0"]),
-        (5.0, ["arc3"]),
-        (8.0, ["arc2"]),
-        (11.0, ["arc4" + OPERATOR_MARK]),
-        (14.0, ["arc2"]),
-        (18.0, [""]),
-    ]
+    lane = [(0, "arc0"), (5, "arc3"), (8, "arc2"), (11, "arc4" + OPERATOR_MARK), (14, "arc2"), (18, "")]
+    assert shown[f"/devices/{SCOUT33}"] == [(at, [holder]) for at, holder in lane]
 
 
-def test_arc_lanes_tell_the_story(path: Path) -> None:
-    with Timeline("lab", path=path) as timeline:
-        play_table1(timeline)
-    shown = lanes(path, "/requests/**")
+def test_arc_lanes_tell_the_story(table1: Path) -> None:
+    shown = lanes(table1, "/requests/**")
     assert set(shown) == {f"/requests/arc{number}" for number in range(5)}
     story = [(at, states[0].split(" · ")[0]) for at, states in shown["/requests/arc2"]]
     kept = [change for index, change in enumerate(story) if index == 0 or change[1] != story[index - 1][1]]
     assert kept == [(1, "waiting"), (8, "running"), (11, "preempted"), (14, "running"), (18, "done")]
-    assert any("arc2 preempted" in text for text in events(path))
+    assert any("arc2 preempted" in text for text in events(table1))
 
 
-def test_an_arc_has_one_colour_and_the_operator_has_its_own(path: Path) -> None:
-    with Timeline("lab", path=path) as timeline:
-        play_table1(timeline)
+def test_an_arc_has_one_colour_and_the_operator_has_its_own(table1: Path) -> None:
     by_text: dict[str, set[int]] = {}
-    for lane in colours(path, "/devices/**").values():
+    for lane in colours(table1, "/devices/**").values():
         for text, colour in lane.items():
             by_text.setdefault(text, set()).add(colour)
-    assert by_text == {
-        "arc0": {PALETTE[0]},
-        "arc1": {PALETTE[1]},
-        "arc2": {PALETTE[2]},
-        "arc3": {PALETTE[3]},
-        "arc4" + OPERATOR_MARK: {OPERATOR},
-    }
-    for lane in colours(path, "/requests/**").values():
+    shades = {f"arc{number}": {PALETTE[number]} for number in range(4)}
+    assert by_text == shades | {"arc4" + OPERATOR_MARK: {OPERATOR}}
+    for lane in colours(table1, "/requests/**").values():
         for text, colour in lane.items():
             assert colour == STATES[text.split(" · ")[0]]
             assert (colour == OPERATOR) == text.startswith("preempted")
@@ -252,6 +243,8 @@ def test_many_threads_keep_their_times(path: Path) -> None:
     assert all(texts == [f"{at:.0f}"] for at, texts in written)
 
 
+@pytest.mark.live
+@pytest.mark.slow
 def test_live_viewers_get_what_the_file_gets(path: Path, tmp_path: Path) -> None:
     copy = tmp_path / "copy.rrd"
     with Timeline("lab", path=path, port=0) as timeline:

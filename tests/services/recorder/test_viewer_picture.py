@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 from PIL import Image, ImageChops
-from rerun.experimental import ViewerClient
+from rerun.experimental import ViewerClient, ViewerState
 
 from tests.hang import HANG
 from tests.ports import free_port
@@ -39,6 +39,8 @@ from zscout.services.recorder.blueprint import AHEAD, LIVE_WINDOW, MARGIN, ONE_P
 from zscout.services.recorder.colours import ABSENT, ALERT, LINES, MAINTENANCE, OPERATOR, PALETTE, STATES
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import Timeline
+
+pytestmark = pytest.mark.live
 
 SECONDS = 18
 WIDTH, HEIGHT = 1600, 1000
@@ -132,9 +134,23 @@ def settled_picture(client: ViewerClient, path: Path) -> Image.Image:
     return until(same)
 
 
+def look(recording: Path, home: Path, *, panes: int = 5, height: int = HEIGHT) -> tuple[Image.Image, ViewerState]:
+    """The picture of a recording, of which no pane complains, and the viewer's state."""
+    with viewer(recording, home, panes=panes, height=height) as client:
+        picture, state = settled_picture(client, home / "picture.png"), client.get_state()
+    assert [report for view in state.views for report in view.reports] == []
+    return picture, state
+
+
 def rgb(rgba: int, part: float = 1.0) -> Rgb:
     red, green, blue = (round((rgba >> shift & 0xFF) * part) for shift in (24, 16, 8))
     return red, green, blue
+
+
+def pixels(picture: Image.Image, colour: Rgb, off: int = 3) -> list[tuple[int, int]]:
+    """Where a colour is that is at most `off` from this one: x and y."""
+    far = np.abs(np.asarray(picture, np.int16) - np.array(colour, np.int16)).max(axis=2)
+    return [(int(x), int(y)) for y, x in np.argwhere(far <= off)]
 
 
 def near(one: Rgb, two: Rgb) -> bool:
@@ -164,20 +180,12 @@ def bars_of(picture: Image.Image, colours: dict[str, int], start: float, length:
     return [text for text, _ in groupby(bars)]
 
 
-def test_the_paper_s_example_in_the_viewer(tmp_path: Path) -> None:
-    record(tmp_path / "run.rrd")
-    with viewer(tmp_path / "run.rrd", tmp_path) as client:
-        picture = settled_picture(client, tmp_path / "picture.png")
-        state = client.get_state()
-
-    assert [report for view in state.views for report in view.reports] == []
-    assert {view.name for view in state.views} == {
-        "Who holds each device",
-        "What each request is doing",
-        "Load average (1 min) per host",
-        "Events",
-        "Who comes and goes",
-    }
+@pytest.mark.essential
+def test_the_paper_s_example_in_the_viewer(path: Path, tmp_path: Path) -> None:
+    record(path)
+    picture, state = look(path, tmp_path)
+    names = {"Who holds each device", "What each request is doing", "Load average (1 min) per host"}
+    assert {view.name for view in state.views} == names | {"Events", "Who comes and goes"}
     (shown,) = state.recordings
     assert [(timeline.name, timeline.time_type) for timeline in shown.timelines] == [(TIME, "duration")]
 
@@ -202,6 +210,7 @@ def test_the_paper_s_example_in_the_viewer(tmp_path: Path) -> None:
         assert pixels.get(rgb(colour), 0) > 500
 
 
+@pytest.mark.slow
 def test_what_several_want_stands_above_and_what_is_not_there_below(tmp_path: Path) -> None:
     with Timeline("lab", path=tmp_path / "run.rrd") as timeline:
         # By their names they would stand the other way round.
@@ -213,13 +222,12 @@ def test_what_several_want_stands_above_and_what_is_not_there_below(tmp_path: Pa
         timeline.contended(1, ["robot/c"])
         timeline.arc(1, "film", "waiting", "for drive: robot/c")
         timeline.event(SECONDS, "the end")
-    with viewer(tmp_path / "run.rrd", tmp_path, panes=7) as client:
-        picture = settled_picture(client, tmp_path / "picture.png")
-        assert [report for view in client.get_state().views for report in view.reports] == []
+    picture, _ = look(tmp_path / "run.rrd", tmp_path, panes=7)
     bars = [round(height_of(picture, colour)) for colour in (OPERATOR, PALETTE[0], ABSENT)]
     assert bars == sorted(bars)
 
 
+@pytest.mark.slow
 def test_what_is_booked_is_outlined_ahead_of_now(tmp_path: Path) -> None:
     now, hour = 1_800_000_000, 3_600
 
@@ -239,10 +247,7 @@ def test_what_is_booked_is_outlined_ahead_of_now(tmp_path: Path) -> None:
         ]
         timeline.bookings.told(0, BookingsTold(now, bookings))
         timeline.event(SECONDS, "the end")
-    with viewer(tmp_path / "run.rrd", tmp_path, panes=7) as client:
-        picture = settled_picture(client, tmp_path / "picture.png")
-        state = client.get_state()
-    assert [report for view in state.views for report in view.reports] == []
+    picture, state = look(tmp_path / "run.rrd", tmp_path, panes=7)
     assert {one.name for one in AHEAD} <= {view.name for view in state.views}
 
     def spread(colour: int) -> tuple[int, int, int, int, int]:
@@ -274,6 +279,7 @@ def height_of(picture: Image.Image, colour: int) -> float:
     return sum(rows) / len(rows)
 
 
+@pytest.mark.slow
 def test_a_recorder_that_was_killed_leaves_a_recording_that_opens(path: Path, tmp_path: Path) -> None:
     code = (
         "import pathlib, sys, threading; from tests.services.recorder.paper_run import *;"
@@ -285,9 +291,7 @@ def test_a_recorder_that_was_killed_leaves_a_recording_that_opens(path: Path, tm
             until(lambda: written(path))
         finally:
             recorder.kill()
-    with viewer(path, tmp_path) as client:
-        picture = settled_picture(client, tmp_path / "picture.png")
-        assert [report for view in client.get_state().views for report in view.reports] == []
+    picture, _ = look(path, tmp_path)
     # It has the live layout: the last minute, and two seconds to come.
     held = bars_of(picture.crop((0, 0, WIDTH, HEIGHT // 3)), ARCS, SECONDS - LIVE_WINDOW, LIVE_WINDOW + 2)
     assert held == [TABLE2[rc] for rc in (FGRAB1, FGRAB2, SCOUT33, SCOUT35)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
@@ -15,7 +15,7 @@ import pytest
 import serial
 
 from tests.hang import HANG
-from tests.simulation.building.test_radio_line import until
+from tests.simulation.building.real_time import in_real_time, until, with_served
 from zscout.config.strict import BadInput
 from zscout.drivers.packets import CameraPacket, DrivePacket, HaltPacket, Packet, encode
 from zscout.simulation.building.bodies import TOP_SPEED
@@ -36,12 +36,7 @@ PLAN = Plan(
 )
 
 
-def play(script: Callable[[Served], Coroutine[Any, Any, None]], plan: Plan = PLAN, **how: Any) -> None:
-    async def run() -> None:
-        async with asyncio.timeout(2 * HANG), Served(plan, **{"speed": 8.0, **how}) as served:
-            await script(served)
-
-    asyncio.run(run())
+in_closet = with_served(lambda: Served(PLAN, speed=8.0))
 
 
 class Driver:
@@ -81,99 +76,89 @@ def alike(one: Picture, other: Picture) -> float:
     return float(np.corrcoef(one.ravel(), other.ravel())[0, 1])
 
 
-def test_a_robot_is_driven_over_the_serial_port_and_stops_by_itself() -> None:
-    async def script(served: Served) -> None:
-        with Driver(served) as driver:
-            body = served.world.bodies["scout33"]
-            before = body.pose
-            driver.send(DrivePacket, 33, 0.8, 0.8, 1.0)
-            await until(lambda: body.travelled > 0 and body.still)
-        there = body.pose
-        assert there.x - before.x == pytest.approx(0.8 * TOP_SPEED, rel=0.1)
-        assert there.y == pytest.approx(before.y, abs=0.01)
-        assert served.world.bodies["scout35"].pose.x == 0.4
-
-    play(script)
+@in_closet
+async def test_a_robot_is_driven_over_the_serial_port_and_stops_by_itself(served: Served) -> None:
+    with Driver(served) as driver:
+        body = served.world.bodies["scout33"]
+        before = body.pose
+        driver.send(DrivePacket, 33, 0.8, 0.8, 1.0)
+        await until(lambda: body.travelled > 0 and body.still)
+    there = body.pose
+    assert there.x - before.x == pytest.approx(0.8 * TOP_SPEED, rel=0.1)
+    assert there.y == pytest.approx(before.y, abs=0.01)
+    assert served.world.bodies["scout35"].pose.x == 0.4
 
 
-def test_a_camera_is_switched_on_and_its_picture_served() -> None:
-    async def script(served: Served) -> None:
-        with Driver(served) as driver:
-            snow = await picture_of(served, 2)
-            driver.send(CameraPacket, 33, 2)
-            await until(lambda: served.world.bodies["scout33"].camera == 2)
-            await served.until(served.time + 3)
-            picture, again = await picture_of(served, 2), await picture_of(served, 2)
-            assert picture.shape == (120, 160)
-            assert abs(alike(snow, picture)) < 0.2
-            assert alike(picture, again) > 0.9
-            driver.send(HaltPacket, 33)
-            await until(lambda: served.world.bodies["scout33"].camera is None)
-            assert abs(alike(picture, await picture_of(served, 2))) < 0.2
-
-    play(script)
+@in_closet
+async def test_a_camera_is_switched_on_and_its_picture_served(served: Served) -> None:
+    with Driver(served) as driver:
+        snow = await picture_of(served, 2)
+        driver.send(CameraPacket, 33, 2)
+        await until(lambda: served.world.bodies["scout33"].camera == 2)
+        await served.until(served.time + 3)
+        picture, again = await picture_of(served, 2), await picture_of(served, 2)
+        assert picture.shape == (120, 160)
+        assert abs(alike(snow, picture)) < 0.2
+        assert alike(picture, again) > 0.9
+        driver.send(HaltPacket, 33)
+        await until(lambda: served.world.bodies["scout33"].camera is None)
+        assert abs(alike(picture, await picture_of(served, 2))) < 0.2
 
 
-def test_two_transmitters_on_one_channel_spoil_each_other_until_one_dies() -> None:
-    async def script(served: Served) -> None:
-        with Driver(served) as driver:
-            driver.send(CameraPacket, 33, 1)
-            await until(lambda: served.world.bodies["scout33"].camera == 1)
-            await served.until(served.time + 3)
-            alone = await picture_of(served, 1)
-            driver.send(CameraPacket, 35, 1)
-            await until(lambda: served.world.bodies["scout35"].camera == 1)
-            await served.until(served.time + 3)
-            assert alike(alone, await picture_of(served, 1)) < 0.6
-            served.kill("scout35")
-            await served.until(served.time + 1)
-            assert alike(alone, await picture_of(served, 1)) > 0.9
-
-    play(script)
-
-
-def test_only_watched_channels_are_drawn_each_at_its_rate() -> None:
-    async def script(served: Served) -> None:
-        await served.until(1.0)
-        assert served.frames == 0
-        await picture_of(served, 1)
-        assert served.frames >= 1
-        await until(lambda: served.video.watched == ())
-        before, since = served.frames, served.time
-        capture = await asyncio.to_thread(
-            cv2.VideoCapture,
-            served.video.url("ch1"),
-            cv2.CAP_FFMPEG,
-            [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 20_000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 20_000],
-        )
-        for _ in range(25):
-            assert (await asyncio.to_thread(capture.read))[0]
-        drawn, passed = served.frames - before, served.time - since
-        await asyncio.to_thread(capture.release)
-        # One may be under way at each end; on a busy machine some are left out.
-        assert 25 <= drawn <= passed * served.frame_rate + 2
-        await until(lambda: served.video.watched == ())
-
-    play(script)
-
-
-def test_a_channel_stalls_and_goes_on() -> None:
-    async def script(served: Served) -> None:
-        served.stall(2)
-        waiting = asyncio.ensure_future(picture_of(served, 2))
-        await until(lambda: served.video.clients == 1)
+@in_closet
+async def test_two_transmitters_on_one_channel_spoil_each_other_until_one_dies(served: Served) -> None:
+    with Driver(served) as driver:
+        driver.send(CameraPacket, 33, 1)
+        await until(lambda: served.world.bodies["scout33"].camera == 1)
+        await served.until(served.time + 3)
+        alone = await picture_of(served, 1)
+        driver.send(CameraPacket, 35, 1)
+        await until(lambda: served.world.bodies["scout35"].camera == 1)
+        await served.until(served.time + 3)
+        assert alike(alone, await picture_of(served, 1)) < 0.6
+        served.kill("scout35")
         await served.until(served.time + 1)
-        assert served.frames == 0
-        served.stall(2, stalled=False)
-        assert (await waiting).shape == (120, 160)
-
-    play(script)
+        assert alike(alone, await picture_of(served, 1)) > 0.9
 
 
-def test_the_radio_is_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
+@in_closet
+async def test_only_watched_channels_are_drawn_each_at_its_rate(served: Served) -> None:
+    await served.until(1.0)
+    assert served.frames == 0
+    await picture_of(served, 1)
+    assert served.frames >= 1
+    await until(lambda: served.video.watched == ())
+    before, since = served.frames, served.time
+    capture = await asyncio.to_thread(
+        cv2.VideoCapture,
+        served.video.url("ch1"),
+        cv2.CAP_FFMPEG,
+        [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 20_000, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 20_000],
+    )
+    for _ in range(25):
+        assert (await asyncio.to_thread(capture.read))[0]
+    drawn, passed = served.frames - before, served.time - since
+    await asyncio.to_thread(capture.release)
+    # One may be under way at each end; on a busy machine some are left out.
+    assert 25 <= drawn <= passed * served.frame_rate + 2
+    await until(lambda: served.video.watched == ())
+
+
+@in_closet
+async def test_a_channel_stalls_and_goes_on(served: Served) -> None:
+    served.stall(2)
+    waiting = asyncio.ensure_future(picture_of(served, 2))
+    await until(lambda: served.video.clients == 1)
+    await served.until(served.time + 1)
+    assert served.frames == 0
+    served.stall(2, stalled=False)
+    assert (await waiting).shape == (120, 160)
+
+
+@in_real_time
+async def test_the_radio_is_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
     link = tmp_path / "radio0"
-
-    async def script(served: Served) -> None:
+    async with Served(PLAN, speed=8.0, radio_link=link) as served:
         with Driver(served):
             served.unplug_radio()
             assert served.radio.port is None
@@ -181,12 +166,11 @@ def test_the_radio_is_unplugged_and_plugged_in_again(tmp_path: Path) -> None:
         with Driver(served) as driver:
             driver.send(CameraPacket, 35, 4)
             await until(lambda: served.world.bodies["scout35"].camera == 4)
-
-    play(script, radio_link=link)
     assert not link.is_symlink()
 
 
-def test_who_is_where_and_what_the_building_looks_like() -> None:
+@in_real_time
+async def test_who_is_where_and_what_the_building_looks_like() -> None:
     # She walks from the beginning.
     walker = Person("anna", path=((0.2, 1.8), (2.2, 1.8)), speed=0.1, first=0.0, jitter=0.0)
     cave = Furniture("bed", "bed", 0.6, 1.0, 1.2, 1.6, 0.5, clearance=0.1)
@@ -194,8 +178,7 @@ def test_who_is_where_and_what_the_building_looks_like() -> None:
     plan = Plan(
         name="bedroom", width=2.4, depth=2.0, furniture=(cave,), lights=PLAN.lights, people=(walker,), robots=robots
     )
-
-    async def script(served: Served) -> None:
+    async with Served(plan, speed=2.0) as served:
         with Driver(served) as driver:
             await served.until(0.5)
             told = await served.poses()
@@ -220,8 +203,6 @@ def test_who_is_where_and_what_the_building_looks_like() -> None:
         # Under the bed is darker than the middle of the floor; rows go down.
         assert picture[high // 4, wide // 4].mean() < picture[high // 2, wide * 3 // 4].mean()
 
-    play(script, plan, speed=2.0)
-
 
 def test_a_large_building_is_drawn_small_enough_for_the_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("zscout.simulation.building.view.MAX_PNG", 30_000)
@@ -231,16 +212,14 @@ def test_a_large_building_is_drawn_small_enough_for_the_mesh(monkeypatch: pytest
     assert len(building_plan(PLAN).picture) > 30_000
 
 
-def test_a_building_that_breaks_says_so() -> None:
-    async def script(served: Served) -> None:
-        def broken(dt: float) -> None:
-            raise RuntimeError(f"the roof came down within {dt} s")
+@in_closet
+async def test_a_building_that_breaks_says_so(served: Served) -> None:
+    def broken(dt: float) -> None:
+        raise RuntimeError(f"the roof came down within {dt} s")
 
-        served.world.step = broken  # type: ignore[method-assign]
-        with pytest.raises(RuntimeError, match="roof"):
-            await served.until(1e6)
-
-    play(script)
+    served.world.step = broken  # type: ignore[method-assign]
+    with pytest.raises(RuntimeError, match="roof"):
+        await served.until(1e6)
 
 
 @pytest.mark.parametrize(
@@ -250,29 +229,22 @@ def test_a_building_that_breaks_says_so() -> None:
         ({"frame_rate": 0}, "write 0.1 to 60"),
         ({"channels": 16}, "write 1 to 15"),
         ({"loss": 2}, "share"),
-        ({"baud": 1}, "write 300"),
     ],
 )
-def test_what_cannot_be_served(how: dict[str, Any], words: str) -> None:
+@in_real_time
+async def test_what_cannot_be_served(how: dict[str, Any], words: str) -> None:
     with pytest.raises(BadInput, match=words):
-        play(_never, **how)
+        await Served(PLAN, **how).__aenter__()
 
 
-async def _never(served: Served) -> None:
-    raise AssertionError(served)
-
-
-def test_the_port_is_free_again_where_a_part_failed(tmp_path: Path) -> None:
+@in_real_time
+async def test_the_port_is_free_again_where_a_part_failed(tmp_path: Path) -> None:
     taken = tmp_path / "taken"
     taken.write_text("mine")
-
-    async def run() -> None:
-        async with Served(PLAN, speed=4) as served:
-            port = int(served.video.page[:-1].rpartition(":")[2])
-            with pytest.raises(BadInput, match="in use"):
-                await Served(PLAN, http=("127.0.0.1", port)).__aenter__()
-        for _ in range(2):
-            with pytest.raises(BadInput, match="is there already"):
-                await Served(PLAN, http=("127.0.0.1", port), radio_link=taken).__aenter__()
-
-    asyncio.run(run())
+    async with Served(PLAN, speed=4) as served:
+        port = int(served.video.page[:-1].rpartition(":")[2])
+        with pytest.raises(BadInput, match="in use"):
+            await Served(PLAN, http=("127.0.0.1", port)).__aenter__()
+    for _ in range(2):
+        with pytest.raises(BadInput, match="is there already"):
+            await Served(PLAN, http=("127.0.0.1", port), radio_link=taken).__aenter__()

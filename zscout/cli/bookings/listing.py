@@ -108,7 +108,7 @@ def _table(found: Sequence[BookingView], me: User, zone: ZoneInfo | None) -> Tab
     lines.sort(key=lambda line: line[0])
     columns = ("NAME", "ID", "WHO", "WHEN", "STATE", "PRIORITY", "REPEATED", "RCS")
     rows, styles = [line[1] for line in lines], [line[2] for line in lines]
-    return Table("", columns, rows, styles, spare={"PRIORITY", "REPEATED"})
+    return Table("", columns, rows, styles, spare=("REPEATED", "PRIORITY"))
 
 
 def _row(booking: BookingView, date: BookedDate, zone: ZoneInfo | None) -> Sequence[str]:

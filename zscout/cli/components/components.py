@@ -116,7 +116,7 @@ class Listing:
             stands = (one.component, one.spec.kind, one.state.replace("_", " "), where, since)
             rows.append((*stands, str(one.restarts), moves, cores, memory, one.reason))
         columns = ("NAME", "KIND", "STATE", "HOST", "UP", "RESTARTS", "MOVES", "CORES", "MEMORY", "WHY")
-        table = Table("Components", columns, rows, styles, ("KIND", "RESTARTS", "MOVES"))
+        table = Table("Components", columns, rows, styles, ("RESTARTS", "MOVES", "KIND"))
         running = self._running()
         hosts = len({one.host for one in running})
         on = f" on {terminal.many(hosts, 'host')}" if running else ""

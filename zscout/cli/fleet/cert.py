@@ -223,7 +223,7 @@ def _print(found: list[dict[str, Any]]) -> None:
         about = "CA" if one["trusted"] is None else f"trusts {', '.join(one['trusted'])}"
         rows.append((one["folder"], one["name"], state, left, one["issuer"] or "-", about))
     columns = ("FOLDER", "NAME", "STATE", "ENDS", "ISSUER", "ABOUT")
-    Table("", columns, rows, [STYLES.get(one["state"], "red") for one in found], {"ISSUER"}).print()
+    Table("", columns, rows, [STYLES.get(one["state"], "red") for one in found], ("ISSUER",)).print()
 
 
 def _authority(folder: Path) -> CertificateAuthority:

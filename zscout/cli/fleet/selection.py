@@ -1,4 +1,4 @@
-"""Which part of a fleet `zscout status NAME...` shows: what has these names, and what has to do with it."""
+"""The part of a fleet that `zscout status NAME...` shows: what has these names, and what it is linked to."""
 
 from __future__ import annotations
 
@@ -16,16 +16,17 @@ from zscout.messages import HoldView, RcmState, WaitView
 
 @dataclass(slots=True)
 class Selection:
-    """Of `state` and `hosts`, both whole without `names`; `homes` has the host of each RC. A name may be a pattern."""
+    """A part of `state` and `hosts`, or all of both without `names`; `homes` has the host of each device. A name may be
+    a pattern."""
 
     names: Sequence[str]
     state: RcmState | None
     homes: Mapping[str, str]
     hosts: Mapping[str, Host]
     _met: set[str] = field(default_factory=set)
-    """Names that something has."""
+    """Names that were found."""
     _all: dict[str, list[str]] = field(default_factory=dict)
-    """What could have been meant."""
+    """Names for a hint."""
     _rcs: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
@@ -57,16 +58,16 @@ class Selection:
         return not self.names or rc in self._rcs
 
     def missing(self) -> common.Failed | None:
-        """What to raise where nothing has one of the names."""
+        """The error to raise if one of the names was not found."""
         name = next((name for name in self.names if name not in self._met), None)
         if name is None:
             return None
-        return common.unknown("RC, ARC or host", name, self._all, "and nothing is there", "known")
+        return common.unknown("device, request or host", name, self._all, "and nothing is there", "known")
 
     def _means(self, *known: str) -> bool:
-        """Whether something of these names is meant. The first of them is what a hint shows."""
+        """Return True if the user means something of these names. A hint shows the first of them."""
         self._all.setdefault(known[0], [])
-        met = {name for name in self.names if any(name == one or fnmatchcase(one, _glob(name)) for one in known)}
+        met = {name for name in self.names if any(name == other or fnmatchcase(other, _glob(name)) for other in known)}
         self._met |= met
         return bool(met)
 

@@ -1,22 +1,23 @@
-"""`zscout status`: who holds what, who waits and why, how the hosts are, who leads."""
+"""`zscout status`: devices and their holders, requests that run or wait, hosts and the leader."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping, Sequence
 from contextlib import AsyncExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import click
 from msgspec import structs
 
+from zscout import terminal
 from zscout.cli import booked, common, completion
 from zscout.cli.device_words import ending, remarks
 from zscout.cli.fleet.fleet_view import Devices, FleetView, Host
 from zscout.cli.fleet.selection import Selection
 from zscout.cli.fleet.watching import Overview, show
-from zscout.cli.requests.waiting import reason_text, whose
+from zscout.cli.requests.waiting import comment, person, reason_text, request_words, whose
 from zscout.config.access import AccessPolicy
 from zscout.keyexpr import Role
 from zscout.messages import BookingsTold, HoldView, Notice, RcmState, RcState, RcView, WaitView, version_words
@@ -30,26 +31,27 @@ MAX_FIGURES_SHOWN: Final = 12
 
 @click.command()
 @click.argument("names", nargs=-1, metavar="[NAME...]", shell_complete=completion.shown)
-@click.option("--watch", is_flag=True, help="Go on showing it: the arrows scroll, q or Ctrl-C ends.")
+@click.option("--watch", is_flag=True, help="Refresh it all the time: the arrows scroll, q or Ctrl-C ends.")
 @click.option("--devices", "every", is_flag=True, help="Show the figures of all devices: rates, drops, latency.")
 @common.json_option("Print one JSON object; with --watch, one on each line.")
 @common.runs
 async def status(names: Sequence[str], watch: bool, every: bool, as_json: bool) -> None:
-    """Show the fleet: RCs and who holds them, ARCs that run and that wait, hosts and their loads.
+    """Show the fleet: devices and the requests that hold them, the queue and what each request waits for, hosts and
+    their loads.
 
-    A NAME is that of an RC, an ARC (or its id) or a host, or a pattern: 'robot/*'. With some, only these are shown, and
-    what has to do with them: an RC with who holds it and who waits for it, an ARC with its RCs and their holders, a
-    host with its RCs and programs. Exit code 1: nothing has one of these names.
+    A NAME is that of a device, a request (or its id) or a host, or a pattern: 'robot/*'. With names, only these are
+    shown and what they are linked to: a device with the requests that hold it or wait for it, a request with its
+    devices and their holders, a host with its devices and programs. Exit code 1: nothing has one of these names.
 
-    With fair shares the groups stand in the order in which they go, with what they lately had and others waited for.
+    HELD BY shows requests by the names that `zscout why`, `cancel` and `release` take, and their persons; `zscout why`
+    also shows their commands. A narrow terminal leaves out less important columns; a pipe gets all of them.
 
-    Warnings come first: of certificates that end within 14 days, roles that nobody enforces, clocks that differ by more
-    than 2 s, versions that differ. The queue stands in rank order, each ARC with what it waits for. Candidates that the
-    fleet file names are shown even where they are not there; other hosts that died only with --watch. A device that
-    says that something is wrong with it is shown with its words, and counts as lost until it is well; one that was seen
-    within a day, or that the fleet file expects, with why it is gone; one that several hosts offer, with those that
-    stand by. --watch refreshes once a second; in a pipe it prints a new block when something else than a load, a time
-    or a figure has changed. Exit code 3: no RCM.
+    Warnings come first: certificates that end within 14 days, roles without [security], clocks that differ by more than
+    2 s, different versions. The queue is in rank order, and so are the groups where shares are fair. Candidates of the
+    fleet file are shown even if they are down; other hosts that went down only with --watch. The health of a device is
+    shown if something is wrong with it, if it is gone (for a day, or always if the fleet file expects it), or if
+    several hosts offer it. --watch refreshes once a second; in a pipe it prints a new block if more has changed than
+    loads, times and figures. Exit code 3: no leader.
 
     \b
     Examples:
@@ -65,12 +67,12 @@ async def status(names: Sequence[str], watch: bool, every: bool, as_json: bool) 
         nobody: common.NobodyThere | None = None
         try:
             standing.state = await fleet_view.settled()
-        except common.NobodyThere as error:  # hosts and RCs are shown all the same
+        except common.NobodyThere as error:  # hosts and devices are shown all the same
             nobody = error
         await asyncio.gather(standing.devices.ask(), standing.ask_bookings())
         if nobody is None and not watch and (missing := standing.selection().missing()):
             raise missing
-        # Whatever becomes of an ARC is published to its client.
+        # Each change of a request is published to its client.
         news = asyncio.Event()
         client.mesh.subscribe(client.mesh.keys.notice_any, Notice, lambda _key, _notice: news.set())
         await show(standing, news, standing.refresh, watch=watch, as_json=as_json)
@@ -80,8 +82,8 @@ async def status(names: Sequence[str], watch: bool, every: bool, as_json: bool) 
 
 @dataclass(slots=True)
 class Standing:
-    """How the fleet stands; `state` is None where there is no RCM. `every`: with figures of all devices. `names`: only
-    these, where there are some."""
+    """What is known of the fleet; `state` is None if no node leads. `every`: show figures of all devices. `names`: if
+    there are some, show only these."""
 
     fleet_view: FleetView
     state: RcmState | None
@@ -91,7 +93,7 @@ class Standing:
     booked: BookingsTold | None = None
 
     def selection(self) -> Selection:
-        """Of what is there now, what is to be shown."""
+        """The part of the fleet that is to be shown."""
         return Selection(self.names, self.state, self._homes(), self.fleet_view.all_hosts())
 
     async def refresh(self) -> None:
@@ -102,7 +104,9 @@ class Standing:
     async def ask_bookings(self) -> None:
         self.booked = await booked.look(self.fleet_view.client) if self.state is not None else None
 
-    def overview(self) -> Overview:
+    def overview(self, *, plain: bool | None = None) -> Overview:
+        """`plain`: for a pipe, in the columns that scripts read."""
+        plain = not terminal.at_terminal() if plain is None else plain
         fleet, links = self.fleet_view.client.fleet.name, many(self.fleet_view.mesh.links(), "link")
         headline = f"Fleet {fleet}: nobody leads; nothing is granted until a node does ({links})"
         tables: list[Table] = []
@@ -112,26 +116,28 @@ class Standing:
             headline = f"Fleet {fleet}: {leader} leads, term {term} ({links})"
             headline += f"; {many(count, 'booking')} within 24 h" if (count := booked.soon(self.booked)) else ""
             ranks = {f"{wait.client}/{wait.id}": number for number, wait in enumerate(self.state.queue, 1)}
-            tables = [self._rcs(chosen.state), self._running(chosen.state), _waiting(chosen.state, ranks)]
+            held = running(chosen.state, self.fleet_view.client.fleet.operator_priority, plain=plain)
+            tables = [self._rcs(chosen.state), held, waiting(chosen.state, ranks, plain=plain)]
             tables += [] if self.names else [shares_table(self._shares())]
-        return Overview(
-            headline, [self._warnings(), *tables, self._hosts(chosen), self._devices(chosen)], alarm=self.state is None
-        )
+        tables = [self._warnings(), *tables, self._hosts(chosen), self._devices(chosen)]
+        if not plain:  # the heads name what stands below them
+            tables = [replace(table, title="") for table in tables]
+        return Overview(headline, tables, alarm=self.state is None)
 
     def _advisory(self) -> bool:
-        """Whether rights are written down that nobody enforces."""
+        """Return True if the fleet file lists rights, but has no [security] to enforce them."""
         fleet = self.fleet_view.client.fleet
         return fleet.security is None and fleet.access != AccessPolicy()
 
     def _warnings(self) -> Table:
-        """What is to be said of the fleet itself."""
         rows = [
             ("certificate", f"{ending(name, left)}; renew it (zscout cert renew)")
             for name, left in self.fleet_view.ending().items()
         ]
         if self._advisory():
-            rows.append(("roles", "they are advisory: nobody proves a name where [security] is not set"))
-        rows += [("clock", f"{booked.clock_words(*one)}; set it") for one in sorted(self._clocks().items())]
+            rows.append(("roles", "they are only advisory: set [security], so that names are proved"))
+        clocks = sorted(self._clocks().items())
+        rows += [("clock", f"{booked.clock_words(host, differs)}; set it") for host, differs in clocks]
         if (versions := mixture(self._versions())) is not None:
             rows.append(("versions", versions))
         return Table("Warnings", ("ABOUT", "WARNING"), rows, ["yellow"] * len(rows))
@@ -143,7 +149,7 @@ class Standing:
         return versions(self.fleet_view.hosts, self.devices.known(), self.state)
 
     def _homes(self) -> dict[str, str]:
-        """By RC: the host of the instance that is meant; of an RCM that does not say, one that offers it."""
+        """The host of each device's named instance, or one that offers the device if the leader names none."""
         offered = {token.name: token.host for token in self.fleet_view.tokens(Role.RC)}
         views = self.state.rcs if self.state is not None else []
         return offered | {view.rc: view.host for view in views if view.host}
@@ -158,31 +164,15 @@ class Standing:
             there = "held" if holders else "maintenance" if view.rc in maintained else "free"
             words = there if view.present else "lost" if view.rc in lost else "absent"
             kind = "shared" if view.sharable else "exclusive"
-            names = ", ".join(common.with_amounts(whose(hold), hold.needs[view.rc]) for hold in holders)
+            names = ",\n".join(request_words(hold.arc, hold.who, hold.client, hold.needs[view.rc]) for hold in holders)
             rows.append((view.rc, kind, words, homes.get(view.rc, "-"), names))
             styles.append(
                 {"absent": "red", "lost": "red", "held": "yellow", "maintenance": "yellow", "free": "green"}[words]
             )
-        return Table("RCs", ("RC", "USE", "STATE", "HOST", "HELD BY"), rows, styles, cut={"HELD BY"})
-
-    def _running(self, state: RcmState) -> Table:
-        rows, styles = [], []
-        for hold in sorted(state.holds, key=lambda hold: (-hold.priority, -hold.held)):
-            since = f"{clock(-hold.held)} ({span(hold.held)})"
-            until = f"{clock(hold.remaining, at_latest=True)} ({span(hold.remaining)})"
-            if hold.keep:
-                until = f"{until}, keeps" if hold.remaining > 0 else "kept"
-            if hold.ends_in is not None:
-                until = f"{until}, likely {clock(hold.ends_in)}"
-            rcs = " ".join(sorted(hold.needs))
-            rows.append((hold.arc, _who(hold), str(hold.priority), since, until, rcs, hold.client))
-            operator = hold.priority >= self.fleet_view.client.fleet.operator_priority
-            styles.append("bold red" if operator else "")
-        columns = ("ARC", "WHO", "PRIORITY", "SINCE", "UNTIL", "RCS", "CLIENT")
-        return Table("Running", columns, rows, styles, {"CLIENT"}, cut={"WHO"})
+        columns, spare = ("DEVICE", "USE", "STATE", "HOST", "HELD BY"), ("USE", "HOST", "HELD BY")
+        return Table("Devices", columns, rows, styles, spare, beneath={"HELD BY"})
 
     def _shares(self) -> list[dict[str, Any]]:
-        """Of all groups, whatever is to be shown."""
         fair = self.fleet_view.client.fleet.scheduling.fair_shares
         return [] if self.state is None else shares(self.state.charged, {} if fair is None else fair.weights)
 
@@ -197,7 +187,8 @@ class Standing:
                 memory = f"{report.memory_available / 2**30:.1f} of {report.memory_total / 2**30:.1f} GiB"
             rows.append((name, words, load, cpu, memory, _doing(host)))
             styles.append(style)
-        return Table("Hosts", ("HOST", "STATE", "LOAD", "CPU", "MEMORY FREE", "RUNS"), rows, styles)
+        columns, spare = ("HOST", "STATE", "LOAD", "CPU", "MEMORY FREE", "RUNS"), ("MEMORY FREE", "CPU", "LOAD", "RUNS")
+        return Table("Hosts", columns, rows, styles, spare, beneath={"RUNS"})
 
     def _condition(self, name: str, host: Host) -> tuple[str, str]:
         if host.gone is not None:
@@ -211,7 +202,7 @@ class Standing:
         return (f"{words}, cordoned", "yellow") if name in self.fleet_view.placer.cordoned else (words, style)
 
     def _devices(self, chosen: Selection) -> Table:
-        """Those of which there is something to say; with `every` also those that report figures."""
+        """Health and figures: of devices with remarks, with `every` of all that report figures."""
         known = self.devices.known()
         said = {view.rc: list(remarks(view)) for view in (self.state.rcs if self.state is not None else ())}
         rows, styles = [], []
@@ -219,16 +210,16 @@ class Standing:
             device, words = known.get(rc), said.get(rc, [])
             figures = device.figures if device is not None else {}
             if device is not None and device.health != "ok":
-                words = [device.health, *(one for one in words if one != device.health)]
+                words = words if words and words[0].startswith(device.health) else [device.health, *words]
             if words or (self.every and figures):
                 rows.append((rc, "; ".join(words) or "ok", figures_text(figures)))
                 styles.append("red" if words else "")
-        return Table("Devices", ("RC", "HEALTH", "FIGURES"), rows, styles)
+        return Table("Health", ("DEVICE", "HEALTH", "FIGURES"), rows, styles)
 
     def as_object(self) -> dict[str, Any]:
-        """What `--json` prints. Spans are seconds, memory bytes; `rcm` is null where there is none. `advisory`: rights
-        are written down that nobody enforces; `ending`: whose certificate ends soon; `clocks`: by how much those of
-        hosts differ from the fleet's; `booked_soon`: dates of bookings within 24 h."""
+        """The output of `--json`, spans in seconds and memory in bytes; `rcm` is null if no node leads. `advisory`:
+        rights are listed and not enforced; `ending`: certificates that end soon; `clocks`: how far hosts' clocks
+        differ from fleet time; `booked_soon`: dates of bookings within 24 h."""
         chosen, versions = self.selection(), self._versions()
         state, homes, now = chosen.state, self._homes(), self.fleet_view.mesh.now()
         holds, views, queue = (state.holds, state.rcs, state.queue) if state is not None else ([], [], [])
@@ -284,7 +275,7 @@ class Standing:
 
 
 def shares(charged: Mapping[str, float], weights: Mapping[str, float]) -> list[dict[str, Any]]:
-    """What groups lately had and others waited for, by group in RC-seconds: the group that goes first first."""
+    """Recent contended usage per group in RC-seconds, the group that is next to be served first."""
     total = sum(charged.values())
     found = [
         {"group": group, "charged": had, "part": had / total if total else 0.0, "weight": weights.get(group, 1.0)}
@@ -297,25 +288,25 @@ def shares_table(found: Sequence[Mapping[str, Any]]) -> Table:
     rows = [
         (one["group"], f"{one['charged']:,.0f}", f"{100 * one['part']:.1f} %", f"{one['weight']:g}") for one in found
     ]
-    return Table("Shares", ("GROUP", "RC-SECONDS", "PART", "WEIGHT"), rows)
+    return Table("Shares", ("GROUP", "DEVICE-SECONDS", "PART", "WEIGHT"), rows)
 
 
 def versions(hosts: Mapping[str, Host], devices: Mapping[str, RcState], state: RcmState | None) -> dict[str, str]:
-    """By host what its node tells of its version; empty: it is too old to tell."""
+    """The version of each host's node; empty if the node is too old to publish it."""
     loads = {name: host.load for name, host in hosts.items() if host.has(Role.LOAD)}
     told = {name: load.version for name, load in loads.items() if load is not None}
-    # An RC that does not tell may be none of zscout's.
+    # An RC that publishes no version may be a foreign one.
     told |= {device.host: device.version for device in devices.values() if device.version}
     return told | ({} if state is None else {state.host: state.version})
 
 
 def by_version(versions: Mapping[str, str]) -> dict[str, list[str]]:
-    """Hosts by what they tell of their version."""
+    """The hosts of each version."""
     return {told: sorted(host for host in versions if versions[host] == told) for told in sorted(versions.values())}
 
 
 def mixture(versions: Mapping[str, str]) -> str | None:
-    """What is to be said where nodes, or they and this program, are of different versions."""
+    """A warning if nodes and this program are of different versions."""
     if set(versions.values()) <= {VERSION}:
         return None
     parts = [f"{version_words(told)} on {_some(hosts)}" for told, hosts in by_version(versions).items()]
@@ -327,40 +318,64 @@ def _some(hosts: Sequence[str]) -> str:
     return ", ".join(hosts[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _waiting(state: RcmState, ranks: Mapping[str, int]) -> Table:
+def running(state: RcmState, operator_priority: int, *, plain: bool) -> Table:
+    rows, styles = [], []
+    for hold in sorted(state.holds, key=lambda hold: (-hold.priority, -hold.held)):
+        since = f"{clock(-hold.held)} ({span(hold.held)})"
+        until = f"{clock(hold.remaining, at_latest=True)} ({span(hold.remaining)})"
+        if hold.keep:
+            until = f"{until}, keeps" if hold.remaining > 0 else "kept"
+        if hold.ends_in is not None:
+            until = f"{until}, likely {clock(hold.ends_in)}"
+        by, more = _by(hold, plain=plain)
+        rows.append((hold.arc, by, str(hold.priority), since, until, "\n".join(sorted(hold.needs)), more))
+        styles.append("bold red" if hold.priority >= operator_priority else "")
+    head, last = ("REQUEST", "CLIENT") if plain else ("RUNNING REQUEST", "COMMENT")
+    columns, spare = (
+        (head, "WHO", "PRIORITY", "SINCE", "UNTIL", "DEVICES", last),
+        (last, "SINCE", "PRIORITY", "DEVICES", "WHO"),
+    )
+    return Table("Running", columns, rows, styles, spare, beneath={"DEVICES", "WHO", last})
+
+
+def waiting(state: RcmState, ranks: Mapping[str, int], *, plain: bool) -> Table:
+    """The queue in rank order, with each request's place in the whole queue."""
     rows = []
     for wait in state.queue:
         number = ranks[f"{wait.client}/{wait.id}"]
         starts = "?" if wait.starts_in is None else f"{clock(wait.starts_in)} (in {span(wait.starts_in)})"
         spans = (f"{clock(-wait.waited)} ({span(wait.waited)})", span(float(wait.min_runtime)), starts)
+        by, more = _by(wait, plain=plain)
         why = reason_text(wait.reason, wait.why)
-        rows.append(
-            (str(number), wait.arc, _who(wait), str(wait.priority), *spans, str(wait.preemptions), why, wait.client)
-        )
-    title = f"Waiting, and {state.more} more" if state.more else "Waiting"
-    columns = ("#", "ARC", "WHO", "PRIORITY", "SINCE", "RUNTIME", "STARTS", "PREEMPTED", "WHY", "CLIENT")
-    # The queue stands in rank order: priority and age say no more where there is little room.
-    spare = {"PRIORITY", "SINCE", "RUNTIME", "PREEMPTED", "CLIENT"}
-    return Table(title, columns, rows, spare=spare, cut={"WHO"})
+        rows.append((str(number), wait.arc, by, str(wait.priority), *spans, str(wait.preemptions), why, more))
+    rest = f", and {state.more} more" if state.more else ""
+    head, last = ("REQUEST", "CLIENT") if plain else (f"WAITING REQUEST{rest}", "COMMENT")
+    columns = ("#", head, "WHO", "PRIORITY", "SINCE", "RUNTIME", "STARTS", "PREEMPTED", "WHY", last)
+    # Rows stand in rank order: priority and age add little where there is little room.
+    spare = ("WHY", last, "PREEMPTED", "RUNTIME", "SINCE", "PRIORITY", "WHO")
+    return Table(f"Waiting{rest}", columns, rows, spare=spare, beneath={"WHY", "WHO", last})
 
 
-def _who(view: HoldView | WaitView) -> str:
-    """Whose it is, and what others are to know."""
-    return whose(view) + (f": {view.who.comment}" if view.who is not None and view.who.comment else "")
+def _by(view: HoldView | WaitView, *, plain: bool) -> tuple[str, str]:
+    """WHO, and the last column: people read the comment there, and the command in `zscout why`."""
+    if plain:
+        return whose(view) + comment(view.who), view.client
+    words = view.who.comment if view.who is not None else ""
+    return person(view.who, view.client), f'"{words}"' if words else ""
 
 
 def _doing(host: Host) -> str:
     parts = ["node"] if host.has(Role.NODE) else []
     parts += ["recorder"] if host.has(Role.RECORDER) else []
     rcs, components = sum(token.role == Role.RC for token in host.tokens), host.components
-    parts += [many(rcs, "RC")] if rcs else []
+    parts += [many(rcs, "device")] if rcs else []
     # Each component is a client too, `<component>.<incarnation>`, and is named below.
     named = [token.name.rpartition(".") for token in host.tokens if token.role == Role.CLIENT]
     clients = sum(not (number.isdigit() and component in components) for component, _, number in named)
     parts += [many(clients, "client")] if clients else []
     parts += components[:MAX_NAMED]
     parts += [f"{len(components) - MAX_NAMED} more components"] if len(components) > MAX_NAMED else []
-    return ", ".join(parts)
+    return ",\n".join(parts)
 
 
 def figures_text(figures: Mapping[str, float]) -> str:

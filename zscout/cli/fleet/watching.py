@@ -1,4 +1,4 @@
-"""A line and tables as they stand now, shown once; or with `--watch` again and again."""
+"""A line and tables, shown once, or with `--watch` again and again."""
 
 from __future__ import annotations
 
@@ -13,18 +13,19 @@ import msgspec
 
 from zscout import terminal
 from zscout.mesh.supervision import done_within
-from zscout.terminal import Table
+from zscout.terminal import Line, Table
 
 if TYPE_CHECKING:
     from rich.console import Group
-    from rich.text import Text
 
 EVERY: Final = 1.0
 """Seconds between two refreshes."""
 HASTE: Final = 0.1
-"""The same where something has changed."""
+"""The same after a change."""
 MAX_ROWS: Final = 500
-"""Of one table at a terminal."""
+"""Rows of one table at a terminal."""
+USUAL: Final = 24
+"""Lines of the usual terminal."""
 PASSING: Final = frozenset(
     {
         "held",
@@ -40,21 +41,21 @@ PASSING: Final = frozenset(
         "gone",
         "clocks",
     }
-    | {"clocks", "uptime", "cpu", "memory", "figures", "charged", "part"}
+    | {"uptime", "cpu", "memory", "figures", "charged", "part"}
 )
-"""Fields that change without anything having happened."""
+"""Fields that change without an event."""
 
 
 STEPS: Final = {b"\x1b[A": -1, b"\x1b[B": 1, b"\x1bOA": -1, b"\x1bOB": 1, b"k": -1, b"j": 1}
 """Lines by which these keys scroll: arrows, and as in `less`."""
 PAGES: Final = {b"\x1b[5": -1, b"\x1b[6": 1, b"b": -1, b" ": 1}
-"""The same in pages; the rest of an escape sequence is nothing."""
+"""The same in pages; the rest of an escape sequence is ignored."""
 ENDS: Final = {b"\x1b[H": 0, b"g": 0, b"\x1b[F": 1_000_000, b"G": 1_000_000}
 
 
 @dataclass(frozen=True, slots=True)
 class Overview:
-    """A line, and tables below it. `alarm`: the line is about something that is wrong."""
+    """A headline, and tables below it. `alarm`: the headline reports a fault."""
 
     headline: str
     tables: Sequence[Table]
@@ -62,7 +63,8 @@ class Overview:
 
     def print(self) -> None:
         if terminal.at_terminal():
-            terminal.console().print(self.picture())
+            console = terminal.console()
+            console.print(terminal.picture(self.lines(console.width)))
             return
         terminal.print_line(terminal.clean(self.headline))
         for table in self.tables:
@@ -70,35 +72,31 @@ class Overview:
                 terminal.print_line("")
                 table.print()
 
-    def head(self) -> Text:
-        from rich.text import Text
-
-        return Text(terminal.clean(self.headline), style="bold red" if self.alarm else "bold")
-
-    def picture(self, *, headed: bool = True) -> Group:
-        """For a terminal."""
-        from rich.console import Group
-        from rich.text import Text
-
-        parts: list[Any] = [self.head()] if headed else []
-        for table in self.tables:
-            if table.rows:
-                parts += [Text(""), table.picture(MAX_ROWS)]
-            if len(table.rows) > MAX_ROWS:
-                parts.append(Text(f"... {len(table.rows) - MAX_ROWS} more rows: --json has all", style="dim"))
-        return Group(*parts)
+    def lines(self, width: int) -> list[Line]:
+        """For a terminal of this width, the headline first; blank lines divide the tables where all of it then fits a
+        terminal of the usual height."""
+        style = "bold red" if self.alarm else "bold"
+        lines = [(line, style) for line in terminal.wrapped(terminal.clean(self.headline), width)]
+        tables = [table for table in self.tables if table.rows]
+        blocks = [table.fitted(width, MAX_ROWS) for table in tables]
+        divided = len(lines) + sum(len(block) + 1 for block in blocks) <= USUAL
+        for table, block in zip(tables, blocks, strict=True):
+            lines += [("", ""), *block] if divided else block
+            if (more := len(table.rows) - MAX_ROWS) > 0:
+                lines.append((f"... {more} more rows: --json has all", "dim"))
+        return lines
 
 
 class Scrolled:
-    """What fits a terminal of an overview: its line above, a hint below, and between them as much of its tables as
-    there is room for, from the line on that keys have chosen."""
+    """The part of an overview that fits a terminal: its headline, as many lines of its tables as there is room for,
+    starting at the line that keys have chosen, and a hint."""
 
     def __init__(self) -> None:
         self._first = self._last = 0
         self._room = 1
 
     def key(self, key: bytes) -> bool:
-        """Whether this key scrolls."""
+        """Scroll, and return True if this key does so."""
         if key in ENDS:
             first = ENDS[key]
         elif key in STEPS or key in PAGES:
@@ -109,13 +107,9 @@ class Scrolled:
         return True
 
     def picture(self, overview: Overview) -> Group:
-        from rich.console import Group
-        from rich.segment import Segment, Segments
-        from rich.text import Text
-
         console = terminal.console()
+        head, *lines = overview.lines(console.width)
         # The last line of a terminal is left to the cursor.
-        lines = console.render_lines(overview.picture(headed=False), pad=False)
         self._room = max(1, console.height - 3)
         self._last = max(0, len(lines) - self._room)
         self._first = min(self._first, self._last)
@@ -124,14 +118,11 @@ class Scrolled:
         if self._last:
             where = f"lines {self._first + 1} to {self._first + len(seen)} of {len(lines)}"
             hint += f"; {where}: arrows, Page Up and Down scroll"
-        head = overview.head()
-        for text in (head, last := Text(hint, style="dim")):
-            text.no_wrap, text.overflow = True, "ellipsis"
-        return Group(head, Segments([one for line in seen for one in (*line, Segment.line())]), last)
+        return terminal.picture([head, *seen, (terminal.shortened(hint, console.width), "dim")])
 
 
 class Displayed(Protocol):
-    """Something as it stands now."""
+    """The newest state of something."""
 
     def overview(self) -> Overview:
         """For people."""
@@ -143,8 +134,8 @@ class Displayed(Protocol):
 async def show(
     shown: Displayed, news: asyncio.Event, refresh: Callable[[], Awaitable[None]], *, watch: bool, as_json: bool
 ) -> None:
-    """Shows it once; with `watch` again as there is news and each second, after a `refresh`, until somebody presses q:
-    in place at a terminal, in a pipe as a block where something has changed that is not a load or a span of time."""
+    """Show it once; with `watch` again after news and each second, after a `refresh`, until the user presses q: in
+    place at a terminal, in a pipe as a block if more has changed than loads and spans of time."""
     stop = asyncio.Event()
     printed: Any = None
     scrolled = Scrolled()
@@ -185,7 +176,7 @@ async def show(
 
 
 def lasting(value: Any) -> Any:
-    """A JSON value without what changes all the time."""
+    """A JSON value without the fields that change all the time."""
     if isinstance(value, msgspec.Struct):
         value = msgspec.structs.asdict(value)
     if isinstance(value, dict):

@@ -1,10 +1,12 @@
-"""What a request waits for: each need, the RCs that would meet it, and who holds them, as the RCM sees it."""
+"""What a request waits for: each need, the devices that meet it, and the requests that hold them, as the leader sees
+them."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any
+from decimal import Decimal
+from typing import Any, Final
 
 from zscout.cli import common
 from zscout.cli.device_words import absence
@@ -14,27 +16,30 @@ from zscout.scheduling.reason import Party, Reason, ReasonCode, named
 from zscout.terminal import clean, clock, span
 from zscout.types import SECOND, Ns
 
+NAMING: Final = (ReasonCode.HELD, ReasonCode.VETOED, ReasonCode.MAINTENANCE, ReasonCode.RESERVED, ReasonCode.BOOKED)
+"""Reasons that name other requests."""
+
 
 @dataclass(frozen=True, slots=True)
 class RcContention:
-    """One RC, and the holds of others on it."""
+    """One device, and the holds of others on it."""
 
     rc: str
     present: bool
     sharable: bool
     holds: list[HoldView]
     lost: str = ""
-    """Why it is not present, in words, if that is known."""
+    """Why the device is absent, in words, if that is known."""
 
 
 @dataclass(slots=True)
 class NeedContention:
-    """One need, and the RCs that would meet it: the one that it names, or those that match."""
+    """One need, and the devices that meet it: the one that it names, or those that match."""
 
     need: str
     rcs: list[RcContention]
     rivals: int = 0
-    """How many of the request's other patterns some of these RCs would meet as well."""
+    """The number of the request's other patterns that some of these devices meet as well."""
 
     @property
     def rc(self) -> str | None:
@@ -54,18 +59,18 @@ class NeedContention:
 
     @property
     def met(self) -> bool:
-        """Whether there is a free one for it, whatever the other needs are met by."""
+        """Return True if a free device is left for it, whichever devices meet the other needs."""
         return len(self.free) > self.rivals
 
     def as_json(self) -> dict[str, Any]:
         """For programs; `rc` is null for a pattern."""
-        said = {name: getattr(self, name) for name in ("need", "rc", "present", "sharable", "free")}
-        return said | {"holders": [hold_json(hold) | {"rc": rc.rc} for rc in self.rcs for hold in rc.holds]}
+        fields = {name: getattr(self, name) for name in ("need", "rc", "present", "sharable", "free")}
+        return fields | {"holders": [hold_json(hold) | {"rc": rc.rc} for rc in self.rcs for hold in rc.holds]}
 
 
 def contention_of(state: RcmState, needs: Collection[str], own: str = "") -> list[NeedContention]:
-    """How each need stands, holds of the ARC `own` (`<host>/<client>/<id>`) left out. What one need names
-    does not meet another."""
+    """The contention for each need, without holds of the request `own` (`<host>/<client>/<id>`). A device that one need
+    names does not meet another."""
     holds = [hold for hold in state.holds if f"{hold.client}/{hold.id}" != own]
     views = {view.rc: view for view in state.rcs}
 
@@ -80,27 +85,46 @@ def contention_of(state: RcmState, needs: Collection[str], own: str = "") -> lis
     for need in sorted(needs):
         meets = matcher(need)
         matching = sorted(rc for rc in views if rc not in needs and meets(rc)) if is_pattern(need) else [need]
-        # What matches and has gone says nothing: another will do.
+        # A device that matches a pattern and is absent is left out: any other will do.
         rcs = [seen(rc) for rc in matching if not is_pattern(need) or views[rc].present]
         found.append(NeedContention(need, rcs))
-    for one in found:
-        own_rcs = {rc.rc for rc in one.rcs}
-        one.rivals = sum(1 for other in found if other is not one and own_rcs & {rc.rc for rc in other.rcs})
+    for contention in found:
+        own_rcs = {rc.rc for rc in contention.rcs}
+        others = (other for other in found if other is not contention)
+        contention.rivals = sum(1 for other in others if own_rcs & {rc.rc for rc in other.rcs})
     return found
 
 
 def whose(view: HoldView | WaitView | ReasonParty) -> str:
-    """Whose ARC that is: `alice@ws1 (survey.py)`."""
+    """The person and the command of a request: `alice@ws1 (survey.py)`."""
     return clean(named(view.who, view.client, view.arc))
 
 
+def person(who: Who | None, client: str) -> str:
+    """The person of a request: `alice@ws1`; its client, `ws1/c7`, if it names no user."""
+    host = "" if who is None else who.host or client.partition("/")[0]
+    return clean(client if who is None or not who.user else f"{who.user}@{host}" if host else who.user)
+
+
+def request_words(arc: str, who: Who | None, client: str, params: Mapping[str, Decimal] | None = None) -> str:
+    """The name of a request and its person: `survey (alice@ws1)`, with the `params` under which it holds a device."""
+    by = person(who, client)
+    return clean(common.with_amounts(f"{arc} ({by})" if by else arc, params or {}))
+
+
+def comment(who: Who | None) -> str:
+    """What the person wants others to know, as it ends a sentence."""
+    return f": {clean(who.comment)}" if who is not None and who.comment else ""
+
+
 def reason_text(reason: str, why: ReasonInfo | None, age: float = 0) -> str:
-    """A reason to wait in words, with times of day by this host's clock; `age` seconds ago it was so."""
-    told = (ReasonCode.HELD, ReasonCode.VETOED, *([ReasonCode.MAINTENANCE] if why is not None and why.by else []))
-    if why is None or why.code not in told or not why.rcs:
-        return reason  # nobody holds it, or an RCM that tells no more
+    """Why a request waits, in words, `age` seconds after the leader sent it: other requests by their names, times of
+    day by this host's clock."""
+    if why is None or why.code not in NAMING or not why.rcs or (why.code != ReasonCode.HELD and not why.by):
+        return reason
+    # A party without a client is shown by its name alone.
     parties = [
-        Party(f"{one.client}/{one.id}", one.arc, one.priority, one.who, _ns(one.yields_in, age)) for one in why.by
+        Party("", request_words(by.arc, by.who, by.client), by.priority, until=_ns(by.yields_in, age)) for by in why.by
     ]
     words = Reason(
         ReasonCode(why.code), tuple(why.rcs), tuple(parties), why.detail, why.count, why.pattern, tuple(why.patterns)
@@ -113,21 +137,19 @@ def _ns(seconds: float | None, age: float) -> Ns | None:
 
 
 def hold_text(hold: HoldView, priority: int) -> str:
-    """Whose hold it is, since and until when, in words, for who asks at this priority."""
+    """Which request holds it, since when and until when, for somebody who asks at this priority."""
     return hold_words(hold_json(hold), priority)
 
 
 def hold_words(hold: Mapping[str, Any], priority: int) -> str:
-    """The same of what `hold_json` made, with `params` if it has any."""
-    who: Who | None = hold["who"]
-    whose = common.with_amounts(named(who, hold["client"], hold["arc"]), hold.get("params", {}))
+    """The same of a hold as `hold_json` gives it, with `params` if it has any."""
+    holder = request_words(hold["arc"], hold["who"], hold["client"], hold.get("params"))
     since = f"since {clock(-hold['held'])} ({span(hold['held'])})"
-    comment = f": {who.comment}" if who is not None and who.comment else ""
-    return clean(f"{whose}, priority {hold['priority']}, {since}, {_until(hold, priority)}{comment}")
+    return f"{holder}, priority {hold['priority']}, {since}, {_until(hold, priority)}{comment(hold['who'])}"
 
 
 def _until(hold: Mapping[str, Any], priority: int) -> str:
-    """Until when it is protected against who asks at this priority, or holds at all."""
+    """Until when the hold is protected from a request of this priority, or lasts."""
     stays, left = hold["keep"] and priority < hold["priority"], hold["remaining"]
     if left <= 0:
         return "kept for as long as it wants" if stays else "its minimum runtime is over"
@@ -136,6 +158,6 @@ def _until(hold: Mapping[str, Any], priority: int) -> str:
 
 
 def hold_json(hold: HoldView) -> dict[str, Any]:
-    """The same for programs."""
-    said = {name: getattr(hold, name) for name in ("arc", "id", "client", "who", "priority", "keep")}
-    return said | {"held": round(hold.held, 3), "remaining": round(hold.remaining, 3)}
+    """A hold for programs."""
+    fields = {name: getattr(hold, name) for name in ("arc", "id", "client", "who", "priority", "keep")}
+    return fields | {"held": round(hold.held, 3), "remaining": round(hold.remaining, 3)}

@@ -1,4 +1,4 @@
-"""`zscout why`: the story of an ARC, and who is in its way."""
+"""`zscout why`: the story of a request, and the requests that are in its way."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from zscout.cli import common
 from zscout.cli.journals import ask_journals, ending, local
 from zscout.cli.journals import hold_json as past_json
 from zscout.cli.requests.options import MAX_ARC_NAME, arc_argument
-from zscout.cli.requests.waiting import NeedContention, contention_of, hold_json, hold_words, reason_text
+from zscout.cli.requests.waiting import NeedContention, comment, contention_of, hold_json, hold_words, reason_text
 from zscout.messages import HistoryAsk, HoldView, RcAsk, RcmState, RcState, WaitView
 from zscout.scheduling.reason import named
 
 MAX_DESCRIBED: Final = 20
-"""ARCs of one name."""
+"""Requests of one name."""
 ASK_RC: Final = 0.5
-"""Seconds that an RC has to say what ails it."""
+"""Seconds that a device has to report its health."""
 
 View = HoldView | WaitView
 
@@ -31,11 +31,11 @@ View = HoldView | WaitView
 @common.json_option("Print one JSON object.")
 @common.runs
 async def why(arc: str, as_json: bool) -> None:
-    """Tell what became of ARC, and why it waits if it does.
+    """Show the story of a request, and why it waits.
 
-    ARC is its name, its id, or HOST/CLIENT/ID. Of each RC that it needs: who holds it, with which priority,
-    since when, for how long yet. Of an ARC that has ended the RCM remembers the story for a while; after that the
-    journals of the candidates tell who held what for how long, and how that ended.
+    ARC is the request's name, its id, or HOST/CLIENT/ID. For each device that it needs you see which request holds it
+    and of which person, with its priority, since when and until when. The leader remembers the story of a request that
+    has ended for a while; after that the journals of the candidates show its holds and how they ended.
 
     \b
     Examples:
@@ -46,7 +46,7 @@ async def why(arc: str, as_json: bool) -> None:
         state = await common.state_of(client, arc, forecast=True)
         views: list[View] = [*state.holds, *state.queue]
         same = [view for view in views if arc in (view.arc, view.id, _full(view))]
-        unknown = common.unknown("ARC", arc, [view.arc for view in views], "and none is open", "open", state.more)
+        unknown = common.unknown("request", arc, [view.arc for view in views], "and none is open", "open", state.more)
         past = [] if same or state.story else await _past_holds(client, arc, unknown)
         found = [await _described(client, view, state) for view in same[:MAX_DESCRIBED]]
         if not same:
@@ -62,8 +62,8 @@ async def why(arc: str, as_json: bool) -> None:
 
 
 async def _past_holds(client: Client, arc: str, unknown: common.Failed) -> list[dict[str, Any]]:
-    """The latest holds of an ARC that the RCM does not know any more, as `zscout history --json` prints them, oldest
-    first. Raises `unknown` where no journal knows it either."""
+    """The latest holds of a request that the leader has forgotten, oldest first, as `zscout history --json` prints
+    them. Raises `unknown` if no journal has any."""
     if len(arc) > MAX_ARC_NAME:
         raise unknown
     try:
@@ -76,8 +76,8 @@ async def _past_holds(client: Client, arc: str, unknown: common.Failed) -> list[
 
 
 async def _described(client: Client, view: View, state: RcmState) -> dict[str, Any]:
-    """One open ARC, with its own story and not that of others of its name. Of a hold each `need` is what was asked
-    for, and `rc` what it has."""
+    """One open request with its own story, without those of others of its name. In a hold each `need` is as asked, and
+    `rc` the device that meets it."""
     story = (await common.state_of(client, _full(view))).story
     met = {rc: need for need, rc in view.bound.items()} if isinstance(view, HoldView) else {}
     needs = []
@@ -93,7 +93,7 @@ async def _described(client: Client, view: View, state: RcmState) -> dict[str, A
 
 
 async def _health(client: Client, need: NeedContention) -> str | None:
-    """Why an RC that counts as lost does so, in its own words, or in the RCM's; None where nobody knows."""
+    """Why a device counts as lost, in its own words or else in the leader's; None if that is not known."""
     if need.rc is None or need.present:
         return None
     lost = need.rcs[0].lost or None
@@ -131,20 +131,18 @@ def _print(arc: dict[str, Any]) -> None:
 
 
 def _print_holds(holds: list[dict[str, Any]]) -> None:
-    _say("Holds, as the candidates' journals have them", bold=True)
+    _say("Holds, from the journals of the candidates", bold=True)
     for hold in holds:
-        whose = named(hold["who"], hold["client"], hold["arc"])
         waited = "" if hold["waited"] is None else f" after {terminal.span(hold['waited'])} in the queue"
         began = local(datetime.fromisoformat(hold["began"]).timestamp())
-        _say(f"  {began}  {whose}, priority {hold['priority']}, held {', '.join(hold['rcs'])}")
+        by = named(hold["who"], hold["client"], hold["arc"])
+        _say(f"  {began}  {by}, priority {hold['priority']}, held {', '.join(hold['rcs'])}")
         _say(f"    for {terminal.span(hold['held'])}{waited}: {hold['end']}")
 
 
 def _print_standing(arc: dict[str, Any]) -> None:
-    whose = named(arc["who"], arc["client"], arc["arc"])
-    comment = f": {arc['who'].comment}" if arc["who"] is not None and arc["who"].comment else ""
-    who = f"{arc['arc']} of {whose}, priority {arc['priority']},"
-    names = f"  id {arc['id']}, client {arc['client']}{comment}"
+    who = f"{arc['arc']} of {named(arc['who'], arc['client'], arc['arc'])}, priority {arc['priority']},"
+    names = f"  id {arc['id']}, client {arc['client']}{comment(arc['who'])}"
     runtime = terminal.span(float(arc["min_runtime"]))
     if arc["state"] == "running":
         _say(f"{who} has run since {_past(arc['held'])}", bold=True, fg="green")
@@ -165,7 +163,7 @@ def _print_standing(arc: dict[str, Any]) -> None:
     ahead = arc["ahead"]
     place = "nobody is ahead of it" if not ahead else f"{ahead} {'is' if ahead == 1 else 'are'} ahead of it"
     _say(f"  {place} in the queue of {arc['queued']}; it wants {runtime}")
-    start = "no start can be foretold as things stand"
+    start = "no start can be estimated as things stand"
     if (starts := arc.get("starts_in")) is not None:
         start = f"it may start at {terminal.clock(starts)} (in {terminal.span(starts)}), if nothing else comes"
     _say(f"  {start}")
@@ -189,9 +187,9 @@ def _print_need(need: dict[str, Any], priority: int) -> None:
     if not need["present"]:
         _say(f"{name}: {need['health'] or 'not on the mesh'}", fg="red")
     elif rc is None and need["free"]:
-        _say(f"{name}: no ARC holds {', '.join(need['free'])}", fg="green")
+        _say(f"{name}: no request holds {', '.join(need['free'])}", fg="green")
     elif not need["holders"]:
-        _say(f"{name}: no other ARC holds it", fg="green")
+        _say(f"{name}: no other request holds it", fg="green")
     for holder in need["holders"] if need["present"] else ():
         which = "" if rc is not None else f"{holder['rc']} "
         relation = "shared with" if need["sharable"] else "held by"

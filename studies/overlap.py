@@ -2,7 +2,7 @@
 lock file and leaves a child in a session of its own that holds it too: whether the next one ever runs beside it, and
 how long it waits for that.
 
-    python -m tests.live.overlap --times 20 --cut 5 --kill 5        (needs root, network namespaces, iproute2)
+    python -m studies overlap --times 20 --cut 5 --kill 5        (needs root, network namespaces, iproute2)
 
 Of so many ends of a hold some come by cutting the program's host off, some by `kill -9` of its `zscout request`, some
 by freezing that; the others are preemptions. Exit code 0: none ran beside another, and none waited for longer than the
@@ -26,7 +26,6 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from statistics import median
-from types import TracebackType
 from typing import Any, Final, Literal, NamedTuple, Self
 
 from tests.chaos import net
@@ -161,13 +160,11 @@ class Rounds:
                     node = [*self._in(host), "-m", "zscout.node", str(file)]
                     self._started.append(subprocess.Popen(node, env=self._env, stdout=log, stderr=log))
         except BaseException:
-            self.__exit__(None, None, None)
+            self.__exit__()
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exc: object) -> None:
         processes = [*(request.process for request in self._requests), *self._started]
         for process in processes:
             if process.poll() is None:
@@ -256,7 +253,7 @@ class Rounds:
 
 
 def main() -> int:
-    options = argparse.ArgumentParser(prog="python -m tests.live.overlap", description=__doc__.partition("\n\n")[0])
+    options = argparse.ArgumentParser(prog="python -m studies overlap", description=__doc__.partition("\n\n")[0])
     options.add_argument("--times", type=int, default=20, help="so many ends of a hold (20)")
     options.add_argument("--cut", type=int, default=5, help="of them by cutting the program's host off (5)")
     options.add_argument("--kill", type=int, default=5, help="of them by kill -9 of its zscout request (5)")
@@ -299,7 +296,3 @@ def main() -> int:
         return 1
     shutil.rmtree(folder, ignore_errors=True)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,7 +1,7 @@
 """A fleet over two sites, whose hosts reach each other by a relay alone: what that costs, and whether a hold inside a
 site feels that the relay dies and comes back.
 
-    python -m tests.live.sites --merges 20 --frozen 5 --cut 5      (needs root, network namespaces, iproute2)
+    python -m studies sites --merges 20 --frozen 5 --cut 5      (needs root, network namespaces, iproute2)
 
 Two programs that hold and command devices of their own sites run through all merges. Exit code 0: none of them was
 disturbed; 1: else; 2: it can't run here."""
@@ -22,7 +22,6 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
-from types import TracebackType
 from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias
 
 import msgspec
@@ -30,7 +29,7 @@ import msgspec
 from tests.chaos import net
 from tests.hang import HANG
 from tests.live.closed import make_keys
-from tests.live.lab import HolderProcess
+from tests.live.lab import HolderProcess, awaited
 from zscout.messages import RcmState
 from zscout.types import Grant, Ns
 
@@ -48,7 +47,6 @@ NODES: Final = {
 }
 """The hosts of both sites, with their RCs. The first of each may lead."""
 ALL: Final = frozenset(rc for rcs in NODES.values() for rc in rcs)
-LOOK: Final = 0.02
 Fault: TypeAlias = Literal["killed", "frozen", "cut"]
 """What happens to the relay; the last: site b's line to it."""
 INSIDE, ACROSS = "inside", "across"
@@ -214,13 +212,11 @@ class Sites:
                 command += ["--log-level", self.log_level]
                 self.processes.start(host, command)
         except BaseException:
-            await self.__aexit__(None, None, None)
+            await self.__aexit__()
             raise
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *exc: object) -> None:
         for program in self.programs:
             program.kill()
         await asyncio.gather(*(program.process.wait() for program in self.programs))
@@ -269,17 +265,13 @@ class Sites:
 
     async def sees(self, program: Program, until: Callable[[RcmState], bool]) -> RcmState:
         """The RCM's state, as this program is told it, as soon as `until` holds of it."""
-        seen = None
-        try:
-            async with asyncio.timeout(HANG):
-                while True:
-                    seen = await program.state() or seen
-                    if seen is not None and until(seen):
-                        return seen
-                    await asyncio.sleep(LOOK)
-        except TimeoutError:
-            logs = "\n".join(f"--- {host}\n{(self.folder / f'{host}.log').read_text()}" for host in (GATE, *NODES))
-            raise AssertionError(f"{program.name} waited in vain; last seen {seen}\n{logs}") from None
+
+        def logs() -> str:
+            return "\n".join(f"--- {host}\n{(self.folder / f'{host}.log').read_text()}" for host in (GATE, *NODES))
+
+        seen = await awaited(program.state, lambda state: state is not None and until(state), logs)
+        assert seen is not None
+        return seen
 
     async def whole(self, *programs: Program) -> RcmState:
         """Waits until one RCM has the devices of both sites, for all of these programs."""
@@ -406,7 +398,7 @@ async def measure(asked: argparse.Namespace, folder: Path) -> bool:
 
 
 def main() -> int:
-    options = argparse.ArgumentParser(prog="python -m tests.live.sites", description=__doc__.partition("\n\n")[0])
+    options = argparse.ArgumentParser(prog="python -m studies sites", description=__doc__.partition("\n\n")[0])
     options.add_argument("--merges", type=int, default=20, help="so often the relay goes and comes back (20)")
     options.add_argument("--frozen", type=int, default=0, help="of these it is frozen, not killed (0)")
     options.add_argument("--cut", type=int, default=0, help="of these a site's line to it is cut (0)")
@@ -431,7 +423,3 @@ def main() -> int:
         return 1
     shutil.rmtree(folder, ignore_errors=True)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

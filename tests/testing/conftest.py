@@ -1,5 +1,0 @@
-"""Tests here may be coroutines."""
-
-from tests.mesh.async_tests import pytest_pyfunc_call, real_time, stack
-
-__all__ = ["pytest_pyfunc_call", "real_time", "stack"]
