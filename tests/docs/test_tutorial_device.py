@@ -73,7 +73,7 @@ def test_a_device_of_ones_own_is_held_commanded_and_on_the_timeline(
         try:
             path = the_file(tmp_path / "runs")
             bright = {value for _, _, values in rows(path, "/device/**", "Scalars:scalars") for value in values}
-            return {50.0, 200.0, 0.0} <= bright and "blink" in str(lanes(path, "/rc/**"))
+            return {50.0, 200.0, 0.0} <= bright and "blink" in str(lanes(path, "/devices/**"))
         except (ValueError, RuntimeError, OSError, KeyError):  # as it is being written
             return False
 

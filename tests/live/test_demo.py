@@ -19,7 +19,7 @@ import psutil
 import pytest
 
 from tests.hang import HANG
-from tests.services.recorder.paper_run import RCS, TABLE2, colours, events, lanes, rows
+from tests.services.recorder.paper_run import PERSON, RCS, TABLE2, USER, colours, events, lanes, rows
 from zscout.services.recorder.timeline import OPERATOR_MARK
 from zscout.simulation.demo.tables import ArcBody, Observed, differences, paper
 from zscout.types import SECOND, Ns
@@ -81,22 +81,25 @@ def test_table_1_live_gives_table_2(tmp_path: Path) -> None:
     path = tmp_path / result["recording"]
     assert list(tmp_path.rglob("*.rrd")) == [path]
     assert path.parent == tmp_path / "runs"
-    shown = lanes(path, "/rc/**")
+    shown = lanes(path, "/devices/**")
     for rc in RCS:
-        holders = [state.removesuffix(OPERATOR_MARK).removeprefix("arc") for _, (state,) in shown[f"/rc/{rc}"]]
+        holders = [
+            state.removesuffix(OPERATOR_MARK).removesuffix(PERSON).removeprefix("arc")
+            for _, (state,) in shown[f"/devices/{rc}"]
+        ]
         assert turns(holders, free="") == turns(TABLE2[rc].split(), free="-")
-    used = {text: colour for lane in colours(path, "/rc/**").values() for text, colour in lane.items()}
-    assert set(used) == {"arc0", "arc1", "arc2", "arc3", "arc4" + OPERATOR_MARK}
+    used = {text: colour for lane in colours(path, "/devices/**").values() for text, colour in lane.items()}
+    assert set(used) == {*(f"arc{number}{PERSON}" for number in range(4)), f"arc4{PERSON}{OPERATOR_MARK}"}
     assert len(set(used.values())) == 5
-    doing = [text.split(" · ")[0] for _, (text,) in lanes(path, "/arc/**")["/arc/arc2"]]
-    assert doing[-4:] == ["running", "preempted", "running", "done"]
+    doing = [text.split(" · ")[0] for _, (text,) in lanes(path, "/requests/**")[f"/requests/{USER}/arc2"]]
+    assert doing[-4:] == ["running", "waiting again", "running", "done"]
     assert set(doing[:-4]) == {"waiting"}
     assert {entity for entity, _, _ in rows(path, "/load/**", "Scalars:scalars")} == {
         "/load/anvil",
         "/load/bellows",
         "/load/crucible",
     }
-    told = re.compile(r"arc2 is preempted by \w+ \(arc4\), priority 10, and waits again")
+    told = re.compile(r"arc2 \(\w+\) is preempted by arc4 \(\w+\), priority 10, and waits again")
     assert any(map(told.fullmatch, events(path)))
 
 
@@ -147,7 +150,9 @@ def test_nothing_runs_on_when_it_is_stopped(tmp_path: Path, number: signal.Signa
     assert demo.returncode == 128 + number
     assert error == "the recording until then: mine/demo.rrd\n"
     # A recorder that came late has seen it free more than once.
-    assert ["arc0"] in [held for _, held in lanes(tmp_path / "mine" / "demo.rrd", "/rc/**")["/rc/robot/scout33"]]
+    assert [f"arc0{PERSON}"] in [
+        held for _, held in lanes(tmp_path / "mine" / "demo.rrd", "/devices/**")["/devices/robot/scout33"]
+    ]
     assert list((tmp_path / "tmp").iterdir()) == []
 
 

@@ -88,8 +88,8 @@ def test_robots_hide_on_a_live_mesh_and_nothing_is_left(tmp_path: Path) -> None:
     assert list((tmp_path / "tmp").iterdir()) == []
     assert list(tmp_path.rglob("*.rrd")) == [recording]
     # What is recorded is readable to its last word, however the demo ended.
-    shown = lanes(recording, "/rc/**")
-    assert set(ROBOTS) <= {name.removeprefix("/rc/") for name in shown}
+    shown = lanes(recording, "/devices/**")
+    assert set(ROBOTS) <= {name.removeprefix("/devices/") for name in shown}
 
     if not (ended or out):
         assert (demo.returncode, out) == (128 + signal.SIGINT, "")
@@ -107,7 +107,7 @@ def test_robots_hide_on_a_live_mesh_and_nothing_is_left(tmp_path: Path) -> None:
     assert told["simulated"] <= 3 * told["seconds"]
     assert told["taken"] in ROBOTS
     operator = f"operator-{told['taken'].partition('/')[2]}"
-    assert any(text.startswith(operator) for _, texts in shown[f"/rc/{told['taken']}"] for text in texts)
+    assert any(text.startswith(operator) for _, texts in shown[f"/devices/{told['taken']}"] for text in texts)
     if told["placed_after"] is not None:
         # The building knows better than a robot's camera: that may err, but not of both.
         assert told["truly_dark"]

@@ -26,7 +26,7 @@ from tests.cli.tools import COMMAND, zscout_here
 from tests.hang import HANG
 from tests.live.lab import Lab
 from tests.ports import free_port
-from tests.services.recorder.paper_run import RCS, RERUN, TABLE2, lanes, play_table1, second_by_second
+from tests.services.recorder.paper_run import PERSON, RCS, RERUN, TABLE2, lanes, play_table1, second_by_second
 from zscout.cli.fleet import view as module
 from zscout.keyexpr import Role
 from zscout.messages import Recorded
@@ -115,8 +115,8 @@ def test_the_page_is_served_with_the_recording_and_ctrl_c_ends_all(recording: Pa
 def shows_table_2(path: Path) -> bool:
     with suppress(ValueError, RuntimeError, OSError, KeyError, IndexError), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the file is still being written
-        shown = lanes(path, "/rc/**")
-        return {rc: second_by_second(shown[f"/rc/{rc}"]) for rc in RCS} == TABLE2
+        shown = lanes(path, "/devices/**")
+        return {rc: second_by_second(shown[f"/devices/{rc}"]) for rc in RCS} == TABLE2
     return False
 
 
@@ -159,11 +159,11 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
         with suppress(ValueError, RuntimeError, OSError, KeyError, IndexError), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             (file,) = (tmp_path / "out").glob("*.rrd")
-            return [state for lane in lanes(file, "/rc/**").values() for _, states in lane for state in states]
+            return [state for lane in lanes(file, "/devices/**").values() for _, states in lane for state in states]
         return []
 
     def has_past() -> bool:
-        return "before (journal)" in shown()
+        return f"before{PERSON} (journal)" in shown()
 
     async def story() -> None:
         async with Lab(tmp_path) as lab:
@@ -180,9 +180,9 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
                     await recorded.wait()
                 arc = await client.request("survey", {"robot/a": {}}, min_runtime=600)
                 # It has no link to who leads yet, perhaps.
-                await asyncio.to_thread(until, lambda: shown()[-1:] == ["survey"], "the hold is not shown")
+                await asyncio.to_thread(until, lambda: shown()[-1:] == [f"survey{PERSON}"], "the hold is not shown")
                 await client.end(arc)
-                await asyncio.to_thread(until, lambda: shown()[-2:] == ["survey", ""], "its end is not shown")
+                await asyncio.to_thread(until, lambda: shown()[-2:] == [f"survey{PERSON}", ""], "its end is not shown")
                 await asyncio.to_thread(until, has_past, "nothing is shown of the past")
                 children = descendants(process)
                 assert len(children) == 2
@@ -192,8 +192,8 @@ def test_a_live_view_serves_the_fleet_and_leaves_a_complete_recording(tmp_path: 
                 assert not listens(stream)
             (file,) = (tmp_path / "out").glob("*.rrd")
             assert f"Recording to {file}\n" in (tmp_path / "view.out").read_text()
-            (lane,) = lanes(file, "/rc/**").values()
-            assert [states for _, states in lane][-2:] == [["survey"], [""]]
+            (lane,) = lanes(file, "/devices/**").values()
+            assert [states for _, states in lane][-2:] == [[f"survey{PERSON}"], [""]]
 
     asyncio.run(story())
 

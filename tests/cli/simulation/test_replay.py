@@ -181,9 +181,9 @@ def test_a_recording_shows_table_2(table1: Path, tmp_path: Path, capsys: pytest.
     recording = tmp_path / "run.rrd"
     assert zscout_here("replay", table1, "--rrd", recording) == 0
     assert f"zscout view {recording}" in capsys.readouterr().out
-    held = lanes(recording, "/rc/**")
-    assert {rc: second_by_second(held[f"/rc/{rc}"]) for rc in RCS} == TABLE2
-    story = [(at, states[0].split(" · ")[0]) for at, states in lanes(recording, "/arc/**")["/arc/arc2"]]
+    held = lanes(recording, "/devices/**")
+    assert {rc: second_by_second(held[f"/devices/{rc}"]) for rc in RCS} == TABLE2
+    story = [(at, states[0].split(" · ")[0]) for at, states in lanes(recording, "/requests/**")["/requests/arc2"]]
     kept = [change for index, change in enumerate(story) if index == 0 or change[1] != story[index - 1][1]]
     assert kept == [(1, "waiting"), (8, "running"), (11, "preempted"), (14, "running"), (18, "done")]
     assert any(text.startswith("arc2: preempted by arc4") for text in events(recording))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import getpass
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
@@ -43,6 +44,9 @@ TABLE2 = {
     FGRAB2: "- - - - - 3 3 3 2 2 2 - - - 2 2 2 2",
 }
 OPERATOR_PRIORITY = 10
+USER = getpass.getuser()
+PERSON = f" ({USER})"
+"""Follows the names of requests that programs of this user make."""
 
 
 def table1() -> Workload:
@@ -151,5 +155,5 @@ def second_by_second(changes: list[tuple[float, list[str]]]) -> str:
     shown = []
     for second in range(18):
         state = [states for at, states in changes if at <= second][-1][0]
-        shown.append(state.removesuffix(OPERATOR_MARK).removeprefix("arc") or "-")
+        shown.append(state.removesuffix(OPERATOR_MARK).removesuffix(PERSON).removeprefix("arc") or "-")
     return " ".join(shown)

@@ -46,6 +46,17 @@ def test_a_picture_that_is_old_says_so(path: Path) -> None:
     assert [at for _, at, _ in rows(path, "/camera/fgrab1/boxes", "Clear:is_recursive")] == [4]
 
 
+def test_an_old_picture_is_a_whole_one_in_the_next_file_too(path: Path, tmp_path: Path) -> None:
+    """An opacity alone has no picture there."""
+    picture = jpeg(0, "scout33", None)
+    with Timeline("lab", path=path) as timeline:
+        timeline.robots.frame(1, CAMERA, head(1), picture)
+        timeline.roll(2, tmp_path / "next.rrd")
+        timeline.robots.no_frame(4, CAMERA)
+    shown = {at: bytes(blob) for _, at, (blob,) in rows(tmp_path / "next.rrd", "/camera/fgrab1", "EncodedImage:blob")}
+    assert shown == {2: picture, 4: picture}
+
+
 def test_boxes_end_with_what_they_mark(path: Path) -> None:
     picture = jpeg(0, "scout33", None)
     next_grant, box = Grant(Term(1, "rcm"), 8), [10, 10, 20, 20]

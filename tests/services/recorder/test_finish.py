@@ -41,7 +41,7 @@ def test_a_recording_that_is_over_has_few_chunks_and_all_that_was_told(
     finished, written = ((tmp_path / f"{name}.rrd") for name in ("finished", "written"))
     assert fewer * chunks(finished) < chunks(written)
     assert finished.stat().st_size < written.stat().st_size
-    for content in ("/rc/**", "/arc/**", "/behavior/**"):
+    for content in ("/devices/**", "/requests/**", "/behavior/**"):
         assert lanes(finished, content) == lanes(written, content)
         assert colours(finished, content) == colours(written, content)
     assert Counter(events(finished)) == Counter(events(written))
@@ -121,12 +121,12 @@ def test_a_recording_goes_on_in_a_file_that_begins_with_what_is_shown(tmp_path: 
     finish(job.path, job.layout)
     assert (job.path, job.layout.span) == (first, (1, 2))
     assert (events(first), events(second)) == (["before"], ["after"])
-    assert lanes(first, "/rc/**")["/rc/robot/a"] == [(1, ["survey"])]
-    assert lanes(second, "/rc/**") == {
-        "/rc/robot/a": [(10, ["survey"]), (12, [""])],
-        "/rc/robot/b": [(10, ["drive (operator)"])],
+    assert lanes(first, "/devices/**")["/devices/robot/a"] == [(1, ["survey"])]
+    assert lanes(second, "/devices/**") == {
+        "/devices/robot/a": [(10, ["survey"]), (12, [""])],
+        "/devices/robot/b": [(10, ["drive (operator)"])],
     }
-    assert colours(second, "/rc/robot/b") == {"/rc/robot/b": {"drive (operator)": OPERATOR}}
+    assert colours(second, "/devices/robot/b") == {"/devices/robot/b": {"drive (operator)": OPERATOR}}
     assert len(list(rows(second, "/load/anvil", "SeriesLines:colors", static=True))) == 1
 
 
@@ -159,16 +159,16 @@ def test_who_is_waited_for_comes_first_and_who_is_absent_last(path: Path) -> Non
         timeline.holders(2, "robot/a", [], "ws1 is gone")
         timeline.contended(2, ["robot/a"])
         layout = timeline.layout(live=False)
-        assert (list(layout.contended), list(layout.absent)) == (["/rc/robot/c"], ["/rc/robot/a"])
+        assert (list(layout.contended), list(layout.absent)) == (["/devices/robot/c"], ["/devices/robot/a"])
         timeline.regroup(3)
-        assert list(timeline.layout(live=True).contended) == ["/rc/robot/c"]
+        assert list(timeline.layout(live=True).contended) == ["/devices/robot/c"]
         # Nobody waits for it any more.
         timeline.regroup(1000)
         assert list(timeline.layout(live=True).contended) == []
         timeline.holders(1001, "robot/a", [])
         assert list(timeline.layout(live=False).absent) == []
-    assert lanes(path, "/rc/robot/a")["/rc/robot/a"][1:] == [(2, ["ws1 is gone"]), (1001, [""])]
-    assert colours(path, "/rc/robot/a")["/rc/robot/a"]["ws1 is gone"] == ABSENT
+    assert lanes(path, "/devices/robot/a")["/devices/robot/a"][1:] == [(2, ["ws1 is gone"]), (1001, [""])]
+    assert colours(path, "/devices/robot/a")["/devices/robot/a"]["ws1 is gone"] == ABSENT
 
 
 def test_an_operator_is_red_among_arcs_and_events_as_well(path: Path) -> None:
@@ -177,7 +177,7 @@ def test_an_operator_is_red_among_arcs_and_events_as_well(path: Path) -> None:
         timeline.arc(1, "drive", "running", "priority 10", operator=True)
         timeline.event(1, "drive runs on robot/a", operator=True)
         timeline.event(2, "survey runs on robot/a")
-    assert colours(path, "/arc/drive")["/arc/drive"]["running · priority 10"] == OPERATOR
+    assert colours(path, "/requests/drive")["/requests/drive"]["running · priority 10"] == OPERATOR
     told = {text[0]: at for _, at, text in rows(path, "/events", "TextLog:text")}
     assert [at for _, at, colour in rows(path, "/events", "TextLog:color") if colour == [OPERATOR]] == [1]
     assert told == {"drive runs on robot/a": 1, "survey runs on robot/a": 2}

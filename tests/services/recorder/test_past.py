@@ -108,11 +108,11 @@ def test_the_past_is_drawn_paler_and_makes_the_run_no_longer(path: Path) -> None
         layout = timeline.layout(live=False)
     # Too late:
     timeline.past(600, {"robot/late": [(-1, [SURVEY])]})
-    assert layout.only_past == ("/rc/robot/gone",)
+    assert layout.only_past == ("/devices/robot/gone",)
     assert (layout.past, layout.span) == (600.0, (0.5, 9.0))
     before = [(-500, ["survey (journal)"]), (-400, ["not known"]), (-300, ["drive (operator) (journal)"])]
-    assert lanes(path, "/rc/robot/a")["/rc/robot/a"] == [*before, (0, [""]), (0.5, ["survey"])]
-    assert colours(path, "/rc/robot/a")["/rc/robot/a"] == {
+    assert lanes(path, "/devices/robot/a")["/devices/robot/a"] == [*before, (0, [""]), (0.5, ["survey"])]
+    assert colours(path, "/devices/robot/a")["/devices/robot/a"] == {
         "survey": PALETTE[0],
         "survey (journal)": faded(PALETTE[0], PAST_PART),
         "not known": ABSENT,
@@ -130,8 +130,8 @@ def test_only_the_first_file_has_the_past(tmp_path: Path) -> None:
         assert job is not None
         assert (job.layout.past, timeline.layout(live=False).past, timeline.layout(live=True).past) == (600, 0, 600)
     finish(job.path, job.layout)
-    assert len(lanes(first, "/rc/**")["/rc/robot/a"]) == 3
-    assert [states for _, states in lanes(second, "/rc/**")["/rc/robot/a"]] == [[""]]
+    assert len(lanes(first, "/devices/**")["/devices/robot/a"]) == 3
+    assert [states for _, states in lanes(second, "/devices/**")["/devices/robot/a"]] == [[""]]
 
 
 async def test_a_recorder_that_comes_late_shows_what_journals_tell(path: Path, tmp_path: Path) -> None:
@@ -151,11 +151,11 @@ async def test_a_recorder_that_comes_late_shows_what_journals_tell(path: Path, t
         await two.ask("again", "robot/b", seconds=600)
         await asyncio.sleep(10)
     await told.close()
-    found = lanes(path, "/rc/**")
-    assert [states for _, states in found["/rc/robot/a"]] == [["survey (journal)"], [""], ["survey"]]
-    assert [states for _, states in found["/rc/robot/b"]] == [["film (journal)"], [""], [""], ["again"]]
-    begun, over, *_ = (at for at, _ in found["/rc/robot/b"])
+    found = lanes(path, "/devices/**")
+    assert [states for _, states in found["/devices/robot/a"]] == [["survey (journal)"], [""], ["survey"]]
+    assert [states for _, states in found["/devices/robot/b"]] == [["film (journal)"], [""], [""], ["again"]]
+    begun, over, *_ = (at for at, _ in found["/devices/robot/b"])
     assert over - begun == pytest.approx(100, abs=1)
     assert over == pytest.approx(-50, abs=1)
-    assert found["/rc/robot/a"][1][0] == 0
+    assert found["/devices/robot/a"][1][0] == 0
     assert "the journals of x, y tell of 2 holds in the 1 h before this recording" in events(path)

@@ -83,7 +83,7 @@ def test_a_component_has_the_colour_of_its_arc(path: Path) -> None:
         on_anvil = [placement(name, "running", "anvil", 1) for name in ("counter", "other")]
         say(timeline.hosts, 1, *on_anvil)
         timeline.holders(2, "robot/a", [HolderRow("other"), HolderRow("next")])
-    rc, host = colours(path, "/rc/**")["/rc/robot/a"], colours(path, "/host/**")["/host/anvil"]
+    rc, host = colours(path, "/devices/**")["/devices/robot/a"], colours(path, "/host/**")["/host/anvil"]
     assert host == {name: rc[name] for name in ("counter", "other")}
     assert len(set(rc.values())) == 4
 

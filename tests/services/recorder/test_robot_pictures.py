@@ -28,8 +28,8 @@ def test_a_minute_of_robots_at_a_glance(path: Path, tmp_path: Path) -> None:
     record(path, until=37)
     picture, state = look(path, tmp_path, panes=10, height=HEIGHT)
     assert {view.name for view in state.views} == {
-        "Who holds each resource",
-        "What each ARC is doing",
+        "Who holds each device",
+        "What each request is doing",
         "What each behavior is doing",
         "Load average (1 min) per host",
         f"Floor   {FLOOR_WORDS}",

@@ -46,16 +46,16 @@ def table1(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_table_1_recorded_reads_as_table_2(table1: Path) -> None:
-    shown = lanes(table1, "/rc/**")
-    assert {rc: second_by_second(shown[f"/rc/{rc}"]) for rc in RCS} == TABLE2
+    shown = lanes(table1, "/devices/**")
+    assert {rc: second_by_second(shown[f"/devices/{rc}"]) for rc in RCS} == TABLE2
     lane = [(0, "arc0"), (5, "arc3"), (8, "arc2"), (11, "arc4" + OPERATOR_MARK), (14, "arc2"), (18, "")]
-    assert shown[f"/rc/{SCOUT33}"] == [(at, [holder]) for at, holder in lane]
+    assert shown[f"/devices/{SCOUT33}"] == [(at, [holder]) for at, holder in lane]
 
 
 def test_arc_lanes_tell_the_story(table1: Path) -> None:
-    shown = lanes(table1, "/arc/**")
-    assert set(shown) == {f"/arc/arc{number}" for number in range(5)}
-    story = [(at, states[0].split(" · ")[0]) for at, states in shown["/arc/arc2"]]
+    shown = lanes(table1, "/requests/**")
+    assert set(shown) == {f"/requests/arc{number}" for number in range(5)}
+    story = [(at, states[0].split(" · ")[0]) for at, states in shown["/requests/arc2"]]
     kept = [change for index, change in enumerate(story) if index == 0 or change[1] != story[index - 1][1]]
     assert kept == [(1, "waiting"), (8, "running"), (11, "preempted"), (14, "running"), (18, "done")]
     assert any("arc2 preempted" in text for text in events(table1))
@@ -63,12 +63,12 @@ def test_arc_lanes_tell_the_story(table1: Path) -> None:
 
 def test_an_arc_has_one_colour_and_the_operator_has_its_own(table1: Path) -> None:
     by_text: dict[str, set[int]] = {}
-    for lane in colours(table1, "/rc/**").values():
+    for lane in colours(table1, "/devices/**").values():
         for text, colour in lane.items():
             by_text.setdefault(text, set()).add(colour)
     shades = {f"arc{number}": {PALETTE[number]} for number in range(4)}
     assert by_text == shades | {"arc4" + OPERATOR_MARK: {OPERATOR}}
-    for lane in colours(table1, "/arc/**").values():
+    for lane in colours(table1, "/requests/**").values():
         for text, colour in lane.items():
             assert colour == STATES[text.split(" · ")[0]]
             assert (colour == OPERATOR) == text.startswith("preempted")
@@ -141,7 +141,7 @@ def test_holders_of_a_sharable_rc_keep_their_rows(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         for at, names in enumerate(("a", "ab", "abc", "bc", "bcd", "")):
             timeline.holders(at, "radio/rf0", [HolderRow(name) for name in names])
-    assert lanes(path, "/rc/**")["/rc/radio/rf0"] == [
+    assert lanes(path, "/devices/**")["/devices/radio/rf0"] == [
         (0, ["a"]),
         (1, ["a", "b"]),
         (2, ["a", "b", "c"]),
@@ -158,7 +158,7 @@ def test_a_crowd_is_summed_up_in_the_last_row(path: Path) -> None:
         timeline.holders(1, "radio/rf0", crowd[:8])
         timeline.holders(2, "radio/rf0", crowd[1:10])
         timeline.holders(3, "radio/rf0", [])
-    changes = [states for _, states in lanes(path, "/rc/**")["/rc/radio/rf0"]]
+    changes = [states for _, states in lanes(path, "/devices/**")["/devices/radio/rf0"]]
     assert changes[0] == [*(f"arc{number}" for number in range(7)), "4 more"]
     assert changes[1] == [f"arc{number}" for number in range(8)]
     assert changes[2] == ["arc7", *(f"arc{number}" for number in range(1, 7)), "2 more"]
@@ -183,10 +183,10 @@ def test_names_past_the_limit_are_noted_once(path: Path, monkeypatch: pytest.Mon
             timeline.holders(number, f"robot/r{number}", [])
             timeline.hosts.load(number, f"host{number}", 0.5)
         timeline.holders(7, "robot/r0", [HolderRow("arc5")])
-    assert set(lanes(path, "/arc/**")) == {"/arc/arc0", "/arc/arc1", "/arc/arc2"}
-    assert set(lanes(path, "/rc/**")) == {"/rc/robot/r0", "/rc/robot/r1"}
+    assert set(lanes(path, "/requests/**")) == {"/requests/arc0", "/requests/arc1", "/requests/arc2"}
+    assert set(lanes(path, "/devices/**")) == {"/devices/robot/r0", "/devices/robot/r1"}
     assert {entity for entity, _, _ in rows(path, "/load/**", "Scalars:scalars")} == {"/load/host0"}
-    assert lanes(path, "/rc/**")["/rc/robot/r0"][-1] == (7, ["arc5"])
+    assert lanes(path, "/devices/**")["/devices/robot/r0"][-1] == (7, ["arc5"])
     notes = events(path)
     assert len(notes) == 3
     assert all(note.startswith("timeline: more than ") for note in notes)
@@ -197,7 +197,7 @@ def test_a_lane_forgets_the_colours_longest_unused(path: Path, monkeypatch: pyte
     with Timeline("lab", path=path) as timeline:
         for number in range(40):
             timeline.holders(number, SCOUT33, [HolderRow(f"arc{number}")])
-    assert list(colours(path, "/rc/**")[f"/rc/{SCOUT33}"]) == [f"arc{number}" for number in range(24, 40)]
+    assert list(colours(path, "/devices/**")[f"/devices/{SCOUT33}"]) == [f"arc{number}" for number in range(24, 40)]
 
 
 def test_hostile_names_and_texts_are_tamed(path: Path) -> None:
@@ -206,8 +206,8 @@ def test_hostile_names_and_texts_are_tamed(path: Path) -> None:
         timeline.event(0, "one\ntwo\x07 \u65e5\u2716 é " + "z" * 10_000, "SHOUT")
         timeline.hosts.load(0, "anvil", math.nan, math.inf)
         timeline.hosts.load(1, "anvil", 0.5, 0.25)
-    ((lane, changes),) = lanes(path, "/arc/**").items()
-    assert lane == "/arc/../a_b_/_/" + "x" * 64
+    ((lane, changes),) = lanes(path, "/requests/**").items()
+    assert lane == "/requests/../a_b_/_/" + "x" * 64
     assert changes[0][1][0].startswith("waiting · because [31mof yyy")
     assert len(changes[0][1][0]) == drawing.MAX_STATE
     (text,) = events(path)
@@ -266,12 +266,12 @@ def becomes_equal(viewer: subprocess.Popen[bytes], path: Path, copy: Path) -> bo
         # A file that is being written has no footer, and at first not even a store.
         with suppress(ValueError, RuntimeError, OSError, KeyError), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            shown = lanes(copy, "/rc/**")
-            table = {rc: second_by_second(shown[f"/rc/{rc}"]) for rc in RCS}
+            shown = lanes(copy, "/devices/**")
+            table = {rc: second_by_second(shown[f"/devices/{rc}"]) for rc in RCS}
             if (
                 table == TABLE2
-                and shown == lanes(path, "/rc/**")
-                and colours(copy, "/rc/**") == colours(path, "/rc/**")
+                and shown == lanes(path, "/devices/**")
+                and colours(copy, "/devices/**") == colours(path, "/devices/**")
             ):
                 return True
         time.sleep(0.02)

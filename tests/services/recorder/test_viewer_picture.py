@@ -35,7 +35,7 @@ from tests.services.recorder.paper_run import (
     second_by_second,
 )
 from zscout.messages import BookedDate, BookingsTold, BookingView
-from zscout.services.recorder.blueprint import AHEAD, LIVE_WINDOW, MARGIN, TIME
+from zscout.services.recorder.blueprint import AHEAD, LIVE_WINDOW, MARGIN, ONE_PANE, TIME
 from zscout.services.recorder.colours import ABSENT, ALERT, LINES, MAINTENANCE, OPERATOR, PALETTE, STATES
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import Timeline
@@ -184,7 +184,7 @@ def bars_of(picture: Image.Image, colours: dict[str, int], start: float, length:
 def test_the_paper_s_example_in_the_viewer(path: Path, tmp_path: Path) -> None:
     record(path)
     picture, state = look(path, tmp_path)
-    names = {"Who holds each resource", "What each ARC is doing", "Load average (1 min) per host"}
+    names = {"Who holds each device", "What each request is doing", "Load average (1 min) per host"}
     assert {view.name for view in state.views} == names | {"Events", "Who comes and goes"}
     (shown,) = state.recordings
     assert [(timeline.name, timeline.time_type) for timeline in shown.timelines] == [(TIME, "duration")]
@@ -217,6 +217,8 @@ def test_what_several_want_stands_above_and_what_is_not_there_below(tmp_path: Pa
         timeline.holders(0, "robot/a", [], "ws1 is gone")
         timeline.holders(0, "robot/b", [HolderRow("survey")])
         timeline.holders(0, "robot/c", [HolderRow("drive", operator=True)])
+        for number in range(ONE_PANE):
+            timeline.holders(0, f"robot/free{number}", [])
         timeline.contended(1, ["robot/c"])
         timeline.arc(1, "film", "waiting", "for drive: robot/c")
         timeline.event(SECONDS, "the end")
@@ -299,8 +301,8 @@ def written(path: Path) -> bool | None:
     """True once all of Table 2 is in the file that is still open."""
     with suppress(ValueError, RuntimeError, OSError, KeyError), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        shown = lanes(path, "/rc/**")
-        done = lanes(path, "/arc/**")
-        if len(done) == 5 and {rc: second_by_second(shown[f"/rc/{rc}"]) for rc in RCS} == TABLE2:
+        shown = lanes(path, "/devices/**")
+        done = lanes(path, "/requests/**")
+        if len(done) == 5 and {rc: second_by_second(shown[f"/devices/{rc}"]) for rc in RCS} == TABLE2:
             return True
     return None

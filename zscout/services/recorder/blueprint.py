@@ -21,6 +21,7 @@ WALL_TIME: Final = "wall_clock_time"
 MARK_WORDS: Final = "▲ placed  ● restarted  ◀ moved away  ▶ moved here  \u00d7 given up"
 FLOOR_WORDS: Final = "green hidden, amber not yet, red operator, violet people"
 
+REQUESTS: Final = "What each request is doing"
 MARGIN: Final = 0.03
 """Part of a finished run's length that is left free after its end."""
 LIVE_WINDOW: Final = 60.0
@@ -30,10 +31,29 @@ LIVE_ROWS: Final = 6
 LIVE_HOST_ROWS: Final = 10
 """Components that a live view has room for."""
 LIVE_BEHAVIOR_ROWS: Final = 9
-LOAD_SHARE: Final = 7
-"""Height of the loads in rows, at least: curves, axis and legend."""
+ONE_PANE: Final = 10
+"""Rows of devices that stand in one pane, whoever wants them."""
+FOLDED: Final = 8
+"""Lanes of requests past which those who wait have a pane, and all requests a tab of it."""
+MAX_LANE_ROWS: Final = 12
+"""Rows of lanes that a pane has room for; it scrolls past them."""
+MAX_WAITING_ROWS: Final = 6
+"""Rows of the pane of those who wait; more of them are summed up in the last row."""
+MOST_ROWS: Final = ONE_PANE + 1, FOLDED + 1, MAX_WAITING_ROWS
+"""Rows of devices, requests and those who wait from which more change nothing in the layout."""
+FRAME: Final = 48
+"""Height of a pane's title and axis, in pixels as all heights here."""
+TITLE: Final = 34
+"""Height of the title of a pane without an axis."""
+ROW: Final = 41
+"""Height of a lane with its label."""
+NEXT_ROW: Final = 23
+"""Height of a further row of one lane."""
+BANNER: Final = 64
+LOAD: Final = 200
+"""Least height of the loads: curves, axis and legend."""
 LOAD_PART: Final = 0.3
-"""And of the height of the panes above."""
+"""Least height of the loads as a part of that of the panes above."""
 LEGEND: Final = 6
 """Curves that a legend leaves room for."""
 BESIDE: Final = 4
@@ -88,10 +108,11 @@ class Layout(msgspec.Struct, frozen=True):
     `span`: begin and end of a run that is over, in seconds of the timeline. Without it the layout is live: the window
     slides with the newest data and shows the last minute. `wall`: whether the timeline has wall-clock times. `rc_rows`,
     `arc_rows` and `host_rows` are the rows expected in the upper panes, which share the height accordingly. Without
-    components `host_rows` is 0. `contended` and `absent` are rows by entity of RCs that several want, and of those that
-    are not there: panes of their own, above the other RCs and below them. `ahead`: rows of the charts of what is
-    booked; 0: none. `past`: seconds before the begin of which journals told, 0: none; `only_past` are entities of RCs
-    of which nothing else is known."""
+    components `host_rows` is 0. `waiting_rows` are those of the requests that wait, in a pane of their own; 0: no such
+    pane. `banner`: a text above all panes. `contended` and `absent` are rows by entity of devices that several want,
+    and of those that are not there: past ONE_PANE rows they have panes of their own, above the other devices and below
+    them. `ahead`: rows of the charts of what is booked; 0: none. `past`: seconds before the begin
+    that the journals know, 0: none; `only_past` are entities of devices of which nothing else is known."""
 
     span: tuple[float, float] | None = None
     wall: bool = False
@@ -99,6 +120,8 @@ class Layout(msgspec.Struct, frozen=True):
     contended: Mapping[str, int] = {}
     absent: Mapping[str, int] = {}
     arc_rows: int = 6
+    waiting_rows: int = 0
+    banner: str = ""
     host_rows: int = 0
     robots: RobotLayout = NO_ROBOTS
     ahead: int = 0
@@ -107,21 +130,23 @@ class Layout(msgspec.Struct, frozen=True):
 
 
 def blueprint(layout: Layout) -> rrb.Blueprint:
-    """Who holds what, what each ARC does and the loads on one time axis, events beside them; with components, also what
-    runs on each host and what it uses.
+    """Who waits, who holds what and what each request does on one time axis, events and loads beside them; with
+    components, also what runs on each host and what it uses, and the loads below that.
 
-    A pane of RCs or ARCs that would be empty beside components is left out. With robots, their behaviors follow the
-    ARCs, loads and hosts share a place, and floor and cameras are at the right, above the events."""
+    A pane of devices or requests that would be empty beside components is left out. With robots, their behaviors follow
+    the requests, loads and hosts share a place, and floor and cameras are at the right, above the events."""
     span, robots, host_rows = layout.span, layout.robots, layout.host_rows
     axis = rrb.archetypes.TimeAxis(view_range=_window(span))
     behavior_rows = LIVE_BEHAVIOR_ROWS if span is None and robots.behavior_rows else robots.behavior_rows
+    waiting = _waiting_pane(layout, axis)
     lanes = (
-        _rc_panes(layout, axis)
+        waiting
+        | _rc_panes(layout, axis)
         | _charts(layout.ahead)
         | {
             origin: (_share(rows), rrb.StateTimelineView(origin=origin, name=name, time_view=axis))
             for origin, name, rows, alone in (
-                ("/arc", "What each ARC is doing", layout.arc_rows, not host_rows),
+                ("/requests", REQUESTS, 0 if waiting else layout.arc_rows, not host_rows and not waiting),
                 ("/host", "What runs on each host", host_rows, False),
                 ("/behavior", "What each behavior is doing", behavior_rows if robots.any else 0, False),
             )
@@ -137,51 +162,70 @@ def blueprint(layout: Layout) -> rrb.Blueprint:
     )
     if robots.any and host_rows:
         load = rrb.Tabs(load, lanes.pop("/host")[1])
-    shares = [share for share, _ in lanes.values()]
-    shares.append(max(LOAD_SHARE, round(LOAD_PART * sum(shares))))
-    panes = rrb.Vertical(*(view for _, view in lanes.values()), load, row_shares=shares)
+    height = sum(share for share, _ in lanes.values())
     time = WALL_TIME if layout.wall else TIME
     beside = _beside(axis, host_rows > 0, robots, time)
-    root = rrb.Horizontal(panes, beside, column_shares=[57, 43] if robots.any else [62, 38])
+    if robots.any or host_rows:
+        lanes["/load"] = max(LOAD, round(LOAD_PART * height)), load
+    else:
+        beside = rrb.Vertical(beside, load, row_shares=[7, 3])
+    panes = rrb.Vertical(*(view for _, view in lanes.values()), row_shares=[share for share, _ in lanes.values()])
+    root: rrb.Container = rrb.Horizontal(panes, beside, column_shares=[57, 43] if robots.any else [62, 38])
+    if layout.banner:
+        text = rrb.TextDocumentView(origin="/banner", name="Please note")
+        root = rrb.Vertical(text, root, row_shares=[BANNER, max(height, 8 * BANNER)])
     return page(root, timeline=time)
+
+
+def _waiting_pane(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[int, rrb.View | rrb.Container]]:
+    """Those who wait, and in a tab all requests; nothing where all requests have room."""
+    if not layout.waiting_rows:
+        return {}
+    waiting = rrb.StateTimelineView(origin="/who", name="Who waits, and for whom", time_view=axis)
+    every = rrb.StateTimelineView(origin="/requests", name=REQUESTS, time_view=axis)
+    rows = min(max(layout.waiting_rows, 2), MAX_WAITING_ROWS)
+    return {"/waiting": (FRAME + ROW + NEXT_ROW * (rows - 1), rrb.Tabs(waiting, every))}
 
 
 def chart_row(rows: int) -> float:
     """How high a row of charts is of which the taller one has so many."""
-    return 32.0 if rows <= 4 else 24.0
+    return 26.0 if rows <= 4 else 24.0
 
 
 def _charts(rows: int) -> dict[str, tuple[int, rrb.View | rrb.Container]]:
     """What is booked, as pages of one pane; none without rows."""
     bounds = rrb.VisualBounds2D(x_range=[0, CHART_WIDTH], y_range=[0, CHART_HEAD + chart_row(rows) * rows])
     views = [rrb.Spatial2DView(origin=one.entity, name=one.name, visual_bounds=bounds) for one in AHEAD if rows]
-    return {"/ahead": (_share(round(rows * chart_row(rows) / 32), 2), rrb.Tabs(*views))} if views else {}
+    height = TITLE + round(CHART_HEAD + rows * chart_row(rows))
+    return {"/ahead": (height, rrb.Tabs(*views))} if views else {}
 
 
 def _rc_panes(layout: Layout, axis: rrb.archetypes.TimeAxis) -> dict[str, tuple[int, rrb.View | rrb.Container]]:
     """Share of the height and view, by any name. Within a view lanes are sorted by their names: what is to stand above
     them has a view of its own, and room to be seen whole."""
-    apart = {**layout.contended, **layout.absent}
+    few = layout.rc_rows <= ONE_PANE
+    contended, absent = ({}, {}) if few else (layout.contended, layout.absent)
+    apart = {**contended, **absent}
     rest = layout.rc_rows - sum(apart.values())
     panes: dict[str, tuple[int, rrb.View | rrb.Container]] = {}
     without = [f"- {entity}" for entity in (*apart, *layout.only_past)]
 
     def add(name: str, rows: int, least: int, *contents: str) -> None:
         view: rrb.View | rrb.Container = rrb.StateTimelineView(
-            origin="/rc", contents=contents or ["$origin/**", *without], name=name, time_view=axis
+            origin="/devices", contents=contents or ["$origin/**", *without], name=name, time_view=axis
         )
         if layout.past and not panes:
             view = rrb.Tabs(view, _past(layout))
         panes[name] = _share(rows, least), view
 
-    if layout.contended:
-        add("Resources that several want, and who holds them", 2 * sum(layout.contended.values()), 2, *layout.contended)
+    if contended:
+        add("Devices that several want, and who holds them", 2 * sum(contended.values()), 2, *contended)
     if apart and rest > 0:
-        add("Who holds each other resource", rest, 2)
+        add("Who holds each other device", rest, 2)
     elif not apart and (layout.rc_rows or not layout.host_rows):
-        add("Who holds each resource", rest, 3)
-    if layout.absent:
-        add("Resources that are not there", sum(layout.absent.values()), 2, *layout.absent)
+        add("Who holds each device", rest, 3)
+    if absent:
+        add("Devices that are not there", sum(absent.values()), 2, *absent)
     return panes
 
 
@@ -196,7 +240,7 @@ def _past(layout: Layout) -> rrb.View:
             start=absolute(seconds=begin - layout.past), end=absolute(seconds=end + layout.past * MARGIN)
         )
     name = f"With the {layout.past / 3600:.3g} h before   dark: from journals"
-    return rrb.StateTimelineView(origin="/rc", name=name, time_view=rrb.archetypes.TimeAxis(view_range=window))
+    return rrb.StateTimelineView(origin="/devices", name=name, time_view=rrb.archetypes.TimeAxis(view_range=window))
 
 
 def page(
@@ -268,5 +312,5 @@ def _window(span: tuple[float, float] | None) -> rr.TimeRange:
 
 
 def _share(rows: int, least: int = 3) -> int:
-    """Height of a pane in rows, with its title and axis; it scrolls past twelve rows."""
-    return 2 + min(max(rows, least), 12)
+    """Height of a pane of lanes."""
+    return FRAME + ROW * min(max(rows, least), MAX_LANE_ROWS)

@@ -42,7 +42,7 @@ STATES: Final[dict[str, int]] = {
     "preempted": OPERATOR,
     "done": 0x2A2A31FF,
 }
-"""RGBA of what an ARC is doing; a state not named here gets `OTHER`."""
+"""RGBA of the state of a request; a state that is not named here gets `OTHER`."""
 LINES: Final[tuple[int, ...]] = (0x56C1FFFF, 0xFFB454FF, 0xB5E07BFF, 0xD6A6FFFF, 0xFFF08AFF, 0x5FE0CFFF)
 """RGBA of the load curves, host by host; brighter than `PALETTE`, as a line is thin."""
 MARKS: Final[dict[str, tuple[int, rr.components.MarkerShape]]] = {

@@ -15,8 +15,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 import rerun as rr
 
+from zscout.messages import Who
 from zscout.services.recorder.blueprint import TIME, WALL_TIME
 from zscout.services.recorder.colours import OPERATOR, OTHER, PALE
+from zscout.types import clean
 
 MAX_SECONDS: Final = 9e9
 """Rerun counts nanoseconds in 64 bits."""
@@ -27,6 +29,8 @@ MAX_SLOTS: Final = 8
 MAX_STATE: Final = 120
 MAX_EVENT: Final = 500
 """Characters."""
+COMPONENT: Final = "component "
+"""Begins the command of a request that a component made: no person stands behind it."""
 # Latin, Greek and Cyrillic letters, dashes, quotation marks, arrows. The viewer's font lacks others, and the
 # viewer ends where it is to draw what its font lacks.
 _UNKNOWN: Final = re.compile(
@@ -117,8 +121,12 @@ class Drawing:
             if entity in self._shown:
                 self.erase(at, entity)
         elif self._shown.get(entity) != (shape, fields):
-            self._shown[entity] = shape, fields
-            self.log(at, entity, _shaped(shape, fields))
+            self.show_again(at, entity, shape, **fields)
+
+    def show_again(self, at: float, entity: str, shape: Callable[..., rr.AsComponents], **fields: Any) -> None:
+        """The same, though nothing may have changed."""
+        self._shown[entity] = shape, fields
+        self.log(at, entity, _shaped(shape, fields))
 
     def erase(self, at: float, entity: str) -> None:
         """What the entity shows ends, and so does a curve: no line goes on to its next point."""
@@ -183,7 +191,7 @@ def _shaped(shape: Callable[..., rr.AsComponents], fields: dict[str, Any]) -> rr
 
 
 class HolderRow(NamedTuple):
-    """An ARC that holds an RC; `operator` if its priority is an operator's; and the robots of its gang."""
+    """A request that holds a device; `operator` if its priority is an operator's; and the robots of its gang."""
 
     arc: str
     operator: bool = False
@@ -204,13 +212,22 @@ class Lanes:
     """The lanes in one folder, at most `limit`; `others` ends the note that there are more.
 
     `colours`: distinct texts of one lane that keep their colour; past it, the one longest unused loses it.
-    `depth`: parts of a name, with `/` between, that have parts of the entity of their own."""
+    `depth`: parts of a name, with `/` between, that have parts of the entity of their own. `slots`: rows of a lane at
+    most."""
 
     def __init__(
-        self, drawing: Drawing, folder: str, limit: int, others: str, *, colours: int = 256, depth: int = 4
+        self,
+        drawing: Drawing,
+        folder: str,
+        limit: int,
+        others: str,
+        *,
+        colours: int = 256,
+        depth: int = 4,
+        slots: int = MAX_SLOTS,
     ) -> None:
         self._drawing, self._folder, self._limit, self._others = drawing, folder, limit, others
-        self._colours, self._depth = colours, depth
+        self._colours, self._depth, self._slots = colours, depth, slots
         self._lanes: dict[str, _Lane] = {}
         """By entity: names that differ may be cleaned to the same."""
 
@@ -243,7 +260,7 @@ class Lanes:
         lane = self._lane(at, entity)
         if lane is None:
             return
-        rows = [shown.get(row, (row, OTHER)) for row in _seat(lane, (name for name in shown if name))]
+        rows = [shown.get(row, (row, OTHER)) for row in _seat(lane, (name for name in shown if name), self._slots)]
         self._configure(entity, lane, rows)
         lane.rows = len(rows)
         self._drawing.show(at, entity, rr.StateChange, state=[text for text, _ in rows])
@@ -283,11 +300,11 @@ class Lanes:
         return known != colour
 
 
-def _seat(lane: _Lane, names: Iterable[str]) -> list[str]:
+def _seat(lane: _Lane, names: Iterable[str], most: int) -> list[str]:
     """Names by row. What stays keeps its row, so that no bar jumps; no row is taken away."""
     wanted = dict.fromkeys(names)
-    crowded = len(wanted) > MAX_SLOTS
-    rows = MAX_SLOTS - 1 if crowded else MAX_SLOTS
+    crowded = len(wanted) > most
+    rows = most - 1 if crowded else most
     slots = [name if name in wanted and row < rows else "" for row, name in enumerate(lane.slots)]
     for name in (name for name in wanted if name not in slots):
         if "" in slots[:rows]:
@@ -304,6 +321,13 @@ def clean_path(folder: str, name: str, depth: int = 4) -> str:
     """The entity of something with this name, which may have up to `depth` parts with `/` between."""
     parts = (re.sub(r"[^A-Za-z0-9_.-]", "_", part)[:64] for part in name.split("/")[:depth])
     return f"/{folder}/{'/'.join(part or '_' for part in parts)}"
+
+
+def with_person(name: str, who: Who | None) -> str:
+    """A request as people know it: `survey (alice)`."""
+    if who is None or not who.user or who.command.startswith(COMPONENT):
+        return name
+    return f"{name} ({clean(who.user)})"
 
 
 def with_detail(word: str, detail: str) -> str:

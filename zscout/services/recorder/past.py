@@ -12,7 +12,7 @@ from typing import Final, NamedTuple, TypeAlias
 from zscout.messages import PastHold
 from zscout.services.journal.asking import Told
 from zscout.services.journal.merging import Span, apart, both
-from zscout.services.recorder.drawing import MAX_SLOTS
+from zscout.services.recorder.drawing import MAX_SLOTS, with_person
 
 MAX_LANES: Final = 500
 """RCs whose past is drawn: those that were held last."""
@@ -77,7 +77,7 @@ def past_lanes(
             max(hold.began, window.began), min(window.ended if hold.ended is None else hold.ended, window.ended)
         )
         for rc in dict.fromkeys(hold.rcs) if span.ended > span.began else ():
-            bar = PastBar(hold.arc, hold.priority >= operator_priority)
+            bar = PastBar(with_person(hold.arc, hold.who), hold.priority >= operator_priority)
             bars.setdefault(rc, []).append((span, bar))
     last = sorted(bars, key=lambda rc: max(span.ended for span, _ in bars[rc]))[-MAX_LANES:]
     return {rc: _lane(sorted(bars[rc], key=itemgetter(0)), unknown, zero) for rc in sorted(last)}

@@ -13,6 +13,7 @@ import logging
 import time
 from collections.abc import Callable
 from contextlib import closing
+from datetime import UTC, datetime
 from typing import Final
 
 from zscout import messages
@@ -47,6 +48,9 @@ TRIES: Final = 5
 """Past it, it is asked when an RCM comes or something was missed."""
 CHECK_EVERY: Final = 1.0
 """Seconds between two checks whether anything was dropped here."""
+DOUBT_EVERY: Final = 5.0
+"""Seconds between two readings of the state while it differs from the tokens on which devices are there."""
+BANNER_AFTER: Final = 2.0
 DEPTH: Final = 8_192
 ROBOT_DEPTH: Final = 1_024
 """Publications of one kind that may wait here."""
@@ -102,6 +106,8 @@ class Recorder:
         self._fresher: set[str] | None = None
         """Components published since the placer was asked for all, until it has answered."""
         self._caught_up = asyncio.Event()
+        self._sound = 0.0
+        """When all was last caught up and led, in seconds of the timeline."""
         self._cameras: dict[str, asyncio.Task[None]] = {}
         self._asking: asyncio.Task[None] | None = None
 
@@ -201,23 +207,28 @@ class Recorder:
         elif token.role in PRESENCE:
             self.timeline.presence(at, PRESENCE[token.role][alive].format(host=token.host, name=token.name), level)
         # Before the state was read, nobody knows that a new RC is free.
-        if token.role == Role.RC and self._caught_up.is_set():
+        if token.role == Role.RC and self._requests.offer(token.name, token.host, alive) and self._caught_up.is_set():
             self._requests.rc(at, token.name, alive)
+            # Its holders, and whether it is there, are the leader's to say.
+            self._wanted.set()
 
     # The whole state, where something was missed
 
     async def _keep_reading(self) -> None:
-        known = 0
+        known, read_at = 0, 0.0
         while True:
             if not await done_within(CHECK_EVERY, self._wanted.wait()):
                 missed = sum(declared.missed for declared in self._declared)
                 if missed == known:
-                    continue
-                log.warning("%d publications were missed; the state is read", missed - known)
-                known = missed
-                self._placer_wanted.set()
+                    if not self._requests.in_doubt or self.now() - read_at < DOUBT_EVERY:
+                        continue
+                else:
+                    log.warning("%d publications were missed; the state is read", missed - known)
+                    known = missed
+                    self._placer_wanted.set()
             self._wanted.clear()
-            if not await self._read() and any(role == Role.RCM for _, role, _ in self._tokens):
+            read_at = self.now()
+            if not await self._read() and self._led:
                 await asyncio.sleep(PAUSE)
                 self._wanted.set()
 
@@ -292,12 +303,35 @@ class Recorder:
                 self.timeline.warn(self.now(), text)
             return
 
+    @property
+    def _led(self) -> bool:
+        return any(role == Role.RCM for _, role, _ in self._tokens)
+
+    def _show_banner(self, at: float) -> None:
+        """Says above the panes why they may be empty or old, once that has lasted for BANNER_AFTER seconds."""
+        if self._caught_up.is_set() and self._led:
+            self._sound = at
+            text = ""
+        elif at - self._sound < BANNER_AFTER:
+            return
+        elif self._led:
+            text = (
+                "Catching up: waiting for the leader's list of devices and requests. The panes fill when it has come."
+            )
+        elif self._caught_up.is_set():
+            since = datetime.fromtimestamp(self._epoch + self._sound, UTC)
+            text = f"No leader since {since:%H:%M:%S} UTC. Holders and waiting requests are shown as they were then."
+        else:
+            text = "Catching up: no leader is seen yet. Devices and requests appear as soon as one leads."
+        self.timeline.banner(text)
+
     # Robots
 
     async def _tick(self) -> None:
         while True:
             await asyncio.sleep(TICK)
             at = self.now()
+            self._show_banner(at)
             self._robots.tick(at)
             self._bookings.tick(at)
             self.timeline.regroup(at)

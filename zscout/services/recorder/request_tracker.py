@@ -1,4 +1,5 @@
-"""Requests and holders of RCs as an RCM publishes them, put together for the timeline: pure; times are passed in."""
+"""Requests and holders of devices as the leader publishes them, put together for the timeline: pure; times are passed
+in."""
 
 from __future__ import annotations
 
@@ -6,9 +7,20 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from zscout.messages import Grants, Holder, HoldView, Notice, RcmState, ReasonInfo, Revocation, WaitView, Who, absurd
-from zscout.scheduling.reason import ReasonCode, ended, short_names, waits
-from zscout.services.recorder.drawing import HolderRow
+from zscout.messages import (
+    Grants,
+    Holder,
+    HoldView,
+    Notice,
+    RcmState,
+    ReasonInfo,
+    ReasonParty,
+    Revocation,
+    WaitView,
+    absurd,
+)
+from zscout.scheduling.reason import ReasonCode, ended, named, short_names, waits
+from zscout.services.recorder.drawing import HolderRow, with_person
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import NO_TERM, Grant, Term, clean
 
@@ -24,26 +36,23 @@ Key = tuple[str, str]
 @dataclass(slots=True)
 class _Request:
     label: str
-    """The ARC's name; of several that are open at one time, a numbered one."""
+    """Name and person: `survey (alice)`; the name has a number where several are open at one time."""
     who: str = ""
-    """Whose it is, where that was told: `alice@ws1`."""
+    """`alice@ws1`, where its client says so."""
     command: str = ""
     """What its user runs, likewise."""
+    preempted: bool = False
+    """It waits again."""
     state: str = ""
     detail: str = ""
     grant: Grant | None = None
     last: tuple[Term, int] = field(default=(NO_TERM, 0))
     """The newest notice."""
 
-    def tell(self, told: Holder | HoldView | WaitView | Notice) -> None:
-        """Takes whose it is from what the RCM says of it."""
-        if told.who is not None and told.who.user:
-            self.who, self.command = _user(told.who, told.client), told.who.command
-
-    @property
-    def subject(self) -> str:
-        """As a sentence about it begins."""
-        return f"{self.label} of {self.who}" if self.who else self.label
+    def take_owner(self, view: Holder | HoldView | WaitView | Notice) -> None:
+        if view.who is not None and view.who.user:
+            host = view.who.host or view.client.partition("/")[0]
+            self.who, self.command = clean(f"{view.who.user}@{host}"), view.who.command
 
 
 class RequestTracker:
@@ -58,7 +67,9 @@ class RequestTracker:
         self._labels: set[str] = set()
         self._rcs = timeline.robots.holds
         self._absent: dict[str, str] = {}
-        """What is said of RCs that are not there: they had holders, or could have had."""
+        """Words for devices that are not there: they had holders, or could have had."""
+        self.offered: dict[str, set[str]] = {}
+        """By device the hosts that offer it, as this recorder sees by token."""
 
     def grants(self, at: float, grants: Grants) -> bool:
         """What the RCM publishes; returns whether something before it was missed."""
@@ -82,13 +93,12 @@ class RequestTracker:
         if notice.state == "ended":
             self._ended(at, key, notice.outcome or "ended", notice.reason)
             return
-        request = self._track(key, notice.arc)
+        request = self._track(key, notice)
         if request is None or (notice.term, notice.step) <= request.last:
             return
         request.last = (notice.term, notice.step)
-        request.tell(notice)
-        # That it runs is read from the publication. What was preempted stays so until it runs again.
-        if notice.state == "queued" and request.state not in ("preempted", "running"):
+        # That it runs, and no longer runs, is read from the publication.
+        if notice.state == "queued" and request.state != "running":
             self._waits(at, request, notice.reason, notice.why)
 
     def state(self, at: float, state: RcmState) -> bool:
@@ -96,7 +106,9 @@ class RequestTracker:
         if (state.term, state.seq) < (self.term, self.seq):
             return False
         self.term, self.seq = state.term, state.seq
-        holders: dict[str, list[HoldView]] = {rc: [] for rc in (*(view.rc for view in state.rcs), *self._rcs)}
+        holders: dict[str, list[HoldView]] = {
+            rc: [] for rc in (*(view.rc for view in state.rcs if view.present), *self._rcs)
+        }
         open_now = {(hold.client, hold.id) for hold in state.holds}
         open_now |= {(wait.client, wait.id) for wait in state.queue}
         for hold in state.holds:
@@ -104,16 +116,11 @@ class RequestTracker:
             for rc in hold.needs:
                 holders.setdefault(rc, []).append(hold)
         for wait in state.queue:
-            request = self._track((wait.client, wait.id), wait.arc)
+            request = self._track((wait.client, wait.id), wait)
             if request is None:
                 continue
-            request.tell(wait)
-            if request.grant is not None or not request.state:
-                request.grant = None
-                if wait.preemptions:
-                    self._set(at, request, "preempted", self._blocked(wait.reason, wait.why))
-            if request.state != "preempted":
-                self._waits(at, request, wait.reason, wait.why)
+            request.grant, request.preempted = None, wait.preemptions > 0
+            self._waits(at, request, wait.reason, wait.why)
         for key in [key for key in self._requests if key not in open_now]:
             # What the answer left out may still wait.
             if not state.more or self._requests[key].grant is not None:
@@ -128,8 +135,21 @@ class RequestTracker:
             self._show(at, rc, held)
         return True
 
+    @property
+    def in_doubt(self) -> bool:
+        """True if the leader's last state and the tokens seen here differ on which devices are there."""
+        return any((rc in self._absent) == (rc in self.offered) for rc in self._rcs)
+
+    def offer(self, rc: str, host: str, alive: bool) -> bool:
+        """A host offers a device from now on, or no longer; returns whether the device has come or gone with that."""
+        before = rc in self.offered
+        (self.offered.setdefault(rc, set()).add if alive else self.offered.get(rc, set()).discard)(host)
+        if not self.offered.get(rc):
+            self.offered.pop(rc, None)
+        return before != (rc in self.offered)
+
     def rc(self, at: float, rc: str, alive: bool) -> None:
-        """An RC has come or gone. One that is not known yet is free."""
+        """A device has come or gone. One that is not known yet is free."""
         was = self._absent.pop(rc, None)
         if not alive and rc in self._rcs:
             self._absent[rc] = "not there"
@@ -155,24 +175,24 @@ class RequestTracker:
         request.grant = None
         match revoked.outcome:
             case "preempted":
-                how = ended("preempted", revoked.reason)
-                self._set(at, request, "preempted", how.removeprefix("preempted "))
+                how, request.preempted = ended("preempted", self._named(revoked.reason, revoked.why)), True
+                self._set(at, request, "waiting again", f"({how})")
                 by = revoked.why.by if revoked.why is not None else []
                 operator = any(party.priority >= self.operator_priority for party in by)
-                self.timeline.warn(at, f"{request.subject} is {how}, and waits again", operator=operator)
+                self.timeline.warn(at, f"{request.label} is {how}, and waits again", operator=operator)
                 self.timeline.contended(at, revoked.rcs)
             case "lost":
                 self._set(at, request, "waiting", revoked.reason)
-                self.timeline.warn(at, f"{request.subject} lost its hold: {revoked.reason}")
+                self.timeline.warn(at, f"{request.label} lost its hold: {revoked.reason}")
             case "handed_over":
                 self._move(at, revoked, grants)
             case outcome:
                 self._ended(at, (revoked.client, revoked.id), outcome, revoked.reason)
 
     def _move(self, at: float, revoked: Revocation, grants: Grants) -> None:
-        """The ARC goes on in another client: it keeps its lane."""
+        """The request continues in another client: it keeps its lane."""
         request = self._requests.pop((revoked.client, revoked.id))
-        self.timeline.event(at, f"{request.subject} goes on elsewhere: {revoked.reason}")
+        self.timeline.event(at, f"{request.label} continues in another client: {revoked.reason}")
         for holder in (holder for rc in revoked.rcs for holder in grants.rcs.get(rc, [])):
             if holder.id == revoked.id and holder.client != revoked.client and holder.arc == revoked.arc:
                 self._requests[holder.client, holder.id] = request
@@ -180,26 +200,26 @@ class RequestTracker:
         self._labels.discard(request.label)
 
     def _runs(self, at: float, hold: Holder | HoldView) -> None:
-        request = self._track((hold.client, hold.id), hold.arc)
+        request = self._track((hold.client, hold.id), hold)
         if request is None or request.grant == hold.grant:
             return
-        request.grant = hold.grant
-        request.tell(hold)
+        request.grant, request.preempted = hold.grant, False
         operator = hold.priority >= self.operator_priority
         who = f"{request.who} ({request.command})" if request.who and request.command else request.who
         details = [f"priority {hold.priority}", f"min {float(hold.min_runtime):g} s", *filter(None, [who])]
         self._set(at, request, "running", " · ".join(details), operator)
-        runs = f"{request.subject} runs on {', '.join(sorted(_rcs_of(hold)))}"
+        runs = f"{request.label} runs on {', '.join(sorted(_rcs_of(hold)))}"
         self.timeline.event(at, runs, operator=operator)
 
     def _waits(self, at: float, request: _Request, reason: str, why: ReasonInfo | None) -> None:
         if why is not None and why.by:
             self.timeline.contended(at, why.rcs)
         detail = self._blocked(reason, why)
-        if (request.state, request.detail) != ("waiting", detail):
-            self._set(at, request, "waiting", detail)
-            words = f"waits {detail}" if detail.startswith("for ") else waits(reason)
-            self.timeline.event(at, f"{request.subject} {words}")
+        state = "waiting again" if request.preempted else "waiting"
+        if (request.state, request.detail) != (state, detail):
+            self._set(at, request, state, detail)
+            words = f"waits {detail}" if detail.startswith("for ") else waits(self._named(reason, why))
+            self.timeline.event(at, f"{request.label} {words}")
 
     def _ended(self, at: float, key: Key, outcome: str, reason: str) -> None:
         request = self._requests.pop(key, None)
@@ -208,18 +228,20 @@ class RequestTracker:
         self._labels.discard(request.label)
         self.timeline.arc(at, request.label, "done", "" if outcome == "completed" else outcome)
         level = "WARN" if outcome == "client_lost" else "INFO"
-        self.timeline.event(at, f"{request.subject} {ended(outcome, reason)}", level)
+        self.timeline.event(at, f"{request.label} {ended(outcome, reason)}", level)
 
-    def _track(self, key: Key, name: str) -> _Request | None:
+    def _track(self, key: Key, view: Holder | HoldView | WaitView | Notice) -> _Request | None:
         """The request, followed from now on; None where too many are open."""
         request = self._requests.get(key)
         if request is None and len(self._requests) < MAX_OPEN:
-            label, number = name, 1
+            label, number = with_person(view.arc, view.who), 1
             while label in self._labels:
                 number += 1
-                label = f"{name}.{number}"
+                label = with_person(f"{view.arc}.{number}", view.who)
             self._labels.add(label)
             request = self._requests[key] = _Request(label)
+        if request is not None:
+            request.take_owner(view)
         return request
 
     def _set(self, at: float, request: _Request, state: str, detail: str, operator: bool = False) -> None:
@@ -229,12 +251,8 @@ class RequestTracker:
     def _blocked(self, reason: str, why: ReasonInfo | None) -> str:
         """Who is in its way, by the names of their lanes: in a short bar only the beginning can be read."""
         if why is None or why.code != ReasonCode.HELD or not why.by:
-            return reason.removeprefix("waits ")
-        others = dict.fromkeys(
-            self._label(party.client, party.id, party.arc)
-            + (f" ({_user(party.who, party.client)})" if party.who is not None and party.who.user else "")
-            for party in why.by
-        )
+            return self._named(reason, why).removeprefix("waits ")
+        others = dict.fromkeys(self._label(party) for party in why.by)
         patterns = why.patterns or [""] * len(why.rcs)
         wanted = [", ".join(short_names(rc for rc, pattern in zip(why.rcs, patterns, strict=False) if not pattern))]
         for one in dict.fromkeys(filter(None, patterns)):
@@ -243,16 +261,22 @@ class RequestTracker:
         more = f" and {why.count - len(why.rcs)} more" if why.count > len(why.rcs) else ""
         return f"for {', '.join(others)}: {'; '.join(filter(None, wanted))}{more}"
 
-    def _label(self, client: str, number: str, arc: str) -> str:
-        request = self._requests.get((client, number))
-        return request.label if request is not None else arc
+    def _named(self, reason: str, why: ReasonInfo | None) -> str:
+        """The reason with requests named as their lanes are."""
+        for party in why.by if why is not None else ():
+            reason = reason.replace(named(party.who, party.client, party.arc), self._label(party))
+        return reason
+
+    def _label(self, view: Holder | HoldView | ReasonParty) -> str:
+        request = self._requests.get((view.client, view.id))
+        return request.label if request is not None else with_person(view.arc, view.who)
 
     def _show(self, at: float, rc: str, holders: Sequence[Holder | HoldView]) -> None:
         if rc not in self._rcs and len(self._rcs) >= MAX_RCS:
             return
         rows: dict[Grant, HolderRow] = {}
         for hold in holders:
-            label = self._label(hold.client, hold.id, hold.arc)
+            label = self._label(hold)
             robots = tuple(sorted(name for name in _rcs_of(hold) if name.startswith("robot/")))
             rows[hold.grant] = HolderRow(label, hold.priority >= self.operator_priority, robots)
         self._rcs[rc] = rows
@@ -260,10 +284,6 @@ class RequestTracker:
 
     def _draw(self, at: float, rc: str) -> None:
         self.timeline.holders(at, rc, list(self._rcs[rc].values()), self._absent.get(rc, ""))
-
-
-def _user(who: Who, client: str) -> str:
-    return clean(f"{who.user}@{who.host or client.partition('/')[0]}")
 
 
 def _rcs_of(hold: Holder | HoldView) -> Iterable[str]:

@@ -124,6 +124,8 @@ class _Camera:
     boxes: dict[BehaviorKey, list[Box]] = field(default_factory=dict)
     size: tuple[int, int] | None = None
     """Of its last picture, in pixels; None before it has a pane."""
+    jpeg: bytes = b""
+    """Its last picture."""
     old: bool = False
 
     @property
@@ -241,7 +243,7 @@ class RobotTracker:
         if seen.size is None and not self._drawing.room(at, self._with_pane(), MAX_CAMERAS, others):
             return
         seen.size, seen.old = size, False
-        self._drawing.log(at, seen.entity, rr.EncodedImage(contents=jpeg, media_type="image/jpeg", opacity=1.0))
+        self._draw_picture(at, seen, jpeg, 1.0)
         self._write(at, seen, *self._caption(seen))
         self._drawing.arrange()
 
@@ -254,9 +256,16 @@ class RobotTracker:
         self._draw_boxes(at, seen)
         if not seen.old and seen.size is not None:
             seen.old = True
-            self._drawing.log(at, seen.entity, rr.EncodedImage.from_fields(opacity=DIM))
+            self._draw_picture(at, seen, seen.jpeg, DIM)
         words = " · ".join(filter(None, (seen.robots, "no picture"))) if self.holds.get(camera) else "not held"
         self._write(at, seen, words, PALE)
+
+    def _draw_picture(self, at: float, seen: _Camera, jpeg: bytes, opacity: float) -> None:
+        """Logs the whole picture at each change: a file, or a viewer that comes late, may lack the one before."""
+        seen.jpeg = jpeg
+        self._drawing.show_again(
+            at, seen.entity, rr.EncodedImage, contents=jpeg, media_type="image/jpeg", opacity=opacity
+        )
 
     def _with_pane(self) -> list[_Camera]:
         return [camera for _, camera in sorted(self._cameras.items()) if camera.size is not None]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import socket
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,16 +16,18 @@ import rerun as rr
 from zscout.config.strict import BadInput
 from zscout.services.recorder.blueprint import (
     APPLICATION,
+    FOLDED,
     LIVE_HOST_ROWS,
     LIVE_ROWS,
     MAX_CHART_ROWS,
-    NO_ROBOTS,
+    MAX_WAITING_ROWS,
+    MOST_ROWS,
     Layout,
     blueprint,
 )
 from zscout.services.recorder.bookings import BookingTracker
 from zscout.services.recorder.colours import ABSENT, OPERATOR, OTHER, PALETTE, STATES, faded
-from zscout.services.recorder.drawing import Drawing, HolderRow, Lanes, clean_text, disconnect, with_detail
+from zscout.services.recorder.drawing import MAX_EVENT, Drawing, HolderRow, Lanes, clean_text, disconnect, with_detail
 from zscout.services.recorder.finish import Job, finish
 from zscout.services.recorder.hosts import HostTracker
 from zscout.services.recorder.past import PastBar, PastLane
@@ -36,20 +39,23 @@ SERVER_MEMORY: Final = "200MB"
 """What the live server keeps for viewers that come late; the oldest goes first."""
 MAX_ARCS: Final = 2000
 MAX_RCS: Final = 1000
+WAITING: Final = ("waiting", "waiting again", "preempted")
+"""States of a request that has a row in the pane of those who wait."""
+WAITING_STATES: Final = 128
 RC_STATES: Final = 256
 MAX_COLOURS: Final = 10_000
 """ARCs and components that have a colour of their own."""
 ARC_STATES: Final = 16
 OPERATOR_MARK: Final = " (operator)"
-"""Follows the ARC's name in an RC's lane where an operator holds it."""
+"""Follows the name of the request in a device's lane where an operator holds it."""
 CONTENDED: Final = 300.0
 """Seconds for which an RC for which nobody waits any more stands among the contended ones of a live view."""
 REGROUP: Final = 5.0
-"""Seconds between two times at which a live view's RCs may change their panes."""
+"""Least time between two changes of a live view's panes, in seconds."""
 ROWS_MORE: Final = 4
 """The chart of bookings grows by so many rows."""
 PAST_MARK: Final = " (journal)"
-"""Follows the ARC's name in an RC's lane where a journal told of it."""
+"""Follows the name of the request in a device's lane where a journal reported it."""
 PAST_PART: Final = 0.4
 """Of a colour that is left then."""
 FILE_TICK: Final = 1.0
@@ -85,19 +91,29 @@ class Timeline(Drawing):
         self._file: rr.RecordingStream | None = None
         self._arcs: set[str] = set()
         self._colours: dict[str, int] = {}
-        """Of ARCs and components, by order of appearance: a component has that of the ARC with its name."""
-        self._rc_lanes = Lanes(self, "rc", MAX_RCS, "RCs: the others have no lane", colours=RC_STATES)
-        self._arc_lanes = Lanes(self, "arc", MAX_ARCS, "ARCs: the others have no lane", colours=ARC_STATES)
+        """Of requests and components, in order of appearance."""
+        self._namesakes: dict[str, str] = {}
+        """The first request of each name: a component or booking of that name has the same colour."""
+        self._rc_lanes = Lanes(self, "devices", MAX_RCS, "devices: the others have no lane", colours=RC_STATES)
+        self._arc_lanes = Lanes(self, "requests", MAX_ARCS, "requests: the others have no lane", colours=ARC_STATES)
+        self._waiting_lane = Lanes(self, "who", 1, "", colours=WAITING_STATES, slots=MAX_WAITING_ROWS)
+        self._waiting: dict[str, tuple[str, int]] = {}
+        """Text and colour of each request that waits, the one that has waited longest first."""
         self.hosts = HostTracker(self, self._colour_of)
         self.robots = RobotTracker(self)
         self.bookings = BookingTracker(self, self._colour_of)
-        self._arranged: object = (False, NO_ROBOTS, 0, 0.0, (), (), ())
+        self._arranged: object = None
+        self._banner = ""
+        self._open_colours: dict[str, int] = {}
+        """Of requests that wait or run."""
         self._contended: dict[str, float] = {}
         """When somebody waited last for an RC, by entity."""
         self._absent: set[str] = set()
         self._grouped = -REGROUP
         """When RCs were grouped last for the live view."""
         self._groups: tuple[tuple[str, ...], tuple[str, ...]] = (), ()
+        self._rows: tuple[int, int, int] = 0, 0, 0
+        """Rows of devices, requests and those who wait, as the live view has room for."""
         self._past, self._past_here = 0.0, False
         """Seconds of the past that journals told of; and whether the present file has them."""
         if port is not None:
@@ -173,10 +189,10 @@ class Timeline(Drawing):
         return Job(old, layout) if disconnect(before, DISCONNECT_SECONDS) else None
 
     def holders(self, at: float, rc: str, holders: Sequence[HolderRow], absent: str = "") -> None:
-        """From `at` on, the RC (`kind/name`) is held by exactly these ARCs; by nobody if empty. `absent` says in words
-        that it is not there.
+        """From `at` on, the device (`kind/name`) is held by exactly these requests; by nobody if empty. `absent`: the
+        words for a device that is not there.
 
-        Several holders get a row each. A row reads the ARC's name, with `OPERATOR_MARK` for an operator's."""
+        Several holders get a row each. A row reads the request's name, with `OPERATOR_MARK` for an operator's."""
         entity = self._rc_lanes.entity(rc)
         (self._absent.add if absent else self._absent.discard)(entity)
         shown: dict[str, tuple[str, int]] = {absent: (clean_text(absent), ABSENT)} if absent and not holders else {}
@@ -214,6 +230,7 @@ class Timeline(Drawing):
         if at - self._grouped >= REGROUP:
             self._grouped = at
             self._groups = self._grouped_rcs(at - CONTENDED)
+            self._rows = self._rc_lanes.rows, self._arc_lanes.rows, self._waiting_lane.rows
             self.arrange()
 
     def _grouped_rcs(self, since: float) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -223,15 +240,38 @@ class Timeline(Drawing):
         return tuple(sorted(contended)), tuple(sorted(self._absent))
 
     def arc(self, at: float, arc: str, state: str, detail: str = "", *, operator: bool = False) -> None:
-        """From `at` on, the ARC is in `state`: "waiting", "running", "preempted", "done" or another word.
+        """From `at` on, the request is in `state`: "waiting", "running", "preempted", "done" or another word.
 
-        `detail` says more in the same bar, as why it waits. An empty `state` ends the lane. What an `operator` runs has
-        an operator's colour."""
-        self._colour(at, arc)
-        if arc in self._arcs:
-            text = with_detail(state, detail)
-            colour = OPERATOR if operator and state == "running" else STATES.get(state, OTHER)
-            self._arc_lanes.show(at, arc, {text: (text, colour)})
+        `arc` is its name, with the person behind it in parentheses: the lane is then `person/name`. `detail` says more
+        in the same bar, such as why it waits. An empty `state` ends the lane. What an `operator` runs has an operator's
+        colour."""
+        own = self._colour(at, arc)
+        if arc not in self._arcs:
+            return
+        self._open_colours[arc] = own
+        if state in ("done", ""):
+            del self._open_colours[arc]
+        text = with_detail(state, detail)
+        colour = (
+            OPERATOR
+            if operator and state == "running"
+            else STATES.get("preempted" if state == "waiting again" else state, OTHER)
+        )
+        name, _, person = arc.removesuffix(")").partition(" (")
+        self._arc_lanes.show(at, f"{person}/{name}" if person else arc, {text: (text, colour)})
+        if state in WAITING:
+            words = clean_text(f"{arc} {state.replace('waiting', 'waits')} {detail}")
+            self._waiting[arc] = words, own if state == "waiting" else colour
+        elif self._waiting.pop(arc, None) is None:
+            return
+        self._waiting_lane.show(at, "waits", self._waiting)
+
+    def banner(self, text: str) -> None:
+        """Shows `text` above all panes of the live view; nothing if it is empty."""
+        if text != self._banner and not self.closed:
+            self._banner = text
+            self.log(None, "banner", rr.TextDocument(clean_text(text, MAX_EVENT)))
+            self.arrange()
 
     def close(self) -> None:
         """Ends file and server, within seconds. The file then opens on the whole run.
@@ -280,7 +320,9 @@ class Timeline(Drawing):
         has no use for empty panes."""
         robots = self.robots.shown
         robots = robots._replace(behavior_rows=min(robots.behavior_rows, 1))
-        now = self.hosts.placing, robots, self._ahead_rows(), self._past, self._rc_lanes.only_past, *self._groups
+        rows = tuple(min(count, most) for count, most in zip(self._rows, MOST_ROWS, strict=True))
+        past = self._past, self._rc_lanes.only_past
+        now = self.hosts.placing, robots, self._ahead_rows(), past, self._groups, rows, self._banner
         if now != self._arranged and not self.closed:
             self._arranged = now
             layout = blueprint(self.layout(live=True))
@@ -296,6 +338,7 @@ class Timeline(Drawing):
             rc_rows, arc_rows, host_rows = max(rc_rows, least), max(arc_rows, least), LIVE_HOST_ROWS
         rows, zero = self._rc_lanes.entities, self.epoch or 0.0
         contended, absent = self._groups if live else self._grouped_rcs(self.begin)
+        waiting_rows = self._waiting_lane.rows if arc_rows > FOLDED else 0
         return Layout(
             span=None if live or self.end < self.begin else (zero + self.begin, zero + self.end),
             wall=self._wall,
@@ -303,6 +346,8 @@ class Timeline(Drawing):
             contended={entity: rows[entity] for entity in contended},
             absent={entity: rows[entity] for entity in absent if entity in rows},
             arc_rows=arc_rows,
+            waiting_rows=waiting_rows,
+            banner=self._banner if live else "",
             host_rows=host_rows if self.hosts.placing else 0,
             robots=robots,
             ahead=self._ahead_rows(),
@@ -315,18 +360,26 @@ class Timeline(Drawing):
         return min(-(-self.bookings.rows // ROWS_MORE) * ROWS_MORE, MAX_CHART_ROWS + 1)
 
     def _colour(self, at: float, arc: str) -> int:
-        others = "ARC names: the others have no lane and no colour of their own"
+        others = "names of requests: the others have no lane and no colour of their own"
         if arc not in self._arcs and not self.room(at, self._arcs, MAX_ARCS, others):
             return OTHER
         self._arcs.add(arc)
         return self._colour_of(arc)
 
-    def _colour_of(self, name: str) -> int:
-        if name not in self._colours:
+    def _colour_of(self, arc: str) -> int:
+        """The first request of a name shares its colour with a component or booking of that name. A new one gets the
+        next colour that the fewest open requests have."""
+        name = arc.partition(" (")[0]
+        if self._namesakes.get(name, name) == name and len(self._namesakes) < MAX_COLOURS:
+            self._namesakes[name] = arc
+        key = name if arc == self._namesakes.get(name) else arc
+        if key not in self._colours:
             if len(self._colours) >= MAX_COLOURS:
                 return OTHER
-            self._colours[name] = PALETTE[len(self._colours) % len(PALETTE)]
-        return self._colours[name]
+            taken = Counter(self._open_colours.values())
+            after = len(self._colours) % len(PALETTE)
+            self._colours[key] = min(PALETTE[after:] + PALETTE[:after], key=lambda colour: taken[colour])
+        return self._colours[key]
 
 
 def _free_port(bind: str, port: int) -> int:
