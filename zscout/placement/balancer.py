@@ -120,19 +120,19 @@ class Balancer:
             scores = {metric: score([outlook], self.profile(kind))[0] for metric, score in SCORES.items()}
             self._choices += 1
             self._chosen[host] = self._choices
-        self._placed[component] = one = _Placed(kind, host, now, scores)
+        self._placed[component] = placement = _Placed(kind, host, now, scores)
         self._there.setdefault(host, set()).add(component)
-        self._pending.setdefault(host, {})[component] = one
+        self._pending.setdefault(host, {})[component] = placement
 
     def gone(self, component: ComponentId) -> None:
         """A component ended, or did not start."""
-        one = self._placed.pop(component, None)
-        if one is not None:
-            there = self._there[one.host]
+        placement = self._placed.pop(component, None)
+        if placement is not None:
+            there = self._there[placement.host]
             there.discard(component)
             if not there:
-                del self._there[one.host]
-            self._let_go(component, one.host)
+                del self._there[placement.host]
+            self._let_go(component, placement.host)
 
     def _let_go(self, component: ComponentId, host: HostName) -> None:
         waiting = self._pending.get(host, {})
@@ -148,24 +148,24 @@ class Balancer:
         return len(self.reports) < MAX_HOSTS
 
     def _add_sample(self, now: Ns, report: LoadReport, use: ComponentUse) -> None:
-        one = self._placed.get(use.component)
-        if one is None and len(self._placed) < MAX_PLACED:
+        placement = self._placed.get(use.component)
+        if placement is None and len(self._placed) < MAX_PLACED:
             # Of a balancer before this one: its profile is learnt, and the load average shows it already.
-            one = _Placed(use.kind, report.host, now, {})
-            self._placed[use.component] = one
+            placement = _Placed(use.kind, report.host, now, {})
+            self._placed[use.component] = placement
             self._there.setdefault(report.host, set()).add(use.component)
-        if one is None or one.host != report.host:
+        if placement is None or placement.host != report.host:
             return
-        one.seen = True
-        if now - one.at >= SHOWN:
-            self._let_go(use.component, one.host)
-        if now - one.at < SETTLED:
+        placement.seen = True
+        if now - placement.at >= SHOWN:
+            self._let_go(use.component, placement.host)
+        if now - placement.at < SETTLED:
             return
-        if len(self.profiles) < MAX_KINDS or one.kind in self.profiles:
-            self.profiles[one.kind] = self.profile(one.kind).learn(use, report.speed)
-        if not one.learnt and use.served is not None and one.scores:
-            one.learnt = True
-            self.learner.seen.append((one.scores, use.served * report.speed))
+        if len(self.profiles) < MAX_KINDS or placement.kind in self.profiles:
+            self.profiles[placement.kind] = self.profile(placement.kind).learn(use, report.speed)
+        if not placement.learnt and use.served is not None and placement.scores:
+            placement.learnt = True
+            self.learner.seen.append((placement.scores, use.served * report.speed))
 
     # Queries
 
@@ -182,11 +182,11 @@ class Balancer:
         outlook = self._outlooks[host]
         if pending and host in self._pending:
             report, load, memory = outlook.report, outlook.load, outlook.memory
-            for one in self._pending[host].values():
-                profile = self.profile(one.kind)
+            for placement in self._pending[host].values():
+                profile = self.profile(placement.kind)
                 # The load average shows a component the better the longer it runs.
-                load += profile.wants(report.speed) * math.exp(-(now - one.at) / LOAD_TIME)
-                memory -= 0 if one.seen else profile.memory
+                load += profile.wants(report.speed) * math.exp(-(now - placement.at) / LOAD_TIME)
+                memory -= 0 if placement.seen else profile.memory
             return Outlook(report, load, memory)
         return outlook
 
@@ -217,13 +217,13 @@ class Balancer:
         if len(best_first) > 1:
             drawn = self._rng.sample(best_first, 2)
             first = self._better(*drawn)
-            best_first.sort(key=lambda one: (one is not first, one not in drawn))
+            best_first.sort(key=lambda candidate: (candidate is not first, candidate not in drawn))
         return best_first
 
-    def _better(self, one: _Found, other: _Found) -> _Found:
-        if math.isclose(one[0], other[0], rel_tol=CLOSE, abs_tol=CLOSE):
-            return min(one, other, key=lambda found: self._chosen.get(found[1], 0))
-        return min(one, other)
+    def _better(self, first: _Found, other: _Found) -> _Found:
+        if math.isclose(first[0], other[0], rel_tol=CLOSE, abs_tol=CLOSE):
+            return min(first, other, key=lambda found: self._chosen.get(found[1], 0))
+        return min(first, other)
 
     def _fit(self, now: Ns, query: RankQuery) -> tuple[dict[HostName, Outlook], dict[HostName, str]]:
         """Eligible hosts, and why the others are not."""
@@ -302,8 +302,8 @@ class RankingCache:
     def _updated(self, query: RankQuery, old: Ranking, changed: set[HostName]) -> Ranking:
         some = frozenset(changed if query.hosts is None else changed & query.hosts)
         new = self._balancer.rank(self._now, replace(query, hosts=some))
-        hosts = [one for one in old.hosts if one.host not in some]
-        for one in new.hosts:
-            insort(hosts, one, key=lambda one: (-one.score, one.host))
+        hosts = [ranked for ranked in old.hosts if ranked.host not in some]
+        for ranked in new.hosts:
+            insort(hosts, ranked, key=lambda entry: (-entry.score, entry.host))
         left_out = {host: why for host, why in old.left_out.items() if host not in some}
         return replace(old, hosts=tuple(hosts), left_out=left_out | dict(new.left_out))

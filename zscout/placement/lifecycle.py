@@ -109,7 +109,7 @@ class Lifecycle:
         """The best host that was not tried in this round."""
         hosts, why_none = self.state.eligible_hosts(record.spec)
         tried = record.tried
-        untried = next((one for one in hosts if one.host not in tried), None)
+        untried = next((ranked for ranked in hosts if ranked.host not in tried), None)
         if untried is not None:
             self._start_on(record, untried)
         elif not hosts and (lacking := self._without_kind(record)):
@@ -125,8 +125,8 @@ class Lifecycle:
                 record.reason = f"no host will do: {why_none}"
                 record.no_host = causes, record.reason
             self.state.wake(record, self.state.now + TRY_AGAIN)
-        elif all(tried[one.host] for one in hosts):
-            refusals = list(dict.fromkeys(tried[one.host] for one in hosts))
+        elif all(tried[ranked.host] for ranked in hosts):
+            refusals = list(dict.fromkeys(tried[ranked.host] for ranked in hosts))
             more = f"; and {len(refusals) - CAUSES_NAMED} more" if len(refusals) > CAUSES_NAMED else ""
             reason = f"no host can start it: {'; '.join(refusals[:CAUSES_NAMED])}{more}"
             self._finish(record, "given_up", reason)
@@ -146,7 +146,7 @@ class Lifecycle:
         state, kind = self.state, record.spec.kind
         before = [host for host in sorted(hosts) if state.kinds[host][0] < record.asked_at]
         if not before or state.now - record.asked_at >= ASK_KINDS:
-            there = sorted({one for host in hosts for one in state.kinds[host][1]})
+            there = sorted({name for host in hosts for name in state.kinds[host][1]})
             near = difflib.get_close_matches(kind, there, n=CAUSES_NAMED)
             more = f" and {len(there) - KINDS_NAMED} more" if len(there) > KINDS_NAMED else ""
             known = f"there are {', '.join(there[:KINDS_NAMED])}{more}" if there else "nor any other"
@@ -404,7 +404,7 @@ def _cause(end: Termination, host: HostName) -> str:
 
 def _explains(reason: str, causes: str) -> bool:
     """Whether a reason of before names these hosts and causes, or no host is known now."""
-    known = [one.partition(": ") for one in causes.split("; ") if ": " in one]
+    known = [part.partition(": ") for part in causes.split("; ") if ": " in part]
     before = FIGURES.sub("", reason)
     return before.startswith("no host will do") and all(
         f"{host}: " in before and cause in before for host, _, cause in known

@@ -140,9 +140,9 @@ def rates(outlooks: Sequence[Outlook], profile: Profile) -> list[float]:
 
 
 SCORES: Final[Mapping[Metric, Callable[[Sequence[Outlook], Profile], list[float]]]] = {
-    "load_average": lambda outlooks, _: [-one.load_per_core for one in outlooks],
-    "processor_speed": lambda outlooks, _: [one.report.speed for one in outlooks],
-    "available_memory": lambda outlooks, _: [float(one.memory) for one in outlooks],
+    "load_average": lambda outlooks, _: [-outlook.load_per_core for outlook in outlooks],
+    "processor_speed": lambda outlooks, _: [outlook.report.speed for outlook in outlooks],
+    "available_memory": lambda outlooks, _: [float(outlook.memory) for outlook in outlooks],
     "composite": rates,
 }
 """All but `auto`, which chooses among them: the scores of these hosts."""
@@ -202,10 +202,10 @@ class MetricLearner:
         return best, f"{best} agrees best with how {len(self.seen)} components ran: {found[best]:.2f} ({others})"
 
 
-def spearman(one: Sequence[float], other: Sequence[float]) -> float:
+def spearman(first: Sequence[float], other: Sequence[float]) -> float:
     """Rank correlation, ties shared, from -1 to 1; 0 where either does not vary."""
     try:
-        return correlation(_ranks(one), _ranks(other))
+        return correlation(_ranks(first), _ranks(other))
     except StatisticsError:
         return 0.0
 

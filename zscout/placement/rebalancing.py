@@ -102,7 +102,7 @@ class Rebalancer:
         return state.now - state.last_change.get(host, state.now) >= state.rules.rest
 
     def _targets(self, query: RankQuery) -> list[HostName]:
-        return [one.host for one in self.state.rankings.rank(query).hosts if self._at_rest(one.host)][:TARGETS]
+        return [ranked.host for ranked in self.state.rankings.rank(query).hosts if self._at_rest(ranked.host)][:TARGETS]
 
     def _outlook(self, host: HostName) -> Outlook:
         """A host as the balancer sees it, less what left it and shows in its load average still."""

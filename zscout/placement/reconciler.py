@@ -129,10 +129,10 @@ class Reconciler:
         answered = self.probes.answered(host, only) if host in state.alive else []
         if listing.kinds is not None:
             state.told_kinds(host, listing.kinds)
-        for one in listing.components:
-            if only in (None, one.component):
-                self._listed(host, one)
-        present = {(one.component, one.incarnation) for one in listing.components}
+        for view in listing.components:
+            if only in (None, view.component):
+                self._listed(host, view)
+        present = {(view.component, view.incarnation) for view in listing.components}
         for record in self._on(host) if only is None else filter(None, [state.components.get(only)]):
             self._not_listed(record, listing, present)
         for name in answered:

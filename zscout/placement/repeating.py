@@ -57,43 +57,43 @@ class SurplusIncarnations:
         """This incarnation must end. It has, if its host is gone."""
         known = self._of.setdefault(component, {})
         if host in self._state.alive and incarnation not in known and len(known) < MAX_SURPLUS:
-            known[incarnation] = one = _Surplus(host, start_until, token)
-            self._stop(component, incarnation, one)
+            known[incarnation] = surplus = _Surplus(host, start_until, token)
+            self._stop(component, incarnation, surplus)
         self._set_timer(component)
 
     def start_answered(self, component: ComponentId, incarnation: Incarnation, *, may_run: bool) -> bool:
         """Whether it is surplus. It is stopped once more: the first stop may have come before its start."""
-        one = self._get(component, incarnation)
-        if one is not None and not may_run:
+        surplus = self._get(component, incarnation)
+        if surplus is not None and not may_run:
             self.ended(component, incarnation)
-        elif one is not None and one.start_until is not None:
-            one.start_until = None
-            self._stop(component, incarnation, one)
+        elif surplus is not None and surplus.start_until is not None:
+            surplus.start_until = None
+            self._stop(component, incarnation, surplus)
             self._set_timer(component)
-        return one is not None
+        return surplus is not None
 
     def stop_answered(self, component: ComponentId, incarnation: Incarnation, *, done: bool) -> None:
-        one = self._get(component, incarnation)
-        if one is None:
+        surplus = self._get(component, incarnation)
+        if surplus is None:
             return
-        one.stop_confirmed = done
+        surplus.stop_confirmed = done
         if not done:
-            one.tries += 1
-            one.due = self._state.now + self._state.back_off_time(one.tries)
-        elif one.start_until is None and not one.token:
+            surplus.tries += 1
+            surplus.due = self._state.now + self._state.back_off_time(surplus.tries)
+        elif surplus.start_until is None and not surplus.token:
             self.ended(component, incarnation)
         else:
-            one.due = self._state.now + SECOND
+            surplus.due = self._state.now + SECOND
         self._set_timer(component)
 
     def token(self, component: ComponentId, incarnation: Incarnation, *, alive: bool) -> None:
         """Its liveliness token appeared or vanished."""
-        one = self._get(component, incarnation)
-        if one is not None:
-            one.token = alive
+        surplus = self._get(component, incarnation)
+        if surplus is not None:
+            surplus.token = alive
             if alive:
-                one.start_until = None
-            elif one.stop_confirmed:
+                surplus.start_until = None
+            elif surplus.stop_confirmed:
                 self.ended(component, incarnation)
 
     def ended(self, component: ComponentId, incarnation: Incarnation) -> None:
@@ -107,7 +107,7 @@ class SurplusIncarnations:
         """The components of which surplus incarnations were lost with the host."""
         found = []
         for component, known in list(self._of.items()):
-            left = {incarnation: one for incarnation, one in known.items() if one.host != host}
+            left = {incarnation: surplus for incarnation, surplus in known.items() if surplus.host != host}
             if len(left) < len(known):
                 self._of[component] = left
                 self._set_timer(component)
@@ -116,22 +116,22 @@ class SurplusIncarnations:
 
     def timer(self, component: ComponentId) -> None:
         now = self._state.now
-        for incarnation, one in self._of.get(component, {}).items():
-            if one.due <= now:
-                if one.start_until is not None and one.start_until <= now:
-                    one.start_until = None
-                self._stop(component, incarnation, one)
+        for incarnation, surplus in self._of.get(component, {}).items():
+            if surplus.due <= now:
+                if surplus.start_until is not None and surplus.start_until <= now:
+                    surplus.start_until = None
+                self._stop(component, incarnation, surplus)
         self._set_timer(component)
 
-    def _stop(self, component: ComponentId, incarnation: Incarnation, one: _Surplus) -> None:
-        one.due = self._state.now + STOP_TIMEOUT
-        self._state.stop(component, incarnation, one.host)
+    def _stop(self, component: ComponentId, incarnation: Incarnation, surplus: _Surplus) -> None:
+        surplus.due = self._state.now + STOP_TIMEOUT
+        self._state.stop(component, incarnation, surplus.host)
 
     def _set_timer(self, component: ComponentId) -> None:
         known = self._of.get(component, {})
         if not known:
             self._of.pop(component, None)
-        due = min((one.due for one in known.values()), default=None)
+        due = min((surplus.due for surplus in known.values()), default=None)
         self._state.timers.set(TimerKind.SURPLUS, component, due)
 
 
@@ -166,8 +166,8 @@ class Probes:
         """A host listed this component, or (None) all. Returns those that were asked for."""
         probes = self._open.get(host, {})
         found = list(probes) if component is None else [component] if component in probes else []
-        for one in found:
-            del probes[one]
+        for name in found:
+            del probes[name]
         self._count -= len(found)
         if not probes:
             self._drop(host)

@@ -203,7 +203,7 @@ class Timers:
             self._at[key] = at
             heapq.heappush(self._heap, (at, key))
             if len(self._heap) > 2 * len(self._at) + self.SLACK:
-                self._heap = [(when, one) for one, when in self._at.items()]
+                self._heap = [(when, timer) for timer, when in self._at.items()]
                 heapq.heapify(self._heap)
 
     def pop_due(self, now: Ns) -> list[TimerKey]:
@@ -277,7 +277,9 @@ class PlacementState:
                 self.published[component] = status
                 effects.append(ComponentChanged(component, status))
         # A host may have been lost in this very instant, after a command to it.
-        return effects + [one for one in self._commands if isinstance(one, PlacementRefused) or one.host in self.alive]
+        return effects + [
+            command for command in self._commands if isinstance(command, PlacementRefused) or command.host in self.alive
+        ]
 
     # Components
 
@@ -356,14 +358,14 @@ class PlacementState:
         ranking = self.rankings.rank(query)
         lacking = {host for host in self.alive if self.lacks(host, spec.kind)} if self.kinds else set()
         usable = self.alive - lacking if lacking else self.alive
-        found = tuple(one for one in ranking.hosts if one.host in usable and one.host != other_than)
+        found = tuple(ranked for ranked in ranking.hosts if ranked.host in usable and ranked.host != other_than)
         left_out = dict(ranking.left_out)
         if only is not None and spec.hosts is not None and only not in spec.hosts:
             left_out = {only: NOT_NAMED}
         elif found:
             return found, ""
         else:
-            left_out |= {one.host: GONE for one in ranking.hosts if one.host not in (other_than, *lacking)}
+            left_out |= {ranked.host: GONE for ranked in ranking.hosts if ranked.host not in (other_than, *lacking)}
             known = self.alive if query.hosts is None else self.alive & query.hosts
             left_out |= dict.fromkeys(known - self.balancer.reports.keys(), NO_REPORT)
             left_out |= dict.fromkeys(known & lacking, f"it has no kind {spec.kind}")
@@ -433,11 +435,15 @@ class PlacementState:
     def start(self, record: ComponentRecord, move: Migration | None = None) -> None:
         """Commands the start of the record's incarnation, or of the one that stands by in a move; for the first time or
         again."""
-        one, host, timer = (record, record.host, self.wake) if move is None else (move, move.to, self.wake_migration)
+        starting, host, timer = (
+            (record, record.host, self.wake) if move is None else (move, move.to, self.wake_migration)
+        )
         if host is not None and host in self.alive:
-            one.start_until = self.now + self.rules.start_timeout + START_SLACK
-            timer(record, one.start_until)
-            start = messages.StartComponent(record.component, one.incarnation, record.spec, standby=move is not None)
+            starting.start_until = self.now + self.rules.start_timeout + START_SLACK
+            timer(record, starting.start_until)
+            start = messages.StartComponent(
+                record.component, starting.incarnation, record.spec, standby=move is not None
+            )
             self._commands.append(HostCommand(host, start))
 
     def hand_over(self, record: ComponentRecord, move: Migration) -> None:

@@ -1,10 +1,8 @@
-"""When will mine run: the core played forward from its present state, as if no further event were to come.
+"""Forecast of starts: a copy of the core played forward, as if no further event were to come.
 
-The forecast runs the very core and strategy that decide. RCs are taken to vote as they have voted; a proposal
-that was never made is taken to be a yes. Higher priority that comes later makes it wrong, of course, and so
-does who releases early: it is an estimate, and is shown as one. Bookings are taken to be taken up at their dates, or
-not at all where these have come; maintenance is taken to last as long as it was said to.
-"""
+RCs vote as they have voted, and unknown votes count as yes. Later requests of higher priority and early releases
+make it wrong: it is an estimate. Bookings are taken up at their dates, or lapse where the date is over; maintenance
+lasts as planned."""
 
 from __future__ import annotations
 
@@ -36,13 +34,13 @@ from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import ArcId, Ns, Term
 
 MAX_CHECKS = 4_000
-"""Queued ARCs, summed over all instants: a forecast must not keep the RCM from its work."""
+"""Queued ARCs, summed over all instants: bounds the time that the RCM spends."""
 
 
 def play_instant(
     core: Core, now: Ns, events: Iterable[Event], vote: Callable[[Propose], Vote]
 ) -> Iterator[list[Effect]]:
-    """One instant, with every vote and every further pass that it takes; yields the effects of each batch."""
+    """One instant, with all its votes and further passes; yields the effects of each batch."""
     batch = list(events)
     while batch:
         effects = core.handle(now, *batch)
@@ -54,31 +52,33 @@ def play_instant(
 
 @dataclass(slots=True)
 class Forecast:
-    """What is to be expected: when who waits starts, and whom a newcomer would preempt at once."""
+    """Expected starts, and the immediate victims of a newcomer."""
 
     starts: dict[ArcId, Ns] = field(default_factory=dict)
-    """ARCs that are missing never start from the present state, or not within what was played."""
+    """A missing ARC never starts from the present state, or not within the forecast."""
     preempts: list[ArcId] = field(default_factory=list)
     reason: Reason | None = None
-    """What the newcomer waits for at first; None if it starts at once."""
+    """The newcomer's first reason to wait; None if it starts at once."""
 
 
 def forecast(
     core: Core, now: Ns, newcomer: ArcRequest | None = None, runtimes: RuntimeEstimator | None = None
 ) -> Forecast:
-    """Plays `core` forward from `now`, with `newcomer` asking at once. `core` is not touched. With `runtimes` holds are
-    taken to be given back when they usually are."""
+    """Play a copy of `core` forward from `now`, with `newcomer` asking at once. With `runtimes` holds end when they
+    usually do."""
     # A strategy may keep unfinished searches: the forecast must not meddle with them.
     copy = Core(STRATEGIES[core.strategy.name](), core.policy)
     joined, lead = core.as_events(Term(core.term.counter + 1, "forecast"))
     result = Forecast()
     ends = {held.request.arc: held.end for held in lead.recovered_holds}
     releases: dict[ArcId, Ns] = {}
-    """When holds are likely to be given back."""
-    booked = {one.id: (one, arc is None) for one, arc in core.bookings()}
-    dates = sorted((at, name) for name, (one, is_open) in booked.items() for at in _dates(one, now, is_open=is_open))
-    unserved = {one.request.arc for one in lead.waiting}
-    """ARCs that are queued and have not started within what was played."""
+    """Likely times of release."""
+    booked = {booking.id: (booking, arc is None) for booking, arc in core.bookings()}
+    dates = sorted(
+        (at, name) for name, (booking, is_open) in booked.items() for at in _dates(booking, now, is_open=is_open)
+    )
+    unserved = {queued.request.arc for queued in lead.waiting}
+    """Queued ARCs that have not started within the forecast."""
 
     def expect(request: ArcRequest, hold: Hold) -> None:
         end = None if runtimes is None else runtimes.end(request, hold, now)
@@ -89,7 +89,6 @@ def forecast(
         return Vote(asked.proposal, core.expects_yes(asked.rc, frozenset(asked.holders)))
 
     def step(events: list[Event], preempting: ArcId | None = None) -> None:
-        """One instant."""
         for effect in itertools.chain.from_iterable(play_instant(copy, now, events, vote)):
             match effect:
                 case Granted(arc=arc, start=start):
@@ -135,7 +134,7 @@ def forecast(
 
 
 def _dates(booking: Booking, now: Ns, *, is_open: bool) -> list[Ns]:
-    """When something becomes of a booking that no hold tells."""
+    """Times at which a booking changes without a hold."""
     if booking.maintenance:
         return [at for at in (booking.start, booking.end) if at > now]
     if booking.start > now:

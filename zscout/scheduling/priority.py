@@ -102,7 +102,7 @@ class AdmissionCheck:
             if not rc.present:
                 absent = [rc for rc in self.arc.rcs if not rc.present]
                 why = rc.absence if len(absent) == 1 else absences(absent)
-                return Inadmissible(rc, of_rcs(ReasonCode.ABSENT, [one.name for one in absent], why))
+                return Inadmissible(rc, of_rcs(ReasonCode.ABSENT, [rc.name for rc in absent], why))
         lasting: tuple[int, float, int] | None = None
         for number, (rc, holder) in enumerate(self.non_preemptible):
             if not off_limits or not rc.bit & off_limits:
@@ -132,7 +132,7 @@ class AdmissionCheck:
             for choice in sorted(self.state.matching(need), key=attrgetter("name")):
                 if choice.present and not choice.sharable and not choice.bit & (union(known) | arc.named_mask):
                     known.add(choice.bit)
-                    told += [(choice, one, need) for one in choice.non_preemptible_holders(arc, self.now)[:1]]
+                    told += [(choice, holder, need) for holder in choice.non_preemptible_holders(arc, self.now)[:1]]
         first = told[:SHOWN_CHOICES]
         return Reason(
             ReasonCode.HELD,
@@ -348,7 +348,7 @@ class Pass:
                 bits = rc.bit
             case "off limits":
                 bits = self.off_limits
-                bits |= union(rc.bit for rc in arc.rcs if any(one.mask & bits for one in rc.holders.values()))
+                bits |= union(rc.bit for rc in arc.rcs if any(holder.mask & bits for holder in rc.holders.values()))
             case VotesNeeded(proposals):
                 bits = sum(rc.bit for rc, _ in proposals if rc.name in self.votes.unresponsive)
             case _:
@@ -405,7 +405,7 @@ class Pass:
                 self._defer(arc, check, ArcState.DEFERRED)
                 self.actions.wait(arc, VOTING, settled=False)
             case VotesNeeded(proposals) if unresponsive := [
-                one for one in proposals if one[0].name in self.votes.unresponsive
+                proposal for proposal in proposals if proposal[0].name in self.votes.unresponsive
             ]:
                 if arc.patterns:
                     self.index.put(arc, ArcState.READY)

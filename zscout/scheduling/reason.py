@@ -185,16 +185,18 @@ def _held(reason: Reason, until: Until | None) -> str:
     held = list(zip(reason.rcs, reason.by, patterns, strict=False))
     parts = []
     for party in dict.fromkeys(party for _, party, pattern in held if not pattern):
-        rcs = ", ".join(rc for rc, one, pattern in held if not pattern and one == party)
+        rcs = ", ".join(rc for rc, holder, pattern in held if not pattern and holder == party)
         parts.append(f"{party}: {rcs}{_last(party, until)}")
-    for pattern, group in groupby((one for one in held if one[2]), key=lambda one: one[2]):
+    for pattern, group in groupby((choice for choice in held if choice[2]), key=lambda choice: choice[2]):
         choices = list(group)
         if len(choices) == 1 and reason.number <= len(held):
             rc, party, _ = choices[0]
             parts.append(f"{party}: {rc} for {pattern}{_last(party, until)}")
             continue
         names = short_names(rc for rc, _, _ in choices)
-        shown = [f"{rc} (held by {one[1]}{_last(one[1], until)})" for rc, one in zip(names, choices, strict=True)]
+        shown = [
+            f"{rc} (held by {choice[1]}{_last(choice[1], until)})" for rc, choice in zip(names, choices, strict=True)
+        ]
         parts.append(f"one of {', '.join(shown)}")
     more = f" and {reason.number - len(held)} more" if reason.number > len(held) else ""
     preferred = f"; by fair shares {reason.detail} goes first" if reason.detail else ""
@@ -211,36 +213,36 @@ def _because(reason: Reason) -> str:
 
 
 _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
-    ReasonCode.ABSENT: lambda one: (
-        f"{one.rcs[0]} is lost: {one.detail}"
-        if one.detail and one.number == 1
-        else f"{_listed(one)} not on the mesh{_because(one)}"
+    ReasonCode.ABSENT: lambda why: (
+        f"{why.rcs[0]} is lost: {why.detail}"
+        if why.detail and why.number == 1
+        else f"{_listed(why)} not on the mesh{_because(why)}"
     ),
-    ReasonCode.NO_MATCH: lambda one: f"no RC on the mesh is left for {_listed(one)}{_because(one)}",
-    ReasonCode.SILENT: lambda one: f"{_listed(one)} does not answer",
-    ReasonCode.UNCONFIRMED: lambda one: f"{_listed(one)} did not confirm the grant",
-    ReasonCode.CLAIMED: lambda one: f"{one.detail} claims it as well",
-    ReasonCode.RESERVED: lambda one: (
-        f"{one.rcs[0]} is kept for {one.by[0]}, whose time to wait is over before this ends"
+    ReasonCode.NO_MATCH: lambda why: f"no RC on the mesh is left for {_listed(why)}{_because(why)}",
+    ReasonCode.SILENT: lambda why: f"{_listed(why)} does not answer",
+    ReasonCode.UNCONFIRMED: lambda why: f"{_listed(why)} did not confirm the grant",
+    ReasonCode.CLAIMED: lambda why: f"{why.detail} claims it as well",
+    ReasonCode.RESERVED: lambda why: (
+        f"{why.rcs[0]} is kept for {why.by[0]}, whose time to wait is over before this ends"
     ),
-    ReasonCode.BOOKED: lambda one: f"{one.rcs[0]} is booked by {one.by[0]} before this would be over",
-    ReasonCode.MAINTENANCE: lambda one: f"maintenance of {one.rcs[0]} by {one.by[0]}",
+    ReasonCode.BOOKED: lambda why: f"{why.rcs[0]} is booked by {why.by[0]} before this would be over",
+    ReasonCode.MAINTENANCE: lambda why: f"maintenance of {why.rcs[0]} by {why.by[0]}",
     ReasonCode.NOT_YET: lambda _: "the time of its booking is still to come",
-    ReasonCode.QUOTA: lambda one: f"host {one.detail} has {one.number} ARCs running, its quota",
-    ReasonCode.RC_QUOTA: lambda one: f"{one.detail} may hold {one.number} RCs at one time",
+    ReasonCode.QUOTA: lambda why: f"host {why.detail} has {why.number} ARCs running, its quota",
+    ReasonCode.RC_QUOTA: lambda why: f"{why.detail} may hold {why.number} RCs at one time",
     ReasonCode.VOTING: lambda _: "votes are out",
     ReasonCode.SEARCHING: lambda _: "a better schedule is sought",
     ReasonCode.EXPIRED: lambda _: "its minimum runtime is over",
     ReasonCode.LIMIT: lambda _: "it had the longest time that this fleet gives a hold (max_runtime)",
-    ReasonCode.PREEMPTED: lambda one: f"preempted by {one.by[0]}, priority {one.by[0].priority}{one.by[0].comment}",
-    ReasonCode.DISPLACED: lambda one: (
-        f"its minimum runtime is over and {one.by[0]}, priority {one.by[0].priority}, needs its RCs{one.by[0].comment}"
+    ReasonCode.PREEMPTED: lambda why: f"preempted by {why.by[0]}, priority {why.by[0].priority}{why.by[0].comment}",
+    ReasonCode.DISPLACED: lambda why: (
+        f"its minimum runtime is over and {why.by[0]}, priority {why.by[0].priority}, needs its RCs{why.by[0].comment}"
     ),
-    ReasonCode.CANCELLED: lambda one: f"cancelled by {one.detail}",
-    ReasonCode.RELEASED: lambda one: f"released by {one.detail}",
-    ReasonCode.CLIENT_LOST: lambda one: one.detail,
-    ReasonCode.HANDED_OVER: lambda one: f"handed over to {one.detail}",
-    ReasonCode.RC_LOST: lambda one: f"{one.rcs[0]} was lost" + (f": {one.detail}" if one.detail else ""),
-    ReasonCode.RC_ENDED: lambda one: f"{one.rcs[0]} ended the hold",
-    ReasonCode.SUPERSEDED: lambda one: f"{one.rcs[0]} has a newer holder",
+    ReasonCode.CANCELLED: lambda why: f"cancelled by {why.detail}",
+    ReasonCode.RELEASED: lambda why: f"released by {why.detail}",
+    ReasonCode.CLIENT_LOST: lambda why: why.detail,
+    ReasonCode.HANDED_OVER: lambda why: f"handed over to {why.detail}",
+    ReasonCode.RC_LOST: lambda why: f"{why.rcs[0]} was lost" + (f": {why.detail}" if why.detail else ""),
+    ReasonCode.RC_ENDED: lambda why: f"{why.rcs[0]} ended the hold",
+    ReasonCode.SUPERSEDED: lambda why: f"{why.rcs[0]} has a newer holder",
 }

@@ -150,7 +150,7 @@ class Reservations:
         if not rc.present:
             return math.inf
         ends = (holder.known_end() for holder in rc.holders.values())
-        starving = (one.over() for one in self.by_rc.get(rc.bit, ()) if one.booked is None)
+        starving = (promise.over() for promise in self.by_rc.get(rc.bit, ()) if promise.booked is None)
         return max((*ends, *starving), default=0)
 
     def before(self, rc: Rc, order: Order) -> list[Reservation]:
@@ -162,13 +162,13 @@ class Reservations:
         """From `start` on, the earliest time from which `arc` finds nothing booked for as long as it needs."""
         end = arc.ends(start)
         for rc in rcs:
-            for one in self.before(rc, order):
-                if one.booked is None or one.booked <= start or one.start >= end:
+            for promise in self.before(rc, order):
+                if promise.booked is None or promise.booked <= start or promise.start >= end:
                     continue
-                beside = rc.sharable and not one.excludes
-                if not (beside and self._votes.accepts(rc.name, frozenset((one.arc.id, arc.id)))):
+                beside = rc.sharable and not promise.excludes
+                if not (beside and self._votes.accepts(rc.name, frozenset((promise.arc.id, arc.id)))):
                     # Each is passed once: time goes forward only.
-                    return self._beside_bookings(arc, rcs, one.booked, order)
+                    return self._beside_bookings(arc, rcs, promise.booked, order)
         return start
 
     def _reserve(self, arc: Arc, order: Order) -> None:
@@ -201,22 +201,22 @@ class Reservations:
         """When its owner has room for `arc`."""
         state, ends = self._state, [float(self._state.now)]
         if state.quota_left(arc) == 0:
-            ends.append(min(one.known_end() for one in state.running.values() if one.owner == arc.owner))
+            ends.append(min(other.known_end() for other in state.running.values() if other.owner == arc.owner))
         for quota in state.policy.rc_quotas.get(arc.owner, ()):
-            running = [one for one in state.running.values() if one.owner in quota.owners]
-            held = sum(len(one.rcs) for one in running)
-            for one in sorted(running, key=lambda one: one.known_end()):
+            running = [other for other in state.running.values() if other.owner in quota.owners]
+            held = sum(len(other.rcs) for other in running)
+            for other in sorted(running, key=lambda other: other.known_end()):
                 if held + len(arc.request.needs) <= quota.rcs:
                     break
-                ends.append(one.known_end())
-                held -= len(one.rcs)
+                ends.append(other.known_end())
+                held -= len(other.rcs)
         return max(ends)
 
     def _free_from(self, rc: Rc, arc: Arc, order: Order) -> float:
         """When `rc` has room for `arc` at the latest; infinite where that is not known."""
         non_preemptible = rc.non_preemptible_holders(arc, self._state.now)
         if rc.sharable:
-            sharing = (one.arc.id for one in self.before(rc, order) if not one.excludes)
+            sharing = (promise.arc.id for promise in self.before(rc, order) if not promise.excludes)
             if self._votes.accepts(rc.name, frozenset((*(holder.id for holder in non_preemptible), *sharing, arc.id))):
                 return self._state.now
             alone = self._votes.known(rc.name, frozenset((arc.id,)))
@@ -268,29 +268,38 @@ class Reservations:
         """The reservations of `rc` that `arc` has to respect: those before its own, and all that is booked as long as
         its own time has not come. It would be early, which nobody has promised it: whether any of these is there."""
         reserved = self.by_rc.get(rc.bit, [])
-        own = next((number for number, one in enumerate(reserved) if one.arc is arc), len(reserved))
+        own = next((number for number, promise in enumerate(reserved) if promise.arc is arc), len(reserved))
         if own == len(reserved) or reserved[own].start <= self._state.now:
             return reserved[:own], False
-        later = [one for one in reserved[own + 1 :] if one.booked is not None]
+        later = [promise for promise in reserved[own + 1 :] if promise.booked is not None]
         return [*reserved[:own], *later], bool(later)
 
     def _together(self, rc: Rc, arc: Arc, before: list[Reservation]) -> list[HolderSet]:
         """Whom `rc` would have to carry beside `arc`, from now on: each time when another comes. Who gives way to that
         one is not in its way."""
-        if all(one.booked is None for one in before):
-            return [frozenset((*rc.holders, arc.id, *(one.arc.id for one in before)))]
+        if all(promise.booked is None for promise in before):
+            return [frozenset((*rc.holders, arc.id, *(promise.arc.id for promise in before)))]
         now = self._state.now
         sets = []
-        for time in sorted({now, *(one.start for one in before if one.start > now)}):
-            there = [one for one in before if one.start <= time and (one.booked is None or one.booked > time)]
-            coming = [arc] if time == now else [one.arc for one in there if one.start == time]
-            staying = [one.id for one in rc.holders.values() if not any(yields(one, other, time) for other in coming)]
-            sets.append(frozenset((*staying, arc.id, *(one.arc.id for one in there))))
+        for time in sorted({now, *(promise.start for promise in before if promise.start > now)}):
+            there = [
+                promise
+                for promise in before
+                if promise.start <= time and (promise.booked is None or promise.booked > time)
+            ]
+            coming = [arc] if time == now else [promise.arc for promise in there if promise.start == time]
+            staying = [
+                holder.id for holder in rc.holders.values() if not any(yields(holder, other, time) for other in coming)
+            ]
+            sets.append(frozenset((*staying, arc.id, *(promise.arc.id for promise in there))))
         return sets
 
     def reserves(self, rc: Rc, arc: Arc) -> bool:
         """Whether `rc` is reserved for another that goes before `arc`, and that it can't share it with."""
-        return any((one.excludes or not rc.sharable) and self._delays(arc, one) for one in self._binding(rc, arc)[0])
+        return any(
+            (promise.excludes or not rc.sharable) and self._delays(arc, promise)
+            for promise in self._binding(rc, arc)[0]
+        )
 
     def _delays(self, arc: Arc, reservation: Reservation) -> bool:
         """Whether `arc`, started now, would hold what is reserved when the time comes, and must not."""

@@ -114,7 +114,7 @@ class _History:
         """The better one of the two, with how well it did; None where too little is known."""
         if self._estimates is None:
             self._estimates = _Estimate(self.spans, by_share=False), _Estimate(self.spans, by_share=True)
-        best = max(self._estimates, key=lambda one: one.accuracy)
+        best = max(self._estimates, key=lambda estimate: estimate.accuracy)
         return best if best.judged >= JUDGED else None
 
 

@@ -120,23 +120,23 @@ class _Search:
 
     def _booked(self, rc: Rc) -> Iterable[_Taken]:
         for claim in self._state.claims.values():
-            one = claim.booking
-            if claim.mask & rc.bit and one.id != self._wanted.id:
-                yield _Taken(one.start, one.end, claim.arc.id, one.maintenance)
+            booking = claim.booking
+            if claim.mask & rc.bit and booking.id != self._wanted.id:
+                yield _Taken(booking.start, booking.end, claim.arc.id, booking.maintenance)
 
     def _add_reserved(self) -> None:
         state = self._state
         if state.policy.patience is None or not state.queued:
             return
         for bit, reserved in reservations(state, state.policy.patience, None).by_rc.items():
-            for one in reserved if bit in self._taken else ():
-                if one.booked is None and state.band(one.arc.priority) >= state.band(self._wanted.priority):
-                    self._taken[bit].append(_Taken(one.start, one.arc.ends(one.start), one.arc.id))
+            for promise in reserved if bit in self._taken else ():
+                if promise.booked is None and state.band(promise.arc.priority) >= state.band(self._wanted.priority):
+                    self._taken[bit].append(_Taken(promise.start, promise.arc.ends(promise.start), promise.arc.id))
 
     def starts(self, until: Ns) -> list[Ns]:
         """Times at which something comes free."""
         first = self._wanted.start
-        ends = {int(one.end) for taken in self._taken.values() for one in taken if first < one.end <= until}
+        ends = {int(span.end) for taken in self._taken.values() for span in taken if first < span.end <= until}
         return sorted({first, *ends})
 
     def fit(self, start: Ns) -> Mapping[Need, RcName] | list[tuple[Rc, HolderSet]] | None:
@@ -166,15 +166,15 @@ class _Search:
     def _is_free(self, rc: Rc, start: Ns) -> bool | HolderSet:
         """Whether `rc` is to be had from then on for long enough; or the holders on which its vote is not known."""
         end = start + self._wanted.runtime
-        taken = [one for one in self._taken[rc.bit] if one.start < end and one.end > start]
-        if not rc.sharable or self._wanted.maintenance or any(one.excludes for one in taken):
+        taken = [span for span in self._taken[rc.bit] if span.start < end and span.end > start]
+        if not rc.sharable or self._wanted.maintenance or any(span.excludes for span in taken):
             return not taken
-        there = frozenset(one.arc for one in taken)
+        there = frozenset(span.arc for span in taken)
         answer = self._state.votes.known(rc.name, there | {self._arc.id})
         return there | {self._arc.id} if answer is None else answer.accept
 
     def latest(self, start: Ns, bound: Iterable[RcName]) -> Ns:
         """Until when it may start as well, on the same RCs."""
         rcs = (*self._named, *(self._state.rc(name) for name in bound))
-        coming = (one.start for rc in rcs for one in self._taken[rc.bit] if one.start > start)
+        coming = (span.start for rc in rcs for span in self._taken[rc.bit] if span.start > start)
         return max(start, min(coming, default=start + (1 << 62)) - self._wanted.runtime)

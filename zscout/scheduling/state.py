@@ -251,7 +251,11 @@ class SchedulerState:
         """`arc` is over, or gets another place: who claims this one as well is considered."""
         if self._at_place.get(arc.place) is arc:
             del self._at_place[arc.place]
-            for other in [one for one in self.held_back.values() if one.place == arc.place and one.held_back is None]:
+            for other in [
+                waiting
+                for waiting in self.held_back.values()
+                if waiting.place == arc.place and waiting.held_back is None
+            ]:
                 self.consider_again(other)
 
     def consider_again(self, arc: Arc) -> None:
@@ -495,9 +499,13 @@ class SchedulerState:
         if not arc.request.continues:
             return None
         mask = arc.mask & ~self.sharable
-        holders = (one for rc in self.rcs_in(mask) for one in rc.holders.values())
+        holders = (holder for rc in self.rcs_in(mask) for holder in rc.holders.values())
         return next(
-            (one for one in holders if arc.request.goes_on_from(one.request) and one.preemptible_by(arc, self.now)),
+            (
+                holder
+                for holder in holders
+                if arc.request.goes_on_from(holder.request) and holder.preemptible_by(arc, self.now)
+            ),
             None,
         )
 
