@@ -13,27 +13,23 @@ from zscout.placement.state import OVER, PROBE_TIMEOUT, ComponentRecord, Placeme
 from zscout.types import SECOND, ComponentId, HostName, Ns
 
 GRACE: Final[Ns] = 2 * SECOND
-"""Within this a host must report what was inherited, or went on elsewhere."""
+"""Time for a host to report an inherited or moved component."""
 MAX_PROBES: Final = 3
-"""A component without token of which so many probes report nothing is lost."""
+"""Unanswered probes before a component without token counts as lost."""
 ASK_KINDS: Final[Ns] = 2 * SECOND
-"""Within this hosts must say whether they have a kind by now that none had."""
+"""Time for hosts to report a kind that none had."""
 TRY_AGAIN: Final[Ns] = SECOND
-"""After this a component without an eligible host is tried again."""
+"""Delay of the next try without an eligible host."""
 AT_ONCE: Final = 100
 """Components placed in one instant; the next follow SHORTLY after."""
 SHORTLY: Final[Ns] = SECOND // 100
 FIGURES: Final = re.compile(r"[\d.,]+ (?=s old|bytes available)")
 """In the reason why there is no eligible host."""
 KINDS_NAMED: Final = 8
-"""Where a kind is not known."""
 CAUSES_NAMED: Final = 4
-"""In the reason why no host can start a component."""
 
 
 class Lifecycle:
-    """Decides for every component that is not `moving`; for that, see `Migrations`."""
-
     def __init__(self, state: PlacementState, surplus: SurplusIncarnations, probes: Probes) -> None:
         self.state, self.surplus, self.probes = state, surplus, probes
 
@@ -71,7 +67,7 @@ class Lifecycle:
         record.tried.clear()
 
     def stop(self, record: ComponentRecord) -> None:
-        """For good. A migration must have been cancelled before."""
+        """Stop for good. A migration must have been cancelled before."""
         record.wanted = False
         self.state.mark_changed(record.component, always=True)
         if record.state == "given_up":
@@ -84,14 +80,13 @@ class Lifecycle:
     # Choosing a host
 
     def place_again(self, record: ComponentRecord, cause: str = "") -> None:
-        """Has it placed at the end of this instant."""
+        """Place it at the end of this instant."""
         record.enter("waiting")
         record.restart_cause, record.whereabouts_unknown = cause, False
         self.state.wake(record, None)
         self.state.to_place[record.component] = None
 
     def place_waiting(self) -> None:
-        """Places what is to be placed, the heaviest first."""
         state = self.state
         records = [state.components[name] for name in state.to_place if name in state.components]
         state.to_place = {}
@@ -106,7 +101,6 @@ class Lifecycle:
                 state.wake(record, state.now + SHORTLY)
 
     def _choose_host(self, record: ComponentRecord) -> None:
-        """The best host that was not tried in this round."""
         hosts, why_none = self.state.eligible_hosts(record.spec)
         tried = record.tried
         untried = next((ranked for ranked in hosts if ranked.host not in tried), None)
@@ -138,11 +132,11 @@ class Lifecycle:
             self._back_off(record, reason, pause)
 
     def _without_kind(self, record: ComponentRecord) -> set[HostName]:
-        """The hosts of which one would do for what was never started, if any known host had its kind."""
+        """The hosts that lack only the kind of a component that was never started, if no known host has it."""
         return self.state.lacking_everywhere(record.spec) if record.incarnation == record.asked_as else set()
 
     def _ask_for_kind(self, record: ComponentRecord, hosts: set[HostName]) -> None:
-        """Gives it up, unless hosts told their kinds before it was asked for: its kind may be installed by now."""
+        """Give it up, unless hosts listed their kinds before the request: its kind may be installed by now."""
         state, kind = self.state, record.spec.kind
         before = [host for host in sorted(hosts) if state.kinds[host][0] < record.asked_at]
         if not before or state.now - record.asked_at >= ASK_KINDS:
@@ -182,7 +176,7 @@ class Lifecycle:
     # Starting and running
 
     def start_answered(self, record: ComponentRecord, answer: StartAnswered) -> None:
-        """Of the record's own incarnation, not of a migration's target."""
+        """For the record's own incarnation, not a migration's target."""
         record.start_until = None
         if answer.result == "failed" and record.state != "starting":
             self.ended(record, Termination("failed", answer.reason, answer.tail, bad_params=answer.bad_params))
@@ -212,7 +206,7 @@ class Lifecycle:
             self._start_failed(record, end, again=answer.again)
 
     def _start_failed(self, record: ComponentRecord, end: Termination, *, again: bool = True) -> None:
-        """It ended before it ran: the next host at once, a few times."""
+        """Try the next host at once, a few times."""
         host = record.host or "its host"
         record.ended_incarnations.append(record.incarnation)
         record.start_until, record.tail = None, end.tail
@@ -226,7 +220,7 @@ class Lifecycle:
             self.place_again(record, cause)
 
     def runs(self, record: ComponentRecord, *, anew: bool = False) -> None:
-        """It is known to run where it is; `anew`: as another incarnation than before."""
+        """Record that it runs; `anew`: as another incarnation."""
         if record.state != "running" or anew:
             record.enter("running")
             record.running_since, record.whereabouts_unknown = self.state.now, False
@@ -237,7 +231,7 @@ class Lifecycle:
         self.state.drain_soon(record.host)
 
     def watch(self, record: ComponentRecord) -> None:
-        """Sets when a running component is checked next."""
+        """Schedule the next check of a running component."""
         state, at = self.state, None
         if not (record.token and record.confirmed):
             at = state.now + PROBE_TIMEOUT
@@ -246,8 +240,8 @@ class Lifecycle:
         state.wake(record, at)
 
     def check(self, record: ComponentRecord) -> Termination | None:
-        """Probes the host of a running component that has no token or is not confirmed, and resets the count
-        of restarts of one that settled. Returns how it ended, if it is to be taken for lost."""
+        """Probe a running component without token or confirmation, and reset the restarts of a settled one. Returns
+        how it ended, if lost."""
         state, host = self.state, record.host
         if record.running_since is not None and state.now - record.running_since >= state.rules.settled:
             record.restarts = 0
@@ -268,7 +262,6 @@ class Lifecycle:
     # Ends and restarts
 
     def ended(self, record: ComponentRecord, end: Termination) -> None:
-        """The record's incarnation has ended, or is taken for lost."""
         state, rules = self.state, self.state.rules
         if record.state == "stopping":
             if end.cause != "lost":
@@ -312,7 +305,7 @@ class Lifecycle:
                 record.restart_cause = cause
 
     def _exhausted(self, record: ComponentRecord, cause: str) -> bool:
-        """Gives it up if that was its last try."""
+        """Give it up if that was its last try."""
         if record.spec.restart == "never":
             self._finish(record, "given_up", cause)
         elif record.restarts >= self.state.rules.restarts:
@@ -335,14 +328,13 @@ class Lifecycle:
             self._stopped(record)
 
     def _stopped(self, record: ComponentRecord) -> None:
-        """What was stopped has ended, or its host is gone."""
         record.start_until = None
         self.state.component_left(record)
         self.state.wake(record, None)
         self._check_stopped(record)
 
     def _check_stopped(self, record: ComponentRecord) -> None:
-        """Stopped is a component once its surplus incarnations have ended, too."""
+        """A component is stopped once its surplus incarnations have ended, too."""
         if record.host is not None or self.surplus.any(record.component):
             return
         if record.wanted:
@@ -352,7 +344,6 @@ class Lifecycle:
             self._finish(record, "ended", "stopped")
 
     def surplus_ended(self, component: ComponentId) -> None:
-        """Surplus incarnations of it may have ended, its own among them if it is being stopped."""
         record = self.state.get(component)
         if record is None or record.state != "stopping":
             return
@@ -403,7 +394,7 @@ def _cause(end: Termination, host: HostName) -> str:
 
 
 def _explains(reason: str, causes: str) -> bool:
-    """Whether a reason of before names these hosts and causes, or no host is known now."""
+    """Return True if an earlier reason names these hosts and causes, or no host is known now."""
     known = [part.partition(": ") for part in causes.split("; ") if ": " in part]
     before = FIGURES.sub("", reason)
     return before.startswith("no host will do") and all(

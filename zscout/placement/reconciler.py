@@ -1,6 +1,5 @@
-"""Which incarnation of a component counts, by tokens, hosts' lists, and what the placer of the term before published;
-and what follows when a host comes or dies. Of two that live the higher one counts; the lower is stopped.
-"""
+"""Decides which incarnation of a component counts, by tokens, hosts' lists and earlier placements, and handles hosts
+that come or die. Of two live incarnations the higher counts; the lower is stopped."""
 
 from __future__ import annotations
 
@@ -14,12 +13,10 @@ from zscout.placement.state import OVER, PROBE_TIMEOUT, ComponentRecord, Placeme
 from zscout.types import ComponentId, HostName
 
 RUNNING: Final = ("running", "stopping")
-"""Phases of a component, as its host lists it, that count as running."""
+"""Phases in a host's list that count as running."""
 
 
 class Reconciler:
-    """Compares what tokens, hosts and earlier placers report with the placer's records, and acts on each difference."""
-
     def __init__(self, state: PlacementState, lifecycle: Lifecycle, migrations: Migrations) -> None:
         self.state, self.lifecycle, self.migrations = state, lifecycle, migrations
         self.surplus, self.probes = lifecycle.surplus, lifecycle.probes
@@ -54,7 +51,7 @@ class Reconciler:
             self._given_twice(record, host, token=True)
 
     def vanished(self, token: TokenVanished) -> None:
-        """How it ended, its host reports; a token may also be gone for a while with the network."""
+        """The host reports the cause; the network may also hide a token for a while."""
         component, incarnation = token.component, token.incarnation
         record = self.state.get(component)
         self.surplus.token(component, incarnation, alive=False)
@@ -73,8 +70,8 @@ class Reconciler:
             move.token, move.target = False, "unknown"
 
     def _given_twice(self, record: ComponentRecord, host: HostName, *, token: bool) -> None:
-        """Two placers that did not see each other gave one number twice. Of two that live the one on the greater host
-        goes on, as they decide themselves where they see each other."""
+        """Two separated placers gave one number twice. Of two live incarnations the one on the greater host
+        continues, which the hosts decide too when they meet."""
         state, other = self.state, record.host
         if other is None or other == host:
             return
@@ -88,7 +85,7 @@ class Reconciler:
         record.confirmed = not token
 
     def _is_at(self, record: ComponentRecord, incarnation: Incarnation, host: HostName, *, token: bool) -> None:
-        """This is the incarnation that counts, and it runs there."""
+        """Make this the incarnation that counts, running there."""
         self.migrations.cancel(record)
         self.state.component_left(record)
         record.incarnation, record.host, record.token, record.confirmed = incarnation, host, token, False
@@ -97,18 +94,17 @@ class Reconciler:
         self.lifecycle.runs(record, anew=True)
 
     def _must_not_live(self, record: ComponentRecord) -> bool:
-        """Its incarnation ended, or is being stopped and its host was believed gone."""
+        """Return True if its incarnation ended, or is being stopped and its host was believed gone."""
         return record.state in OVER or (record.state == "stopping" and record.host is None)
 
     def _can_be_at(self, record: ComponentRecord, host: HostName) -> bool:
-        """Whether the incarnation can be at that host; if it was nowhere, it is there from now on."""
+        """Return True if the incarnation can be at that host; without a host, it now is there."""
         if record.host is None and host in self.state.alive:
             record.host = host
             record.host_reason = f"found running on {host}"
         return record.host == host
 
     def _other_runs(self, record: ComponentRecord, incarnation: Incarnation, host: HostName, *, token: bool) -> None:
-        """An incarnation runs that is not the record's."""
         if self.surplus.has(record.component, incarnation):
             return
         stopped = record.state == "stopping" or record.state in OVER
@@ -141,7 +137,7 @@ class Reconciler:
                 state.wake(waiting, state.now)
 
     def _on(self, host: HostName) -> list[ComponentRecord]:
-        """What is on a host, or on its way there."""
+        """Components on a host, or moving there."""
         return [
             record
             for record in self.state.components.values()
@@ -168,7 +164,7 @@ class Reconciler:
             self._other_runs(record, incarnation, host, token=False)
 
     def _adopt(self, host: HostName, listed: ComponentView) -> None:
-        """A placer of a term before had it started."""
+        """Take over a component that an earlier placer started."""
         record = ComponentRecord(listed.component, listed.spec, "starting", listed.incarnation, host=host)
         if listed.phase in ("ended", "standby") or host not in self.state.alive or not self.state.add(record):
             return
@@ -182,7 +178,6 @@ class Reconciler:
             self.state.start(record)
 
     def _listed_alive(self, record: ComponentRecord, host: HostName, listed: ComponentView) -> None:
-        """The record's incarnation lives."""
         if self._must_not_live(record):
             if listed.phase != "standby":
                 self.surplus.add(record.component, listed.incarnation, host)
@@ -222,8 +217,7 @@ class Reconciler:
     def _not_listed(
         self, record: ComponentRecord, listing: ComponentsListed, present: set[tuple[ComponentId, Incarnation]]
     ) -> None:
-        """An incarnation that a list lacks is not there, unless it started after the list was made: a token,
-        or a start that is not answered, prove more."""
+        """A missing incarnation is gone, unless a token or an unanswered start is newer than the list."""
         state, move, host = self.state, record.migration, listing.host
         if (
             move is not None
@@ -269,7 +263,7 @@ class Reconciler:
                 state.wake(record, state.now + GRACE)
 
     def host_lost(self, host: HostName) -> None:
-        """Its components have ended with it, or, if its node was only silent, are probed once it is back."""
+        """End its components; they are probed if the host returns, as its node may only have been silent."""
         state = self.state
         state.alive.discard(host)
         state.last_change.pop(host, None)
@@ -291,7 +285,7 @@ class Reconciler:
     # What was published before
 
     def inherited(self, status: Placement) -> None:
-        """It stands until a host reports otherwise, or none does within GRACE."""
+        """Valid until a host contradicts it, or none confirms it within GRACE."""
         state = self.state
         if not state.note_incarnation(status.component, status.incarnation):
             return

@@ -1,4 +1,4 @@
-"""What is repeated to a host until it answers: stops of surplus incarnations, and probes."""
+"""Commands repeated until a host answers: stops of surplus incarnations, and probes."""
 
 from __future__ import annotations
 
@@ -13,24 +13,23 @@ from zscout.types import SECOND, ComponentId, HostName, Ns
 MAX_SURPLUS: Final = 100
 """Of one component."""
 PROBES_AT_ONCE: Final = 200
-"""To one host; the next follow when these are answered, or time is up."""
+"""To one host; the next follow after the answers or a timeout."""
 
 
 @dataclass(slots=True)
 class _Surplus:
     host: HostName
     start_until: Ns | None
-    """Until then its start may still be on the way, and a stop that came first has stopped nothing."""
+    """Until then its start may still be on the way, and an earlier stop had no effect."""
     token: bool = False
-    """It is alive: a report that it was stopped is older than its start."""
+    """Alive: a report of its stop is older than its start."""
     stop_confirmed: bool = False
     tries: int = 0
     due: Ns = 0
 
 
 class SurplusIncarnations:
-    """Incarnations that must not live, as another one counts or none. Each is stopped until its host reports
-    its end, or is lost."""
+    """Incarnations that must not live. Each is stopped until its host reports its end, or is lost."""
 
     def __init__(self, state: PlacementState) -> None:
         self._state = state
@@ -54,7 +53,7 @@ class SurplusIncarnations:
         *,
         token: bool = False,
     ) -> None:
-        """This incarnation must end. It has, if its host is gone."""
+        """End this incarnation; without its host it has ended."""
         known = self._of.setdefault(component, {})
         if host in self._state.alive and incarnation not in known and len(known) < MAX_SURPLUS:
             known[incarnation] = surplus = _Surplus(host, start_until, token)
@@ -62,7 +61,7 @@ class SurplusIncarnations:
         self._set_timer(component)
 
     def start_answered(self, component: ComponentId, incarnation: Incarnation, *, may_run: bool) -> bool:
-        """Whether it is surplus. It is stopped once more: the first stop may have come before its start."""
+        """Return True if it is surplus, and stop it again: the first stop may have come before its start."""
         surplus = self._get(component, incarnation)
         if surplus is not None and not may_run:
             self.ended(component, incarnation)
@@ -87,7 +86,6 @@ class SurplusIncarnations:
         self._set_timer(component)
 
     def token(self, component: ComponentId, incarnation: Incarnation, *, alive: bool) -> None:
-        """Its liveliness token appeared or vanished."""
         surplus = self._get(component, incarnation)
         if surplus is not None:
             surplus.token = alive
@@ -104,7 +102,7 @@ class SurplusIncarnations:
         self._set_timer(component)
 
     def host_lost(self, host: HostName) -> list[ComponentId]:
-        """The components of which surplus incarnations were lost with the host."""
+        """The components with surplus incarnations on the lost host."""
         found = []
         for component, known in list(self._of.items()):
             left = {incarnation: surplus for incarnation, surplus in known.items() if surplus.host != host}
@@ -136,8 +134,7 @@ class SurplusIncarnations:
 
 
 class Probes:
-    """Components of which a host is asked until it answers: those whose token nobody expected, and, after the
-    host was lost, all that it had."""
+    """Components to ask a host for until it answers: with unexpected tokens, or on it when it was lost."""
 
     def __init__(self, state: PlacementState) -> None:
         self._state = state
@@ -146,7 +143,7 @@ class Probes:
         self._count = 0
 
     def add(self, host: HostName, component: ComponentId) -> None:
-        """Asks at once if the host is there, else when it joins."""
+        """Ask at once if the host is alive, else when it joins."""
         if self._count >= MAX_COMPONENTS:
             # The oldest are of hosts that will not come back.
             self._drop(next(iter(self._open)))
@@ -163,7 +160,7 @@ class Probes:
         return component in self._open.get(host, {})
 
     def answered(self, host: HostName, component: ComponentId | None) -> list[ComponentId]:
-        """A host listed this component, or (None) all. Returns those that were asked for."""
+        """A host listed this component, or (None) all. Returns the probed ones."""
         probes = self._open.get(host, {})
         found = list(probes) if component is None else [component] if component in probes else []
         for name in found:

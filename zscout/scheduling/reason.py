@@ -1,4 +1,4 @@
-"""Why an ARC waits, or why a hold or a wait ended: data in effects and messages, text where people read it."""
+"""Reasons for a wait or an end: data in effects and messages, text for people."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from zscout.messages import Who
 from zscout.types import ArcId, ClientId, Need, Ns, RcName, clean
 
 ITS_CLIENT: Final = "its client"
-"""In the `detail` of an end: it was its own client's will."""
+"""`detail` of an end by its own client."""
 SHOWN = 3
-"""How many RCs a reason names; it counts the rest."""
+"""RCs that a reason names; the rest are counted."""
 SHOWN_CHOICES = 8
-"""The same where RCs are choices for a pattern."""
+"""The same for choices of a pattern."""
 
 
 class ReasonCode(StrEnum):
     # An ARC waits:
     ABSENT = "absent"
-    """`rcs` are not on the mesh, or can't carry anybody; `detail` says why, as far as that is known."""
+    """`rcs` are not on the mesh or can't carry holders; `detail`: the cause, if known."""
     NO_MATCH = "no_match"
-    """No RC is left for the patterns in `rcs`; `detail` says why RCs that would do are lost."""
+    """No RC is left for the patterns in `rcs`; `detail`: why matching RCs are lost."""
     HELD = "held"
-    """`rcs` are held by `by`, one each, who are not preempted for it; of a pattern all its choices are told. `detail`
-    is the group of one that was preferred by fair shares."""
+    """`rcs` are held by `by`, one each, not preempted for it; for a pattern, all choices. `detail`: the group
+    preferred by fair shares."""
     VETOED = "vetoed"
-    """The RC refuses it beside `by`, who hold it and are not preempted for it; `detail` in the RC's own words."""
+    """The RC refuses it beside its holders `by`, not preempted for it; `detail` in the RC's own words."""
     UNCONFIRMED = "unconfirmed"
-    """`rcs` did not confirm a grant: it is not granted again for a while."""
+    """`rcs` did not confirm a grant: no new grant for a while."""
     CLAIMED = "claimed"
     """The client `detail` has an ARC of the same place: one of the two may run."""
     SILENT = "silent"
@@ -38,67 +38,60 @@ class ReasonCode(StrEnum):
     RESERVED = "reserved"
     """The RC is reserved for `by`, which has waited too long."""
     BOOKED = "booked"
-    """The RC is booked by `by` before this would be over."""
+    """The RC is booked by `by` before this would end."""
     MAINTENANCE = "maintenance"
-    """The RC is in maintenance, `by` says whose and until when; or will be before this would be over. For that a kept
-    hold ends as well."""
+    """The RC is in maintenance by `by`, or will be before this would end. It also ends kept holds."""
     NOT_YET = "not_yet"
-    """It has taken up a booking, whose time is still to come."""
+    """The date of its booking is still to come."""
     QUOTA = "quota"
     """`detail`, its host, has its quota of ARCs running: `number`."""
     RC_QUOTA = "rc_quota"
     """With it `detail`, a name or a group, would hold more RCs than its quota: `number`."""
     VOTING = "voting"
-    """Votes on it, or on one that ranks before it, are out."""
+    """Votes on it or on a higher rank are out."""
     SEARCHING = "searching"
-    """A search for a better schedule is under way."""
     # A hold, or a wait, ended:
     EXPIRED = "expired"
     """Its minimum runtime is over."""
     LIMIT = "limit"
     """It had the longest time that the fleet gives a hold."""
     PREEMPTED = "preempted"
-    """By `by`."""
     DISPLACED = "displaced"
     """A kept hold past its minimum runtime, by `by`."""
     CANCELLED = "cancelled"
-    """By `detail`."""
     RELEASED = "released"
-    """By `detail`."""
+    """By `detail`, as CANCELLED."""
     CLIENT_LOST = "client_lost"
-    """`detail` says how."""
     HANDED_OVER = "handed_over"
     """To the client `detail`."""
     RC_LOST = "rc_lost"
-    """The RC left; `detail` says why, if that is known."""
+    """The RC left; `detail`: the cause, if known."""
     RC_ENDED = "rc_ended"
-    """The RC ended the hold."""
     SUPERSEDED = "superseded"
     """At a takeover the RC had a newer holder."""
 
 
 class Party(NamedTuple):
-    """An ARC that is in another's way, or was preferred to it; `str` of it says whose it is."""
+    """An ARC in another's way or preferred to it; `str` names its owner."""
 
     arc: ArcId
     name: str
     priority: int
     who: Who | None = None
     until: Ns | None = None
-    """When it holds no more, or may be preempted for the other, at the latest; None: not known."""
+    """When its hold ends or may be preempted, at the latest; None: unknown."""
 
     def __str__(self) -> str:
         return named(self.who, self.arc.rpartition("/")[0], self.name)
 
     @property
     def comment(self) -> str:
-        """What its user wants others to know, as it ends a sentence."""
+        """What its user wants others to know, as the end of a sentence."""
         return f": {clean(self.who.comment)}" if self.who is not None and self.who.comment else ""
 
 
 def named(who: Who | None, client: ClientId, arc: str) -> str:
-    """Whose ARC that is, for people: `alice@ws1 (survey.py)`; the client and the ARC's name, `ws1/c7 (survey)`, where
-    nobody says more."""
+    """The owner of an ARC, for people: `alice@ws1 (survey.py)`, else client and ARC, `ws1/c7 (survey)`."""
     if who is None or not (who.user or who.command):
         return f"{client} ({arc})" if client else arc
     host = who.host or client.partition("/")[0]
@@ -106,12 +99,12 @@ def named(who: Who | None, client: ClientId, arc: str) -> str:
 
 
 Until = Callable[[Ns], str]
-"""How the end of another's hold is told: `14:32`."""
+"""Formats the end of another's hold: `14:32`."""
 
 
 class Reason(NamedTuple):
-    """A reason; `str` of it is its text. `number` counts `rcs`, of which the first `SHOWN` (with `patterns`
-    `SHOWN_CHOICES`) are named, or is a quota."""
+    """A reason; `str` is its text. `number` is a quota, or counts `rcs`, of which `SHOWN` (`SHOWN_CHOICES` with
+    `patterns`) are named."""
 
     code: ReasonCode
     rcs: tuple[RcName, ...] = ()
@@ -119,16 +112,15 @@ class Reason(NamedTuple):
     detail: str = ""
     number: int = 0
     pattern: Need | None = None
-    """Which pattern of its needs keeps the ARC out; the rest is about one of the RCs that meet it, or with `patterns`
-    about all of them."""
+    """The unmet pattern; the rest is about one RC that matches it, or with `patterns` about all."""
     patterns: tuple[Need, ...] = ()
-    """By each of `rcs` the pattern that it is a choice for, empty where the ARC names it."""
+    """For each of `rcs` the pattern that it is a choice for, empty where named."""
 
     def __str__(self) -> str:
         return self.text()
 
     def text(self, until: Until | None = None) -> str:
-        """In words; with `until` also until when others hold what is waited for."""
+        """In words; with `until` including the ends of others' holds."""
         if self.code is ReasonCode.HELD:
             return _held(self, until)
         if self.code is ReasonCode.VETOED:
@@ -151,7 +143,6 @@ def ended(outcome: str, reason: str) -> str:
 
 
 def of_rcs(code: ReasonCode, rcs: Sequence[RcName], detail: str = "") -> Reason:
-    """A reason that concerns all of `rcs`."""
     return Reason(code, tuple(rcs[:SHOWN]), number=len(rcs), detail=detail)
 
 
@@ -171,7 +162,7 @@ def _vetoed(reason: Reason, until: Until | None) -> str:
 
 
 def short_names(rcs: Iterable[RcName]) -> Iterator[RcName]:
-    """RCs in a row: a kind is not said twice."""
+    """RCs in a row, without repeating a kind."""
     last = ""
     for rc in rcs:
         kind = rc.partition("/")[0] + "/"
@@ -180,7 +171,7 @@ def short_names(rcs: Iterable[RcName]) -> Iterator[RcName]:
 
 
 def _held(reason: Reason, until: Until | None) -> str:
-    """Who holds what is waited for: first those in the way of what the ARC names, then for each pattern its choices."""
+    """Holders in the way: of the named RCs, then of each pattern's choices."""
     patterns = reason.patterns or ("",) * len(reason.rcs)
     held = list(zip(reason.rcs, reason.by, patterns, strict=False))
     parts = []

@@ -1,9 +1,9 @@
-"""When all of these can be had together: times at which a booking would be kept.
+"""Free times of a set of RCs: when a booking would be kept.
 
-What is in the way: other bookings, maintenance too, whatever their priority; holds that would not be over, or not be
-preempted; and what starving ARCs of equal or higher priority are reserved. Whoever else is queued goes round a booking.
-Sharable RCs are asked about all who would be there at once. What is found is exact for the RCs that earlier bookings
-were given for their patterns; it does not try to give those others."""
+Obstacles: all other bookings and maintenance, whatever their priority; holds that neither end nor yield; and
+reservations of starving ARCs of equal or higher priority. Other queued ARCs avoid bookings. Sharable RCs are asked
+about all holders at that time. The result is exact for the present bindings of earlier bookings; it does not try to
+change them."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from zscout.scheduling.votes import HolderSet
 from zscout.types import ArcId, Need, Ns, RcName
 
 MAX_TRIED: Final = 4_000
-"""Times that one question looks at."""
+"""Times that one question checks."""
 
 
 class Slot(NamedTuple):
-    """From `start` to `latest` it may begin at any time; `bound` has the RC for each pattern."""
+    """It may begin at any time from `start` to `latest`; `bound` has the RC for each pattern."""
 
     start: Ns
     latest: Ns
@@ -36,21 +36,19 @@ class Slot(NamedTuple):
 @dataclass(slots=True)
 class SlotsFound:
     found: list[Slot] = field(default_factory=list)
-    """The earliest, first."""
     unknown: list[tuple[Rc, HolderSet]] = field(default_factory=list)
-    """Votes that have to be known before the next one can be told."""
+    """Votes needed before the next slot is known."""
     complete: bool = True
-    """False: there was more to look at than one question may."""
+    """False: the search was cut off at MAX_TRIED."""
 
 
 class _Taken(NamedTuple):
-    """An RC is not to be had in this time, or if it is sharable, has this holder."""
+    """A time at which an RC is taken, or, if sharable, has this holder."""
 
     start: Ns
     end: float
     arc: ArcId
     excludes: bool = False
-    """Whether even a sharable RC has no other holder then."""
 
 
 def slots(
@@ -64,9 +62,8 @@ def slots(
     presume: bool = False,
     likely: Mapping[ArcId, Ns] = MappingProxyType({}),
 ) -> SlotsFound:
-    """The first `limit` stretches of time in which `wanted` might start, from its own start to `until`; `arc` stands
-    for it. `bookings_only`: as if nobody held or waited for anything. `presume`: votes that are not known are presumed
-    to be a yes. `likely`: when holds are taken to be over, if that is earlier: what is found then is a guess."""
+    """The first `limit` times at which `wanted` might start, until `until`; `arc` represents it. `bookings_only`
+    ignores holds and queue; `presume` counts unknown votes as yes; `likely` has earlier ends of holds, for a guess."""
     search, result = _Search(state, wanted, arc, bookings_only, presume, likely), SlotsFound()
     latest: Ns = wanted.start - 1
     for tried, start in enumerate(search.starts(until)):
@@ -134,13 +131,13 @@ class _Search:
                     self._taken[bit].append(_Taken(promise.start, promise.arc.ends(promise.start), promise.arc.id))
 
     def starts(self, until: Ns) -> list[Ns]:
-        """Times at which something comes free."""
+        """Times at which something becomes free."""
         first = self._wanted.start
         ends = {int(span.end) for taken in self._taken.values() for span in taken if first < span.end <= until}
         return sorted({first, *ends})
 
     def fit(self, start: Ns) -> Mapping[Need, RcName] | list[tuple[Rc, HolderSet]] | None:
-        """How its patterns are met if it starts then; None: it can't; or the votes that decide."""
+        """The binding of its patterns if it starts then; None: impossible; or the votes that decide."""
         unknown: list[tuple[Rc, HolderSet]] = []
         for rc in self._named:
             free = self._is_free(rc, start)
@@ -164,7 +161,7 @@ class _Search:
         return None if chosen is None else {need: rc.name for need, rc in chosen.items()}
 
     def _is_free(self, rc: Rc, start: Ns) -> bool | HolderSet:
-        """Whether `rc` is to be had from then on for long enough; or the holders on which its vote is not known."""
+        """True if `rc` is free from `start` for long enough; or the holders of an unknown vote."""
         end = start + self._wanted.runtime
         taken = [span for span in self._taken[rc.bit] if span.start < end and span.end > start]
         if not rc.sharable or self._wanted.maintenance or any(span.excludes for span in taken):
@@ -174,7 +171,7 @@ class _Search:
         return there | {self._arc.id} if answer is None else answer.accept
 
     def latest(self, start: Ns, bound: Iterable[RcName]) -> Ns:
-        """Until when it may start as well, on the same RCs."""
+        """The last possible start on the same RCs."""
         rcs = (*self._named, *(self._state.rc(name) for name in bound))
         coming = (span.start for rc in rcs for span in self._taken[rc.bit] if span.start > start)
         return max(start, min(coming, default=start + (1 << 62)) - self._wanted.runtime)
