@@ -67,14 +67,12 @@ class Balancer:
     def __init__(self, rng: Random) -> None:
         self._rng = rng
         self.reports: dict[HostName, tuple[Ns, LoadReport]] = {}
-        self._outlooks: dict[HostName, Outlook] = {}
-        """From the reports alone."""
+        self._outlooks: dict[HostName, Outlook] = {}  # from the reports alone
         self.profiles: dict[Kind, Profile] = {}
         self.cordoned: set[HostName] = set()
         self.learner = MetricLearner()
         self._placed: dict[ComponentId, _Placed] = {}
-        self._there: dict[HostName, set[ComponentId]] = {}
-        """The same by host: a lost host takes many."""
+        self._there: dict[HostName, set[ComponentId]] = {}  # the same by host: a lost host takes many
         self._pending: dict[HostName, dict[ComponentId, _Placed]] = {}
         self._chosen: dict[HostName, int] = {}
         self._choices = 0
@@ -160,8 +158,6 @@ class Balancer:
         if not placement.learnt and use.served is not None and placement.scores:
             placement.learnt = True
             self.learner.seen.append((placement.scores, use.served * report.speed))
-
-    # Queries
 
     def profile(self, kind: Kind) -> Profile:
         return self.profiles.get(kind) or Profile()
@@ -266,8 +262,7 @@ class RankingCache:
     def __init__(self, balancer: Balancer) -> None:
         self._balancer = balancer
         self._now: Ns = 0
-        self._cached: dict[RankQuery, tuple[Ranking, set[HostName]]] = {}
-        """With the hosts changed since."""
+        self._cached: dict[RankQuery, tuple[Ranking, set[HostName]]] = {}  # with the hosts changed since
 
     def begin(self, now: Ns) -> None:
         self._now, self._cached = now, {}

@@ -21,9 +21,6 @@ class _OnHost:
     host: HostName
 
 
-# Events
-
-
 @dataclass(frozen=True, slots=True)
 class StartAnswered(_OnHost):
     """`ok` (runs or is on standby), `refused` (another host may accept), `failed` (ended, or was not ready), `unknown`
@@ -112,9 +109,6 @@ PlacerEvent: TypeAlias = (
     | HostLost
     | Inherited
 )
-
-
-# Effects
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,8 +33,6 @@ class Lifecycle:
     def __init__(self, state: PlacementState, surplus: SurplusIncarnations, probes: Probes) -> None:
         self.state, self.surplus, self.probes = state, surplus, probes
 
-    # Requests
-
     def place(self, component: ComponentId, spec: ComponentSpec) -> None:
         state = self.state
         record = state.get(component)
@@ -76,8 +74,6 @@ class Lifecycle:
             record.enter("stopping")
             record.reason = "asked to stop"
             self.end_incarnation(record)
-
-    # Choosing a host
 
     def place_again(self, record: ComponentRecord, cause: str = "") -> None:
         """Place it at the end of this instant."""
@@ -173,8 +169,6 @@ class Lifecycle:
         record.whereabouts_unknown = False
         self.state.retire(record)
 
-    # Starting and running
-
     def start_answered(self, record: ComponentRecord, answer: StartAnswered) -> None:
         """For the record's own incarnation, not a migration's target."""
         record.start_until = None
@@ -258,8 +252,6 @@ class Lifecycle:
         state.probe(record.component, host)
         state.wake(record, state.now + PROBE_TIMEOUT)
         return None
-
-    # Ends and restarts
 
     def ended(self, record: ComponentRecord, end: Termination) -> None:
         state, rules = self.state, self.state.rules
@@ -351,8 +343,6 @@ class Lifecycle:
             self._stopped(record)
         else:
             self._check_stopped(record)
-
-    # Time
 
     def timer(self, record: ComponentRecord) -> None:
         match record.state:

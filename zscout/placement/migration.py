@@ -31,8 +31,6 @@ class Migrations:
     def __init__(self, state: PlacementState, lifecycle: Lifecycle) -> None:
         self.state, self.lifecycle = state, lifecycle
 
-    # Beginning
-
     def request(self, component: ComponentId, to: HostName | None) -> None:
         state = self.state
         record = state.known(component)
@@ -73,8 +71,6 @@ class Migrations:
         record.reason, record.drain_reason = f"moving to {to}, {why}", ""
         state.component_arrives(_reservation(record), record.spec.kind, to)
         state.start(record, record.migration)
-
-    # The target
 
     def target_answered(self, record: ComponentRecord, move: Migration, answer: StartAnswered) -> None:
         if move.stage != "starting":
@@ -135,8 +131,6 @@ class Migrations:
         else:
             self._stay(record, move, f"host {move.to} is gone")
 
-    # The source
-
     def answered(self, record: ComponentRecord, move: Migration, answer: MoveAnswered) -> None:
         if move.stage == "starting":
             return
@@ -176,8 +170,6 @@ class Migrations:
         if move.stage == "probing":
             move.source = "running"
             self._judge(record, move)
-
-    # Which of them goes on
 
     def _probe(self, record: ComponentRecord, move: Migration) -> None:
         """Ask both hosts, or the remaining one."""
@@ -220,8 +212,6 @@ class Migrations:
             self._lose(record, move)
         else:
             self._stay(record, move, "nobody tells what came of it")
-
-    # Ends of a migration
 
     def _finish(self, record: ComponentRecord, move: Migration, dead: float | None = None) -> None:
         """Make the running target the record's incarnation."""

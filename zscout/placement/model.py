@@ -153,8 +153,6 @@ WORDS: Final[Mapping[Metric, Callable[[Outlook, Profile], str]]] = {
 }
 """Explanations for the listed hosts: slower than scores."""
 
-# What is learnt from how components run: the profiles of their kinds, and which metric to trust
-
 CHOICES: Final[tuple[Metric, ...]] = tuple(SCORES)
 REMEMBERED: Final = 200
 """The latest placements to learn from."""

@@ -33,8 +33,7 @@ _Move: TypeAlias = tuple[ComponentId, HostName]
 class Rebalancer:
     def __init__(self, state: PlacementState, migrations: Migrations) -> None:
         self.state, self.migrations = state, migrations
-        self._paying: dict[_Move, Ns] = {}
-        """Since when each move has paid."""
+        self._paying: dict[_Move, Ns] = {}  # since when each move has paid
 
     def timer(self) -> None:
         state = self.state

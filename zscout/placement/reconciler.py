@@ -21,8 +21,6 @@ class Reconciler:
         self.state, self.lifecycle, self.migrations = state, lifecycle, migrations
         self.surplus, self.probes = lifecycle.surplus, lifecycle.probes
 
-    # Tokens
-
     def appeared(self, token: TokenAppeared) -> None:
         state, component, incarnation, host = self.state, token.component, token.incarnation, token.host
         record = state.get(component)
@@ -116,8 +114,6 @@ class Reconciler:
         if record.host is not None:
             self.surplus.add(record.component, record.incarnation, record.host, record.start_until, token=record.token)
         self._is_at(record, incarnation, host, token=token)
-
-    # Hosts' lists
 
     def listed(self, listing: ComponentsListed) -> None:
         state, host, only = self.state, listing.host, listing.only
@@ -240,8 +236,6 @@ class Reconciler:
         elif record.state == "running":
             self.lifecycle.ended(record, end)
 
-    # Hosts
-
     def host_joined(self, host: HostName) -> None:
         state = self.state
         if host in state.alive:
@@ -281,8 +275,6 @@ class Reconciler:
                 self.migrations.target_host_lost(record, move)
             else:
                 self.migrations.source_ended(record, move, host_gone(host))
-
-    # What was published before
 
     def inherited(self, status: Placement) -> None:
         """Valid until a host contradicts it, or none confirms it within GRACE."""

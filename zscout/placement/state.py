@@ -239,14 +239,10 @@ class PlacementState:
         self.timers = Timers()
         self._lowest: Incarnation = counter * PER_TERM
         self._highest = max(LAST_TERMS * PER_TERM, self._lowest + FAR_AHEAD)
-        self._incarnations: dict[ComponentId, Incarnation] = {}
-        """The highest of each component."""
-        self._ended: dict[ComponentId, None] = {}
-        """Oldest first."""
+        self._incarnations: dict[ComponentId, Incarnation] = {}  # the highest of each component
+        self._ended: dict[ComponentId, None] = {}  # oldest first
         self._changed: dict[ComponentId, bool] = {}
         self._commands: list[HostCommand | PlacementRefused] = []
-
-    # One instant
 
     def begin(self, now: Ns) -> None:
         if now < self.now:
@@ -272,8 +268,6 @@ class PlacementState:
         return effects + [
             command for command in self._commands if isinstance(command, PlacementRefused) or command.host in self.alive
         ]
-
-    # Components
 
     def mark_changed(self, component: ComponentId, *, always: bool = False) -> None:
         """Publish its status if it differs, or `always`: a request waits for it."""
@@ -319,8 +313,6 @@ class PlacementState:
         self._lowest = max(self._lowest, self._incarnations.pop(component, 0))
         self.timers.set(TimerKind.LIFECYCLE, component, None)
 
-    # Incarnations
-
     def note_incarnation(self, component: ComponentId, incarnation: Incarnation) -> bool:
         """Keep the next incarnation higher. False: this one is impossible, and ignored."""
         if incarnation > self._highest:
@@ -336,8 +328,6 @@ class PlacementState:
         incarnation = max(self._incarnations.get(component, 0), self._lowest) + 1
         self.note_incarnation(component, incarnation)
         return incarnation
-
-    # Hosts
 
     def eligible_hosts(
         self, spec: ComponentSpec, *, other_than: HostName | None = None, only: HostName | None = None
@@ -403,8 +393,6 @@ class PlacementState:
                 self.departed.setdefault(host, deque(maxlen=100)).append((self.now, wants * shown))
         record.host, record.running_since, record.token, record.probed = None, None, False, False
 
-    # Timers
-
     def wake(self, record: ComponentRecord, at: Ns | None) -> None:
         self.timers.set(TimerKind.LIFECYCLE, record.component, at)
 
@@ -418,8 +406,6 @@ class PlacementState:
 
     def back_off_time(self, failures: int) -> Ns:
         return min(self.rules.back_off << min(failures, 20), self.rules.longest_back_off)
-
-    # Effects
 
     def start(self, record: ComponentRecord, move: Migration | None = None) -> None:
         """Command the start of the record's incarnation or of a move's standby, the first time or again."""

@@ -99,12 +99,10 @@ class Adaptive(Strategy):
         self._log_line = ""
         self._reserved: Reservations | None = None
         self._searches: dict[ArcId, _Search] = {}
-        self._work = 0
-        """Steps that this pass may still spend on branch and bound."""
+        self._work = 0  # steps that this pass may still spend on branch and bound
         self._steps = 0
         self._unfinished: list[_Search] = []
-        self._seen: tuple[int, ...] = ()
-        """The situation of the unfinished searches."""
+        self._seen: tuple[int, ...] = ()  # the situation of the unfinished searches
 
     def log_line(self) -> str:
         """Report where a search has beaten the heuristic, and at what cost."""

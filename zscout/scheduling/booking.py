@@ -66,9 +66,6 @@ class BookingState(StrEnum):
     UNBOOKED = "unbooked"
 
 
-# Events
-
-
 class Booked(Struct, frozen=True):
     """A booking made by this RCM or an earlier one. `tentative`: conflicts are unknown; its ARC waits until it is
     certain."""
@@ -92,9 +89,6 @@ class Redated(Struct, frozen=True):
     start: Ns
 
 
-# Effects
-
-
 class BookingChanged(Struct, frozen=True):
     """`arc` has the booking, or had it."""
 
@@ -108,9 +102,6 @@ class BookingThreatened(Struct, frozen=True):
 
     booking: str
     reason: Reason | None
-
-
-# The state after the last batch of events
 
 
 class BookingStatus(Struct, frozen=True):

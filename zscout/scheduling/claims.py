@@ -37,12 +37,9 @@ def request_for(booking: Booking) -> ArcRequest:
 class Claims:
     def __init__(self, state: SchedulerState, actions: Actions, emit: Callable[[Effect], None]) -> None:
         self._state, self._actions, self._emit = state, actions, emit
-        self._reserved: Reservations | None = None
-        """The reservations at the last search for dangers."""
-        self._endangered: dict[Claim, None] = {}
-        """Bookings last reported as endangered."""
-        self._wanting: dict[str, list[Arc]] = {}
-        """By booking: ARCs that want it while it is absent or taken."""
+        self._reserved: Reservations | None = None  # the reservations at the last search for dangers
+        self._endangered: dict[Claim, None] = {}  # bookings last reported as endangered
+        self._wanting: dict[str, list[Arc]] = {}  # by booking: ARCs that want it while it is absent or taken
         self.certain_from: Ns = 0
         """Dates before this are uncertain: no booking begins or expires for good."""
 

@@ -36,16 +36,11 @@ class _Search:
         self.state, self.votes, self.reserved = state, state.votes, reserved
         self.preemptible: dict[ArcId, Arc] = {}
         """Running ARCs that might have to end."""
-        self._heap: list[tuple[Rank, int, Arc, Rc | None]] = []
-        """Candidates, each by itself or as a watcher of an RC."""
-        self._called = 0
-        """Bits of the RCs whose watchers are in the heap."""
-        self._started: Counter[str] = Counter()
-        """By owner with a quota: ARCs that might start."""
-        self._taken: Counter[str] = Counter()
-        """By owner with a quota: RCs of these ARCs."""
-        self._shared_taken = 0
-        """Sharable RCs where one ARC already passed the starving ones; a second was not checked."""
+        self._heap: list[tuple[Rank, int, Arc, Rc | None]] = []  # candidates, each by itself or as a watcher of an RC
+        self._called = 0  # bits of the RCs whose watchers are in the heap
+        self._started: Counter[str] = Counter()  # by owner with a quota: ARCs that might start
+        self._taken: Counter[str] = Counter()  # by owner with a quota: RCs of these ARCs
+        self._shared_taken = 0  # sharable RCs where one ARC already passed the starving ones; a second was not checked
 
     def run(self, limit: int | None) -> list[Arc] | None:
         index = self.state.index
@@ -156,8 +151,7 @@ def split(arcs: Iterable[Arc]) -> list[list[Arc]]:
             number = root[number]
         return number
 
-    first: dict[int, int] = {}
-    """By bit: the first ARC that needs the RC."""
+    first: dict[int, int] = {}  # by bit: the first ARC that needs the RC
     for number, arc in enumerate(members):
         mask = arc.mask
         while mask:

@@ -56,8 +56,7 @@ class Core:
         self._arrivals = 0
         self._effects: list[model.Effect] = []
         self._claims = Claims(self._state, self, lambda effect: self._effects.append(effect))
-        self._over: set[Grant] = set()
-        """Grants of earlier terms that ended in this term."""
+        self._over: set[Grant] = set()  # grants of earlier terms that ended in this term
         self._wake: Ns | None = None
         self._run_again = False
 
@@ -114,8 +113,6 @@ class Core:
     def policy(self, policy: SchedulingPolicy) -> None:
         """Running holds continue; the next pass uses the new policy."""
         self._state.take_policy(policy)
-
-    # The present state
 
     def status(self, limit: int | None = None) -> Status:
         """The fleet as of the last batch, with the best-ranked `limit` of the queue (None: all)."""
@@ -282,8 +279,6 @@ class Core:
             reason,
             arc.reason,
         )
-
-    # Events
 
     def _apply(self, event: model.Event) -> None:
         match event:
@@ -519,8 +514,6 @@ class Core:
                 party = claim.booking.party._replace(until=claim.booking.end)
                 self._end_hold(arc, Outcome.COMPLETED, Reason(ReasonCode.MAINTENANCE, (rc.name,), (party,)))
 
-    # What a strategy may do (state.Actions)
-
     def start(self, arc: Arc) -> None:
         grant = Grant(self.term, self.number())
         now, state = self._state.now, self._state
@@ -552,8 +545,6 @@ class Core:
 
     def run_again(self) -> None:
         self._run_again = True
-
-    # Holds
 
     def _end_hold(self, arc: Arc, outcome: Outcome, reason: Reason, *, requeue: bool = True) -> None:
         """End a hold. An ARC past its minimum runtime is not queued again."""

@@ -63,16 +63,12 @@ class Shares:
     def __init__(self, state: FleetState, policy: FairShares) -> None:
         self._state, self._policy = state, policy
         self._accounts: dict[str, GroupAccount] = {}
-        self._queued: dict[str, GroupAccount] = {}
-        """Accounts of groups that wait."""
+        self._queued: dict[str, GroupAccount] = {}  # accounts of groups that wait
         self._waiting: dict[int, Counter[tuple[str, int]]] = {}
         """By bit of an RC: how many queued ARCs of each group and priority name it."""
-        self._patterns: dict[Need, Counter[tuple[str, int]]] = {}
-        """The same by pattern."""
-        self._charged: dict[ArcId, int] = {}
-        """By hold that is not an operator's: bits of its charged RCs."""
-        self._next: Ns = 0
-        """When the groups are next ordered."""
+        self._patterns: dict[Need, Counter[tuple[str, int]]] = {}  # the same by pattern
+        self._charged: dict[ArcId, int] = {}  # by hold that is not an operator's: bits of its charged RCs
+        self._next: Ns = 0  # when the groups are next ordered
         self._swept: Ns = 0
 
     def group(self, arc: Arc) -> str:
@@ -111,8 +107,6 @@ class Shares:
         for group, had in charged.items():
             self._settle(self._account(group), self._state.now).charged += had
 
-    # What the state tells
-
     def count_waiting(self, arc: Arc, by: int) -> None:
         """Count a queued ARC in (1) or out (-1)."""
         group = self.group(arc)
@@ -145,8 +139,6 @@ class Shares:
     def end(self, arc: Arc) -> None:
         if bits := self._charged.pop(arc.id, 0):
             self._settle(self._account(self.group(arc)), self._state.now).rate -= bits.bit_count()
-
-    # The order
 
     def order(self) -> bool:
         """Order the waiting groups, once a quantum at most. True: a position has changed."""
@@ -182,8 +174,6 @@ class Shares:
             if had >= FORGOTTEN and number >= spare:
                 break
             del self._accounts[group]
-
-    # Accounts
 
     def _account(self, group: str) -> GroupAccount:
         account = self._accounts.get(group)

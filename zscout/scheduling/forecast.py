@@ -71,14 +71,12 @@ def forecast(
     joined, lead = core.as_events(Term(core.term.counter + 1, "forecast"))
     result = Forecast()
     ends = {held.request.arc: held.end for held in lead.recovered_holds}
-    releases: dict[ArcId, Ns] = {}
-    """Likely times of release."""
+    releases: dict[ArcId, Ns] = {}  # likely times of release
     booked = {booking.id: (booking, arc is None) for booking, arc in core.bookings()}
     dates = sorted(
         (at, name) for name, (booking, is_open) in booked.items() for at in _dates(booking, now, is_open=is_open)
     )
-    unserved = {queued.request.arc for queued in lead.waiting}
-    """Queued ARCs that have not started within the forecast."""
+    unserved = {queued.request.arc for queued in lead.waiting}  # queued ARCs that have not started within the forecast
 
     def expect(request: ArcRequest, hold: Hold) -> None:
         end = None if runtimes is None else runtimes.end(request, hold, now)

@@ -61,8 +61,7 @@ class LocalSearch:
         self._chosen = chosen
         self._value = self.problem.value(chosen)
         self._used = 0
-        self._pool: list[int] = []
-        """RCs that might be put to better use."""
+        self._pool: list[int] = []  # RCs that might be put to better use
         self._at = [-1] * len(self._cover)
         for number in numbers(chosen):
             if number in self._needs:

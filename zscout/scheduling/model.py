@@ -275,9 +275,6 @@ def union(masks: Iterable[int]) -> int:
     return functools.reduce(operator.or_, masks, 0)
 
 
-# Events: each carries everything the core may know about it
-
-
 class Requested(Struct, frozen=True):
     """`place` is set for an ARC of an earlier RCM, and `since`, if known, is when it was last queued."""
 
@@ -436,9 +433,6 @@ Event: TypeAlias = (
 )
 
 
-# Effects
-
-
 class Outcome(StrEnum):
     COMPLETED = "completed"
     """It had its minimum runtime."""
@@ -513,9 +507,6 @@ class WakeAt(Struct, frozen=True):
 
 
 Effect: TypeAlias = Propose | Granted | HoldEnded | Queued | Dropped | BookingChanged | BookingThreatened | WakeAt
-
-
-# The state after the last batch of events
 
 
 class ArcStatus(Struct, frozen=True):

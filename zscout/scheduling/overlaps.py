@@ -27,8 +27,7 @@ def overlaps(state: SchedulerState, order: Iterable[str], starts: Mapping[str, N
     """Check claims in `order`. `starts`: dates by the fleet's current clock, which holds do not follow. Absent RCs
     are not judged: whether they are sharable is unknown."""
     result = Overlaps()
-    standing: dict[tuple[int, int], list[Claim]] = {}
-    """By bit and day, to avoid comparing thousands of dates of one RC."""
+    standing: dict[tuple[int, int], list[Claim]] = {}  # by bit and day, to avoid comparing thousands of dates of one RC
     for name in order:
         if (claim := state.claims.get(name)) is None:
             continue

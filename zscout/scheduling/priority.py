@@ -271,10 +271,8 @@ class Pass:
         """Bits of the RCs changed since the last pass began."""
         self._heap: list[tuple[Rank, int, Arc, Rc | None]] = []
         """The next ARCs to check, beside the ready ones; each RC has one watcher here."""
-        self._walked: set[int] = set()
-        """Bits of the RCs with a watcher in the heap."""
-        self._changed_here = 0
-        """Bits of the RCs changed by this pass."""
+        self._walked: set[int] = set()  # bits of the RCs with a watcher in the heap
+        self._changed_here = 0  # bits of the RCs changed by this pass
 
     def run(self, ready_arcs: Iterable[Arc], off_limits: int = 0) -> None:
         ready = sorted(ready_arcs, key=attrgetter("rank"))

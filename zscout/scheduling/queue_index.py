@@ -35,8 +35,7 @@ class QueueIndex:
         """Bits of the RCs with new holders that are not reported to watchers yet."""
         self.ranks: list[Rank] = []
         """Of all queued ARCs, best first."""
-        self._not_starving: list[tuple[Ns, ArcId]] = []
-        """Other queued ARCs, by the time since when they wait."""
+        self._not_starving: list[tuple[Ns, ArcId]] = []  # other queued ARCs, by the time since when they wait
         self.starving: list[tuple[int, Ns, ArcId]] = []
         """By band of priorities (negated), then waiting time."""
         self.starving_version = 0

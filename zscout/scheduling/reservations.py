@@ -106,8 +106,7 @@ class Reservations:
         self._booked: dict[int, list[Reservation]] = last._booked if last is not None and known else self._all_booked()
         self.by_rc: dict[int, list[Reservation]] = dict(self._booked)
         """By bit of the RC, in their order."""
-        self._free: dict[int, Ns] = {}
-        """By bit: the end of earlier reservations."""
+        self._free: dict[int, Ns] = {}  # by bit: the end of earlier reservations
         self.starts: list[Ns] = []
         """Reserved times of starving ARCs."""
         for priority, since, arc in state.index.starving[:MAX_STARVING]:

@@ -49,8 +49,7 @@ class SchedulerState:
         self._claim_ends: list[tuple[Ns, str]] = []
         """A heap of lapses and ends of bookings and starts of maintenance. Outdated entries are skipped."""
         self._by_date: list[Claim] = []
-        self._claims_at: dict[int, list[Claim]] = {}
-        """By bit of the RC: its bookings by date."""
+        self._claims_at: dict[int, list[Claim]] = {}  # by bit of the RC: its bookings by date
         self._at_place: dict[Place, Arc] = {}
         """By place: the ARC considered or running. Two clients may claim one ARC, which has to run once."""
         self.present = 0
