@@ -133,7 +133,6 @@ class Balancer:
             self._pending.pop(host, None)
 
     def _room(self, now: Ns) -> bool:
-        """Make room for a host by dropping silent ones."""
         if len(self.reports) >= MAX_HOSTS:
             for host in [host for host, (at, _) in self.reports.items() if now - at > STALE]:
                 self.lost(host)
@@ -216,7 +215,6 @@ class Balancer:
         return min(first, other)
 
     def _fit(self, now: Ns, query: RankQuery) -> tuple[dict[HostName, Outlook], dict[HostName, str]]:
-        """Eligible hosts, and why the others are not."""
         pending = query.policy in COUNTING
         doubtful: Iterable[HostName]
         if query.hosts is not None or self.cordoned or query.labels or query.memory:

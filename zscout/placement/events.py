@@ -77,8 +77,6 @@ class ComponentsListed:
 
 @dataclass(frozen=True, slots=True)
 class HostJoined:
-    """A host's node has its token."""
-
     host: HostName
 
 
@@ -95,20 +93,9 @@ class Inherited:
     cordoned: frozenset[HostName] = frozenset()
 
 
-PlacerEvent: TypeAlias = (
-    messages.PlacementOperation
-    | messages.DrainHost
-    | messages.UncordonHost
-    | StartAnswered
-    | StopAnswered
-    | MoveAnswered
-    | TokenAppeared
-    | TokenVanished
-    | ComponentsListed
-    | HostJoined
-    | HostLost
-    | Inherited
-)
+_Request: TypeAlias = messages.PlacementOperation | messages.DrainHost | messages.UncordonHost
+_Answer: TypeAlias = StartAnswered | StopAnswered | MoveAnswered | ComponentsListed
+PlacerEvent: TypeAlias = _Request | _Answer | TokenAppeared | TokenVanished | HostJoined | HostLost | Inherited
 
 
 @dataclass(frozen=True, slots=True)

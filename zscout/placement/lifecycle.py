@@ -76,7 +76,6 @@ class Lifecycle:
             self.end_incarnation(record)
 
     def place_again(self, record: ComponentRecord, cause: str = "") -> None:
-        """Place it at the end of this instant."""
         record.enter("waiting")
         record.restart_cause, record.whereabouts_unknown = cause, False
         self.state.wake(record, None)
@@ -225,7 +224,6 @@ class Lifecycle:
         self.state.drain_soon(record.host)
 
     def watch(self, record: ComponentRecord) -> None:
-        """Schedule the next check of a running component."""
         state, at = self.state, None
         if not (record.token and record.confirmed):
             at = state.now + PROBE_TIMEOUT
@@ -297,7 +295,6 @@ class Lifecycle:
                 record.restart_cause = cause
 
     def _exhausted(self, record: ComponentRecord, cause: str) -> bool:
-        """Give it up if that was its last try."""
         if record.spec.restart == "never":
             self._finish(record, "given_up", cause)
         elif record.restarts >= self.state.rules.restarts:

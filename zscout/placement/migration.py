@@ -24,7 +24,6 @@ MAX_PATIENT_PROBES: Final = 15
 RETRY: Final[Ns] = 5 * SECOND
 """Pause after a failed move off a drained host."""
 MOVES_PER_HOST: Final = 2
-"""Off a drained host at the same time."""
 
 
 class Migrations:
@@ -172,7 +171,6 @@ class Migrations:
             self._judge(record, move)
 
     def _probe(self, record: ComponentRecord, move: Migration) -> None:
-        """Ask both hosts, or the remaining one."""
         state = self.state
         if move.stage != "probing":
             move.stage, move.tries = "probing", 0
@@ -214,7 +212,6 @@ class Migrations:
             self._stay(record, move, "nobody tells what came of it")
 
     def _finish(self, record: ComponentRecord, move: Migration, dead: float | None = None) -> None:
-        """Make the running target the record's incarnation."""
         state, old, source, token = self.state, record.incarnation, record.host, record.token
         self._close(record, move)
         state.component_left(record)

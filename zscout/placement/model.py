@@ -28,7 +28,6 @@ THRASHING: Final = 0.05
 """Share of its speed that a component keeps when memory is far too small."""
 MEGABYTE: Final = 1_000_000
 LEAST: Final = 0.01
-"""Cores that any component wants."""
 
 
 class Profile(NamedTuple):
@@ -155,9 +154,7 @@ WORDS: Final[Mapping[Metric, Callable[[Outlook, Profile], str]]] = {
 
 CHOICES: Final[tuple[Metric, ...]] = tuple(SCORES)
 REMEMBERED: Final = 200
-"""The latest placements to learn from."""
 ENOUGH: Final = 12
-"""Placements before any metric is trusted."""
 EXPLORE: Final = 0.1
 DEFAULT: Final[Metric] = "composite"
 AHEAD: Final = 0.02

@@ -22,7 +22,6 @@ from zscout.types import SECOND, ComponentId, HostName, Ns
 
 EVERY: Final[Ns] = SECOND
 TARGETS: Final = 8
-"""The best hosts considered for each kind."""
 FORGOTTEN: Final[Ns] = 8 * LOAD_TIME
 """After this a thousandth of a departed load is still in a host's load average."""
 
@@ -81,14 +80,8 @@ class Rebalancer:
     def _may_leave(self, record: ComponentRecord, host: HostName) -> bool:
         # One that came lately: its host is not at rest then.
         state = self.state
-        return (
-            record.movable
-            and record.wanted
-            and record.token
-            and record.not_before <= state.now
-            and host not in state.balancer.cordoned
-            and self._at_rest(host)
-        )
+        free = record.movable and record.wanted and record.token and record.not_before <= state.now
+        return free and host not in state.balancer.cordoned and self._at_rest(host)
 
     def _at_rest(self, host: HostName) -> bool:
         state = self.state

@@ -83,7 +83,6 @@ class Reconciler:
         record.confirmed = not token
 
     def _is_at(self, record: ComponentRecord, incarnation: Incarnation, host: HostName, *, token: bool) -> None:
-        """Make this the incarnation that counts, running there."""
         self.migrations.cancel(record)
         self.state.component_left(record)
         record.incarnation, record.host, record.token, record.confirmed = incarnation, host, token, False
@@ -133,7 +132,6 @@ class Reconciler:
                 state.wake(waiting, state.now)
 
     def _on(self, host: HostName) -> list[ComponentRecord]:
-        """Components on a host, or moving there."""
         return [
             record
             for record in self.state.components.values()
@@ -160,7 +158,6 @@ class Reconciler:
             self._other_runs(record, incarnation, host, token=False)
 
     def _adopt(self, host: HostName, listed: ComponentView) -> None:
-        """Take over a component that an earlier placer started."""
         record = ComponentRecord(listed.component, listed.spec, "starting", listed.incarnation, host=host)
         if listed.phase in ("ended", "standby") or host not in self.state.alive or not self.state.add(record):
             return

@@ -19,10 +19,8 @@ PROBES_AT_ONCE: Final = 200
 @dataclass(slots=True)
 class _Surplus:
     host: HostName
-    start_until: Ns | None
-    """Until then its start may still be on the way, and an earlier stop had no effect."""
-    token: bool = False
-    """Alive: a report of its stop is older than its start."""
+    start_until: Ns | None  # until then its start may still be on the way, and an earlier stop had no effect
+    token: bool = False  # alive: a report of its stop is older than its start
     stop_confirmed: bool = False
     tries: int = 0
     due: Ns = 0
@@ -102,7 +100,6 @@ class SurplusIncarnations:
         self._set_timer(component)
 
     def host_lost(self, host: HostName) -> list[ComponentId]:
-        """The components with surplus incarnations on the lost host."""
         found = []
         for component, known in list(self._of.items()):
             left = {incarnation: surplus for incarnation, surplus in known.items() if surplus.host != host}
@@ -143,7 +140,6 @@ class Probes:
         self._count = 0
 
     def add(self, host: HostName, component: ComponentId) -> None:
-        """Ask at once if the host is alive, else when it joins."""
         if self._count >= MAX_COMPONENTS:
             # The oldest are of hosts that will not come back.
             self._drop(next(iter(self._open)))

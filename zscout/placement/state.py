@@ -34,7 +34,6 @@ MAX_ENDED: Final = 1_000
 """Each is kept for RETENTION."""
 RETENTION: Final[Ns] = 3_600 * SECOND
 MAX_ENDED_INCARNATIONS: Final = 16
-"""Of one component."""
 HOSTS_NAMED: Final = 3
 
 TRANSITIONS: Final[Mapping[ComponentState, frozenset[ComponentState]]] = {
@@ -53,7 +52,6 @@ GONE: Final = "its node is not there"
 NOT_NAMED: Final = "it is not among the hosts that the component asks for"
 
 SideState: TypeAlias = Literal["unknown", "running", "standby", "ended"]
-"""The source or target of a migration."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,10 +83,8 @@ class Migration:
     tries: int = 0
     source: SideState = "running"
     target: SideState = "unknown"
-    token: bool = False
-    """The target has its token: it has taken over."""
-    termination: Termination | None = None
-    """Of the source, if it ended while the outcome was unknown."""
+    token: bool = False  # the target has its token: it has taken over
+    termination: Termination | None = None  # of the source, if it ended while the outcome was unknown
 
 
 @dataclass(slots=True)
@@ -97,53 +93,38 @@ class ComponentRecord:
 
     component: ComponentId
     spec: ComponentSpec
-    state: ComponentState = "waiting"
-    """Changed by `enter` alone."""
+    state: ComponentState = "waiting"  # changed by `enter` alone
     incarnation: Incarnation = 0
     asked_at: Ns = 0
-    asked_as: Incarnation = 0
-    """Its incarnation then: while unchanged, it was never started."""
-    superseded: bool = False
-    """The incarnation is of an earlier component of this name, and must not live."""
+    asked_as: Incarnation = 0  # its incarnation then: while unchanged, it was never started
+    superseded: bool = False  # the incarnation is of an earlier component of this name, and must not live
     host: HostName | None = None
     wanted: bool = True
     reason: str = ""
-    host_reason: str = ""
-    """The reason while it runs."""
-    drain_reason: str = ""
-    """Why it is still on a drained host; shown in place of `reason`."""
+    host_reason: str = ""  # the reason while it runs
+    drain_reason: str = ""  # why it is still on a drained host; shown in place of `reason`
     restart_cause: str = ""
     tail: str = ""
     movable: bool = False
     restarts: int = 0
-    failed_rounds: int = 0
-    """Rounds in which all hosts failed."""
+    failed_rounds: int = 0  # rounds in which all hosts failed
     moves: int = 0
-    dead: float | None = None
-    """Dead time of its last move, in seconds."""
+    dead: float | None = None  # dead time of its last move, in seconds
     running_since: Ns | None = None
-    start_until: Ns | None = None
-    """While a start is unanswered; then it counts as lost."""
-    unanswered: int = 0
-    """Unanswered attempts in a row of the present command or probe."""
+    start_until: Ns | None = None  # while a start is unanswered; then it counts as lost
+    unanswered: int = 0  # unanswered attempts in a row of the present command or probe
     token: bool = False
-    confirmed: bool = False
-    """Its host reported that it runs, and whether it is movable."""
+    confirmed: bool = False  # its host reported that it runs, and whether it is movable
     probed: bool = False
-    no_host: tuple[str, str] | None = None
-    """Causes without their figures, and the reason given for them."""
+    no_host: tuple[str, str] | None = None  # causes without their figures, and the reason given for them
     tried: dict[HostName, str] = field(default_factory=dict)
     """Hosts that did not start it in this round, with the reason if another try there would not help."""
-    whereabouts_unknown: bool = False
-    """It reported a move, and no host has reported it yet."""
-    migration: Migration | None = None
-    """Present exactly while `moving`."""
-    not_before: Ns = 0
-    """Until then it is neither moved off a drained host nor, if inherited, placed."""
+    whereabouts_unknown: bool = False  # it reported a move, and no host has reported it yet
+    migration: Migration | None = None  # present exactly while `moving`
+    not_before: Ns = 0  # until then it is neither moved off a drained host nor, if inherited, placed
     ended_incarnations: deque[Incarnation] = field(default_factory=lambda: deque(maxlen=MAX_ENDED_INCARNATIONS))
 
     def enter(self, state: ComponentState) -> None:
-        """Raises ValueError for a transition outside the table."""
         if state not in TRANSITIONS[self.state] and state != self.state:
             raise ValueError(f"{self.component}: from {self.state} to {state}")
         self.state = state
@@ -202,7 +183,6 @@ class Timers:
                 heapq.heapify(self._heap)
 
     def pop_due(self, now: Ns) -> list[TimerKey]:
-        """Remove and return the due keys, soonest first."""
         found = []
         while self._heap and self._heap[0][0] <= now:
             at, key = heapq.heappop(self._heap)
@@ -226,14 +206,11 @@ class PlacementState:
         self.now: Ns = 0
         self.components: dict[ComponentId, ComponentRecord] = {}
         self.published: dict[ComponentId, Placement] = {}
-        self.to_place: dict[ComponentId, None] = {}
-        """Placed at the end of this instant."""
-        self.alive: set[HostName] = set()
-        """Hosts whose node has its token."""
+        self.to_place: dict[ComponentId, None] = {}  # placed at the end of this instant
+        self.alive: set[HostName] = set()  # hosts whose node has its token
         self.kinds: dict[HostName, tuple[Ns, frozenset[Kind]]] = {}
         """Kinds that hosts can start, and when they listed them; kept for lost hosts, which may return."""
-        self.last_change: dict[HostName, Ns] = {}
-        """When the placer last added or removed a component."""
+        self.last_change: dict[HostName, Ns] = {}  # when the placer last added or removed a component
         self.departed: dict[HostName, deque[tuple[Ns, float]]] = {}
         """Departures from a host: when, and the cores that the load average showed then."""
         self.timers = Timers()
@@ -274,7 +251,6 @@ class PlacementState:
         self._changed[component] = always or self._changed.get(component, False)
 
     def get(self, component: ComponentId) -> ComponentRecord | None:
-        """A record to change."""
         record = self.components.get(component)
         if record is not None:
             self.mark_changed(component)
@@ -409,15 +385,11 @@ class PlacementState:
 
     def start(self, record: ComponentRecord, move: Migration | None = None) -> None:
         """Command the start of the record's incarnation or of a move's standby, the first time or again."""
-        starting, host, timer = (
-            (record, record.host, self.wake) if move is None else (move, move.to, self.wake_migration)
-        )
+        side, host, timer = (record, record.host, self.wake) if move is None else (move, move.to, self.wake_migration)
         if host is not None and host in self.alive:
-            starting.start_until = self.now + self.rules.start_timeout + START_SLACK
-            timer(record, starting.start_until)
-            start = messages.StartComponent(
-                record.component, starting.incarnation, record.spec, standby=move is not None
-            )
+            side.start_until = self.now + self.rules.start_timeout + START_SLACK
+            timer(record, side.start_until)
+            start = messages.StartComponent(record.component, side.incarnation, record.spec, standby=move is not None)
             self._commands.append(HostCommand(host, start))
 
     def hand_over(self, record: ComponentRecord, move: Migration) -> None:

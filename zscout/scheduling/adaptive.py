@@ -66,15 +66,12 @@ class _Search:
     heuristic: int
     best: int
     begun: bool = False
-    inexact: bool = False
-    """Not proven optimal: the heuristic's set must pass the votes before it serves as baseline."""
-    local: LocalSearch | None = None
-    """None before the search begins, and after it has ended."""
+    inexact: bool = False  # not proven optimal: the heuristic's set must pass the votes before it serves as baseline
+    local: LocalSearch | None = None  # none before the search begins, and after it has ended
     steps: int = 0
     slices: int = 0
     rounds: int = 0
-    asked: list[tuple[Rc, HolderSet]] | None = None
-    """The last round of proposals."""
+    asked: list[tuple[Rc, HolderSet]] | None = None  # the last round of proposals
 
     @property
     def exhausted(self) -> bool:
@@ -192,7 +189,6 @@ class Adaptive(Strategy):
         return "open"
 
     def _search(self, group: ConflictGroup, earlier: list[_Search]) -> _Search | None:
-        """The search in this group as far as it has come; None where nothing can be gained."""
         if len(earlier) == 1 and earlier[0].fits(group):
             return earlier[0]
         problem = group.problem()
@@ -258,12 +254,10 @@ def _one_without_choice(state: SchedulerState) -> bool:
 
 
 def _situation(state: SchedulerState) -> tuple[int, ...]:
-    """Changes when an ARC comes, goes, starts or ends, or an RC comes or goes."""
     return (state.entries, len(state.queued), len(state.running), state.present, state.sharable)
 
 
 def _warm_start(earlier: list[_Search], arcs: list[ArcId]) -> int:
-    """The choices of earlier searches, as far as they still exist."""
     wanted = {search.arcs[number] for search in earlier for number in numbers(search.best)}
     return sum(1 << number for number, arc in enumerate(arcs) if arc in wanted)
 

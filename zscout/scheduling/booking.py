@@ -21,7 +21,6 @@ class Booking(Struct, frozen=True):
     Raises ValueError as `needs.check_request` does, and for maintenance of patterns."""
 
     id: str
-    """Unlike any ARC's."""
     needs: Mapping[Need, Params]
     priority: int
     start: Ns
@@ -30,7 +29,6 @@ class Booking(Struct, frozen=True):
     since: Ns
     """When it was made: among equals the older booking wins."""
     bound: Mapping[Need, RcName] = {}
-    """The RC kept for each pattern of its needs."""
     owner: str = ""
     """The host or person whose quotas count."""
     label: str = ""
@@ -49,7 +47,6 @@ class Booking(Struct, frozen=True):
 
     @property
     def lapses(self) -> Ns:
-        """The end of a booking that is not taken up."""
         return self.end if self.maintenance else min(self.start + self.patience, self.end)
 
     @property
@@ -90,16 +87,12 @@ class Redated(Struct, frozen=True):
 
 
 class BookingChanged(Struct, frozen=True):
-    """`arc` has the booking, or had it."""
-
     booking: str
     state: BookingState
     arc: ArcId | None = None
 
 
 class BookingThreatened(Struct, frozen=True):
-    """The danger to a booking's start; None: no longer in danger."""
-
     booking: str
     reason: Reason | None
 

@@ -21,7 +21,6 @@ from zscout.types import NO_TERM, Ns, Place
 
 
 def request_for(booking: Booking) -> ArcRequest:
-    """The request by which its owner takes it up."""
     return ArcRequest(
         booking.id,
         f"{booking.owner}/",
@@ -40,8 +39,7 @@ class Claims:
         self._reserved: Reservations | None = None  # the reservations at the last search for dangers
         self._endangered: dict[Claim, None] = {}  # bookings last reported as endangered
         self._wanting: dict[str, list[Arc]] = {}  # by booking: ARCs that want it while it is absent or taken
-        self.certain_from: Ns = 0
-        """Dates before this are uncertain: no booking begins or expires for good."""
+        self.certain_from: Ns = 0  # dates before this are uncertain: no booking begins or expires for good
 
     def stand_in(self, booking: Booking) -> Arc:
         """An ARC that represents a booking until it is taken up."""
@@ -121,7 +119,6 @@ class Claims:
         self._wait_until(arc, date)
 
     def _go_on(self, arc: Arc) -> None:
-        """Stop waiting for a date."""
         if arc.held_back is not None and not arc.held_back[1]:
             self._state.consider_again(arc)
 
@@ -229,12 +226,10 @@ class Claims:
 
     @property
     def next_start(self) -> Ns | None:
-        """The next reserved start of a starving ARC."""
         starts = self._reserved.starts if self._reserved is not None else ()
         return min((start for start in starts if start > self._state.now), default=None)
 
     def _relieving(self, claim: Claim) -> int:
-        """Bits of the RCs whose change may end the danger."""
         patterns = claim.arc.patterns
         return claim.kept | union(rc.bit for need in patterns for rc in self._state.matching(need))
 

@@ -34,8 +34,7 @@ def undecided_arcs(
 class _Search:
     def __init__(self, state: SchedulerState, reserved: Reservations | None) -> None:
         self.state, self.votes, self.reserved = state, state.votes, reserved
-        self.preemptible: dict[ArcId, Arc] = {}
-        """Running ARCs that might have to end."""
+        self.preemptible: dict[ArcId, Arc] = {}  # running ARCs that might have to end
         self._heap: list[tuple[Rank, int, Arc, Rc | None]] = []  # candidates, each by itself or as a watcher of an RC
         self._called = 0  # bits of the RCs whose watchers are in the heap
         self._started: Counter[str] = Counter()  # by owner with a quota: ARCs that might start
@@ -194,8 +193,6 @@ def _one_group(arcs: Sequence[Arc]) -> bool:
 
 
 class ConflictGroup:
-    """ARCs decided together, and the votes on them."""
-
     def __init__(self, state: SchedulerState, arcs: list[Arc], reserved: Reservations | None = None) -> None:
         self.state, self.votes = state, state.votes
         now = state.now
@@ -203,8 +200,7 @@ class ConflictGroup:
         last = max((arc.position for arc in arcs if arc.hold is None), default=0)
         keyed = sorted((_level_key(arc, first, last, now), arc.rank, arc) for arc in arcs)
         self.arcs = [arc for _, _, arc in keyed]
-        self.mask = union(arc.mask for arc in arcs)
-        """All RCs that they need or hold."""
+        self.mask = union(arc.mask for arc in arcs)  # all RCs that they need or hold
         keys = [key for key, _, _ in keyed]
         levels = {key: level for level, key in enumerate(dict.fromkeys(keys))}
         exclusive = ~state.sharable
@@ -221,8 +217,7 @@ class ConflictGroup:
         self._number = {arc.id: number for number, arc in enumerate(self.arcs)}
         self.sharables = list(state.rcs_in(self.mask & state.sharable))
         vetoes = {rc.name: set(self._vetoes(rc)) for rc in self.sharables}
-        self.nogoods = set().union(*vetoes.values())
-        """Sets ruled out by vetoes, as in `PackingProblem`."""
+        self.nogoods = set().union(*vetoes.values())  # sets ruled out by vetoes, as in `PackingProblem`
         self._contended = {name for name, nogoods in vetoes.items() if nogoods}
         """The sharable RCs that vetoed some set of these ARCs."""
 

@@ -20,19 +20,7 @@ from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
 from zscout.scheduling import model
 from zscout.scheduling.booking import Booked, Booking, BookingStatus, Redated, Unbooked
 from zscout.scheduling.claims import Claims
-from zscout.scheduling.model import (
-    HOLD_BACK,
-    MAX_HOLD_BACK,
-    QUANTUM,
-    Arc,
-    ArcState,
-    ArcStatus,
-    Hold,
-    Outcome,
-    Rc,
-    RcStatus,
-    Status,
-)
+from zscout.scheduling.model import Arc, ArcState, ArcStatus, Hold, Outcome, Rc, RcStatus, Status
 from zscout.scheduling.overlaps import Overlaps, overlaps
 from zscout.scheduling.priority import AdmissionCheck, Priority, reasons_of_now
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
@@ -44,8 +32,6 @@ from zscout.types import NO_TERM, ArcId, ClientId, Grant, Ns, Place, RcName, Ter
 
 
 class Core:
-    """All scheduling state of one fleet, and the rules by which it changes."""
-
     def __init__(self, strategy: Strategy | None = None, policy: SchedulingPolicy = DEFAULT) -> None:
         self.strategy = strategy or Priority()
         self._state = SchedulerState(policy)
@@ -111,7 +97,6 @@ class Core:
 
     @policy.setter
     def policy(self, policy: SchedulingPolicy) -> None:
-        """Running holds continue; the next pass uses the new policy."""
         self._state.take_policy(policy)
 
     def status(self, limit: int | None = None) -> Status:
@@ -127,7 +112,6 @@ class Core:
         )
 
     def arc(self, arc_id: ArcId) -> ArcStatus | None:
-        """An ARC as of the last batch; None if it neither waits nor runs."""
         arc = self._state.arc(arc_id)
         return None if arc is None else self._arc_status(arc)
 
@@ -154,7 +138,6 @@ class Core:
         return [arc.id for arc in sorted(arcs, key=lambda arc: (arc.hold is not None, arc.entry))]
 
     def arcs(self) -> list[ArcId]:
-        """All ARCs, waiting first."""
         return [arc.id for arc in self._state.all_arcs()]
 
     def is_open(self, arc_id: ArcId) -> bool:
@@ -235,8 +218,7 @@ class Core:
         return proposals
 
     def booking(self, name: str) -> BookingStatus | None:
-        claim = self._state.claims.get(name)
-        if claim is None:
+        if (claim := self._state.claims.get(name)) is None:
             return None
         bound = claim.booking.bound if claim.arc.hold is None else claim.arc.bound
         return BookingStatus(claim.booking, claim.arc.id if claim.is_taken else None, bound)
@@ -245,15 +227,12 @@ class Core:
         return self._claims.is_wanted(name)
 
     def charged(self) -> dict[str, float]:
-        """By group: recent contended RC-seconds; empty without fair shares."""
         return self._state.charged()
 
     def charged_in_all(self) -> dict[str, float]:
-        """The same since the core was made, not decayed: for studies."""
         return {} if self._state.shares is None else self._state.shares.totals()
 
     def bookings(self) -> list[tuple[Booking, ArcId | None]]:
-        """Active bookings, each with the ARC that has taken it up."""
         return [(claim.booking, claim.arc.id if claim.is_taken else None) for claim in self._state.claims.values()]
 
     def expects_yes(self, rc: RcName, holders: HolderSet) -> bool:
@@ -267,18 +246,8 @@ class Core:
             check = AdmissionCheck(self._state, arc)
             obstacle = check.obstacle(0)
             reason = obstacle.reason if obstacle is not None else check.refusal() or reason
-        return ArcStatus(
-            arc.request,
-            arc.place,
-            arc.hold,
-            arc.needs,
-            arc.bound,
-            arc.since,
-            arc.preemptions,
-            ahead,
-            reason,
-            arc.reason,
-        )
+        known = arc.request, arc.place, arc.hold, arc.needs, arc.bound, arc.since, arc.preemptions
+        return ArcStatus(*known, ahead, reason, arc.reason)
 
     def _apply(self, event: model.Event) -> None:
         match event:
@@ -354,8 +323,7 @@ class Core:
         return self._state.new_arc(request, place)
 
     def _end_request(self, arc_id: ArcId, outcome: Outcome, reason: Reason) -> None:
-        arc = self._state.arc(arc_id)
-        if arc is None:
+        if (arc := self._state.arc(arc_id)) is None:
             return
         if arc.hold is not None:
             if outcome is Outcome.RELEASED and arc.past_min_runtime(self._state.now):
@@ -397,7 +365,9 @@ class Core:
         self._end_hold(arc, Outcome.LOST, reason)
         if arc.id in self._state.queued:
             arc.unconfirmed = times + 1
-            self._state.hold_back(arc, self._state.now + min(HOLD_BACK << min(times, 8), MAX_HOLD_BACK), rcs)
+            self._state.hold_back(
+                arc, self._state.now + min(model.HOLD_BACK << min(times, 8), model.MAX_HOLD_BACK), rcs
+            )
             self.wait(arc, reason)
 
     def _hand_over(self, arc_id: ArcId, to: str, renamed: ArcId) -> None:
@@ -407,10 +377,8 @@ class Core:
         reason = Reason(ReasonCode.HANDED_OVER, detail=to)
         if existing is not None:
             # Where a change of RCM hid the outcome, both clients may have reported the one ARC.
-            same = existing.place == arc.place or (
-                existing.hold is not None and existing.request.needs == arc.request.needs
-            )
-            if not same:
+            same_needs = existing.request.needs == arc.request.needs
+            if existing.place != arc.place and (existing.hold is None or not same_needs):
                 return
             if existing.hold is not None or arc.hold is None:
                 self._end_request(arc_id, Outcome.HANDED_OVER, reason)
@@ -536,12 +504,7 @@ class Core:
         self._effects.append(model.Queued(arc.id, arc.request.client, reason, settled))
 
     def propose(self, rc: Rc, holders: HolderSet) -> None:
-        number = self._votes.propose(rc.name, holders, self._state.now)
-        if number is None:
-            return
-        arcs = (self._state.voter(holder) for holder in sorted(holders))
-        params = {arc.id: self._state.params(arc, rc) for arc in arcs if arc is not None}
-        self._effects.append(model.Propose(number, rc.name, params))
+        self._effects += self.ask_votes([(rc, holders)])
 
     def run_again(self) -> None:
         self._run_again = True
@@ -588,7 +551,7 @@ class Core:
             if end is not None:
                 at = end if at is None else min(at, end)
         if self._state.queued:
-            at = min(self._state.now + QUANTUM, at) if at is not None else self._state.now + QUANTUM
+            at = min(self._state.now + model.QUANTUM, at) if at is not None else self._state.now + model.QUANTUM
         if self._run_again:
             at = self._state.now
         if at != self._wake or self._run_again:

@@ -35,17 +35,12 @@ SWEEP: Final[Ns] = 60 * SECOND
 
 @dataclass(slots=True)
 class GroupAccount:
-    charged: float = 0.0
-    """RC-seconds, decayed as of `at`."""
-    total: float = 0.0
-    """RC-seconds, not decayed."""
+    charged: float = 0.0  # RC-seconds, decayed as of `at`
+    total: float = 0.0  # RC-seconds, not decayed
     at: Ns = 0
-    rate: int = 0
-    """Contended RCs of its holds."""
-    waiting: int = 0
-    """Queued ARCs."""
-    position: int = 0
-    """Among the waiting groups as of the last ordering, from 0; groups with near shares have the same."""
+    rate: int = 0  # contended RCs of its holds
+    waiting: int = 0  # queued ARCs
+    position: int = 0  # among the waiting groups as of the last ordering, from 0; groups with near shares have the same
 
 
 class FleetState(Protocol):
@@ -58,8 +53,6 @@ class FleetState(Protocol):
 
 
 class Shares:
-    """The accounts of all groups, and the demand for each RC."""
-
     def __init__(self, state: FleetState, policy: FairShares) -> None:
         self._state, self._policy = state, policy
         self._accounts: dict[str, GroupAccount] = {}
@@ -75,7 +68,6 @@ class Shares:
         return self._policy.groups.get(arc.owner, arc.owner)
 
     def position(self, arc: Arc) -> int:
-        """The position of its group in its rank: 0 for an operator."""
         if self._state.operator(arc.priority):
             return 0
         return self._account(self.group(arc)).position
@@ -103,7 +95,6 @@ class Shares:
         return {group: self._settle(account, now).total for group, account in self._accounts.items()}
 
     def restore(self, charged: Mapping[str, float]) -> None:
-        """Add charges from before the start, decayed as of now."""
         for group, had in charged.items():
             self._settle(self._account(group), self._state.now).charged += had
 
@@ -210,7 +201,6 @@ class Shares:
                 self._charge(rc, holder)
 
     def _charge(self, rc: Rc, holder: Arc) -> None:
-        """Update the charge of `holder` for `rc`."""
         charged = self._charged[holder.id]
         if self._is_contended(rc, holder) != bool(charged & rc.bit):
             self._charged[holder.id] = charged ^ rc.bit

@@ -10,24 +10,11 @@ import itertools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
+from zscout.scheduling import model
 from zscout.scheduling.booking import Booking
 from zscout.scheduling.claims import request_for
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import (
-    ArcRequest,
-    Effect,
-    Event,
-    Granted,
-    Hold,
-    HoldEnded,
-    Outcome,
-    Propose,
-    Released,
-    Requested,
-    Tick,
-    Vote,
-    WakeAt,
-)
+from zscout.scheduling.model import ArcRequest, Effect, Event, Granted, Hold, HoldEnded, Outcome, Propose, Released
 from zscout.scheduling.reason import Reason
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.scheduling.strategies import STRATEGIES
@@ -38,7 +25,7 @@ MAX_CHECKS = 4_000
 
 
 def play_instant(
-    core: Core, now: Ns, events: Iterable[Event], vote: Callable[[Propose], Vote]
+    core: Core, now: Ns, events: Iterable[Event], vote: Callable[[Propose], model.Vote]
 ) -> Iterator[list[Effect]]:
     """One instant, with all its votes and further passes; yields the effects of each batch."""
     batch = list(events)
@@ -46,19 +33,16 @@ def play_instant(
         effects = core.handle(now, *batch)
         yield effects
         batch = [vote(effect) for effect in effects if isinstance(effect, Propose)]
-        if not batch and any(isinstance(effect, WakeAt) and effect.at == now for effect in effects):
-            batch = [Tick()]
+        if not batch and any(isinstance(effect, model.WakeAt) and effect.at == now for effect in effects):
+            batch = [model.Tick()]
 
 
 @dataclass(slots=True)
 class Forecast:
-    """Expected starts, and the immediate victims of a newcomer."""
-
     starts: dict[ArcId, Ns] = field(default_factory=dict)
     """A missing ARC never starts from the present state, or not within the forecast."""
     preempts: list[ArcId] = field(default_factory=list)
-    reason: Reason | None = None
-    """The newcomer's first reason to wait; None if it starts at once."""
+    reason: Reason | None = None  # the newcomer's first reason to wait; None if it starts at once
 
 
 def forecast(
@@ -83,8 +67,8 @@ def forecast(
         if end is not None:
             releases[request.arc] = end
 
-    def vote(asked: Propose) -> Vote:
-        return Vote(asked.proposal, core.expects_yes(asked.rc, frozenset(asked.holders)))
+    def vote(asked: Propose) -> model.Vote:
+        return model.Vote(asked.proposal, core.expects_yes(asked.rc, frozenset(asked.holders)))
 
     def step(events: list[Event], preempting: ArcId | None = None) -> None:
         for effect in itertools.chain.from_iterable(play_instant(copy, now, events, vote)):
@@ -112,7 +96,7 @@ def forecast(
     step([*joined, lead])
     if newcomer is not None:
         unserved.add(newcomer.arc)
-        step([Requested(newcomer)], newcomer.arc)
+        step([model.Requested(newcomer)], newcomer.arc)
         asking = copy.arc(newcomer.arc)
         result.reason = asking.reported if asking is not None else None
     checks = 0
@@ -121,12 +105,12 @@ def forecast(
         if checks > MAX_CHECKS:
             break
         now = max(now, min((*ends.values(), *releases.values(), *(date for date, _ in dates[:1]))))
-        events: list[Event] = [Tick(), *(Released(arc) for arc, at in releases.items() if at <= now)]
+        events: list[Event] = [model.Tick(), *(Released(arc) for arc, at in releases.items() if at <= now)]
         while dates and dates[0][0] <= now:
             date, name = dates.pop(0)
             booking, is_open = booked[name]
             if is_open and date == booking.start and not booking.maintenance:
-                events.append(Requested(request_for(booking)))
+                events.append(model.Requested(request_for(booking)))
         step(events)
     return result
 

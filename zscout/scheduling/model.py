@@ -51,7 +51,6 @@ class ArcRequest(Struct, frozen=True):
     continues: str = ""
     """The name of the ARC of the same client that it continues, on the same RCs where possible."""
     booking: str = ""
-    """The booking to take up, with the same needs and priority."""
     not_before: Ns = 0
     """The date to wait for while its booking is absent or impossible."""
     who: Who | None = None
@@ -77,7 +76,6 @@ class Hold(Struct, frozen=True):
     protected_below: int | None = None
     """Before `end` only this priority or higher preempts it; None: any higher priority."""
     last: Ns | None = None
-    """The end of a kept hold; None: unlimited."""
 
 
 class ArcState(StrEnum):
@@ -90,7 +88,6 @@ class ArcState(StrEnum):
     DEFERRED = "deferred"
     """Stopped by the open votes of a higher rank."""
     WATCHING = "watching"
-    """One RC alone keeps it out."""
     PARKED = "parked"
     """An RC that does not answer proposals keeps it out."""
     HELD_BACK = "held_back"
@@ -104,15 +101,10 @@ _LEAVES: Final = (ArcState.HELD_BACK, ArcState.RUNNING, ArcState.ENDED)
 _WAITS: Final = (ArcState.READY, ArcState.HELD_BACK)
 TRANSITIONS: Final[Mapping[ArcState, tuple[ArcState, ...]]] = {
     ArcState.NEW: (*_WAITS, ArcState.RUNNING),
-    ArcState.READY: (*_CHECKED, *_LEAVES),
-    ArcState.VOTING: (*_CHECKED, *_LEAVES),
-    ArcState.DEFERRED: (*_CHECKED, *_LEAVES),
-    ArcState.WATCHING: (*_CHECKED, *_LEAVES),
-    # It is made ready before it is checked.
-    ArcState.PARKED: (ArcState.READY, *_LEAVES),
+    **dict.fromkeys(_CHECKED, (*_CHECKED, *_LEAVES)),
+    ArcState.PARKED: (ArcState.READY, *_LEAVES),  # made ready before it is checked
     ArcState.HELD_BACK: (*_WAITS, ArcState.ENDED),
-    # Preempted, or an RC was lost: queued again.
-    ArcState.RUNNING: (ArcState.READY, ArcState.ENDED),
+    ArcState.RUNNING: (ArcState.READY, ArcState.ENDED),  # preempted, or an RC was lost: queued again
     ArcState.ENDED: (),
 }
 
@@ -121,51 +113,36 @@ TRANSITIONS: Final[Mapping[ArcState, tuple[ArcState, ...]]] = {
 class Arc:
     request: ArcRequest
     place: Place
-    mask: int
-    """Bits of the needed RCs (`SchedulerState.rc`); for a pattern, of the bound RC."""
+    mask: int  # bits of the needed RCs (`SchedulerState.rc`); for a pattern, of the bound RC
     patterns: tuple[Need, ...] = ()
-    named_mask: int = 0
-    """Bits of the RCs named without patterns."""
+    named_mask: int = 0  # bits of the RCs named without patterns
     state: ArcState = ArcState.NEW
-    hold: Hold | None = None
-    """Present exactly while it runs."""
+    hold: Hold | None = None  # present exactly while it runs
     reason: Reason | None = None
     """The last reported reason to wait; None while it runs. `Core.arc` has the current reason."""
-    since: Ns = 0
-    """When it was last queued or granted."""
+    since: Ns = 0  # when it was last queued or granted
     preemptions: int = 0
-    entry: int = 0
-    """Grows with each entry into the queue or among the running."""
-    rcs: tuple[Rc, ...] = ()
-    """The RCs of `mask` in bit order; set when first queued."""
-    footprint: int | None = None
-    """While VOTING, DEFERRED or PARKED: bits of the RCs that it would take or free."""
+    entry: int = 0  # grows with each entry into the queue or among the running
+    rcs: tuple[Rc, ...] = ()  # the RCs of `mask` in bit order; set when first queued
+    footprint: int | None = None  # while VOTING, DEFERRED or PARKED: bits of the RCs that it would take or free
     masked_obstacles: int = 0
     """While VOTING or DEFERRED: bits of the RCs whose obstacle was off limits and did not count."""
     watched: Rc | None = None
-    unconfirmed: int = 0
-    """Unconfirmed holds in a row."""
+    unconfirmed: int = 0  # unconfirmed holds in a row
     held_back: tuple[Ns, tuple[RcName, ...]] | None = None
     """While HELD_BACK: until when, and for which RCs; None where another ARC has its place."""
-    starving: bool = False
-    """Waiting for too long (`reservations.py`)."""
+    starving: bool = False  # waiting for too long (`reservations.py`)
     bound: Mapping[Need, RcName] = field(default_factory=dict)
     """The RC of each pattern (`patterns.py`), while it runs or is checked. Empty if some pattern has none."""
-    claim: Claim | None = None
-    """The active booking that it has taken up."""
-    position: int = 0
-    """The position of its group (`fair_shares.py`); while it runs, as of its start."""
-    late: Ns = 0
-    """Delay that its group's share adds to its waiting time (`reservations.py`)."""
-    owner: str = field(init=False)
-    """Its client's host, for quotas."""
+    claim: Claim | None = None  # the active booking that it has taken up
+    position: int = 0  # the position of its group (`fair_shares.py`); while it runs, as of its start
+    late: Ns = 0  # delay that its group's share adds to its waiting time (`reservations.py`)
+    owner: str = field(init=False)  # its client's host, for quotas
     id: ArcId = field(init=False)
     priority: int = field(init=False)
-    rank: Rank = field(init=False)
-    """After a takeover two clients may claim one place: the id keeps the order total."""
+    rank: Rank = field(init=False)  # after a takeover two clients may claim one place: the id keeps the order total
     party: Party = field(init=False)
-    needs: Mapping[RcName, Params] = field(init=False)
-    """By RC: held, or wanted as bound."""
+    needs: Mapping[RcName, Params] = field(init=False)  # by RC: held, or wanted as bound
 
     def __post_init__(self) -> None:
         self.needs = self.request.needs
@@ -188,7 +165,6 @@ class Arc:
         return end if self.claim is None or start >= self.claim.booking.end else self.claim.booking.end
 
     def move_to(self, state: ArcState) -> None:
-        """Raises ValueError for a move that is not in `TRANSITIONS`."""
         if state not in TRANSITIONS[self.state]:
             raise ValueError(f"ARC {self.id} is {self.state} and can't become {state}")
         self.state = state
@@ -204,8 +180,7 @@ class Arc:
     def blocks(self, other: Arc) -> Party:
         """Its party in the reason of `other`, with the time until it blocks that."""
         end = self.known_end(other)
-        party = self.party
-        return Party(party.arc, party.name, party.priority, party.who, None if math.isinf(end) else int(end))
+        return self.party._replace(until=None if math.isinf(end) else int(end))
 
     def past_min_runtime(self, now: Ns) -> bool:
         """Return True for a kept hold past its minimum runtime: equal priority may preempt it."""
@@ -225,14 +200,10 @@ class Arc:
 @dataclass(slots=True, eq=False)
 class Claim:
     booking: Booking
-    arc: Arc
-    """The ARC that took it up; before, a placeholder in reservations and votes that never waits nor runs."""
-    kept: int
-    """Bits of the RCs kept for it; its ARC may choose others for its patterns."""
-    tentative: bool = False
-    """Conflicts are not checked yet: it can't be taken up."""
-    danger: Reason | None = None
-    """The last reported danger."""
+    arc: Arc  # the ARC that took it up; before, a placeholder in reservations and votes that never waits nor runs
+    kept: int  # bits of the RCs kept for it; its ARC may choose others for its patterns
+    tentative: bool = False  # conflicts are not checked yet: it can't be taken up
+    danger: Reason | None = None  # the last reported danger
 
     @property
     def is_taken(self) -> bool:
@@ -252,11 +223,9 @@ class Rc:
     bit: int
     present: bool = False
     sharable: bool = False
-    absence: str = ""
-    """The reason while absent, if known."""
+    absence: str = ""  # the reason while absent, if known
     holders: dict[ArcId, Arc] = field(default_factory=dict)
-    demand: int = 0
-    """Queued ARCs that name it."""
+    demand: int = 0  # queued ARCs that name it
     watchers: list[Rank] = field(default_factory=list)
     """Ranks of the queued ARCs that watch it (`QueueIndex`), best first."""
 
@@ -265,7 +234,6 @@ class Rc:
 
 
 def absences(rcs: Iterable[Rc]) -> str:
-    """The known reasons for the absence of these RCs, in words."""
     known = [f"{rc.name}: {rc.absence}" for rc in rcs if rc.absence]
     more = f"; {len(known) - SHOWN} more" if len(known) > SHOWN else ""
     return "; ".join(known[:SHOWN]) + more
@@ -284,15 +252,11 @@ class Requested(Struct, frozen=True):
 
 
 class Cancelled(Struct, frozen=True):
-    """The ARC is no longer wanted."""
-
     arc: ArcId
     by: str = ITS_CLIENT
 
 
 class Released(Struct, frozen=True):
-    """A running ARC ends its hold; a waiting ARC leaves the queue."""
-
     arc: ArcId
     by: str = ITS_CLIENT
 
@@ -304,8 +268,6 @@ class Vote(Struct, frozen=True):
 
 
 class VoteOverdue(Struct, frozen=True):
-    """A proposal was not answered in time, or could not be delivered."""
-
     proposal: int
 
 
@@ -331,8 +293,6 @@ class RcLost(Struct, frozen=True):
 
 
 class ClientLost(Struct, frozen=True):
-    """A program is gone: its holds and requests end."""
-
     client: ClientId
     reason: str = "its client left the mesh"
 
@@ -353,8 +313,6 @@ class Unconfirmed(Struct, frozen=True):
 
 
 class Reachable(Struct, frozen=True):
-    """A client sees an RC again that had not confirmed its grant."""
-
     arc: ArcId
 
 
@@ -375,7 +333,6 @@ class RecoveredHold(Struct, frozen=True):
     start: Ns
     end: Ns
     bound: Mapping[Need, RcName] = {}
-    """The RC held for each pattern."""
 
     def __post_init__(self) -> None:
         patterns = {need for need in self.request.needs if is_pattern(need)}
@@ -410,32 +367,13 @@ class Tick(Struct, frozen=True):
     """Time has passed."""
 
 
-Event: TypeAlias = (
-    Requested
-    | Cancelled
-    | Released
-    | Vote
-    | VoteOverdue
-    | RcJoined
-    | RcReported
-    | RcLost
-    | ClientLost
-    | PlaceShown
-    | Unconfirmed
-    | Reachable
-    | HandedOver
-    | LeadTaken
-    | Adopted
-    | Booked
-    | Unbooked
-    | Redated
-    | Tick
-)
+_ArcEvent: TypeAlias = Requested | Cancelled | Released | ClientLost | PlaceShown | Unconfirmed | Reachable | HandedOver
+_RcEvent: TypeAlias = Vote | VoteOverdue | RcJoined | RcReported | RcLost
+Event: TypeAlias = _ArcEvent | _RcEvent | LeadTaken | Adopted | Booked | Unbooked | Redated | Tick
 
 
 class Outcome(StrEnum):
     COMPLETED = "completed"
-    """It had its minimum runtime."""
     PREEMPTED = "preempted"
     """Queued again with its place."""
     RELEASED = "released"
@@ -445,12 +383,9 @@ class Outcome(StrEnum):
     """An RC of the gang went away; queued again with its place."""
     CLIENT_LOST = "client_lost"
     HANDED_OVER = "handed_over"
-    """Continued by another client under a new grant."""
 
 
 class Propose(Struct, frozen=True):
-    """Ask a sharable RC whether it would carry exactly these holders."""
-
     proposal: int
     rc: RcName
     holders: Mapping[ArcId, Params]
@@ -492,8 +427,6 @@ class Queued(Struct, frozen=True):
 
 
 class Dropped(Struct, frozen=True):
-    """A waiting ARC left the queue without having run."""
-
     arc: ArcId
     client: ClientId
     outcome: Outcome
@@ -510,16 +443,12 @@ Effect: TypeAlias = Propose | Granted | HoldEnded | Queued | Dropped | BookingCh
 
 
 class ArcStatus(Struct, frozen=True):
-    """An ARC that is queued (`hold is None`) or runs."""
-
     request: ArcRequest
     place: Place
     hold: Hold | None
     needs: Mapping[RcName, Params]
-    """By RC: held, or wanted as bound at present."""
     bound: Mapping[Need, RcName]
     since: Ns
-    """When it was last queued or granted."""
     preemptions: int
     ahead: int | None
     """Queued ARCs of higher rank; None while it runs."""
@@ -538,8 +467,6 @@ class ArcStatus(Struct, frozen=True):
 
 
 class RcStatus(Struct, frozen=True):
-    """`holders` in order of arrival."""
-
     name: RcName
     present: bool
     sharable: bool

@@ -40,7 +40,6 @@ WORK: Final = 200_000
 MAX_PACKED: Final = 80
 """Larger groups skip branch and bound: at 30x60 it takes 11 ms and CP-SAT 18, at 40x80 it seldom finds a proof."""
 STEPS: Final = 6_000
-"""Steps of local search for a large group."""
 MAX_VETOES: Final = 256
 """Vetoes on one group before `priority` decides it: a proof may need a question for each of very many sets."""
 

@@ -17,10 +17,8 @@ DAY: Final[Ns] = 86_400 * SECOND
 
 @dataclass(slots=True)
 class Overlaps:
-    losers: dict[str, str] = field(default_factory=dict)
-    """Bookings that lose, each with an earlier one in its way."""
-    unknown: list[tuple[Rc, HolderSet]] = field(default_factory=list)
-    """Votes needed for a complete answer."""
+    losers: dict[str, str] = field(default_factory=dict)  # bookings that lose, each with an earlier one in its way
+    unknown: list[tuple[Rc, HolderSet]] = field(default_factory=list)  # votes needed for a complete answer
 
 
 def overlaps(state: SchedulerState, order: Iterable[str], starts: Mapping[str, Ns]) -> Overlaps:

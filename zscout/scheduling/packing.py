@@ -29,7 +29,6 @@ class PackingItem(NamedTuple):
 
     @property
     def in_min_runtime(self) -> bool:
-        """Return True if ending it is a preemption."""
         return self.running and not self.past_min_runtime
 
 
@@ -54,13 +53,9 @@ class PackingProblem:
         self.unit = [base ** (self.levels - 1 - item.level) for item in items]
         """The worth of one RC at an item's level: more than all lower levels together."""
         self.masks = [item.mask for item in items]
-        self.worth = [
-            0 if item.past_min_runtime else item.width * unit for item, unit in zip(items, self.unit, strict=True)
-        ]
-        self.extra = [
-            0 if item.past_min_runtime else (item.width - item.mask.bit_count()) * unit
-            for item, unit in zip(items, self.unit, strict=True)
-        ]
+        valued = [0 if item.past_min_runtime else unit for item, unit in zip(items, self.unit, strict=True)]
+        self.worth = [item.width * unit for item, unit in zip(items, valued, strict=True)]
+        self.extra = [(item.width - item.mask.bit_count()) * unit for item, unit in zip(items, valued, strict=True)]
         self.plain = self.levels == 1 and not any(self.extra) and not any(item.past_min_runtime for item in items)
         """Each RC in use counts one."""
         self.nogoods: list[list[int]] = [[] for _ in items]
@@ -100,7 +95,6 @@ class PackingProblem:
         return sum(self.worth[number] for number in numbers(chosen))
 
     def key(self, chosen: int) -> tuple[int, int]:
-        """Compares sets by value, then by preemptions; greater is better."""
         left_out = (self.items[number] for number in self.running if not chosen >> number & 1)
         return self.value(chosen), -sum(item.in_min_runtime for item in left_out)
 

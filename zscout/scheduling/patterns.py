@@ -37,7 +37,6 @@ class Fitness(IntEnum):
     CLAIMED = 2
     """Bound already to a higher rank in this pass."""
     PREEMPTIBLE = 3
-    """Its holder would be preempted."""
     RESERVED = 4
     """Reserved for another, or unresponsive with an unknown vote."""
     HELD = 5

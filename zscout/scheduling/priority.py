@@ -55,15 +55,11 @@ from zscout.types import ArcId, Need, RcName
 
 @dataclass(frozen=True, slots=True)
 class VotesNeeded:
-    """These proposals must be answered first."""
-
     proposals: list[tuple[Rc, HolderSet]]
 
 
 @dataclass(frozen=True, slots=True)
 class Admissible:
-    """The ARC may start once these are preempted."""
-
     victims: list[Arc]
 
 
@@ -74,8 +70,7 @@ class AdmissionCheck:
         self.state, self.arc = state, arc
         self.votes, self.now = state.votes, state.now
         self.non_preemptible: list[tuple[Rc, Arc]] = []
-        self.exclusive_victims: dict[ArcId, Arc] = {}
-        """Preemptible holders of its exclusive RCs: they end if it starts."""
+        self.exclusive_victims: dict[ArcId, Arc] = {}  # preemptible holders of its exclusive RCs: they end if it starts
         self._sharables: list[Rc] = []
         for rc in arc.rcs:
             if rc.sharable:
@@ -88,7 +83,6 @@ class AdmissionCheck:
                     self.non_preemptible.append((rc, holder))
 
     def footprint(self) -> int:
-        """Bits of the RCs that the ARC would take or free."""
         return union(arc.mask for arc in (self.arc, *self.exclusive_victims.values(), *self._preemptible_sharers()))
 
     def obstacle(self, off_limits: int) -> Inadmissible | None:
@@ -225,7 +219,6 @@ class AdmissionCheck:
 
 VOTING: Final = Reason(ReasonCode.VOTING)
 MAX_BINDINGS: Final = 16
-"""Bindings that one check tries."""
 MAX_REPORTED: Final = 4
 """Watchers of an RC that learn of a new holder (the others by `Core.arc`): bounds the reports in a long queue."""
 
@@ -267,8 +260,7 @@ class Pass:
         self.state, self.actions, self.reserved = state, actions, reserved
         self.votes, self.index = state.votes, state.index
         self.off_limits = 0
-        self.changed = 0
-        """Bits of the RCs changed since the last pass began."""
+        self.changed = 0  # bits of the RCs changed since the last pass began
         self._heap: list[tuple[Rank, int, Arc, Rc | None]] = []
         """The next ARCs to check, beside the ready ones; each RC has one watcher here."""
         self._walked: set[int] = set()  # bits of the RCs with a watcher in the heap

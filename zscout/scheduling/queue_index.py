@@ -22,24 +22,16 @@ class QueueIndex:
 
     def __init__(self, band: Callable[[int], int]) -> None:
         self._band = band
-        self.ready: dict[ArcId, Arc] = {}
-        """READY, VOTING or DEFERRED."""
+        self.ready: dict[ArcId, Arc] = {}  # READY, VOTING or DEFERRED
         self.parked: dict[ArcId, Arc] = {}
-        self.watched = 0
-        """Bits of the RCs with watchers."""
-        self.freed = 0
-        """Bits of the RCs that may admit watchers since the last pass."""
-        self.touched = 0
-        """Bits of the RCs with other changes: these affect all but watchers."""
-        self.retold = 0
-        """Bits of the RCs with new holders that are not reported to watchers yet."""
-        self.ranks: list[Rank] = []
-        """Of all queued ARCs, best first."""
+        self.watched = 0  # bits of the RCs with watchers
+        self.freed = 0  # bits of the RCs that may admit watchers since the last pass
+        self.touched = 0  # bits of the RCs with other changes: these affect all but watchers
+        self.retold = 0  # bits of the RCs with new holders that are not reported to watchers yet
+        self.ranks: list[Rank] = []  # of all queued ARCs, best first
         self._not_starving: list[tuple[Ns, ArcId]] = []  # other queued ARCs, by the time since when they wait
-        self.starving: list[tuple[int, Ns, ArcId]] = []
-        """By band of priorities (negated), then waiting time."""
-        self.starving_version = 0
-        """Grows when an ARC starts or stops starving."""
+        self.starving: list[tuple[int, Ns, ArcId]] = []  # by band of priorities (negated), then waiting time
+        self.starving_version = 0  # grows when an ARC starts or stops starving
 
     def add(self, arc: Arc) -> None:
         insort(self.ranks, arc.rank)

@@ -32,17 +32,13 @@ class ReasonCode(StrEnum):
     UNCONFIRMED = "unconfirmed"
     """`rcs` did not confirm a grant: no new grant for a while."""
     CLAIMED = "claimed"
-    """The client `detail` has an ARC of the same place: one of the two may run."""
     SILENT = "silent"
-    """`rcs` do not answer proposals."""
     RESERVED = "reserved"
-    """The RC is reserved for `by`, which has waited too long."""
     BOOKED = "booked"
     """The RC is booked by `by` before this would end."""
     MAINTENANCE = "maintenance"
     """The RC is in maintenance by `by`, or will be before this would end. It also ends kept holds."""
     NOT_YET = "not_yet"
-    """The date of its booking is still to come."""
     QUOTA = "quota"
     """`detail`, its host, has its quota of ARCs running: `number`."""
     RC_QUOTA = "rc_quota"
@@ -52,7 +48,6 @@ class ReasonCode(StrEnum):
     SEARCHING = "searching"
     # A hold, or a wait, ended:
     EXPIRED = "expired"
-    """Its minimum runtime is over."""
     LIMIT = "limit"
     """It had the longest time that the fleet gives a hold."""
     PREEMPTED = "preempted"
@@ -68,7 +63,6 @@ class ReasonCode(StrEnum):
     """The RC left; `detail`: the cause, if known."""
     RC_ENDED = "rc_ended"
     SUPERSEDED = "superseded"
-    """At a takeover the RC had a newer holder."""
 
 
 class Party(NamedTuple):

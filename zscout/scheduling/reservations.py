@@ -53,7 +53,6 @@ class Reservation(NamedTuple):
         return not self.order[0]
 
     def over(self) -> Ns:
-        """Its earliest end."""
         return self.arc.ends(self.start) if self.booked is None else self.booked
 
 
@@ -104,11 +103,9 @@ class Reservations:
         self._booked_of = _booked_versions(state)
         known = last is not None and last._booked_of == self._booked_of
         self._booked: dict[int, list[Reservation]] = last._booked if last is not None and known else self._all_booked()
-        self.by_rc: dict[int, list[Reservation]] = dict(self._booked)
-        """By bit of the RC, in their order."""
+        self.by_rc: dict[int, list[Reservation]] = dict(self._booked)  # by bit of the RC, in their order
         self._free: dict[int, Ns] = {}  # by bit: the end of earlier reservations
-        self.starts: list[Ns] = []
-        """Reserved times of starving ARCs."""
+        self.starts: list[Ns] = []  # reserved times of starving ARCs
         for priority, since, arc in state.index.starving[:MAX_STARVING]:
             if state.queued[arc].claim is None:
                 self._reserve(state.queued[arc], (True, priority, since + (patience or 0) // 2, arc))
@@ -185,7 +182,6 @@ class Reservations:
         return rcs
 
     def _within_quota(self, arc: Arc) -> float:
-        """When its owner's quotas have room for `arc`."""
         state, ends = self._state, [float(self._state.now)]
         if state.quota_left(arc) == 0:
             ends.append(min(other.known_end() for other in state.running.values() if other.owner == arc.owner))
@@ -289,13 +285,11 @@ class Reservations:
     def _delays(self, arc: Arc, reservation: Reservation) -> bool:
         """Return True if `arc`, started now, would unlawfully hold reserved RCs at their time."""
         band, now = self._state.band, self._state.now
-        binds = band(arc.priority) <= band(reservation.arc.priority) or (
-            reservation.excludes and reservation.start <= now
-        )
+        begun = reservation.excludes and reservation.start <= now
+        binds = begun or band(arc.priority) <= band(reservation.arc.priority)
         return binds and arc.ends(now) > reservation.start
 
     def changed(self, earlier: Reservations) -> int:
-        """Bits of the RCs with other reservations than in `earlier`."""
         return _changed(self.by_rc, earlier.by_rc)
 
 
@@ -305,7 +299,6 @@ def _changed(now: Mapping[int, list[Reservation]], earlier: Mapping[int, list[Re
 
 
 def kept_for(rc: Rc, reservation: Reservation) -> Reason:
-    """The reason of an ARC that would delay a reservation."""
     if reservation.excludes:
         party = reservation.arc.party._replace(until=reservation.booked)
         return Reason(ReasonCode.MAINTENANCE, (rc.name,), (party,))

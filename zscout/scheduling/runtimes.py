@@ -37,7 +37,6 @@ class Wish(NamedTuple):
     command: str
     needs: frozenset[Need]
     runtime: Ns
-    """> 0."""
 
     @classmethod
     def of(cls, request: ArcRequest) -> Wish:
@@ -53,8 +52,6 @@ class Wish(NamedTuple):
 
 
 class RuntimeEstimator:
-    """Histories of all programs of a fleet, in bounded memory."""
-
     def __init__(self, most: int = MAX_HISTORIES) -> None:
         self._most = most
         self._histories: OrderedDict[Hashable, _History] = OrderedDict()
@@ -106,7 +103,6 @@ class _History:
         self._estimates = None
 
     def estimate(self) -> _Estimate | None:
-        """The better estimate; None with too few holds."""
         if self._estimates is None:
             self._estimates = _Estimate(self.spans, by_share=False), _Estimate(self.spans, by_share=True)
         best = max(self._estimates, key=lambda estimate: estimate.accuracy)
@@ -114,8 +110,6 @@ class _History:
 
 
 class _Estimate:
-    """By time in ns, or by share of the requested time."""
-
     __slots__ = ("_by_share", "_median", "_values", "accuracy", "asked_accuracy", "judged")
 
     def __init__(self, spans: Iterable[_Span], *, by_share: bool) -> None:

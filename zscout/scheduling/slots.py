@@ -36,10 +36,8 @@ class Slot(NamedTuple):
 @dataclass(slots=True)
 class SlotsFound:
     found: list[Slot] = field(default_factory=list)
-    unknown: list[tuple[Rc, HolderSet]] = field(default_factory=list)
-    """Votes needed before the next slot is known."""
-    complete: bool = True
-    """False: the search was cut off at MAX_TRIED."""
+    unknown: list[tuple[Rc, HolderSet]] = field(default_factory=list)  # votes needed before the next slot is known
+    complete: bool = True  # false: the search was cut off at MAX_TRIED
 
 
 class _Taken(NamedTuple):
@@ -131,7 +129,6 @@ class _Search:
                     self._taken[bit].append(_Taken(promise.start, promise.arc.ends(promise.start), promise.arc.id))
 
     def starts(self, until: Ns) -> list[Ns]:
-        """Times at which something becomes free."""
         first = self._wanted.start
         ends = {int(span.end) for taken in self._taken.values() for span in taken if first < span.end <= until}
         return sorted({first, *ends})
@@ -171,7 +168,6 @@ class _Search:
         return there | {self._arc.id} if answer is None else answer.accept
 
     def latest(self, start: Ns, bound: Iterable[RcName]) -> Ns:
-        """The last possible start on the same RCs."""
         rcs = (*self._named, *(self._state.rc(name) for name in bound))
         coming = (span.start for rc in rcs for span in self._taken[rc.bit] if span.start > start)
         return max(start, min(coming, default=start + (1 << 62)) - self._wanted.runtime)

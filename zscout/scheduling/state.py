@@ -29,8 +29,7 @@ class SchedulerState:
 
     def __init__(self, policy: SchedulingPolicy = DEFAULT) -> None:
         self.policy = policy
-        self.now: Ns = 0
-        """The instant of the latest batch of events."""
+        self.now: Ns = 0  # the instant of the latest batch of events
         self.votes = Votes()
         self._ends: list[tuple[Ns, ArcId]] = []
         """A heap of the ends of minimum runtimes and longest times. Outdated entries are skipped."""
@@ -39,13 +38,10 @@ class SchedulerState:
         self.running: dict[ArcId, Arc] = {}
         self.held_back: dict[ArcId, Arc] = {}
         """Queued ARCs not considered for a while, or while another has their place."""
-        self.claims: dict[str, Claim] = {}
-        """Active bookings by id."""
+        self.claims: dict[str, Claim] = {}  # active bookings by id
         self.maintenance: dict[str, Claim] = {}
-        self.claimed = 0
-        """Bits of the RCs booked at any time."""
-        self.claims_version = 0
-        """Grows with each change of bookings and of the ARCs that took them up."""
+        self.claimed = 0  # bits of the RCs booked at any time
+        self.claims_version = 0  # grows with each change of bookings and of the ARCs that took them up
         self._claim_ends: list[tuple[Ns, str]] = []
         """A heap of lapses and ends of bookings and starts of maintenance. Outdated entries are skipped."""
         self._by_date: list[Claim] = []
@@ -53,13 +49,10 @@ class SchedulerState:
         self._at_place: dict[Place, Arc] = {}
         """By place: the ARC considered or running. Two clients may claim one ARC, which has to run once."""
         self.present = 0
-        self.sharable = 0
-        """Bits of the RCs that vote and take several holders."""
-        self.busy = 0
-        """Bits of the held exclusive RCs."""
+        self.sharable = 0  # bits of the RCs that vote and take several holders
+        self.busy = 0  # bits of the held exclusive RCs
         self.index = QueueIndex(self.band)
-        self.by_pattern: dict[ArcId, Arc] = {}
-        """Queued ARCs with patterns."""
+        self.by_pattern: dict[ArcId, Arc] = {}  # queued ARCs with patterns
         self._matching: dict[Need, list[Rc]] = {}
         self.running_by_owner: Counter[str] = Counter()
         self.held_by_owner: Counter[str] = Counter()
@@ -67,10 +60,8 @@ class SchedulerState:
         self._clients: dict[ClientId, dict[ArcId, Arc]] = {}
         self._owners: dict[str, dict[ArcId, Arc]] = {}
         self.entries = 0
-        self.version = 0
-        """Grows with each change of holders, present RCs and preemptibility."""
-        self.changed = 0
-        """Bits of the RCs where it grew, since `Claims` last emptied this."""
+        self.version = 0  # grows with each change of holders, present RCs and preemptibility
+        self.changed = 0  # bits of the RCs where it grew, since `Claims` last emptied this
         self.shares = Shares(self, policy.fair_shares) if policy.fair_shares is not None else None
         """None where fair shares are off."""
 
@@ -84,7 +75,6 @@ class SchedulerState:
         return rc
 
     def matching(self, need: Need) -> list[Rc]:
-        """The known RCs that match a pattern, present or not."""
         found = self._matching.get(need)
         if found is None:
             matches = matcher(need)
@@ -115,22 +105,16 @@ class SchedulerState:
         return arc
 
     def params(self, arc: Arc, rc: Rc) -> Params:
-        """The parameters of an ARC for an RC, whether bound or not."""
         if rc.name in arc.needs:
             return arc.needs[rc.name]
         return arc.request.needs[next(need for need in arc.patterns if rc in self.matching(need))]
 
     def possible_sharables(self, arc: Arc) -> Iterator[Rc]:
-        """All sharable RCs that an ARC could hold."""
         matching = union(rc.bit for need in arc.patterns for rc in self.matching(need)) if arc.patterns else 0
         return self.rcs_in((arc.mask | matching) & self.sharable)
 
     def mask(self, names: Iterable[RcName]) -> int:
-        mask, rcs = 0, self.rcs
-        for name in names:
-            rc = rcs.get(name) or self.rc(name)
-            mask |= rc.bit
-        return mask
+        return union(self.rc(name).bit for name in names)
 
     def rcs_in(self, mask: int) -> Iterator[Rc]:
         while mask:
@@ -149,7 +133,6 @@ class SchedulerState:
         return self.running.get(arc) or self.queued.get(arc) or self.held_back.get(arc)
 
     def all_arcs(self) -> Iterator[Arc]:
-        """Waiting ARCs first."""
         for arcs in (self.queued, self.held_back, self.running):
             yield from arcs.values()
 
@@ -219,7 +202,6 @@ class SchedulerState:
         self.held_back[arc.id] = arc
 
     def let_in(self, rc: RcName | None = None) -> None:
-        """Consider the ARCs held back until now or for this RC."""
         for arc in list(self.held_back.values()):
             if arc.held_back is not None and (arc.held_back[0] <= self.now or rc in arc.held_back[1]):
                 self.consider_again(arc)
@@ -284,11 +266,9 @@ class SchedulerState:
 
     @property
     def begun(self) -> int:
-        """How many bookings have reached their dates."""
         return bisect_right(self._by_date, self.now, key=_date)
 
     def claims_before(self, time: float, rc: Rc | None = None) -> list[Claim]:
-        """The bookings with dates up to then, of all or of one RC."""
         claims = self._by_date if rc is None else self._claims_at.get(rc.bit, [])
         return claims[: bisect_right(claims, time, key=_date)]
 
@@ -409,12 +389,10 @@ class SchedulerState:
         return priority if alone else self.policy.operator_priority - 1
 
     def order_groups(self) -> None:
-        if self.shares is None or not self.shares.order():
-            return
-        self._put_all(self.shares)
+        if self.shares is not None and self.shares.order():
+            self._put_all(self.shares)
 
     def take_policy(self, policy: SchedulingPolicy) -> None:
-        """Running holds continue; the next pass uses the new policy. Groups keep their charges by name."""
         charged, same = self.charged(), policy.fair_shares == self.policy.fair_shares
         self.policy = policy
         if same:
@@ -440,7 +418,6 @@ class SchedulerState:
         arc.late = max(0, fair.patience - patience) if arc.position and fair is not None and patience is not None else 0
 
     def charged(self) -> dict[str, float]:
-        """By group: recent contended RC-seconds; empty without fair shares."""
         return {} if self.shares is None else self.shares.charged()
 
     def longest(self, start: Ns) -> Ns | None:
@@ -471,18 +448,12 @@ class SchedulerState:
 
     def continued(self, arc: Arc) -> Arc | None:
         """The running ARC that `arc` continues and ends by its start: quotas don't count it."""
-        if not arc.request.continues:
-            return None
-        mask = arc.mask & ~self.sharable
-        holders = (holder for rc in self.rcs_in(mask) for holder in rc.holders.values())
-        return next(
-            (
-                holder
-                for holder in holders
-                if arc.request.goes_on_from(holder.request) and holder.preemptible_by(arc, self.now)
-            ),
-            None,
-        )
+        if arc.request.continues:
+            for rc in self.rcs_in(arc.mask & ~self.sharable):
+                for holder in rc.holders.values():
+                    if arc.request.goes_on_from(holder.request) and holder.preemptible_by(arc, self.now):
+                        return holder
+        return None
 
     def barred(self, arc: Arc) -> int:
         """Bits of the RCs to which no pattern of `arc` is bound."""
@@ -529,7 +500,6 @@ def _date(claim: Claim) -> Ns:
 
 
 def _instants(booking: Booking) -> tuple[Ns, ...]:
-    """Times at which a booking changes by itself."""
     return (booking.start, booking.end) if booking.maintenance else (booking.lapses, booking.end)
 
 

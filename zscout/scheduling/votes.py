@@ -34,12 +34,9 @@ class RcVotes:
     def __init__(self) -> None:
         self.accepted: dict[HolderSet, None] = {}
         self.vetoed: dict[HolderSet, str] = {}
-        self.proposals: dict[HolderSet, list[int]] = {}
-        """Numbers of the open proposals of each set, newest last."""
-        self.overdue: set[HolderSet] = set()
-        """Sets whose newest proposal may be lost: they may be proposed again."""
-        self.retry_at: Ns = 0
-        """When an unresponsive RC may be asked again."""
+        self.proposals: dict[HolderSet, list[int]] = {}  # numbers of the open proposals of each set, newest last
+        self.overdue: set[HolderSet] = set()  # sets whose newest proposal may be lost: they may be proposed again
+        self.retry_at: Ns = 0  # when an unresponsive RC may be asked again
         self._accepted_with: dict[ArcId, dict[HolderSet, None]] = {}
         self._vetoed_at: dict[ArcId, dict[HolderSet, None]] = {}
         """Each vetoed set once, under its ARC with the fewest entries: short lists are searched."""
@@ -123,12 +120,9 @@ class Votes:
         self.unresponsive: set[RcName] = set()
         """RCs whose last vote is overdue: no decision waits for them until they answer."""
         self.version = 0
-        self.answered: set[RcName] = set()
-        """RCs that answered or became unresponsive, since a pass last emptied this."""
-        self.invalidated: set[RcName] = set()
-        """RCs whose answers were dropped, since a pass last emptied this."""
-        self.changed: set[RcName] = set()
-        """RCs with new or dropped answers, since `Claims` last emptied this."""
+        self.answered: set[RcName] = set()  # RCs that answered or became unresponsive, since a pass last emptied this
+        self.invalidated: set[RcName] = set()  # RCs whose answers were dropped, since a pass last emptied this
+        self.changed: set[RcName] = set()  # RCs with new or dropped answers, since `Claims` last emptied this
 
     def known(self, rc: RcName, holders: HolderSet) -> Answer | None:
         """The answer in force for exactly this set, direct or implied; None if unknown."""
@@ -143,7 +137,6 @@ class Votes:
         return list(self._by_rc[rc].vetoed)
 
     def due(self, now: Ns) -> list[RcName]:
-        """The unresponsive RCs that may be asked again by now."""
         return [rc for rc in self.unresponsive if self._by_rc[rc].retry_at <= now]
 
     def propose(self, rc: RcName, holders: HolderSet, now: Ns) -> int | None:
@@ -167,7 +160,6 @@ class Votes:
         return number
 
     def answer(self, proposal: int, *, accept: bool, reason: str) -> None:
-        """Take an answer, even late, while its proposal is open."""
         if proposal not in self.proposals:
             return
         rc, holders = self.proposals[proposal]
@@ -218,7 +210,6 @@ class Votes:
             self._close(votes, holders)
 
     def rename_arc(self, rc: RcName, arc: ArcId, renamed: ArcId) -> None:
-        """Rename an ARC in votes and open proposals."""
         votes = self._by_rc.get(rc)
         if votes is not None:
             for number in votes.rename(arc, renamed):
