@@ -141,7 +141,7 @@ class Balancer:
     def _add_sample(self, now: Ns, report: LoadReport, use: ComponentUse) -> None:
         placement = self._placed.get(use.component)
         if placement is None and len(self._placed) < MAX_PLACED:
-            # Of a balancer before this one: its profile is learnt, and the load average shows it already.
+            # From an earlier balancer: learn its profile; the load average includes it.
             placement = _Placed(use.kind, report.host, now, {})
             self._placed[use.component] = placement
             self._there.setdefault(report.host, set()).add(use.component)
@@ -173,7 +173,7 @@ class Balancer:
             report, load, memory = outlook.report, outlook.load, outlook.memory
             for placement in self._pending[host].values():
                 profile = self.profile(placement.kind)
-                # The load average shows a component the better the longer it runs.
+                # The load average includes a component gradually.
                 load += profile.wants(report.speed) * math.exp(-(now - placement.at) / LOAD_TIME)
                 memory -= 0 if placement.seen else profile.memory
             return Outlook(report, load, memory)
@@ -221,7 +221,7 @@ class Balancer:
             fit: dict[HostName, Outlook] = {}
             doubtful = self.reports if query.hosts is None else query.hosts
         else:
-            # Of thousands, only those are examined that may differ from their reports.
+            # Examine only hosts that may differ from their reports.
             fit = self._outlooks.copy()
             overdue = takewhile(lambda host: now - self.reports[host][0] > STALE, self.reports)
             doubtful = {*overdue, *(self._pending.keys() & fit.keys() if pending else ())}
@@ -271,7 +271,7 @@ class RankingCache:
 
     def rank(self, query: RankQuery) -> Ranking:
         if query.metric == "auto" or query.policy in ("randomized", "two_choices"):
-            # These draw lots, each time anew.
+            # These draw lots on every call.
             return self._balancer.rank(self._now, query)
         ranking, changed = self._cached.get(query, (None, set[HostName]()))
         if ranking is None:

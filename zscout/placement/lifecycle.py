@@ -48,7 +48,7 @@ class Lifecycle:
             record.superseded = True
             self.place_again(record)
         elif not record.wanted:
-            # It is being stopped; what is requested now comes after that.
+            # It is placed again after its stop.
             self._reset(record, spec)
         elif record.spec != spec:
             message = f"{component} is placed already, and is another: stop it first, or take another name"
@@ -105,10 +105,10 @@ class Lifecycle:
             self._ask_for_kind(record, lacking)
         elif not hosts:
             tried.clear()
-            # The figures change all the time: for them alone it is not published again.
+            # Changed figures alone are not published.
             causes = FIGURES.sub("", why_none)
             if record.no_host is None and _explains(record.reason, causes):
-                # Inherited: all that is known of the causes then is the reason.
+                # Inherited: only the reason is known.
                 record.no_host = causes, record.reason
             if record.no_host != (causes, record.reason):
                 record.reason = f"no host will do: {why_none}"
@@ -189,7 +189,7 @@ class Lifecycle:
             record.ended_incarnations.append(record.incarnation)
             state.component_left(record)
             if answer.again:
-                # The host may know of another incarnation that lives there.
+                # Another incarnation may live there.
                 state.probe(record.component, host)
             cause = f"{host} refused it: {answer.reason}"
             record.tried[host] = "" if answer.again else cause
@@ -212,9 +212,9 @@ class Lifecycle:
         elif not self._exhausted(record, cause):
             self.place_again(record, cause)
 
-    def runs(self, record: ComponentRecord, *, anew: bool = False) -> None:
-        """Record that it runs; `anew`: as another incarnation."""
-        if record.state != "running" or anew:
+    def runs(self, record: ComponentRecord, *, replaced: bool = False) -> None:
+        """Record that it runs; `replaced`: as another incarnation."""
+        if record.state != "running" or replaced:
             record.enter("running")
             record.running_since, record.whereabouts_unknown = self.state.now, False
             record.failed_rounds, record.reason = 0, record.host_reason
@@ -301,7 +301,7 @@ class Lifecycle:
             self._finish(record, "given_up", f"{cause}; {record.restarts} starts in a row failed")
         return record.state == "given_up"
 
-    # Stopping: what is to end is surplus
+    # Stopping makes an incarnation surplus
 
     def end_incarnation(self, record: ComponentRecord) -> None:
         state, host = self.state, record.host
@@ -309,7 +309,7 @@ class Lifecycle:
             self.surplus.add(record.component, record.incarnation, host, record.start_until, token=record.token)
             state.wake(record, None)
         elif host is not None and state.now < record.not_before:
-            # Inherited: its host may be there, and has not joined yet.
+            # Inherited: its host may not have joined yet.
             state.wake(record, record.not_before)
         else:
             if host is not None:

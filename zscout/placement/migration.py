@@ -137,7 +137,7 @@ class Migrations:
             move.source = "ended"
             self._finish(record, move, answer.dead)
         elif answer.result == "unknown" or move.token:
-            # Refused, and yet the target took over: it was given back, or was not.
+            # Refused although the target took over: ask which of the two runs.
             self._probe(record, move)
         else:
             self._stay(record, move, answer.reason)
@@ -225,7 +225,7 @@ class Migrations:
         record.start_until, record.confirmed, record.probed = None, True, False
         record.host_reason = f"moved from {source}, {move.why}"
         state.component_arrives(record.component, record.spec.kind, move.to)
-        self.lifecycle.runs(record, anew=True)
+        self.lifecycle.runs(record, replaced=True)
         state.drain_soon(source)
 
     def _stay(self, record: ComponentRecord, move: Migration, reason: str) -> None:
@@ -256,7 +256,7 @@ class Migrations:
         record.enter("running")
         state.wake_migration(record, None)
 
-    # Drained hosts: nothing is placed there, and what is movable leaves, heaviest first
+    # Drained hosts take no placements; movable components leave, heaviest first
 
     def drain(self, host: HostName) -> None:
         """Drain a host. An unknown one is refused: it is likely a typo."""

@@ -47,7 +47,7 @@ class Profile(NamedTuple):
 
     def learn(self, use: ComponentUse, speed: float) -> Profile:
         """Add a sample; memory is the slowly decaying maximum."""
-        # What it wanted, not what a busy host gave it.
+        # Its demand, not its share of a busy host.
         wanted = use.cpu / max(use.served, LEAST_SERVED) if use.served is not None else use.cpu
         threads = max(1, math.ceil(round(wanted, 1)))
         if not self.samples:

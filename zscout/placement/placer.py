@@ -10,7 +10,7 @@ carried out in order: changes are published before they are acted upon.
 
 At most one incarnation of a component runs. Each start on another host or after an end has a higher incarnation; a
 start with unknown outcome is repeated on the same host with the same incarnation, until the host's node is gone. So
-nothing runs twice for long, whatever is lost."""
+nothing runs twice for long, despite losses."""
 
 from __future__ import annotations
 
@@ -104,13 +104,13 @@ class Placer:
                 for status in components:
                     self._reconciler.inherited(status)
 
-    # Answers: those about an incarnation that no longer counts change nothing
+    # Answers about an incarnation that no longer counts change nothing
 
     def _start_answered(self, answer: events.StartAnswered) -> None:
         record = self._state.get(answer.component)
         may_run = answer.result in ("ok", "unknown")
         if record is None or record.state != "stopping" or record.incarnation != answer.incarnation:
-            may_run = True  # a refusal may be of another try to start it
+            may_run = True  # the refusal may be of another start
         if self._surplus.start_answered(answer.component, answer.incarnation, may_run=may_run):
             self._lifecycle.surplus_ended(answer.component)
             return

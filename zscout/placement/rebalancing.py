@@ -78,7 +78,7 @@ class Rebalancer:
         return found
 
     def _may_leave(self, record: ComponentRecord, host: HostName) -> bool:
-        # One that came lately: its host is not at rest then.
+        # The host of a recent arrival is not at rest.
         state = self.state
         free = record.movable and record.wanted and record.token and record.not_before <= state.now
         return free and host not in state.balancer.cordoned and self._at_rest(host)

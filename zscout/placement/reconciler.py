@@ -33,7 +33,7 @@ class Reconciler:
         if record is None:
             return
         if incarnation in record.ended_incarnations:
-            # Late news, or it started after it was stopped.
+            # A late report, or it started after its stop.
             self.surplus.add(component, incarnation, host, token=True)
         elif (move := record.migration) is not None and incarnation == move.incarnation:
             self.migrations.target_appeared(record, move)
@@ -88,7 +88,7 @@ class Reconciler:
         record.incarnation, record.host, record.token, record.confirmed = incarnation, host, token, False
         record.superseded = False
         record.host_reason = f"found running on {host}"
-        self.lifecycle.runs(record, anew=True)
+        self.lifecycle.runs(record, replaced=True)
 
     def _must_not_live(self, record: ComponentRecord) -> bool:
         """Return True if its incarnation ended, or is being stopped and its host was believed gone."""
@@ -116,10 +116,10 @@ class Reconciler:
 
     def listed(self, listing: ComponentsListed) -> None:
         state, host, only = self.state, listing.host, listing.only
-        # What a host sent before it was lost is no answer.
+        # A list sent before the host was lost is no answer.
         answered = self.probes.answered(host, only) if host in state.alive else []
         if listing.kinds is not None:
-            state.told_kinds(host, listing.kinds)
+            state.set_kinds(host, listing.kinds)
         for view in listing.components:
             if only in (None, view.component):
                 self._listed(host, view)
@@ -154,7 +154,7 @@ class Reconciler:
         elif incarnation == record.incarnation and not record.superseded:
             self._listed_alive(record, host, listed)
         elif listed.phase in RUNNING or (listed.phase == "starting" and incarnation < record.incarnation):
-            # One that only starts may be going to stand by for a move: its token tells, once it runs.
+            # A starting incarnation may become a standby: once it runs, its token appears.
             self._other_runs(record, incarnation, host, token=False)
 
     def _adopt(self, host: HostName, listed: ComponentView) -> None:
@@ -244,13 +244,13 @@ class Reconciler:
         for record in state.components.values():
             if record.state == "waiting":
                 if self.probes.has(host, record.component):
-                    # Perhaps it is there still: better than to start it anew.
+                    # It may still run there, which is better than a restart.
                     record.not_before = state.now + PROBE_TIMEOUT
                 state.wake(record, max(state.now, record.not_before))
             elif record.state == "stopping" and record.host == host:
                 self.lifecycle.end_incarnation(record)
             elif record.state == "running" and record.host == host:
-                # Its list or its token comes in a moment.
+                # Its list or token is about to arrive.
                 state.wake(record, state.now + GRACE)
 
     def host_lost(self, host: HostName) -> None:
@@ -280,7 +280,7 @@ class Reconciler:
             return
         record = state.get(status.component)
         if record is not None:
-            # A host was quicker; that it is to stop is known here only.
+            # A host reported first, but only the placement has the stop request.
             if not status.wanted and record.wanted and record.state not in OVER:
                 self.migrations.cancel(record)
                 self.lifecycle.stop(record)

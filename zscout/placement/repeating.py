@@ -141,7 +141,7 @@ class Probes:
 
     def add(self, host: HostName, component: ComponentId) -> None:
         if self._count >= MAX_COMPONENTS:
-            # The oldest are of hosts that will not come back.
+            # The oldest belong to hosts unlikely to return.
             self._drop(next(iter(self._open)))
         probes = self._open.setdefault(host, {})
         if component not in probes:

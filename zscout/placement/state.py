@@ -96,7 +96,7 @@ class ComponentRecord:
     state: ComponentState = "waiting"  # changed by `enter` alone
     incarnation: Incarnation = 0
     asked_at: Ns = 0
-    asked_as: Incarnation = 0  # its incarnation then: while unchanged, it was never started
+    asked_as: Incarnation = 0  # its incarnation at `asked_at`: while unchanged, it was never started
     superseded: bool = False  # the incarnation is of an earlier component of this name, and must not live
     host: HostName | None = None
     wanted: bool = True
@@ -241,7 +241,7 @@ class PlacementState:
             if always or self.published.get(component) != status:
                 self.published[component] = status
                 effects.append(ComponentChanged(component, status))
-        # A host may have been lost in this very instant, after a command to it.
+        # A host may be lost in this instant, after a command to it.
         return effects + [
             command for command in self._commands if isinstance(command, PlacementRefused) or command.host in self.alive
         ]
@@ -290,7 +290,7 @@ class PlacementState:
         self.timers.set(TimerKind.LIFECYCLE, component, None)
 
     def note_incarnation(self, component: ComponentId, incarnation: Incarnation) -> bool:
-        """Keep the next incarnation higher. False: this one is impossible, and ignored."""
+        """Keep the next incarnation higher. False: impossible, and ignored."""
         if incarnation > self._highest:
             return False
         if incarnation > self._incarnations.get(component, self._lowest):
@@ -334,16 +334,16 @@ class PlacementState:
         none = "there is no host" if other_than is None else "there is no other that it may use"
         return (), "; ".join(named) or none
 
-    def told_kinds(self, host: HostName, kinds: frozenset[Kind]) -> None:
+    def set_kinds(self, host: HostName, kinds: frozenset[Kind]) -> None:
         self.kinds.pop(host, None)
         self.kinds[host] = self.now, kinds
         if len(self.kinds) > MAX_HOSTS:
             del self.kinds[next(iter(self.kinds))]
 
     def lacks(self, host: HostName, kind: Kind) -> bool:
-        """Return True if a host has listed its kinds without this one."""
-        told = self.kinds.get(host)
-        return told is not None and kind not in told[1]
+        """Return True if a host has listed its kinds without `kind`."""
+        listed = self.kinds.get(host)
+        return listed is not None and kind not in listed[1]
 
     def lacking_everywhere(self, spec: ComponentSpec) -> set[HostName]:
         """The live hosts that lack only its kind, if no known host has it."""

@@ -67,7 +67,7 @@ class _Search:
     best: int
     begun: bool = False
     inexact: bool = False  # not proven optimal: the heuristic's set must pass the votes before it serves as baseline
-    local: LocalSearch | None = None  # none before the search begins, and after it has ended
+    local: LocalSearch | None = None  # None before the search begins, and after it has ended
     steps: int = 0
     slices: int = 0
     rounds: int = 0

@@ -115,10 +115,10 @@ class Claims:
             self._actions.wait(arc, Reason(ReasonCode.NOT_YET))
 
     def _wait_again(self, arc: Arc, date: Ns) -> None:
-        self._go_on(arc)
+        self._stop_waiting(arc)
         self._wait_until(arc, date)
 
-    def _go_on(self, arc: Arc) -> None:
+    def _stop_waiting(self, arc: Arc) -> None:
         if arc.held_back is not None and not arc.held_back[1]:
             self._state.consider_again(arc)
 
@@ -153,7 +153,7 @@ class Claims:
         if arc is not None and (at_present or self._state.now < self.certain_from):
             self._wanting[claim.booking.id] = [*self._wanting.get(claim.booking.id, ()), arc]
         if arc is not None and not at_present:
-            self._go_on(arc)
+            self._stop_waiting(arc)
             self._wait_until(arc, self.certain_from)
 
     def expire(self) -> None:
@@ -199,7 +199,7 @@ class Claims:
         self._state.claims_changed()
         return True
 
-    def tell_dangers(self) -> None:
+    def report_dangers(self) -> None:
         """Report bookings newly in danger, or no longer. Checks the bookings that changes may affect, those in
         danger and overdue ones."""
         state = self._state
@@ -222,7 +222,7 @@ class Claims:
         concerned |= {claim: None for claim in self._endangered if self._relieving(claim) & (changed | voted)}
         for claim in concerned:
             if state.claims.get(claim.booking.id) is claim:
-                self._tell_danger(claim)
+                self._report_danger(claim)
 
     @property
     def next_start(self) -> Ns | None:
@@ -233,7 +233,7 @@ class Claims:
         patterns = claim.arc.patterns
         return claim.kept | union(rc.bit for need in patterns for rc in self._state.matching(need))
 
-    def _tell_danger(self, claim: Claim) -> None:
+    def _report_danger(self, claim: Claim) -> None:
         state, reserved = self._state, reservations(self._state, self._state.policy.patience, self._reserved)
         found = danger(state, reserved, claim)
         if isinstance(found, Reason) and self._keep_another(claim):

@@ -160,7 +160,7 @@ def split(arcs: Iterable[Arc]) -> list[list[Arc]]:
     groups: dict[int, list[Arc]] = {}
     for number, arc in enumerate(members):
         groups.setdefault(find(number), []).append(arc)
-    # Each begins with its best-ranked, and they were met in that order.
+    # Groups and members are in rank order by construction.
     return list(groups.values())
 
 
@@ -230,7 +230,7 @@ class ConflictGroup:
         ruled_out = False
         for rc in self.sharables:
             holders = frozenset(self._holders(rc, chosen))
-            # Its present holders have been accepted; an RC that can't carry them any longer reports that.
+            # Present holders are accepted; an RC that can no longer carry them reports that.
             if holders <= rc.holders.keys():
                 continue
             answer = self.votes.known(rc.name, holders)

@@ -62,7 +62,7 @@ class Core:
         self._run_again = False
         self._expire()
         self._claims.expire()
-        self._state.let_in()
+        self._state.readmit()
         if len(events) == 1 and isinstance(events[0], model.Requested):
             self._ask(events[0], alone=True)
         else:
@@ -75,14 +75,14 @@ class Core:
         for arc in self._state.held_back.values():
             if arc.held_back is None and (other := self._state.at_place(arc.place)) is not None:
                 self.wait(arc, _claimed_by(other))
-        self._claims.tell_dangers()
+        self._claims.report_dangers()
         self._set_wake()
         return self._effects
 
     @property
     def reasons_changed(self) -> bool:
         """Return True if a waiting ARC may have another reason than the one last reported."""
-        return bool(self._state.index.retold)
+        return bool(self._state.index.unreported)
 
     def tell_reasons(self) -> list[model.Effect]:
         """The reasons that changed since the last report, for callers that display them."""
@@ -265,7 +265,7 @@ class Core:
                 if self._state.rc(rc).present:
                     self._lose_rc(rc, "it started anew")
                 self._state.join(rc, sharable=sharable)
-                self._state.let_in(rc)
+                self._state.readmit(rc)
             case model.RcReported(rc, ended, rules_changed):
                 for arc in ended:
                     if arc in self._state.rc(rc).holders:
@@ -306,7 +306,7 @@ class Core:
             return
         arc = self._new_arc(asked.request, asked.place)
         if alone and asked.since is None and not asked.request.booking and self._state.is_free(arc):
-            # What any strategy would do, without a queue of one.
+            # As any strategy would, without a queue of one.
             self._state.enter(arc)
             self.start(arc)
             return
@@ -376,7 +376,7 @@ class Core:
             return
         reason = Reason(ReasonCode.HANDED_OVER, detail=to)
         if existing is not None:
-            # Where a change of RCM hid the outcome, both clients may have reported the one ARC.
+            # After a change of RCM both clients may have reported the ARC.
             same_needs = existing.request.needs == arc.request.needs
             if existing.place != arc.place and (existing.hold is None or not same_needs):
                 return
@@ -416,7 +416,7 @@ class Core:
 
     def _adopt(self, held: model.RecoveredHold) -> None:
         known = self._state.arc(held.request.arc)
-        # What this RCM granted and does not know any more it has ended.
+        # A grant of this term that is unknown here has ended.
         over = held.grant in self._over or held.grant.term == self.term
         if over or (known is not None and known.hold is not None):
             return
@@ -427,7 +427,7 @@ class Core:
             held = replace(held, place=min(known.place, held.place))
         arc = self._take_up(held)
         if known is not None and arc.hold is None and self._state.arc(arc.id) is arc:
-            # As its client asked: of an RC that is absent the others of its gang know no parameters.
+            # Use its client's request: the report lacks parameters of absent RCs.
             self._state.dequeue(arc)
             self._forget(arc)
             self._claims.leave(arc)
@@ -497,7 +497,7 @@ class Core:
         return arc.id in self._state.queued
 
     def wait(self, arc: Arc, reason: Reason, *, settled: bool = True) -> None:
-        # An earlier reason is kept while proposals are open: it would change back and forth otherwise.
+        # Keep the earlier reason while proposals are open, to avoid flapping.
         if reason == arc.reason or (not settled and arc.reason):
             return
         arc.reason = reason

@@ -76,7 +76,7 @@ def _overlaps(state: SchedulerState, claim: Claim, promise: Reservation, date: N
     """Return True if the promise keeps out a booking that begins at `date`."""
     if promise.start >= claim.booking.end or promise.over() <= date:
         return False
-    # Maintenance of lower priority keeps out only who would start in it.
+    # Maintenance of lower priority keeps out only bookings that start during it.
     return not promise.excludes or promise.start <= date or state.band(claim.booking.priority) <= -promise.order[1]
 
 

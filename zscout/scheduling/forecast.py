@@ -50,7 +50,7 @@ def forecast(
 ) -> Forecast:
     """Play a copy of `core` forward from `now`, with `newcomer` asking at once. With `runtimes` holds end when they
     usually do."""
-    # A strategy may keep unfinished searches: the forecast must not meddle with them.
+    # A copy, as a strategy may keep unfinished searches.
     copy = Core(STRATEGIES[core.strategy.name](), core.policy)
     joined, lead = core.as_events(Term(core.term.counter + 1, "forecast"))
     result = Forecast()
@@ -87,7 +87,7 @@ def forecast(
                         unserved.add(arc)
                     if preempting is not None and by == preempting and outcome is Outcome.PREEMPTED:
                         result.preempts.append(arc)
-        # A kept hold goes on past its minimum runtime: what counts is when it becomes preemptible.
+        # A kept hold outlasts its minimum runtime: only the time until it is preemptible counts.
         for arc in [arc for arc, end in ends.items() if end <= now]:
             del ends[arc]
 

@@ -63,7 +63,7 @@ class ArcRequest(Struct, frozen=True):
     def name(self) -> str:
         return self.label or self.arc
 
-    def goes_on_from(self, other: ArcRequest) -> bool:
+    def continues_from(self, other: ArcRequest) -> bool:
         return self.continues == other.name and self.client == other.client
 
 

@@ -53,13 +53,13 @@ def improve(problem: PackingProblem, start: int, budget: float = SOLVER_BUDGET) 
     """A feasible set at least as good as the feasible `start`; the best set, if time allows."""
     found = _Solver(problem, start, budget).solve()
     best = max((problem.complete(found), found), key=problem.key)
-    # Only a proof tells sets of equal worth apart; otherwise the start stays.
+    # Only a proof decides between sets of equal worth; otherwise the start stays.
     return best if problem.key(best) > problem.key(start) or best == found else start
 
 
 class _Solver:
     def __init__(self, problem: PackingProblem, start: int, budget: float) -> None:
-        from ortools.sat.python import cp_model  # large: only who needs it loads it
+        from ortools.sat.python import cp_model  # large, so imported on use
 
         self.problem, self.found, self.left = problem, start, budget
         self.cp = cp_model
@@ -152,7 +152,7 @@ class Optimal(Strategy):
         for group in conflict_groups(state):
             if not decide(group, actions):
                 held |= group.mask
-        # Nothing is left for it to start; it reports to the waiting ARCs what they wait for.
+        # It starts none, but reports the reasons of waiting ARCs.
         priority.run_pass(state, actions, off_limits=held)
 
 
@@ -162,7 +162,7 @@ def decide(group: ConflictGroup, actions: Actions) -> bool:
     while proposals is None:
         if len(group.nogoods) > MAX_VETOES:
             return True
-        # None: a veto that was known ruled it out, and each round bars at least one more set.
+        # None: ruled out by a known veto; each round bars at least one more set.
         proposals = group.missing_votes(chosen := best(group.problem()))
     if proposals:
         for rc, holders in proposals:

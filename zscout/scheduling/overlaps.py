@@ -29,7 +29,7 @@ def overlaps(state: SchedulerState, order: Iterable[str], starts: Mapping[str, N
     for name in order:
         if (claim := state.claims.get(name)) is None:
             continue
-        # What it has for a pattern while it runs, it has.
+        # A running ARC keeps the RCs of its patterns.
         needed = claim.kept if claim.arc.hold is None else claim.arc.named_mask
         for rc in state.rcs_in(needed & state.present):
             near = (standing.get((rc.bit, day), ()) for day in _days(claim, starts))

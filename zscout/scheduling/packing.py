@@ -146,8 +146,7 @@ class _BranchAndBound:
         self.problem = problem
         self.limit = nodes
         items = problem.items
-        # These stay wherever they fit, so there is nothing to decide about them. Others that run have to be
-        # decided by rank, and the set as a whole is checked.
+        # These stay wherever they fit. Other running items are decided by rank, and the whole set is checked.
         self.always_kept = [
             item.in_min_runtime and not nogoods for item, nogoods in zip(items, problem.nogoods, strict=True)
         ]

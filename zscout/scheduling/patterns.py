@@ -90,10 +90,12 @@ def _fitness(
             return Fitness.RESERVED, rc.demand
         if answer is not None and not answer.accept:
             return Fitness.HELD, rc.demand
-        # What it continues ends for it; its device goes on only where it has the same RC.
+        # The ARC that it continues ends for it; its device continues only on the same RC.
         asked = arc.request
-        goes_on = bool(asked.continues) and any(asked.goes_on_from(holder.request) for holder in rc.holders.values())
-        return Fitness.FREE, -1 if goes_on or kept else len(rc.holders) + (answer is None)
+        continues_here = bool(asked.continues) and any(
+            asked.continues_from(holder.request) for holder in rc.holders.values()
+        )
+        return Fitness.FREE, -1 if continues_here or kept else len(rc.holders) + (answer is None)
     if non_preemptible:
         held_until = max(0 if holder.hold is None else holder.hold.end for holder in non_preemptible)
         return Fitness.HELD, held_until
@@ -187,7 +189,7 @@ def bind_all(state: SchedulerState, reserved: Reservations | None = None) -> Non
 
 def no_match(state: SchedulerState, arc: Arc) -> Reason:
     there = {need: sum(rc.present for rc in state.matching(need)) for need in arc.patterns}
-    # Those without any; else there are some for each, but not enough for all.
+    # Patterns without any RC; else all, as there are too few for all.
     short = sorted(need for need, count in there.items() if not count) or sorted(there)
     lost = [rc for need in short for rc in state.matching(need) if not rc.present]
     return of_rcs(ReasonCode.NO_MATCH, short, absences(dict.fromkeys(lost)))

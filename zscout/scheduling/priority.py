@@ -113,8 +113,8 @@ class AdmissionCheck:
             rcs, parties = tuple(rc.name for rc, _ in shown), tuple(holder.blocks(arc) for _, holder in shown)
             return Reason(ReasonCode.HELD, rcs, parties, self._preferred(), number)
         bound = {rc: need for need, rc in arc.bound.items()}
-        told = [(rc, holder, "") for rc, holder in self.non_preemptible if rc.name not in bound]
-        known = {rc.bit for rc, _, _ in told}
+        held = [(rc, holder, "") for rc, holder in self.non_preemptible if rc.name not in bound]
+        known = {rc.bit for rc, _, _ in held}
         for rc, _ in self.non_preemptible:
             if rc.bit in known:  # two patterns may have the same choices
                 continue
@@ -122,14 +122,14 @@ class AdmissionCheck:
             for choice in sorted(self.state.matching(need), key=attrgetter("name")):
                 if choice.present and not choice.sharable and not choice.bit & (union(known) | arc.named_mask):
                     known.add(choice.bit)
-                    told += [(choice, holder, need) for holder in choice.non_preemptible_holders(arc, self.now)[:1]]
-        first = told[:SHOWN_CHOICES]
+                    held += [(choice, holder, need) for holder in choice.non_preemptible_holders(arc, self.now)[:1]]
+        first = held[:SHOWN_CHOICES]
         return Reason(
             ReasonCode.HELD,
             tuple(rc.name for rc, _, _ in first),
             tuple(holder.blocks(arc) for _, holder, _ in first),
             self._preferred(),
-            len(told),
+            len(held),
             patterns=tuple(need for _, _, need in first),
         )
 
@@ -245,8 +245,8 @@ def run_pass(
 def reasons_of_now(state: SchedulerState) -> Iterator[tuple[Arc, Reason]]:
     """New reasons of the best MAX_REPORTED watchers of each RC taken since the last call. No pass computes them:
     most are out of date before they are read."""
-    retold, state.index.retold = state.index.retold & state.index.watched, 0
-    for rc in state.rcs_in(retold):
+    unreported, state.index.unreported = state.index.unreported & state.index.watched, 0
+    for rc in state.rcs_in(unreported):
         for rank in rc.watchers[:MAX_REPORTED]:
             arc = state.queued[rank[-1]]
             if (obstacle := AdmissionCheck(state, arc).obstacle(0)) is not None:
@@ -287,7 +287,7 @@ class Pass:
                     self._check(arc)
             if rc is not None:
                 self._call_next_watcher(rc, last)
-        # Those who were checked before a change further down have not seen it.
+        # ARCs checked before a later change have not seen it.
         self.index.touched |= self._changed_here
 
     def _check(self, arc: Arc) -> None:
@@ -351,7 +351,7 @@ class Pass:
     def _apply(self, arc: Arc, check: AdmissionCheck, verdict: _Verdict) -> None:
         match verdict:
             case Inadmissible(rc, reason, proposal) if proposal is not None:
-                # An RC that has not answered in time is asked again now and then: no change there would call the ARC.
+                # A silent RC is asked again at times: no change there would queue the check.
                 silent = rc.name in self.votes.unresponsive
                 self.index.put(arc, ArcState.READY)
                 self.actions.wait(arc, reason if silent else VOTING, settled=silent)
@@ -365,13 +365,13 @@ class Pass:
                         self.index.watch(arc, rc)
                     self.actions.wait(arc, reason)
                 else:
-                    # The ARC could do with another RC.
+                    # Another RC could serve the ARC.
                     self.index.put(arc, ArcState.READY)
                     if reason.code is ReasonCode.VETOED:
                         reason = reason._replace(rcs=check.refusing(pattern))
                     self.actions.wait(arc, reason._replace(pattern=pattern))
             case "over quota":
-                # Whoever of its owner's ends may let it go: no RC shows that.
+                # The end of any ARC of its owner may admit it: no RC shows that.
                 self.index.put(arc, ArcState.READY)
                 quota = self.state.policy.max_running_per_host or 0
                 self.actions.wait(arc, Reason(ReasonCode.QUOTA, detail=arc.owner, number=quota))
@@ -406,7 +406,7 @@ class Pass:
     def _defer(self, arc: Arc, check: AdmissionCheck, state: ArcState) -> None:
         footprint = check.footprint()
         if arc.patterns:
-            # It is checked again whatever happens: another RC may do.
+            # Always checked again: another RC may serve it.
             self.index.put(arc, ArcState.READY)
         else:
             self.index.put(arc, state, footprint, check.masked_obstacles())
@@ -471,5 +471,5 @@ class Pass:
         if rc.sharable or rc.bit & self.off_limits or not rc.non_preemptible_holders(arc, self.state.now):
             return True
         self._walked.discard(rc.bit)
-        self.index.retold |= rc.bit
+        self.index.unreported |= rc.bit
         return False

@@ -27,9 +27,9 @@ class QueueIndex:
         self.watched = 0  # bits of the RCs with watchers
         self.freed = 0  # bits of the RCs that may admit watchers since the last pass
         self.touched = 0  # bits of the RCs with other changes: these affect all but watchers
-        self.retold = 0  # bits of the RCs with new holders that are not reported to watchers yet
+        self.unreported = 0  # bits of the RCs with new holders that are not reported to watchers yet
         self.ranks: list[Rank] = []  # of all queued ARCs, best first
-        self._not_starving: list[tuple[Ns, ArcId]] = []  # other queued ARCs, by the time since when they wait
+        self._not_starving: list[tuple[Ns, ArcId]] = []  # queued ARCs, by the start of their wait
         self.starving: list[tuple[int, Ns, ArcId]] = []  # by band of priorities (negated), then waiting time
         self.starving_version = 0  # grows when an ARC starts or stops starving
 

@@ -90,7 +90,7 @@ def _versions(state: SchedulerState) -> tuple[int, ...]:
 
 
 def _booked_versions(state: SchedulerState) -> tuple[int, ...]:
-    # A booking whose time has come is kept for as long only as all that it needs is there.
+    # After its date a booking is kept only while all its RCs are present.
     begun = state.begun
     return state.claims_version, begun, state.present if begun else 0
 
@@ -152,7 +152,7 @@ class Reservations:
                     continue
                 beside = rc.sharable and not promise.excludes
                 if not (beside and self._votes.accepts(rc.name, frozenset((promise.arc.id, arc.id)))):
-                    # Each is passed once: time goes forward only.
+                    # Each booking is passed once, as time only increases.
                     return self._beside_bookings(arc, rcs, promise.booked, order)
         return start
 
@@ -167,7 +167,7 @@ class Reservations:
         reservation = Reservation(arc, start, order)
         self.starts.append(start)
         for rc in rcs:
-            # A list of its own: that of what is booked is shared with the next reservations.
+            # A copy: the next reservations share the list of bookings.
             self.by_rc[rc.bit] = list(self.by_rc.get(rc.bit, ()))
             insort(self.by_rc[rc.bit], reservation, key=attrgetter("order"))
             self._free[rc.bit] = max(self._free.get(rc.bit, 0), arc.ends(start))
@@ -283,7 +283,7 @@ class Reservations:
         )
 
     def _delays(self, arc: Arc, reservation: Reservation) -> bool:
-        """Return True if `arc`, started now, would unlawfully hold reserved RCs at their time."""
+        """Return True if `arc`, started now, would hold reserved RCs at their time, and must not."""
         band, now = self._state.band, self._state.now
         begun = reservation.excludes and reservation.start <= now
         binds = begun or band(arc.priority) <= band(reservation.arc.priority)

@@ -137,7 +137,7 @@ class _Estimate:
         median = _median(left) if elapsed else self._median
         if median is not None:
             return max(elapsed + 1, round(median * unit))
-        # It has outlasted those that are known: what is expected grows with what has passed.
+        # Longer than all known holds: the expectation grows with the elapsed time.
         return elapsed + elapsed // 8 + 1 if elapsed else None
 
 

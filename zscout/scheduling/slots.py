@@ -22,7 +22,7 @@ from zscout.scheduling.votes import HolderSet
 from zscout.types import ArcId, Need, Ns, RcName
 
 MAX_TRIED: Final = 4_000
-"""Times that one question checks."""
+"""Times checked per question."""
 
 
 class Slot(NamedTuple):
@@ -37,7 +37,7 @@ class Slot(NamedTuple):
 class SlotsFound:
     found: list[Slot] = field(default_factory=list)
     unknown: list[tuple[Rc, HolderSet]] = field(default_factory=list)  # votes needed before the next slot is known
-    complete: bool = True  # false: the search was cut off at MAX_TRIED
+    complete: bool = True  # False: the search was cut off at MAX_TRIED
 
 
 class _Taken(NamedTuple):
@@ -99,7 +99,7 @@ class _Search:
         self._choices: dict[Need, list[Rc]] = {}
         for need in arc.patterns:
             known = [rc for rc in state.matching(need) if not rc.bit & barred]
-            # One that is away may be back by then, but nobody counts on it.
+            # Absent RCs may return by then, but count only where none is present.
             self._choices[need] = [rc for rc in known if rc.present] or known
         self._taken: dict[int, list[_Taken]] = {}
         for rc in {rc.bit: rc for rc in chain(self._named, *self._choices.values())}.values():
@@ -148,7 +148,7 @@ class _Search:
             if self._presume:
                 allowed[need] += [rc for rc in choices if not isinstance(found[rc.bit], bool)]
             if len(allowed[need]) < len(self._choices) and not self._presume:
-                # With enough that are free without it nobody is asked.
+                # With enough free RCs no vote is needed.
                 unknown += [(rc, free) for rc in choices if not isinstance(free := found[rc.bit], bool)]
         chosen = distinct(allowed)
         if unknown and chosen is not None and not any(rc in self._named for rc, _ in unknown):

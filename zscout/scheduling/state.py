@@ -195,13 +195,13 @@ class SchedulerState:
         self.index.remove(arc)
 
     def hold_back(self, arc: Arc, until: Ns, rcs: tuple[RcName, ...]) -> None:
-        """A queued ARC is not considered before then, unless `let_in` admits it."""
+        """A queued ARC is not considered before then, unless `readmit` admits it."""
         self.dequeue(arc)
         arc.move_to(ArcState.HELD_BACK)
         arc.held_back = until, rcs
         self.held_back[arc.id] = arc
 
-    def let_in(self, rc: RcName | None = None) -> None:
+    def readmit(self, rc: RcName | None = None) -> None:
         for arc in list(self.held_back.values()):
             if arc.held_back is not None and (arc.held_back[0] <= self.now or rc in arc.held_back[1]):
                 self.consider_again(arc)
@@ -451,7 +451,7 @@ class SchedulerState:
         if arc.request.continues:
             for rc in self.rcs_in(arc.mask & ~self.sharable):
                 for holder in rc.holders.values():
-                    if arc.request.goes_on_from(holder.request) and holder.preemptible_by(arc, self.now):
+                    if arc.request.continues_from(holder.request) and holder.preemptible_by(arc, self.now):
                         return holder
         return None
 
