@@ -1,16 +1,14 @@
 """The pure core of the load balancer: reports and placements in, rankings out.
 
-A host is eligible if it has reported lately, is not cordoned, and meets the requirements. What was placed and
-is not in the reports yet is *pending*: policies `pending` and `two_choices` add it to the host's load, so
-that components that start together spread; the other policies use the reports only.
+A host is eligible if its report is recent, it is not cordoned, and it meets the requirements. Placements missing from
+the reports are *pending*: policies `pending` and `two_choices` add them to the host's load, so that components that
+start together spread; the other policies use the reports only.
 
-- `least_loaded`: the best score (the paper; all on one host when all start at once: its Figure 3a).
-- `randomized`: the best after a little noise on each load (the cure that the paper proposes).
-  It changes the metrics that depend on load: `load_average` and `composite`.
-- `two_choices`: the better of two hosts drawn at random (Mitzenmacher, IEEE TPDS 12(10), 2001), first. Of two
-  that can't be told apart, the one that was chosen longer ago.
-- `pending`: the best score.
-"""
+- `least_loaded`: the best score (the paper; simultaneous starts all pick one host: its Figure 3a).
+- `randomized`: the best after noise on each load (the paper's cure). It affects `load_average` and `composite`.
+- `two_choices`: the better of two random hosts first (Mitzenmacher, IEEE TPDS 12(10), 2001). Of two equal hosts, the
+  one chosen longer ago.
+- `pending`: the best score."""
 
 from __future__ import annotations
 
@@ -30,30 +28,30 @@ from zscout.types import SECOND, ComponentId, HostName, Kind, Metric, Ns
 LOAD_TIME: Final = 60 * SECOND
 """Time constant of the one-minute load average, in ns."""
 NOISE: Final = 0.25
-"""Greatest noise of policy `randomized`, in load a core."""
+"""Greatest noise of policy `randomized`, in load per core."""
 COUNTING: Final = frozenset({"two_choices", "pending"})
-"""Policies that count what was placed and is not in the reports yet."""
+"""Policies that count pending placements."""
 CLOSE: Final = 0.05
-"""Scores that differ by less, or by less of the greater, are equal to policy `two_choices`."""
+"""Absolute or relative difference of scores that are equal to policy `two_choices`."""
 SETTLED: Final = 3 * SECOND
-"""A component's figures count for its kind's profile and for `auto` once it has run as long, in ns."""
+"""Run time in ns before a component's figures count."""
 SHOWN: Final = 8 * LOAD_TIME
-"""A component that has run as long is in the load average but for a thousandth of it."""
+"""After this run time the load average shows a component to a thousandth."""
 MAX_HOSTS: Final = 10_000
 MAX_KINDS: Final = 10_000
 MAX_PLACED: Final = 100_000
 LARGEST: Final = 2**63
-"""No load and no bytes of memory that a report may have are more."""
+"""Limit of load and bytes of memory in a report."""
 SMALLEST: Final = 0.001
-"""Cores: what is divided by."""
+"""Least cores in a report."""
 
 _Found: TypeAlias = tuple[float, HostName]
-"""A host's score, negated: so the best comes first, and of equals the first by name."""
+"""A host's negated score: best first, equals by name."""
 
 
 @dataclass(slots=True)
 class _Placed:
-    """A component that this balancer's placer started, or that was found in a report: then without scores."""
+    """A component placed here, or found in a report: then without scores."""
 
     kind: Kind
     host: HostName
@@ -64,27 +62,23 @@ class _Placed:
 
 
 class Balancer:
-    """Everything that is known of hosts, kinds and placements. `rng` is for noise and lots."""
+    """Everything known of hosts, kinds and placements. `rng` is for noise and lots."""
 
     def __init__(self, rng: Random) -> None:
         self._rng = rng
         self.reports: dict[HostName, tuple[Ns, LoadReport]] = {}
-        """The oldest first."""
-        self._outlooks: dict[HostName, Outlook] = {}
-        """From the reports alone."""
+        self._outlooks: dict[HostName, Outlook] = {}  # from the reports alone
         self.profiles: dict[Kind, Profile] = {}
         self.cordoned: set[HostName] = set()
         self.learner = MetricLearner()
         self._placed: dict[ComponentId, _Placed] = {}
-        self._there: dict[HostName, set[ComponentId]] = {}
-        """The same by host, for hosts are lost many at once."""
+        self._there: dict[HostName, set[ComponentId]] = {}  # the same by host: a lost host takes many
         self._pending: dict[HostName, dict[ComponentId, _Placed]] = {}
         self._chosen: dict[HostName, int] = {}
         self._choices = 0
 
     def reported(self, now: Ns, report: LoadReport) -> None:
-        """A load report came. One with an older number than the last is dropped. Raises ValueError for
-        figures that no host can have."""
+        """Record a load report unless it is out of order. Raises ValueError for impossible figures."""
         load, memory = report.load_average[0], report.memory_available
         if not (0 <= load <= LARGEST and 0 <= memory <= LARGEST and report.cores >= SMALLEST):
             figures = f"load_average {load}, memory_available {memory} and cores {report.cores}"
@@ -101,7 +95,6 @@ class Balancer:
             self._add_sample(now, report, use)
 
     def lost(self, host: HostName) -> None:
-        """A host is gone, and what ran there."""
         self.reports.pop(host, None)
         self._outlooks.pop(host, None)
         self._pending.pop(host, None)
@@ -110,7 +103,7 @@ class Balancer:
             del self._placed[component]
 
     def placed(self, now: Ns, component: ComponentId, kind: Kind, host: HostName) -> None:
-        """A component is being started on a host; it leaves the host that it was on."""
+        """Count a component that starts on a host; it leaves its earlier host."""
         self.gone(component)
         if len(self._placed) >= MAX_PLACED:
             return
@@ -120,19 +113,18 @@ class Balancer:
             scores = {metric: score([outlook], self.profile(kind))[0] for metric, score in SCORES.items()}
             self._choices += 1
             self._chosen[host] = self._choices
-        self._placed[component] = one = _Placed(kind, host, now, scores)
+        self._placed[component] = placement = _Placed(kind, host, now, scores)
         self._there.setdefault(host, set()).add(component)
-        self._pending.setdefault(host, {})[component] = one
+        self._pending.setdefault(host, {})[component] = placement
 
     def gone(self, component: ComponentId) -> None:
-        """A component ended, or did not start."""
-        one = self._placed.pop(component, None)
-        if one is not None:
-            there = self._there[one.host]
+        placement = self._placed.pop(component, None)
+        if placement is not None:
+            there = self._there[placement.host]
             there.discard(component)
             if not there:
-                del self._there[one.host]
-            self._let_go(component, one.host)
+                del self._there[placement.host]
+            self._let_go(component, placement.host)
 
     def _let_go(self, component: ComponentId, host: HostName) -> None:
         waiting = self._pending.get(host, {})
@@ -141,33 +133,30 @@ class Balancer:
             self._pending.pop(host, None)
 
     def _room(self, now: Ns) -> bool:
-        """Room for a host more: where there is none, silent ones make it."""
         if len(self.reports) >= MAX_HOSTS:
             for host in [host for host, (at, _) in self.reports.items() if now - at > STALE]:
                 self.lost(host)
         return len(self.reports) < MAX_HOSTS
 
     def _add_sample(self, now: Ns, report: LoadReport, use: ComponentUse) -> None:
-        one = self._placed.get(use.component)
-        if one is None and len(self._placed) < MAX_PLACED:
-            # Of a balancer before this one: its profile is learnt, and the load average shows it already.
-            one = _Placed(use.kind, report.host, now, {})
-            self._placed[use.component] = one
+        placement = self._placed.get(use.component)
+        if placement is None and len(self._placed) < MAX_PLACED:
+            # From an earlier balancer: learn its profile; the load average includes it.
+            placement = _Placed(use.kind, report.host, now, {})
+            self._placed[use.component] = placement
             self._there.setdefault(report.host, set()).add(use.component)
-        if one is None or one.host != report.host:
+        if placement is None or placement.host != report.host:
             return
-        one.seen = True
-        if now - one.at >= SHOWN:
-            self._let_go(use.component, one.host)
-        if now - one.at < SETTLED:
+        placement.seen = True
+        if now - placement.at >= SHOWN:
+            self._let_go(use.component, placement.host)
+        if now - placement.at < SETTLED:
             return
-        if len(self.profiles) < MAX_KINDS or one.kind in self.profiles:
-            self.profiles[one.kind] = self.profile(one.kind).learn(use, report.speed)
-        if not one.learnt and use.served is not None and one.scores:
-            one.learnt = True
-            self.learner.seen.append((one.scores, use.served * report.speed))
-
-    # Queries
+        if len(self.profiles) < MAX_KINDS or placement.kind in self.profiles:
+            self.profiles[placement.kind] = self.profile(placement.kind).learn(use, report.speed)
+        if not placement.learnt and use.served is not None and placement.scores:
+            placement.learnt = True
+            self.learner.seen.append((placement.scores, use.served * report.speed))
 
     def profile(self, kind: Kind) -> Profile:
         return self.profiles.get(kind) or Profile()
@@ -178,20 +167,20 @@ class Balancer:
         return [name for _, _, name in sorted((-profile.cpu, -profile.memory, name) for profile, name in profiles)]
 
     def outlook(self, now: Ns, host: HostName, *, pending: bool) -> Outlook:
-        """A host as reported, with what is pending there if `pending`. Raises KeyError."""
+        """A host as reported, with pending components if `pending`. Raises KeyError."""
         outlook = self._outlooks[host]
         if pending and host in self._pending:
             report, load, memory = outlook.report, outlook.load, outlook.memory
-            for one in self._pending[host].values():
-                profile = self.profile(one.kind)
-                # The load average shows a component the better the longer it runs.
-                load += profile.wants(report.speed) * math.exp(-(now - one.at) / LOAD_TIME)
-                memory -= 0 if one.seen else profile.memory
+            for placement in self._pending[host].values():
+                profile = self.profile(placement.kind)
+                # The load average includes a component gradually.
+                load += profile.wants(report.speed) * math.exp(-(now - placement.at) / LOAD_TIME)
+                memory -= 0 if placement.seen else profile.memory
             return Outlook(report, load, memory)
         return outlook
 
     def rank(self, now: Ns, query: RankQuery, at_most: int | None = None) -> Ranking:
-        """Hosts best first, by the metric and policy of the query; `at_most` are listed."""
+        """Hosts best first; the first `at_most` are listed."""
         metric, why = query.metric, "as asked"
         if metric == "auto":
             metric, why = self.learner.choose(self._rng)
@@ -212,28 +201,27 @@ class Balancer:
         return Ranking(hosts, metric, why, left_out, more=len(found) - len(best_first))
 
     def _two_choices(self, found: list[_Found]) -> list[_Found]:
-        """The better of two that are drawn, then the other, then the rest."""
+        """The better of two drawn hosts, then the other, then the rest."""
         best_first = sorted(found)
         if len(best_first) > 1:
             drawn = self._rng.sample(best_first, 2)
             first = self._better(*drawn)
-            best_first.sort(key=lambda one: (one is not first, one not in drawn))
+            best_first.sort(key=lambda candidate: (candidate is not first, candidate not in drawn))
         return best_first
 
-    def _better(self, one: _Found, other: _Found) -> _Found:
-        if math.isclose(one[0], other[0], rel_tol=CLOSE, abs_tol=CLOSE):
-            return min(one, other, key=lambda found: self._chosen.get(found[1], 0))
-        return min(one, other)
+    def _better(self, first: _Found, other: _Found) -> _Found:
+        if math.isclose(first[0], other[0], rel_tol=CLOSE, abs_tol=CLOSE):
+            return min(first, other, key=lambda found: self._chosen.get(found[1], 0))
+        return min(first, other)
 
     def _fit(self, now: Ns, query: RankQuery) -> tuple[dict[HostName, Outlook], dict[HostName, str]]:
-        """Eligible hosts, and why the others are not."""
         pending = query.policy in COUNTING
         doubtful: Iterable[HostName]
         if query.hosts is not None or self.cordoned or query.labels or query.memory:
             fit: dict[HostName, Outlook] = {}
             doubtful = self.reports if query.hosts is None else query.hosts
         else:
-            # Of thousands, only those are examined that may differ from their reports.
+            # Examine only hosts that may differ from their reports.
             fit = self._outlooks.copy()
             overdue = takewhile(lambda host: now - self.reports[host][0] > STALE, self.reports)
             doubtful = {*overdue, *(self._pending.keys() & fit.keys() if pending else ())}
@@ -248,7 +236,6 @@ class Balancer:
         return fit, left_out
 
     def _unfit(self, now: Ns, host: HostName, query: RankQuery) -> str | None:
-        """Why a host is not eligible; None if it is."""
         if host not in self.reports:
             return NO_REPORT
         at, report = self.reports[host]
@@ -267,27 +254,24 @@ class Balancer:
 
 
 class RankingCache:
-    """Rankings of one instant. To rank a thousand hosts takes milliseconds, and of many components that are
-    placed in one instant each changes one host: only that one is ranked anew."""
+    """Rankings of one instant. A thousand hosts take milliseconds, and each placement changes one host: only that is
+    ranked again."""
 
     def __init__(self, balancer: Balancer) -> None:
         self._balancer = balancer
         self._now: Ns = 0
-        self._cached: dict[RankQuery, tuple[Ranking, set[HostName]]] = {}
-        """With the hosts that have changed since."""
+        self._cached: dict[RankQuery, tuple[Ranking, set[HostName]]] = {}  # with the hosts changed since
 
     def begin(self, now: Ns) -> None:
-        """Another instant, or hosts were cordoned: nothing is cached."""
         self._now, self._cached = now, {}
 
     def invalidate(self, host: HostName) -> None:
-        """A component came to a host or left it."""
         for _, changed in self._cached.values():
             changed.add(host)
 
     def rank(self, query: RankQuery) -> Ranking:
         if query.metric == "auto" or query.policy in ("randomized", "two_choices"):
-            # These draw lots, each time anew.
+            # These draw lots on every call.
             return self._balancer.rank(self._now, query)
         ranking, changed = self._cached.get(query, (None, set[HostName]()))
         if ranking is None:
@@ -302,8 +286,8 @@ class RankingCache:
     def _updated(self, query: RankQuery, old: Ranking, changed: set[HostName]) -> Ranking:
         some = frozenset(changed if query.hosts is None else changed & query.hosts)
         new = self._balancer.rank(self._now, replace(query, hosts=some))
-        hosts = [one for one in old.hosts if one.host not in some]
-        for one in new.hosts:
-            insort(hosts, one, key=lambda one: (-one.score, one.host))
+        hosts = [ranked for ranked in old.hosts if ranked.host not in some]
+        for ranked in new.hosts:
+            insort(hosts, ranked, key=lambda entry: (-entry.score, entry.host))
         left_out = {host: why for host, why in old.left_out.items() if host not in some}
         return replace(old, hosts=tuple(hosts), left_out=left_out | dict(new.left_out))

@@ -1,8 +1,7 @@
-"""Events and effects of the placer's core (`placer.py`). What is requested of it and what it has hosts do are
-the messages that carry that; what it knows of components it publishes as `Placement`.
+"""Events and effects of the placer's core (`placer.py`). Requests and host commands are messages; `Placement` publishes
+a component's state.
 
-Times are whole ns on the caller's clock. Reasons are text for people; nothing reads them.
-"""
+Times are whole ns on the caller's clock. Reasons are text for people alone."""
 
 from __future__ import annotations
 
@@ -17,22 +16,17 @@ from zscout.types import ComponentId, HostName, Kind, Ns
 
 @dataclass(frozen=True, slots=True)
 class _OnHost:
-    """An incarnation of a component on a host."""
-
     component: ComponentId
     incarnation: Incarnation
     host: HostName
 
 
-# Events
-
-
 @dataclass(frozen=True, slots=True)
 class StartAnswered(_OnHost):
-    """Outcome of a StartComponent: `ok` (it runs, or stands by), `refused` (this host will not: another may),
-    `failed` (it started and ended, or did not get ready), `unknown` (no answer: it may run or not).
+    """`ok` (runs or is on standby), `refused` (another host may accept), `failed` (ended, or was not ready), `unknown`
+    (no answer).
 
-    `again`: whether another try there could help; an unregistered kind stays one."""
+    `again`: another try on this host could help."""
 
     result: Literal["ok", "refused", "failed", "unknown"]
     reason: str = ""
@@ -40,40 +34,40 @@ class StartAnswered(_OnHost):
     movable: bool = False
     again: bool = True
     bad_params: bool = False
-    """It failed because of its parameters, which are no better on another host."""
+    """Failed for its parameters: another host is no better."""
 
 
 @dataclass(frozen=True, slots=True)
 class StopAnswered(_OnHost):
-    """Outcome of a StopComponent. `done` False: no answer."""
+    """`done` False: no answer."""
 
     done: bool
 
 
 @dataclass(frozen=True, slots=True)
 class MoveAnswered(_OnHost):
-    """Outcome of a MoveComponent: `moved`, `refused` (it stays where it was), `unknown`."""
+    """`refused`: it stays where it was."""
 
     result: Literal["moved", "refused", "unknown"]
     reason: str = ""
     dead: float = 0.0
-    """The dead time in seconds: from the source's last work to the target's first."""
+    """Dead time in seconds: from the source's last work to the target's first."""
 
 
 @dataclass(frozen=True, slots=True)
 class TokenAppeared(_OnHost):
-    """A component's liveliness token: this incarnation runs there."""
+    """The component's liveliness token appeared: this incarnation runs there."""
 
 
 @dataclass(frozen=True, slots=True)
 class TokenVanished(_OnHost):
-    """A component's token is gone. How it ended is in its host's next list (`ComponentsListed`)."""
+    """The token is gone; the host's next list has the cause (`ComponentsListed`)."""
 
 
 @dataclass(frozen=True, slots=True)
 class ComponentsListed:
-    """A host's list, as answer to a ListComponents or at a change of leader: all of its components, or, with
-    `only`, that one. `kinds` are those that the host can start; None: it does not tell."""
+    """A host's reply to ListComponents, or its list at a change of leader: all its components, or `only` one.
+    `kinds`: kinds it can start; None: unknown."""
 
     host: HostName
     components: Sequence[messages.ComponentView]
@@ -83,49 +77,30 @@ class ComponentsListed:
 
 @dataclass(frozen=True, slots=True)
 class HostJoined:
-    """A host's node has its token."""
-
     host: HostName
 
 
 @dataclass(frozen=True, slots=True)
 class HostLost:
-    """A host's node is gone, and its components with it."""
-
     host: HostName
 
 
 @dataclass(frozen=True, slots=True)
 class Inherited:
-    """What the placer of the term before had published: all that is known of components on dead hosts."""
+    """The published placements of the previous placer: all that is known of components on dead hosts."""
 
     components: Sequence[Placement] = ()
     cordoned: frozenset[HostName] = frozenset()
 
 
-PlacerEvent: TypeAlias = (
-    messages.PlacementOperation
-    | messages.DrainHost
-    | messages.UncordonHost
-    | StartAnswered
-    | StopAnswered
-    | MoveAnswered
-    | TokenAppeared
-    | TokenVanished
-    | ComponentsListed
-    | HostJoined
-    | HostLost
-    | Inherited
-)
-
-
-# Effects
+_Request: TypeAlias = messages.PlacementOperation | messages.DrainHost | messages.UncordonHost
+_Answer: TypeAlias = StartAnswered | StopAnswered | MoveAnswered | ComponentsListed
+PlacerEvent: TypeAlias = _Request | _Answer | TokenAppeared | TokenVanished | HostJoined | HostLost | Inherited
 
 
 @dataclass(frozen=True, slots=True)
 class HostCommand:
-    """Have this host do it. A start is idempotent, and repeated after `unknown`; the answer to a list of one
-    component is ComponentsListed with `only`, or none."""
+    """Starts are idempotent, and repeated after `unknown`; a list of one component may stay unanswered."""
 
     host: HostName
     operation: messages.StartComponent | messages.StopComponent | messages.MoveComponent | messages.ListComponents
@@ -133,7 +108,7 @@ class HostCommand:
 
 @dataclass(frozen=True, slots=True)
 class ComponentChanged:
-    """Publish the component's placement (None: it is forgotten), and answer requests that wait for it."""
+    """Publish the placement (None: forgotten), and answer requests that wait for it."""
 
     component: ComponentId
     placement: Placement | None
@@ -141,8 +116,8 @@ class ComponentChanged:
 
 @dataclass(frozen=True, slots=True)
 class PlacementRefused:
-    """A request is refused: `code` as in docs/protocol.md, `message` one line. `subject` names the component,
-    or the host that can't be drained."""
+    """`code` as in docs/protocol.md, `message` one line. `subject`: the component, or the host that can't be
+    drained."""
 
     subject: str
     code: str
@@ -151,7 +126,7 @@ class PlacementRefused:
 
 @dataclass(frozen=True, slots=True)
 class PlacerWakeAt:
-    """Have the core handle no event then, if none came before. Replaces the last one; None: not needed."""
+    """Wake the core at this time if no event comes before. Replaces the last one; None: not needed."""
 
     at: Ns | None
 

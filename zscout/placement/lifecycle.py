@@ -13,31 +13,25 @@ from zscout.placement.state import OVER, PROBE_TIMEOUT, ComponentRecord, Placeme
 from zscout.types import SECOND, ComponentId, HostName, Ns
 
 GRACE: Final[Ns] = 2 * SECOND
-"""Within this a host must report what was inherited, or went on elsewhere."""
+"""Time for a host to report an inherited or moved component."""
 MAX_PROBES: Final = 3
-"""A component without token of which so many probes report nothing is lost."""
+"""Unanswered probes before a component without token counts as lost."""
 ASK_KINDS: Final[Ns] = 2 * SECOND
-"""Within this hosts must say whether they have a kind by now that none had."""
+"""Time for hosts to report a kind that none had."""
 TRY_AGAIN: Final[Ns] = SECOND
-"""After this a component without an eligible host is tried again."""
+"""Delay of the next try without an eligible host."""
 AT_ONCE: Final = 100
 """Components placed in one instant; the next follow SHORTLY after."""
 SHORTLY: Final[Ns] = SECOND // 100
 FIGURES: Final = re.compile(r"[\d.,]+ (?=s old|bytes available)")
 """In the reason why there is no eligible host."""
 KINDS_NAMED: Final = 8
-"""Where a kind is not known."""
 CAUSES_NAMED: Final = 4
-"""In the reason why no host can start a component."""
 
 
 class Lifecycle:
-    """Decides for every component that is not `moving`; for that, see `Migrations`."""
-
     def __init__(self, state: PlacementState, surplus: SurplusIncarnations, probes: Probes) -> None:
         self.state, self.surplus, self.probes = state, surplus, probes
-
-    # Requests
 
     def place(self, component: ComponentId, spec: ComponentSpec) -> None:
         state = self.state
@@ -54,7 +48,7 @@ class Lifecycle:
             record.superseded = True
             self.place_again(record)
         elif not record.wanted:
-            # It is being stopped; what is requested now comes after that.
+            # It is placed again after its stop.
             self._reset(record, spec)
         elif record.spec != spec:
             message = f"{component} is placed already, and is another: stop it first, or take another name"
@@ -71,7 +65,7 @@ class Lifecycle:
         record.tried.clear()
 
     def stop(self, record: ComponentRecord) -> None:
-        """For good. A migration must have been cancelled before."""
+        """Stop for good. A migration must have been cancelled before."""
         record.wanted = False
         self.state.mark_changed(record.component, always=True)
         if record.state == "given_up":
@@ -81,17 +75,13 @@ class Lifecycle:
             record.reason = "asked to stop"
             self.end_incarnation(record)
 
-    # Choosing a host
-
     def place_again(self, record: ComponentRecord, cause: str = "") -> None:
-        """Has it placed at the end of this instant."""
         record.enter("waiting")
         record.restart_cause, record.whereabouts_unknown = cause, False
         self.state.wake(record, None)
         self.state.to_place[record.component] = None
 
     def place_waiting(self) -> None:
-        """Places what is to be placed, the heaviest first."""
         state = self.state
         records = [state.components[name] for name in state.to_place if name in state.components]
         state.to_place = {}
@@ -106,27 +96,26 @@ class Lifecycle:
                 state.wake(record, state.now + SHORTLY)
 
     def _choose_host(self, record: ComponentRecord) -> None:
-        """The best host that was not tried in this round."""
         hosts, why_none = self.state.eligible_hosts(record.spec)
         tried = record.tried
-        untried = next((one for one in hosts if one.host not in tried), None)
+        untried = next((ranked for ranked in hosts if ranked.host not in tried), None)
         if untried is not None:
             self._start_on(record, untried)
         elif not hosts and (lacking := self._without_kind(record)):
             self._ask_for_kind(record, lacking)
         elif not hosts:
             tried.clear()
-            # The figures change all the time: for them alone it is not published again.
+            # Changed figures alone are not published.
             causes = FIGURES.sub("", why_none)
             if record.no_host is None and _explains(record.reason, causes):
-                # Inherited: all that is known of the causes then is the reason.
+                # Inherited: only the reason is known.
                 record.no_host = causes, record.reason
             if record.no_host != (causes, record.reason):
                 record.reason = f"no host will do: {why_none}"
                 record.no_host = causes, record.reason
             self.state.wake(record, self.state.now + TRY_AGAIN)
-        elif all(tried[one.host] for one in hosts):
-            refusals = list(dict.fromkeys(tried[one.host] for one in hosts))
+        elif all(tried[ranked.host] for ranked in hosts):
+            refusals = list(dict.fromkeys(tried[ranked.host] for ranked in hosts))
             more = f"; and {len(refusals) - CAUSES_NAMED} more" if len(refusals) > CAUSES_NAMED else ""
             reason = f"no host can start it: {'; '.join(refusals[:CAUSES_NAMED])}{more}"
             self._finish(record, "given_up", reason)
@@ -138,15 +127,15 @@ class Lifecycle:
             self._back_off(record, reason, pause)
 
     def _without_kind(self, record: ComponentRecord) -> set[HostName]:
-        """The hosts of which one would do for what was never started, if any known host had its kind."""
+        """The hosts that lack only the kind of a component that was never started, if no known host has it."""
         return self.state.lacking_everywhere(record.spec) if record.incarnation == record.asked_as else set()
 
     def _ask_for_kind(self, record: ComponentRecord, hosts: set[HostName]) -> None:
-        """Gives it up, unless hosts told their kinds before it was asked for: its kind may be installed by now."""
+        """Give it up, unless hosts listed their kinds before the request: its kind may be installed by now."""
         state, kind = self.state, record.spec.kind
         before = [host for host in sorted(hosts) if state.kinds[host][0] < record.asked_at]
         if not before or state.now - record.asked_at >= ASK_KINDS:
-            there = sorted({one for host in hosts for one in state.kinds[host][1]})
+            there = sorted({name for host in hosts for name in state.kinds[host][1]})
             near = difflib.get_close_matches(kind, there, n=CAUSES_NAMED)
             more = f" and {len(there) - KINDS_NAMED} more" if len(there) > KINDS_NAMED else ""
             known = f"there are {', '.join(there[:KINDS_NAMED])}{more}" if there else "nor any other"
@@ -179,10 +168,8 @@ class Lifecycle:
         record.whereabouts_unknown = False
         self.state.retire(record)
 
-    # Starting and running
-
     def start_answered(self, record: ComponentRecord, answer: StartAnswered) -> None:
-        """Of the record's own incarnation, not of a migration's target."""
+        """For the record's own incarnation, not a migration's target."""
         record.start_until = None
         if answer.result == "failed" and record.state != "starting":
             self.ended(record, Termination("failed", answer.reason, answer.tail, bad_params=answer.bad_params))
@@ -202,7 +189,7 @@ class Lifecycle:
             record.ended_incarnations.append(record.incarnation)
             state.component_left(record)
             if answer.again:
-                # The host may know of another incarnation that lives there.
+                # Another incarnation may live there.
                 state.probe(record.component, host)
             cause = f"{host} refused it: {answer.reason}"
             record.tried[host] = "" if answer.again else cause
@@ -212,7 +199,7 @@ class Lifecycle:
             self._start_failed(record, end, again=answer.again)
 
     def _start_failed(self, record: ComponentRecord, end: Termination, *, again: bool = True) -> None:
-        """It ended before it ran: the next host at once, a few times."""
+        """Try the next host at once, a few times."""
         host = record.host or "its host"
         record.ended_incarnations.append(record.incarnation)
         record.start_until, record.tail = None, end.tail
@@ -225,9 +212,9 @@ class Lifecycle:
         elif not self._exhausted(record, cause):
             self.place_again(record, cause)
 
-    def runs(self, record: ComponentRecord, *, anew: bool = False) -> None:
-        """It is known to run where it is; `anew`: as another incarnation than before."""
-        if record.state != "running" or anew:
+    def runs(self, record: ComponentRecord, *, replaced: bool = False) -> None:
+        """Record that it runs; `replaced`: as another incarnation."""
+        if record.state != "running" or replaced:
             record.enter("running")
             record.running_since, record.whereabouts_unknown = self.state.now, False
             record.failed_rounds, record.reason = 0, record.host_reason
@@ -237,7 +224,6 @@ class Lifecycle:
         self.state.drain_soon(record.host)
 
     def watch(self, record: ComponentRecord) -> None:
-        """Sets when a running component is checked next."""
         state, at = self.state, None
         if not (record.token and record.confirmed):
             at = state.now + PROBE_TIMEOUT
@@ -246,8 +232,8 @@ class Lifecycle:
         state.wake(record, at)
 
     def check(self, record: ComponentRecord) -> Termination | None:
-        """Probes the host of a running component that has no token or is not confirmed, and resets the count
-        of restarts of one that settled. Returns how it ended, if it is to be taken for lost."""
+        """Probe a running component without token or confirmation, and reset the restarts of a settled one. Returns
+        how it ended, if lost."""
         state, host = self.state, record.host
         if record.running_since is not None and state.now - record.running_since >= state.rules.settled:
             record.restarts = 0
@@ -265,10 +251,7 @@ class Lifecycle:
         state.wake(record, state.now + PROBE_TIMEOUT)
         return None
 
-    # Ends and restarts
-
     def ended(self, record: ComponentRecord, end: Termination) -> None:
-        """The record's incarnation has ended, or is taken for lost."""
         state, rules = self.state, self.state.rules
         if record.state == "stopping":
             if end.cause != "lost":
@@ -312,14 +295,13 @@ class Lifecycle:
                 record.restart_cause = cause
 
     def _exhausted(self, record: ComponentRecord, cause: str) -> bool:
-        """Gives it up if that was its last try."""
         if record.spec.restart == "never":
             self._finish(record, "given_up", cause)
         elif record.restarts >= self.state.rules.restarts:
             self._finish(record, "given_up", f"{cause}; {record.restarts} starts in a row failed")
         return record.state == "given_up"
 
-    # Stopping: what is to end is surplus
+    # Stopping makes an incarnation surplus
 
     def end_incarnation(self, record: ComponentRecord) -> None:
         state, host = self.state, record.host
@@ -327,7 +309,7 @@ class Lifecycle:
             self.surplus.add(record.component, record.incarnation, host, record.start_until, token=record.token)
             state.wake(record, None)
         elif host is not None and state.now < record.not_before:
-            # Inherited: its host may be there, and has not joined yet.
+            # Inherited: its host may not have joined yet.
             state.wake(record, record.not_before)
         else:
             if host is not None:
@@ -335,14 +317,13 @@ class Lifecycle:
             self._stopped(record)
 
     def _stopped(self, record: ComponentRecord) -> None:
-        """What was stopped has ended, or its host is gone."""
         record.start_until = None
         self.state.component_left(record)
         self.state.wake(record, None)
         self._check_stopped(record)
 
     def _check_stopped(self, record: ComponentRecord) -> None:
-        """Stopped is a component once its surplus incarnations have ended, too."""
+        """A component is stopped once its surplus incarnations have ended, too."""
         if record.host is not None or self.surplus.any(record.component):
             return
         if record.wanted:
@@ -352,7 +333,6 @@ class Lifecycle:
             self._finish(record, "ended", "stopped")
 
     def surplus_ended(self, component: ComponentId) -> None:
-        """Surplus incarnations of it may have ended, its own among them if it is being stopped."""
         record = self.state.get(component)
         if record is None or record.state != "stopping":
             return
@@ -360,8 +340,6 @@ class Lifecycle:
             self._stopped(record)
         else:
             self._check_stopped(record)
-
-    # Time
 
     def timer(self, record: ComponentRecord) -> None:
         match record.state:
@@ -403,8 +381,8 @@ def _cause(end: Termination, host: HostName) -> str:
 
 
 def _explains(reason: str, causes: str) -> bool:
-    """Whether a reason of before names these hosts and causes, or no host is known now."""
-    known = [one.partition(": ") for one in causes.split("; ") if ": " in one]
+    """Return True if an earlier reason names these hosts and causes, or no host is known now."""
+    known = [part.partition(": ") for part in causes.split("; ") if ": " in part]
     before = FIGURES.sub("", reason)
     return before.startswith("no host will do") and all(
         f"{host}: " in before and cause in before for host, _, cause in known

@@ -1,8 +1,7 @@
-"""Moving running components: on request, off a drained host, or because it pays (`rebalancing`).
+"""Migration of running components: on request, off a drained host, or because it pays (`rebalancing`).
 
-A standby starts on the target, then the source hands over to it. Whatever goes wrong, one of the two goes on;
-where no answer says which, both hosts are probed.
-"""
+A standby starts on the target, then the source hands over to it. On any failure one of the two continues; where no
+answer decides which, both hosts are probed."""
 
 from __future__ import annotations
 
@@ -16,25 +15,20 @@ from zscout.placement.state import PROBE_TIMEOUT, ComponentRecord, Migration, Pl
 from zscout.types import SECOND, ComponentId, HostName, Ns
 
 MAX_STARTS: Final = 3
-"""Starts of the standby that are not answered."""
+"""Unanswered starts of the standby."""
 HAND_OVER_TIMEOUT: Final[Ns] = 30 * SECOND
 """After this both hosts are probed."""
 MAX_PROBES: Final = 3
 MAX_PATIENT_PROBES: Final = 15
-"""While one runs and the other stands by: they may be at it still, and a standby ends itself after 30 s."""
+"""For a running source and a standby, which may still be busy; a standby ends itself after 30 s."""
 RETRY: Final[Ns] = 5 * SECOND
-"""From a move off a drained host that failed to the next."""
+"""Pause after a failed move off a drained host."""
 MOVES_PER_HOST: Final = 2
-"""Off a drained host at the same time."""
 
 
 class Migrations:
-    """Decides for components that are `moving`."""
-
     def __init__(self, state: PlacementState, lifecycle: Lifecycle) -> None:
         self.state, self.lifecycle = state, lifecycle
-
-    # Beginning
 
     def request(self, component: ComponentId, to: HostName | None) -> None:
         state = self.state
@@ -69,15 +63,13 @@ class Migrations:
                 state.refuse(component, "move_failed", message)
 
     def begin(self, record: ComponentRecord, to: HostName, why: str) -> None:
-        """The record runs and is movable, and `to` is eligible for it. `why`: in words."""
+        """Move a running, movable record to an eligible host. `why`: in words."""
         state = self.state
         record.enter("moving")
         record.migration = Migration(to, state.next_incarnation(record.component), why)
         record.reason, record.drain_reason = f"moving to {to}, {why}", ""
         state.component_arrives(_reservation(record), record.spec.kind, to)
         state.start(record, record.migration)
-
-    # The target
 
     def target_answered(self, record: ComponentRecord, move: Migration, answer: StartAnswered) -> None:
         if move.stage != "starting":
@@ -105,7 +97,7 @@ class Migrations:
             self.state.wake_migration(record, self.state.now + self.state.back_off_time(move.tries - 1))
 
     def target_appeared(self, record: ComponentRecord, move: Migration) -> None:
-        """Its token: it has taken over. The source answers in a moment with the dead time."""
+        """The target has taken over; the source soon reports the dead time."""
         move.token, move.target = True, "running"
         if move.stage == "handing_over" and move.source == "running":
             self.state.wake_migration(record, self.state.now + PROBE_TIMEOUT)
@@ -138,8 +130,6 @@ class Migrations:
         else:
             self._stay(record, move, f"host {move.to} is gone")
 
-    # The source
-
     def answered(self, record: ComponentRecord, move: Migration, answer: MoveAnswered) -> None:
         if move.stage == "starting":
             return
@@ -147,7 +137,7 @@ class Migrations:
             move.source = "ended"
             self._finish(record, move, answer.dead)
         elif answer.result == "unknown" or move.token:
-            # Refused, and yet the target took over: it was given back, or was not.
+            # Refused although the target took over: ask which of the two runs.
             self._probe(record, move)
         else:
             self._stay(record, move, answer.reason)
@@ -164,7 +154,7 @@ class Migrations:
             self._probe(record, move)
 
     def source_vanished(self, record: ComponentRecord, move: Migration) -> None:
-        """Its token is gone: as a rule because it handed over, and its answer is on its way."""
+        """The source's token is gone: usually after a handover, with its answer on the way."""
         if move.stage == "starting":
             record.unanswered = 0
             self.source_timer(record, move)
@@ -180,10 +170,7 @@ class Migrations:
             move.source = "running"
             self._judge(record, move)
 
-    # Which of them goes on
-
     def _probe(self, record: ComponentRecord, move: Migration) -> None:
-        """Asks both hosts, or the one that is left."""
         state = self.state
         if move.stage != "probing":
             move.stage, move.tries = "probing", 0
@@ -224,10 +211,7 @@ class Migrations:
         else:
             self._stay(record, move, "nobody tells what came of it")
 
-    # Ends of a migration
-
     def _finish(self, record: ComponentRecord, move: Migration, dead: float | None = None) -> None:
-        """The target runs, and is the record's incarnation from now on."""
         state, old, source, token = self.state, record.incarnation, record.host, record.token
         self._close(record, move)
         state.component_left(record)
@@ -241,11 +225,10 @@ class Migrations:
         record.start_until, record.confirmed, record.probed = None, True, False
         record.host_reason = f"moved from {source}, {move.why}"
         state.component_arrives(record.component, record.spec.kind, move.to)
-        self.lifecycle.runs(record, anew=True)
+        self.lifecycle.runs(record, replaced=True)
         state.drain_soon(source)
 
     def _stay(self, record: ComponentRecord, move: Migration, reason: str) -> None:
-        """The source goes on."""
         self.cancel(record, stop_standby=move.target != "ended")
         record.reason = f"it did not move to {move.to}, {move.why}: {reason}"
         record.unanswered = 0
@@ -253,12 +236,11 @@ class Migrations:
         self.state.drain_soon(record.host)
 
     def _lose(self, record: ComponentRecord, move: Migration) -> None:
-        """Neither goes on: it is started anew, if it is to be."""
+        """Both ended; the lifecycle restarts the component if it is still wanted."""
         self.cancel(record)
         self.lifecycle.ended(record, move.termination or Termination("lost", "it was lost while it moved"))
 
     def cancel(self, record: ComponentRecord, *, stop_standby: bool = True) -> None:
-        """Ends the migration, if there is one."""
         move = record.migration
         if move is None:
             return
@@ -274,10 +256,10 @@ class Migrations:
         record.enter("running")
         state.wake_migration(record, None)
 
-    # Drained hosts: nothing is placed there, and what is movable leaves, heaviest first
+    # Drained hosts take no placements; movable components leave, heaviest first
 
     def drain(self, host: HostName) -> None:
-        """An unknown host is refused: it is a slip of the pen, and the host that was meant would go on."""
+        """Drain a host. An unknown one is refused: it is likely a typo."""
         state = self.state
         cordoned = state.balancer.cordoned
         if host not in cordoned:
@@ -311,7 +293,7 @@ class Migrations:
             self._empty(host, on[host])
 
     def _empty(self, host: HostName, records: list[ComponentRecord]) -> None:
-        """Moves what may go now, and notes of the rest why it stays."""
+        """Move components that may go now, and note why the rest stay."""
         state = self.state
         room = MOVES_PER_HOST - sum(record.migration is not None for record in records)
         names = [(record.component, record.spec.kind) for record in records if record.migration is None]
@@ -333,5 +315,5 @@ class Migrations:
 
 
 def _reservation(record: ComponentRecord) -> ComponentId:
-    """Keeps room on the target; no component's name, for names have no blanks."""
+    """Reserves room on the target; not a component's name, which has no blanks."""
     return f"{record.component} on its way"

@@ -1,14 +1,11 @@
-"""What the load balancer knows of hosts and kinds of components, and how each metric scores a host.
+"""Hosts and kinds of components as the load balancer knows them, and the score of a host by each metric.
 
-The greater score is the better host, whatever the unit. `load_average`, `processor_speed` and `available_memory` are
-the paper's (section 5). `composite` predicts how fast the component would run there: a processor shared by all who want
-it, and a memory that must hold it.
+A greater score is a better host. `load_average`, `processor_speed` and `available_memory` are the paper's (section 5).
+`composite` predicts how fast the component would run there, sharing the processor and fitting in memory.
 
-Metric `auto` (the paper's open question: which figures predict how well a component runs) keeps each placement with
-every metric's score of the chosen host, and, once the component has run for a while, with how well it ran. The metric
-whose scores agree best with that, by Spearman's rank correlation over the latest placements, is used for the next. One
-placement in ten is made by the metrics in turn: a bad host that is never tried is never known to be one.
-"""
+Metric `auto` (the paper's open question) records every metric's score of the chosen host and how well the component
+then ran. The next placement uses the metric with the best Spearman rank correlation over the latest placements. One
+placement in ten tries the metrics in turn: a bad host must be tried to be known."""
 
 from __future__ import annotations
 
@@ -25,22 +22,19 @@ from zscout.messages import ComponentSpec, ComponentUse, LoadReport, RankAsk, Ra
 from zscout.types import SECOND, HostName, Kind, Metric, Ns, Policy
 
 REPORT_EVERY: Final[Ns] = SECOND
-"""Period of a host's load reports."""
 STALE: Final[Ns] = 3 * REPORT_EVERY + REPORT_EVERY // 2
-"""A host whose last report is older is never ranked."""
+"""A host with an older report is never ranked."""
 THRASHING: Final = 0.05
-"""What a component keeps of its speed where memory is far too small for it."""
+"""Share of its speed that a component keeps when memory is far too small."""
 MEGABYTE: Final = 1_000_000
 LEAST: Final = 0.01
-"""Cores that any component wants."""
 
 
 class Profile(NamedTuple):
-    """What a kind of component is known to use, or taken to if it never ran: `cpu` in cores of speed 1.0, `memory` in
-    bytes.
+    """Known or assumed use of a kind: `cpu` in cores of speed 1.0, `memory` in bytes.
 
-    `threads`: it never wants more cores than that, however slow they are. A component that computes all the
-    time wants one core on any host; one that keeps a pace wants less of a faster one."""
+    `threads`: the most cores it wants, however slow. A component that computes all the time wants one core on any
+    host; a paced one wants less of a faster host."""
 
     cpu: float = 0.25
     memory: int = 64_000_000
@@ -48,12 +42,12 @@ class Profile(NamedTuple):
     threads: int = 1
 
     def wants(self, speed: float) -> float:
-        """Cores that it wants of a host of this speed. A kind that never ran counts the same on all."""
+        """Cores wanted of a host of this speed. A kind that never ran counts the same on all."""
         return min(self.cpu / speed if self.samples else self.cpu, float(self.threads))
 
     def learn(self, use: ComponentUse, speed: float) -> Profile:
-        """With one sample more; memory is the most that was seen, forgotten slowly."""
-        # What it wanted, not what a busy host gave it.
+        """Add a sample; memory is the slowly decaying maximum."""
+        # Its demand, not its share of a busy host.
         wanted = use.cpu / max(use.served, LEAST_SERVED) if use.served is not None else use.cpu
         threads = max(1, math.ceil(round(wanted, 1)))
         if not self.samples:
@@ -68,8 +62,8 @@ class Profile(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RankQuery:
-    """Which hosts are best for a component? They must have all `labels`, and `memory` bytes available.
-    `hosts`: only these; None: all that report."""
+    """Requirements of a component: all `labels`, and `memory` bytes available. `hosts`: only these; None: all that
+    report."""
 
     kind: Kind = ""
     metric: Metric = "composite"
@@ -89,8 +83,8 @@ NO_REPORT: Final = "no report of it"
 
 @dataclass(frozen=True, slots=True)
 class Ranking:
-    """Hosts best first; `metric` is the one that was used, `why` is how it was chosen; `more` hosts are
-    ranked behind those listed. `left_out`: why the others can't be used."""
+    """Hosts best first; `why`: how `metric` was chosen; `more`: ranked hosts not listed; `left_out`: why others
+    can't be used."""
 
     hosts: tuple[RankedHost, ...]
     metric: Metric
@@ -101,13 +95,13 @@ class Ranking:
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """A host as it will be: its report, and what was placed there and is not in the report yet."""
+    """A host as reported, plus pending placements."""
 
     report: LoadReport
     load: float
-    """Processes that want a processor: the load average, and what is not in it yet."""
+    """Processes that want a processor: the load average plus pending ones."""
     memory: int
-    """Bytes available when all that was placed has taken its own."""
+    """Bytes available after all placements."""
 
     @property
     def load_per_core(self) -> float:
@@ -115,12 +109,12 @@ class Outlook:
 
 
 def rate(outlook: Outlook, profile: Profile) -> float:
-    """How fast a component of this profile would run: 1.0 is a core of speed 1.0 whenever it wants one."""
+    """Predicted speed of a component: 1.0 is a core of speed 1.0 whenever it wants one."""
     return rates([outlook], profile)[0]
 
 
 def rates(outlooks: Sequence[Outlook], profile: Profile) -> list[float]:
-    """Of thousands of hosts at once: `profile.wants` is inlined, as a call would cost more."""
+    """For thousands of hosts at once: `profile.wants` is inlined, as a call would cost more."""
     cpu, threads, needed = profile.cpu, float(profile.threads), profile.memory
     found = []
     for outlook in outlooks:
@@ -140,12 +134,12 @@ def rates(outlooks: Sequence[Outlook], profile: Profile) -> list[float]:
 
 
 SCORES: Final[Mapping[Metric, Callable[[Sequence[Outlook], Profile], list[float]]]] = {
-    "load_average": lambda outlooks, _: [-one.load_per_core for one in outlooks],
-    "processor_speed": lambda outlooks, _: [one.report.speed for one in outlooks],
-    "available_memory": lambda outlooks, _: [float(one.memory) for one in outlooks],
+    "load_average": lambda outlooks, _: [-outlook.load_per_core for outlook in outlooks],
+    "processor_speed": lambda outlooks, _: [outlook.report.speed for outlook in outlooks],
+    "available_memory": lambda outlooks, _: [float(outlook.memory) for outlook in outlooks],
     "composite": rates,
 }
-"""All but `auto`, which chooses among them: the scores of these hosts."""
+"""Scores of hosts by all metrics but `auto`."""
 
 WORDS: Final[Mapping[Metric, Callable[[Outlook, Profile], str]]] = {
     "load_average": lambda outlook, _: f"load {outlook.load_per_core:.2f} a core",
@@ -156,35 +150,28 @@ WORDS: Final[Mapping[Metric, Callable[[Outlook, Profile], str]]] = {
         f"load {outlook.load_per_core:.2f} a core, {outlook.memory / MEGABYTE:,.0f} MB available"
     ),
 }
-"""The same in words, for the hosts that are listed: they take longer than the scores."""
-
-# What is learnt from how components run: the profiles of their kinds, and which metric to trust
+"""Explanations for the listed hosts: slower than scores."""
 
 CHOICES: Final[tuple[Metric, ...]] = tuple(SCORES)
 REMEMBERED: Final = 200
-"""Placements that are learnt from: the latest."""
 ENOUGH: Final = 12
-"""Placements before any metric is trusted."""
 EXPLORE: Final = 0.1
 DEFAULT: Final[Metric] = "composite"
 AHEAD: Final = 0.02
-"""By how much another metric has to agree better than `DEFAULT`."""
+"""How much better another metric than `DEFAULT` has to agree."""
 LEAST_SERVED: Final = 0.05
-"""A smaller share does not show what a component wants."""
+"""A smaller share does not show how much a component wants."""
 LEARN: Final = 0.2
 """Weight of the latest figure in a profile."""
 
 
 class MetricLearner:
-    """Chooses the metric for `auto`."""
-
     def __init__(self) -> None:
         self.seen: deque[tuple[Mapping[Metric, float], float]] = deque(maxlen=REMEMBERED)
-        """The metrics' scores of a host, and how fast a component then ran there (`rate`)."""
+        """All scores of a host, and how fast a component then ran there (`rate`)."""
         self._turn = 0
 
     def choose(self, rng: Random) -> tuple[Metric, str]:
-        """The metric for the next placement, and why."""
         if rng.random() < EXPLORE:
             metric = CHOICES[self._turn % len(CHOICES)]
             self._turn += 1
@@ -192,7 +179,6 @@ class MetricLearner:
         return self.judge()
 
     def judge(self) -> tuple[Metric, str]:
-        """The metric that agrees best, and why."""
         if len(self.seen) < ENOUGH:
             return DEFAULT, f"the default: {len(self.seen)} placements seen, {ENOUGH} tell enough"
         ran = [rate for _, rate in self.seen]
@@ -202,10 +188,10 @@ class MetricLearner:
         return best, f"{best} agrees best with how {len(self.seen)} components ran: {found[best]:.2f} ({others})"
 
 
-def spearman(one: Sequence[float], other: Sequence[float]) -> float:
+def spearman(first: Sequence[float], other: Sequence[float]) -> float:
     """Rank correlation, ties shared, from -1 to 1; 0 where either does not vary."""
     try:
-        return correlation(_ranks(one), _ranks(other))
+        return correlation(_ranks(first), _ranks(other))
     except StatisticsError:
         return 0.0
 

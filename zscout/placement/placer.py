@@ -2,17 +2,15 @@
 
     effects = placer.handle(now, PlaceComponent("counter", spec), ...)
 
-Every decision about where components run is made here and in the modules around the one `state`: `lifecycle`
-places, restarts and stops; `migration` and `rebalancing` move; `reconciler` decides which incarnation counts.
+This module and those around its `state` decide where components run: `lifecycle` places, restarts and stops;
+`migration` and `rebalancing` move; `reconciler` decides which incarnation counts.
 
-A batch of events is one instant: the events are applied in the order given, then the timers that are due,
-then all that is to be placed, the heaviest first. The effects are to be carried out in their order: what has
-changed is published before it is acted upon.
+A batch of events is one instant: events in order, then due timers, then placements, the heaviest first. Effects must be
+carried out in order: changes are published before they are acted upon.
 
-Of every component one incarnation runs, or none. Each start on another host and each start after an end has
-a higher incarnation than all before; a start whose outcome is unknown is repeated on the same host under the
-same incarnation, until that host's node is gone. So nothing runs twice for long, whatever is lost.
-"""
+At most one incarnation of a component runs. Each start on another host or after an end has a higher incarnation; a
+start with unknown outcome is repeated on the same host with the same incarnation, until the host's node is gone. So
+nothing runs twice for long, despite losses."""
 
 from __future__ import annotations
 
@@ -33,8 +31,8 @@ from zscout.types import ComponentId, HostName, Ns
 
 
 class Placer:
-    """All components of one fleet. `balancer` knows the hosts, and learns what is placed; `counter` is that
-    of the term, and makes incarnations higher than those of terms before."""
+    """`balancer` knows the hosts and learns placements; `counter` of the term makes incarnations higher than earlier
+    terms'."""
 
     def __init__(self, balancer: Balancer, counter: int, rules: PlacementPolicy = DEFAULT_PLACEMENT) -> None:
         self._state = state = PlacementState(balancer, counter, rules)
@@ -45,7 +43,7 @@ class Placer:
         self._reconciler = Reconciler(state, self._lifecycle, self._migrations)
         self._wake: Ns | None = None
         self.components: Mapping[ComponentId, Placement] = MappingProxyType(state.published)
-        """As they were last published: a view that follows what is handled."""
+        """A live view of the published placements."""
         if rules.rebalance:
             state.timers.set(TimerKind.REBALANCE, "", 0)
 
@@ -54,7 +52,7 @@ class Placer:
         return frozenset(self._state.balancer.cordoned)
 
     def handle(self, now: Ns, *batch: events.PlacerEvent) -> list[events.PlacerEffect]:
-        """Applies one instant's events, or only the time. Raises ValueError if `now` goes backwards."""
+        """Apply one instant's events, or only the time. Raises ValueError if `now` goes backwards."""
         state = self._state
         state.begin(now)
         for event in batch:
@@ -106,13 +104,13 @@ class Placer:
                 for status in components:
                     self._reconciler.inherited(status)
 
-    # Answers: those about an incarnation that no longer counts change nothing
+    # Answers about an incarnation that no longer counts change nothing
 
     def _start_answered(self, answer: events.StartAnswered) -> None:
         record = self._state.get(answer.component)
         may_run = answer.result in ("ok", "unknown")
         if record is None or record.state != "stopping" or record.incarnation != answer.incarnation:
-            may_run = True  # a refusal may be of another try to start it
+            may_run = True  # the refusal may be of another start
         if self._surplus.start_answered(answer.component, answer.incarnation, may_run=may_run):
             self._lifecycle.surplus_ended(answer.component)
             return

@@ -1,12 +1,10 @@
-"""Rebalancing: moves the one component that gains most, if that has paid for a while.
+"""Rebalancing: moves the component with the greatest gain, once it has paid for a while.
 
-The gain is predicted as metric `composite` does: how fast a component runs where it is, and how fast it would
-run on the target. Others count as well: what they lose on the target, less what they gain on the host that it
-leaves. The load average forgets what left a host as slowly as it came to see it; that is subtracted.
+The gain is the change in speed predicted by metric `composite`. Losses of others on the target and gains on the old
+host count too. The load average forgets a component as slowly as it learned of it; that is subtracted.
 
-Against going back and forth: a move must make it run better by `gain`, for `steady` at a stretch; component
-and hosts have been left alone for `rest`; and one moves at a time. Two equal hosts never swap.
-"""
+Against oscillation: a move must gain `gain` for `steady` at a stretch, component and hosts must have been at rest
+for `rest`, and one moves at a time. Two equal hosts never swap."""
 
 from __future__ import annotations
 
@@ -24,9 +22,8 @@ from zscout.types import SECOND, ComponentId, HostName, Ns
 
 EVERY: Final[Ns] = SECOND
 TARGETS: Final = 8
-"""Hosts considered for each kind: the best."""
 FORGOTTEN: Final[Ns] = 8 * LOAD_TIME
-"""After this a thousandth of what left a host is still in its load average."""
+"""After this a thousandth of a departed load is still in a host's load average."""
 
 
 _Move: TypeAlias = tuple[ComponentId, HostName]
@@ -35,11 +32,9 @@ _Move: TypeAlias = tuple[ComponentId, HostName]
 class Rebalancer:
     def __init__(self, state: PlacementState, migrations: Migrations) -> None:
         self.state, self.migrations = state, migrations
-        self._paying: dict[_Move, Ns] = {}
-        """Since when each move has paid."""
+        self._paying: dict[_Move, Ns] = {}  # since when each move has paid
 
     def timer(self) -> None:
-        """Moves one component at most."""
         state = self.state
         state.timers.set(TimerKind.REBALANCE, "", state.now + EVERY)
         if any(record.migration is not None for record in state.components.values()):
@@ -55,8 +50,8 @@ class Rebalancer:
             self.migrations.begin(state.components[component], to, f"where it runs {gain:.0%} better")
 
     def _changes(self) -> dict[_Move, float]:
-        """All moves that would pay now, and by how much the component would run better, as a share of how it
-        runs now. Of equal components on one host the first by name stands for all."""
+        """All moves that would pay now, each with its relative gain in speed. Of equal components on one host only
+        the first by name."""
         state = self.state
         groups: dict[tuple[HostName, RankQuery], ComponentRecord] = {}
         running: Counter[HostName] = Counter()
@@ -83,16 +78,10 @@ class Rebalancer:
         return found
 
     def _may_leave(self, record: ComponentRecord, host: HostName) -> bool:
-        # One that came lately: its host is not at rest then.
+        # The host of a recent arrival is not at rest.
         state = self.state
-        return (
-            record.movable
-            and record.wanted
-            and record.token
-            and record.not_before <= state.now
-            and host not in state.balancer.cordoned
-            and self._at_rest(host)
-        )
+        free = record.movable and record.wanted and record.token and record.not_before <= state.now
+        return free and host not in state.balancer.cordoned and self._at_rest(host)
 
     def _at_rest(self, host: HostName) -> bool:
         state = self.state
@@ -102,10 +91,10 @@ class Rebalancer:
         return state.now - state.last_change.get(host, state.now) >= state.rules.rest
 
     def _targets(self, query: RankQuery) -> list[HostName]:
-        return [one.host for one in self.state.rankings.rank(query).hosts if self._at_rest(one.host)][:TARGETS]
+        return [ranked.host for ranked in self.state.rankings.rank(query).hosts if self._at_rest(ranked.host)][:TARGETS]
 
     def _outlook(self, host: HostName) -> Outlook:
-        """A host as the balancer sees it, less what left it and shows in its load average still."""
+        """The balancer's view of a host, less departed load that its average still shows."""
         state = self.state
         outlook = state.balancer.outlook(state.now, host, pending=True)
         departed = state.departed.get(host, deque())
@@ -116,19 +105,18 @@ class Rebalancer:
 
 
 def _without(outlook: Outlook, profile: Profile) -> Outlook:
-    """The host if the component were not there."""
     load = max(0.0, outlook.load - profile.wants(outlook.report.speed))
     return replace(outlook, load=load, memory=outlook.memory + profile.memory)
 
 
 def _share(outlook: Outlook, more: float = 0.0) -> float:
-    """How fast what runs there runs, and what it would be with so many more cores wanted."""
+    """Speed of the components there, if `more` cores were wanted."""
     report = outlook.report
     return report.speed * min(1.0, report.cores / max(outlook.load + more, 0.01))
 
 
 def _pays(here: Outlook, there: Outlook, profile: Profile, others: tuple[int, int]) -> bool:
-    """Whether all components of both hosts together run better for the move. `here` is without it."""
+    """Return True if all components of both hosts together gain. `here` is without the component."""
     wants_here, wants_there = profile.wants(here.report.speed), profile.wants(there.report.speed)
     own = rate(there, profile) - rate(here, profile)
     stay = others[0] * (_share(here) - _share(here, wants_here))

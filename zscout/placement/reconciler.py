@@ -1,6 +1,5 @@
-"""Which incarnation of a component counts, by tokens, hosts' lists, and what the placer of the term before published;
-and what follows when a host comes or dies. Of two that live the higher one counts; the lower is stopped.
-"""
+"""Decides which incarnation of a component counts, by tokens, hosts' lists and earlier placements, and handles hosts
+that come or die. Of two live incarnations the higher counts; the lower is stopped."""
 
 from __future__ import annotations
 
@@ -14,17 +13,13 @@ from zscout.placement.state import OVER, PROBE_TIMEOUT, ComponentRecord, Placeme
 from zscout.types import ComponentId, HostName
 
 RUNNING: Final = ("running", "stopping")
-"""Phases of a component, as its host lists it, that count as running."""
+"""Phases in a host's list that count as running."""
 
 
 class Reconciler:
-    """Compares what tokens, hosts and earlier placers report with the placer's records, and acts on each difference."""
-
     def __init__(self, state: PlacementState, lifecycle: Lifecycle, migrations: Migrations) -> None:
         self.state, self.lifecycle, self.migrations = state, lifecycle, migrations
         self.surplus, self.probes = lifecycle.surplus, lifecycle.probes
-
-    # Tokens
 
     def appeared(self, token: TokenAppeared) -> None:
         state, component, incarnation, host = self.state, token.component, token.incarnation, token.host
@@ -38,7 +33,7 @@ class Reconciler:
         if record is None:
             return
         if incarnation in record.ended_incarnations:
-            # Late news, or it started after it was stopped.
+            # A late report, or it started after its stop.
             self.surplus.add(component, incarnation, host, token=True)
         elif (move := record.migration) is not None and incarnation == move.incarnation:
             self.migrations.target_appeared(record, move)
@@ -54,7 +49,7 @@ class Reconciler:
             self._given_twice(record, host, token=True)
 
     def vanished(self, token: TokenVanished) -> None:
-        """How it ended, its host reports; a token may also be gone for a while with the network."""
+        """The host reports the cause; the network may also hide a token for a while."""
         component, incarnation = token.component, token.incarnation
         record = self.state.get(component)
         self.surplus.token(component, incarnation, alive=False)
@@ -73,8 +68,8 @@ class Reconciler:
             move.token, move.target = False, "unknown"
 
     def _given_twice(self, record: ComponentRecord, host: HostName, *, token: bool) -> None:
-        """Two placers that did not see each other gave one number twice. Of two that live the one on the greater host
-        goes on, as they decide themselves where they see each other."""
+        """Two separated placers gave one number twice. Of two live incarnations the one on the greater host
+        continues, which the hosts decide too when they meet."""
         state, other = self.state, record.host
         if other is None or other == host:
             return
@@ -88,27 +83,25 @@ class Reconciler:
         record.confirmed = not token
 
     def _is_at(self, record: ComponentRecord, incarnation: Incarnation, host: HostName, *, token: bool) -> None:
-        """This is the incarnation that counts, and it runs there."""
         self.migrations.cancel(record)
         self.state.component_left(record)
         record.incarnation, record.host, record.token, record.confirmed = incarnation, host, token, False
         record.superseded = False
         record.host_reason = f"found running on {host}"
-        self.lifecycle.runs(record, anew=True)
+        self.lifecycle.runs(record, replaced=True)
 
     def _must_not_live(self, record: ComponentRecord) -> bool:
-        """Its incarnation ended, or is being stopped and its host was believed gone."""
+        """Return True if its incarnation ended, or is being stopped and its host was believed gone."""
         return record.state in OVER or (record.state == "stopping" and record.host is None)
 
     def _can_be_at(self, record: ComponentRecord, host: HostName) -> bool:
-        """Whether the incarnation can be at that host; if it was nowhere, it is there from now on."""
+        """Return True if the incarnation can be at that host; without a host, it now is there."""
         if record.host is None and host in self.state.alive:
             record.host = host
             record.host_reason = f"found running on {host}"
         return record.host == host
 
     def _other_runs(self, record: ComponentRecord, incarnation: Incarnation, host: HostName, *, token: bool) -> None:
-        """An incarnation runs that is not the record's."""
         if self.surplus.has(record.component, incarnation):
             return
         stopped = record.state == "stopping" or record.state in OVER
@@ -121,18 +114,16 @@ class Reconciler:
             self.surplus.add(record.component, record.incarnation, record.host, record.start_until, token=record.token)
         self._is_at(record, incarnation, host, token=token)
 
-    # Hosts' lists
-
     def listed(self, listing: ComponentsListed) -> None:
         state, host, only = self.state, listing.host, listing.only
-        # What a host sent before it was lost is no answer.
+        # A list sent before the host was lost is no answer.
         answered = self.probes.answered(host, only) if host in state.alive else []
         if listing.kinds is not None:
-            state.told_kinds(host, listing.kinds)
-        for one in listing.components:
-            if only in (None, one.component):
-                self._listed(host, one)
-        present = {(one.component, one.incarnation) for one in listing.components}
+            state.set_kinds(host, listing.kinds)
+        for view in listing.components:
+            if only in (None, view.component):
+                self._listed(host, view)
+        present = {(view.component, view.incarnation) for view in listing.components}
         for record in self._on(host) if only is None else filter(None, [state.components.get(only)]):
             self._not_listed(record, listing, present)
         for name in answered:
@@ -141,7 +132,6 @@ class Reconciler:
                 state.wake(waiting, state.now)
 
     def _on(self, host: HostName) -> list[ComponentRecord]:
-        """What is on a host, or on its way there."""
         return [
             record
             for record in self.state.components.values()
@@ -164,11 +154,10 @@ class Reconciler:
         elif incarnation == record.incarnation and not record.superseded:
             self._listed_alive(record, host, listed)
         elif listed.phase in RUNNING or (listed.phase == "starting" and incarnation < record.incarnation):
-            # One that only starts may be going to stand by for a move: its token tells, once it runs.
+            # A starting incarnation may become a standby: once it runs, its token appears.
             self._other_runs(record, incarnation, host, token=False)
 
     def _adopt(self, host: HostName, listed: ComponentView) -> None:
-        """A placer of a term before had it started."""
         record = ComponentRecord(listed.component, listed.spec, "starting", listed.incarnation, host=host)
         if listed.phase in ("ended", "standby") or host not in self.state.alive or not self.state.add(record):
             return
@@ -182,7 +171,6 @@ class Reconciler:
             self.state.start(record)
 
     def _listed_alive(self, record: ComponentRecord, host: HostName, listed: ComponentView) -> None:
-        """The record's incarnation lives."""
         if self._must_not_live(record):
             if listed.phase != "standby":
                 self.surplus.add(record.component, listed.incarnation, host)
@@ -222,8 +210,7 @@ class Reconciler:
     def _not_listed(
         self, record: ComponentRecord, listing: ComponentsListed, present: set[tuple[ComponentId, Incarnation]]
     ) -> None:
-        """An incarnation that a list lacks is not there, unless it started after the list was made: a token,
-        or a start that is not answered, prove more."""
+        """A missing incarnation is gone, unless a token or an unanswered start is newer than the list."""
         state, move, host = self.state, record.migration, listing.host
         if (
             move is not None
@@ -246,8 +233,6 @@ class Reconciler:
         elif record.state == "running":
             self.lifecycle.ended(record, end)
 
-    # Hosts
-
     def host_joined(self, host: HostName) -> None:
         state = self.state
         if host in state.alive:
@@ -259,17 +244,17 @@ class Reconciler:
         for record in state.components.values():
             if record.state == "waiting":
                 if self.probes.has(host, record.component):
-                    # Perhaps it is there still: better than to start it anew.
+                    # It may still run there, which is better than a restart.
                     record.not_before = state.now + PROBE_TIMEOUT
                 state.wake(record, max(state.now, record.not_before))
             elif record.state == "stopping" and record.host == host:
                 self.lifecycle.end_incarnation(record)
             elif record.state == "running" and record.host == host:
-                # Its list or its token comes in a moment.
+                # Its list or token is about to arrive.
                 state.wake(record, state.now + GRACE)
 
     def host_lost(self, host: HostName) -> None:
-        """Its components have ended with it, or, if its node was only silent, are probed once it is back."""
+        """End its components; they are probed if the host returns, as its node may only have been silent."""
         state = self.state
         state.alive.discard(host)
         state.last_change.pop(host, None)
@@ -288,16 +273,14 @@ class Reconciler:
             else:
                 self.migrations.source_ended(record, move, host_gone(host))
 
-    # What was published before
-
     def inherited(self, status: Placement) -> None:
-        """It stands until a host reports otherwise, or none does within GRACE."""
+        """Valid until a host contradicts it, or none confirms it within GRACE."""
         state = self.state
         if not state.note_incarnation(status.component, status.incarnation):
             return
         record = state.get(status.component)
         if record is not None:
-            # A host was quicker; that it is to stop is known here only.
+            # A host reported first, but only the placement has the stop request.
             if not status.wanted and record.wanted and record.state not in OVER:
                 self.migrations.cancel(record)
                 self.lifecycle.stop(record)

@@ -1,4 +1,4 @@
-"""What is repeated to a host until it answers: stops of surplus incarnations, and probes."""
+"""Commands repeated until a host answers: stops of surplus incarnations, and probes."""
 
 from __future__ import annotations
 
@@ -13,24 +13,21 @@ from zscout.types import SECOND, ComponentId, HostName, Ns
 MAX_SURPLUS: Final = 100
 """Of one component."""
 PROBES_AT_ONCE: Final = 200
-"""To one host; the next follow when these are answered, or time is up."""
+"""To one host; the next follow after the answers or a timeout."""
 
 
 @dataclass(slots=True)
 class _Surplus:
     host: HostName
-    start_until: Ns | None
-    """Until then its start may still be on the way, and a stop that came first has stopped nothing."""
-    token: bool = False
-    """It is alive: a report that it was stopped is older than its start."""
+    start_until: Ns | None  # until then its start may still be on the way, and an earlier stop had no effect
+    token: bool = False  # alive: a report of its stop is older than its start
     stop_confirmed: bool = False
     tries: int = 0
     due: Ns = 0
 
 
 class SurplusIncarnations:
-    """Incarnations that must not live, as another one counts or none. Each is stopped until its host reports
-    its end, or is lost."""
+    """Incarnations that must not live. Each is stopped until its host reports its end, or is lost."""
 
     def __init__(self, state: PlacementState) -> None:
         self._state = state
@@ -54,46 +51,45 @@ class SurplusIncarnations:
         *,
         token: bool = False,
     ) -> None:
-        """This incarnation must end. It has, if its host is gone."""
+        """End this incarnation; without its host it has ended."""
         known = self._of.setdefault(component, {})
         if host in self._state.alive and incarnation not in known and len(known) < MAX_SURPLUS:
-            known[incarnation] = one = _Surplus(host, start_until, token)
-            self._stop(component, incarnation, one)
+            known[incarnation] = surplus = _Surplus(host, start_until, token)
+            self._stop(component, incarnation, surplus)
         self._set_timer(component)
 
     def start_answered(self, component: ComponentId, incarnation: Incarnation, *, may_run: bool) -> bool:
-        """Whether it is surplus. It is stopped once more: the first stop may have come before its start."""
-        one = self._get(component, incarnation)
-        if one is not None and not may_run:
+        """Return True if it is surplus, and stop it again: the first stop may have come before its start."""
+        surplus = self._get(component, incarnation)
+        if surplus is not None and not may_run:
             self.ended(component, incarnation)
-        elif one is not None and one.start_until is not None:
-            one.start_until = None
-            self._stop(component, incarnation, one)
+        elif surplus is not None and surplus.start_until is not None:
+            surplus.start_until = None
+            self._stop(component, incarnation, surplus)
             self._set_timer(component)
-        return one is not None
+        return surplus is not None
 
     def stop_answered(self, component: ComponentId, incarnation: Incarnation, *, done: bool) -> None:
-        one = self._get(component, incarnation)
-        if one is None:
+        surplus = self._get(component, incarnation)
+        if surplus is None:
             return
-        one.stop_confirmed = done
+        surplus.stop_confirmed = done
         if not done:
-            one.tries += 1
-            one.due = self._state.now + self._state.back_off_time(one.tries)
-        elif one.start_until is None and not one.token:
+            surplus.tries += 1
+            surplus.due = self._state.now + self._state.back_off_time(surplus.tries)
+        elif surplus.start_until is None and not surplus.token:
             self.ended(component, incarnation)
         else:
-            one.due = self._state.now + SECOND
+            surplus.due = self._state.now + SECOND
         self._set_timer(component)
 
     def token(self, component: ComponentId, incarnation: Incarnation, *, alive: bool) -> None:
-        """Its liveliness token appeared or vanished."""
-        one = self._get(component, incarnation)
-        if one is not None:
-            one.token = alive
+        surplus = self._get(component, incarnation)
+        if surplus is not None:
+            surplus.token = alive
             if alive:
-                one.start_until = None
-            elif one.stop_confirmed:
+                surplus.start_until = None
+            elif surplus.stop_confirmed:
                 self.ended(component, incarnation)
 
     def ended(self, component: ComponentId, incarnation: Incarnation) -> None:
@@ -104,10 +100,9 @@ class SurplusIncarnations:
         self._set_timer(component)
 
     def host_lost(self, host: HostName) -> list[ComponentId]:
-        """The components of which surplus incarnations were lost with the host."""
         found = []
         for component, known in list(self._of.items()):
-            left = {incarnation: one for incarnation, one in known.items() if one.host != host}
+            left = {incarnation: surplus for incarnation, surplus in known.items() if surplus.host != host}
             if len(left) < len(known):
                 self._of[component] = left
                 self._set_timer(component)
@@ -116,28 +111,27 @@ class SurplusIncarnations:
 
     def timer(self, component: ComponentId) -> None:
         now = self._state.now
-        for incarnation, one in self._of.get(component, {}).items():
-            if one.due <= now:
-                if one.start_until is not None and one.start_until <= now:
-                    one.start_until = None
-                self._stop(component, incarnation, one)
+        for incarnation, surplus in self._of.get(component, {}).items():
+            if surplus.due <= now:
+                if surplus.start_until is not None and surplus.start_until <= now:
+                    surplus.start_until = None
+                self._stop(component, incarnation, surplus)
         self._set_timer(component)
 
-    def _stop(self, component: ComponentId, incarnation: Incarnation, one: _Surplus) -> None:
-        one.due = self._state.now + STOP_TIMEOUT
-        self._state.stop(component, incarnation, one.host)
+    def _stop(self, component: ComponentId, incarnation: Incarnation, surplus: _Surplus) -> None:
+        surplus.due = self._state.now + STOP_TIMEOUT
+        self._state.stop(component, incarnation, surplus.host)
 
     def _set_timer(self, component: ComponentId) -> None:
         known = self._of.get(component, {})
         if not known:
             self._of.pop(component, None)
-        due = min((one.due for one in known.values()), default=None)
+        due = min((surplus.due for surplus in known.values()), default=None)
         self._state.timers.set(TimerKind.SURPLUS, component, due)
 
 
 class Probes:
-    """Components of which a host is asked until it answers: those whose token nobody expected, and, after the
-    host was lost, all that it had."""
+    """Components to ask a host for until it answers: with unexpected tokens, or on it when it was lost."""
 
     def __init__(self, state: PlacementState) -> None:
         self._state = state
@@ -146,9 +140,8 @@ class Probes:
         self._count = 0
 
     def add(self, host: HostName, component: ComponentId) -> None:
-        """Asks at once if the host is there, else when it joins."""
         if self._count >= MAX_COMPONENTS:
-            # The oldest are of hosts that will not come back.
+            # The oldest belong to hosts unlikely to return.
             self._drop(next(iter(self._open)))
         probes = self._open.setdefault(host, {})
         if component not in probes:
@@ -163,11 +156,11 @@ class Probes:
         return component in self._open.get(host, {})
 
     def answered(self, host: HostName, component: ComponentId | None) -> list[ComponentId]:
-        """A host listed this component, or (None) all. Returns those that were asked for."""
+        """A host listed this component, or (None) all. Returns the probed ones."""
         probes = self._open.get(host, {})
         found = list(probes) if component is None else [component] if component in probes else []
-        for one in found:
-            del probes[one]
+        for name in found:
+            del probes[name]
         self._count -= len(found)
         if not probes:
             self._drop(host)

@@ -1,5 +1,5 @@
-"""The placer's one state, and the few operations that change it; what to change is decided elsewhere
-(`lifecycle`, `migration`, `rebalancing`, `reconciler`)."""
+"""The placer's state and the few operations that change it; `lifecycle`, `migration`, `rebalancing` and `reconciler`
+decide."""
 
 from __future__ import annotations
 
@@ -20,23 +20,21 @@ from zscout.placement.model import NO_REPORT, RankQuery
 from zscout.types import SECOND, ComponentId, HostName, Kind, Ns
 
 PER_TERM: Final = 1_000
-"""Incarnations of a component begin, in each term, at its counter times this."""
+"""The first incarnation of a term is its counter times this."""
 FAR_AHEAD: Final = 1_000_000
-"""An incarnation this far above what the term gives is believed unless it is of one of the last terms (`LAST_TERMS`):
-its host refuses lower ones for good, so the next has to be above it, and of the last there may be no room above."""
+"""An incarnation this far above the term's is believed, unless of one of the last terms (`LAST_TERMS`): its host
+refuses lower ones for good, so the next must exceed it, and the last terms may leave no room."""
 PROBE_TIMEOUT: Final[Ns] = 2 * SECOND
 START_SLACK: Final[Ns] = 2 * PROBE_TIMEOUT
-"""Beyond the time that a start may take: then it is commanded again."""
+"""Beyond the start timeout: then the start is repeated."""
 STOP_TIMEOUT: Final[Ns] = 15 * SECOND
 """More than a component may take to end."""
 MAX_COMPONENTS: Final = 10_000
 MAX_ENDED: Final = 1_000
-"""Ended and given-up components that are kept, each for RETENTION."""
+"""Each is kept for RETENTION."""
 RETENTION: Final[Ns] = 3_600 * SECOND
 MAX_ENDED_INCARNATIONS: Final = 16
-"""Of one component: those that are known to have ended."""
 HOSTS_NAMED: Final = 3
-"""In the reason why there is no eligible host."""
 
 TRANSITIONS: Final[Mapping[ComponentState, frozenset[ComponentState]]] = {
     "waiting": frozenset({"starting", "running", "backing_off", "stopping", "ended", "given_up"}),
@@ -54,13 +52,12 @@ GONE: Final = "its node is not there"
 NOT_NAMED: Final = "it is not among the hosts that the component asks for"
 
 SideState: TypeAlias = Literal["unknown", "running", "standby", "ended"]
-"""What is known of the source or the target of a migration."""
 
 
 @dataclass(frozen=True, slots=True)
 class Termination:
-    """How an incarnation ended; `lost`: nobody knows how. `with_host`: with its host, so that it does not
-    count as its failure. `bad_params`: it failed because of its parameters, and would again."""
+    """`lost`: the cause is unknown. `with_host`: its host ended, so it is not the component's failure. `bad_params`:
+    it would fail again."""
 
     cause: HowEnded | Literal["lost"]
     reason: str
@@ -75,8 +72,8 @@ def host_gone(host: HostName | None) -> Termination:
 
 @dataclass(slots=True)
 class Migration:
-    """A move under way: the target gets ready (`starting`), the source hands over (`handing_over`), or the
-    outcome is unknown and both hosts are asked (`probing`)."""
+    """A move: the target starts (`starting`), the source hands over (`handing_over`), or both hosts are asked for
+    the outcome (`probing`)."""
 
     to: HostName
     incarnation: Incarnation
@@ -86,67 +83,48 @@ class Migration:
     tries: int = 0
     source: SideState = "running"
     target: SideState = "unknown"
-    token: bool = False
-    """The target has its token: it has taken over."""
-    termination: Termination | None = None
-    """Of the source, if it ended while the outcome was unknown."""
+    token: bool = False  # the target has its token: it has taken over
+    termination: Termination | None = None  # of the source, if it ended while the outcome was unknown
 
 
 @dataclass(slots=True)
 class ComponentRecord:
-    """A component. `host` is where its incarnation is, or starts; None: nowhere."""
+    """`host` is where its incarnation is or starts; None: nowhere."""
 
     component: ComponentId
     spec: ComponentSpec
-    state: ComponentState = "waiting"
-    """Changed by `enter` alone."""
+    state: ComponentState = "waiting"  # changed by `enter` alone
     incarnation: Incarnation = 0
     asked_at: Ns = 0
-    """When it was asked for."""
-    asked_as: Incarnation = 0
-    """Its incarnation then: as long as it is the same, it was never started since."""
-    superseded: bool = False
-    """The incarnation belongs to what was placed before under this name, and must not live."""
+    asked_as: Incarnation = 0  # its incarnation at `asked_at`: while unchanged, it was never started
+    superseded: bool = False  # the incarnation is of an earlier component of this name, and must not live
     host: HostName | None = None
     wanted: bool = True
     reason: str = ""
-    host_reason: str = ""
-    """Why it is where it is: the reason while it runs."""
-    drain_reason: str = ""
-    """Why it is still on a host that is drained; shown in place of `reason`."""
+    host_reason: str = ""  # the reason while it runs
+    drain_reason: str = ""  # why it is still on a drained host; shown in place of `reason`
     restart_cause: str = ""
     tail: str = ""
     movable: bool = False
     restarts: int = 0
-    failed_rounds: int = 0
-    """How often all hosts were tried in vain."""
+    failed_rounds: int = 0  # rounds in which all hosts failed
     moves: int = 0
-    dead: float | None = None
-    """Seconds that its last move took it out of work."""
+    dead: float | None = None  # dead time of its last move, in seconds
     running_since: Ns | None = None
-    start_until: Ns | None = None
-    """A start is commanded and not answered; it is taken for lost then."""
-    unanswered: int = 0
-    """Attempts in a row of the present command or probe that were not answered."""
+    start_until: Ns | None = None  # while a start is unanswered; then it counts as lost
+    unanswered: int = 0  # unanswered attempts in a row of the present command or probe
     token: bool = False
-    confirmed: bool = False
-    """Its host reported that it runs, and whether it is movable."""
+    confirmed: bool = False  # its host reported that it runs, and whether it is movable
     probed: bool = False
-    """A probe is sent, and not answered."""
-    no_host: tuple[str, str] | None = None
-    """Why no host would do, without its figures, and the reason given for that."""
+    no_host: tuple[str, str] | None = None  # causes without their figures, and the reason given for them
     tried: dict[HostName, str] = field(default_factory=dict)
     """Hosts that did not start it in this round, with the reason if another try there would not help."""
-    whereabouts_unknown: bool = False
-    """It reported that it went on elsewhere, and no host has reported it yet."""
-    migration: Migration | None = None
-    """There exactly while it is `moving`."""
-    not_before: Ns = 0
-    """Until then it is neither moved off a drained host nor, if inherited, placed."""
+    whereabouts_unknown: bool = False  # it reported a move, and no host has reported it yet
+    migration: Migration | None = None  # present exactly while `moving`
+    not_before: Ns = 0  # until then it is neither moved off a drained host nor, if inherited, placed
     ended_incarnations: deque[Incarnation] = field(default_factory=lambda: deque(maxlen=MAX_ENDED_INCARNATIONS))
 
     def enter(self, state: ComponentState) -> None:
-        """Raises ValueError for a transition that the table does not have."""
         if state not in TRANSITIONS[self.state] and state != self.state:
             raise ValueError(f"{self.component}: from {self.state} to {state}")
         self.state = state
@@ -170,7 +148,7 @@ class ComponentRecord:
 
 
 class TimerKind(IntEnum):
-    """In the order in which timers of one instant are handled."""
+    """In the order of handling within an instant."""
 
     DRAIN = 0
     LIFECYCLE = 1
@@ -181,21 +159,19 @@ class TimerKind(IntEnum):
 
 
 TimerKey: TypeAlias = tuple[TimerKind, str]
-"""With the name of a component or host; empty where there is one timer of the kind."""
+"""With the name of a component or host; empty for a single timer."""
 
 
 class Timers:
-    """One time for each key, on the caller's clock."""
-
     SLACK: Final = 64
-    """Outdated entries that the heap may hold beside as many as count."""
+    """Outdated heap entries allowed beyond the number of valid ones."""
 
     def __init__(self) -> None:
         self._at: dict[TimerKey, Ns] = {}
         self._heap: list[tuple[Ns, TimerKey]] = []
 
     def set(self, kind: TimerKind, name: str, at: Ns | None) -> None:
-        """Replaces the time of this key; None: removes it."""
+        """Set the time of this key; None removes it."""
         key = kind, name
         if at is None:
             self._at.pop(key, None)
@@ -203,11 +179,10 @@ class Timers:
             self._at[key] = at
             heapq.heappush(self._heap, (at, key))
             if len(self._heap) > 2 * len(self._at) + self.SLACK:
-                self._heap = [(when, one) for one, when in self._at.items()]
+                self._heap = [(when, timer) for timer, when in self._at.items()]
                 heapq.heapify(self._heap)
 
     def pop_due(self, now: Ns) -> list[TimerKey]:
-        """Removes and returns the keys whose time has come, soonest first."""
         found = []
         while self._heap and self._heap[0][0] <= now:
             at, key = heapq.heappop(self._heap)
@@ -217,14 +192,13 @@ class Timers:
         return found
 
     def next(self) -> Ns | None:
-        """The soonest time that is set."""
         while self._heap and self._at.get(self._heap[0][1]) != self._heap[0][0]:
             heapq.heappop(self._heap)
         return self._heap[0][0] if self._heap else None
 
 
 class PlacementState:
-    """Everything that the placer knows. `now` is the instant that is handled."""
+    """`now` is the instant that is handled."""
 
     def __init__(self, balancer: Balancer, counter: int, rules: PlacementPolicy) -> None:
         self.balancer, self.rules = balancer, rules
@@ -232,30 +206,22 @@ class PlacementState:
         self.now: Ns = 0
         self.components: dict[ComponentId, ComponentRecord] = {}
         self.published: dict[ComponentId, Placement] = {}
-        self.to_place: dict[ComponentId, None] = {}
-        """Placed at the end of this instant."""
-        self.alive: set[HostName] = set()
-        """Hosts whose node has its token."""
+        self.to_place: dict[ComponentId, None] = {}  # placed at the end of this instant
+        self.alive: set[HostName] = set()  # hosts whose node has its token
         self.kinds: dict[HostName, tuple[Ns, frozenset[Kind]]] = {}
-        """What hosts can start, and when they said so; those that are gone included, for they may come back."""
-        self.last_change: dict[HostName, Ns] = {}
-        """When the placer last brought a component to a host or took one from it."""
+        """Kinds that hosts can start, and when they listed them; kept for lost hosts, which may return."""
+        self.last_change: dict[HostName, Ns] = {}  # when the placer last added or removed a component
         self.departed: dict[HostName, deque[tuple[Ns, float]]] = {}
-        """What left a host: when, and how many cores of it the load average showed then."""
+        """Departures from a host: when, and the cores that the load average showed then."""
         self.timers = Timers()
         self._lowest: Incarnation = counter * PER_TERM
         self._highest = max(LAST_TERMS * PER_TERM, self._lowest + FAR_AHEAD)
-        self._incarnations: dict[ComponentId, Incarnation] = {}
-        """The highest of each component."""
-        self._ended: dict[ComponentId, None] = {}
-        """Ended and given-up components, the oldest first."""
+        self._incarnations: dict[ComponentId, Incarnation] = {}  # the highest of each component
+        self._ended: dict[ComponentId, None] = {}  # oldest first
         self._changed: dict[ComponentId, bool] = {}
         self._commands: list[HostCommand | PlacementRefused] = []
 
-    # One instant
-
     def begin(self, now: Ns) -> None:
-        """Raises ValueError if time goes backwards."""
         if now < self.now:
             raise ValueError(f"time went backwards: {now} after {self.now}")
         self.now = now
@@ -263,8 +229,7 @@ class PlacementState:
         self.rankings.begin(now)
 
     def finish(self) -> list[PlacerEffect]:
-        """The effects of this instant. Changes come first: they are published before they are acted upon, so
-        that the next placer knows of every start."""
+        """The effects of this instant, changes first: so the next placer knows of every start."""
         effects: list[PlacerEffect] = []
         for component, always in self._changed.items():
             record = self.components.get(component)
@@ -276,30 +241,29 @@ class PlacementState:
             if always or self.published.get(component) != status:
                 self.published[component] = status
                 effects.append(ComponentChanged(component, status))
-        # A host may have been lost in this very instant, after a command to it.
-        return effects + [one for one in self._commands if isinstance(one, PlacementRefused) or one.host in self.alive]
-
-    # Components
+        # A host may be lost in this instant, after a command to it.
+        return effects + [
+            command for command in self._commands if isinstance(command, PlacementRefused) or command.host in self.alive
+        ]
 
     def mark_changed(self, component: ComponentId, *, always: bool = False) -> None:
-        """Has its status published if it differs, or `always`: a request waits for it."""
+        """Publish its status if it differs, or `always`: a request waits for it."""
         self._changed[component] = always or self._changed.get(component, False)
 
     def get(self, component: ComponentId) -> ComponentRecord | None:
-        """To be changed."""
         record = self.components.get(component)
         if record is not None:
             self.mark_changed(component)
         return record
 
     def known(self, component: ComponentId) -> ComponentRecord | None:
-        """As `get`; a request for one that there is not is refused."""
+        """Like `get`, but refuse the request if it does not exist."""
         if component not in self.components:
             self.refuse(component, "unknown_component", f"there is no component {component}")
         return self.get(component)
 
     def add(self, record: ComponentRecord) -> bool:
-        """False: there is no room for it."""
+        """False: no room."""
         if len(self.components) >= MAX_COMPONENTS:
             if not self._ended:
                 return False
@@ -309,7 +273,6 @@ class PlacementState:
         return True
 
     def retire(self, record: ComponentRecord) -> None:
-        """It is only remembered from now on."""
         self._ended[record.component] = None
         self.wake(record, self.now + RETENTION)
         if len(self._ended) > MAX_ENDED:
@@ -319,17 +282,15 @@ class PlacementState:
         self._ended.pop(record.component, None)
 
     def forget(self, component: ComponentId) -> None:
-        """Its highest incarnation becomes the lowest for all, so that none is used twice."""
+        """Its highest incarnation becomes the minimum for all, so none is used twice."""
         self._ended.pop(component, None)
         if self.components.pop(component, None) is not None:
             self.mark_changed(component)
         self._lowest = max(self._lowest, self._incarnations.pop(component, 0))
         self.timers.set(TimerKind.LIFECYCLE, component, None)
 
-    # Incarnations
-
     def note_incarnation(self, component: ComponentId, incarnation: Incarnation) -> bool:
-        """It exists or existed: the next one must be higher. False: it can't be, and is not noted."""
+        """Keep the next incarnation higher. False: impossible, and ignored."""
         if incarnation > self._highest:
             return False
         if incarnation > self._incarnations.get(component, self._lowest):
@@ -344,26 +305,24 @@ class PlacementState:
         self.note_incarnation(component, incarnation)
         return incarnation
 
-    # Hosts
-
     def eligible_hosts(
         self, spec: ComponentSpec, *, other_than: HostName | None = None, only: HostName | None = None
     ) -> tuple[Sequence[RankedHost], str]:
-        """Hosts that can run a component, best first; if there is none, why: one bounded line."""
+        """Eligible hosts, best first; if none, why: one bounded line."""
         query = RankQuery.of(spec)
         if only is not None:
             query = replace(query, hosts=frozenset({only}))
         ranking = self.rankings.rank(query)
         lacking = {host for host in self.alive if self.lacks(host, spec.kind)} if self.kinds else set()
         usable = self.alive - lacking if lacking else self.alive
-        found = tuple(one for one in ranking.hosts if one.host in usable and one.host != other_than)
+        found = tuple(ranked for ranked in ranking.hosts if ranked.host in usable and ranked.host != other_than)
         left_out = dict(ranking.left_out)
         if only is not None and spec.hosts is not None and only not in spec.hosts:
             left_out = {only: NOT_NAMED}
         elif found:
             return found, ""
         else:
-            left_out |= {one.host: GONE for one in ranking.hosts if one.host not in (other_than, *lacking)}
+            left_out |= {ranked.host: GONE for ranked in ranking.hosts if ranked.host not in (other_than, *lacking)}
             known = self.alive if query.hosts is None else self.alive & query.hosts
             left_out |= dict.fromkeys(known - self.balancer.reports.keys(), NO_REPORT)
             left_out |= dict.fromkeys(known & lacking, f"it has no kind {spec.kind}")
@@ -375,30 +334,28 @@ class PlacementState:
         none = "there is no host" if other_than is None else "there is no other that it may use"
         return (), "; ".join(named) or none
 
-    def told_kinds(self, host: HostName, kinds: frozenset[Kind]) -> None:
+    def set_kinds(self, host: HostName, kinds: frozenset[Kind]) -> None:
         self.kinds.pop(host, None)
         self.kinds[host] = self.now, kinds
         if len(self.kinds) > MAX_HOSTS:
             del self.kinds[next(iter(self.kinds))]
 
     def lacks(self, host: HostName, kind: Kind) -> bool:
-        """Whether a host has said what it can start, and this kind was not among it."""
-        told = self.kinds.get(host)
-        return told is not None and kind not in told[1]
+        """Return True if a host has listed its kinds without `kind`."""
+        listed = self.kinds.get(host)
+        return listed is not None and kind not in listed[1]
 
     def lacking_everywhere(self, spec: ComponentSpec) -> set[HostName]:
-        """The hosts that are there and could be used but for its kind, if no host that is known has that."""
+        """The live hosts that lack only its kind, if no known host has it."""
         known = self.alive | self.kinds.keys() if spec.hosts is None else set(spec.hosts)
         return known & self.alive if all(self.lacks(host, spec.kind) for host in known) else set()
 
     def component_arrives(self, component: ComponentId, kind: Kind, host: HostName) -> None:
-        """It is on its way to a host."""
         self.balancer.placed(self.now, component, kind, host)
         self.rankings.invalidate(host)
         self.last_change[host] = self.now
 
     def component_left(self, record: ComponentRecord) -> None:
-        """It is not on its host any more."""
         host = record.host
         self.balancer.gone(record.component)
         if host is not None:
@@ -412,8 +369,6 @@ class PlacementState:
                 self.departed.setdefault(host, deque(maxlen=100)).append((self.now, wants * shown))
         record.host, record.running_since, record.token, record.probed = None, None, False, False
 
-    # Timers
-
     def wake(self, record: ComponentRecord, at: Ns | None) -> None:
         self.timers.set(TimerKind.LIFECYCLE, record.component, at)
 
@@ -421,23 +376,20 @@ class PlacementState:
         self.timers.set(TimerKind.MIGRATION, record.component, at)
 
     def drain_soon(self, host: HostName | None) -> None:
-        """There may be something to move off this host, if it is drained."""
+        """Check for components to move off this host, if it is drained."""
         if host in self.balancer.cordoned:
             self.timers.set(TimerKind.DRAIN, "", self.now)
 
     def back_off_time(self, failures: int) -> Ns:
         return min(self.rules.back_off << min(failures, 20), self.rules.longest_back_off)
 
-    # Effects
-
     def start(self, record: ComponentRecord, move: Migration | None = None) -> None:
-        """Commands the start of the record's incarnation, or of the one that stands by in a move; for the first time or
-        again."""
-        one, host, timer = (record, record.host, self.wake) if move is None else (move, move.to, self.wake_migration)
+        """Command the start of the record's incarnation or of a move's standby, the first time or again."""
+        side, host, timer = (record, record.host, self.wake) if move is None else (move, move.to, self.wake_migration)
         if host is not None and host in self.alive:
-            one.start_until = self.now + self.rules.start_timeout + START_SLACK
-            timer(record, one.start_until)
-            start = messages.StartComponent(record.component, one.incarnation, record.spec, standby=move is not None)
+            side.start_until = self.now + self.rules.start_timeout + START_SLACK
+            timer(record, side.start_until)
+            start = messages.StartComponent(record.component, side.incarnation, record.spec, standby=move is not None)
             self._commands.append(HostCommand(host, start))
 
     def hand_over(self, record: ComponentRecord, move: Migration) -> None:
@@ -449,7 +401,6 @@ class PlacementState:
         self._commands.append(HostCommand(host, messages.StopComponent(component, incarnation)))
 
     def probe(self, component: ComponentId, host: HostName | None) -> None:
-        """Asks a host for this component."""
         if host is not None:
             self._commands.append(HostCommand(host, messages.ListComponents(component)))
 

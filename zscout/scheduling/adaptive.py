@@ -1,23 +1,22 @@
-"""Strategy `adaptive`: the heuristic, and a search for the better set only where there may be one.
+"""Strategy `adaptive`: the heuristic, and a search only where a better set may exist.
 
 A pass:
 
 1. Reserve RCs for ARCs that have waited too long (`reservations.py`).
-2. Take the undecided ARCs, in groups that have no RC in common (`conflict_groups.py`).
-3. Take each group's set by the heuristic, as if every vote that is not known were a yes. Where it reaches
-   the upper bound nothing can be gained: the group is left to step 6.
+2. Take the undecided ARCs, in groups without a common RC (`conflict_groups.py`).
+3. Take each group's set by the heuristic, counting unknown votes as yes. A set at the upper bound can't be improved:
+   its group is left to step 6.
 4. Elsewhere search the best set: by branch and bound, or by local search where that takes too long.
-5. Ask the votes that a better set needs, and take it once they are in. While a group is searched or its votes
-   are out, it is off limits and all others go on.
+5. Ask the votes that a better set needs, and take the set once they are in. While a group is searched or its votes are
+   out, it is off limits; the other groups continue.
 6. Run a pass of `priority` over the rest.
 
-Nobody waits long for a search. Its time is counted in steps, a pass takes one slice of them, and another pass is asked
-for at once, so that the RCM answers between two slices. A search works on a snapshot: when the group has changed, it
-starts again from what is left of the best set. A group has only so many slices and rounds of votes, whatever happens
-meanwhile; then the best set that needs no more votes is taken, or `priority` decides.
+Search time is counted in steps. A pass takes one slice and asks for another pass at once, so the RCM answers between
+slices. A search works on a snapshot: when the group has changed, it restarts from the rest of its best set. Slices and
+rounds of votes of a group are bounded; then it takes the best set that needs no more votes, or leaves the group to
+`priority`.
 
-In each pass the outcome is worth at least what that of `priority` is, among the ARCs that no reservation holds back.
-"""
+Each pass is worth at least as much as one of `priority`, among the ARCs that no reservation holds back."""
 
 from __future__ import annotations
 
@@ -37,31 +36,29 @@ from zscout.scheduling.votes import HolderSet
 from zscout.types import ArcId
 
 WORK: Final = 20_000
-"""Steps of branch and bound, times items: some 3 ms."""
+"""Steps of branch and bound times items: some 3 ms."""
 MAX_PACKED: Final = 60
 """Larger groups go to local search at once."""
 SLICE: Final = 150
 """Steps of local search in one pass: some 3 ms."""
 MAX_STARTABLE: Final = 1_000
-"""Where more ARCs than that could start at one instant, `priority` decides."""
+"""With more ARCs that could start at one instant, `priority` decides."""
 MAX_STEPS: Final = 6_500
 MAX_SLICES: Final = 48
-"""Passes for which one group is searched at most, begun anew or not."""
+"""Passes that search one group, restarts included."""
 MAX_ROUNDS: Final = 16
-"""Rounds of votes likewise."""
+"""Rounds of votes on one group."""
 
 SEARCHING: Final = Reason(ReasonCode.SEARCHING)
 
 
 def steps_for(size: int) -> int:
-    """Steps that a group of so many ARCs is worth: 246 for 100, 5,480 for 600."""
+    """Steps that a group of `size` ARCs is worth: 246 for 100, 5,480 for 600."""
     return min(MAX_STEPS, size * (85 + size) // 75)
 
 
 @dataclass(slots=True)
 class _Search:
-    """The search in one group, kept from pass to pass."""
-
     items: list[PackingItem]
     arcs: list[ArcId]
     nogoods: set[int]
@@ -69,19 +66,15 @@ class _Search:
     heuristic: int
     best: int
     begun: bool = False
-    inexact: bool = False
-    """Optimality is not proven, so the heuristic's set must pass the votes before it serves as baseline."""
-    local: LocalSearch | None = None
-    """None before it begins, and once there is nothing more to look for."""
+    inexact: bool = False  # not proven optimal: the heuristic's set must pass the votes before it serves as baseline
+    local: LocalSearch | None = None  # None before the search begins, and after it has ended
     steps: int = 0
     slices: int = 0
     rounds: int = 0
-    asked: list[tuple[Rc, HolderSet]] | None = None
-    """The last round."""
+    asked: list[tuple[Rc, HolderSet]] | None = None  # the last round of proposals
 
     @property
     def exhausted(self) -> bool:
-        """The group has had its time: it is `priority`'s from now on."""
         return self.slices >= MAX_SLICES or self.rounds >= MAX_ROUNDS
 
     def fits(self, group: ConflictGroup) -> bool:
@@ -95,7 +88,7 @@ class _Search:
 
 
 class Adaptive(Strategy):
-    """One run of the strategy. It keeps unfinished searches, so each core has its own."""
+    """Keeps unfinished searches, so each core has its own."""
 
     name: StrategyName = "adaptive"
 
@@ -103,16 +96,13 @@ class Adaptive(Strategy):
         self._log_line = ""
         self._reserved: Reservations | None = None
         self._searches: dict[ArcId, _Search] = {}
-        self._work = 0
-        """What this pass may still spend on branch and bound."""
+        self._work = 0  # steps that this pass may still spend on branch and bound
         self._steps = 0
-        """Steps of local search likewise."""
         self._unfinished: list[_Search] = []
-        self._seen: tuple[int, ...] = ()
-        """The situation in which they are unfinished."""
+        self._seen: tuple[int, ...] = ()  # the situation of the unfinished searches
 
     def log_line(self) -> str:
-        """Where a search has beaten the heuristic, and at what cost."""
+        """Report where a search has beaten the heuristic, and at what cost."""
         line, self._log_line = self._log_line, ""
         return line
 
@@ -134,8 +124,8 @@ class Adaptive(Strategy):
         self._seen = _situation(state)
 
     def _reserve(self, state: SchedulerState) -> Reservations | None:
-        """What is reserved for the starving ARCs in this pass. Where a reservation has ended or changed, the
-        ARCs that it held back are checked again."""
+        """Reserve for the starving ARCs. Where a reservation has ended or changed, ARCs that it held back are
+        checked again."""
         patience = state.policy.patience
         if patience is None and not state.claims and self._reserved is None:
             return None
@@ -147,14 +137,14 @@ class Adaptive(Strategy):
         return reserved
 
     def _nothing_new(self, state: SchedulerState) -> bool:
-        """Whether a whole pass would only find everything as the last one left it."""
+        """Return True if a whole pass would change nothing."""
         index, votes = state.index, state.votes
         changed = index.freed or index.touched or votes.answered or votes.invalidated or votes.due(state.now)
         return not changed and self._seen == _situation(state)
 
     def _decide(self, group: ConflictGroup, before: dict[ArcId, _Search], actions: Actions) -> bool:
-        """Takes the better set of a group, or leaves it to `priority`. False: it is off limits for now."""
-        earlier = list({id(one): one for arc in group.arcs if (one := before.get(arc.id))}.values())
+        """Take the better set of a group, or leave it to `priority`. False: off limits for now."""
+        earlier = list({id(known): known for arc in group.arcs if (known := before.get(arc.id))}.values())
         while (search := self._search(group, earlier)) is not None:
             self._searches.update(dict.fromkeys(search.arcs, search))
             if search.exhausted:
@@ -185,7 +175,7 @@ class Adaptive(Strategy):
     def _ask(
         self, group: ConflictGroup, search: _Search, chosen: int, actions: Actions
     ) -> Literal["yes", "no", "open"]:
-        """Asks what is not known yet about a set. `no`: a silent RC rules it out; that is barred now."""
+        """Ask the unknown votes about a set. `no`: a silent RC rules the set out, which is barred now."""
         proposals = group.missing_votes(chosen)
         if proposals == []:
             return "yes"
@@ -199,7 +189,6 @@ class Adaptive(Strategy):
         return "open"
 
     def _search(self, group: ConflictGroup, earlier: list[_Search]) -> _Search | None:
-        """The search in this group, as far as it has come; None where nothing can be gained."""
         if len(earlier) == 1 and earlier[0].fits(group):
             return earlier[0]
         problem = group.problem()
@@ -210,14 +199,14 @@ class Adaptive(Strategy):
         preferred = problem.complete(_warm_start(earlier, arcs)) if earlier else heuristic
         best = max(heuristic, preferred, key=problem.key)
         search = _Search(list(group.items), arcs, set(group.nogoods), problem, heuristic, best)
-        for one in earlier:
-            search.steps = max(search.steps, one.steps)
-            search.slices = max(search.slices, one.slices)
-            search.rounds = max(search.rounds, one.rounds)
+        for known in earlier:
+            search.steps = max(search.steps, known.steps)
+            search.slices = max(search.slices, known.slices)
+            search.rounds = max(search.rounds, known.rounds)
         return search
 
     def _advance(self, search: _Search) -> bool:
-        """Goes on with a search for as long as this pass has time. True: it is over."""
+        """Continue a search while this pass has time. True: it has ended."""
         if search.exhausted or not search.begun:
             return search.exhausted
         local = search.local
@@ -256,8 +245,7 @@ class Adaptive(Strategy):
 
 
 def _one_without_choice(state: SchedulerState) -> bool:
-    """Whether one ARC waits alone, and who would have to end for it is plain: the usual case where nothing is
-    scarce, at the cost of `priority`."""
+    """Return True for the usual case of one waiting ARC whose victims are obvious: `priority` is enough."""
     if len(state.queued) != 1 or state.policy.promise != "equals":
         return False
     (arc,) = state.queued.values()
@@ -266,18 +254,15 @@ def _one_without_choice(state: SchedulerState) -> bool:
 
 
 def _situation(state: SchedulerState) -> tuple[int, ...]:
-    """Differs when an ARC came, went, started or ended, or an RC came or went."""
     return (state.entries, len(state.queued), len(state.running), state.present, state.sharable)
 
 
 def _warm_start(earlier: list[_Search], arcs: list[ArcId]) -> int:
-    """What earlier searches would have chosen, as far as it is still there."""
     wanted = {search.arcs[number] for search in earlier for number in numbers(search.best)}
     return sum(1 << number for number, arc in enumerate(arcs) if arc in wanted)
 
 
 def _pairs(group: ConflictGroup, chosen: int) -> dict[int, int]:
-    """Pairs in use at each priority, the highest first."""
     pairs = dict.fromkeys(sorted({arc.priority for arc in group.arcs}, reverse=True), 0)
     for number in numbers(chosen):
         item = group.items[number]

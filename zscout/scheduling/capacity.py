@@ -1,4 +1,4 @@
-"""What a sharable RC with a capacity for each bandwidth parameter can carry."""
+"""Capacity check of sharable RCs."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from zscout.types import ArcId, Params
 
 
 def excess(capacity: Mapping[str, Fraction], holders: Iterable[tuple[ArcId, Params]]) -> str:
-    """Why a sharable RC of this capacity can't carry these holders; empty if it can.
+    """Explain why an RC of this capacity can't carry these holders; empty if it can.
 
-    A parameter without a capacity is unbounded, a missing one counts 0; sums are exact."""
+    A parameter without a capacity is unbounded, a missing parameter counts 0; sums are exact."""
     totals: dict[str, Fraction] = {}
     for _, params in holders:
         for parameter, value in params.items():

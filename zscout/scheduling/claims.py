@@ -1,7 +1,7 @@
-"""Bookings as the core keeps them: a claim with a date, until its owner's request takes it up.
+"""Bookings in the core: a claim with a date, until its owner's request takes it up.
 
-That nobody gets into its way is done by `reservations.py`, when there is time for one is told by `slots.py`, and what
-endangers one by `dangers.py`. Maintenance is a claim that nobody takes up."""
+`reservations.py` keeps their RCs free, `slots.py` finds times, `dangers.py` finds threats. Maintenance is a claim
+that is never taken up."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from zscout.types import NO_TERM, Ns, Place
 
 
 def request_for(booking: Booking) -> ArcRequest:
-    """The request by which its owner takes it up."""
     return ArcRequest(
         booking.id,
         f"{booking.owner}/",
@@ -35,21 +34,15 @@ def request_for(booking: Booking) -> ArcRequest:
 
 
 class Claims:
-    """The rules by which the bookings of a core change."""
-
     def __init__(self, state: SchedulerState, actions: Actions, emit: Callable[[Effect], None]) -> None:
         self._state, self._actions, self._emit = state, actions, emit
-        self._reserved: Reservations | None = None
-        """What was reserved when dangers were looked for last."""
-        self._endangered: dict[Claim, None] = {}
-        """The bookings of which it was told last that they are in danger."""
-        self._wanting: dict[str, list[Arc]] = {}
-        """By booking: ARCs that would take it up, and can't: it is not there at present, or another has it."""
-        self.certain_from: Ns = 0
-        """Until then dates are not certain: no date has come, and what is over may be to come again."""
+        self._reserved: Reservations | None = None  # the reservations at the last search for dangers
+        self._endangered: dict[Claim, None] = {}  # bookings last reported as endangered
+        self._wanting: dict[str, list[Arc]] = {}  # by booking: ARCs that want it while it is absent or taken
+        self.certain_from: Ns = 0  # dates before this are uncertain: no booking begins or expires for good
 
     def stand_in(self, booking: Booking) -> Arc:
-        """What stands for a booking before it is taken up."""
+        """An ARC that represents a booking until it is taken up."""
         arc = self._state.new_arc(request_for(booking), Place(NO_TERM, 0))
         if arc.patterns:
             self._state.bind(arc, booking.bound)
@@ -86,8 +79,8 @@ class Claims:
         self.expire()
 
     def take_up(self, booking: str, arc: Arc) -> None:
-        """An ARC, which waits or runs, stands for its booking from now on, or as soon as that is there and open.
-        It waits for the date."""
+        """Let a waiting or running ARC take its booking up, now or once that is there and open. The ARC waits for
+        the date."""
         claim = self._state.claims.get(booking)
         if not booking or (claim is not None and (claim.booking.maintenance or claim is arc.claim)):
             return
@@ -107,7 +100,7 @@ class Claims:
         return booking in self._wanting
 
     def _offer(self, claim: Claim) -> None:
-        """It is there and open: who wants it has it, if it is its owner's. Nobody here has checked that before."""
+        """Offer an open booking to the ARCs that want it, if they are its owner's: not checked before."""
         booking = claim.booking
         for arc in [] if claim.tentative else self._wanting.pop(booking.id, ()):
             asked = arc.request
@@ -122,17 +115,15 @@ class Claims:
             self._actions.wait(arc, Reason(ReasonCode.NOT_YET))
 
     def _wait_again(self, arc: Arc, date: Ns) -> None:
-        """Until that date instead of another one."""
-        self._go_on(arc)
+        self._stop_waiting(arc)
         self._wait_until(arc, date)
 
-    def _go_on(self, arc: Arc) -> None:
-        """It waits for no date any more."""
+    def _stop_waiting(self, arc: Arc) -> None:
         if arc.held_back is not None and not arc.held_back[1]:
             self._state.consider_again(arc)
 
     def give_up(self, arc: Arc, outcome: Outcome, *, had_it: bool) -> None:
-        """An ARC is over. What it had taken up is open again if its program is gone, or gave up before it had it."""
+        """End the booking of an ended ARC; reopen it if the program is gone or gave up before it held."""
         claim = arc.claim
         again = outcome is Outcome.CLIENT_LOST or not had_it
         if claim is not None and not (again and self._state.now < claim.booking.lapses):
@@ -141,9 +132,9 @@ class Claims:
             self.leave(arc)
 
     def leave(self, arc: Arc) -> None:
-        """An ARC is over, or another object stands for it: what it had taken up is open."""
+        """Reopen the booking of an ARC that has ended or is replaced."""
         name, claim = arc.request.booking, arc.claim
-        if wanting := [one for one in self._wanting.pop(name, ()) if one is not arc]:
+        if wanting := [waiting for waiting in self._wanting.pop(name, ()) if waiting is not arc]:
             self._wanting[name] = wanting
         if claim is not None:
             arc.claim = None
@@ -162,11 +153,11 @@ class Claims:
         if arc is not None and (at_present or self._state.now < self.certain_from):
             self._wanting[claim.booking.id] = [*self._wanting.get(claim.booking.id, ()), arc]
         if arc is not None and not at_present:
-            self._go_on(arc)
+            self._stop_waiting(arc)
             self._wait_until(arc, self.certain_from)
 
     def expire(self) -> None:
-        """Ends the bookings whose time is over, or whose owner's to take them up."""
+        """End the bookings whose time or patience is over."""
         for claim in self._state.claims_over():
             if claim.booking.end <= self._state.now:
                 used = claim.is_taken or claim.booking.maintenance
@@ -175,8 +166,8 @@ class Claims:
                 self._end(claim, BookingState.LAPSED)
 
     def in_maintenance(self) -> Iterator[tuple[Claim, Rc, Arc]]:
-        """Who holds an RC that is in maintenance, and has to end: those of equal or lower priority, past their minimum
-        runtimes. The caller may end them meanwhile."""
+        """Holders that maintenance ends: of equal or lower priority, past their minimum runtimes. The caller may end
+        them meanwhile."""
         now = self._state.now
         for claim in self._state.maintenance.values() if self._state.maintenance else ():
             for rc in self._state.rcs_in(claim.kept) if claim.booking.start <= now else ():
@@ -188,12 +179,11 @@ class Claims:
         self._keep_others(rc.bit)
 
     def _keep_others(self, bits: int) -> None:
-        """Bookings for which some of these RCs are kept, where others would do, are kept others that are free then."""
+        """Rebind the patterns of bookings that have some of these RCs, where other RCs are free then."""
         for claim in [claim for claim in self._state.claims.values() if claim.kept & bits & ~claim.arc.named_mask]:
             self._keep_another(claim)
 
     def _keep_another(self, claim: Claim) -> bool:
-        """Keeps other RCs for the patterns of a booking, if that helps."""
         arc, booking, now = claim.arc, claim.booking, self._state.now
         if not arc.patterns or arc.hold is not None:
             return False
@@ -209,9 +199,9 @@ class Claims:
         self._state.claims_changed()
         return True
 
-    def tell_dangers(self) -> None:
-        """Tells of each booking that is in danger, or is no more, since this was called last. Looked at are those
-        that what has changed may concern, those in danger, and those that should have begun."""
+    def report_dangers(self) -> None:
+        """Report bookings newly in danger, or no longer. Checks the bookings that changes may affect, those in
+        danger and overdue ones."""
         state = self._state
         if not state.claims:
             self._reserved = None
@@ -232,20 +222,18 @@ class Claims:
         concerned |= {claim: None for claim in self._endangered if self._relieving(claim) & (changed | voted)}
         for claim in concerned:
             if state.claims.get(claim.booking.id) is claim:
-                self._tell_danger(claim)
+                self._report_danger(claim)
 
     @property
     def next_start(self) -> Ns | None:
-        """When the next of those starving may start, whatever is booked after it began to starve."""
         starts = self._reserved.starts if self._reserved is not None else ()
         return min((start for start in starts if start > self._state.now), default=None)
 
     def _relieving(self, claim: Claim) -> int:
-        """Bits of the RCs that may end the danger that it is in."""
         patterns = claim.arc.patterns
         return claim.kept | union(rc.bit for need in patterns for rc in self._state.matching(need))
 
-    def _tell_danger(self, claim: Claim) -> None:
+    def _report_danger(self, claim: Claim) -> None:
         state, reserved = self._state, reservations(self._state, self._state.policy.patience, self._reserved)
         found = danger(state, reserved, claim)
         if isinstance(found, Reason) and self._keep_another(claim):

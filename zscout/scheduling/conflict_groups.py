@@ -1,12 +1,10 @@
-"""What a pass could change at all, in groups that can be decided apart.
+"""The ARCs that a pass could change, in groups that are decided separately.
 
-Most of a busy fleet is settled. A running ARC that no startable ARC could preempt stays; an ARC needing its exclusive
-RCs waits. The others are undecided. The index of the queue gives whom to look at: all but watchers, the watchers of RCs
-at which something was freed, and, where a running ARC may have to end, the watchers of what it holds.
+Most of a busy fleet is settled: a running ARC that no startable ARC could preempt stays, and an ARC that needs its
+exclusive RCs waits. The others are undecided. The queue index gives the candidates: all but watchers, the watchers of
+freed RCs, and, where a running ARC may have to end, the watchers of its RCs.
 
-Undecided ARCs that share no RC, not even by way of others, are decided apart: so a slow voter delays no ARC outside its
-group, and the cost is that of the groups.
-"""
+Undecided ARCs that share no RC, even indirectly, are decided separately: a slow voter delays only its own group."""
 
 from __future__ import annotations
 
@@ -27,8 +25,7 @@ from zscout.types import ArcId, Ns
 def undecided_arcs(
     state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None
 ) -> list[Arc] | None:
-    """The queued ARCs that might start, best-ranked first, then the running ones that might have to end;
-    None: more than `limit` might start."""
+    """The queued ARCs that might start, best-ranked first, then the running ARCs that might end; None: over `limit`."""
     if state.by_pattern:
         bind_all(state, reserved)
     return _Search(state, reserved).run(limit)
@@ -37,18 +34,12 @@ def undecided_arcs(
 class _Search:
     def __init__(self, state: SchedulerState, reserved: Reservations | None) -> None:
         self.state, self.votes, self.reserved = state, state.votes, reserved
-        self.preemptible: dict[ArcId, Arc] = {}
-        """Running ARCs that might have to end."""
-        self._heap: list[tuple[Rank, int, Arc, Rc | None]] = []
-        """The next ARCs to look at, each by itself or as a watcher of an RC."""
-        self._called = 0
-        """Bits of the RCs whose watchers come."""
-        self._started: Counter[str] = Counter()
-        """ARCs of each owner that might start, where there is a quota."""
-        self._taken: Counter[str] = Counter()
-        """RCs that these would hold, likewise."""
-        self._shared_taken = 0
-        """Sharable RCs where one ARC was already let past the starving ones; a second was not checked."""
+        self.preemptible: dict[ArcId, Arc] = {}  # running ARCs that might have to end
+        self._heap: list[tuple[Rank, int, Arc, Rc | None]] = []  # candidates, each by itself or as a watcher of an RC
+        self._called = 0  # bits of the RCs whose watchers are in the heap
+        self._started: Counter[str] = Counter()  # by owner with a quota: ARCs that might start
+        self._taken: Counter[str] = Counter()  # by owner with a quota: RCs of these ARCs
+        self._shared_taken = 0  # sharable RCs where one ARC already passed the starving ones; a second was not checked
 
     def run(self, limit: int | None) -> list[Arc] | None:
         index = self.state.index
@@ -71,7 +62,6 @@ class _Search:
         return [*found, *self.preemptible.values()]
 
     def _call_watchers(self, bits: int, rank: Rank | None) -> None:
-        """The watchers of these RCs come, those below `rank`."""
         new = bits & self.state.index.watched & ~self._called
         self._called |= new
         for rc in self.state.rcs_in(new):
@@ -97,13 +87,12 @@ class _Search:
         return holder.id not in self.preemptible and not holder.preemptible_by(arc, self.state.now)
 
     def _refused(self, rc: Rc, arc: Arc) -> bool:
-        """Whether an RC has vetoed the ARC beside the holders that stay in any case, or is unresponsive."""
+        """Return True if an RC is unresponsive, or vetoed the ARC beside the holders that stay."""
         stay = (holder.id for holder in rc.holders.values() if self._stays(holder, arc))
         answer = self.votes.known(rc.name, frozenset((*stay, arc.id)))
         return rc.name in self.votes.unresponsive if answer is None else not answer.accept
 
     def _reserved_for_other(self, arc: Arc) -> bool:
-        """Whether an RC that it would take is reserved for another ARC."""
         reserved = self.reserved
         if reserved is None or not arc.mask & reserved.bits:
             return False
@@ -127,7 +116,6 @@ class _Search:
         return True
 
     def _note_preemptible(self, arc: Arc) -> None:
-        """Notes the running ARCs that might have to end for `arc`."""
         for rc in arc.rcs:
             for holder in rc.holders.values():
                 if holder.id not in self.preemptible and holder.preemptible_by(arc, self.state.now):
@@ -138,10 +126,9 @@ class _Search:
 def conflict_groups(
     state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None
 ) -> list[ConflictGroup]:
-    """The groups in which there is a choice, best-ranked first; none if more than `limit` ARCs could start.
+    """The groups with a choice, best-ranked first; none if more than `limit` ARCs could start.
 
-    There is no choice in a group of one ARC, or where one ARC is queued and none of the group needs a sharable RC:
-    `priority` starts it, as any strategy would."""
+    One ARC, or one queued ARC without sharable RCs in its group, leaves no choice: `priority` starts it."""
     return [
         ConflictGroup(state, members, reserved)
         for members in split(undecided_arcs(state, reserved, limit) or ())
@@ -151,7 +138,7 @@ def conflict_groups(
 
 
 def split(arcs: Iterable[Arc]) -> list[list[Arc]]:
-    """The ARCs in groups that have no RC in common, each in rank order; the best-ranked group first."""
+    """Split the ARCs into groups without a common RC, each in rank order; the best-ranked group first."""
     members = sorted(arcs, key=attrgetter("rank"))
     if _one_group(members):
         return [members]
@@ -163,8 +150,7 @@ def split(arcs: Iterable[Arc]) -> list[list[Arc]]:
             number = root[number]
         return number
 
-    first: dict[int, int] = {}
-    """By bit: the first that needs the RC."""
+    first: dict[int, int] = {}  # by bit: the first ARC that needs the RC
     for number, arc in enumerate(members):
         mask = arc.mask
         while mask:
@@ -174,14 +160,14 @@ def split(arcs: Iterable[Arc]) -> list[list[Arc]]:
     groups: dict[int, list[Arc]] = {}
     for number, arc in enumerate(members):
         groups.setdefault(find(number), []).append(arc)
-    # Each begins with its best-ranked, and they were met in that order.
+    # Groups and members are in rank order by construction.
     return list(groups.values())
 
 
 def _level_key(arc: Arc, first: set[ArcId], last: int, now: Ns) -> tuple[int, int]:
-    """Sorts ARCs into levels, the best smallest, by priority. A protected hold counts at least as the highest priority
-    that may not end it. Among equals, those to go `first` and holds within their minimum runtime come before the
-    rest, and these by the position of their groups, of which `last` is the last; holds that yield are at the end."""
+    """Sort key of levels, by priority, best smallest. A protected hold counts at least as the highest priority that
+    can't end it. Among equals come the ARCs in `first` and holds within their minimum runtime, then the rest by
+    position, up to `last`; holds that yield come last."""
     if (below := arc.protected_below(now)) is not None:
         return min(-arc.priority, 1 - below), 0
     if arc.past_min_runtime(now) if arc.hold is not None else arc.id not in first:
@@ -191,7 +177,7 @@ def _level_key(arc: Arc, first: set[ArcId], last: int, now: Ns) -> tuple[int, in
 
 
 def _one_group(arcs: Sequence[Arc]) -> bool:
-    """Whether a few looks are enough to see that there is one group only: the usual case."""
+    """Return True if a quick look shows a single group: the usual case."""
     mask, rest = 0, list(arcs)
     for _ in range(3):
         others = []
@@ -207,8 +193,6 @@ def _one_group(arcs: Sequence[Arc]) -> bool:
 
 
 class ConflictGroup:
-    """ARCs that are decided together, and how the RCs have voted on them."""
-
     def __init__(self, state: SchedulerState, arcs: list[Arc], reserved: Reservations | None = None) -> None:
         self.state, self.votes = state, state.votes
         now = state.now
@@ -216,9 +200,7 @@ class ConflictGroup:
         last = max((arc.position for arc in arcs if arc.hold is None), default=0)
         keyed = sorted((_level_key(arc, first, last, now), arc.rank, arc) for arc in arcs)
         self.arcs = [arc for _, _, arc in keyed]
-        """Best first."""
-        self.mask = union(arc.mask for arc in arcs)
-        """All that they need or hold."""
+        self.mask = union(arc.mask for arc in arcs)  # all RCs that they need or hold
         keys = [key for key, _, _ in keyed]
         levels = {key: level for level, key in enumerate(dict.fromkeys(keys))}
         exclusive = ~state.sharable
@@ -235,10 +217,9 @@ class ConflictGroup:
         self._number = {arc.id: number for number, arc in enumerate(self.arcs)}
         self.sharables = list(state.rcs_in(self.mask & state.sharable))
         vetoes = {rc.name: set(self._vetoes(rc)) for rc in self.sharables}
-        self.nogoods = set().union(*vetoes.values())
-        """Sets that vetoes rule out, as `PackingProblem` has them."""
+        self.nogoods = set().union(*vetoes.values())  # sets ruled out by vetoes, as in `PackingProblem`
         self._contended = {name for name, nogoods in vetoes.items() if nogoods}
-        """Names of the sharable RCs that vetoed some set of these ARCs."""
+        """The sharable RCs that vetoed some set of these ARCs."""
 
     def problem(self) -> PackingProblem:
         return PackingProblem(self.items, sorted(self.nogoods))
@@ -249,7 +230,7 @@ class ConflictGroup:
         ruled_out = False
         for rc in self.sharables:
             holders = frozenset(self._holders(rc, chosen))
-            # Its present holders have been accepted; an RC that can't carry them any longer reports that.
+            # Present holders are accepted; an RC that can no longer carry them reports that.
             if holders <= rc.holders.keys():
                 continue
             answer = self.votes.known(rc.name, holders)
@@ -263,32 +244,28 @@ class ConflictGroup:
         return None if ruled_out else proposals
 
     def take(self, chosen: int, actions: Actions) -> None:
-        """Carries the set out: preempts the running ARCs that it lacks, starts its queued ones."""
+        """Preempt the running ARCs outside the set, start the queued ARCs in it."""
         taken = [chosen >> number & 1 for number in range(len(self.arcs))]
-        starting = [arc for arc, one in zip(self.arcs, taken, strict=True) if one and arc.hold is None]
-        ending = [arc for arc, one in zip(self.arcs, taken, strict=True) if not one and arc.hold is not None]
+        starting = [arc for arc, is_taken in zip(self.arcs, taken, strict=True) if is_taken and arc.hold is None]
+        ending = [arc for arc, is_taken in zip(self.arcs, taken, strict=True) if not is_taken and arc.hold is not None]
         for victim in ending:
             actions.preempt(victim, by=self._taker(victim, starting))
         for arc in starting:
             actions.start(arc)
 
     def _vetoes(self, rc: Rc) -> Iterator[int]:
-        """The vetoes of `rc` that bear on these ARCs. Its other holders stay."""
+        """The vetoes of `rc` on these ARCs. Its other holders stay."""
         for holders in self.votes.vetoed(rc.name):
             if all(arc in self._number or arc in rc.holders for arc in holders) and (nogood := self._bits(holders)):
                 yield nogood
 
     def _probe(self, rc: Rc, holders: HolderSet) -> HolderSet:
-        """To propose to a contended RC: half of the ARCs that it has not accepted yet, beside the others.
-
-        A veto of few rules out far more sets than one of many; in a few rounds all are asked."""
+        """Propose half of the ARCs not accepted yet: a veto of few ARCs rules out far more sets than a veto of many."""
         ranked, accepted = self._ranked(rc, holders)
         return frozenset(ranked[: (accepted + len(ranked) + 1) // 2])
 
     def _ranked(self, rc: Rc, holders: HolderSet) -> tuple[list[ArcId], int]:
-        """The present holders of `rc`, then the others by rank; and how many of these it has accepted.
-
-        Not all of `holders` are accepted."""
+        """The present holders of `rc`, then the others by rank; and how many of these are accepted (not all)."""
         newcomers = (arc.id for arc in self.arcs if arc.id in holders and arc.id not in rc.holders)
         ranked = [*(holders & rc.holders.keys()), *newcomers]
         accepted = len(ranked) - 1
@@ -300,7 +277,6 @@ class ConflictGroup:
         return holders <= rc.holders.keys() or self.votes.accepts(rc.name, holders)
 
     def _holders(self, rc: Rc, chosen: int) -> Iterator[ArcId]:
-        """The ARCs that would hold `rc`."""
         for holder in rc.holders:
             if holder not in self._number:
                 yield holder
@@ -312,8 +288,8 @@ class ConflictGroup:
         return sum(1 << self._number[arc] for arc in holders if arc in self._number)
 
     def _taker(self, victim: Arc, starting: list[Arc]) -> Arc:
-        """For whom a hold is taken away: the best-ranked newcomer that needs one of its exclusive RCs, else
-        one of its sharable ones, else the best-ranked of all."""
+        """The ARC that takes the hold: the best-ranked newcomer that needs one of its exclusive RCs, else of its
+        sharable RCs, else of all."""
         entitled = [arc for arc in starting if victim.preemptible_by(arc, self.state.now)] or starting
         exclusive = ~self.state.sharable
         for mask in (victim.mask & exclusive, victim.mask):

@@ -1,16 +1,13 @@
-"""The core of the RCM: events in, effects out, time given.
+"""The core of the RCM: events in, effects out, time given; no clock, thread, socket or log inside.
 
-Every decision of the RCM is made in this room, and this is its door; there is no clock, thread, socket or log inside.
-This module applies events and carries out what is decided; who starts, and who is preempted for it, is decided by the
-strategy's pass (`priority.py` has its steps), ARC by ARC, by the rule of `Arc.preemptible_by`; what RCs voted is in
-`votes.py`, who holds what in `state.py`. The RCM service, `zscout replay`, the study and the forecast drive this one
-class:
+This module applies events and carries out decisions. The strategy's pass (`priority.py` has its steps) decides which
+ARC starts and which is preempted, by the rule of `Arc.preemptible_by`; `votes.py` keeps the votes of RCs, `state.py`
+holds and queue. The RCM service, `zscout replay`, the study and the forecast use this class:
 
     effects = core.handle(now, Requested(request), ...)
 
-A batch of events is one instant (`Core.handle` has its steps). The caller carries the effects out in their order and
-comes back with what follows from them: votes, and a `Tick` at the latest when `WakeAt` says.
-"""
+A batch of events is one instant. The caller carries the effects out in order and returns with their results: votes,
+and a `Tick` at the latest when `WakeAt` asks for it."""
 
 from __future__ import annotations
 
@@ -23,19 +20,7 @@ from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
 from zscout.scheduling import model
 from zscout.scheduling.booking import Booked, Booking, BookingStatus, Redated, Unbooked
 from zscout.scheduling.claims import Claims
-from zscout.scheduling.model import (
-    HOLD_BACK,
-    MAX_HOLD_BACK,
-    QUANTUM,
-    Arc,
-    ArcState,
-    ArcStatus,
-    Hold,
-    Outcome,
-    Rc,
-    RcStatus,
-    Status,
-)
+from zscout.scheduling.model import Arc, ArcState, ArcStatus, Hold, Outcome, Rc, RcStatus, Status
 from zscout.scheduling.overlaps import Overlaps, overlaps
 from zscout.scheduling.priority import AdmissionCheck, Priority, reasons_of_now
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
@@ -47,34 +32,28 @@ from zscout.types import NO_TERM, ArcId, ClientId, Grant, Ns, Place, RcName, Ter
 
 
 class Core:
-    """All scheduling state of one fleet, and the rules by which it changes."""
-
     def __init__(self, strategy: Strategy | None = None, policy: SchedulingPolicy = DEFAULT) -> None:
-        """The strategy is `priority` unless another is given."""
         self.strategy = strategy or Priority()
         self._state = SchedulerState(policy)
         self._votes = self._state.votes
         self.term: Term = NO_TERM
         self.seq = 0
         self.batches = 0
-        """How many batches of events were handled."""
         self._arrivals = 0
         self._effects: list[model.Effect] = []
         self._claims = Claims(self._state, self, lambda effect: self._effects.append(effect))
-        self._over: set[Grant] = set()
-        """Grants of earlier terms that ended in this one."""
+        self._over: set[Grant] = set()  # grants of earlier terms that ended in this term
         self._wake: Ns | None = None
         self._run_again = False
-        """Whether the strategy asked for another pass at once."""
 
     def handle(self, now: Ns, *events: model.Event) -> list[model.Effect]:
-        """Applies one instant's events and runs a pass. Raises ValueError where `now` goes backwards.
+        """Apply one instant's events and run a pass. Raises ValueError where `now` goes backwards.
 
         1. End the holds whose time is over.
         2. Apply the events, in the order given.
-        3. End the kept holds that are in the way of maintenance.
-        4. Run a pass of the strategy, if anybody is queued (its steps: `priority.py`, `adaptive.py`).
-        5. Say which bookings are in danger, and when to wake."""
+        3. End the kept holds that block maintenance.
+        4. Run a pass of the strategy, if the queue is not empty.
+        5. Report endangered bookings and the next wake-up."""
         if now < self._state.now:
             raise ValueError(f"time went backwards: {now} after {self._state.now}")
         self._state.now = now
@@ -83,7 +62,7 @@ class Core:
         self._run_again = False
         self._expire()
         self._claims.expire()
-        self._state.let_in()
+        self._state.readmit()
         if len(events) == 1 and isinstance(events[0], model.Requested):
             self._ask(events[0], alone=True)
         else:
@@ -96,17 +75,17 @@ class Core:
         for arc in self._state.held_back.values():
             if arc.held_back is None and (other := self._state.at_place(arc.place)) is not None:
                 self.wait(arc, _claimed_by(other))
-        self._claims.tell_dangers()
+        self._claims.report_dangers()
         self._set_wake()
         return self._effects
 
     @property
     def reasons_changed(self) -> bool:
-        """Whether somebody may wait for another reason than was told last."""
-        return bool(self._state.index.retold)
+        """Return True if a waiting ARC may have another reason than the one last reported."""
+        return bool(self._state.index.unreported)
 
     def tell_reasons(self) -> list[model.Effect]:
-        """Why those wait whose reason has changed: for who reads it, as often as that is."""
+        """The reasons that changed since the last report, for callers that display them."""
         self._effects = []
         for arc, reason in reasons_of_now(self._state):
             self.wait(arc, reason)
@@ -118,13 +97,10 @@ class Core:
 
     @policy.setter
     def policy(self, policy: SchedulingPolicy) -> None:
-        """What runs goes on; the next pass goes by the new one."""
         self._state.take_policy(policy)
 
-    # The present state
-
     def status(self, limit: int | None = None) -> Status:
-        """The whole fleet as of the last batch, with the best-ranked `limit` of the queue (all: None)."""
+        """The fleet as of the last batch, with the best-ranked `limit` of the queue (None: all)."""
         state = self._state
         return Status(
             running=tuple(self._arc_status(arc) for arc in state.running.values()),
@@ -136,7 +112,6 @@ class Core:
         )
 
     def arc(self, arc_id: ArcId) -> ArcStatus | None:
-        """One ARC as of the last batch; None if it neither waits nor runs."""
         arc = self._state.arc(arc_id)
         return None if arc is None else self._arc_status(arc)
 
@@ -152,39 +127,32 @@ class Core:
 
     @property
     def waiting(self) -> int:
-        """How many ARCs are queued."""
         return len(self._state.queued) + len(self._state.held_back)
 
     def holders(self, rc: RcName) -> list[ArcStatus]:
-        """Who holds an RC."""
         return [self._arc_status(arc) for arc in self._state.rc(rc).holders.values()]
 
     def arcs_of(self, client: ClientId) -> list[ArcId]:
-        """The ARCs of one client, those that wait first: so none of them profits from the others' end."""
+        """The ARCs of one client, waiting first, so that none profits from the end of the others."""
         arcs = self._state.arcs_of(client)
         return [arc.id for arc in sorted(arcs, key=lambda arc: (arc.hold is not None, arc.entry))]
 
     def arcs(self) -> list[ArcId]:
-        """All ARCs, those that wait first."""
         return [arc.id for arc in self._state.all_arcs()]
 
     def is_open(self, arc_id: ArcId) -> bool:
-        """Whether it waits or runs."""
         return self._state.arc(arc_id) is not None
 
     def is_running(self, arc_id: ArcId) -> bool:
         return arc_id in self._state.running
 
     def count_of(self, client: ClientId) -> int:
-        """How many ARCs one client has."""
         return len(self._state.arcs_of(client))
 
     def count_of_owner(self, owner: str) -> int:
-        """How many ARCs all clients of a host or a person have."""
         return len(self._state.arcs_of_owner(owner))
 
     def arcs_of_owners(self, owners: Collection[str]) -> list[ArcId]:
-        """The ARCs of all clients of these hosts and people."""
         return [arc.id for owner in owners for arc in self._state.arcs_of_owner(owner)]
 
     def place_of(self, arc_id: ArcId) -> Place | None:
@@ -192,17 +160,17 @@ class Core:
         return None if arc is None else arc.place
 
     def at_place(self, place: Place) -> list[ArcId]:
-        """The ARCs of this place: one, or more where clients claim the same after a takeover."""
+        """The ARCs of this place: several where clients claim the same after a takeover."""
         first = self._state.at_place(place)
         others = [arc.id for arc in self._state.held_back.values() if arc.place == place and arc is not first]
         return others if first is None else [first.id, *others]
 
     def could_have_issued(self, place: Place) -> bool:
-        """Whether this core may have given out `place`; True for other terms, of which it does not know."""
+        """Return True if this core may have given out `place`, or the term is another."""
         return place.term != self.term or place.arrival <= self._arrivals
 
     def as_events(self, term: Term) -> tuple[list[model.Event], model.LeadTaken]:
-        """The events that bring another core to the state of this one, in a term of its own."""
+        """The events that bring another core to this state, in a term of its own."""
         state = self._state
         joined: list[model.Event] = [
             model.RcJoined(rc.name, rc.sharable) if rc.present else model.RcLost(rc.name, why=rc.absence)
@@ -220,61 +188,55 @@ class Core:
         return joined, model.LeadTaken(term, recovered_holds, waiting, self.charged())
 
     def slots(self, wanted: Booking, until: Ns, limit: int, *, bookings_only: bool = False) -> SlotsFound:
-        """The first `limit` stretches of time, from the start of `wanted` to `until`, in which it would be kept;
-        `bookings_only`: beside all other bookings, whoever holds or waits for what."""
+        """The first `limit` times between the start of `wanted` and `until` at which it would be kept.
+        `bookings_only` ignores holds and queue."""
         arc = self._claims.stand_in(wanted)
         return slots(self._state, wanted, arc, until, limit, bookings_only=bookings_only)
 
     def likely_slot(self, wanted: Booking, until: Ns, runtimes: RuntimeEstimator) -> Ns | None:
-        """When it could start if holds were given back when they usually are: a guess, for which nothing is kept."""
+        """An estimate of its start if holds end when they usually do; nothing is kept for it."""
         now, running = self._state.now, self._state.running.values()
-        ends = {one.id: runtimes.end(one.request, one.hold, now) for one in running if one.hold is not None}
+        ends = {arc.id: runtimes.end(arc.request, arc.hold, now) for arc in running if arc.hold is not None}
         likely = {arc: end for arc, end in ends.items() if end is not None}
         found = slots(self._state, wanted, self._claims.stand_in(wanted), until, 1, likely=likely).found
         return found[0].start if found else None
 
     def overlaps(self, order: Iterable[str], starts: Mapping[str, Ns] = MappingProxyType({})) -> Overlaps:
-        """Which bookings can't be beside those that go before them in this order of their ids. `starts`: when they
-        begin, as far as that is not known here."""
+        """The bookings that conflict with earlier ones in this `order` of ids. `starts` overrides dates unknown
+        here."""
         return overlaps(self._state, order, starts)
 
     def ask_votes(self, unknown: Iterable[tuple[Rc, HolderSet]], wanted: Booking | None = None) -> list[model.Propose]:
-        """Proposals for votes that are to be known of bookings; `wanted` is one that is not made yet."""
+        """Proposals for unknown votes on bookings; `wanted` is not made yet."""
         stranger = None if wanted is None else self._claims.stand_in(wanted)
         proposals = []
         for rc, holders in unknown:
             if (number := self._votes.propose(rc.name, holders, self._state.now)) is not None:
-                arcs = [self._state.voter(one) or stranger for one in sorted(holders)]
+                arcs = [self._state.voter(holder) or stranger for holder in sorted(holders)]
                 params = {arc.id: self._state.params(arc, rc) for arc in arcs if arc is not None}
                 proposals.append(model.Propose(number, rc.name, params))
         return proposals
 
     def booking(self, name: str) -> BookingStatus | None:
-        """A booking that is not over."""
-        claim = self._state.claims.get(name)
-        if claim is None:
+        if (claim := self._state.claims.get(name)) is None:
             return None
         bound = claim.booking.bound if claim.arc.hold is None else claim.arc.bound
         return BookingStatus(claim.booking, claim.arc.id if claim.is_taken else None, bound)
 
     def is_wanted(self, name: str) -> bool:
-        """Whether an ARC would take up that booking, and could not yet."""
         return self._claims.is_wanted(name)
 
     def charged(self) -> dict[str, float]:
-        """By group: RC-seconds that it lately had and others waited for; empty where fair shares are off."""
         return self._state.charged()
 
     def charged_in_all(self) -> dict[str, float]:
-        """The same since the core was made, not decayed: for studies."""
         return {} if self._state.shares is None else self._state.shares.totals()
 
     def bookings(self) -> list[tuple[Booking, ArcId | None]]:
-        """Those that are not over, with the ARC that has taken each up."""
-        return [(one.booking, one.arc.id if one.is_taken else None) for one in self._state.claims.values()]
+        return [(claim.booking, claim.arc.id if claim.is_taken else None) for claim in self._state.claims.values()]
 
     def expects_yes(self, rc: RcName, holders: HolderSet) -> bool:
-        """Whether an RC would accept these holders, by the votes that it has given; True if unknown."""
+        """Return True if an RC would accept these holders, or its vote is unknown."""
         answer = self._votes.known(rc, holders)
         return answer is None or answer.accept
 
@@ -284,20 +246,8 @@ class Core:
             check = AdmissionCheck(self._state, arc)
             obstacle = check.obstacle(0)
             reason = obstacle.reason if obstacle is not None else check.refusal() or reason
-        return ArcStatus(
-            arc.request,
-            arc.place,
-            arc.hold,
-            arc.needs,
-            arc.bound,
-            arc.since,
-            arc.preemptions,
-            ahead,
-            reason,
-            arc.reason,
-        )
-
-    # Events
+        known = arc.request, arc.place, arc.hold, arc.needs, arc.bound, arc.since, arc.preemptions
+        return ArcStatus(*known, ahead, reason, arc.reason)
 
     def _apply(self, event: model.Event) -> None:
         match event:
@@ -315,7 +265,7 @@ class Core:
                 if self._state.rc(rc).present:
                     self._lose_rc(rc, "it started anew")
                 self._state.join(rc, sharable=sharable)
-                self._state.let_in(rc)
+                self._state.readmit(rc)
             case model.RcReported(rc, ended, rules_changed):
                 for arc in ended:
                     if arc in self._state.rc(rc).holders:
@@ -351,12 +301,12 @@ class Core:
                 pass
 
     def _ask(self, asked: model.Requested, *, alone: bool = False) -> None:
-        """`alone`: nothing else happens in this instant."""
+        """`alone`: the only event of this instant."""
         if self._state.arc(asked.request.arc) is not None:
             return
         arc = self._new_arc(asked.request, asked.place)
         if alone and asked.since is None and not asked.request.booking and self._state.is_free(arc):
-            # What any strategy would do, without a queue of one.
+            # As any strategy would, without a queue of one.
             self._state.enter(arc)
             self.start(arc)
             return
@@ -373,8 +323,7 @@ class Core:
         return self._state.new_arc(request, place)
 
     def _end_request(self, arc_id: ArcId, outcome: Outcome, reason: Reason) -> None:
-        arc = self._state.arc(arc_id)
-        if arc is None:
+        if (arc := self._state.arc(arc_id)) is None:
             return
         if arc.hold is not None:
             if outcome is Outcome.RELEASED and arc.past_min_runtime(self._state.now):
@@ -387,7 +336,7 @@ class Core:
         self._claims.give_up(arc, outcome, had_it=False)
 
     def _lose_rc(self, name: str, reason: str) -> None:
-        """An RC is gone: each gang it was part of ends as a whole and is queued with its place."""
+        """End each gang of a lost RC as a whole and queue it at its place."""
         rc = self._state.rc(name)
         for arc in list(rc.holders.values()):
             self._end_hold(arc, Outcome.LOST, Reason(ReasonCode.RC_LOST, (name,), detail=reason))
@@ -408,7 +357,7 @@ class Core:
                 self._state.hold_back(arc, *held_back)
 
     def _not_confirmed(self, arc_id: ArcId, grant: Grant, rcs: tuple[RcName, ...]) -> None:
-        """That hold ends, and no other. Its ARC keeps its place, and is held back, longer each time in a row."""
+        """End exactly this hold. Its ARC keeps its place and is held back, longer each time in a row."""
         arc = self._state.running.get(arc_id)
         if arc is None or arc.hold is None or arc.hold.grant != grant:
             return
@@ -416,7 +365,9 @@ class Core:
         self._end_hold(arc, Outcome.LOST, reason)
         if arc.id in self._state.queued:
             arc.unconfirmed = times + 1
-            self._state.hold_back(arc, self._state.now + min(HOLD_BACK << min(times, 8), MAX_HOLD_BACK), rcs)
+            self._state.hold_back(
+                arc, self._state.now + min(model.HOLD_BACK << min(times, 8), model.MAX_HOLD_BACK), rcs
+            )
             self.wait(arc, reason)
 
     def _hand_over(self, arc_id: ArcId, to: str, renamed: ArcId) -> None:
@@ -425,11 +376,9 @@ class Core:
             return
         reason = Reason(ReasonCode.HANDED_OVER, detail=to)
         if existing is not None:
-            # Where a change of RCM hid the outcome, both clients may have reported the one ARC.
-            same = existing.place == arc.place or (
-                existing.hold is not None and existing.request.needs == arc.request.needs
-            )
-            if not same:
+            # After a change of RCM both clients may have reported the ARC.
+            same_needs = existing.request.needs == arc.request.needs
+            if existing.place != arc.place and (existing.hold is None or not same_needs):
                 return
             if existing.hold is not None or arc.hold is None:
                 self._end_request(arc_id, Outcome.HANDED_OVER, reason)
@@ -466,9 +415,8 @@ class Core:
             self._ask(asked)
 
     def _adopt(self, held: model.RecoveredHold) -> None:
-        """An ARC that waits here under the same id is the one that holds."""
         known = self._state.arc(held.request.arc)
-        # What this RCM granted and does not know any more it has ended.
+        # A grant of this term that is unknown here has ended.
         over = held.grant in self._over or held.grant.term == self.term
         if over or (known is not None and known.hold is not None):
             return
@@ -479,7 +427,7 @@ class Core:
             held = replace(held, place=min(known.place, held.place))
         arc = self._take_up(held)
         if known is not None and arc.hold is None and self._state.arc(arc.id) is arc:
-            # As its client asked: of an RC that is absent the others of its gang know no parameters.
+            # Use its client's request: the report lacks parameters of absent RCs.
             self._state.dequeue(arc)
             self._forget(arc)
             self._claims.leave(arc)
@@ -491,8 +439,8 @@ class Core:
         self._expire()
 
     def _take_up(self, held: model.RecoveredHold) -> Arc:
-        """A hold of an earlier term goes on, if all its RCs are there and free, and no other ARC runs at its place;
-        else it ends, and its ARC is queued."""
+        """Continue a hold of an earlier term if all its RCs are present and free, and no other ARC runs at its
+        place; else end it and queue its ARC."""
         arc = self._new_arc(held.request, held.place)
         if arc.patterns:
             self._state.bind(arc, held.bound)
@@ -534,8 +482,6 @@ class Core:
                 party = claim.booking.party._replace(until=claim.booking.end)
                 self._end_hold(arc, Outcome.COMPLETED, Reason(ReasonCode.MAINTENANCE, (rc.name,), (party,)))
 
-    # What a strategy may do (state.Actions)
-
     def start(self, arc: Arc) -> None:
         grant = Grant(self.term, self.number())
         now, state = self._state.now, self._state
@@ -551,27 +497,20 @@ class Core:
         return arc.id in self._state.queued
 
     def wait(self, arc: Arc, reason: Reason, *, settled: bool = True) -> None:
-        # An earlier reason is kept while proposals are open: it would change back and forth otherwise.
+        # Keep the earlier reason while proposals are open, to avoid flapping.
         if reason == arc.reason or (not settled and arc.reason):
             return
         arc.reason = reason
         self._effects.append(model.Queued(arc.id, arc.request.client, reason, settled))
 
     def propose(self, rc: Rc, holders: HolderSet) -> None:
-        number = self._votes.propose(rc.name, holders, self._state.now)
-        if number is None:
-            return
-        arcs = (self._state.voter(holder) for holder in sorted(holders))
-        params = {arc.id: self._state.params(arc, rc) for arc in arcs if arc is not None}
-        self._effects.append(model.Propose(number, rc.name, params))
+        self._effects += self.ask_votes([(rc, holders)])
 
     def run_again(self) -> None:
         self._run_again = True
 
-    # Holds
-
     def _end_hold(self, arc: Arc, outcome: Outcome, reason: Reason, *, requeue: bool = True) -> None:
-        """Ends a hold. What has had its minimum runtime is not queued again."""
+        """End a hold. An ARC past its minimum runtime is not queued again."""
         requeue = requeue and not arc.past_min_runtime(self._state.now)
         hold = self._state.stop(arc)
         self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=requeue))
@@ -589,7 +528,7 @@ class Core:
             self._votes.forget_arc(rc.name, arc.id)
 
     def number(self) -> int:
-        """The next number of this term. Grants take theirs here, and so does all else that is published."""
+        """The next number of this term, for grants and all other publications."""
         self.seq += 1
         return self.seq
 
@@ -612,7 +551,7 @@ class Core:
             if end is not None:
                 at = end if at is None else min(at, end)
         if self._state.queued:
-            at = min(self._state.now + QUANTUM, at) if at is not None else self._state.now + QUANTUM
+            at = min(self._state.now + model.QUANTUM, at) if at is not None else self._state.now + model.QUANTUM
         if self._run_again:
             at = self._state.now
         if at != self._wake or self._run_again:

@@ -1,9 +1,8 @@
-"""What would keep a booking from its start at its date, by what is known now: told before it is too late to do
-something about it.
+"""Threats to a booking's start at its date, found early enough to act on.
 
-Looked at are the RCs that are kept for it: whether they are there, who holds them and neither ends nor yields by then,
-what is promised before it, and how sharable ones have voted. A vote that is not known is no danger, but does not end
-one either; and who is queued is none before it is promised something. From the date on it is told why its ARC waits."""
+Checks the RCs kept for it: presence, holders that neither end nor yield by then, earlier promises, and votes. An
+unknown vote neither causes nor ends a danger; a queued ARC without a promise causes none. After the date, the danger
+is its ARC's reason to wait."""
 
 from __future__ import annotations
 
@@ -18,18 +17,18 @@ from zscout.scheduling.votes import HolderSet
 from zscout.types import Ns
 
 _PASSING: Final = (ReasonCode.VOTING, ReasonCode.SEARCHING, ReasonCode.NOT_YET)
-"""What an ARC waits for that is about to start."""
+"""Reasons of an ARC that is about to start."""
 
 
 class Undecided(NamedTuple):
-    """That a vote will tell: the one on `proposal`, or one that is out."""
+    """A vote decides: the vote on `proposal`, or one in progress."""
 
     rc: Rc | None = None
     proposal: HolderSet = frozenset()
 
 
 def danger(state: SchedulerState, reserved: Reservations, claim: Claim) -> Reason | Undecided | None:
-    """Why a booking would not start at its date, or now if that has come; None: nothing is in its way."""
+    """The reason why a booking would miss its date, or can't start now; None: nothing in its way."""
     booking, arc = claim.booking, claim.arc
     if booking.maintenance or arc.hold is not None:
         return None
@@ -50,10 +49,14 @@ def danger(state: SchedulerState, reserved: Reservations, claim: Claim) -> Reaso
         return Reason(ReasonCode.HELD, tuple(rc for rc, _ in shown), tuple(by for _, by in shown), number=len(held))
     unknown: Undecided | None = None
     for rc in rcs:
-        before = [one for one in reserved.before(rc, order_of(state, booking)) if _overlaps(state, claim, one, date)]
-        for one in before:
-            if one.excludes or not rc.sharable:
-                return kept_for(rc, one)
+        before = [
+            promise
+            for promise in reserved.before(rc, order_of(state, booking))
+            if _overlaps(state, claim, promise, date)
+        ]
+        for promise in before:
+            if promise.excludes or not rc.sharable:
+                return kept_for(rc, promise)
         if rc.sharable and (refusal := _refusal(state, rc, arc, before, date)) is not None:
             unknown = unknown or (refusal if isinstance(refusal, Undecided) else None)
             if isinstance(refusal, Reason):
@@ -69,20 +72,20 @@ def _why_it_waits(state: SchedulerState, claim: Claim) -> Reason | Undecided | N
     return arc.reason if arc.reason is not None and arc.reason.code not in _PASSING else None
 
 
-def _overlaps(state: SchedulerState, claim: Claim, one: Reservation, date: Ns) -> bool:
-    """Whether what is reserved keeps out a booking that would begin then."""
-    if one.start >= claim.booking.end or one.over() <= date:
+def _overlaps(state: SchedulerState, claim: Claim, promise: Reservation, date: Ns) -> bool:
+    """Return True if the promise keeps out a booking that begins at `date`."""
+    if promise.start >= claim.booking.end or promise.over() <= date:
         return False
-    # Maintenance of lower priority keeps out only who would start in it.
-    return not one.excludes or one.start <= date or state.band(claim.booking.priority) <= -one.order[1]
+    # Maintenance of lower priority keeps out only bookings that start during it.
+    return not promise.excludes or promise.start <= date or state.band(claim.booking.priority) <= -promise.order[1]
 
 
 def _refusal(state: SchedulerState, rc: Rc, arc: Arc, before: list[Reservation], date: Ns) -> Reason | Undecided | None:
-    """How a sharable RC refuses the booking of `arc` beside those who would be there at some time of it."""
+    """The refusal of `arc` by a sharable RC beside the holders expected at any time of the booking."""
     unknown: Undecided | None = None
-    for time in sorted({date, *(one.start for one in before if one.start > date)}):
+    for time in sorted({date, *(promise.start for promise in before if promise.start > date)}):
         parties = {holder.id: holder.blocks(arc) for holder in rc.holders.values() if not yields(holder, arc, time)}
-        parties |= {one.arc.id: one.arc.party for one in before if one.start <= time < one.over()}
+        parties |= {promise.arc.id: promise.arc.party for promise in before if promise.start <= time < promise.over()}
         together = frozenset((*parties, arc.id))
         answer = state.votes.known(rc.name, together)
         if answer is None:

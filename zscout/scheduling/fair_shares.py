@@ -1,15 +1,13 @@
-"""Fair shares: what each group lately had of what others waited for, and the order of the groups that follows.
+"""Fair shares: recent contended usage per group, and the order of groups that follows.
 
-A hold is charged each of its RCs for as long as an ARC of another group waits for it: one that is queued, of the hold's
-priority or a higher one, all of whose needs are there, and that names the RC or has a pattern which the RC meets. What
-nobody else waits for is free. Operators' holds are free, and their ARCs go first as ever.
+A hold is charged for each of its RCs while an ARC of another group waits for it: a queued ARC of the hold's priority or
+higher, with all its needs present, that names the RC or has a matching pattern. Uncontended RCs and operators' holds
+are free, and operators' ARCs still go first.
 
-What was charged halves in each half-life, so a group's account is what it lately had. A group's *share* is that over
-its weight. The order is by share, the smallest first; shares that differ by little count as equal, and between these
-the shorter minimum runtime goes first, as without fair shares.
+Charges halve in each half-life. A group's *share* is its charge over its weight. Groups are in order of share, smallest
+first; shares that differ little count as equal, and then the shorter minimum runtime goes first.
 
-Holds and queued ARCs are told as they come and go (`SchedulerState`), so that nothing is summed up in a pass.
-"""
+`SchedulerState` reports holds and queued ARCs as they come and go, so a pass sums up nothing."""
 
 from __future__ import annotations
 
@@ -28,34 +26,24 @@ NEAR: Final = 0.01
 LITTLE: Final = 60.0
 """or by less RC-seconds than this, count as equal."""
 FORGOTTEN: Final = 1.0
-"""RC-seconds: a group that has less on its account, holds nothing that counts and waits for nothing is forgotten."""
+"""RC-seconds: a group with less, and without counted holds or queued ARCs, is forgotten."""
 MAX_GROUPS: Final = 1_000
-"""Accounts that are kept; beyond, those with least are forgotten,"""
+"""Accounts kept; beyond, the smallest are forgotten,"""
 SWEEP: Final[Ns] = 60 * SECOND
-"""so often at most."""
+"""at most this often."""
 
 
 @dataclass(slots=True)
 class GroupAccount:
-    """What one group had."""
-
-    charged: float = 0.0
-    """RC-seconds, decayed as of `at`."""
-    total: float = 0.0
-    """The same, not decayed."""
+    charged: float = 0.0  # RC-seconds, decayed as of `at`
+    total: float = 0.0  # RC-seconds, not decayed
     at: Ns = 0
-    rate: int = 0
-    """How many RCs of its holds others wait for."""
-    waiting: int = 0
-    """How many of its ARCs are queued."""
-    position: int = 0
-    """Among the groups that wait, as of the last look; the first has 0, and so has who waits for nothing. Groups whose
-    shares are near have the same."""
+    rate: int = 0  # contended RCs of its holds
+    waiting: int = 0  # queued ARCs
+    position: int = 0  # among the waiting groups as of the last ordering, from 0; groups with near shares have the same
 
 
 class FleetState(Protocol):
-    """What is asked of the state."""
-
     now: Ns
     present: int
 
@@ -65,63 +53,53 @@ class FleetState(Protocol):
 
 
 class Shares:
-    """The accounts of all groups, and who waits for what."""
-
     def __init__(self, state: FleetState, policy: FairShares) -> None:
         self._state, self._policy = state, policy
         self._accounts: dict[str, GroupAccount] = {}
-        self._queued: dict[str, GroupAccount] = {}
-        """Those of the groups that wait."""
+        self._queued: dict[str, GroupAccount] = {}  # accounts of groups that wait
         self._waiting: dict[int, Counter[tuple[str, int]]] = {}
         """By bit of an RC: how many queued ARCs of each group and priority name it."""
-        self._patterns: dict[Need, Counter[tuple[str, int]]] = {}
-        """By pattern: likewise."""
-        self._charged: dict[ArcId, int] = {}
-        """Of each hold that is not an operator's: the bits of its RCs that are charged now."""
-        self._next: Ns = 0
-        """When the groups are put in order again."""
+        self._patterns: dict[Need, Counter[tuple[str, int]]] = {}  # the same by pattern
+        self._charged: dict[ArcId, int] = {}  # by hold that is not an operator's: bits of its charged RCs
+        self._next: Ns = 0  # when the groups are next ordered
         self._swept: Ns = 0
 
     def group(self, arc: Arc) -> str:
         return self._policy.groups.get(arc.owner, arc.owner)
 
     def position(self, arc: Arc) -> int:
-        """The position of its group, for its rank: 0 for an operator's."""
         if self._state.operator(arc.priority):
             return 0
         return self._account(self.group(arc)).position
 
     def preferred(self, arc: Arc, holders: Iterable[Arc]) -> str:
-        """The group of the first of these holders that came while `arc` waited, and would have stood behind it but for
-        its group's share; empty if there is none."""
-        for one in holders:
-            if one.priority == arc.priority and one.position < arc.position and one.hold is not None:
-                shorter = (arc.request.min_runtime, arc.place) < (one.request.min_runtime, one.place)
-                if shorter and one.hold.start >= arc.since:
-                    return self.group(one)
+        """The group of the first holder that came while `arc` waited and outranked it by its group's share alone;
+        empty if none."""
+        for holder in holders:
+            if holder.priority == arc.priority and holder.position < arc.position and holder.hold is not None:
+                shorter = (arc.request.min_runtime, arc.place) < (holder.request.min_runtime, holder.place)
+                if shorter and holder.hold.start >= arc.since:
+                    return self.group(holder)
         return ""
 
     def charged(self) -> dict[str, float]:
-        """By group: RC-seconds, decayed as of now, the greatest first; without those that had next to nothing."""
+        """By group: decayed RC-seconds, greatest first; without negligible ones."""
         now = self._state.now
         found = {group: self._settle(account, now).charged for group, account in self._accounts.items()}
         most = sorted(found.items(), key=lambda item: (-item[1], item[0]))[:MAX_GROUPS]
         return {group: had for group, had in most if had >= FORGOTTEN}
 
     def totals(self) -> dict[str, float]:
-        """By group: RC-seconds that were charged in all, since this was begun or the group was forgotten."""
+        """By group: RC-seconds charged in all, since the start or since the group was forgotten."""
         now = self._state.now
         return {group: self._settle(account, now).total for group, account in self._accounts.items()}
 
     def restore(self, charged: Mapping[str, float]) -> None:
-        """Takes what was charged before this was begun, decayed as of now."""
         for group, had in charged.items():
             self._settle(self._account(group), self._state.now).charged += had
 
-    # What the state tells
-
     def count_waiting(self, arc: Arc, by: int) -> None:
-        """An ARC is queued (1), or is no more (-1)."""
+        """Count a queued ARC in (1) or out (-1)."""
         group = self.group(arc)
         account = self._queued.get(group)
         if account is None:
@@ -135,15 +113,14 @@ class Shares:
             self._count(arc, by)
 
     def count_absent(self, rc: Rc, arcs: Iterable[Arc], by: int) -> None:
-        """Of these that are queued, those who name an RC wait for others again (1: it is about to join), or do so no
-        more (-1: it is about to leave)."""
+        """Count the queued ARCs in (1) before `rc` joins, or out (-1) before it leaves, where it decides whether
+        they wait."""
         others = self._state.present & ~rc.bit
         for arc in arcs:
             if arc.named_mask & rc.bit and not arc.named_mask & ~rc.bit & ~others:
                 self._count(arc, by)
 
     def hold(self, arc: Arc) -> None:
-        """An ARC has begun to hold."""
         if self._state.operator(arc.priority):
             return
         self._charged[arc.id] = 0
@@ -151,14 +128,11 @@ class Shares:
             self._charge(rc, arc)
 
     def end(self, arc: Arc) -> None:
-        """It holds no more."""
         if bits := self._charged.pop(arc.id, 0):
             self._settle(self._account(self.group(arc)), self._state.now).rate -= bits.bit_count()
 
-    # The order
-
     def order(self) -> bool:
-        """Puts the groups that wait in order, once a quantum at most. True: a position has changed."""
+        """Order the waiting groups, once a quantum at most. True: a position has changed."""
         now = self._state.now
         if now < self._next:
             return False
@@ -192,8 +166,6 @@ class Shares:
                 break
             del self._accounts[group]
 
-    # Accounts
-
     def _account(self, group: str) -> GroupAccount:
         account = self._accounts.get(group)
         if account is None:
@@ -201,7 +173,7 @@ class Shares:
         return account
 
     def _settle(self, account: GroupAccount, now: Ns) -> GroupAccount:
-        """The account as of now: what it had decays, and so does what it was charged meanwhile."""
+        """Bring the account up to now: the old charge decays, and so does the new one."""
         passed = now - account.at
         if passed:
             account.at = now
@@ -229,7 +201,6 @@ class Shares:
                 self._charge(rc, holder)
 
     def _charge(self, rc: Rc, holder: Arc) -> None:
-        """Whether `holder` is charged for `rc` from now on."""
         charged = self._charged[holder.id]
         if self._is_contended(rc, holder) != bool(charged & rc.bit):
             self._charged[holder.id] = charged ^ rc.bit
@@ -238,17 +209,17 @@ class Shares:
 
     def _is_contended(self, rc: Rc, holder: Arc) -> bool:
         group, priority = self.group(holder), holder.priority
-        if any(one >= priority and other != group for other, one in self._waiting.get(rc.bit, ())):
+        if any(level >= priority and other != group for other, level in self._waiting.get(rc.bit, ())):
             return True
         return any(
-            one >= priority and other != group and rc in self._state.matching(need)
+            level >= priority and other != group and rc in self._state.matching(need)
             for need, waiting in self._patterns.items()
-            for other, one in waiting
+            for other, level in waiting
         )
 
 
 def _counts(waiting: Counter[tuple[str, int]], who: tuple[str, int], by: int) -> bool:
-    """Counts `who`; True where it is the first, or was the last."""
+    """Count `who`; True for the first or the last."""
     waiting[who] += by
     if waiting[who] == 0:
         del waiting[who]
@@ -257,11 +228,11 @@ def _counts(waiting: Counter[tuple[str, int]], who: tuple[str, int], by: int) ->
 
 
 def decayed(charged: float, passed: Ns, half_life: Ns) -> float:
-    """What is left of RC-seconds that were charged, after so many ns."""
+    """RC-seconds that remain after `passed` ns."""
     return charged * math.exp2(-passed / half_life)
 
 
 def _mean_life(passed: Ns, half_life: Ns) -> float:
-    """What is left of one RC's seconds in the last `passed` ns."""
+    """The decayed RC-seconds of one RC in the last `passed` ns."""
     # The integral of 2**(-t / half_life), by expm1: for short times the difference of two ones would be all noise.
     return -half_life / SECOND / math.log(2) * math.expm1(-math.log(2) * passed / half_life)

@@ -1,10 +1,8 @@
-"""When will mine run: the core played forward from its present state, as if no further event were to come.
+"""Forecast of starts: a copy of the core played forward, as if no further event were to come.
 
-The forecast runs the very core and strategy that decide. RCs are taken to vote as they have voted; a proposal
-that was never made is taken to be a yes. Higher priority that comes later makes it wrong, of course, and so
-does who releases early: it is an estimate, and is shown as one. Bookings are taken to be taken up at their dates, or
-not at all where these have come; maintenance is taken to last as long as it was said to.
-"""
+RCs vote as they have voted, and unknown votes count as yes. Later requests of higher priority and early releases
+make it wrong: it is an estimate. Bookings are taken up at their dates, or lapse where the date is over; maintenance
+lasts as planned."""
 
 from __future__ import annotations
 
@@ -12,84 +10,67 @@ import itertools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
+from zscout.scheduling import model
 from zscout.scheduling.booking import Booking
 from zscout.scheduling.claims import request_for
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import (
-    ArcRequest,
-    Effect,
-    Event,
-    Granted,
-    Hold,
-    HoldEnded,
-    Outcome,
-    Propose,
-    Released,
-    Requested,
-    Tick,
-    Vote,
-    WakeAt,
-)
+from zscout.scheduling.model import ArcRequest, Effect, Event, Granted, Hold, HoldEnded, Outcome, Propose, Released
 from zscout.scheduling.reason import Reason
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import ArcId, Ns, Term
 
 MAX_CHECKS = 4_000
-"""Queued ARCs, summed over all instants: a forecast must not keep the RCM from its work."""
+"""Queued ARCs, summed over all instants: bounds the time that the RCM spends."""
 
 
 def play_instant(
-    core: Core, now: Ns, events: Iterable[Event], vote: Callable[[Propose], Vote]
+    core: Core, now: Ns, events: Iterable[Event], vote: Callable[[Propose], model.Vote]
 ) -> Iterator[list[Effect]]:
-    """One instant, with every vote and every further pass that it takes; yields the effects of each batch."""
+    """One instant, with all its votes and further passes; yields the effects of each batch."""
     batch = list(events)
     while batch:
         effects = core.handle(now, *batch)
         yield effects
         batch = [vote(effect) for effect in effects if isinstance(effect, Propose)]
-        if not batch and any(isinstance(effect, WakeAt) and effect.at == now for effect in effects):
-            batch = [Tick()]
+        if not batch and any(isinstance(effect, model.WakeAt) and effect.at == now for effect in effects):
+            batch = [model.Tick()]
 
 
 @dataclass(slots=True)
 class Forecast:
-    """What is to be expected: when who waits starts, and whom a newcomer would preempt at once."""
-
     starts: dict[ArcId, Ns] = field(default_factory=dict)
-    """ARCs that are missing never start from the present state, or not within what was played."""
+    """A missing ARC never starts from the present state, or not within the forecast."""
     preempts: list[ArcId] = field(default_factory=list)
-    reason: Reason | None = None
-    """What the newcomer waits for at first; None if it starts at once."""
+    reason: Reason | None = None  # the newcomer's first reason to wait; None if it starts at once
 
 
 def forecast(
     core: Core, now: Ns, newcomer: ArcRequest | None = None, runtimes: RuntimeEstimator | None = None
 ) -> Forecast:
-    """Plays `core` forward from `now`, with `newcomer` asking at once. `core` is not touched. With `runtimes` holds are
-    taken to be given back when they usually are."""
-    # A strategy may keep unfinished searches: the forecast must not meddle with them.
+    """Play a copy of `core` forward from `now`, with `newcomer` asking at once. With `runtimes` holds end when they
+    usually do."""
+    # A copy, as a strategy may keep unfinished searches.
     copy = Core(STRATEGIES[core.strategy.name](), core.policy)
     joined, lead = core.as_events(Term(core.term.counter + 1, "forecast"))
     result = Forecast()
     ends = {held.request.arc: held.end for held in lead.recovered_holds}
-    releases: dict[ArcId, Ns] = {}
-    """When holds are likely to be given back."""
-    booked = {one.id: (one, arc is None) for one, arc in core.bookings()}
-    dates = sorted((at, name) for name, (one, is_open) in booked.items() for at in _dates(one, now, is_open=is_open))
-    unserved = {one.request.arc for one in lead.waiting}
-    """ARCs that are queued and have not started within what was played."""
+    releases: dict[ArcId, Ns] = {}  # likely times of release
+    booked = {booking.id: (booking, arc is None) for booking, arc in core.bookings()}
+    dates = sorted(
+        (at, name) for name, (booking, is_open) in booked.items() for at in _dates(booking, now, is_open=is_open)
+    )
+    unserved = {queued.request.arc for queued in lead.waiting}  # queued ARCs that have not started within the forecast
 
     def expect(request: ArcRequest, hold: Hold) -> None:
         end = None if runtimes is None else runtimes.end(request, hold, now)
         if end is not None:
             releases[request.arc] = end
 
-    def vote(asked: Propose) -> Vote:
-        return Vote(asked.proposal, core.expects_yes(asked.rc, frozenset(asked.holders)))
+    def vote(asked: Propose) -> model.Vote:
+        return model.Vote(asked.proposal, core.expects_yes(asked.rc, frozenset(asked.holders)))
 
     def step(events: list[Event], preempting: ArcId | None = None) -> None:
-        """One instant."""
         for effect in itertools.chain.from_iterable(play_instant(copy, now, events, vote)):
             match effect:
                 case Granted(arc=arc, start=start):
@@ -106,7 +87,7 @@ def forecast(
                         unserved.add(arc)
                     if preempting is not None and by == preempting and outcome is Outcome.PREEMPTED:
                         result.preempts.append(arc)
-        # A kept hold goes on past its minimum runtime: what counts is when it becomes preemptible.
+        # A kept hold outlasts its minimum runtime: only the time until it is preemptible counts.
         for arc in [arc for arc, end in ends.items() if end <= now]:
             del ends[arc]
 
@@ -115,7 +96,7 @@ def forecast(
     step([*joined, lead])
     if newcomer is not None:
         unserved.add(newcomer.arc)
-        step([Requested(newcomer)], newcomer.arc)
+        step([model.Requested(newcomer)], newcomer.arc)
         asking = copy.arc(newcomer.arc)
         result.reason = asking.reported if asking is not None else None
     checks = 0
@@ -124,18 +105,18 @@ def forecast(
         if checks > MAX_CHECKS:
             break
         now = max(now, min((*ends.values(), *releases.values(), *(date for date, _ in dates[:1]))))
-        events: list[Event] = [Tick(), *(Released(arc) for arc, at in releases.items() if at <= now)]
+        events: list[Event] = [model.Tick(), *(Released(arc) for arc, at in releases.items() if at <= now)]
         while dates and dates[0][0] <= now:
             date, name = dates.pop(0)
             booking, is_open = booked[name]
             if is_open and date == booking.start and not booking.maintenance:
-                events.append(Requested(request_for(booking)))
+                events.append(model.Requested(request_for(booking)))
         step(events)
     return result
 
 
 def _dates(booking: Booking, now: Ns, *, is_open: bool) -> list[Ns]:
-    """When something becomes of a booking that no hold tells."""
+    """Times at which a booking changes without a hold."""
     if booking.maintenance:
         return [at for at in (booking.start, booking.end) if at > now]
     if booking.start > now:

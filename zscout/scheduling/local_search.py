@@ -1,10 +1,8 @@
-"""A better set by local search, where a part is too large for an exact answer. Its time is counted in steps.
+"""Local search for a better set, where the group is too large for an exact answer. Time is counted in steps.
 
-A step picks an RC at random that is free, or used below the highest level that could use it, and forces in
-the best item that covers it: those in its way leave, and whatever fits then comes in. What was moved a moment
-ago does not move again (tabu), so the search walks on from a local best. Every set that looks better than the
-best is made feasible first (`PackingProblem.complete`), so that the result can be taken as it is.
-"""
+A step picks a random RC that is free or used below the highest level that could use it, and forces in the best item
+that covers it: items in its way leave, and others that fit come in. An item that has just moved stays (tabu), so the
+search leaves local optima. Each set that looks better is made feasible first (`PackingProblem.complete`)."""
 
 from __future__ import annotations
 
@@ -13,17 +11,17 @@ from typing import Final
 from zscout.scheduling.packing import PackingProblem, numbers
 
 MAX_ITEMS: Final = 2_000
-"""Items that the search looks at, best ranks first; the others only fill what it leaves."""
+"""Items searched, best ranks first; the others only fill gaps."""
 MAX_LEVELS: Final = 12
-"""Levels likewise: a value has a digit for each, and numbers get slow."""
+"""Levels searched: a value has a digit for each, and large numbers are slow."""
 TENURE: Final = 7
-"""Steps for which an item stays as it was moved."""
+"""Steps for which a moved item stays."""
 IDLE_FACTOR: Final = 40
-"""The search ends when so many steps per item brought nothing."""
+"""The search ends after this many steps per item without gain."""
 
 
 class LocalSearch:
-    """A search that goes on in slices. `best` is always feasible, and at least as good as the start."""
+    """A search in slices. `best` is always feasible, and at least as good as the start."""
 
     def __init__(self, problem: PackingProblem, start: int) -> None:
         self.problem = problem
@@ -56,17 +54,14 @@ class LocalSearch:
 
     @property
     def done(self) -> bool:
-        """Whether nothing better is there, or nothing better was found for long."""
         return self.best_key[0] >= self.upper_bound or not self._pool or self.steps - self._improved_at > self._idle
 
     def _adopt(self, chosen: int) -> None:
-        """Starts from this set."""
         self._owner = [-1] * len(self._cover)
         self._chosen = chosen
         self._value = self.problem.value(chosen)
         self._used = 0
-        self._pool: list[int] = []
-        """RCs that might be put to better use."""
+        self._pool: list[int] = []  # RCs that might be put to better use
         self._at = [-1] * len(self._cover)
         for number in numbers(chosen):
             if number in self._needs:
@@ -79,7 +74,7 @@ class LocalSearch:
                 self._pool.append(rc)
 
     def run(self, steps: int) -> int:
-        """Goes on for at most so many steps; returns how many it took."""
+        """Take at most `steps` steps; return how many were taken."""
         began = self.steps
         while self.steps - began < steps and not self.done:
             self.steps += 1
@@ -102,7 +97,7 @@ class LocalSearch:
             self._adopt(completed)
 
     def _pick(self, rc: int) -> int:
-        """The item to force in at `rc`: that which gains most, the longest unmoved of equals; -1 for none."""
+        """The item to force in at `rc`: the greatest gain, the longest unmoved of equals; -1 for none."""
         worth, owner, moved, needs = self.problem.worth, self._owner, self._moved, self._needs
         aim = self.best_key[0] - self._value
         fresh = self.steps - TENURE
@@ -127,7 +122,6 @@ class LocalSearch:
         return best
 
     def _may(self, number: int, out: list[int]) -> bool:
-        """Whether `number` may come in for those that would leave."""
         problem, level = self.problem, self._level[number]
         for other in out:
             item = problem.items[other]
@@ -141,7 +135,7 @@ class LocalSearch:
         return problem.allowed(number, left)
 
     def _force(self, number: int) -> None:
-        """Puts `number` in; those in its way leave, and what fits into what they leave comes in."""
+        """Put `number` in; conflicting items leave, and items that fit the gaps come in."""
         problem, owner, masks = self.problem, self._owner, self.problem.masks
         out = {owner[need] for need in self._needs[number]}
         out.discard(-1)
@@ -153,7 +147,7 @@ class LocalSearch:
         fits: set[int] = set()
         for rc in numbers(freed & ~masks[number]):
             fits.update(other for other in self._cover[rc] if not masks[other] & self._used)
-        for other in sorted(fits - out, key=lambda one: (-problem.worth[one], one)):
+        for other in sorted(fits - out, key=lambda candidate: (-problem.worth[candidate], candidate)):
             if not masks[other] & self._used and (not problem.vetoes or problem.allowed(other, self._chosen)):
                 self._enter(other)
 

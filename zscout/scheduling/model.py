@@ -1,9 +1,6 @@
-"""What the scheduling core takes, keeps and gives: requests and resource controllers (RCs); events that
-it is given, its effects, in the order in which they must be done, and the present state.
+"""Data of the scheduling core: requests, RCs, events, effects in the order to carry them out, and status.
 
-Times are whole nanoseconds on one clock of the caller's choice; nothing here reads a clock. Bandwidth
-parameters are `Fraction`, so that sums are exact (0.1 + 0.2 is 0.3).
-"""
+Times are whole ns on the caller's clock. Bandwidth parameters are `Fraction`, so sums are exact."""
 
 from __future__ import annotations
 
@@ -25,21 +22,19 @@ from zscout.scheduling.reason import ITS_CLIENT, SHOWN, Party, Reason
 from zscout.types import SECOND, ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName, Term
 
 QUANTUM: Ns = SECOND
-"""The paper's quantum: while anything waits, a pass runs at least this often."""
+"""The paper's quantum: while an ARC waits, a pass runs at least this often."""
 HOLD_BACK: Final[Ns] = SECOND
-"""From a hold that was not confirmed to the next one of its ARC: twice as long each time in a row,"""
+"""Pause of an ARC after an unconfirmed hold: doubled each time in a row,"""
 MAX_HOLD_BACK: Final[Ns] = 30 * SECOND
-"""and at most."""
+"""up to this."""
 
 Rank: TypeAlias = tuple[int, int, Ns, Place, ArcId]
-"""Sorts contenders, best first: priority (negated), position of the group (`fair_shares.py`), minimum runtime, place,
-id."""
+"""Sort key, best first: priority (negated), position of the group (`fair_shares.py`), minimum runtime, place, id."""
 
 
 class ArcRequest(Struct, frozen=True):
-    """One ARC as its client asked for it: all of `needs` at once, for at least `min_runtime` ns (> 0).
-
-    A need names an RC, or is a pattern that any one RC meets (`keyexpr.check_need`).
+    """All of `needs` at once, for at least `min_runtime` ns (> 0). A need names an RC, or is a pattern that any one RC
+    meets.
 
     Raises ValueError as `needs.check_request` does."""
 
@@ -50,17 +45,16 @@ class ArcRequest(Struct, frozen=True):
     min_runtime: Ns
     keep: bool = False
     label: str = ""
-    """What people call it; the core only prints it."""
+    """The name for people; unused by the core."""
     direct: bool = False
-    """Whether its program touches devices past their RCs; the core only keeps it."""
+    """Its program accesses devices without their RCs; unused by the core."""
     continues: str = ""
-    """The name of the ARC of the same client's that it goes on from, where it can with what that has."""
+    """The name of the ARC of the same client that it continues, on the same RCs where possible."""
     booking: str = ""
-    """The booking that it takes up; its needs and its priority are that booking's."""
     not_before: Ns = 0
-    """Of a booking that is not there yet, or can't be at present: the date that is waited for all the same."""
+    """The date to wait for while its booking is absent or impossible."""
     who: Who | None = None
-    """Who asked, as people are told; the core only prints it."""
+    """The requester, for people; unused by the core."""
 
     def __post_init__(self) -> None:
         check_request(f"ARC {self.arc}", self.needs, self.min_runtime)
@@ -69,38 +63,35 @@ class ArcRequest(Struct, frozen=True):
     def name(self) -> str:
         return self.label or self.arc
 
-    def goes_on_from(self, other: ArcRequest) -> bool:
+    def continues_from(self, other: ArcRequest) -> bool:
         return self.continues == other.name and self.client == other.client
 
 
 class Hold(Struct, frozen=True):
-    """A grant in force. `end` is when the minimum runtime is over; with `keep` the hold goes on past it."""
+    """A grant in force. `end`: end of the minimum runtime; with `keep` the hold outlasts it."""
 
     grant: Grant
     start: Ns
     end: Ns
     protected_below: int | None = None
-    """Below this priority nobody preempts it before `end`; None: any higher priority does."""
+    """Before `end` only this priority or higher preempts it; None: any higher priority."""
     last: Ns | None = None
-    """When it ends though it is kept; None: nothing ends it but others and its client."""
 
 
 class ArcState(StrEnum):
-    """The state of an ARC. All between NEW and RUNNING are queued; `QueueIndex` says what follows."""
+    """All states between NEW and RUNNING are queued; see `QueueIndex`."""
 
     NEW = "new"
     READY = "ready"
-    """The next pass checks it, whatever happens."""
+    """Checked by the next pass in any case."""
     VOTING = "voting"
-    """Its last check waits for votes."""
     DEFERRED = "deferred"
-    """Its last check was stopped by that of a higher rank, which waits for votes."""
+    """Stopped by the open votes of a higher rank."""
     WATCHING = "watching"
-    """One RC alone keeps it out."""
     PARKED = "parked"
     """An RC that does not answer proposals keeps it out."""
     HELD_BACK = "held_back"
-    """An RC did not confirm its last hold: it is not considered for a while. Or another ARC has its place."""
+    """Not considered for a while after an unconfirmed hold, or while another ARC has its place."""
     RUNNING = "running"
     ENDED = "ended"
 
@@ -110,106 +101,76 @@ _LEAVES: Final = (ArcState.HELD_BACK, ArcState.RUNNING, ArcState.ENDED)
 _WAITS: Final = (ArcState.READY, ArcState.HELD_BACK)
 TRANSITIONS: Final[Mapping[ArcState, tuple[ArcState, ...]]] = {
     ArcState.NEW: (*_WAITS, ArcState.RUNNING),
-    ArcState.READY: (*_CHECKED, *_LEAVES),
-    ArcState.VOTING: (*_CHECKED, *_LEAVES),
-    ArcState.DEFERRED: (*_CHECKED, *_LEAVES),
-    ArcState.WATCHING: (*_CHECKED, *_LEAVES),
-    # It is made ready before it is checked.
-    ArcState.PARKED: (ArcState.READY, *_LEAVES),
+    **dict.fromkeys(_CHECKED, (*_CHECKED, *_LEAVES)),
+    ArcState.PARKED: (ArcState.READY, *_LEAVES),  # made ready before it is checked
     ArcState.HELD_BACK: (*_WAITS, ArcState.ENDED),
-    # Preempted, or an RC was lost: queued again.
-    ArcState.RUNNING: (ArcState.READY, ArcState.ENDED),
+    ArcState.RUNNING: (ArcState.READY, ArcState.ENDED),  # preempted, or an RC was lost: queued again
     ArcState.ENDED: (),
 }
 
 
 @dataclass(slots=True, eq=False)
 class Arc:
-    """A request the core follows, queued or running."""
-
     request: ArcRequest
     place: Place
-    mask: int
-    """Bits of the needed RCs (`SchedulerState.rc`); of a pattern, the bit of the RC that it is bound to."""
+    mask: int  # bits of the needed RCs (`SchedulerState.rc`); for a pattern, of the bound RC
     patterns: tuple[Need, ...] = ()
-    """Those of its needs that are patterns."""
-    named_mask: int = 0
-    """Bits of the others."""
+    named_mask: int = 0  # bits of the RCs named without patterns
     state: ArcState = ArcState.NEW
-    hold: Hold | None = None
-    """What it holds, exactly while it runs."""
+    hold: Hold | None = None  # present exactly while it runs
     reason: Reason | None = None
-    """Why it waits, as last reported; None while it runs. `Core.arc` has the reason of now."""
-    since: Ns = 0
-    """When it was last queued or granted."""
+    """The last reported reason to wait; None while it runs. `Core.arc` has the current reason."""
+    since: Ns = 0  # when it was last queued or granted
     preemptions: int = 0
-    entry: int = 0
-    """Grows with each entry into the queue or among the running: who came there first."""
-    rcs: tuple[Rc, ...] = ()
-    """Those of `mask`, in the order of the bits; set when the ARC is first queued."""
-    footprint: int | None = None
-    """While it is VOTING, DEFERRED or PARKED: bits of the RCs that it would take or free."""
+    entry: int = 0  # grows with each entry into the queue or among the running
+    rcs: tuple[Rc, ...] = ()  # the RCs of `mask` in bit order; set when first queued
+    footprint: int | None = None  # while VOTING, DEFERRED or PARKED: bits of the RCs that it would take or free
     masked_obstacles: int = 0
-    """While VOTING or DEFERRED: bits of the RCs whose obstacle was off limits, so that it did not count."""
+    """While VOTING or DEFERRED: bits of the RCs whose obstacle was off limits and did not count."""
     watched: Rc | None = None
-    """The RC that it is WATCHING."""
-    unconfirmed: int = 0
-    """How many of its holds in a row were not confirmed."""
+    unconfirmed: int = 0  # unconfirmed holds in a row
     held_back: tuple[Ns, tuple[RcName, ...]] | None = None
-    """While it is HELD_BACK: until when, and for which RCs; None where another ARC has its place."""
-    starving: bool = False
-    """Whether it has waited for too long (`reservations.py`)."""
+    """While HELD_BACK: until when, and for which RCs; None where another ARC has its place."""
+    starving: bool = False  # waiting for too long (`reservations.py`)
     bound: Mapping[Need, RcName] = field(default_factory=dict)
-    """The RC that each pattern is bound to (`patterns.py`): while it runs, and for the time of a check. Empty
-    if there is none for some pattern."""
-    claim: Claim | None = None
-    """The booking that it has taken up, until that is over."""
-    position: int = 0
-    """That of its group (`fair_shares.py`); while it runs, that which it started with."""
-    late: Ns = 0
-    """While it waits: so much later it counts as queued when it comes to who is due (`reservations.py`)."""
-    owner: str = field(init=False)
-    """Whose quota it counts against: its client's host."""
+    """The RC of each pattern (`patterns.py`), while it runs or is checked. Empty if some pattern has none."""
+    claim: Claim | None = None  # the active booking that it has taken up
+    position: int = 0  # the position of its group (`fair_shares.py`); while it runs, as of its start
+    late: Ns = 0  # delay that its group's share adds to its waiting time (`reservations.py`)
+    owner: str = field(init=False)  # its client's host, for quotas
     id: ArcId = field(init=False)
     priority: int = field(init=False)
-    rank: Rank = field(init=False)
-    """Higher priority, then the group that had less, then shorter minimum runtime, then earlier place goes first.
-
-    Clients give their places after a takeover, so two may claim one: the id keeps the order total."""
+    rank: Rank = field(init=False)  # after a takeover two clients may claim one place: the id keeps the order total
     party: Party = field(init=False)
-    """The ARC as reasons name it."""
-    needs: Mapping[RcName, Params] = field(init=False)
-    """By RC: what it holds, or would as it is bound."""
+    needs: Mapping[RcName, Params] = field(init=False)  # by RC: held, or wanted as bound
 
     def __post_init__(self) -> None:
         self.needs = self.request.needs
         self.take(self.request)
 
     def take(self, request: ArcRequest) -> None:
-        """Takes this for its request: its own one, or that of another client with the same needs."""
+        """Replace its request, by itself or another client's with the same needs."""
         self.request, self.id, self.priority = request, request.arc, request.priority
         self.owner = request.client.partition("/")[0]
         self.party = Party(self.id, request.label or self.id, self.priority, request.who)
         self.put_at(self.position)
 
     def put_at(self, position: int) -> None:
-        """Its group has this position."""
         self.position = position
         self.rank = (-self.priority, position, self.request.min_runtime, self.place, self.id)
 
     def ends(self, start: Ns) -> Ns:
-        """When its minimum runtime is over if it starts then: with a booking, when that is over."""
+        """The end of its minimum runtime, or of its booking, if it starts then."""
         end = start + self.request.min_runtime
         return end if self.claim is None or start >= self.claim.booking.end else self.claim.booking.end
 
     def move_to(self, state: ArcState) -> None:
-        """Raises ValueError for a move that is not in `TRANSITIONS`."""
         if state not in TRANSITIONS[self.state]:
             raise ValueError(f"ARC {self.id} is {self.state} and can't become {state}")
         self.state = state
 
     def known_end(self, other: Arc | None = None) -> float:
-        """When its hold ends, or `other` may preempt it, by what is known now; infinite for what it keeps."""
+        """When its hold ends or `other` may preempt it, as known now; infinite for a kept hold."""
         if self.hold is None:
             return math.inf
         kept = self.request.keep and (other is None or self.priority > other.priority)
@@ -217,40 +178,32 @@ class Arc:
         return last if kept else min(self.hold.end, last)
 
     def blocks(self, other: Arc) -> Party:
-        """How the reason names it for which `other` waits, that may not preempt it yet."""
+        """Its party in the reason of `other`, with the time until it blocks that."""
         end = self.known_end(other)
-        one = self.party
-        return Party(one.arc, one.name, one.priority, one.who, None if math.isinf(end) else int(end))
+        return self.party._replace(until=None if math.isinf(end) else int(end))
 
     def past_min_runtime(self, now: Ns) -> bool:
-        """True when a kept hold has had its minimum runtime: equal priority may preempt it then."""
+        """Return True for a kept hold past its minimum runtime: equal priority may preempt it."""
         return self.hold is not None and self.request.keep and now >= self.hold.end
 
     def preemptible_by(self, other: Arc, now: Ns) -> bool:
-        """Whether `other` may take what this running ARC holds."""
         if self.priority >= other.priority:
             return self.priority == other.priority and self.past_min_runtime(now)
         below = self.protected_below(now)
         return below is None or other.priority >= below
 
     def protected_below(self, now: Ns) -> int | None:
-        """The priority below which nobody preempts its hold now; None: any higher priority does."""
+        """Priorities below this can't preempt its hold now; None: any higher priority can."""
         return self.hold.protected_below if self.hold is not None and now < self.hold.end else None
 
 
 @dataclass(slots=True, eq=False)
 class Claim:
-    """A booking that is not over."""
-
     booking: Booking
-    arc: Arc
-    """Who has taken it up; before, an ARC that stands for it in reservations and votes, and never waits nor runs."""
-    kept: int
-    """Bits of the RCs that are kept for it; who has taken it up may choose others for its patterns."""
-    tentative: bool = False
-    """Whether it is still to be seen if it can be: nobody takes it up."""
-    danger: Reason | None = None
-    """What keeps it from its start, as last told."""
+    arc: Arc  # the ARC that took it up; before, a placeholder in reservations and votes that never waits nor runs
+    kept: int  # bits of the RCs kept for it; its ARC may choose others for its patterns
+    tentative: bool = False  # conflicts are not checked yet: it can't be taken up
+    danger: Reason | None = None  # the last reported danger
 
     @property
     def is_taken(self) -> bool:
@@ -258,49 +211,40 @@ class Claim:
 
     @property
     def mask(self) -> int:
-        """Bits of the RCs that it holds, or that are kept for it."""
+        """Bits of the RCs held by it or kept for it."""
         return self.kept if self.arc.hold is None else self.arc.mask
 
 
 @dataclass(slots=True, eq=False)
 class Rc:
-    """One resource controller. `bit` is its bit in every mask, kept for as long as the core lives."""
+    """`bit` is its bit in every mask, for the life of the core."""
 
     name: RcName
     bit: int
     present: bool = False
     sharable: bool = False
-    absence: str = ""
-    """While it is absent: why, if that is known."""
+    absence: str = ""  # the reason while absent, if known
     holders: dict[ArcId, Arc] = field(default_factory=dict)
-    demand: int = 0
-    """How many of the queued ARCs name it."""
+    demand: int = 0  # queued ARCs that name it
     watchers: list[Rank] = field(default_factory=list)
-    """Ranks of the queued ARCs that watch this RC (`QueueIndex`), best first."""
+    """Ranks of the queued ARCs that watch it (`QueueIndex`), best first."""
 
     def non_preemptible_holders(self, arc: Arc, now: Ns) -> list[Arc]:
-        """Its holders that are not preempted for `arc`."""
         return [holder for holder in self.holders.values() if not holder.preemptible_by(arc, now)]
 
 
 def absences(rcs: Iterable[Rc]) -> str:
-    """Why these RCs are absent, as far as that is known, in words."""
     known = [f"{rc.name}: {rc.absence}" for rc in rcs if rc.absence]
     more = f"; {len(known) - SHOWN} more" if len(known) > SHOWN else ""
     return "; ".join(known[:SHOWN]) + more
 
 
 def union(masks: Iterable[int]) -> int:
-    """The bits of all masks."""
     return functools.reduce(operator.or_, masks, 0)
 
 
-# Events: each carries everything the core may know about it
-
-
 class Requested(Struct, frozen=True):
-    """A program requests an ARC. `place` is set when it had one under an earlier RCM; `since` is then when it
-    was last queued, on the core's clock, if that is known."""
+    """`place` is set for an ARC of an earlier RCM, and `since`, if known, is when it was last queued."""
 
     request: ArcRequest
     place: Place | None = None
@@ -308,42 +252,32 @@ class Requested(Struct, frozen=True):
 
 
 class Cancelled(Struct, frozen=True):
-    """The ARC is not wanted any more, whether it waits or runs."""
-
     arc: ArcId
     by: str = ITS_CLIENT
 
 
 class Released(Struct, frozen=True):
-    """A running ARC gives back what it holds; a waiting one leaves the queue."""
-
     arc: ArcId
     by: str = ITS_CLIENT
 
 
 class Vote(Struct, frozen=True):
-    """A sharable RC's answer to a proposal."""
-
     proposal: int
     accept: bool
     reason: str = ""
 
 
 class VoteOverdue(Struct, frozen=True):
-    """No answer to a proposal in time, or it could not be delivered."""
-
     proposal: int
 
 
 class RcJoined(Struct, frozen=True):
-    """An RC is there and can be granted."""
-
     rc: RcName
     sharable: bool
 
 
 class RcReported(Struct, frozen=True):
-    """An RC reports that holds ended there, or that the rules it votes by have changed."""
+    """Holds ended at the RC, or its voting rules changed."""
 
     rc: RcName
     ended: tuple[ArcId, ...] = ()
@@ -351,8 +285,7 @@ class RcReported(Struct, frozen=True):
 
 
 class RcLost(Struct, frozen=True):
-    """An RC is gone, or can't carry its holders any longer; `why`, if that is known, stands in the reason of whoever
-    waits for it."""
+    """An RC is gone or can't carry its holders; `why`, if known, appears in the reasons of waiting ARCs."""
 
     rc: RcName
     reason: str = "it left the mesh"
@@ -360,21 +293,19 @@ class RcLost(Struct, frozen=True):
 
 
 class ClientLost(Struct, frozen=True):
-    """A program is gone: what it holds is free and what it asked for is forgotten."""
-
     client: ClientId
     reason: str = "its client left the mesh"
 
 
 class PlaceShown(Struct, frozen=True):
-    """A client shows the place that its ARC was given before; it has entered without."""
+    """A client presents the earlier place of an ARC that entered without it."""
 
     arc: ArcId
     place: Place
 
 
 class Unconfirmed(Struct, frozen=True):
-    """A client could not confirm a grant: these RCs know nothing of it, or do not answer."""
+    """A client could not confirm a grant: these RCs don't know it, or do not answer."""
 
     arc: ArcId
     grant: Grant
@@ -382,14 +313,11 @@ class Unconfirmed(Struct, frozen=True):
 
 
 class Reachable(Struct, frozen=True):
-    """One of the RCs that a client could not confirm a grant with has shown itself to it anew."""
-
     arc: ArcId
 
 
 class HandedOver(Struct, frozen=True):
-    """An ARC goes on in another client (migration), by the name `renamed`: same place; if it runs, same RCs,
-    same end, new grant."""
+    """An ARC moves to client `to` as `renamed`: same place, RCs and end, new grant."""
 
     arc: ArcId
     to: ClientId
@@ -397,7 +325,7 @@ class HandedOver(Struct, frozen=True):
 
 
 class RecoveredHold(Struct, frozen=True):
-    """A hold that was in force when an RCM took the lead: its grant is kept, `end` is on the core's clock."""
+    """A hold in force at a change of RCM: its grant is kept, `end` is on the core's clock."""
 
     request: ArcRequest
     place: Place
@@ -405,7 +333,6 @@ class RecoveredHold(Struct, frozen=True):
     start: Ns
     end: Ns
     bound: Mapping[Need, RcName] = {}
-    """By each pattern of its needs: the RC that it holds."""
 
     def __post_init__(self) -> None:
         patterns = {need for need in self.request.needs if is_pattern(need)}
@@ -418,81 +345,54 @@ class RecoveredHold(Struct, frozen=True):
 
 
 class LeadTaken(Struct, frozen=True):
-    """This RCM leads from now on, in `term`, over the holds and the queue that it recovered."""
+    """This RCM leads in `term`, with the recovered holds and queue."""
 
     term: Term
     recovered_holds: tuple[RecoveredHold, ...] = ()
     waiting: tuple[Requested, ...] = ()
     charged: Mapping[str, float] = {}
-    """By group: RC-seconds that it had and others waited for, decayed as of now (`fair_shares.py`)."""
+    """By group: contended RC-seconds, decayed as of now (`fair_shares.py`)."""
     dates_from: Ns = 0
-    """Until then dates are not certain: who waits for one does not begin."""
+    """Dates before this are uncertain: their ARCs do not begin."""
 
 
 class Adopted(Struct, frozen=True):
-    """RCs have joined with a hold of an earlier term, which goes on if all of its gang have, unless this RCM has ended
-    it, or its ARC holds something newer."""
+    """RCs joined with a hold of an earlier term. It continues if its gang is complete, unless this RCM has ended it
+    or its ARC holds something newer."""
 
     held: RecoveredHold
 
 
 class Tick(Struct, frozen=True):
-    """Time has passed: holds may be over, the quantum may be."""
+    """Time has passed."""
 
 
-Event: TypeAlias = (
-    Requested
-    | Cancelled
-    | Released
-    | Vote
-    | VoteOverdue
-    | RcJoined
-    | RcReported
-    | RcLost
-    | ClientLost
-    | PlaceShown
-    | Unconfirmed
-    | Reachable
-    | HandedOver
-    | LeadTaken
-    | Adopted
-    | Booked
-    | Unbooked
-    | Redated
-    | Tick
-)
-
-
-# Effects
+_ArcEvent: TypeAlias = Requested | Cancelled | Released | ClientLost | PlaceShown | Unconfirmed | Reachable | HandedOver
+_RcEvent: TypeAlias = Vote | VoteOverdue | RcJoined | RcReported | RcLost
+Event: TypeAlias = _ArcEvent | _RcEvent | LeadTaken | Adopted | Booked | Unbooked | Redated | Tick
 
 
 class Outcome(StrEnum):
-    """How a hold, or the wait for one, came to its end."""
-
     COMPLETED = "completed"
-    """It had its minimum runtime."""
     PREEMPTED = "preempted"
-    """Taken away by a higher priority; queued again with its place."""
+    """Queued again with its place."""
     RELEASED = "released"
-    """Given back by its client before the time."""
+    """Ended by its client before the time."""
     CANCELLED = "cancelled"
     LOST = "lost"
     """An RC of the gang went away; queued again with its place."""
     CLIENT_LOST = "client_lost"
     HANDED_OVER = "handed_over"
-    """It goes on in another client, under a new grant."""
 
 
 class Propose(Struct, frozen=True):
-    """Ask a sharable RC whether it would carry exactly these holders, by ARC, with their parameters."""
-
     proposal: int
     rc: RcName
     holders: Mapping[ArcId, Params]
 
 
 class Granted(Struct, frozen=True):
-    """All of `rcs` are the ARC's until `end`; None where it may keep them past its minimum runtime."""
+    """All of `rcs` belong to the ARC until `end`; None: kept beyond its minimum runtime."""
 
     arc: ArcId
     client: ClientId
@@ -501,11 +401,11 @@ class Granted(Struct, frozen=True):
     start: Ns
     end: Ns | None
     waited: Ns | None = None
-    """How long its ARC was queued before; None: no hold begins here, one that stood goes on."""
+    """ns in the queue before; None for a hold that only continues."""
 
 
 class HoldEnded(Struct, frozen=True):
-    """A hold is over. `requeued` says whether its ARC waits again; `by` is the ARC it was taken for."""
+    """`requeued`: its ARC waits again; `by`: the ARC that took the hold."""
 
     arc: ArcId
     client: ClientId
@@ -518,9 +418,7 @@ class HoldEnded(Struct, frozen=True):
 
 
 class Queued(Struct, frozen=True):
-    """The ARC waits, for this reason; sent at the first wait and when the reason changes.
-
-    `settled` is False while the RCM itself is still asking votes, so that the answer is near."""
+    """Sent at the first wait and when the reason changes. `settled` is False while the RCM awaits votes."""
 
     arc: ArcId
     client: ClientId
@@ -529,8 +427,6 @@ class Queued(Struct, frozen=True):
 
 
 class Dropped(Struct, frozen=True):
-    """A waiting ARC left the queue without having run."""
-
     arc: ArcId
     client: ClientId
     outcome: Outcome
@@ -538,7 +434,7 @@ class Dropped(Struct, frozen=True):
 
 
 class WakeAt(Struct, frozen=True):
-    """Send a `Tick` at this time, or earlier; a later effect replaces it. None: nothing to wait for."""
+    """Send a `Tick` at this time or earlier; replaces the last one. None: nothing to wait for."""
 
     at: Ns | None
 
@@ -546,28 +442,20 @@ class WakeAt(Struct, frozen=True):
 Effect: TypeAlias = Propose | Granted | HoldEnded | Queued | Dropped | BookingChanged | BookingThreatened | WakeAt
 
 
-# The state after the last batch of events
-
-
 class ArcStatus(Struct, frozen=True):
-    """One ARC that is queued (`hold is None`) or runs."""
-
     request: ArcRequest
     place: Place
     hold: Hold | None
     needs: Mapping[RcName, Params]
-    """By RC: what it holds, or would hold as its patterns are bound at present."""
     bound: Mapping[Need, RcName]
-    """The RC that each pattern of its needs is bound to."""
     since: Ns
-    """When it was last queued or granted."""
     preemptions: int
     ahead: int | None
-    """How many of the queued rank above it; None while it runs."""
+    """Queued ARCs of higher rank; None while it runs."""
     reason: Reason | None
-    """Why it is queued, with all that is in its way; None while it runs."""
+    """The full reason to wait; None while it runs."""
     reported: Reason | None
-    """The reason of its latest `Queued` effect: not every change of holders far ahead of it is one."""
+    """The reason of its latest `Queued` effect, which may be out of date."""
 
     @property
     def id(self) -> ArcId:
@@ -579,8 +467,6 @@ class ArcStatus(Struct, frozen=True):
 
 
 class RcStatus(Struct, frozen=True):
-    """One RC; `holders` in the order in which they came to hold it."""
-
     name: RcName
     present: bool
     sharable: bool
@@ -588,8 +474,7 @@ class RcStatus(Struct, frozen=True):
 
 
 class Status(Struct, frozen=True):
-    """The whole fleet: who runs, in the order in which they started; who is queued, best rank first and
-    perhaps not all of the `waiting`; the RCs by name."""
+    """The fleet: running ARCs by start, queued ARCs by rank and perhaps not all `waiting`, RCs by name."""
 
     running: tuple[ArcStatus, ...]
     queued: tuple[ArcStatus, ...]

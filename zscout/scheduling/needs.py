@@ -1,5 +1,3 @@
-"""What an ARC or a booking may ask for."""
-
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -9,8 +7,8 @@ from zscout.types import Need, Ns, Params
 
 
 def check_request(name: str, needs: Mapping[Need, Params], min_runtime: Ns) -> None:
-    """Raises ValueError where there are no needs, the minimum runtime is not positive, a parameter is negative, and as
-    `check_patterns` does; `name` says of what."""
+    """Raises ValueError if needs are empty, the minimum runtime is not positive or a parameter is negative, and as
+    `check_patterns`."""
     if not needs:
         raise ValueError(f"{name} needs nothing; name at least one RC")
     if min_runtime <= 0:
@@ -22,8 +20,7 @@ def check_request(name: str, needs: Mapping[Need, Params], min_runtime: Ns) -> N
 
 
 def check_patterns(needs: Mapping[Need, Params]) -> None:
-    """Raises ValueError (BadName) for a pattern that is none, and where the choice of RCs would decide what
-    is asked of one: its votes must not depend on that."""
+    """Raises ValueError for an invalid pattern (BadName), and where parameters would depend on the choice of RCs."""
     asked: dict[str, Params] = {}
     for need, params in needs.items():
         if not is_pattern(need):

@@ -2,19 +2,17 @@
 
 A pass:
 
-1. Take the candidates, in groups that have no RC in common (`conflict_groups.py`).
-2. Find the best set of each group as if every vote that is not known were a yes: by branch and bound where
-   that is quick, else by CP-SAT if OR-tools is installed (the extra `optimal`), else by local search.
-3. Ask the votes that the set needs and that are not known; until they are in, the group is off limits. A veto
-   rules out that set of holders and every larger one: then back to 2.
-4. Take the set: preempt who has to end, start who is to start.
-5. Run a pass of `priority` over the rest: it starts nobody, and reports what they wait for.
+1. Take the candidates, in groups without a common RC (`conflict_groups.py`).
+2. Find each group's best set, counting unknown votes as yes: by branch and bound where quick, else by CP-SAT if
+   OR-tools is installed (the extra `optimal`), else by local search.
+3. Ask the unknown votes that the set needs; until they are in, the group is off limits. A veto rules out that set of
+   holders and every larger set: back to 2.
+4. Take the set: preempt its victims, start its ARCs.
+5. Run a pass of `priority` over the rest: it starts none, and reports their reasons.
 
-The set's value is the vector of (ARC, RC) pairs in use by priority, highest first (`packing.py`).
-
-OR-tools is imported at the first use, because it is large. The solver runs on its deterministic clock, with
-one worker: the same problem gives the same set everywhere, as the rest of the core does.
-"""
+A set's value is the vector of (ARC, RC) pairs in use by priority, highest first (`packing.py`). OR-tools is imported
+at first use, because it is large. The solver has a deterministic clock and one worker: the same problem always gives
+the same set."""
 
 from __future__ import annotations
 
@@ -33,41 +31,35 @@ if TYPE_CHECKING:
     from ortools.sat.python import cp_model
 
 SOLVER_BUDGET: Final = 0.3
-"""Deterministic time of all stages together; about half a second. Stages that prove their answer leave the
-rest to the next."""
+"""Deterministic time of all stages together: about half a second. Unused time passes to the next stage."""
 LEAST: Final = 0.01
 CHUNK: Final = 40
 """Items whose ranks are weighed in one stage: their weights are powers of two."""
 WORK: Final = 200_000
-"""Steps of branch and bound, times items, before a group counts as large: some 20 ms. What is not proven by
-then seldom is soon after."""
+"""Steps of branch and bound times items before a group counts as large: some 20 ms. More seldom proves more."""
 MAX_PACKED: Final = 80
-"""Larger groups are not even tried by branch and bound: at 30x60 it takes 11 ms and CP-SAT 18, at 40x80 it
-seldom comes to a proof."""
+"""Larger groups skip branch and bound: at 30x60 it takes 11 ms and CP-SAT 18, at 40x80 it seldom finds a proof."""
 STEPS: Final = 6_000
-"""Steps of local search for a large group."""
 MAX_VETOES: Final = 256
-"""Vetoes on one group. A voter gives no reason that could be reckoned with, so a proof may take a question
-for each of very many sets; beyond so many vetoes `priority` decides the group."""
+"""Vetoes on one group before `priority` decides it: a proof may need a question for each of very many sets."""
 
 
 @functools.cache
 def solver_available() -> bool:
-    """Whether OR-tools is installed."""
     return importlib.util.find_spec("ortools") is not None
 
 
 def improve(problem: PackingProblem, start: int, budget: float = SOLVER_BUDGET) -> int:
-    """A lawful set that is at least as good as `start`, which is lawful; the best one, if time allows."""
+    """A feasible set at least as good as the feasible `start`; the best set, if time allows."""
     found = _Solver(problem, start, budget).solve()
     best = max((problem.complete(found), found), key=problem.key)
-    # Only a proof tells sets of equal worth apart; otherwise the start stays.
+    # Only a proof decides between sets of equal worth; otherwise the start stays.
     return best if problem.key(best) > problem.key(start) or best == found else start
 
 
 class _Solver:
     def __init__(self, problem: PackingProblem, start: int, budget: float) -> None:
-        from ortools.sat.python import cp_model  # large: only who needs it loads it
+        from ortools.sat.python import cp_model  # large, so imported on use
 
         self.problem, self.found, self.left = problem, start, budget
         self.cp = cp_model
@@ -99,7 +91,7 @@ class _Solver:
         return self.found
 
     def _stage(self, goal: Any) -> bool:
-        """Maximises `goal` and holds on to what was reached; False if the best is not proven."""
+        """Maximise `goal` and fix its value; False if not proven."""
         if self.left < LEAST:
             return False
         self.model.clear_hints()  # type: ignore[no-untyped-call]
@@ -134,7 +126,7 @@ class _Solver:
             self.model.add_bool_or(~self.takes[number] for number in numbers(nogood))
 
     def _keep_running(self) -> None:
-        """Who runs stays, unless one that goes before is in the way, or all others of a veto are."""
+        """Keep running items, unless a chosen item that outranks them conflicts, or all others of a veto do."""
         problem = self.problem
         for running in problem.running:
             mask = problem.masks[running]
@@ -153,8 +145,6 @@ class _Solver:
 
 
 class Optimal(Strategy):
-    """The strategy; it keeps nothing from pass to pass."""
-
     name: StrategyName = "optimal"
 
     def run_pass(self, state: SchedulerState, actions: Actions) -> None:
@@ -162,17 +152,17 @@ class Optimal(Strategy):
         for group in conflict_groups(state):
             if not decide(group, actions):
                 held |= group.mask
-        # Nothing is left for it to start; it reports to the waiting ARCs what they wait for.
+        # It starts none, but reports the reasons of waiting ARCs.
         priority.run_pass(state, actions, off_limits=held)
 
 
 def decide(group: ConflictGroup, actions: Actions) -> bool:
-    """Takes the best set of a group, or leaves it to `priority`. False: votes are out; nothing changes yet."""
+    """Take the best set of a group, or leave it to `priority`. False: votes are out; nothing changes yet."""
     proposals = None
     while proposals is None:
         if len(group.nogoods) > MAX_VETOES:
             return True
-        # None: a veto that was known ruled it out, and each round bars at least one more set.
+        # None: ruled out by a known veto; each round bars at least one more set.
         proposals = group.missing_votes(chosen := best(group.problem()))
     if proposals:
         for rc, holders in proposals:
@@ -183,7 +173,7 @@ def decide(group: ConflictGroup, actions: Actions) -> bool:
 
 
 def best(problem: PackingProblem) -> int:
-    """The best set, or the best that was found within the budget: never less than the heuristic finds."""
+    """The best set, or the best within the budget: at least as good as the heuristic's."""
     size = len(problem.items)
     packing = pack(problem, WORK // max(1, size) if size <= MAX_PACKED else 0)
     if packing.exact:

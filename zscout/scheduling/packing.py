@@ -1,13 +1,11 @@
-"""Which ARCs may hold their RCs together, and which such set is the best: branch and bound over bit masks.
+"""The best set of ARCs that may hold their RCs together: branch and bound over bit masks.
 
-The value of a set is the vector of (ARC, RC) pairs in use by priority level, highest level first, compared
-lexicographically; among equals the set with fewest preemptions, then the one that holds the best-ranked item
-in which they differ. Items are numbered by rank. With "take it" tried first and best ranks decided first, the
-first best set that is met is the best-ranked one, so only strictly better sets need be looked for.
+The value of a set is the vector of (ARC, RC) pairs in use by priority level, highest first, compared lexicographically;
+among equals the fewest preemptions win, then the best-ranked item in which they differ. Items are numbered by rank.
+Taking the best rank first finds the best-ranked of equal sets first, so only strictly better sets are searched.
 
-The upper bound: an RC is used once, so free RCs, each counted at the highest level that still covers it,
-can't be beaten; pairs at sharable RCs are added as they are.
-"""
+Upper bound: each free exclusive RC counts once, at the highest level that covers it; pairs at sharable RCs are
+added."""
 
 from __future__ import annotations
 
@@ -19,10 +17,9 @@ NO_LIMIT = 1 << 60
 
 
 class PackingItem(NamedTuple):
-    """A contender: exclusive RCs as a bit mask, RCs in all, its level (0 is the highest), whether it runs.
+    """A contender: exclusive RCs as a mask, RCs in all, level (0 is the highest), whether it runs.
 
-    `past_min_runtime` marks one that runs on after its minimum runtime: it is worth nothing and may have to
-    end for its own level as well, but for no lower one."""
+    `past_min_runtime`: worth nothing, and may have to end for its own level too, but for no lower one."""
 
     mask: int
     width: int
@@ -32,13 +29,12 @@ class PackingItem(NamedTuple):
 
     @property
     def in_min_runtime(self) -> bool:
-        """Whether to end it is a preemption."""
         return self.running and not self.past_min_runtime
 
 
 @dataclass(frozen=True, slots=True)
 class Packing:
-    """The best set found, as a bit set of item numbers; `exact` if it is proven that none is better."""
+    """A set as bits of item numbers; `exact` if it is proven to be the best."""
 
     chosen: int
     exact: bool
@@ -46,26 +42,22 @@ class Packing:
 
 
 class PackingProblem:
-    """Items in rank order, so levels never fall; and `nogoods`, item sets that must not be chosen together.
+    """Items in rank order, so levels never fall; `nogoods`: item sets that must not be chosen together.
 
-    All running items fit together, or are barred from it by a veto."""
+    All running items fit together, except as vetoed."""
 
     def __init__(self, items: Sequence[PackingItem], nogoods: Iterable[int] = ()) -> None:
         self.items = items
         self.levels = items[-1].level + 1 if items else 1
         base = sum(item.width for item in items) + 1
         self.unit = [base ** (self.levels - 1 - item.level) for item in items]
-        """What one RC in use is worth at an item's level: more than all lower levels together."""
+        """The worth of one RC at an item's level: more than all lower levels together."""
         self.masks = [item.mask for item in items]
-        self.worth = [
-            0 if item.past_min_runtime else item.width * unit for item, unit in zip(items, self.unit, strict=True)
-        ]
-        self.extra = [
-            0 if item.past_min_runtime else (item.width - item.mask.bit_count()) * unit
-            for item, unit in zip(items, self.unit, strict=True)
-        ]
+        valued = [0 if item.past_min_runtime else unit for item, unit in zip(items, self.unit, strict=True)]
+        self.worth = [item.width * unit for item, unit in zip(items, valued, strict=True)]
+        self.extra = [(item.width - item.mask.bit_count()) * unit for item, unit in zip(items, valued, strict=True)]
         self.plain = self.levels == 1 and not any(self.extra) and not any(item.past_min_runtime for item in items)
-        """Whether an RC in use counts one, whoever uses it."""
+        """Each RC in use counts one."""
         self.nogoods: list[list[int]] = [[] for _ in items]
         for nogood in nogoods:
             for number in numbers(nogood):
@@ -74,12 +66,11 @@ class PackingProblem:
         self.running = [number for number, item in enumerate(items) if item.running]
 
     def allowed(self, number: int, chosen: int) -> bool:
-        """Whether no veto keeps an item out beside those chosen."""
         beside = chosen | 1 << number
         return all(nogood & ~beside for nogood in self.nogoods[number])
 
     def upper_bound(self, open_: Iterable[int]) -> int:
-        """What these items can be worth together, at most. Levels must not fall."""
+        """The most that these items can be worth together. Levels must not fall."""
         masks, units = self.masks, self.unit
         if self.plain:
             layer = 0
@@ -104,13 +95,12 @@ class PackingProblem:
         return sum(self.worth[number] for number in numbers(chosen))
 
     def key(self, chosen: int) -> tuple[int, int]:
-        """Compares sets by value, then by preemptions; greater is better."""
         left_out = (self.items[number] for number in self.running if not chosen >> number & 1)
         return self.value(chosen), -sum(item.in_min_runtime for item in left_out)
 
     def complete(self, preferred: int = 0) -> int:
-        """A feasible set that nothing can be added to: level by level the running items, the preferred, the
-        rest by rank. Without preferred items it is the heuristic's."""
+        """A maximal feasible set: level by level the running items, the preferred, the rest by rank. Without
+        `preferred` it is the heuristic's."""
         items, masks = self.items, self.masks
 
         def order(number: int) -> tuple[int, int]:
@@ -127,7 +117,7 @@ class PackingProblem:
         return chosen
 
     def preempts_only_if_needed(self, chosen: int) -> bool:
-        """No running item is dropped that fits beside the chosen items which outrank it."""
+        """Return True if each dropped running item conflicts with chosen items that outrank it."""
         for number in self.running:
             if chosen >> number & 1:
                 continue
@@ -141,13 +131,13 @@ class PackingProblem:
         return True
 
     def outranks(self, other: int, running: int) -> bool:
-        """Whether `running` may have to end because `other` was chosen."""
+        """Return True if `running` may have to end because `other` was chosen."""
         them, item = self.items[other], self.items[running]
         return them.level < item.level or (them.level == item.level and (them.running or item.past_min_runtime))
 
 
 def pack(problem: PackingProblem, nodes: int = NO_LIMIT) -> Packing:
-    """The best set, or the best that is found in so many steps, at least the heuristic's."""
+    """The best set, or the best found in `nodes` steps: at least the heuristic's."""
     return _BranchAndBound(problem, nodes).run()
 
 
@@ -156,8 +146,7 @@ class _BranchAndBound:
         self.problem = problem
         self.limit = nodes
         items = problem.items
-        # These stay wherever they fit, so there is nothing to decide about them. Others that run have to be
-        # decided by rank, and the set as a whole is checked.
+        # These stay wherever they fit. Other running items are decided by rank, and the whole set is checked.
         self.always_kept = [
             item.in_min_runtime and not nogoods for item, nogoods in zip(items, problem.nogoods, strict=True)
         ]
@@ -185,9 +174,9 @@ class _BranchAndBound:
     def _descend(
         self, todo: list[tuple[list[int], int, int, int]], open_: list[int], chosen: int, value: int, preemptions: int
     ) -> bool:
-        """Takes whatever comes first, down to a complete set; what else might be done is put on `todo`.
+        """Take the first items down to a complete set; alternatives go to `todo`. `open_` are allowed beside `chosen`.
 
-        `open_` are allowed beside `chosen`. True: the limit left something unseen."""
+        True: the limit left sets unseen."""
         problem, masks, worth = self.problem, self.problem.masks, self.problem.worth
         while open_:
             self.nodes += 1
@@ -215,7 +204,7 @@ class _BranchAndBound:
         return False
 
     def _in_the_way(self, head: int, taken: int, tail: list[int]) -> bool:
-        """Whether a veto on `head` can still bite, if all that are open were taken as well."""
+        """Return True if a veto on `head` could apply if all open items were taken."""
         nogoods = self.problem.nogoods[head]
         if not nogoods:
             return False

@@ -1,42 +1,39 @@
-"""Strategy `priority`: the paper's heuristic, with votes that take their time.
+"""Strategy `priority`: the paper's heuristic, with asynchronous votes.
 
 A pass:
 
-1. Take the changes since the last pass: RCs freed, joined or lost, votes that came or fell.
-2. Collect the ARCs to check: the ready ones, and the first watcher of each RC that was freed.
+1. Take the changes since the last pass: RCs freed, joined or lost, new and invalidated votes.
+2. Collect the ARCs to check: the ready ones, and the first watcher of each freed RC.
 3. Check them in rank order (`AdmissionCheck`). For each, `a`:
-   a. An RC of `a` is absent, or held by one that is not preempted for `a`: `a` waits.
-   b. Every sharable RC that `a` needs must accept `a` beside all who would still hold it if the exclusive
-      victims (who hold an exclusive RC that `a` needs) and the preemptible sharers (who hold a sharable RC
-      that `a` needs) were gone. Otherwise `a` waits, and nothing is preempted.
+   a. An RC of `a` is absent, or its holder is not preempted for `a`: `a` waits.
+   b. Every sharable RC that `a` needs must accept `a` beside its holders without the exclusive victims (of exclusive
+    RCs of `a`) and the preemptible sharers (of sharable RCs of `a`). Otherwise `a` waits, and nothing is preempted.
    c. Reprieve: preemptible sharers stay, in rank order, as long as the votes allow; others are preempted.
    d. `a` starts.
-4. Index `a` by what it waits for, or preempt its victims and start it; ARCs that this concerns are checked.
+4. Index `a` by its obstacle, or preempt its victims and start it; check the ARCs that this affects.
 
-A vote that is not known yet leaves a check undecided. What an undecided check would take or free is *off
-limits* for lower ranks, and so is what a check stopped by that would take or free; all others go on.
+An unknown vote leaves a check undecided. The RCs that an undecided check would take or free are *off limits* for lower
+ranks, and so are those of a check that this stops; all others continue.
 
-**Why a pass can be run again at any time.** What a lower rank takes never makes a higher one possible (a lower rank
-only preempts holders that would have been preempted for the higher one as well, and votes are monotone). So an answer
-that arrives simply runs the next pass, and the outcome is that of votes given on the spot.
+**Why a pass can run again at any time.** An RC taken by a lower rank never makes a higher rank possible (a lower rank
+only preempts holders that the higher one would preempt too, and votes are monotone). So an answer runs the next pass,
+and the outcome is the same as with immediate votes.
 
-**Why the index may pass ARCs over** (`QueueIndex`). The outcome is that of a pass over the whole queue, because one is
-passed over only where its check would again come to "waits", stopping nobody and asking nothing:
+**Why the index may skip ARCs** (`QueueIndex`). The outcome is the same as for a pass over the whole queue, because an
+ARC is skipped only where its check would again end in "waits", stopping no other and asking nothing:
 
-- It is WATCHING an RC outside what is off limits. (a) An absent RC: until it joins. (b) An exclusive RC whose holder is
-  not preempted for it: until that holder goes or passes its minimum runtime. Who takes the RC instead ranks above all
-  that still watch it below, so it is not preempted for them either: after the first watcher that takes the RC, the
-  others need no check. (c) A sharable RC that vetoed it beside the holders that are not preempted: until one of them
-  goes or passes its minimum runtime, or the RC's rules change; more holders leave a veto in force, because what an RC
-  accepts it accepts of every subset. (d) An RC that is reserved for another (`reservations.py`): until its reservations
-  change. When the RC becomes off limits, its watchers below are checked.
-- It is PARKED before an RC that does not answer. Its check reads nothing outside its footprint; it is checked
-  when anything within changes, is answered or becomes off limits, and when that RC may be asked again.
-- It is VOTING or DEFERRED, but nothing within its footprint has changed: if what it would take is off limits
-  and what masks its obstacles still is, or it waits for the same votes as before.
+- WATCHING an RC that is not off limits. (a) Absent: until it joins. (b) Exclusive, its holder not preempted: until the
+  holder ends or passes its minimum runtime. A watcher that takes the RC outranks all watchers below it, so they need no
+  check. (c) Sharable, vetoed beside the holders that are not preempted: until one of them ends or passes its minimum
+  runtime, or the RC's rules change; more holders leave a veto in force, because an RC that accepts a set accepts each
+  subset. (d) Reserved for another (`reservations.py`): until its reservations change. When the RC becomes off limits,
+  its watchers below are checked.
+- PARKED before an RC that does not answer. Its check reads nothing outside its footprint; it is checked when anything
+  within changes, is answered or becomes off limits, and when the RC may be asked again.
+- VOTING or DEFERRED without changes in its footprint: its RCs and the mask of its obstacles are still off limits, or it
+  waits for the same votes as before.
 
-An ARC with patterns is always checked, unless an RC that it names keeps it out.
-"""
+An ARC with patterns is always checked, unless an RC that it names keeps it out."""
 
 from __future__ import annotations
 
@@ -58,28 +55,22 @@ from zscout.types import ArcId, Need, RcName
 
 @dataclass(frozen=True, slots=True)
 class VotesNeeded:
-    """The check can't be decided before these proposals are answered."""
-
     proposals: list[tuple[Rc, HolderSet]]
 
 
 @dataclass(frozen=True, slots=True)
 class Admissible:
-    """The ARC may start once these are preempted."""
-
     victims: list[Arc]
 
 
 class AdmissionCheck:
-    """The holders in the way of a queued ARC, the RCs that it would take and free, how the RCs vote."""
+    """The obstacles of a queued ARC, its footprint, and the votes on it."""
 
     def __init__(self, state: SchedulerState, arc: Arc) -> None:
         self.state, self.arc = state, arc
         self.votes, self.now = state.votes, state.now
         self.non_preemptible: list[tuple[Rc, Arc]] = []
-        """Exclusive RCs that it needs, with holders that are not preempted for it."""
-        self.exclusive_victims: dict[ArcId, Arc] = {}
-        """Holders of exclusive RCs that it needs, preemptible for it: they end if it starts."""
+        self.exclusive_victims: dict[ArcId, Arc] = {}  # preemptible holders of its exclusive RCs: they end if it starts
         self._sharables: list[Rc] = []
         for rc in arc.rcs:
             if rc.sharable:
@@ -92,17 +83,16 @@ class AdmissionCheck:
                     self.non_preemptible.append((rc, holder))
 
     def footprint(self) -> int:
-        """All that the ARC would take or free, as bits."""
         return union(arc.mask for arc in (self.arc, *self.exclusive_victims.values(), *self._preemptible_sharers()))
 
     def obstacle(self, off_limits: int) -> Inadmissible | None:
-        """An RC that keeps the ARC out by itself, whatever becomes of the RCs `off_limits`; None if there is none. Of
-        several that are held, one that is likely to stay held for long: that saves checks."""
+        """An RC that keeps the ARC out by itself, apart from RCs `off_limits`. Prefers a hold likely to last: that
+        saves checks."""
         for rc in self.arc.rcs:
             if not rc.present:
                 absent = [rc for rc in self.arc.rcs if not rc.present]
                 why = rc.absence if len(absent) == 1 else absences(absent)
-                return Inadmissible(rc, of_rcs(ReasonCode.ABSENT, [one.name for one in absent], why))
+                return Inadmissible(rc, of_rcs(ReasonCode.ABSENT, [rc.name for rc in absent], why))
         lasting: tuple[int, float, int] | None = None
         for number, (rc, holder) in enumerate(self.non_preemptible):
             if not off_limits or not rc.bit & off_limits:
@@ -116,15 +106,15 @@ class AdmissionCheck:
         return None
 
     def _held(self) -> Reason:
-        """That it waits for holders who are not preempted: of an RC that it names, of all choices for a pattern."""
+        """The holders in its way: of a named RC, or of all choices for a pattern."""
         arc, number = self.arc, len(self.non_preemptible)
         if not arc.patterns:
             shown = self.non_preemptible[:SHOWN]
             rcs, parties = tuple(rc.name for rc, _ in shown), tuple(holder.blocks(arc) for _, holder in shown)
             return Reason(ReasonCode.HELD, rcs, parties, self._preferred(), number)
         bound = {rc: need for need, rc in arc.bound.items()}
-        told = [(rc, holder, "") for rc, holder in self.non_preemptible if rc.name not in bound]
-        known = {rc.bit for rc, _, _ in told}
+        held = [(rc, holder, "") for rc, holder in self.non_preemptible if rc.name not in bound]
+        known = {rc.bit for rc, _, _ in held}
         for rc, _ in self.non_preemptible:
             if rc.bit in known:  # two patterns may have the same choices
                 continue
@@ -132,19 +122,19 @@ class AdmissionCheck:
             for choice in sorted(self.state.matching(need), key=attrgetter("name")):
                 if choice.present and not choice.sharable and not choice.bit & (union(known) | arc.named_mask):
                     known.add(choice.bit)
-                    told += [(choice, one, need) for one in choice.non_preemptible_holders(arc, self.now)[:1]]
-        first = told[:SHOWN_CHOICES]
+                    held += [(choice, holder, need) for holder in choice.non_preemptible_holders(arc, self.now)[:1]]
+        first = held[:SHOWN_CHOICES]
         return Reason(
             ReasonCode.HELD,
             tuple(rc.name for rc, _, _ in first),
             tuple(holder.blocks(arc) for _, holder, _ in first),
             self._preferred(),
-            len(told),
+            len(held),
             patterns=tuple(need for _, _, need in first),
         )
 
     def _preferred(self) -> str:
-        """The group that goes before its own by fair shares, if one of them is in its way for that."""
+        """The group preferred by fair shares, if one of its holders is in the way for that."""
         shares = self.state.shares
         return "" if shares is None else shares.preferred(self.arc, (holder for _, holder in self.non_preemptible))
 
@@ -154,7 +144,7 @@ class AdmissionCheck:
         return union(rc.bit for rc, _ in self.non_preemptible) | union(vetoing)
 
     def decide(self) -> Inadmissible | VotesNeeded | Admissible:
-        """Steps 3b and 3c, with the votes that are known. Only for a check without an obstacle."""
+        """Steps 3b and 3c with the known votes, for a check without an obstacle."""
         kept = {rc.name: self._with_non_preemptible(rc) for rc in self._sharables}
         verdict = self._votes_on([(rc, kept[rc.name]) for rc in self._sharables])
         if verdict is not None:
@@ -191,8 +181,7 @@ class AdmissionCheck:
         return Inadmissible(rc, Reason(ReasonCode.VETOED, (rc.name,), parties, answer.reason, len(beside)))
 
     def refusing(self, pattern: Need) -> tuple[RcName, ...]:
-        """The RCs among the choices for a pattern of the ARC that are known to refuse it, the one that it is bound to
-        first."""
+        """The choices for a pattern that are known to refuse the ARC, the bound RC first."""
         bound = self.arc.bound[pattern]
         found = [bound]
         for rc in self.state.matching(pattern):
@@ -202,15 +191,12 @@ class AdmissionCheck:
         return tuple(found[:SHOWN_CHOICES])
 
     def _answer(self, rc: Rc) -> Answer | None:
-        """What `rc` votes on the ARC beside its holders that are not preempted for it."""
         return self.votes.known(rc.name, self._with_non_preemptible(rc))
 
     def _with_non_preemptible(self, rc: Rc) -> HolderSet:
-        """The ARC and the holders of `rc` that are not preempted for it."""
         return frozenset((*(holder.id for holder in rc.non_preemptible_holders(self.arc, self.now)), self.arc.id))
 
     def _preemptible_sharers(self) -> list[Arc]:
-        """In rank order, the holders of its sharable RCs that may be preempted for it."""
         found = {
             holder.id: holder
             for rc in self._sharables
@@ -233,17 +219,13 @@ class AdmissionCheck:
 
 VOTING: Final = Reason(ReasonCode.VOTING)
 MAX_BINDINGS: Final = 16
-"""Bindings that one check tries."""
 MAX_REPORTED: Final = 4
-"""To how many of an RC's watchers a new holder is reported; for the others `Core.arc` has it. In a long queue every
-grant would else be reported to every ARC."""
+"""Watchers of an RC that learn of a new holder (the others by `Core.arc`): bounds the reports in a long queue."""
 
 _Verdict: TypeAlias = Inadmissible | VotesNeeded | Admissible | RcQuota | Literal["off limits", "over quota"]
 
 
 class Priority(Strategy):
-    """The strategy, on its own."""
-
     name: StrategyName = "priority"
 
     def run_pass(self, state: SchedulerState, actions: Actions) -> None:
@@ -253,18 +235,18 @@ class Priority(Strategy):
 def run_pass(
     state: SchedulerState, actions: Actions, *, off_limits: int = 0, reserved: Reservations | None = None
 ) -> None:
-    """One pass over the queue, as far as something has changed for the queued ARCs.
+    """One pass over the ARCs that changes affect.
 
-    `off_limits`: bits of RCs that another strategy is still deciding about. `reserved`: what is reserved for
-    starving ARCs; the paper's own strategy knows no such thing."""
+    `off_limits`: bits of RCs that another strategy still decides about. `reserved`: reservations for starving ARCs,
+    absent in the paper."""
     Pass(state, actions, reserved).run(state.index.ready.values(), off_limits)
 
 
 def reasons_of_now(state: SchedulerState) -> Iterator[tuple[Arc, Reason]]:
-    """Why those wait who watch an RC that has been taken by another since this was asked last: the best MAX_REPORTED of
-    each such RC. No pass computes that, as most is out of date before anybody reads it."""
-    retold, state.index.retold = state.index.retold & state.index.watched, 0
-    for rc in state.rcs_in(retold):
+    """New reasons of the best MAX_REPORTED watchers of each RC taken since the last call. No pass computes them:
+    most are out of date before they are read."""
+    unreported, state.index.unreported = state.index.unreported & state.index.watched, 0
+    for rc in state.rcs_in(unreported):
         for rank in rc.watchers[:MAX_REPORTED]:
             arc = state.queued[rank[-1]]
             if (obstacle := AdmissionCheck(state, arc).obstacle(0)) is not None:
@@ -272,23 +254,19 @@ def reasons_of_now(state: SchedulerState) -> Iterator[tuple[Arc, Reason]]:
 
 
 class Pass:
-    """Checks in rank order the ready ARCs, and the watchers of RCs that have been freed."""
+    """Checks the ready ARCs and the watchers of freed RCs, in rank order."""
 
     def __init__(self, state: SchedulerState, actions: Actions, reserved: Reservations | None = None) -> None:
         self.state, self.actions, self.reserved = state, actions, reserved
         self.votes, self.index = state.votes, state.index
         self.off_limits = 0
-        self.changed = 0
-        """Bits of the RCs at which something is new since the last pass began."""
+        self.changed = 0  # bits of the RCs changed since the last pass began
         self._heap: list[tuple[Rank, int, Arc, Rc | None]] = []
-        """The next ARCs to check, beside the ready ones; the watchers of an RC one after the other."""
-        self._walked: set[int] = set()
-        """Bits of the RCs whose watchers come."""
-        self._changed_here = 0
-        """Bits of the RCs at which this pass itself has changed something."""
+        """The next ARCs to check, beside the ready ones; each RC has one watcher here."""
+        self._walked: set[int] = set()  # bits of the RCs with a watcher in the heap
+        self._changed_here = 0  # bits of the RCs changed by this pass
 
     def run(self, ready_arcs: Iterable[Arc], off_limits: int = 0) -> None:
-        """Checks `ready_arcs` and whom changes call; `off_limits` are bits of RCs."""
         ready = sorted(ready_arcs, key=attrgetter("rank"))
         self._take_votes()
         self._take_changes(None)
@@ -309,7 +287,7 @@ class Pass:
                     self._check(arc)
             if rc is not None:
                 self._call_next_watcher(rc, last)
-        # Those who were checked before a change further down have not seen it.
+        # ARCs checked before a later change have not seen it.
         self.index.touched |= self._changed_here
 
     def _check(self, arc: Arc) -> None:
@@ -320,7 +298,7 @@ class Pass:
             self._apply(arc, check, self._verdict(arc, check))
 
     def _check_patterns(self, arc: Arc) -> None:
-        """Tries one binding after the other, the best first, until one lets the ARC start or asks votes."""
+        """Try bindings, best first, until the ARC starts or asks votes."""
         without, tried = 0, 0
         best: tuple[Mapping[Need, RcName], _Verdict] | None = None
         while tried < MAX_BINDINGS and bind(self.state, arc, self.reserved, without=without):
@@ -342,13 +320,13 @@ class Pass:
         self._apply(arc, AdmissionCheck(self.state, arc), best[1])
 
     def _blamed(self, arc: Arc, verdict: _Verdict) -> int:
-        """Bits of those RCs of a binding that keep the ARC out, where others might not."""
+        """Bits of the bound RCs that keep the ARC out, where others might not."""
         match verdict:
             case Inadmissible(rc, _, proposal) if proposal is None or rc.name in self.votes.unresponsive:
                 bits = rc.bit
             case "off limits":
                 bits = self.off_limits
-                bits |= union(rc.bit for rc in arc.rcs if any(one.mask & bits for one in rc.holders.values()))
+                bits |= union(rc.bit for rc in arc.rcs if any(holder.mask & bits for holder in rc.holders.values()))
             case VotesNeeded(proposals):
                 bits = sum(rc.bit for rc, _ in proposals if rc.name in self.votes.unresponsive)
             case _:
@@ -356,7 +334,6 @@ class Pass:
         return bits & arc.mask & ~arc.named_mask
 
     def _verdict(self, arc: Arc, check: AdmissionCheck) -> _Verdict:
-        """The outcome of a check in the present state."""
         obstacle = check.obstacle(self.off_limits)
         if obstacle is not None:
             return obstacle
@@ -374,7 +351,7 @@ class Pass:
     def _apply(self, arc: Arc, check: AdmissionCheck, verdict: _Verdict) -> None:
         match verdict:
             case Inadmissible(rc, reason, proposal) if proposal is not None:
-                # An RC that has not answered in time is asked again now and then: no change there would call the ARC.
+                # A silent RC is asked again at times: no change there would queue the check.
                 silent = rc.name in self.votes.unresponsive
                 self.index.put(arc, ArcState.READY)
                 self.actions.wait(arc, reason if silent else VOTING, settled=silent)
@@ -388,13 +365,13 @@ class Pass:
                         self.index.watch(arc, rc)
                     self.actions.wait(arc, reason)
                 else:
-                    # The ARC could do with another RC.
+                    # Another RC could serve the ARC.
                     self.index.put(arc, ArcState.READY)
                     if reason.code is ReasonCode.VETOED:
                         reason = reason._replace(rcs=check.refusing(pattern))
                     self.actions.wait(arc, reason._replace(pattern=pattern))
             case "over quota":
-                # Whoever of its owner's ends may let it go: no RC shows that.
+                # The end of any ARC of its owner may admit it: no RC shows that.
                 self.index.put(arc, ArcState.READY)
                 quota = self.state.policy.max_running_per_host or 0
                 self.actions.wait(arc, Reason(ReasonCode.QUOTA, detail=arc.owner, number=quota))
@@ -405,7 +382,7 @@ class Pass:
                 self._defer(arc, check, ArcState.DEFERRED)
                 self.actions.wait(arc, VOTING, settled=False)
             case VotesNeeded(proposals) if unresponsive := [
-                one for one in proposals if one[0].name in self.votes.unresponsive
+                proposal for proposal in proposals if proposal[0].name in self.votes.unresponsive
             ]:
                 if arc.patterns:
                     self.index.put(arc, ArcState.READY)
@@ -429,14 +406,14 @@ class Pass:
     def _defer(self, arc: Arc, check: AdmissionCheck, state: ArcState) -> None:
         footprint = check.footprint()
         if arc.patterns:
-            # It is checked again whatever happens: another RC may do.
+            # Always checked again: another RC may serve it.
             self.index.put(arc, ArcState.READY)
         else:
             self.index.put(arc, state, footprint, check.masked_obstacles())
         self._put_off_limits(footprint, arc.rank)
 
     def _still_deferred(self, arc: Arc, footprint: int) -> bool:
-        """Whether a check that could not be decided can't be again, seen without repeating it."""
+        """Return True if a repeated check would be undecided again."""
         if footprint & self.changed or arc.masked_obstacles & ~self.off_limits:
             return False
         if arc.state is not ArcState.VOTING and not footprint & self.off_limits:
@@ -445,7 +422,7 @@ class Pass:
         return True
 
     def _put_off_limits(self, footprint: int, rank: Rank | None) -> None:
-        """Puts all of `footprint` off limits for those below `rank`; for all of them without a rank."""
+        """Put `footprint` off limits for ranks below `rank`, or for all (None)."""
         new = footprint & ~self.off_limits
         if new:
             self.off_limits |= new
@@ -462,7 +439,7 @@ class Pass:
         votes.answered.clear()
 
     def _take_changes(self, rank: Rank | None) -> int:
-        """Calls whom the latest changes concern, below `rank`; returns where something changed."""
+        """Queue the ARCs affected by changes, below `rank`; return the changed RCs."""
         index = self.index
         freed, touched = index.freed, index.freed | index.touched
         index.freed = index.touched = 0
@@ -482,7 +459,6 @@ class Pass:
                 heapq.heappush(self._heap, (arc.rank, 0, arc, None))
 
     def _call_next_watcher(self, rc: Rc, rank: Rank | None) -> None:
-        """The next watcher of `rc` below `rank` comes."""
         following = self.state.next_watcher(rc, rank)
         if following is None:
             self._walked.discard(rc.bit)
@@ -490,10 +466,10 @@ class Pass:
             heapq.heappush(self._heap, following)
 
     def _needs_check(self, rc: Rc, arc: Arc) -> bool:
-        """False ends the walk along the watchers of `rc`: it is held again, and nobody from `arc` downwards may preempt
-        its holder. What they wait for now is told later, to who reads it (`reasons_of_now`)."""
+        """Return False to end the walk along the watchers of `rc`: held again, and no watcher from `arc` on may
+        preempt its holder. `reasons_of_now` reports their reasons later."""
         if rc.sharable or rc.bit & self.off_limits or not rc.non_preemptible_holders(arc, self.state.now):
             return True
         self._walked.discard(rc.bit)
-        self.index.retold |= rc.bit
+        self.index.unreported |= rc.bit
         return False

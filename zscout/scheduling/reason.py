@@ -1,4 +1,4 @@
-"""Why an ARC waits, or why a hold or a wait ended: data in effects and messages, text where people read it."""
+"""Reasons for a wait or an end: data in effects and messages, text for people."""
 
 from __future__ import annotations
 
@@ -11,94 +11,81 @@ from zscout.messages import Who
 from zscout.types import ArcId, ClientId, Need, Ns, RcName, clean
 
 ITS_CLIENT: Final = "its client"
-"""In the `detail` of an end: it was its own client's will."""
+"""`detail` of an end by its own client."""
 SHOWN = 3
-"""How many RCs a reason names; it counts the rest."""
+"""RCs that a reason names; the rest are counted."""
 SHOWN_CHOICES = 8
-"""The same where RCs are choices for a pattern."""
+"""The same for choices of a pattern."""
 
 
 class ReasonCode(StrEnum):
     # An ARC waits:
     ABSENT = "absent"
-    """`rcs` are not on the mesh, or can't carry anybody; `detail` says why, as far as that is known."""
+    """`rcs` are not on the mesh or can't carry holders; `detail`: the cause, if known."""
     NO_MATCH = "no_match"
-    """No RC is left for the patterns in `rcs`; `detail` says why RCs that would do are lost."""
+    """No RC is left for the patterns in `rcs`; `detail`: why matching RCs are lost."""
     HELD = "held"
-    """`rcs` are held by `by`, one each, who are not preempted for it; of a pattern all its choices are told. `detail`
-    is the group of one that was preferred by fair shares."""
+    """`rcs` are held by `by`, one each, not preempted for it; for a pattern, all choices. `detail`: the group
+    preferred by fair shares."""
     VETOED = "vetoed"
-    """The RC refuses it beside `by`, who hold it and are not preempted for it; `detail` in the RC's own words."""
+    """The RC refuses it beside its holders `by`, not preempted for it; `detail` in the RC's own words."""
     UNCONFIRMED = "unconfirmed"
-    """`rcs` did not confirm a grant: it is not granted again for a while."""
+    """`rcs` did not confirm a grant: no new grant for a while."""
     CLAIMED = "claimed"
-    """The client `detail` has an ARC of the same place: one of the two may run."""
     SILENT = "silent"
-    """`rcs` do not answer proposals."""
     RESERVED = "reserved"
-    """The RC is reserved for `by`, which has waited too long."""
     BOOKED = "booked"
-    """The RC is booked by `by` before this would be over."""
+    """The RC is booked by `by` before this would end."""
     MAINTENANCE = "maintenance"
-    """The RC is in maintenance, `by` says whose and until when; or will be before this would be over. For that a kept
-    hold ends as well."""
+    """The RC is in maintenance by `by`, or will be before this would end. It also ends kept holds."""
     NOT_YET = "not_yet"
-    """It has taken up a booking, whose time is still to come."""
     QUOTA = "quota"
     """`detail`, its host, has its quota of ARCs running: `number`."""
     RC_QUOTA = "rc_quota"
     """With it `detail`, a name or a group, would hold more RCs than its quota: `number`."""
     VOTING = "voting"
-    """Votes on it, or on one that ranks before it, are out."""
+    """Votes on it or on a higher rank are out."""
     SEARCHING = "searching"
-    """A search for a better schedule is under way."""
     # A hold, or a wait, ended:
     EXPIRED = "expired"
-    """Its minimum runtime is over."""
     LIMIT = "limit"
     """It had the longest time that the fleet gives a hold."""
     PREEMPTED = "preempted"
-    """By `by`."""
     DISPLACED = "displaced"
     """A kept hold past its minimum runtime, by `by`."""
     CANCELLED = "cancelled"
-    """By `detail`."""
     RELEASED = "released"
-    """By `detail`."""
+    """By `detail`, as CANCELLED."""
     CLIENT_LOST = "client_lost"
-    """`detail` says how."""
     HANDED_OVER = "handed_over"
     """To the client `detail`."""
     RC_LOST = "rc_lost"
-    """The RC left; `detail` says why, if that is known."""
+    """The RC left; `detail`: the cause, if known."""
     RC_ENDED = "rc_ended"
-    """The RC ended the hold."""
     SUPERSEDED = "superseded"
-    """At a takeover the RC had a newer holder."""
 
 
 class Party(NamedTuple):
-    """An ARC that is in another's way, or was preferred to it; `str` of it says whose it is."""
+    """An ARC in another's way or preferred to it; `str` names its owner."""
 
     arc: ArcId
     name: str
     priority: int
     who: Who | None = None
     until: Ns | None = None
-    """When it holds no more, or may be preempted for the other, at the latest; None: not known."""
+    """When its hold ends or may be preempted, at the latest; None: unknown."""
 
     def __str__(self) -> str:
         return named(self.who, self.arc.rpartition("/")[0], self.name)
 
     @property
     def comment(self) -> str:
-        """What its user wants others to know, as it ends a sentence."""
+        """What its user wants others to know, as the end of a sentence."""
         return f": {clean(self.who.comment)}" if self.who is not None and self.who.comment else ""
 
 
 def named(who: Who | None, client: ClientId, arc: str) -> str:
-    """Whose ARC that is, for people: `alice@ws1 (survey.py)`; the client and the ARC's name, `ws1/c7 (survey)`, where
-    nobody says more."""
+    """The owner of an ARC, for people: `alice@ws1 (survey.py)`, else client and ARC, `ws1/c7 (survey)`."""
     if who is None or not (who.user or who.command):
         return f"{client} ({arc})" if client else arc
     host = who.host or client.partition("/")[0]
@@ -106,12 +93,12 @@ def named(who: Who | None, client: ClientId, arc: str) -> str:
 
 
 Until = Callable[[Ns], str]
-"""How the end of another's hold is told: `14:32`."""
+"""Formats the end of another's hold: `14:32`."""
 
 
 class Reason(NamedTuple):
-    """A reason; `str` of it is its text. `number` counts `rcs`, of which the first `SHOWN` (with `patterns`
-    `SHOWN_CHOICES`) are named, or is a quota."""
+    """A reason; `str` is its text. `number` is a quota, or counts `rcs`, of which `SHOWN` (`SHOWN_CHOICES` with
+    `patterns`) are named."""
 
     code: ReasonCode
     rcs: tuple[RcName, ...] = ()
@@ -119,16 +106,15 @@ class Reason(NamedTuple):
     detail: str = ""
     number: int = 0
     pattern: Need | None = None
-    """Which pattern of its needs keeps the ARC out; the rest is about one of the RCs that meet it, or with `patterns`
-    about all of them."""
+    """The unmet pattern; the rest is about one RC that matches it, or with `patterns` about all."""
     patterns: tuple[Need, ...] = ()
-    """By each of `rcs` the pattern that it is a choice for, empty where the ARC names it."""
+    """For each of `rcs` the pattern that it is a choice for, empty where named."""
 
     def __str__(self) -> str:
         return self.text()
 
     def text(self, until: Until | None = None) -> str:
-        """In words; with `until` also until when others hold what is waited for."""
+        """In words; with `until` including the ends of others' holds."""
         if self.code is ReasonCode.HELD:
             return _held(self, until)
         if self.code is ReasonCode.VETOED:
@@ -151,7 +137,6 @@ def ended(outcome: str, reason: str) -> str:
 
 
 def of_rcs(code: ReasonCode, rcs: Sequence[RcName], detail: str = "") -> Reason:
-    """A reason that concerns all of `rcs`."""
     return Reason(code, tuple(rcs[:SHOWN]), number=len(rcs), detail=detail)
 
 
@@ -171,7 +156,7 @@ def _vetoed(reason: Reason, until: Until | None) -> str:
 
 
 def short_names(rcs: Iterable[RcName]) -> Iterator[RcName]:
-    """RCs in a row: a kind is not said twice."""
+    """RCs in a row, without repeating a kind."""
     last = ""
     for rc in rcs:
         kind = rc.partition("/")[0] + "/"
@@ -180,21 +165,23 @@ def short_names(rcs: Iterable[RcName]) -> Iterator[RcName]:
 
 
 def _held(reason: Reason, until: Until | None) -> str:
-    """Who holds what is waited for: first those in the way of what the ARC names, then for each pattern its choices."""
+    """Holders in the way: of the named RCs, then of each pattern's choices."""
     patterns = reason.patterns or ("",) * len(reason.rcs)
     held = list(zip(reason.rcs, reason.by, patterns, strict=False))
     parts = []
     for party in dict.fromkeys(party for _, party, pattern in held if not pattern):
-        rcs = ", ".join(rc for rc, one, pattern in held if not pattern and one == party)
+        rcs = ", ".join(rc for rc, holder, pattern in held if not pattern and holder == party)
         parts.append(f"{party}: {rcs}{_last(party, until)}")
-    for pattern, group in groupby((one for one in held if one[2]), key=lambda one: one[2]):
+    for pattern, group in groupby((choice for choice in held if choice[2]), key=lambda choice: choice[2]):
         choices = list(group)
         if len(choices) == 1 and reason.number <= len(held):
             rc, party, _ = choices[0]
             parts.append(f"{party}: {rc} for {pattern}{_last(party, until)}")
             continue
         names = short_names(rc for rc, _, _ in choices)
-        shown = [f"{rc} (held by {one[1]}{_last(one[1], until)})" for rc, one in zip(names, choices, strict=True)]
+        shown = [
+            f"{rc} (held by {choice[1]}{_last(choice[1], until)})" for rc, choice in zip(names, choices, strict=True)
+        ]
         parts.append(f"one of {', '.join(shown)}")
     more = f" and {reason.number - len(held)} more" if reason.number > len(held) else ""
     preferred = f"; by fair shares {reason.detail} goes first" if reason.detail else ""
@@ -211,36 +198,36 @@ def _because(reason: Reason) -> str:
 
 
 _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
-    ReasonCode.ABSENT: lambda one: (
-        f"{one.rcs[0]} is lost: {one.detail}"
-        if one.detail and one.number == 1
-        else f"{_listed(one)} not on the mesh{_because(one)}"
+    ReasonCode.ABSENT: lambda why: (
+        f"{why.rcs[0]} is lost: {why.detail}"
+        if why.detail and why.number == 1
+        else f"{_listed(why)} not on the mesh{_because(why)}"
     ),
-    ReasonCode.NO_MATCH: lambda one: f"no RC on the mesh is left for {_listed(one)}{_because(one)}",
-    ReasonCode.SILENT: lambda one: f"{_listed(one)} does not answer",
-    ReasonCode.UNCONFIRMED: lambda one: f"{_listed(one)} did not confirm the grant",
-    ReasonCode.CLAIMED: lambda one: f"{one.detail} claims it as well",
-    ReasonCode.RESERVED: lambda one: (
-        f"{one.rcs[0]} is kept for {one.by[0]}, whose time to wait is over before this ends"
+    ReasonCode.NO_MATCH: lambda why: f"no RC on the mesh is left for {_listed(why)}{_because(why)}",
+    ReasonCode.SILENT: lambda why: f"{_listed(why)} does not answer",
+    ReasonCode.UNCONFIRMED: lambda why: f"{_listed(why)} did not confirm the grant",
+    ReasonCode.CLAIMED: lambda why: f"{why.detail} claims it as well",
+    ReasonCode.RESERVED: lambda why: (
+        f"{why.rcs[0]} is kept for {why.by[0]}, whose time to wait is over before this ends"
     ),
-    ReasonCode.BOOKED: lambda one: f"{one.rcs[0]} is booked by {one.by[0]} before this would be over",
-    ReasonCode.MAINTENANCE: lambda one: f"maintenance of {one.rcs[0]} by {one.by[0]}",
+    ReasonCode.BOOKED: lambda why: f"{why.rcs[0]} is booked by {why.by[0]} before this would be over",
+    ReasonCode.MAINTENANCE: lambda why: f"maintenance of {why.rcs[0]} by {why.by[0]}",
     ReasonCode.NOT_YET: lambda _: "the time of its booking is still to come",
-    ReasonCode.QUOTA: lambda one: f"host {one.detail} has {one.number} ARCs running, its quota",
-    ReasonCode.RC_QUOTA: lambda one: f"{one.detail} may hold {one.number} RCs at one time",
+    ReasonCode.QUOTA: lambda why: f"host {why.detail} has {why.number} ARCs running, its quota",
+    ReasonCode.RC_QUOTA: lambda why: f"{why.detail} may hold {why.number} RCs at one time",
     ReasonCode.VOTING: lambda _: "votes are out",
     ReasonCode.SEARCHING: lambda _: "a better schedule is sought",
     ReasonCode.EXPIRED: lambda _: "its minimum runtime is over",
     ReasonCode.LIMIT: lambda _: "it had the longest time that this fleet gives a hold (max_runtime)",
-    ReasonCode.PREEMPTED: lambda one: f"preempted by {one.by[0]}, priority {one.by[0].priority}{one.by[0].comment}",
-    ReasonCode.DISPLACED: lambda one: (
-        f"its minimum runtime is over and {one.by[0]}, priority {one.by[0].priority}, needs its RCs{one.by[0].comment}"
+    ReasonCode.PREEMPTED: lambda why: f"preempted by {why.by[0]}, priority {why.by[0].priority}{why.by[0].comment}",
+    ReasonCode.DISPLACED: lambda why: (
+        f"its minimum runtime is over and {why.by[0]}, priority {why.by[0].priority}, needs its RCs{why.by[0].comment}"
     ),
-    ReasonCode.CANCELLED: lambda one: f"cancelled by {one.detail}",
-    ReasonCode.RELEASED: lambda one: f"released by {one.detail}",
-    ReasonCode.CLIENT_LOST: lambda one: one.detail,
-    ReasonCode.HANDED_OVER: lambda one: f"handed over to {one.detail}",
-    ReasonCode.RC_LOST: lambda one: f"{one.rcs[0]} was lost" + (f": {one.detail}" if one.detail else ""),
-    ReasonCode.RC_ENDED: lambda one: f"{one.rcs[0]} ended the hold",
-    ReasonCode.SUPERSEDED: lambda one: f"{one.rcs[0]} has a newer holder",
+    ReasonCode.CANCELLED: lambda why: f"cancelled by {why.detail}",
+    ReasonCode.RELEASED: lambda why: f"released by {why.detail}",
+    ReasonCode.CLIENT_LOST: lambda why: why.detail,
+    ReasonCode.HANDED_OVER: lambda why: f"handed over to {why.detail}",
+    ReasonCode.RC_LOST: lambda why: f"{why.rcs[0]} was lost" + (f": {why.detail}" if why.detail else ""),
+    ReasonCode.RC_ENDED: lambda why: f"{why.rcs[0]} ended the hold",
+    ReasonCode.SUPERSEDED: lambda why: f"{why.rcs[0]} has a newer holder",
 }

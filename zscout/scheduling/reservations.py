@@ -1,23 +1,21 @@
-"""Bounded waiting: once an ARC has waited for the fleet's patience it is *due*, and nobody may pass it.
+"""Bounded waiting: once an ARC has waited for the fleet's patience it is *due*, and no other may pass it.
 
-Shortest-first starves, and so does the larger set of ARCs where it is preferred to a smaller one. The remedy is that of
-batch schedulers, reservation with conservative backfill (Mu'alem and Feitelson, IEEE TPDS 12(6), 2001), on distinct RCs
-instead of many equal processors, and with a date: what is reserved is the time from which the ARC is due, so that no
-ARC is held back that would be over by then. Minimum runtimes are exact, so reservations are.
+Shortest-first starves, and so do larger sets of ARCs. The remedy is reservation with conservative backfill (Mu'alem and
+Feitelson, IEEE TPDS 12(6), 2001), on distinct RCs instead of equal processors, and from the time at which the ARC is
+due: an ARC that would end before is not held back. Minimum runtimes are exact, so reservations are.
 
-From half its patience on, an ARC is *starving*. In the order of priority, then of waiting, each starving ARC is given
-the earliest time, from when it is due, at which its RCs are free of the holders that are not preempted for it, and of
-the ARCs that were starving before it. An ARC of equal or lower priority that shares an RC with it may start only if it
-is over by then, or if the RC is sharable and accepts it beside everyone concerned.
+From half its patience on, an ARC is *starving*. By priority, then waiting time, each starving ARC gets the earliest
+time, from when it is due, at which its RCs are free of holders that are not preempted for it and of earlier starving
+ARCs. An ARC of equal or lower priority on these RCs may start only if it ends by then, or if the RC is sharable and
+accepts it beside all concerned.
 
-A booking is reserved its RCs for its own time, likewise. Promises to equals are kept in the order in which they were
-made: a booking that was there when an ARC began to starve is gone round, and one that was made later is not seen.
-Maintenance stands before all promises to who has no higher priority, and while it lasts before all.
+A booking reserves its RCs for its own time. Promises to equals are kept in the order in which they were made: starving
+ARCs avoid older bookings and ignore newer ones. Maintenance precedes all promises except to higher priorities, and all
+while it lasts.
 
-With fair shares an ARC whose group had more than another that waits counts as queued later (`Arc.late`).
+With fair shares an ARC whose group had more than another waiting group counts as queued later (`Arc.late`).
 
-`docs/scheduling.md` states the promise that follows, and what else was tried.
-"""
+`docs/scheduling.md` states the resulting promise, and the alternatives tried."""
 
 from __future__ import annotations
 
@@ -35,57 +33,51 @@ from zscout.scheduling.votes import HolderSet
 from zscout.types import Ns
 
 MAX_STARVING: Final = 16
-"""ARCs that have reservations at one time; those that starve after them follow as these start."""
+"""ARCs with reservations at one time; later starving ARCs follow as these start."""
 
 
 Order: TypeAlias = tuple[bool, int, Ns, str]
-"""Sorts promises, the first first: maintenance before all, then by band of priorities (negated), when they were made,
-and id."""
+"""Sort key of promises: maintenance first, then band of priorities (negated), when made, id."""
 
 
 class Reservation(NamedTuple):
-    """An RC is reserved for `arc` from `start` on."""
-
     arc: Arc
     start: Ns
     order: Order
     booked: Ns | None = None
-    """When that is over, if it is booked."""
+    """The end, if it is booked."""
 
     @property
     def excludes(self) -> bool:
-        """Whether it is maintenance, beside which the RC has no other holder."""
+        """Maintenance: the RC has no other holder."""
         return not self.order[0]
 
     def over(self) -> Ns:
-        """When it is over if it is as long as it has to be."""
         return self.arc.ends(self.start) if self.booked is None else self.booked
 
 
 class Inadmissible(NamedTuple):
-    """`rc` keeps an ARC out as long as its situation is this, or until the vote on `proposal` says otherwise."""
+    """`rc` keeps an ARC out while this lasts, or until the vote on `proposal` changes it."""
 
     rc: Rc
     reason: Reason
     proposal: HolderSet | None = None
     early: bool = False
-    """Its own time, which is reserved, may let it start without any change at the RC."""
+    """The ARC's own reserved time may let it start without a change at the RC."""
 
 
 def order_of(state: SchedulerState, booking: Booking) -> Order:
-    """Where a booking stands among the promises."""
     return not booking.maintenance, -state.band(booking.priority), booking.since, booking.id
 
 
 def yields(holder: Arc, other: Arc, time: Ns) -> bool:
-    """Whether a hold is over at some time, or gives way to an ARC that comes then."""
+    """Return True if a hold is over at some time, or yields to an ARC that comes then."""
     return holder.known_end(other) <= time or holder.preemptible_by(other, time)
 
 
 def reservations(state: SchedulerState, patience: Ns | None, last: Reservations | None) -> Reservations:
-    """What is reserved now: the `last` that was found, if nothing has changed that it depends on.
-
-    Passing time alone does not change the RCs or their order; for an ARC already due no backfill is possible."""
+    """The present reservations: `last` if nothing has changed that it depends on. Passing time alone does not change
+    RCs or order; for a due ARC no backfill is possible."""
     if patience is not None:
         state.index.mark_starving(state.now - patience // 2, state.queued)
     if last is not None and last.made_of == _versions(state):
@@ -98,36 +90,30 @@ def _versions(state: SchedulerState) -> tuple[int, ...]:
 
 
 def _booked_versions(state: SchedulerState) -> tuple[int, ...]:
-    # A booking whose time has come is kept for as long only as all that it needs is there.
+    # After its date a booking is kept only while all its RCs are present.
     begun = state.begun
     return state.claims_version, begun, state.present if begun else 0
 
 
 class Reservations:
-    """What is reserved for whom: for those starving, and for bookings."""
-
     def __init__(self, state: SchedulerState, patience: Ns | None, last: Reservations | None = None) -> None:
-        """Without a patience nobody starves. What is booked is taken from the `last` if it has not changed."""
+        """Without a patience no ARC starves. Bookings are copied from `last` if unchanged."""
         self._state, self._votes, self._patience = state, state.votes, patience
         self.made_of = _versions(state)
         self._booked_of = _booked_versions(state)
         known = last is not None and last._booked_of == self._booked_of
         self._booked: dict[int, list[Reservation]] = last._booked if last is not None and known else self._all_booked()
-        self.by_rc: dict[int, list[Reservation]] = dict(self._booked)
-        """By bit of the RC, in their order."""
-        self._free: dict[int, Ns] = {}
-        """By bit: when the earlier reservations of the RC end."""
-        self.starts: list[Ns] = []
-        """The times that are reserved for those starving."""
+        self.by_rc: dict[int, list[Reservation]] = dict(self._booked)  # by bit of the RC, in their order
+        self._free: dict[int, Ns] = {}  # by bit: the end of earlier reservations
+        self.starts: list[Ns] = []  # reserved times of starving ARCs
         for priority, since, arc in state.index.starving[:MAX_STARVING]:
             if state.queued[arc].claim is None:
                 self._reserve(state.queued[arc], (True, priority, since + (patience or 0) // 2, arc))
         self.bits = union(self.by_rc)
-        """RCs with reservations."""
 
     def _all_booked(self) -> dict[int, list[Reservation]]:
-        """What is booked is reserved while it is held as well: it may be preempted in this very pass. Once its time has
-        come, what is left of a booking is not kept while some of it is away."""
+        """Bookings are reserved while held too: this pass may preempt them. After its date an incomplete booking is
+        not kept."""
         state, found = self._state, dict[int, list[Reservation]]()
         for claim in state.claims.values():
             booking = claim.booking
@@ -142,33 +128,32 @@ class Reservations:
         return found
 
     def booked_changed(self, earlier: Reservations) -> int:
-        """Bits of the RCs at which other things are booked than in `earlier` ones."""
+        """Bits of the RCs with other bookings than in `earlier`."""
         return 0 if self._booked is earlier._booked else _changed(self._booked, earlier._booked)
 
     def horizon(self, rc: Rc) -> float:
-        """Until when what is held, or reserved for the starving, may be in the way at an RC."""
+        """The latest time at which present holds or starving ARCs may block an RC."""
         if not rc.present:
             return math.inf
         ends = (holder.known_end() for holder in rc.holders.values())
-        starving = (one.over() for one in self.by_rc.get(rc.bit, ()) if one.booked is None)
+        starving = (promise.over() for promise in self.by_rc.get(rc.bit, ()) if promise.booked is None)
         return max((*ends, *starving), default=0)
 
     def before(self, rc: Rc, order: Order) -> list[Reservation]:
-        """The reservations of `rc` that go before one in this `order`."""
         reserved = self.by_rc.get(rc.bit, [])
         return reserved[: bisect_left(reserved, order, key=attrgetter("order"))]
 
     def _beside_bookings(self, arc: Arc, rcs: list[Rc], start: Ns, order: Order) -> Ns:
-        """From `start` on, the earliest time from which `arc` finds nothing booked for as long as it needs."""
+        """The earliest time from `start` at which `arc` meets no booking."""
         end = arc.ends(start)
         for rc in rcs:
-            for one in self.before(rc, order):
-                if one.booked is None or one.booked <= start or one.start >= end:
+            for promise in self.before(rc, order):
+                if promise.booked is None or promise.booked <= start or promise.start >= end:
                     continue
-                beside = rc.sharable and not one.excludes
-                if not (beside and self._votes.accepts(rc.name, frozenset((one.arc.id, arc.id)))):
-                    # Each is passed once: time goes forward only.
-                    return self._beside_bookings(arc, rcs, one.booked, order)
+                beside = rc.sharable and not promise.excludes
+                if not (beside and self._votes.accepts(rc.name, frozenset((promise.arc.id, arc.id)))):
+                    # Each booking is passed once, as time only increases.
+                    return self._beside_bookings(arc, rcs, promise.booked, order)
         return start
 
     def _reserve(self, arc: Arc, order: Order) -> None:
@@ -182,14 +167,13 @@ class Reservations:
         reservation = Reservation(arc, start, order)
         self.starts.append(start)
         for rc in rcs:
-            # A list of its own: that of what is booked is shared with the next reservations.
+            # A copy: the next reservations share the list of bookings.
             self.by_rc[rc.bit] = list(self.by_rc.get(rc.bit, ()))
             insort(self.by_rc[rc.bit], reservation, key=attrgetter("order"))
             self._free[rc.bit] = max(self._free.get(rc.bit, 0), arc.ends(start))
 
     def _rcs(self, arc: Arc, order: Order) -> list[Rc]:
-        """The RCs to reserve. For each pattern the matching RC that is free earliest; an absent placeholder
-        RC if none is left."""
+        """The RCs to reserve: for each pattern the match that is free first; an absent placeholder if none is left."""
         rcs = list(self._state.rcs_in(arc.named_mask)) if arc.patterns else list(arc.rcs)
         for need in arc.patterns:
             matching = self._state.matching(need)
@@ -198,25 +182,24 @@ class Reservations:
         return rcs
 
     def _within_quota(self, arc: Arc) -> float:
-        """When its owner has room for `arc`."""
         state, ends = self._state, [float(self._state.now)]
         if state.quota_left(arc) == 0:
-            ends.append(min(one.known_end() for one in state.running.values() if one.owner == arc.owner))
+            ends.append(min(other.known_end() for other in state.running.values() if other.owner == arc.owner))
         for quota in state.policy.rc_quotas.get(arc.owner, ()):
-            running = [one for one in state.running.values() if one.owner in quota.owners]
-            held = sum(len(one.rcs) for one in running)
-            for one in sorted(running, key=lambda one: one.known_end()):
+            running = [other for other in state.running.values() if other.owner in quota.owners]
+            held = sum(len(other.rcs) for other in running)
+            for other in sorted(running, key=lambda other: other.known_end()):
                 if held + len(arc.request.needs) <= quota.rcs:
                     break
-                ends.append(one.known_end())
-                held -= len(one.rcs)
+                ends.append(other.known_end())
+                held -= len(other.rcs)
         return max(ends)
 
     def _free_from(self, rc: Rc, arc: Arc, order: Order) -> float:
-        """When `rc` has room for `arc` at the latest; infinite where that is not known."""
+        """When `rc` has room for `arc` at the latest; infinite if unknown."""
         non_preemptible = rc.non_preemptible_holders(arc, self._state.now)
         if rc.sharable:
-            sharing = (one.arc.id for one in self.before(rc, order) if not one.excludes)
+            sharing = (promise.arc.id for promise in self.before(rc, order) if not promise.excludes)
             if self._votes.accepts(rc.name, frozenset((*(holder.id for holder in non_preemptible), *sharing, arc.id))):
                 return self._state.now
             alone = self._votes.known(rc.name, frozenset((arc.id,)))
@@ -225,18 +208,17 @@ class Reservations:
         return max((self._free.get(rc.bit, self._state.now), *(holder.known_end(arc) for holder in non_preemptible)))
 
     def due(self, arc: Arc) -> Ns:
-        """When its patience is over."""
         return arc.since + arc.late + (self._patience or 0)
 
     def goes_first(self, arc: Arc) -> bool:
-        """Whether `arc` goes before its equals that could start as well. A sharable RC may accept each
-        backfilled ARC alone but not all together, so a due ARC goes first there."""
+        """Return True if `arc` precedes its equals. A sharable RC may accept each backfilled ARC alone but not all
+        together, so a due ARC goes first there."""
         state = self._state
         due = arc.claim is not None or (arc.starving and self.due(arc) <= state.now)
         return due and bool(arc.mask & state.sharable)
 
     def conflict(self, arc: Arc) -> Inadmissible | None:
-        """What `arc` would be in the way of if it started now."""
+        """The reservation that `arc` would delay if it started now."""
         if not arc.mask & self.bits:
             return None
         for rc in self._state.rcs_in(arc.mask & self.bits):
@@ -265,43 +247,49 @@ class Reservations:
         return None
 
     def _binding(self, rc: Rc, arc: Arc) -> tuple[list[Reservation], bool]:
-        """The reservations of `rc` that `arc` has to respect: those before its own, and all that is booked as long as
-        its own time has not come. It would be early, which nobody has promised it: whether any of these is there."""
+        """The reservations of `rc` that bind `arc`: those before its own and, until its own time, all bookings; and
+        whether any of these would let it start early."""
         reserved = self.by_rc.get(rc.bit, [])
-        own = next((number for number, one in enumerate(reserved) if one.arc is arc), len(reserved))
+        own = next((number for number, promise in enumerate(reserved) if promise.arc is arc), len(reserved))
         if own == len(reserved) or reserved[own].start <= self._state.now:
             return reserved[:own], False
-        later = [one for one in reserved[own + 1 :] if one.booked is not None]
+        later = [promise for promise in reserved[own + 1 :] if promise.booked is not None]
         return [*reserved[:own], *later], bool(later)
 
     def _together(self, rc: Rc, arc: Arc, before: list[Reservation]) -> list[HolderSet]:
-        """Whom `rc` would have to carry beside `arc`, from now on: each time when another comes. Who gives way to that
-        one is not in its way."""
-        if all(one.booked is None for one in before):
-            return [frozenset((*rc.holders, arc.id, *(one.arc.id for one in before)))]
+        """The holder sets beside `arc`, from now on: at each arrival, without the holders that yield to it."""
+        if all(promise.booked is None for promise in before):
+            return [frozenset((*rc.holders, arc.id, *(promise.arc.id for promise in before)))]
         now = self._state.now
         sets = []
-        for time in sorted({now, *(one.start for one in before if one.start > now)}):
-            there = [one for one in before if one.start <= time and (one.booked is None or one.booked > time)]
-            coming = [arc] if time == now else [one.arc for one in there if one.start == time]
-            staying = [one.id for one in rc.holders.values() if not any(yields(one, other, time) for other in coming)]
-            sets.append(frozenset((*staying, arc.id, *(one.arc.id for one in there))))
+        for time in sorted({now, *(promise.start for promise in before if promise.start > now)}):
+            there = [
+                promise
+                for promise in before
+                if promise.start <= time and (promise.booked is None or promise.booked > time)
+            ]
+            coming = [arc] if time == now else [promise.arc for promise in there if promise.start == time]
+            staying = [
+                holder.id for holder in rc.holders.values() if not any(yields(holder, other, time) for other in coming)
+            ]
+            sets.append(frozenset((*staying, arc.id, *(promise.arc.id for promise in there))))
         return sets
 
     def reserves(self, rc: Rc, arc: Arc) -> bool:
-        """Whether `rc` is reserved for another that goes before `arc`, and that it can't share it with."""
-        return any((one.excludes or not rc.sharable) and self._delays(arc, one) for one in self._binding(rc, arc)[0])
+        """Return True if `rc` is reserved exclusively for another ARC that precedes `arc`."""
+        return any(
+            (promise.excludes or not rc.sharable) and self._delays(arc, promise)
+            for promise in self._binding(rc, arc)[0]
+        )
 
     def _delays(self, arc: Arc, reservation: Reservation) -> bool:
-        """Whether `arc`, started now, would hold what is reserved when the time comes, and must not."""
+        """Return True if `arc`, started now, would hold reserved RCs at their time, and must not."""
         band, now = self._state.band, self._state.now
-        binds = band(arc.priority) <= band(reservation.arc.priority) or (
-            reservation.excludes and reservation.start <= now
-        )
+        begun = reservation.excludes and reservation.start <= now
+        binds = begun or band(arc.priority) <= band(reservation.arc.priority)
         return binds and arc.ends(now) > reservation.start
 
     def changed(self, earlier: Reservations) -> int:
-        """Bits of the RCs at which the reservations differ from the `earlier` ones."""
         return _changed(self.by_rc, earlier.by_rc)
 
 
@@ -311,7 +299,6 @@ def _changed(now: Mapping[int, list[Reservation]], earlier: Mapping[int, list[Re
 
 
 def kept_for(rc: Rc, reservation: Reservation) -> Reason:
-    """Why an ARC waits that would delay a reservation."""
     if reservation.excludes:
         party = reservation.arc.party._replace(until=reservation.booked)
         return Reason(ReasonCode.MAINTENANCE, (rc.name,), (party,))

@@ -1,16 +1,13 @@
-"""How long holds last, learned from those that are over: who asks for an hour and always takes ten minutes is expected
-to take ten minutes.
+"""Predicted hold times, learned from past holds.
 
 After Tsafrir, Etsion and Feitelson, "Backfilling using system-generated predictions rather than user runtime estimates"
-(IEEE TPDS 18(6), 2007): what is asked for is kept for whatever ends a hold or promises something, and predictions
-serve estimates alone. Histories are by name, command and RCs as asked, and by name and command alone where too little
-is known of that. A hold that was taken away would have lasted longer: its time is a lower bound, and medians are those
-of Kaplan and Meier ("Nonparametric estimation from incomplete observations", JASA 53, 1958), among the holds that
-lasted longer than the one in question has already.
+(IEEE TPDS 18(6), 2007): requested times still end holds and make promises; predictions serve estimates alone. Histories
+are by name, command and requested RCs, or by name and command where these are too few. The time of a hold that was cut
+short is a lower bound: medians are Kaplan and Meier's ("Nonparametric estimation from incomplete observations", JASA
+53, 1958), among the holds that lasted longer than the present one.
 
-Each history judges itself. It foretells every hold in two ways, by the time that earlier ones lasted and by the share
-of what they had asked for, and goes by the better one only where that was nearer than what was asked for.
-"""
+Each history judges itself: it predicts every hold by the time of earlier holds and by their share of the requested
+time, and uses the better one only where that was nearer than the requested time."""
 
 from __future__ import annotations
 
@@ -23,26 +20,23 @@ from zscout.scheduling.model import ArcRequest, Hold
 from zscout.types import Need, Ns
 
 MAX_HISTORIES: Final = 4_000
-"""The one that was not added to for longest is dropped."""
+"""The history unused for longest is dropped."""
 MAX_KEPT: Final = 20
-"""Holds of one history: the latest."""
+"""The latest holds of one history."""
 MAX_NEEDS: Final = 32
-"""A request of more RCs is known by its name and command alone."""
+"""A request of more RCs is known by name and command alone."""
 MAX_TEXT: Final = 200
 """Characters of a name or command that count."""
 JUDGED: Final = 2
-"""Holds that a history must have foretold before it is asked: its first one foretells nothing."""
+"""Holds that a history must have predicted before use: its first hold predicts nothing."""
 TOLERANCE: Final = 1e-9
 
 
 class Wish(NamedTuple):
-    """What a request is known by, and what it asks for."""
-
     name: str
     command: str
     needs: frozenset[Need]
     runtime: Ns
-    """> 0."""
 
     @classmethod
     def of(cls, request: ArcRequest) -> Wish:
@@ -50,7 +44,7 @@ class Wish(NamedTuple):
         return cls(request.name, command, frozenset(request.needs), request.min_runtime)
 
     def histories(self) -> Iterator[Hashable]:
-        """The keys of those that it belongs to, the closest first."""
+        """The keys of its histories, the closest first."""
         name, command = self.name[:MAX_TEXT], self.command[:MAX_TEXT]
         if len(self.needs) <= MAX_NEEDS:
             yield name, command, self.needs
@@ -58,14 +52,12 @@ class Wish(NamedTuple):
 
 
 class RuntimeEstimator:
-    """What is known of all programs of a fleet. It has no clock, and its memory is bounded."""
-
     def __init__(self, most: int = MAX_HISTORIES) -> None:
         self._most = most
         self._histories: OrderedDict[Hashable, _History] = OrderedDict()
 
     def observe(self, wish: Wish, lasted: Ns, *, whole: bool) -> None:
-        """A hold is over. `whole`: its program gave it back, or it had all that was asked for; else it was taken."""
+        """Record a hold. `whole`: released, or ran its requested time; else cut short."""
         for key in wish.histories():
             history = self._histories.setdefault(key, _History())
             self._histories.move_to_end(key)
@@ -74,8 +66,8 @@ class RuntimeEstimator:
             self._histories.popitem(last=False)
 
     def runtime(self, wish: Wish, elapsed: Ns = 0) -> Ns | None:
-        """How long a hold will have lasted in all, given that it has for `elapsed` ns: always longer than that. None:
-        nothing better is known than what was asked for."""
+        """The expected length of a hold that has lasted `elapsed` ns: always more. None: no better guess than the
+        requested time."""
         for key in wish.histories():
             history = self._histories.get(key)
             if history is not None and (estimate := history.estimate()) is not None:
@@ -83,7 +75,7 @@ class RuntimeEstimator:
         return None
 
     def end(self, request: ArcRequest, hold: Hold, now: Ns) -> Ns | None:
-        """When a hold is likely to be given back: after `now`, and before it is over. None: that is not known."""
+        """The likely release of a hold, after `now` and before its end. None: unknown."""
         runtime = self.runtime(Wish.of(request), now - hold.start)
         if runtime is None:
             return None
@@ -98,7 +90,7 @@ class _Span(NamedTuple):
 
 
 class _History:
-    """The latest holds of one key. What follows of them is worked out when it is asked for."""
+    """The latest holds of one key; estimates are computed on demand."""
 
     __slots__ = ("_estimates", "spans")
 
@@ -111,25 +103,22 @@ class _History:
         self._estimates = None
 
     def estimate(self) -> _Estimate | None:
-        """The better one of the two, with how well it did; None where too little is known."""
         if self._estimates is None:
             self._estimates = _Estimate(self.spans, by_share=False), _Estimate(self.spans, by_share=True)
-        best = max(self._estimates, key=lambda one: one.accuracy)
+        best = max(self._estimates, key=lambda estimate: estimate.accuracy)
         return best if best.judged >= JUDGED else None
 
 
 class _Estimate:
-    """By the time that holds lasted, in ns, or by the share of what they had asked for."""
-
     __slots__ = ("_by_share", "_median", "_values", "accuracy", "asked_accuracy", "judged")
 
     def __init__(self, spans: Iterable[_Span], *, by_share: bool) -> None:
         self._by_share = by_share
         self.accuracy = self.asked_accuracy = 0.0
-        """Summed over the `judged` holds that it would have foretold: its own, and that of what was asked for."""
+        """Summed over the `judged` holds: of this estimate, and of the requested time."""
         self.judged = 0
         self._values: list[tuple[float, bool]] = []
-        """With whether they were cut short; of equals, those last: they would have been longer."""
+        """Each with whether it was cut short; of equals, these last: they would have been longer."""
         self._median: float | None = None
         for span in spans:
             unit = span.asked if by_share else 1
@@ -148,7 +137,7 @@ class _Estimate:
         median = _median(left) if elapsed else self._median
         if median is not None:
             return max(elapsed + 1, round(median * unit))
-        # It has outlasted those that are known: what is expected grows with what has passed.
+        # Longer than all known holds: the expectation grows with the elapsed time.
         return elapsed + elapsed // 8 + 1 if elapsed else None
 
 
@@ -164,5 +153,5 @@ def _median(values: Sequence[tuple[float, bool]]) -> float | None:
 
 
 def _accuracy(expected: float, lasted: Ns) -> float:
-    """From 0 to 1, as the paper has it: so no single hold counts for more than another."""
+    """From 0 to 1, as in the paper, so that no hold counts more than another."""
     return min(expected, lasted) / max(expected, lasted)

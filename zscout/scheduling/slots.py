@@ -1,9 +1,9 @@
-"""When all of these can be had together: times at which a booking would be kept.
+"""Free times of a set of RCs: when a booking would be kept.
 
-What is in the way: other bookings, maintenance too, whatever their priority; holds that would not be over, or not be
-preempted; and what starving ARCs of equal or higher priority are reserved. Whoever else is queued goes round a booking.
-Sharable RCs are asked about all who would be there at once. What is found is exact for the RCs that earlier bookings
-were given for their patterns; it does not try to give those others."""
+Obstacles: all other bookings and maintenance, whatever their priority; holds that neither end nor yield; and
+reservations of starving ARCs of equal or higher priority. Other queued ARCs avoid bookings. Sharable RCs are asked
+about all holders at that time. The result is exact for the present bindings of earlier bookings; it does not try to
+change them."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from zscout.scheduling.votes import HolderSet
 from zscout.types import ArcId, Need, Ns, RcName
 
 MAX_TRIED: Final = 4_000
-"""Times that one question looks at."""
+"""Times checked per question."""
 
 
 class Slot(NamedTuple):
-    """From `start` to `latest` it may begin at any time; `bound` has the RC for each pattern."""
+    """It may begin at any time from `start` to `latest`; `bound` has the RC for each pattern."""
 
     start: Ns
     latest: Ns
@@ -36,21 +36,17 @@ class Slot(NamedTuple):
 @dataclass(slots=True)
 class SlotsFound:
     found: list[Slot] = field(default_factory=list)
-    """The earliest, first."""
-    unknown: list[tuple[Rc, HolderSet]] = field(default_factory=list)
-    """Votes that have to be known before the next one can be told."""
-    complete: bool = True
-    """False: there was more to look at than one question may."""
+    unknown: list[tuple[Rc, HolderSet]] = field(default_factory=list)  # votes needed before the next slot is known
+    complete: bool = True  # False: the search was cut off at MAX_TRIED
 
 
 class _Taken(NamedTuple):
-    """An RC is not to be had in this time, or if it is sharable, has this holder."""
+    """A time at which an RC is taken, or, if sharable, has this holder."""
 
     start: Ns
     end: float
     arc: ArcId
     excludes: bool = False
-    """Whether even a sharable RC has no other holder then."""
 
 
 def slots(
@@ -64,9 +60,8 @@ def slots(
     presume: bool = False,
     likely: Mapping[ArcId, Ns] = MappingProxyType({}),
 ) -> SlotsFound:
-    """The first `limit` stretches of time in which `wanted` might start, from its own start to `until`; `arc` stands
-    for it. `bookings_only`: as if nobody held or waited for anything. `presume`: votes that are not known are presumed
-    to be a yes. `likely`: when holds are taken to be over, if that is earlier: what is found then is a guess."""
+    """The first `limit` times at which `wanted` might start, until `until`; `arc` represents it. `bookings_only`
+    ignores holds and queue; `presume` counts unknown votes as yes; `likely` has earlier ends of holds, for a guess."""
     search, result = _Search(state, wanted, arc, bookings_only, presume, likely), SlotsFound()
     latest: Ns = wanted.start - 1
     for tried, start in enumerate(search.starts(until)):
@@ -104,7 +99,7 @@ class _Search:
         self._choices: dict[Need, list[Rc]] = {}
         for need in arc.patterns:
             known = [rc for rc in state.matching(need) if not rc.bit & barred]
-            # One that is away may be back by then, but nobody counts on it.
+            # Absent RCs may return by then, but count only where none is present.
             self._choices[need] = [rc for rc in known if rc.present] or known
         self._taken: dict[int, list[_Taken]] = {}
         for rc in {rc.bit: rc for rc in chain(self._named, *self._choices.values())}.values():
@@ -120,27 +115,26 @@ class _Search:
 
     def _booked(self, rc: Rc) -> Iterable[_Taken]:
         for claim in self._state.claims.values():
-            one = claim.booking
-            if claim.mask & rc.bit and one.id != self._wanted.id:
-                yield _Taken(one.start, one.end, claim.arc.id, one.maintenance)
+            booking = claim.booking
+            if claim.mask & rc.bit and booking.id != self._wanted.id:
+                yield _Taken(booking.start, booking.end, claim.arc.id, booking.maintenance)
 
     def _add_reserved(self) -> None:
         state = self._state
         if state.policy.patience is None or not state.queued:
             return
         for bit, reserved in reservations(state, state.policy.patience, None).by_rc.items():
-            for one in reserved if bit in self._taken else ():
-                if one.booked is None and state.band(one.arc.priority) >= state.band(self._wanted.priority):
-                    self._taken[bit].append(_Taken(one.start, one.arc.ends(one.start), one.arc.id))
+            for promise in reserved if bit in self._taken else ():
+                if promise.booked is None and state.band(promise.arc.priority) >= state.band(self._wanted.priority):
+                    self._taken[bit].append(_Taken(promise.start, promise.arc.ends(promise.start), promise.arc.id))
 
     def starts(self, until: Ns) -> list[Ns]:
-        """Times at which something comes free."""
         first = self._wanted.start
-        ends = {int(one.end) for taken in self._taken.values() for one in taken if first < one.end <= until}
+        ends = {int(span.end) for taken in self._taken.values() for span in taken if first < span.end <= until}
         return sorted({first, *ends})
 
     def fit(self, start: Ns) -> Mapping[Need, RcName] | list[tuple[Rc, HolderSet]] | None:
-        """How its patterns are met if it starts then; None: it can't; or the votes that decide."""
+        """The binding of its patterns if it starts then; None: impossible; or the votes that decide."""
         unknown: list[tuple[Rc, HolderSet]] = []
         for rc in self._named:
             free = self._is_free(rc, start)
@@ -154,7 +148,7 @@ class _Search:
             if self._presume:
                 allowed[need] += [rc for rc in choices if not isinstance(found[rc.bit], bool)]
             if len(allowed[need]) < len(self._choices) and not self._presume:
-                # With enough that are free without it nobody is asked.
+                # With enough free RCs no vote is needed.
                 unknown += [(rc, free) for rc in choices if not isinstance(free := found[rc.bit], bool)]
         chosen = distinct(allowed)
         if unknown and chosen is not None and not any(rc in self._named for rc, _ in unknown):
@@ -164,17 +158,16 @@ class _Search:
         return None if chosen is None else {need: rc.name for need, rc in chosen.items()}
 
     def _is_free(self, rc: Rc, start: Ns) -> bool | HolderSet:
-        """Whether `rc` is to be had from then on for long enough; or the holders on which its vote is not known."""
+        """True if `rc` is free from `start` for long enough; or the holders of an unknown vote."""
         end = start + self._wanted.runtime
-        taken = [one for one in self._taken[rc.bit] if one.start < end and one.end > start]
-        if not rc.sharable or self._wanted.maintenance or any(one.excludes for one in taken):
+        taken = [span for span in self._taken[rc.bit] if span.start < end and span.end > start]
+        if not rc.sharable or self._wanted.maintenance or any(span.excludes for span in taken):
             return not taken
-        there = frozenset(one.arc for one in taken)
+        there = frozenset(span.arc for span in taken)
         answer = self._state.votes.known(rc.name, there | {self._arc.id})
         return there | {self._arc.id} if answer is None else answer.accept
 
     def latest(self, start: Ns, bound: Iterable[RcName]) -> Ns:
-        """Until when it may start as well, on the same RCs."""
         rcs = (*self._named, *(self._state.rc(name) for name in bound))
-        coming = (one.start for rc in rcs for one in self._taken[rc.bit] if one.start > start)
+        coming = (span.start for rc in rcs for span in self._taken[rc.bit] if span.start > start)
         return max(start, min(coming, default=start + (1 << 62)) - self._wanted.runtime)

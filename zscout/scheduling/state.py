@@ -1,7 +1,6 @@
-"""Who holds what, who waits, what is known of votes: the state that a scheduling pass reads and changes.
+"""The state that a scheduling pass reads and changes: holders, queue, votes.
 
-Sets of RCs are integer bit masks; `needs & ~free == 0` is the whole test for an ARC of exclusive RCs.
-"""
+Sets of RCs are integer bit masks; `needs & ~free == 0` is the whole test for an ARC of exclusive RCs."""
 
 from __future__ import annotations
 
@@ -26,64 +25,48 @@ from zscout.types import ArcId, ClientId, Need, Ns, Params, Place, RcName
 
 
 class SchedulerState:
-    """The RCs, the ARCs and the holds between them. Every change goes through its methods."""
+    """The RCs, the ARCs and their holds. Every change uses these methods."""
 
     def __init__(self, policy: SchedulingPolicy = DEFAULT) -> None:
         self.policy = policy
-        self.now: Ns = 0
-        """The instant of the latest batch of events."""
+        self.now: Ns = 0  # the instant of the latest batch of events
         self.votes = Votes()
         self._ends: list[tuple[Ns, ArcId]] = []
-        """A heap of the ends of minimum runtimes and longest times. Those of holds that ended otherwise are skipped."""
+        """A heap of the ends of minimum runtimes and longest times. Outdated entries are skipped."""
         self.rcs: dict[RcName, Rc] = {}
         self.queued: dict[ArcId, Arc] = {}
         self.running: dict[ArcId, Arc] = {}
         self.held_back: dict[ArcId, Arc] = {}
-        """ARCs that are queued, but not considered for a while, or as long as another has their place."""
-        self.claims: dict[str, Claim] = {}
-        """Bookings that are not over, by id."""
+        """Queued ARCs not considered for a while, or while another has their place."""
+        self.claims: dict[str, Claim] = {}  # active bookings by id
         self.maintenance: dict[str, Claim] = {}
-        """Those that are maintenance."""
-        self.claimed = 0
-        """Bits of the RCs that are booked, at whatever time."""
-        self.claims_version = 0
-        """Grows with all that changes what is booked, and by whom it is taken up."""
+        self.claimed = 0  # bits of the RCs booked at any time
+        self.claims_version = 0  # grows with each change of bookings and of the ARCs that took them up
         self._claim_ends: list[tuple[Ns, str]] = []
-        """A heap of when bookings lapse or end, and when maintenance begins. What is not so any more is skipped."""
+        """A heap of lapses and ends of bookings and starts of maintenance. Outdated entries are skipped."""
         self._by_date: list[Claim] = []
-        """All bookings in the order of their dates."""
-        self._claims_at: dict[int, list[Claim]] = {}
-        """By bit of the RC: those for which it is kept, likewise."""
+        self._claims_at: dict[int, list[Claim]] = {}  # by bit of the RC: its bookings by date
         self._at_place: dict[Place, Arc] = {}
-        """By place: who is considered, or runs. Two clients may claim one ARC, which has to run once."""
+        """By place: the ARC considered or running. Two clients may claim one ARC, which has to run once."""
         self.present = 0
-        """Bits of the RCs that are there."""
-        self.sharable = 0
-        """Bits of the RCs that vote and take several holders."""
-        self.busy = 0
-        """Bits of the exclusive RCs that somebody holds."""
+        self.sharable = 0  # bits of the RCs that vote and take several holders
+        self.busy = 0  # bits of the held exclusive RCs
         self.index = QueueIndex(self.band)
-        self.by_pattern: dict[ArcId, Arc] = {}
-        """Those of the queued that need an RC by pattern."""
+        self.by_pattern: dict[ArcId, Arc] = {}  # queued ARCs with patterns
         self._matching: dict[Need, list[Rc]] = {}
         self.running_by_owner: Counter[str] = Counter()
-        """How many ARCs of each owner run."""
         self.held_by_owner: Counter[str] = Counter()
-        """How many RCs they hold."""
         self._by_bit: list[Rc] = []
         self._clients: dict[ClientId, dict[ArcId, Arc]] = {}
         self._owners: dict[str, dict[ArcId, Arc]] = {}
         self.entries = 0
-        """Counts who was queued or started."""
-        self.version = 0
-        """Grows with all that changes who holds what, which RCs are there, and who is preemptible."""
-        self.changed = 0
-        """Bits of the RCs at which it grew, since who looks after bookings last emptied this."""
+        self.version = 0  # grows with each change of holders, present RCs and preemptibility
+        self.changed = 0  # bits of the RCs where it grew, since `Claims` last emptied this
         self.shares = Shares(self, policy.fair_shares) if policy.fair_shares is not None else None
-        """What each group had, where fair shares are on."""
+        """None where fair shares are off."""
 
     def rc(self, name: RcName) -> Rc:
-        """The RC of this name, made known (absent, exclusive) if it was not."""
+        """The RC of this name, added (absent, exclusive) if unknown."""
         rc = self.rcs.get(name)
         if rc is None:
             rc = self.rcs[name] = Rc(name, 1 << len(self._by_bit))
@@ -92,7 +75,6 @@ class SchedulerState:
         return rc
 
     def matching(self, need: Need) -> list[Rc]:
-        """The RCs that meet a pattern, as far as they are known, present or not."""
         found = self._matching.get(need)
         if found is None:
             matches = matcher(need)
@@ -100,7 +82,7 @@ class SchedulerState:
         return found
 
     def bind(self, arc: Arc, bound: Mapping[Need, RcName]) -> None:
-        """Gives the patterns of an ARC that does not run these RCs, one for each; none if some pattern has no RC."""
+        """Bind the patterns of an ARC that does not run to these RCs; empty if a pattern has none."""
         if arc.bound == bound and arc.rcs:
             return
         wanted, unbound = arc.request.needs, () if bound else arc.patterns
@@ -110,8 +92,8 @@ class SchedulerState:
         arc.rcs = tuple(self.rcs_in(arc.mask))
 
     def new_arc(self, request: ArcRequest, place: Place) -> Arc:
-        """An ARC that neither waits nor runs yet. Nobody gets a longer minimum runtime than the policy's `max_runtime`:
-        what is reckoned with it (ranks, reservations) is the shorter."""
+        """An ARC that neither waits nor runs yet. `max_runtime` of the policy caps its minimum runtime, also in
+        ranks and reservations."""
         longest = self.policy.max_runtime
         if longest is not None and request.min_runtime > longest:
             request = structs.replace(request, min_runtime=longest)
@@ -123,32 +105,25 @@ class SchedulerState:
         return arc
 
     def params(self, arc: Arc, rc: Rc) -> Params:
-        """What an ARC would ask of an RC, whether it is bound to it at present or not."""
         if rc.name in arc.needs:
             return arc.needs[rc.name]
         return arc.request.needs[next(need for need in arc.patterns if rc in self.matching(need))]
 
     def possible_sharables(self, arc: Arc) -> Iterator[Rc]:
-        """All sharable RCs that an ARC could hold."""
         matching = union(rc.bit for need in arc.patterns for rc in self.matching(need)) if arc.patterns else 0
         return self.rcs_in((arc.mask | matching) & self.sharable)
 
     def mask(self, names: Iterable[RcName]) -> int:
-        mask, rcs = 0, self.rcs
-        for name in names:
-            rc = rcs.get(name) or self.rc(name)
-            mask |= rc.bit
-        return mask
+        return union(self.rc(name).bit for name in names)
 
     def rcs_in(self, mask: int) -> Iterator[Rc]:
-        """The RCs of a mask, in the order in which they became known."""
         while mask:
             low = mask & -mask
             yield self._by_bit[low.bit_length() - 1]
             mask ^= low
 
     def next_watcher(self, rc: Rc, rank: Rank | None) -> tuple[Rank, int, Arc, Rc] | None:
-        """The best of the watchers of `rc` below `rank`, of all of them without a rank: for a heap."""
+        """The best watcher of `rc` below `rank` (None: of all), as a heap entry."""
         at = 0 if rank is None else bisect_right(rc.watchers, rank)
         if at == len(rc.watchers):
             return None
@@ -158,7 +133,6 @@ class SchedulerState:
         return self.running.get(arc) or self.queued.get(arc) or self.held_back.get(arc)
 
     def all_arcs(self) -> Iterator[Arc]:
-        """Those that wait first."""
         for arcs in (self.queued, self.held_back, self.running):
             yield from arcs.values()
 
@@ -182,15 +156,15 @@ class SchedulerState:
         self._grow(rc.bit)
 
     def is_free(self, arc: Arc) -> bool:
-        """Whether a new ARC finds all that it needs there, exclusive and free, and nobody waits: the usual case where
-        nothing is scarce. Who is bound by a quota or a pattern is not looked at so closely."""
+        """Return True if a new ARC without quota or pattern finds all RCs exclusive and free, and the queue is
+        empty."""
         if self.queued or self.held_back or arc.patterns or arc.place in self._at_place or arc.mask & self.claimed:
             return False
         bound = self.policy.max_running_per_host is not None or self.policy.rc_quotas
         return not bound and not arc.mask & ~self.present and not arc.mask & (self.busy | self.sharable)
 
     def enter(self, arc: Arc) -> None:
-        """A new ARC is started without having been queued."""
+        """Add a new ARC that starts without being queued."""
         arc.rcs = tuple(self.rcs_in(arc.mask))
         self._know(arc)
         self._at_place[arc.place] = arc
@@ -212,7 +186,6 @@ class SchedulerState:
         self.index.add(arc)
 
     def dequeue(self, arc: Arc) -> None:
-        """A queued ARC waits no more, and runs neither."""
         if self.held_back.pop(arc.id, None) is not None:
             arc.held_back = None
             return
@@ -222,36 +195,37 @@ class SchedulerState:
         self.index.remove(arc)
 
     def hold_back(self, arc: Arc, until: Ns, rcs: tuple[RcName, ...]) -> None:
-        """A queued ARC is not considered before then, unless `let_in` lets it."""
+        """A queued ARC is not considered before then, unless `readmit` admits it."""
         self.dequeue(arc)
         arc.move_to(ArcState.HELD_BACK)
         arc.held_back = until, rcs
         self.held_back[arc.id] = arc
 
-    def let_in(self, rc: RcName | None = None) -> None:
-        """Considers again who was held back until now, and for this RC."""
+    def readmit(self, rc: RcName | None = None) -> None:
         for arc in list(self.held_back.values()):
             if arc.held_back is not None and (arc.held_back[0] <= self.now or rc in arc.held_back[1]):
                 self.consider_again(arc)
 
     def _is_first(self, arc: Arc) -> bool:
-        """Whether nobody else is considered at its place."""
         return self._at_place.setdefault(arc.place, arc) is arc
 
     def at_place(self, place: Place) -> Arc | None:
-        """Who is considered at this place, or runs."""
         return self._at_place.get(place)
 
     def put_before(self, arc: Arc, other: Arc) -> None:
-        """`arc`, which is new, has the place of `other`, which is queued and waits for its end now."""
+        """Give new `arc` the place of `other`, which is queued and now waits for its end."""
         self._at_place[arc.place] = arc
         self.consider_again(other)
 
     def leave_place(self, arc: Arc) -> None:
-        """`arc` is over, or gets another place: who claims this one as well is considered."""
+        """Free the place of an ended or moved ARC, and consider its other claimants."""
         if self._at_place.get(arc.place) is arc:
             del self._at_place[arc.place]
-            for other in [one for one in self.held_back.values() if one.place == arc.place and one.held_back is None]:
+            for other in [
+                waiting
+                for waiting in self.held_back.values()
+                if waiting.place == arc.place and waiting.held_back is None
+            ]:
                 self.consider_again(other)
 
     def consider_again(self, arc: Arc) -> None:
@@ -259,33 +233,29 @@ class SchedulerState:
         self.enqueue(arc, arc.since)
 
     def forget(self, arc: Arc) -> None:
-        """An ARC that neither waits nor runs is over for good."""
         arc.move_to(ArcState.ENDED)
         self._forget_client(arc)
         self.leave_place(arc)
 
     def claim(self, claim: Claim) -> None:
-        """A booking is made."""
         self.claims[claim.booking.id] = claim
         if claim.booking.maintenance:
             self.maintenance[claim.booking.id] = claim
         self.redated(claim)
 
     def redated(self, claim: Claim) -> None:
-        """A booking has this date from now on."""
         for at in _instants(claim.booking):
             heapq.heappush(self._claim_ends, (at, claim.booking.id))
         self.claims_changed()
 
     def unclaim(self, claim: Claim) -> None:
-        """A booking is over."""
         del self.claims[claim.booking.id]
         self.maintenance.pop(claim.booking.id, None)
         claim.arc.claim = None
         self.claims_changed()
 
     def claims_changed(self) -> None:
-        """Bookings, or by whom they are taken up, or the RCs that are kept for them, are not what they were."""
+        """Update the indexes after bookings, their ARCs or their RCs have changed."""
         self._by_date = sorted(self.claims.values(), key=_date)
         self._claims_at = {}
         for claim in self._by_date:
@@ -296,16 +266,14 @@ class SchedulerState:
 
     @property
     def begun(self) -> int:
-        """How many of the bookings have come to their dates."""
         return bisect_right(self._by_date, self.now, key=_date)
 
     def claims_before(self, time: float, rc: Rc | None = None) -> list[Claim]:
-        """The bookings with dates up to then, all of them or those that an RC is kept for."""
         claims = self._by_date if rc is None else self._claims_at.get(rc.bit, [])
         return claims[: bisect_right(claims, time, key=_date)]
 
     def claims_over(self) -> Iterator[Claim]:
-        """Bookings whose time is over by now, or whose owner's is to take them up; each may come twice."""
+        """Bookings whose time or patience is over; each may come twice."""
         while self._claim_ends and self._claim_ends[0][0] <= self.now:
             at, booking = heapq.heappop(self._claim_ends)
             claim = self.claims.get(booking)
@@ -313,7 +281,6 @@ class SchedulerState:
                 yield claim
 
     def next_claim_change(self) -> Ns | None:
-        """When the next booking lapses or ends, or maintenance begins."""
         while self._claim_ends:
             at, booking = self._claim_ends[0]
             claim = self.claims.get(booking)
@@ -323,7 +290,7 @@ class SchedulerState:
         return None
 
     def voter(self, arc: ArcId) -> Arc | None:
-        """Who is meant by an id in a set of holders: an ARC, or what stands for a booking."""
+        """The ARC of an id in a set of holders, or the placeholder of a booking."""
         return self.arc(arc) or (self.claims[arc].arc if arc in self.claims else None)
 
     def _know(self, arc: Arc) -> None:
@@ -340,11 +307,10 @@ class SchedulerState:
         return self._clients.get(client, {}).values()
 
     def arcs_of_owner(self, owner: str) -> Collection[Arc]:
-        """The ARCs of all clients of a host or a person."""
         return self._owners.get(owner, {}).values()
 
     def hand_over(self, arc: Arc, to: ClientId, renamed: ArcId) -> None:
-        """An ARC goes on under another client, by another name. Its hold or its wait goes on."""
+        """Continue an ARC's hold or wait under another client and name."""
         if arc.hold is None:
             self.dequeue(arc)
             self._rename(arc, to, renamed)
@@ -379,7 +345,6 @@ class SchedulerState:
         self.busy |= arc.mask & ~self.sharable
 
     def stop(self, arc: Arc) -> Hold:
-        """Takes everything from a running ARC; what it was holding is returned."""
         hold = arc.hold
         assert hold is not None, arc.id  # noqa: S101
         self._remove_running(arc)
@@ -389,8 +354,7 @@ class SchedulerState:
         return hold
 
     def expired_arcs(self) -> Iterator[Arc]:
-        """The running ARCs whose minimum runtime or longest time is over by now, each time once; the caller may end
-        others meanwhile."""
+        """The running ARCs whose minimum or longest time is over, once each; the caller may end others meanwhile."""
         while self._ends and self._ends[0][0] <= self.now:
             at, arc_id = heapq.heappop(self._ends)
             arc = self.running.get(arc_id)
@@ -398,7 +362,6 @@ class SchedulerState:
                 yield arc
 
     def next_end(self) -> Ns | None:
-        """When the next minimum runtime or longest time is over."""
         while self._ends:
             at, arc_id = self._ends[0]
             arc = self.running.get(arc_id)
@@ -408,7 +371,7 @@ class SchedulerState:
         return None
 
     def min_runtime_over(self, arc: Arc) -> None:
-        """A kept hold has had its minimum runtime: from now on its equals may preempt it."""
+        """From now on equals may preempt a kept hold."""
         self.index.freed |= arc.mask
         self._grow(arc.mask)
 
@@ -417,22 +380,19 @@ class SchedulerState:
         self.changed |= mask
 
     def operator(self, priority: int) -> bool:
-        """Whether it is an operator's, whom no knob of the policy keeps waiting."""
+        """Return True for an operator's priority, which no setting delays."""
         return priority >= self.policy.operator_priority
 
     def band(self, priority: int) -> int:
-        """The band of a priority: ARCs whose priorities share a band respect each other's reservations."""
+        """ARCs whose priorities share a band respect each other's reservations."""
         alone = self.policy.promise == "equals" or self.operator(priority)
         return priority if alone else self.policy.operator_priority - 1
 
     def order_groups(self) -> None:
-        """Puts the groups in the order of their shares, and the queued ARCs with them."""
-        if self.shares is None or not self.shares.order():
-            return
-        self._put_all(self.shares)
+        if self.shares is not None and self.shares.order():
+            self._put_all(self.shares)
 
     def take_policy(self, policy: SchedulingPolicy) -> None:
-        """What runs goes on; the next pass goes by the new one. Groups keep what they had, by name."""
         charged, same = self.charged(), policy.fair_shares == self.policy.fair_shares
         self.policy = policy
         if same:
@@ -453,35 +413,31 @@ class SchedulerState:
         self.index.sort(self.queued, self.rcs_in(self.index.watched))
 
     def _put(self, arc: Arc, shares: Shares | None) -> None:
-        """Puts an ARC where its group is."""
         arc.put_at(0 if shares is None else shares.position(arc))
         fair, patience = self.policy.fair_shares, self.policy.patience
         arc.late = max(0, fair.patience - patience) if arc.position and fair is not None and patience is not None else 0
 
     def charged(self) -> dict[str, float]:
-        """By group: RC-seconds that it lately had and others waited for; empty where fair shares are off."""
         return {} if self.shares is None else self.shares.charged()
 
     def longest(self, start: Ns) -> Ns | None:
-        """When a hold from `start` on ends at the latest."""
         limit = self.policy.max_runtime
         return None if limit is None else start + limit
 
     def protected_below(self, arc: Arc) -> int | None:
-        """Below which priority nobody takes a hold that `arc` is granted now, before its minimum runtime is
-        over; None: no such rule."""
+        """The priority needed to take a hold granted to `arc` now, before its minimum runtime is over; None: no such
+        rule."""
         promised = self.policy.promise == "all" and arc.starving
         return self.policy.operator_priority if promised or self.policy.preempt != "always" else None
 
     def quota_left(self, arc: Arc) -> int | None:
-        """How many more ARCs of its owner may run, if `arc` is bound by a quota."""
         quota = self.policy.max_running_per_host
         if quota is None or self.operator(arc.priority):
             return None
         return max(0, quota - self.running_by_owner[arc.owner] + (self.continued(arc) is not None))
 
     def rc_quota(self, arc: Arc, starting: Mapping[str, int] = MappingProxyType({})) -> RcQuota | None:
-        """The quota of RCs that has no room for `arc`, beside the RCs of each owner that are `starting` as well."""
+        """The RC quota that has no room for `arc`, beside the `starting` RCs of each owner."""
         quotas = self.policy.rc_quotas.get(arc.owner, ())
         ends = len(continued.rcs) if quotas and (continued := self.continued(arc)) is not None else 0
         for quota in quotas:
@@ -491,15 +447,13 @@ class SchedulerState:
         return None
 
     def continued(self, arc: Arc) -> Arc | None:
-        """The running ARC that `arc` continues, and that ends when it starts: no quota counts it against `arc`."""
-        if not arc.request.continues:
-            return None
-        mask = arc.mask & ~self.sharable
-        holders = (one for rc in self.rcs_in(mask) for one in rc.holders.values())
-        return next(
-            (one for one in holders if arc.request.goes_on_from(one.request) and one.preemptible_by(arc, self.now)),
-            None,
-        )
+        """The running ARC that `arc` continues and ends by its start: quotas don't count it."""
+        if arc.request.continues:
+            for rc in self.rcs_in(arc.mask & ~self.sharable):
+                for holder in rc.holders.values():
+                    if arc.request.continues_from(holder.request) and holder.preemptible_by(arc, self.now):
+                        return holder
+        return None
 
     def barred(self, arc: Arc) -> int:
         """Bits of the RCs to which no pattern of `arc` is bound."""
@@ -546,33 +500,30 @@ def _date(claim: Claim) -> Ns:
 
 
 def _instants(booking: Booking) -> tuple[Ns, ...]:
-    """When something becomes of a booking by itself."""
     return (booking.start, booking.end) if booking.maintenance else (booking.lapses, booking.end)
 
 
 class Actions(Protocol):
-    """What a strategy may do; each call changes the state at once and becomes an effect."""
+    """Actions of a strategy: each changes the state at once and becomes an effect."""
 
     def start(self, arc: Arc) -> None: ...
-    def preempt(self, arc: Arc, by: Arc) -> bool:
-        """Takes everything from a running ARC for `by`; True if it is queued again."""
-        ...
+    def preempt(self, arc: Arc, by: Arc) -> bool: ...
 
     def wait(self, arc: Arc, reason: Reason, *, settled: bool = True) -> None: ...
     def propose(self, rc: Rc, holders: HolderSet) -> None: ...
     def run_again(self) -> None:
-        """Asks for another pass at once: the strategy needs more time, and others shall have their turn."""
+        """Ask for another pass at once: the strategy needs more time, after others."""
         ...
 
 
 class Strategy(Protocol):
-    """Decides who runs. One that keeps something from pass to pass serves one core only."""
+    """Decides which ARCs run. A strategy with state serves one core only."""
 
     name: StrategyName
 
     def run_pass(self, state: SchedulerState, actions: Actions) -> None:
-        """One pass: reads the state, and acts."""
+        """One pass over the state."""
 
     def log_line(self) -> str:
-        """What is worth a line in a log since it was last asked for; mostly empty."""
+        """News for the log since the last call; mostly empty."""
         return ""

@@ -1,5 +1,3 @@
-"""The strategies by name."""
-
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
@@ -16,4 +14,4 @@ STRATEGIES: Final[Mapping[StrategyName, Callable[[], Strategy]]] = {
     "optimal": Optimal,
     "adaptive": Adaptive,
 }
-"""Each makes a strategy for one core."""
+"""Factories: each core has its own strategy."""

@@ -1,9 +1,8 @@
-"""How sharable RCs have voted: the answers in force, and the proposals that are open (sent and not answered;
-the query ends after the LATE_VOTE of `services/rcm/rcm.py`).
+"""Votes of sharable RCs: the answers in force, and the open proposals (the query ends after the LATE_VOTE of
+`services/rcm/rcm.py`).
 
-An RC accepts or vetoes a set of holders. What it accepts, it accepts of every subset; so a veto holds for
-every superset, and one answer settles many sets. Answers are in force until the RC's rules change.
-"""
+An RC that accepts a set of holders accepts every subset; so a veto holds for every superset, and one answer settles
+many sets. Answers are in force until the RC's rules change."""
 
 from __future__ import annotations
 
@@ -17,9 +16,9 @@ from zscout.types import ArcId, Ns, RcName
 HolderSet: TypeAlias = frozenset[ArcId]
 
 ANSWERS_PER_RC = 4096
-"""Oldest answers beyond this many are forgotten; the RC is then asked again."""
+"""Older answers are forgotten; the RC is then asked again."""
 PROPOSALS_PER_SET = 8
-"""How many proposals of one set may be open: an unresponsive RC is asked anew, and any answer counts."""
+"""Open proposals of one set: an unresponsive RC is asked again, and any answer counts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,21 +31,15 @@ YES = Answer(accept=True)
 
 
 class RcVotes:
-    """One RC's answers."""
-
     def __init__(self) -> None:
         self.accepted: dict[HolderSet, None] = {}
         self.vetoed: dict[HolderSet, str] = {}
-        self.proposals: dict[HolderSet, list[int]] = {}
-        """Numbers of the open proposals of each set, newest last."""
-        self.overdue: set[HolderSet] = set()
-        """Sets whose newest proposal is overdue, and perhaps lost: they may be proposed anew."""
-        self.retry_at: Ns = 0
-        """When it may be asked again, if it is unresponsive."""
+        self.proposals: dict[HolderSet, list[int]] = {}  # numbers of the open proposals of each set, newest last
+        self.overdue: set[HolderSet] = set()  # sets whose newest proposal may be lost: they may be proposed again
+        self.retry_at: Ns = 0  # when an unresponsive RC may be asked again
         self._accepted_with: dict[ArcId, dict[HolderSet, None]] = {}
-        """The accepted sets that each ARC is in."""
         self._vetoed_at: dict[ArcId, dict[HolderSet, None]] = {}
-        """Each vetoed set once, under the one of its ARCs that had the fewest entries: short lists are searched."""
+        """Each vetoed set once, under its ARC with the fewest entries: short lists are searched."""
 
     def known(self, holders: HolderSet) -> Answer | None:
         if holders in self.accepted:
@@ -80,7 +73,7 @@ class RcVotes:
             self._drop(next(iter(self.vetoed)), self.vetoed, self._vetoed_at)
 
     def forget(self, arc: ArcId) -> None:
-        """Of sets with this ARC, what was accepted is accepted without it too, and vetoes are dropped."""
+        """Accepted sets with this ARC are accepted without it; vetoes are dropped."""
         for holders in list(self._accepted_with.get(arc, ())):
             self._drop(holders, self.accepted, self._accepted_with)
             if len(holders) > 1:
@@ -89,7 +82,7 @@ class RcVotes:
             self._drop(holders, self.vetoed, self._vetoed_at)
 
     def rename(self, arc: ArcId, renamed: ArcId) -> list[int]:
-        """An ARC goes on by another name. Returns the numbers of the open proposals that name it."""
+        """Rename an ARC; return the numbers of the open proposals that name it."""
         for holders in list(self._accepted_with.get(arc, ())):
             self._drop(holders, self.accepted, self._accepted_with)
             self.accept(_renamed(holders, arc, renamed))
@@ -118,45 +111,37 @@ def _renamed(holders: HolderSet, arc: ArcId, renamed: ArcId) -> HolderSet:
 
 
 class Votes:
-    """The votes of all RCs. Proposals are numbered; an answer to a number that is not open is ignored."""
+    """Proposals are numbered; an answer to a closed number is ignored."""
 
     def __init__(self) -> None:
         self._by_rc: defaultdict[RcName, RcVotes] = defaultdict(RcVotes)
         self.proposals: dict[int, tuple[RcName, HolderSet]] = {}
-        """The open proposals, by their numbers."""
         self._next = 1
         self.unresponsive: set[RcName] = set()
         """RCs whose last vote is overdue: no decision waits for them until they answer."""
         self.version = 0
-        """Grows with all that changes what is known."""
-        self.answered: set[RcName] = set()
-        """RCs that answered, or became unresponsive, since a pass last emptied this."""
-        self.invalidated: set[RcName] = set()
-        """RCs whose answers are no longer in force, likewise."""
-        self.changed: set[RcName] = set()
-        """RCs of which more or less is known since who looks after bookings last emptied this."""
+        self.answered: set[RcName] = set()  # RCs that answered or became unresponsive, since a pass last emptied this
+        self.invalidated: set[RcName] = set()  # RCs whose answers were dropped, since a pass last emptied this
+        self.changed: set[RcName] = set()  # RCs with new or dropped answers, since `Claims` last emptied this
 
     def known(self, rc: RcName, holders: HolderSet) -> Answer | None:
-        """The answer in force for exactly this set, by itself or by what it implies; None if unknown."""
+        """The answer in force for exactly this set, direct or implied; None if unknown."""
         return self._by_rc[rc].known(holders)
 
     def accepts(self, rc: RcName, holders: HolderSet) -> bool:
-        """Whether it is known that an RC accepts this set."""
         answer = self.known(rc, holders)
         return answer is not None and answer.accept
 
     def vetoed(self, rc: RcName) -> list[HolderSet]:
-        """The sets that an RC has vetoed; each rules out every larger one as well."""
+        """Each vetoed set rules out every larger set as well."""
         return list(self._by_rc[rc].vetoed)
 
     def due(self, now: Ns) -> list[RcName]:
-        """The unresponsive RCs that may be asked again by now."""
         return [rc for rc in self.unresponsive if self._by_rc[rc].retry_at <= now]
 
     def propose(self, rc: RcName, holders: HolderSet, now: Ns) -> int | None:
-        """The number of a new proposal to send, or None where one is open already or the RC is not due.
-
-        An unresponsive RC is asked again once a quantum, so that it can show that it is back."""
+        """The number of a new proposal, or None if one is open or the RC is not due: an unresponsive RC is asked
+        once a quantum."""
         votes = self._by_rc[rc]
         if rc in self.unresponsive:
             if now < votes.retry_at:
@@ -175,7 +160,6 @@ class Votes:
         return number
 
     def answer(self, proposal: int, *, accept: bool, reason: str) -> None:
-        """Takes an answer, a late one too, unless its proposal is not open any more."""
         if proposal not in self.proposals:
             return
         rc, holders = self.proposals[proposal]
@@ -191,7 +175,7 @@ class Votes:
             votes.veto(holders, reason)
 
     def overdue(self, proposal: int, now: Ns) -> None:
-        """Marks the RC unresponsive. The proposal stays open: an answer counts until its query ends."""
+        """Mark the RC unresponsive. The proposal stays open: an answer counts until its query ends."""
         if proposal not in self.proposals:
             return
         rc, holders = self.proposals[proposal]
@@ -206,7 +190,7 @@ class Votes:
             votes.retry_at = now + QUANTUM
 
     def forget_rc(self, rc: RcName) -> None:
-        """The RC left, came anew or changed its rules: its votes and open proposals are dropped."""
+        """Drop the votes and proposals of an RC that left, restarted or changed its rules."""
         self.invalidated.add(rc)
         self.changed.add(rc)
         self.version += 1
@@ -217,7 +201,6 @@ class Votes:
                 self._close(votes, holders)
 
     def forget_arc(self, rc: RcName, arc: ArcId) -> None:
-        """An ARC that needed `rc` has ended: what was accepted with it is accepted without it too."""
         votes = self._by_rc.get(rc)
         if votes is None:
             return
@@ -227,7 +210,6 @@ class Votes:
             self._close(votes, holders)
 
     def rename_arc(self, rc: RcName, arc: ArcId, renamed: ArcId) -> None:
-        """An ARC goes on by another name: its votes stay in force, its proposals open."""
         votes = self._by_rc.get(rc)
         if votes is not None:
             for number in votes.rename(arc, renamed):
