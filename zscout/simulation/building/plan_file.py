@@ -108,19 +108,15 @@ def _check_point(point: tuple[float, ...], plan: Plan, where: Where, beyond: flo
 
 
 def _check_piece(piece: Furniture, plan: Plan, where: Where) -> None:
-    low, half = piece.height - 0.02, min(piece.width, piece.depth) / 2
-    for key, value, bad, remedy in (
-        ("height", piece.height, piece.height > plan.height, f"{plan.height:g}, the room's"),
-        (
-            "clearance",
-            piece.clearance,
-            piece.kind in ("raised", "sofa", "bed") and piece.clearance + 0.02 > piece.height,
-            f"{low:g}, below the height",
-        ),
-        ("leg", piece.leg, piece.kind not in ("solid", "shelf") and piece.leg > half, f"{half:g}, half of the piece"),
-    ):
-        if bad:
-            raise (where / key).bad(f"is {value:g} m", f"write at most {remedy}")
+    def at_most(key: str, value: float, bound: float, meaning: str) -> None:
+        if value > bound:
+            raise (where / key).bad(f"is {value:g} m", f"write at most {bound:g}, {meaning}")
+
+    at_most("height", piece.height, plan.height, "the room's")
+    if piece.kind in ("raised", "sofa", "bed"):
+        at_most("clearance", piece.clearance, piece.height - 0.02, "below the height")
+    if piece.kind not in ("solid", "shelf"):
+        at_most("leg", piece.leg, min(piece.width, piece.depth) / 2, "half of the piece")
 
 
 def _check_light(light: Light, plan: Plan, where: Where) -> None:
