@@ -30,8 +30,7 @@ class Body:
     """A robot, moved by the world and driven by `receive` or `command`."""
 
     def __init__(self, robot: Robot, start: Pose, rng: np.random.Generator) -> None:
-        self.name = robot.name
-        self.id = robot.id
+        self.name, self.id = robot.name, robot.id
         self.x, self.y, self.heading = start
         self.left = self.right = 0.0  # commands, -1 to 1 of top speed
         self.camera: int | None = None  # the transmitter's channel; None: off

@@ -108,9 +108,13 @@ def hiding_places(plan: Plan) -> list[float]:
     return [float(area) for area in areas if area >= HIDE_AREA]
 
 
+def _uniform(rng: np.random.Generator, low: float, high: float, digits: int = 2) -> float:
+    return round(float(rng.uniform(low, high)), digits)
+
+
 def _room(rng: np.random.Generator, name: str) -> Plan:
     width, depth = (round(float(side), 2) for side in rng.uniform(3.2, 6.5, 2))
-    door = round(float(rng.uniform(0.8, width - 0.8)), 2)
+    door = _uniform(rng, 0.8, width - 0.8)
     furniture = [Furniture("door", "solid", door, 0.02, DOOR, 0.04, 2.05, shade=0.75)]
     # The floor before the door stays free.
     taken = [_Footprint(door, 0.5, DOOR, 1.0, 0.0)]
@@ -120,7 +124,7 @@ def _room(rng: np.random.Generator, name: str) -> Plan:
         piece = _put(rng, template, width, depth, taken, len(furniture))
         if piece is not None:
             furniture.append(piece)
-    window = round(float(rng.uniform(0.9, width - 0.9)), 2)
+    window = _uniform(rng, 0.9, width - 0.9)
     lamps = [
         Light(
             f"lamp{number + 1}",
@@ -132,24 +136,18 @@ def _room(rng: np.random.Generator, name: str) -> Plan:
         )
         for number, at in enumerate((0.5,) if width < 5 else (0.3, 0.7))
     ]
-    sun = Light("window", window, depth, 1.4, 1.2, 1.0, round(float(rng.uniform(0.3, 1.0)), 2), "window")
-    rug = Rug(
-        round(width / 2, 2),
-        round(depth / 2, 2),
-        round(float(rng.uniform(0.8, 1.6)), 2),
-        round(float(rng.uniform(0.6, 1.2)), 2),
-        round(float(rng.uniform(-0.4, 0.4)), 2),
-        round(float(rng.uniform(0.08, 0.3)), 2),
-    )
+    sun = Light("window", window, depth, 1.4, 1.2, 1.0, _uniform(rng, 0.3, 1.0), "window")
+    measures = [_uniform(rng, low, high) for low, high in ((0.8, 1.6), (0.6, 1.2), (-0.4, 0.4), (0.08, 0.3))]
+    rug = Rug(round(width / 2, 2), round(depth / 2, 2), *measures)
     return Plan(
         name=name,
         width=width,
         depth=depth,
-        height=round(float(rng.uniform(2.4, 2.8)), 2),
+        height=_uniform(rng, 2.4, 2.8),
         covering=COVERINGS[int(rng.integers(len(COVERINGS)))],
-        floor_shade=round(float(rng.uniform(0.3, 0.5)), 2),
-        wall_shade=round(float(rng.uniform(0.5, 0.7)), 2),
-        noise=Noise(flicker=round(float(rng.uniform(0, 0.02)), 3)),
+        floor_shade=_uniform(rng, 0.3, 0.5),
+        wall_shade=_uniform(rng, 0.5, 0.7),
+        noise=Noise(flicker=_uniform(rng, 0, 0.02, 3)),
         receiver=Receiver(x=round(width - 0.2, 2), y=0.2),
         furniture=tuple(furniture),
         rugs=(rug,) if rng.random() < 0.5 else (),
@@ -192,7 +190,7 @@ def _put(
 ) -> Furniture | None:
     """Add a piece to `taken` where it has room; None if it has none."""
     wide, deep, high, clearance, shade = (
-        round(float(rng.uniform(*measure)), 2)
+        _uniform(rng, *measure)
         for measure in (template.width, template.depth, template.height, template.clearance, template.shade)
     )
     for _ in range(60):
@@ -215,18 +213,8 @@ def _put(
             continue
         if footprint.clear_of(taken, WAY):
             taken.append(footprint)
-            return Furniture(
-                f"{template.name}{number}",
-                template.kind,
-                round(x, 3),
-                round(y, 3),
-                wide,
-                deep,
-                high,
-                round(turn, 4),
-                clearance,
-                shade=shade,
-            )
+            name, at = f"{template.name}{number}", (round(x, 3), round(y, 3))
+            return Furniture(name, template.kind, *at, wide, deep, high, round(turn, 4), clearance, shade=shade)
     return None
 
 
@@ -243,16 +231,9 @@ def _people(
                 path.append((round(x, 2), round(y, 2)))
             if len(path) == 5:
                 break
-        people.append(
-            Person(
-                f"person{number + 1}",
-                (*path, *path[-2::-1]),
-                speed=round(float(rng.uniform(0.7, 1.3)), 2),
-                first=round(float(rng.uniform(10, 40)), 1),
-                every=round(float(rng.uniform(20, 60)), 1),
-                shade=round(float(rng.uniform(0.12, 0.45)), 2),
-            )
-        )
+        speed, first, every = _uniform(rng, 0.7, 1.3), _uniform(rng, 10, 40, 1), _uniform(rng, 20, 60, 1)
+        way = (*path, *path[-2::-1])
+        people.append(Person(f"person{number + 1}", way, speed, first, every, shade=_uniform(rng, 0.12, 0.45)))
     return tuple(people)
 
 

@@ -20,8 +20,7 @@ class Walker:
     """A person over time, absent between walks."""
 
     def __init__(self, person: Person, rng: np.random.Generator) -> None:
-        self._person = person
-        self._rng = rng
+        self._person, self._rng = person, rng
         path = np.array(person.path, float)
         steps = np.diff(path, axis=0)
         lengths = np.hypot(steps[:, 0], steps[:, 1])
@@ -60,8 +59,8 @@ class Walker:
             return []
         swing = STRIDE / 2 * float(np.sin(np.pi * self._gone / STRIDE))
         way_x, way_y = float(self._way[0]), float(self._way[1])
-        dx, dy = way_x * swing - way_y * _APART, way_y * swing + way_x * _APART
-        return [(self.x + dx, self.y + dy, FOOT), (self.x - dx, self.y - dy, FOOT)]
+        dx, dy, side_x, side_y = way_x * swing, way_y * swing, way_y * _APART, way_x * _APART
+        return [(self.x + dx * sign - side_x * sign, self.y + dy * sign + side_y * sign, FOOT) for sign in (1, -1)]
 
     def shapes(self, light: float) -> list[Cylinder]:
         """Cylinders for cameras; `light` is the light on the floor there."""

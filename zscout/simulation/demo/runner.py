@@ -37,7 +37,7 @@ class DemoRunner(ABC):
 
     def __init__(self, folder: Path, show: Callable[[float, str], None]) -> None:
         self.folder = folder
-        self.zero: Ns | None = None
+        self.zero: Ns | None = None  # origin of the shown times
         self._fleet_file = folder / "fleet.toml"
         self._show = show
         # Has an exception once a process ends unexpectedly.

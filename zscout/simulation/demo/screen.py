@@ -39,12 +39,10 @@ class DemoScreen:
     """Events as lines in a pipe, as a picture with the latest at a terminal, or not at all with `--json`."""
 
     def __init__(self, *, as_json: bool, decimals: int, live: LiveView | None = None) -> None:
-        self._live = live
-        self._where = ""
-        self._as_json = as_json
+        self._live, self._where = live, ""
+        self._as_json, self._decimals = as_json, decimals
         self._plain = not as_json and not terminal.at_terminal()
         self._drawn = not as_json and not self._plain
-        self._decimals = decimals
         self._events: list[str] = []
 
     def print_line(self, text: str) -> None:
