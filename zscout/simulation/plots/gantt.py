@@ -51,10 +51,11 @@ def rows_of(
         if first >= last:
             continue
         for rc in hold.rcs:
-            if not (free := [row for row in lanes[rc] if not any(row[first:last])]):
-                lanes[rc].append(row := [None] * width)
-                free = [row]
-            free[0][first:last] = [hold.arc] * (last - first)
+            row = next((row for row in lanes[rc] if not any(row[first:last])), None)
+            if row is None:
+                row = [None] * width
+                lanes[rc].append(row)
+            row[first:last] = [hold.arc] * (last - first)
     return ((rc, row) for rc, rows in lanes.items() for row in rows)
 
 
