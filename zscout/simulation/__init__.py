@@ -1,5 +1,5 @@
-"""What runs without devices: the simulated building, demos, workloads and their replay."""
+"""Runs without devices: the simulated building, demos, workloads and their replay."""
 
 
 class DemoFailed(RuntimeError):
-    """A demo could not be carried out: one line, with the remedy."""
+    """A demo failed: one line, with the remedy."""

@@ -1,4 +1,4 @@
-"""Plays a workload through the core under virtual time, and keeps what came of it."""
+"""Plays a workload through the core under virtual time."""
 
 from __future__ import annotations
 
@@ -17,13 +17,15 @@ from zscout.scheduling.state import Strategy
 from zscout.simulation.workload import Workload
 from zscout.types import ArcId, Ns, RcName
 
-SERVED: Final = (model.Outcome.COMPLETED, model.Outcome.RELEASED)
-"""How holds end that had all that their programs wanted of them."""
+SERVED: Final = (
+    model.Outcome.COMPLETED,
+    model.Outcome.RELEASED,
+)  # outcomes of holds that ran as long as their programs wanted
 
 
 @dataclass(frozen=True, slots=True)
 class HoldRecord:
-    """One hold from its grant to its end, in ns."""
+    """A hold from its grant to its end, ns."""
 
     arc: ArcId
     start: Ns
@@ -34,7 +36,7 @@ class HoldRecord:
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """What came of a workload: holds by start, ARC, end; and the ARCs that never completed, by name."""
+    """Holds sorted by start, ARC and end, and the names of the ARCs that never completed, sorted."""
 
     holds: tuple[HoldRecord, ...]
     unserved: tuple[ArcId, ...]
@@ -51,10 +53,10 @@ def replay(
     policy: SchedulingPolicy = DEFAULT,
     lasting: Mapping[ArcId, Ns] = MappingProxyType({}),
 ) -> Replay:
-    """Runs the workload to its end. `watch` sees the core after each batch, for tests and recorders. By ARC, `lasting`
-    is after how many ns its program gives back what it holds, if that is before the minimum runtime is over.
+    """Run the workload to its end. `watch` is called with the core after each batch. `lasting` is by ARC the time
+    (ns) after which its program releases its hold, if shorter than its minimum runtime.
 
-    What is kept past its minimum runtime ends when nothing else is left to come."""
+    Holds kept past their minimum runtime end when no other event is left."""
     core = Core(strategy, policy)
     capacity = {rc.name: rc.capacity for rc in workload.rcs if rc.sharable}
     runtime = {arrival.request.arc: arrival.request.min_runtime for arrival in workload.arrivals}
@@ -68,7 +70,6 @@ def replay(
         return model.Vote(asked.proposal, accept=not reason, reason=reason)
 
     def step(now: Ns, events: Iterable[model.Event]) -> None:
-        """One instant."""
         for effects in play_instant(core, now, events, vote):
             if watch is not None:
                 watch(now, core, effects)
@@ -82,8 +83,8 @@ def replay(
     now: Ns = 0
     step(now, [model.RcJoined(rc.name, rc.sharable) for rc in workload.rcs])
     while arrivals or running:
-        # Only an arrival or the end of a minimum runtime (a kept hold may be displaced from then on)
-        # changes anything here; the quantum's ticks would not.
+        # The quantum's ticks change nothing; only arrivals and ends of minimum runtimes do (kept holds may be
+        # displaced from then on).
         ends = [hold.start + early.get(arc, runtime[arc]) for arc, hold in running.items()]
         coming = [end for end in ends if end > now]
         if arrivals:
@@ -92,8 +93,8 @@ def replay(
             step(now, [model.Released(arc) for arc in sorted(running)])
             continue
         now = min(coming)
-        back = [arc for arc, hold in running.items() if arc in early and hold.start + early[arc] <= now]
-        events: list[model.Event] = [*map(model.Released, sorted(back))]
+        released = sorted(arc for arc, hold in running.items() if arc in early and hold.start + early[arc] <= now)
+        events: list[model.Event] = [*map(model.Released, released)]
         while arrivals and arrivals[0].at == now:
             events.append(model.Requested(arrivals.popleft().request))
         step(now, events or [model.Tick()])

@@ -1,9 +1,9 @@
-"""A workload: RCs, and the ARCs that come to ask for them; and the file of it that `zscout replay` reads.
+"""A workload (RCs and the ARCs that request them), and its file for `zscout replay`.
 
     [[rc]]
     name = "radio/rf0"
     sharable = true                      # several holders at once; exclusive without it
-    capacity = { command_rate = 10.0 }   # vetoes any set of holders whose sum is greater
+    capacity = { command_rate = 10.0 }   # vetoes holders whose sum is greater
 
     [[arc]]
     name = "arc0"
@@ -13,8 +13,7 @@
     [arc.needs]
     "radio/rf0" = { command_rate = 5.0 } # a parameter left out counts 0
 
-Names are free texts here, since nothing goes onto a mesh. An ARC may need an RC that the file does not have:
-it then never runs, and ends among the unserved.
+Names are free texts, since nothing goes onto a mesh. An ARC that needs an RC missing from the file stays unserved.
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from zscout.types import Ns, Params, RcName
 
 @dataclass(frozen=True, slots=True)
 class WorkloadRc:
-    """An RC of a workload. A sharable one vetoes what exceeds its capacity; no capacity means no bound."""
+    """A sharable RC vetoes holders that exceed its capacity; no capacity means no bound."""
 
     name: RcName
     sharable: bool = False
@@ -44,28 +43,23 @@ class WorkloadRc:
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """An ARC that asks at `at` ns."""
-
     at: Ns
     request: ArcRequest
 
 
 @dataclass(frozen=True, slots=True)
 class Workload:
-    """RCs and arrivals; arrivals of one instant ask in the order given."""
+    """Arrivals of one instant are requested in the order given."""
 
     rcs: tuple[WorkloadRc, ...]
     arrivals: tuple[Arrival, ...]
 
 
-MAX_BYTES: Final = 64_000_000
-"""Largest workload file that is worth reading; for whoever opens it."""
+MAX_BYTES: Final = 64_000_000  # of a workload file
 MAX_ARCS: Final = 100_000
 MAX_RCS: Final = 10_000
-MAX_NEEDS: Final = 1_000
-"""RCs that one ARC may need."""
-MAX_PARAMETERS: Final = 64
-"""Bandwidth parameters that an ARC may give to one RC, and capacities that one RC may have."""
+MAX_NEEDS: Final = 1_000  # RCs per ARC
+MAX_PARAMETERS: Final = 64  # per RC: capacities, and bandwidth parameters of an ARC
 MAX_PRIORITY: Final = 1_000_000_000
 _MAX_NAME: Final = 130
 
@@ -92,9 +86,7 @@ class _File(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def parse_workload(text: str, source: str) -> Workload:
-    """The workload that `text` describes: times in whole ns, amounts exact, RCs and ARCs in the file's order.
-
-    `source` names the file in errors. Raises BadInput at the first thing that is wrong."""
+    """Parse `text`, keeping the file's order. `source` names the file in errors. Raises BadInput."""
     file = parse_toml(text, source, _File)
     top = Where(source)
     check_unique((rc.name for rc in file.rc), top / "rc", "name")

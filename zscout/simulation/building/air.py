@@ -1,7 +1,7 @@
-"""The air between cameras and receivers: analog pictures on a few channels, and what spoils them. Seeded.
+"""Analog transmission of pictures from cameras to receivers, with seeded noise.
 
-A receiver has a channel and shows whatever is on it: snow where nobody transmits, one robot's picture with
-the noise, ghosts and torn lines of its distance, and where two or more transmit, a mixture of use to nobody.
+A receiver shows its channel: snow if no robot transmits, a robot's picture with noise, ghosts and torn lines by
+distance, and a useless mixture if several robots transmit.
 """
 
 from __future__ import annotations
@@ -18,19 +18,15 @@ from zscout.simulation.building.world import World
 
 ROWS: Final = 120
 COLUMNS: Final = 160
-GRAIN: Final = 1.5
-"""Standard deviation in grey levels that the air adds to the best of pictures."""
-WEAK: Final = 28.0
-"""And more of it where nothing is left of the signal."""
-TORN: Final = 0.02
-"""Share of good pictures in which some lines are torn aside."""
-GHOST: Final = 0.06
-"""Share of the picture that comes a second time, off a wall, at half strength."""
+GRAIN: Final = 1.5  # standard deviation in grey levels at full strength
+WEAK: Final = 28.0  # added to it without any signal
+TORN: Final = 0.02  # share of good pictures in which some lines are torn aside
+GHOST: Final = 0.06  # share of the picture that comes again by reflection, without any signal
 SOLID: Final = 0.999
 
 
 class Air:
-    """What the receivers of one building get."""
+    """The receivers of a building."""
 
     def __init__(self, *, seed: int = 0) -> None:
         self._rng = np.random.default_rng((seed, 0xA1))
@@ -38,32 +34,27 @@ class Air:
         self._columns = np.arange(COLUMNS, dtype=np.float32)[None, :]
 
     def receive(self, world: World, channel: int) -> Picture:
-        """What a receiver on `channel` shows now: uint8 of shape (120, 160). A transmitting camera is looked
-        through for it, so each call is one picture."""
+        """The picture of a receiver on `channel`, uint8 (120, 160). Each call takes a new picture of the cameras."""
         senders = [body for body in world.bodies.values() if body.alive and body.camera == channel]
         if not senders:
             return self._snow()
         if len(senders) > 1:
             return self._jam([world.picture(body.name).astype(np.float32) for body in senders[:3]])
         body = senders[0]
-        strength = strength_at(world.plan, body.x, body.y)
-        warmth = body.warmth(world.time)
+        picture, warmth = world.picture(body.name), body.warmth(world.time)
         if warmth < SOLID:
-            # While it warms up the carrier comes and goes.
-            picture = world.picture(body.name).astype(np.float32)
             share = warmth**3
-            return _picture(share * picture + (1 - share) * self._snow().astype(np.float32))
-        return self._transmit(world.picture(body.name), strength, world.plan.noise.analog)
+            return _picture(share * picture.astype(np.float32) + (1 - share) * self._snow().astype(np.float32))
+        return self._transmit(picture, strength_at(world.plan, body.x, body.y), world.plan.noise.analog)
 
     def _transmit(self, picture: Picture, strength: float, analog: float) -> Picture:
-        rng = self._rng
-        signal = picture.astype(np.float32)
-        weakness = 1 - strength
         if analog == 0:
             return picture
+        rng, weakness = self._rng, 1 - strength
+        signal = picture.astype(np.float32)
         ghost = GHOST * weakness * analog
         signal = (1 - ghost) * signal + ghost * np.roll(signal, 7, axis=1)
-        # Noise of a narrow band: neighbours along a line are alike.
+        # Narrow-band noise: neighbours along a line are alike.
         grain = rng.standard_normal((ROWS, COLUMNS), dtype=np.float32)
         grain[:, 1:] = 0.8 * grain[:, 1:] + 0.6 * grain[:, :-1]
         signal += (GRAIN + WEAK * weakness**2) * analog * grain
@@ -72,7 +63,7 @@ class Air:
         return _picture(signal)
 
     def _jam(self, pictures: list[Floats]) -> Picture:
-        """Two carriers beat: bars roll through, lines lose their sync, and both pictures shine through."""
+        """Carriers beat: bars roll through, lines lose their sync, and the pictures mix."""
         rng = self._rng
         phase = float(rng.uniform(0, 2 * np.pi))
         beat = np.sin(self._rows * rng.uniform(0.25, 0.6) + self._columns * rng.uniform(0.2, 0.9) + phase)
@@ -91,7 +82,7 @@ class Air:
 
 
 def tear(signal: Floats | Picture, rng: np.random.Generator, *, bands: int) -> None:
-    """Some lines lose their sync: so many bands of them stand aside."""
+    """Shift some bands of lines aside, as if they lost their sync."""
     for _ in range(bands):
         first = int(rng.integers(0, ROWS - 2))
         last = min(ROWS, first + int(rng.integers(1, 5)))
@@ -99,7 +90,7 @@ def tear(signal: Floats | Picture, rng: np.random.Generator, *, bands: int) -> N
 
 
 def strength_at(plan: Plan, x: float, y: float) -> float:
-    """Share of a transmitter's signal that is left at the plan's receiver, 0 to 1; a half at its `range`."""
+    """Share of a transmitter's signal at the plan's receiver, 0 to 1; a half at the receiver's `range`."""
     away = float(np.hypot(x - plan.receiver.x, y - plan.receiver.y)) / plan.receiver.range
     return 1 / (1 + away * away)
 

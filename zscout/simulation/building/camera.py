@@ -1,8 +1,7 @@
-"""A robot's camera as light: what the rays of `casting` meet, painted with the light of `light`.
+"""A robot's camera: surfaces found by `casting`, painted as linear light from `light`; `sensor` makes grey levels.
 
-Light and texture are sampled between their cells by OpenCV's remap. The result is linear; `sensor` makes grey
-levels of it. So of a camera that stands, all that stands is painted once in the light of each kind, and what moves is
-painted over their sum.
+Since light adds up, the fixed scene of a camera at rest is painted once for each kind of light, and moving bodies
+are painted over the sum.
 """
 
 from __future__ import annotations
@@ -37,60 +36,48 @@ from zscout.simulation.building.textures import floor_albedo, grain
 Picture = NDArray[np.uint8]
 """Grey levels, shape (120, 160), row 0 at the top."""
 
-_FAR_ROWS: Final = 14
-"""Rows below the horizon that cover so much floor that it is taken at several depths and averaged."""
+_FAR_ROWS: Final = 14  # rows below the horizon whose floor is averaged over _SUBROWS depths
 _SUBROWS: Final = 4
-_SHADE: Final = 5.0
-"""Radii from the middle of what moves to where nothing is left of its shadow."""
-MAX_VIEWS: Final = 64
-"""Poses of which is kept what is seen from there: more than cameras that stand and are looked through, 0.5 MB each."""
+_SHADE: Final = 5.0  # extent of a moving body's shadow in radii
+MAX_VIEWS: Final = 64  # cached poses, 0.5 MB each: more than there are watched cameras at rest
 _GRAIN_FADE: Final = (1 / (1 + (FLOOR_DEPTH**2 / (EYE * FOCAL) / 0.008) ** 2)).astype(np.float32)[:, None]
-"""What is left of the floor's grain, by row: a pixel that covers much of it shows its mean."""
+"""Visible share of the floor's grain by row: a pixel that covers much floor shows the mean."""
 
 
 def shaded_by(x: float, y: float, heading: float, body: Cylinder) -> slice | None:
-    """The columns in which a body's shadow on the floor may be seen from (x, y) along `heading`; None for none."""
+    """The columns that may show a body's shadow on the floor from (x, y) along `heading`, or None."""
     return None if body.low > 0.1 else columns_of(x, y, heading, body._replace(radius=_SHADE * body.radius))
 
 
 @dataclass(slots=True)
 class _View:
-    """What is seen from one pose of all that stands."""
+    """The fixed scene from a pose."""
 
     seen: Geometry
-    at_x: Floats
-    """Of each pixel below the horizon the place on the floor, metres, shape (60, 160)."""
+    at_x: Floats  # place on the floor of each pixel below the horizon, m, shape (60, 160)
     at_y: Floats
     lit: tuple[Floats, Floats] | None = None
-    """It in the light of the lamps and of the windows; None before it is looked at again."""
+    """The scene in the light of lamps and of windows; None until the second look from this pose."""
 
 
 class Camera:
-    """Pictures of one plan."""
-
     def __init__(self, plan: Plan, boxes: Cuboids, lit: Lit) -> None:
-        self._plan = plan
-        self._boxes = boxes
-        self._lit = lit
+        self._plan, self._boxes, self._lit = plan, boxes, lit
         self.caster = Caster(plan, boxes)
         self._floor = lit.floor * floor_albedo(plan, lit.cell, lit.floor.shape[1:])
         shades = np.concatenate((np.full(4, plan.wall_shade, np.float32), np.repeat(boxes.shade, FACES)))
         self._atlas = lit.atlas * np.repeat(shades, lit.patches[:, 1])[:, None]
         self._grain = grain()
         _add_windows(plan, lit, self._atlas)
-        first = lit.patches[:, 0].astype(np.float32)
-        self._first = first
-        self._rows = lit.patches[:, 1].astype(np.float32) - 1
-        self._columns = lit.patches[:, 2].astype(np.float32) - 1
-        lengths = np.stack((boxes.half_width, boxes.half_depth, boxes.half_width, boxes.half_depth), 1) * 2
-        self._lengths = lengths
+        self._first, rows, columns = lit.patches.T.astype(np.float32)
+        self._rows, self._columns = rows - 1, columns - 1
+        self._lengths = np.stack((boxes.half_width, boxes.half_depth) * 2, 1) * 2
         self._views: OrderedDict[tuple[float, float, float], _View] = OrderedDict()
 
     def linear(
         self, x: float, y: float, heading: float, moving: list[Cylinder], lamps: float, windows: float
     ) -> Floats:
-        """The picture as linear light, shape (120, 160), before the camera's own doing; `lamps` and `windows`
-        are factors on their light."""
+        """The picture as linear light, shape (120, 160); `lamps` and `windows` are factors on their light."""
         view = self._views.pop((x, y, heading), None)
         if view is None:
             view = self._cast(x, y, heading)
@@ -119,10 +106,8 @@ class Camera:
         depths = seen.depth[HORIZON:]
         return _View(seen, x + depths * seen.ways[0], y + depths * seen.ways[1])
 
-    # Light
-
     def _paint(self, x: float, y: float, view: _View, floor: Floats, atlas: Floats, ambient: float) -> Floats:
-        """All that stands, in the light that the floor, the atlas and the ceiling have."""
+        """Paint the fixed scene with the light of floor, atlas and ceiling."""
         picture = np.empty((HEIGHT, WIDTH), np.float32)
         self._paint_floor(x, y, view, floor, picture)
         picture[:HORIZON] = 0.8 * ambient
@@ -137,16 +122,15 @@ class Camera:
         far_x, far_y = x + part * ways[0], y + part * ways[1]
         far = _between(floor, far_x / cell - 0.5, far_y / cell - 0.5)
         light[:_FAR_ROWS] = far.reshape(_FAR_ROWS, _SUBROWS, WIDTH).mean(1)
-        # 4 mm to a cell of grain, and the finer the farther: it fades where a pixel covers more.
+        # A cell of grain is 4 mm; it fades where a pixel covers more.
         fine = _between(self._grain, view.at_x * 250, view.at_y * 250, tiled=True)
         picture[HORIZON:] = light * (1 + fine * _GRAIN_FADE)
 
     def _shade(self, x: float, y: float, heading: float, view: _View, moving: list[Cylinder], picture: Floats) -> None:
-        """The shadows on the floor of what moves."""
+        """Paint the shadows of moving bodies on the floor."""
         floor = view.seen.surface[HORIZON:] == 0
         for body in moving:
-            shaded = shaded_by(x, y, heading, body)
-            if shaded is None:
+            if (shaded := shaded_by(x, y, heading, body)) is None:
                 continue
             square = (view.at_x[:, shaded] - body.x) ** 2 + (view.at_y[:, shaded] - body.y) ** 2
             left = 1 - 0.6 * np.exp(square * (-0.5 / (body.radius * 1.3) ** 2))
@@ -169,8 +153,7 @@ class Camera:
         texture = _between(self._grain, run * 40, height * 40, tiled=True).ravel()
         broad = _between(self._grain, run * 5, height * 3, tiled=True).ravel()
         light *= 1 + 0.35 * texture + 0.6 * broad
-        skirting = (number < FIRST_BOX) & (height < 0.07)
-        light[skirting] *= 0.7
+        light[(number < FIRST_BOX) & (height < 0.07)] *= 0.7  # skirting boards
         picture.ravel()[pixels] = light
 
     def _wall_maps(
@@ -183,14 +166,13 @@ class Camera:
         depth: Floats,
         number: NDArray[np.intp],
     ) -> tuple[Floats, Floats, Floats]:
-        """Places in the atlas for pixels of the outer walls; metres along the wall."""
+        """Atlas columns and rows for pixels of outer walls, and metres along the wall."""
         plan = self._plan
         wall = np.minimum(number - 2, 3)
         at_x, at_y = x + depth * seen.ways[0][column], y + depth * seen.ways[1][column]
-        # Wall 0 is run from x=0 to x=width, 1 up, 2 back, 3 down, as the corners of the room go.
+        # Walls run counter-clockwise: 0 along +x, 1 along +y, 2 along -x, 3 along -y.
         run = np.where(wall % 2 == 0, at_x, at_y)
-        length = np.where(wall % 2 == 0, plan.width, plan.depth).astype(np.float32)
-        share = run / length
+        share = run / np.where(wall % 2 == 0, plan.width, plan.depth).astype(np.float32)
         share = np.where(wall >= 2, 1 - share, share)
         map_x = share * self._columns[wall]
         map_y = self._first[wall] + np.clip(height / plan.height, 0, 1) * self._rows[wall]
@@ -210,18 +192,17 @@ class Camera:
         map_y: Floats,
         run: Floats,
     ) -> None:
-        """The same for pixels of boxes, written into the maps."""
+        """Write the same for pixels of boxes into the maps."""
         boxes = self._boxes
         box = number[standing] - FIRST_BOX
         key = box * WIDTH + column[standing]
         deep = depth[standing]
-        entry = seen.entry.ravel()[key]
         side = seen.side.ravel()[key].astype(np.intp)
         along = seen.along.ravel()[key]
         face = 4 + FACES * box + side
         share_u = along / self._lengths[box, side]
         share_v = (height[standing] - boxes.low[box]) / (boxes.high[box] - boxes.low[box])
-        under = np.flatnonzero(deep > entry + 1e-5)
+        under = np.flatnonzero(deep > seen.entry.ravel()[key] + 1e-5)
         if len(under):
             which, at = box[under], column[standing][under]
             dx = x + deep[under] * seen.ways[0][at] - boxes.x[which]
@@ -235,8 +216,7 @@ class Camera:
         run[standing] = along + box * 1.7
 
     def _paint_moving(self, x: float, y: float, seen: Geometry, moving: list[Cylinder], picture: Floats) -> None:
-        """A cylinder is brightest on one and the same side: where the light comes from matters little for
-        what moves, but that it looks round does."""
+        """Shade each cylinder from the same side, whatever the light: it only has to look round."""
         flat = seen.surface.ravel()
         pixels = np.flatnonzero(flat >= self.caster.first_moving)
         column, depth = pixels % WIDTH, seen.depth.ravel()[pixels]
@@ -249,24 +229,23 @@ class Camera:
 
 
 def _between(image: Floats, x: Floats, y: Floats, *, tiled: bool = False) -> Floats:
-    """`image` at those columns and rows, between its cells; beyond its edge again, or the edge itself."""
+    """Interpolate `image` at columns `x` and rows `y`; beyond its edge it is tiled, or the edge repeats."""
     border = cv2.BORDER_WRAP if tiled else cv2.BORDER_REPLICATE
     return np.asarray(cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=border), np.float32)
 
 
 def _add_windows(plan: Plan, lit: Lit, atlas: Floats) -> None:
-    """Windows shine themselves: texels of the outer walls that lie in one."""
+    """Make the texels of windows bright."""
     for light in plan.lights:
         if light.kind != "window":
             continue
         edges = np.array([light.y, plan.width - light.x, plan.depth - light.y, light.x])
         wall = int(edges.argmin())
-        first, rows, columns = (int(one) for one in lit.patches[wall])
+        first, rows, columns = lit.patches[wall].tolist()
         length = plan.width if wall % 2 == 0 else plan.depth
         middle = (light.x, light.y, plan.width - light.x, plan.depth - light.y)[wall]
         run = np.linspace(0, length, columns)
         height = np.linspace(0, plan.height, rows)
         high, wide = np.abs(height - light.z) <= light.depth / 2, np.abs(run - middle) <= light.width / 2
-        inside = high[:, None] & wide
         bright = 4 * light.power / max(light.width * light.depth, 0.1)
-        atlas[1, first : first + rows, :columns][inside] = bright
+        atlas[1, first : first + rows, :columns][high[:, None] & wide] = bright

@@ -1,8 +1,8 @@
-"""What a camera 4 cm above the floor meets: a ray caster over upright boxes and cylinders.
+"""Ray caster over upright boxes and cylinders, for a camera 4 cm above the floor.
 
-What stands upright meets all rays of a picture's column at the same depths (Wolfenstein's trick), so the slab
-test in the plane is done per column, and only the heights per pixel, within the part of the picture that the
-thing can cover at all. Depths are along the optical axis, which is level; the horizon is in the middle.
+All rays of a picture's column meet an upright surface at the same depth (Wolfenstein's trick), so the slab test in
+the plane is done per column, and only heights are tested per pixel, within the part of the picture that the body can
+cover. Depths are along the optical axis, which is level; the horizon is in the middle.
 """
 
 from __future__ import annotations
@@ -19,16 +19,13 @@ from zscout.simulation.building.solids import Cuboids, Floats
 
 WIDTH: Final = 160
 HEIGHT: Final = 120
-EYE: Final = 0.04
-"""Height of the camera, m."""
-VIEW: Final = math.radians(65)
-"""Horizontal field of view, radians."""
-FOCAL: Final = WIDTH / 2 / math.tan(VIEW / 2)
-"""Pixels."""
+EYE: Final = 0.04  # m, height of the camera
+VIEW: Final = math.radians(65)  # horizontal field of view
+FOCAL: Final = WIDTH / 2 / math.tan(VIEW / 2)  # pixels
 HORIZON: Final = HEIGHT // 2
 NEAR: Final = 0.01
 FIRST_BOX: Final = 6
-"""Surface numbers: 0 the floor, 1 the ceiling, 2 to 5 the outer walls, then boxes, then what moves."""
+"""Surface numbers: 0 floor, 1 ceiling, 2 to 5 outer walls, then boxes, then moving bodies."""
 
 LATERAL: Final[Floats] = ((WIDTH / 2 - 0.5 - np.arange(WIDTH)) / FOCAL).astype(np.float32)
 """Tangent of each column's angle, left positive."""
@@ -37,12 +34,11 @@ SLOPE: Final[Floats] = ((HORIZON - 0.5 - np.arange(HEIGHT)) / FOCAL).astype(np.f
 _STEEPEST: Final = float(SLOPE[0])
 FLOOR_DEPTH: Final[Floats] = (-EYE / SLOPE[HORIZON:]).astype(np.float32)
 """Depth of the floor by row below the horizon, m."""
-ALL: Final = slice(0, WIDTH)
-"""All columns of a picture."""
+ALL: Final = slice(0, WIDTH)  # columns
 
 
 class Cylinder(NamedTuple):
-    """An upright cylinder that moves: a leg, a trunk, another robot. `light` is that on the floor there."""
+    """An upright moving cylinder: a leg, a trunk, another robot. `light` is the light on the floor there."""
 
     x: float
     y: float
@@ -55,8 +51,7 @@ class Cylinder(NamedTuple):
 
 
 def columns_of(x: float, y: float, heading: float, body: Cylinder) -> slice | None:
-    """The columns of a picture taken from (x, y) along `heading` that the cylinder may cover; None if it is
-    out of view."""
+    """The columns that the cylinder may cover, seen from (x, y) along `heading`; None if out of view."""
     away_x, away_y = body.x - x, body.y - y
     away = math.hypot(away_x, away_y)
     if away <= body.radius:
@@ -73,36 +68,24 @@ def columns_of(x: float, y: float, heading: float, body: Cylinder) -> slice | No
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
-    """Which surface each pixel shows, and how deep, for 120 rows and the columns that were cast."""
+    """The surface and depth of each pixel, for all rows and the columns cast."""
 
-    surface: NDArray[np.int16]
-    """Shape (120, columns)."""
-    depth: Floats
-    """Metres along the optical axis, shape (120, columns)."""
-    ways: Floats
-    """Plan direction of each column per metre of depth, shape (2, columns)."""
-    stop: Floats
-    """Depth in each column behind which nothing is seen: a wall, or what fills it from floor to the picture's top."""
-    entry: Floats
-    """Depth at which each column meets the sides of each box, shape (boxes, columns)."""
-    side: NDArray[np.int8]
-    """Which side of a box that is, as `Lit.patches` has it."""
-    along: Floats
-    """Metres along that side from its start."""
+    surface: NDArray[np.int16]  # shape (120, columns)
+    depth: Floats  # m along the optical axis, shape (120, columns)
+    ways: Floats  # direction in the plan of each column per metre of depth, shape (2, columns)
+    stop: Floats  # depth of the first surface that hides all behind it, by column
+    entry: Floats  # depth at which each column meets the sides of each box, shape (boxes, columns)
+    side: NDArray[np.int8]  # side of the box that is met, numbered as in `Lit.patches`
+    along: Floats  # m along that side from its start
 
 
 class Caster:
-    """Casts the rays of pictures into one plan."""
-
     def __init__(self, plan: Plan, boxes: Cuboids) -> None:
-        self._plan = plan
-        self._boxes = boxes
-        self.first_moving = FIRST_BOX + len(boxes)
-        """Number of the surface of the first thing that moves."""
+        self._plan, self._boxes = plan, boxes
+        self.first_moving = FIRST_BOX + len(boxes)  # surface number of the first moving body
 
     def cast(self, x: float, y: float, heading: float, columns: slice = ALL) -> Geometry:
-        """What is seen from (x, y) along `heading` of all that stands; `columns` limits it, and all shapes of the
-        answer, to a part of the picture."""
+        """The fixed scene from (x, y) along `heading`, for a part of the picture's columns."""
         forward = np.array([np.cos(heading), np.sin(heading)], np.float32)
         left = np.array([-forward[1], forward[0]], np.float32)
         ways = forward[:, None] + left[:, None] * LATERAL[columns]
@@ -127,7 +110,7 @@ class Caster:
         return Geometry(surface, depth, ways, stop, entry, side, along)
 
     def with_moving(self, seen: Geometry, x: float, y: float, moving: list[Cylinder]) -> Geometry:
-        """What was cast from (x, y), and before it what moves."""
+        """`seen`, cast from (x, y), with moving bodies in front."""
         table = np.array([body[:5] for body in moving], np.float32).reshape(-1, 5)
         entry, leave = _meet_round(x, y, seen.ways, table)
         here = (entry < leave) & (entry <= seen.stop)
@@ -168,7 +151,7 @@ class Caster:
             start_x[:, None] + entry * way_x + boxes.half_width[:, None],
         )
         length = np.where(on_x, boxes.half_depth[:, None], boxes.half_width[:, None]) * 2
-        # Sides 2 and 3 are run through the other way round.
+        # Sides 2 and 3 run in the opposite direction.
         return entry, leave, side, np.where(side >= 2, length - at, at)
 
 
@@ -182,7 +165,7 @@ def _draw(
     depth: Floats,
     surface: NDArray[np.int16],
 ) -> None:
-    """Draws one box or cylinder into `depth` and `surface`, where it is nearer."""
+    """Draw a box or cylinder into `depth` and `surface` where it is nearer."""
     columns = np.flatnonzero(seen)
     a, b = int(columns[0]), int(columns[-1]) + 1
     nearest, farthest = float(entry[a:b].min()), float(leave[a:b].max())

@@ -1,4 +1,4 @@
-"""What a robot can't drive through, and how it is turned aside: circles against upright boxes and circles."""
+"""Collisions of robots, as circles, with upright boxes and circles."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ from zscout.simulation.building.solids import Cuboids
 Grid = NDArray[np.float64]
 
 _ROUNDS = 4
-SLACK = 1e-4
-"""Metres by which a robot may seem to reach into what it touches."""
+SLACK = 1e-4  # m that a robot may reach into what it touches
 
 
 class Obstacles:
-    """The walls, and the parts of furniture that stand lower than a robot is high."""
+    """The walls, and the parts of furniture below a robot's height."""
 
     def __init__(self, plan: Plan, boxes: Cuboids) -> None:
         low = boxes.where(boxes.low < ROBOT_HEIGHT)
@@ -28,7 +27,7 @@ class Obstacles:
         self._half_width, self._half_depth = low.half_width.astype(float), low.half_depth.astype(float)
 
     def gap(self, x: float, y: float) -> float:
-        """Metres from a point to the nearest obstacle; below 0 within one."""
+        """Metres from a point to the nearest obstacle; below 0 inside."""
         room = min(x, self.width - x, y, self.depth - y)
         if not len(self._x):
             return room
@@ -37,13 +36,12 @@ class Obstacles:
         return min(room, float((outside + np.minimum(np.maximum(across, along), 0)).min()))
 
     def room_for(self, radius: float, cell: float, shape: tuple[int, int]) -> NDArray[np.bool_]:
-        """Where a circle can be without touching anything: a grid of `shape` (rows, columns) over the floor,
-        `cell` metres each, asked at the middles of its cells."""
+        """True where a circle at the middle of a cell touches nothing; `shape` (rows, columns), `cell` in metres."""
         x, y = (np.arange(shape[1]) + 0.5) * cell, (np.arange(shape[0]) + 0.5) * cell
         across, along = np.minimum(x, self.width - x) >= radius, np.minimum(y, self.depth - y) >= radius
         free: NDArray[np.bool_] = along[:, None] & across
         for box in range(len(self._x)):
-            # Only the cells around the box are asked.
+            # Test only the cells around the box.
             reach = float(np.hypot(self._half_width[box], self._half_depth[box])) + radius
             left, right = np.searchsorted(x, (self._x[box] - reach, self._x[box] + reach))
             low, high = np.searchsorted(y, (self._y[box] - reach, self._y[box] + reach))
@@ -57,11 +55,11 @@ class Obstacles:
     def push_out(
         self, x: float, y: float, radius: float, others: list[tuple[float, float, float]]
     ) -> tuple[float, float]:
-        """A place nearby for a circle that overlaps nothing, found by pushing it out of one thing after the other.
-        `others` are circles (x, y, radius). In a corner too narrow the place may still overlap: ask `gap`."""
+        """Push a circle out of each obstacle and of `others` (x, y, radius) in turn, and return its new place, which
+        may still overlap in a narrow corner (see `gap`)."""
         for _ in range(_ROUNDS):
             before = (x, y)
-            x, y = self._into_room(x, y, radius)
+            x, y = min(max(x, radius), self.width - radius), min(max(y, radius), self.depth - radius)
             x, y = self._out_of_boxes(x, y, radius)
             for other_x, other_y, other_radius in others:
                 away_x, away_y = x - other_x, y - other_y
@@ -73,9 +71,6 @@ class Obstacles:
                 break
         return x, y
 
-    def _into_room(self, x: float, y: float, radius: float) -> tuple[float, float]:
-        return min(max(x, radius), self.width - radius), min(max(y, radius), self.depth - radius)
-
     def _offsets(self, x: float, y: float) -> tuple[Grid, Grid]:
         dx, dy = x - self._x, y - self._y
         across = np.abs(dx * self._cos + dy * self._sin) - self._half_width
@@ -83,11 +78,8 @@ class Obstacles:
         return across, along
 
     def _out_of_boxes(self, x: float, y: float, radius: float) -> tuple[float, float]:
-        if not len(self._x):
-            return x, y
         across, along = self._offsets(x, y)
-        near = np.flatnonzero(np.maximum(across, along) < radius)
-        for box in near:
+        for box in np.flatnonzero(np.maximum(across, along) < radius):
             cos, sin = self._cos[box], self._sin[box]
             dx, dy = x - self._x[box], y - self._y[box]
             u, v = dx * cos + dy * sin, dy * cos - dx * sin

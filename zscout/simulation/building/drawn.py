@@ -1,14 +1,15 @@
-"""Buildings drawn at random: believable rooms, with places to hide in and things that only look like it.
+"""Plausible rooms drawn at random, with hiding places and decoys.
 
-A drawn room has a door, a window and a lamp or two, low furniture that a robot drives under (sofas, beds,
-sideboards), tables and chairs, and solid things: shelves, cartons, one of them black, and now and then a dark
-rug. People cross it from the door and back. What stands in it never overlaps, and leaves a way between.
+A room has a door, a window, one or two lamps, low furniture that robots drive under (sofas, beds, sideboards), tables
+and chairs, solid pieces (shelves, cartons, a black box), and sometimes a dark rug. People cross it from the door and
+back. Pieces never overlap, and a robot can pass between them.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 import cv2
@@ -18,22 +19,17 @@ import numpy as np
 from zscout.simulation.building.plan import Covering, Furniture, Kind, Light, Noise, Person, Plan, Receiver, Robot, Rug
 from zscout.simulation.building.world import World
 
-TRIES: Final = 30
-"""Rooms that are drawn until one has what it must."""
-WAY: Final = 0.28
-"""Metres that are left free between two pieces: a robot and a half."""
-HIDES: Final = 2
-"""Dark places that a drawn room has at least."""
-HIDE_AREA: Final = 0.06
-"""Square metres of floor, for the middle of a robot, that make a dark place one to hide in."""
+TRIES: Final = 30  # rooms drawn at most for a plan
+WAY: Final = 0.28  # m between two pieces
+HIDES: Final = 2  # least hiding places of a room
+HIDE_AREA: Final = 0.06  # m2, least dark floor of a hiding place, for the middle of a robot
 FIRST_ROBOT: Final = 33
 DOOR: Final = 0.9
-STRIDE: Final = 0.25
-"""Metres between a walker's way and furniture."""
+STRIDE: Final = 0.25  # m between a walker's way and furniture
 
 
 class Template(NamedTuple):
-    """A kind of piece, with the ranges that its measures are drawn from, metres."""
+    """A kind of piece, and the ranges of its measures, metres."""
 
     name: str
     kind: Kind
@@ -52,7 +48,7 @@ LOW: Final = (
     Template("sideboard", "raised", (1.2, 1.8), (0.45, 0.55), (0.7, 0.85), (0.11, 0.15)),
     Template("wardrobe", "raised", (1.0, 1.6), (0.55, 0.65), (1.8, 2.0), (0.10, 0.14)),
 )
-"""What is driven under, and truly dark there."""
+"""Robots drive under these, and it is dark there."""
 OTHERS: Final = (
     Template("table", "table", (1.0, 1.6), (0.7, 0.9), (0.7, 0.76), at_wall=False),
     Template("coffee_table", "table", (0.7, 1.1), (0.5, 0.6), (0.4, 0.46), at_wall=False),
@@ -68,30 +64,27 @@ COVERINGS: Final[tuple[Covering, ...]] = ("plain", "planks", "tiles", "carpet")
 
 
 def drawn_plan(seed: int, *, robots: int = 4) -> Plan:
-    """A room of 3.2 to 6.5 m a side, the same for the same arguments. It has HIDES or more dark places
-    that can be reached from where the robots start. Raises ValueError where none of TRIES rooms has."""
+    """A room of 3.2 to 6.5 m a side, the same for the same arguments, with at least HIDES hiding places that robots
+    can reach from their starts. Raises ValueError if none of TRIES rooms has them."""
     rng = np.random.default_rng((seed, 0xD7A))
     for _ in range(TRIES):
         plan = _room(rng, f"drawn-{seed}")
-        if len(hiding_places(plan)) < HIDES:
-            continue
-        try:
-            return with_robots(plan, robots, seed=seed)
-        except ValueError:
-            continue
+        if len(hiding_places(plan)) >= HIDES:
+            with suppress(ValueError):
+                return with_robots(plan, robots, seed=seed)
     raise ValueError(f"no room of {TRIES} drawn from seed {seed} had {HIDES} places to hide; take another seed")
 
 
 def with_robots(plan: Plan, count: int, *, seed: int = 0) -> Plan:
-    """The same building with `count` robots, scout33, scout35 and so on, on open and lit floor. Raises
-    ValueError where there is no room for them."""
+    """The same building with `count` robots, scout33, scout35 and so on, on open and lit floor. Raises ValueError
+    if they have no room."""
     bare = msgspec.structs.replace(plan, robots=())
     world, rng = World(bare), np.random.default_rng((seed, 0x5C0))
     robots: list[Robot] = []
     for number in range(count):
         for _ in range(500):
             pose = world.random_start(rng)
-            if all(math.dist((pose.x, pose.y), (one.x, one.y)) > WAY for one in robots):
+            if all(math.dist((pose.x, pose.y), (other.x, other.y)) > WAY for other in robots):
                 break
         else:
             raise ValueError(f"{plan.name} has no open floor for {count} robots")
@@ -102,25 +95,28 @@ def with_robots(plan: Plan, count: int, *, seed: int = 0) -> Plan:
 
 
 def hiding_places(plan: Plan) -> list[float]:
-    """Square metres of each dark place of HIDE_AREA or more that a robot can drive to from the open floor."""
+    """Square metres of each hiding place that a robot can reach from the open floor."""
     truth = World(msgspec.structs.replace(plan, robots=())).truth
-    open_cells = np.argwhere(truth.open)
-    if not len(open_cells):
+    if not truth.open.any():
         return []
     _, parts = cv2.connectedComponents(truth.standing.astype(np.uint8), connectivity=4)
     counts = np.bincount(parts[truth.open])
-    # From the largest piece of floor: that is where robots start.
+    # Robots start on the largest piece of floor.
     dark = truth.dark & (parts == int(np.argmax(counts)))
     _, _, stats, _ = cv2.connectedComponentsWithStats(dark.astype(np.uint8), connectivity=4)
     areas = stats[1:, cv2.CC_STAT_AREA] * truth.cell**2
     return [float(area) for area in areas if area >= HIDE_AREA]
 
 
+def _uniform(rng: np.random.Generator, low: float, high: float, digits: int = 2) -> float:
+    return round(float(rng.uniform(low, high)), digits)
+
+
 def _room(rng: np.random.Generator, name: str) -> Plan:
     width, depth = (round(float(side), 2) for side in rng.uniform(3.2, 6.5, 2))
-    door = round(float(rng.uniform(0.8, width - 0.8)), 2)
+    door = _uniform(rng, 0.8, width - 0.8)
     furniture = [Furniture("door", "solid", door, 0.02, DOOR, 0.04, 2.05, shade=0.75)]
-    # Nobody puts furniture in front of a door.
+    # The floor before the door stays free.
     taken = [_Footprint(door, 0.5, DOOR, 1.0, 0.0)]
     low = [LOW[int(at)] for at in rng.choice(len(LOW), int(rng.integers(2, 4)), replace=False)]
     chosen = rng.permutation(len(OTHERS))[: int(rng.integers(3, len(OTHERS) + 1))]
@@ -128,7 +124,7 @@ def _room(rng: np.random.Generator, name: str) -> Plan:
         piece = _put(rng, template, width, depth, taken, len(furniture))
         if piece is not None:
             furniture.append(piece)
-    window = round(float(rng.uniform(0.9, width - 0.9)), 2)
+    window = _uniform(rng, 0.9, width - 0.9)
     lamps = [
         Light(
             f"lamp{number + 1}",
@@ -140,24 +136,18 @@ def _room(rng: np.random.Generator, name: str) -> Plan:
         )
         for number, at in enumerate((0.5,) if width < 5 else (0.3, 0.7))
     ]
-    sun = Light("window", window, depth, 1.4, 1.2, 1.0, round(float(rng.uniform(0.3, 1.0)), 2), "window")
-    rug = Rug(
-        round(width / 2, 2),
-        round(depth / 2, 2),
-        round(float(rng.uniform(0.8, 1.6)), 2),
-        round(float(rng.uniform(0.6, 1.2)), 2),
-        round(float(rng.uniform(-0.4, 0.4)), 2),
-        round(float(rng.uniform(0.08, 0.3)), 2),
-    )
+    sun = Light("window", window, depth, 1.4, 1.2, 1.0, _uniform(rng, 0.3, 1.0), "window")
+    measures = [_uniform(rng, low, high) for low, high in ((0.8, 1.6), (0.6, 1.2), (-0.4, 0.4), (0.08, 0.3))]
+    rug = Rug(round(width / 2, 2), round(depth / 2, 2), *measures)
     return Plan(
         name=name,
         width=width,
         depth=depth,
-        height=round(float(rng.uniform(2.4, 2.8)), 2),
+        height=_uniform(rng, 2.4, 2.8),
         covering=COVERINGS[int(rng.integers(len(COVERINGS)))],
-        floor_shade=round(float(rng.uniform(0.3, 0.5)), 2),
-        wall_shade=round(float(rng.uniform(0.5, 0.7)), 2),
-        noise=Noise(flicker=round(float(rng.uniform(0, 0.02)), 3)),
+        floor_shade=_uniform(rng, 0.3, 0.5),
+        wall_shade=_uniform(rng, 0.5, 0.7),
+        noise=Noise(flicker=_uniform(rng, 0, 0.02, 3)),
         receiver=Receiver(x=round(width - 0.2, 2), y=0.2),
         furniture=tuple(furniture),
         rugs=(rug,) if rng.random() < 0.5 else (),
@@ -167,8 +157,6 @@ def _room(rng: np.random.Generator, name: str) -> Plan:
 
 
 class _Footprint(NamedTuple):
-    """A piece from above."""
-
     x: float
     y: float
     width: float
@@ -176,7 +164,7 @@ class _Footprint(NamedTuple):
     turn: float
 
     def gap(self, x: float, y: float) -> float:
-        """Metres from a place to the piece; 0 or less inside it."""
+        """Metres from a place to the piece; at most 0 inside."""
         cos, sin = math.cos(-self.turn), math.sin(-self.turn)
         across = abs((x - self.x) * cos - (y - self.y) * sin) - self.width / 2
         along = abs((x - self.x) * sin + (y - self.y) * cos) - self.depth / 2
@@ -200,9 +188,9 @@ class _Footprint(NamedTuple):
 def _put(
     rng: np.random.Generator, template: Template, width: float, depth: float, taken: list[_Footprint], number: int
 ) -> Furniture | None:
-    """A piece of this kind where it has room; None where it has none."""
+    """Add a piece to `taken` where it has room; None if it has none."""
     wide, deep, high, clearance, shade = (
-        round(float(rng.uniform(*measure)), 2)
+        _uniform(rng, *measure)
         for measure in (template.width, template.depth, template.height, template.clearance, template.shade)
     )
     for _ in range(60):
@@ -225,25 +213,15 @@ def _put(
             continue
         if footprint.clear_of(taken, WAY):
             taken.append(footprint)
-            return Furniture(
-                f"{template.name}{number}",
-                template.kind,
-                round(x, 3),
-                round(y, 3),
-                wide,
-                deep,
-                high,
-                round(turn, 4),
-                clearance,
-                shade=shade,
-            )
+            name, at = f"{template.name}{number}", (round(x, 3), round(y, 3))
+            return Furniture(name, template.kind, *at, wide, deep, high, round(turn, 4), clearance, shade=shade)
     return None
 
 
 def _people(
     rng: np.random.Generator, door: float, width: float, depth: float, taken: Sequence[_Footprint]
 ) -> tuple[Person, ...]:
-    """One or two who come in, walk to some places that they can see from where they are, and leave."""
+    """One or two people who come in, walk straight from place to place, and leave."""
     people = []
     for number in range(int(rng.integers(1, 3))):
         path = [(door, -0.6), (door, 0.6)]
@@ -253,17 +231,9 @@ def _people(
                 path.append((round(x, 2), round(y, 2)))
             if len(path) == 5:
                 break
-        back = list(reversed(path[:-1]))
-        people.append(
-            Person(
-                f"person{number + 1}",
-                (*path, *back),
-                speed=round(float(rng.uniform(0.7, 1.3)), 2),
-                first=round(float(rng.uniform(10, 40)), 1),
-                every=round(float(rng.uniform(20, 60)), 1),
-                shade=round(float(rng.uniform(0.12, 0.45)), 2),
-            )
-        )
+        speed, first, every = _uniform(rng, 0.7, 1.3), _uniform(rng, 10, 40, 1), _uniform(rng, 20, 60, 1)
+        way = (*path, *path[-2::-1])
+        people.append(Person(f"person{number + 1}", way, speed, first, every, shade=_uniform(rng, 0.12, 0.45)))
     return tuple(people)
 
 

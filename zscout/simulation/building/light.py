@@ -1,11 +1,10 @@
-"""The light of a room, worked out once per plan: on the floor finely, on walls and furniture coarsely.
+"""The light of a room, computed once per plan: finely on the floor, coarsely on walls and furniture.
 
-Lamps and windows are areas, taken as a grid of points (soft shadows). On the floor, what a box hides from one
-such point, or from one direction of the sky of walls and ceiling, is a convex shadow that OpenCV fills in
-(shadow volumes on a plane, as in projective shadows: Blinn, "Me and my (fake) shadow", 1988). The sky takes
-directions spread evenly over the disc, which weighs them by the cosine (Malley's method). Where furniture
-hides the sky, what comes back is a share of the light on the floor nearby; so it falls off inwards.
-Faces are taken at a few points each, by rays against all boxes.
+Lamps and windows are grids of points (soft shadows). A box hides from the floor each such point, and each direction
+of the sky (walls and ceiling), within a convex shadow that OpenCV fills (projective shadows: Blinn, "Me and my (fake)
+shadow", 1988). Directions of the sky are spread evenly over the disc, which weighs them by the cosine (Malley's
+method). Furniture that hides the sky returns a share of the floor's light nearby, so light falls off inwards. Faces
+are sampled at a few points, by rays against all boxes.
 """
 
 from __future__ import annotations
@@ -22,50 +21,35 @@ from numpy.typing import NDArray
 from zscout.simulation.building.plan import Light, Noise, Plan, Receiver
 from zscout.simulation.building.solids import Cuboids, Floats, cuboids_of
 
-FINEST: Final = 0.025
-"""Metres of a floor cell, unless the room is so large that it has more than `MAX_CELLS`."""
+FINEST: Final = 0.025  # m of a floor cell, if the floor has at most MAX_CELLS
 MAX_CELLS: Final = 40_000
-SKY: Final = 96
-"""Directions of the sky over the floor."""
+SKY: Final = 96  # directions of the sky over the floor
 FACE_SKY: Final = 24
 ATLAS_WIDTH: Final = 32
-FLUX: Final = 3.2
-"""Intensity of a lamp of power 1: gives 20 m2 under a ceiling of 2.5 m about 0.5 in the middle."""
-AMBIENT: Final = 0.9
-"""Light that walls and ceiling give back, as a share of the mean direct light on the floor."""
-RETURNED: Final = 0.07
-"""Share of the floor's light that comes back from furniture close above or beside it."""
+FLUX: Final = 3.2  # intensity of a lamp of power 1: about 0.5 in the middle of 20 m2 below a ceiling of 2.5 m
+AMBIENT: Final = 0.9  # light from walls and ceiling, as a share of the mean direct light on the floor
+RETURNED: Final = 0.07  # share of the floor's light returned by furniture close above or beside it
+FACES: Final = 5  # visible faces of a box, see `Lit.patches`
 _SHIFT: Final = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Lit:
-    """Light by kind of source: index 0 lamps, 1 windows. All linear; 0.5 is usual."""
+    """Linear light by kind of source (index 0 lamps, 1 windows); 0.5 is usual."""
 
-    cell: float
-    """Metres of a floor cell; [row, column] has its middle at ((column + 0.5) cell, (row + 0.5) cell)."""
-    floor: Floats
-    """Light on the floor, shape (2, rows, columns)."""
-    atlas: Floats
-    """Light on faces, shape (2, rows, ATLAS_WIDTH): the patches of all faces, one below the other."""
+    cell: float  # m; the middle of cell [row, column] is at ((column + 0.5) cell, (row + 0.5) cell)
+    floor: Floats  # shape (2, rows, columns)
+    atlas: Floats  # light on faces, their patches in a column, shape (2, rows, ATLAS_WIDTH)
     patches: NDArray[np.int32]
     """Per face: first row, rows, columns of its patch; shape (faces, 3). 0 to 3: the outer walls y=0,
-    x=width, y=depth, x=0; then five for each box: its sides -y, +x, +y, -x in its own axes, its underside."""
-    ambient: NDArray[np.float32]
-    """Light from the sky of walls and ceiling, shape (2,)."""
-
-
-FACES: Final = 5
-"""Faces of a box that can be seen from just above the floor, by `Lit.patches`."""
+    x=width, y=depth, x=0; then for each box its sides -y, +x, +y, -x in its own axes, and its underside."""
+    ambient: NDArray[np.float32]  # light from the sky, shape (2,)
 
 
 def light_of(plan: Plan) -> Lit:
-    """The light of a plan; remembered for the last few plans of this process, whoever moves in them."""
-    return _bake(
-        msgspec.structs.replace(
-            plan, name="", people=(), robots=(), rugs=(), covering="plain", noise=Noise(), receiver=Receiver()
-        )
-    )
+    """The light of a plan, cached by everything that affects it."""
+    bare = {"people": (), "robots": (), "rugs": (), "covering": "plain", "noise": Noise(), "receiver": Receiver()}
+    return _bake(msgspec.structs.replace(plan, name="", **bare))
 
 
 @lru_cache(maxsize=16)
@@ -90,11 +74,8 @@ def _bake(plan: Plan) -> Lit:
     return Lit(cell, floor, atlas, patches, ambient)
 
 
-# The floor
-
-
 def _points_of(light: Light, plan: Plan, across: int) -> tuple[Floats, Floats]:
-    """Points of a light's area, shape (n, 3), and the way it faces, shape (3,)."""
+    """Points of a light's area, shape (n, 3), and its direction, shape (3,)."""
     steps = ((np.arange(across) + 0.5) / across - 0.5).astype(np.float32)
     a, b = (grid.ravel() for grid in np.meshgrid(steps * light.width, steps * light.depth))
     flat = np.zeros_like(a)
@@ -110,7 +91,7 @@ def _points_of(light: Light, plan: Plan, across: int) -> tuple[Floats, Floats]:
 
 
 def _shade_into(mask: NDArray[np.uint8], shadows: Floats, cell: float) -> None:
-    """Sets to 0 the convex hull of each box's points, shape (n, 8, 2) in metres."""
+    """Set the convex hull of each box's points to 0; `shadows` has shape (n, 8, 2), metres."""
     scaled = np.clip((shadows / cell - 0.5) * (1 << _SHIFT), -300_000, 300_000).astype(np.int32)
     for points in scaled:
         cv2.fillConvexPoly(mask, cv2.convexHull(points), 0, shift=_SHIFT)
@@ -133,7 +114,7 @@ def _floor_direct(plan: Plan, lights: list[Light], boxes: Cuboids, cell: float, 
             mask.fill(1)
             cast = []
             for height in (boxes.low, boxes.high):
-                # A box that reaches above the light shades as if it ended just below: its shadow has no end.
+                # A box that reaches above the light is cut just below it, since its shadow is endless.
                 height = np.minimum(height, point[2] - 0.02)
                 away = (point[2] / (point[2] - height))[:, None, None]
                 cast.append(point[:2] + (corners - point[:2]) * away)
@@ -152,7 +133,7 @@ def _disc(count: int) -> tuple[Floats, Floats]:
 
 
 def _floor_sky(boxes: Cuboids, cell: float, shape: tuple[int, int]) -> Floats:
-    """The share of the sky that each cell of the floor sees past the furniture."""
+    """Share of the sky visible from each cell of the floor."""
     total = np.zeros(shape, np.float32)
     mask = np.empty(shape, np.uint8)
     corners = boxes.corners()
@@ -163,9 +144,6 @@ def _floor_sky(boxes: Cuboids, cell: float, shape: tuple[int, int]) -> Floats:
         _shade_into(mask, np.concatenate(cast, axis=1), cell)
         total += mask
     return np.asarray(total / SKY, np.float32)
-
-
-# Faces
 
 
 def _patches(plan: Plan, boxes: Cuboids) -> NDArray[np.int32]:
@@ -183,7 +161,7 @@ def _patches(plan: Plan, boxes: Cuboids) -> NDArray[np.int32]:
 
 
 def _face_points(plan: Plan, boxes: Cuboids, patches: NDArray[np.int32]) -> tuple[Floats, Floats]:
-    """Points on all faces and where they look, both of shape (points, 3), in the order of the patches."""
+    """Points on all faces and their normals, both of shape (points, 3), in the order of the patches."""
     corners = boxes.corners()
     room = np.array([[0, 0], [plan.width, 0], [plan.width, plan.depth], [0, plan.depth]], np.float32)
     points, normals = [], []
@@ -211,7 +189,7 @@ def _face_points(plan: Plan, boxes: Cuboids, patches: NDArray[np.int32]) -> tupl
 
 
 def hidden(origin: Floats, way: Floats, reach: Floats, boxes: Cuboids) -> NDArray[np.bool_]:
-    """Whether a box lies on each ray within `reach` of its way; origin and way (n, 3), reach (n,)."""
+    """True for each ray that meets a box within `reach` times its way; origin and way (n, 3), reach (n,)."""
     found = np.zeros(len(origin), np.bool_)
     tiny = np.float32(1e-9)
     with np.errstate(over="ignore", invalid="ignore"):
@@ -254,8 +232,7 @@ def _faces(
                 square = (way * way).sum(1)
                 arriving, leaving = (way * normals).sum(1), -(way @ facing)
                 seen = np.flatnonzero((arriving > 0) & (leaving > 0))
-                clear = ~hidden(points[seen], way[seen], np.ones(len(seen), np.float32), boxes)
-                seen = seen[clear]
+                seen = seen[~hidden(points[seen], way[seen], np.ones(len(seen), np.float32), boxes)]
                 strength = FLUX * light.power / len(sources)
                 got[kind, seen] += strength * arriving[seen] * leaving[seen] / (square[seen] ** 2)
     got += _face_sky(plan, points, normals, boxes, floor, cell, ambient)
@@ -277,7 +254,7 @@ def _face_sky(
     cell: float,
     ambient: NDArray[np.float32],
 ) -> Floats:
-    """What comes to faces from walls, ceiling, floor and furniture, by one bounce."""
+    """Light on faces from walls, ceiling, floor and furniture, by a single bounce."""
     rows, columns = floor.shape[1:]
 
     def on_floor(x: Floats, y: Floats) -> Floats:
@@ -292,7 +269,7 @@ def _face_sky(
     for a, b in zip(*_disc(FACE_SKY), strict=True):
         up = np.sqrt(max(1 - a * a - b * b, 0.0))
         way = (a * other + b * third + up * normals).astype(np.float32)
-        # To the floor, or as far as no room is wide.
+        # To the floor, or farther than any room is wide.
         fall = np.minimum(way[:, 2], -1e-3)
         reach = np.where(way[:, 2] < -1e-3, -points[:, 2] / fall, 30).astype(np.float32)
         end_x, end_y = points[:, 0] + way[:, 0] * reach, points[:, 1] + way[:, 1] * reach

@@ -1,4 +1,4 @@
-"""The node file of a served building: its devices, configured as those of a real one would be."""
+"""The node file of a served building, configured as for a real building's devices."""
 
 from __future__ import annotations
 
@@ -12,19 +12,17 @@ from zscout.simulation.building.radio_line import BITS, MAX_BAUD, MIN_BAUD
 from zscout.simulation.building.serve import Served
 
 RADIO: Final = "radio/rf0"
+# A packet may wait BOUND seconds, or as long as BOUND_BYTES take on a slow line, at most MAX_BOUND seconds.
 BOUND: Final = 0.25
-"""Seconds that a packet may wait on a quick line ..."""
 BOUND_BYTES: Final = 60
-"""... or as long as so many bytes take."""
 MAX_BOUND: Final = 10.0
-MIN_RATE: Final = 0.1
+MIN_RATE: Final = 0.1  # frames per second of a framegrabber
 MAX_RATE: Final = 60.0
-"""Of a framegrabber's frames a second."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceTables:
-    """The [[rc]] tables of a building's devices: TOML, one after another as a node file wants them."""
+    """The [[rc]] tables of a building's devices, in TOML."""
 
     radio: str
     robots: list[str]
@@ -43,9 +41,8 @@ def device_tables(
     rate: float,
     framegrabbers: int,
 ) -> DeviceTables:
-    """A radio at serial `port`, `robots` (RC names and ids on the air), a video channel for each of `urls`,
-    and `framegrabbers` receivers that tune in to any of them at `rate` frames a second. `bound` and `warm_up`
-    in seconds."""
+    """A radio at serial `port`, `robots` (ids on the air by RC), a video channel for each of `urls`, and
+    `framegrabbers` receivers that tune in to any of them at `rate` frames a second; `bound`, `warm_up` in seconds."""
     videos = [video_name(number) for number, _ in enumerate(urls, 1)]
     channels = _inline({rc: str(number) for number, rc in enumerate(videos, 1)})
     sources = _inline({rc: _text(url) for rc, url in zip(videos, urls, strict=True)})
@@ -61,19 +58,17 @@ def device_tables(
     )
 
 
-def video_name(channel: int) -> str:
-    """The RC of a video channel, from 1."""
+def video_name(channel: int) -> str:  # from 1
     return f"video/ch{channel}"
 
 
-def framegrabber_name(number: int) -> str:
-    """The RC of a framegrabber, from 1."""
+def framegrabber_name(number: int) -> str:  # from 1
     return f"framegrabber/fgrab{number}"
 
 
 def node_file(served: Served, *, fleet: Path | None, framegrabbers: int) -> str:
-    """TOML with an RC for the radio, each robot, each video channel and `framegrabbers` receivers. Times are
-    ours: a building twice as fast warms up its cameras in half of the time."""
+    """TOML with an RC for the radio, each robot, each video channel and `framegrabbers` receivers, in real time:
+    a building at double speed warms up its cameras in half the time."""
     speed = served.speed
     baud = min(max(served.radio.baud, MIN_BAUD), MAX_BAUD)
     devices = device_tables(
@@ -88,8 +83,7 @@ def node_file(served: Served, *, fleet: Path | None, framegrabbers: int) -> str:
     )
     head = "# The devices of a simulated building, written by zscout simulate. For: zscout-node THIS_FILE\n"
     node = _table("[node]", {} if fleet is None else {"fleet": _text(str(fleet.absolute()))})
-    tables = [head, node, devices.radio, *devices.robots, *devices.videos, *devices.framegrabbers]
-    return "\n".join(tables)
+    return "\n".join([head, node, devices.radio, *devices.robots, *devices.videos, *devices.framegrabbers])
 
 
 def rc_table(name: str, driver: str, **keys: str) -> str:
@@ -111,5 +105,5 @@ def _text(text: str) -> str:
 
 
 def _number(value: float) -> str:
-    """With three decimals at most, never a power of ten."""
+    """At most three decimals, never an exponent."""
     return f"{round(value, 3):g}"

@@ -1,4 +1,4 @@
-"""People who walk their paths now and then: when, where their feet are, and how they look from the floor."""
+"""People who walk their paths now and then: times, places of their feet, and shapes for cameras."""
 
 from __future__ import annotations
 
@@ -9,21 +9,18 @@ import numpy as np
 from zscout.simulation.building.casting import Cylinder
 from zscout.simulation.building.plan import Person
 
-STRIDE: Final = 0.7
-"""Metres from one foot's step to its next, halved: the feet swing by half of it ahead and behind."""
-FOOT: Final = 0.055
-"""Radius of a leg at the floor, m."""
+STRIDE: Final = 0.7  # m of a step; the feet swing by half of it ahead and behind
+FOOT: Final = 0.055  # m, radius of a leg at the floor
 _HIP: Final = 0.8
 _TALL: Final = 1.75
 _APART: Final = 0.09
 
 
 class Walker:
-    """One person over time. Between walks there is nobody."""
+    """A person over time, absent between walks."""
 
     def __init__(self, person: Person, rng: np.random.Generator) -> None:
-        self._person = person
-        self._rng = rng
+        self._person, self._rng = person, rng
         path = np.array(person.path, float)
         steps = np.diff(path, axis=0)
         lengths = np.hypot(steps[:, 0], steps[:, 1])
@@ -40,7 +37,7 @@ class Walker:
         self._gone = 0.0
 
     def at(self, time: float) -> None:
-        """Goes on to `time`, seconds; never back."""
+        """Advance to `time`, seconds; never back."""
         person = self._person
         while True:
             self._gone = (time - self._begins) * person.speed
@@ -62,17 +59,11 @@ class Walker:
             return []
         swing = STRIDE / 2 * float(np.sin(np.pi * self._gone / STRIDE))
         way_x, way_y = float(self._way[0]), float(self._way[1])
-        return [
-            (
-                self.x + way_x * swing * sign - way_y * _APART * sign,
-                self.y + way_y * swing * sign + way_x * _APART * sign,
-                FOOT,
-            )
-            for sign in (1, -1)
-        ]
+        dx, dy, side_x, side_y = way_x * swing, way_y * swing, way_y * _APART, way_x * _APART
+        return [(self.x + dx * sign - side_x * sign, self.y + dy * sign + side_y * sign, FOOT) for sign in (1, -1)]
 
     def shapes(self, light: float) -> list[Cylinder]:
-        """How it looks; `light` is that on the floor where it walks."""
+        """Cylinders for cameras; `light` is the light on the floor there."""
         if not self.here:
             return []
         shade = self._person.shade

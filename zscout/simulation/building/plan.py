@@ -1,4 +1,4 @@
-"""The plan of a building: what its TOML file holds."""
+"""The plan of a building, as in its TOML file."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ MAX_LIGHTS: Final = 8
 MAX_PEOPLE: Final = 8
 MAX_ROBOTS: Final = 16
 MAX_CORNERS: Final = 16
-ROBOT_HEIGHT: Final = 0.05
-"""Metres; what stands higher above the floor than this is driven under."""
+ROBOT_HEIGHT: Final = 0.05  # m; robots drive under anything higher above the floor
 
 Size = Annotated[float, Meta(ge=0.01, le=20)]
 Place = Annotated[float, Meta(ge=-2, le=22)]
@@ -25,7 +24,7 @@ Angle = Annotated[float, Meta(ge=-7, le=7)]
 Shade = Annotated[float, Meta(ge=0.01, le=0.95)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 Point = Annotated[tuple[Place, ...], Meta(max_length=2)]
-"""A place [x, y] in metres. Two numbers: checked after reading."""
+"""A place [x, y] in metres; its length is checked after reading."""
 
 Kind = Literal["solid", "table", "desk", "chair", "raised", "sofa", "bed", "shelf"]
 Covering = Literal["plain", "planks", "tiles", "carpet"]
@@ -40,10 +39,10 @@ class Wall(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Furniture(Struct, frozen=True, forbid_unknown_fields=True):
-    """One piece: its middle, its extent before it is turned about that, and how far it is off the floor.
+    """A piece by its middle and its extent before it is turned about that.
 
-    `solid` and `shelf` stand on the floor; a `table` is a slab on four legs, a `chair` has a back as well, a
-    `desk` panels at its sides; `raised`, `sofa` and `bed` are bodies on short feet, `clearance` above it."""
+    `solid` and `shelf` touch the floor; a `table` is a slab on four legs, a `chair` also has a back, a `desk`
+    panels at its sides; `raised`, `sofa` and `bed` are bodies on short feet, `clearance` above the floor."""
 
     name: str
     kind: Kind
@@ -54,14 +53,12 @@ class Furniture(Struct, frozen=True, forbid_unknown_fields=True):
     height: Annotated[float, Meta(ge=0.01, le=4)]
     turn: Angle = 0.0
     clearance: Annotated[float, Meta(ge=0, le=2)] = 0.12
-    leg: Annotated[float, Meta(ge=0.02, le=0.3)] = 0.05
-    """Metres of a leg or foot, square."""
-    shade: Shade = 0.4
-    """Share of the light that it gives back."""
+    leg: Annotated[float, Meta(ge=0.02, le=0.3)] = 0.05  # m, side of a square leg or foot
+    shade: Shade = 0.4  # share of the light that is reflected
 
 
 class Rug(Struct, frozen=True, forbid_unknown_fields=True):
-    """A flat thing on the floor. A dark one looks like shadow and hides nobody."""
+    """A dark rug looks like shadow, but hides no robot."""
 
     x: Place
     y: Place
@@ -72,9 +69,9 @@ class Rug(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Light(Struct, frozen=True, forbid_unknown_fields=True):
-    """A lamp that shines down from `z` (none given: the ceiling), or a window in an outer wall.
+    """A lamp that shines down from `z` (0: the ceiling), or a window in an outer wall.
 
-    A window is `width` along its wall by `depth` in height, `z` its middle; only it follows the daylight."""
+    A window is `width` along its wall by `depth` in height, `z` its middle; only windows follow the daylight."""
 
     name: str
     x: Place
@@ -82,25 +79,20 @@ class Light(Struct, frozen=True, forbid_unknown_fields=True):
     z: Annotated[float, Meta(ge=0, le=6)] = 0.0
     width: Size = 0.5
     depth: Size = 0.5
-    power: Annotated[float, Meta(ge=0, le=1000)] = 1.0
-    """1 gives a usual room of 20 m2 its usual light."""
+    power: Annotated[float, Meta(ge=0, le=1000)] = 1.0  # 1 is usual for a room of 20 m2
     kind: Literal["lamp", "window"] = "lamp"
 
 
 class Person(Struct, frozen=True, forbid_unknown_fields=True):
-    """Somebody who walks a path now and then; between walks he is out of the building."""
+    """A person who walks a path now and then, and is out of the building between walks."""
 
     name: str
     path: Annotated[tuple[Point, ...], Meta(max_length=MAX_CORNERS)]
     speed: Annotated[float, Meta(ge=0.1, le=3)] = 1.0
-    first: Annotated[float, Meta(ge=0, le=100_000)] = 20.0
-    """Seconds until the first walk."""
-    every: Annotated[float, Meta(ge=1, le=100_000)] = 60.0
-    """Seconds from the end of a walk to the next."""
-    jitter: Share = 0.3
-    """Share of `first` and `every` by which they may differ from walk to walk."""
-    walks: Annotated[int, Meta(ge=0, le=1_000_000)] = 0
-    """How many walks at most; 0: no end."""
+    first: Annotated[float, Meta(ge=0, le=100_000)] = 20.0  # s until the first walk
+    every: Annotated[float, Meta(ge=1, le=100_000)] = 60.0  # s from the end of a walk to the next
+    jitter: Share = 0.3  # share by which `first` and `every` vary
+    walks: Annotated[int, Meta(ge=0, le=1_000_000)] = 0  # most walks; 0: no limit
     shade: Shade = 0.25
 
 
@@ -113,35 +105,29 @@ class Robot(Struct, frozen=True, forbid_unknown_fields=True):
     y: Place
     heading: Angle = 0.0
     slip: Annotated[float, Meta(ge=0, le=0.3)] = 0.03
-    """How much the wheels differ from what is commanded: a constant share each, and noise beside it."""
+    """Share by which a wheel's speed differs from its command, as a constant and again as noise."""
 
 
 class Noise(Struct, frozen=True, forbid_unknown_fields=True):
-    """What spoils pictures; 1 is a usual cheap camera."""
+    """Noise of pictures; factors of 1 are a usual cheap camera."""
 
-    sensor: Annotated[float, Meta(ge=0, le=10)] = 1.0
-    """Factor on the camera's own noise."""
-    analog: Annotated[float, Meta(ge=0, le=10)] = 1.0
-    """Factor on what the air adds."""
-    flicker: Annotated[float, Meta(ge=0, le=0.5)] = 0.01
-    """Share by which lamps differ from picture to picture."""
-    daylight: Annotated[float, Meta(ge=0, le=0.95)] = 0.1
-    """Share by which windows grow brighter and darker, slowly."""
-    daylight_period: Annotated[float, Meta(ge=10, le=100_000)] = 600.0
-    """Seconds from bright to bright."""
+    sensor: Annotated[float, Meta(ge=0, le=10)] = 1.0  # factor on the camera's noise
+    analog: Annotated[float, Meta(ge=0, le=10)] = 1.0  # factor on the transmission's noise
+    flicker: Annotated[float, Meta(ge=0, le=0.5)] = 0.01  # share by which lamps vary between pictures
+    daylight: Annotated[float, Meta(ge=0, le=0.95)] = 0.1  # share by which windows vary, slowly
+    daylight_period: Annotated[float, Meta(ge=10, le=100_000)] = 600.0  # s
 
 
 class Receiver(Struct, frozen=True, forbid_unknown_fields=True):
-    """Where the video receivers stand."""
+    """The place of the video receivers."""
 
     x: Place = 0.0
     y: Place = 0.0
-    range: Annotated[float, Meta(ge=1, le=1_000)] = 30.0
-    """Metres at which half of the picture is noise."""
+    range: Annotated[float, Meta(ge=1, le=1_000)] = 30.0  # m at which half of the picture is noise
 
 
 class Plan(Struct, frozen=True, forbid_unknown_fields=True):
-    """A building of one outer rectangle, from (0, 0) to (`width`, `depth`), metres."""
+    """A rectangular building from (0, 0) to (`width`, `depth`), metres."""
 
     name: str
     width: Annotated[float, Meta(ge=1.5, le=20)]

@@ -1,4 +1,4 @@
-"""Buildings from files: a plan is read strictly, and refused where its parts do not go together."""
+"""Plans from files, read strictly and checked for consistency."""
 
 from __future__ import annotations
 
@@ -11,16 +11,14 @@ from typing import Final
 from zscout.config.strict import BadInput, Where, check_name, check_unique, quoted, read_toml
 from zscout.simulation.building.plan import Furniture, Light, Person, Plan, Robot, Rug
 
-RANDOM: Final = "random"
-"""Before a colon and a seed: a building that is drawn."""
+RANDOM: Final = "random"  # `random:SEED` draws a building
 MAX_SEED: Final = 2**32 - 1
 MAX_BYTES: Final = 100_000
-PORCH: Final = 1.0
-"""Metres beyond the outer walls that a person's path may begin and end at: they come in by a door."""
+PORCH: Final = 1.0  # m beyond the outer walls, for paths that come in by a door
 
 
 def load_plan(path: Path) -> Plan:
-    """Reads a building. Raises BadInput, which names file, key and remedy."""
+    """Read a building. Raises BadInput, which names file, key and remedy."""
     plan = read_toml(path, Plan, max_bytes=MAX_BYTES)
     top = Where(str(path))
     check_plan(plan, top)
@@ -29,18 +27,16 @@ def load_plan(path: Path) -> Plan:
 
 
 def shipped_plans() -> dict[str, Path]:
-    """The buildings that come with zscout, by name."""
     folder = Path(str(resources.files("zscout.simulation.building"))) / "plans"
     return {path.stem: path for path in sorted(folder.glob("*.toml"))}
 
 
 def known_buildings() -> str:
-    """What names one, for people."""
     return ", ".join((*shipped_plans(), f"{RANDOM}:SEED"))
 
 
 def plan_named(name: str) -> Plan:
-    """The plan that people mean by `name`. Raises BadInput."""
+    """The plan of a shipped building, of `random:SEED`, or of a file. Raises BadInput."""
     shipped = shipped_plans()
     if name in shipped:
         return load_plan(shipped[name])
@@ -58,7 +54,7 @@ def plan_named(name: str) -> Plan:
 
 
 def check_plan(plan: Plan, top: Where) -> None:
-    """Refuses a plan whose parts do not go together. Raises BadInput."""
+    """Raises BadInput for an inconsistent plan."""
     check_name(plan.name, top / "name")
     if not plan.lights:
         raise (top / "light").bad("there is none", "add a [[light]]: cameras see nothing without")
@@ -107,22 +103,20 @@ def _check_point(point: tuple[float, ...], plan: Plan, where: Where, beyond: flo
         raise where.bad(f"has {len(point)} number(s)", "write a place as [x, y]")
     x, y = point
     if not (-beyond <= x <= plan.width + beyond and -beyond <= y <= plan.depth + beyond):
-        raise where.bad(
-            f"({x:g}, {y:g}) is outside",
-            f"write x from {0 - beyond:g} to {plan.width + beyond:g}, y from {0 - beyond:g} to {plan.depth + beyond:g}",
-        )
+        ends = [f"from {0 - beyond:g} to {size + beyond:g}" for size in (plan.width, plan.depth)]
+        raise where.bad(f"({x:g}, {y:g}) is outside", f"write x {ends[0]}, y {ends[1]}")
 
 
 def _check_piece(piece: Furniture, plan: Plan, where: Where) -> None:
-    if piece.height > plan.height:
-        remedy = f"write at most {plan.height:g}, the room's"
-        raise (where / "height").bad(f"is {piece.height:g} m", remedy)
-    if piece.kind in ("raised", "sofa", "bed") and piece.clearance + 0.02 > piece.height:
-        remedy = f"write at most {piece.height - 0.02:g}, below the height"
-        raise (where / "clearance").bad(f"is {piece.clearance:g} m", remedy)
-    if piece.kind not in ("solid", "shelf") and 2 * piece.leg > min(piece.width, piece.depth):
-        remedy = f"write at most {min(piece.width, piece.depth) / 2:g}, half of the piece"
-        raise (where / "leg").bad(f"is {piece.leg:g} m", remedy)
+    def at_most(key: str, value: float, bound: float, meaning: str) -> None:
+        if value > bound:
+            raise (where / key).bad(f"is {value:g} m", f"write at most {bound:g}, {meaning}")
+
+    at_most("height", piece.height, plan.height, "the room's")
+    if piece.kind in ("raised", "sofa", "bed"):
+        at_most("clearance", piece.clearance, piece.height - 0.02, "below the height")
+    if piece.kind not in ("solid", "shelf"):
+        at_most("leg", piece.leg, min(piece.width, piece.depth) / 2, "half of the piece")
 
 
 def _check_light(light: Light, plan: Plan, where: Where) -> None:
@@ -141,8 +135,8 @@ def _check_light(light: Light, plan: Plan, where: Where) -> None:
 
 
 def check_starts(plan: Plan, top: Where) -> None:
-    """Refuses robots that start within a wall, furniture or each other: they would never move. Raises BadInput."""
-    # numpy is loaded by them: most commands need no building.
+    """Raises BadInput for robots that start within a wall, furniture or each other, since they could not move."""
+    # Imported late: these load numpy, which most commands do not need.
     from zscout.simulation.building.bodies import RADIUS
     from zscout.simulation.building.collisions import Obstacles
     from zscout.simulation.building.solids import cuboids_of

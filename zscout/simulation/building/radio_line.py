@@ -1,9 +1,8 @@
-"""The radio's end of a serial line: a pty that carries no more than the line it stands for.
+"""The radio's end of a serial line: a pty limited to the line's rate.
 
-A pty hands over as fast as one can copy. So bytes are taken out of it only as the line would have carried them, at a
-tenth of its baud rate a second (a byte has ten bits there); the rest stays in the kernel, and a writer that is too
-quick finds it full. The kernel would keep some 20 kB; once more than a UART's 4 kB wait, the line's output is stopped
-until there is room again. What comes out is decoded, some packets are lost, and the others are received.
+A pty copies at once, so bytes are read from it only as the line would have carried them, a tenth of its baud rate per
+second (ten bits to a byte). The rest stays in the kernel, where a writer that is too quick blocks: not at the kernel's
+own 20 kB, but at a UART's 4 kB, by stopping the line's output. Packets are then decoded, and some are lost.
 """
 
 from __future__ import annotations
@@ -22,38 +21,31 @@ from typing import Final, Self
 from zscout.config.strict import BadInput
 from zscout.drivers.packets import Packet, PacketDecoder
 
-BITS: Final = 10
-"""On the line for one byte: a start bit, eight of data, a stop bit."""
+BITS: Final = 10  # per byte: a start bit, eight of data, a stop bit
 MIN_BAUD: Final = 300
 MAX_BAUD: Final = 1_000_000
 MAX_SPEED: Final = 100.0
-HOLDS: Final = 4_000
-"""Bytes that may wait before the writer does, about a serial port's own buffer."""
-STEP: Final = 0.008
-"""Seconds of a busy line from one look to the next, if that is at least MIN_CHUNK bytes."""
+HOLDS: Final = 4_000  # bytes in the buffer before the writer blocks, about as in a serial port
+STEP: Final = 0.008  # s between reads of a busy line, for at least MIN_CHUNK bytes
 MIN_CHUNK: Final = 8
-SLACK: Final = 0.1
-"""Seconds by which a look may come late without the line losing time by it."""
-RATES: Final = {rate: getattr(termios, f"B{rate}") for rate in (300, 600, 1200, 2400, 4800, 9600)} | {
-    rate: getattr(termios, f"B{rate}") for rate in (19_200, 38_400, 57_600, 115_200, 230_400, 460_800)
-}
-"""The rates that termios has names for."""
+SLACK: Final = 0.1  # s that a read may be late without costing the line time
+_USUAL: Final = (300, 600, 1200, 2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400, 460_800)
+RATES: Final = {rate: getattr(termios, f"B{rate}") for rate in _USUAL}
 _SPEED_OUT: Final = 5
 _SPEED_IN: Final = 4
 
 
 class Pace:
-    """When bytes are through a line of `rate` bytes a second. Pure: times in seconds are passed in."""
+    """Times of bytes on a line of `rate` bytes per second. Pure: times in seconds are passed in."""
 
     def __init__(self, rate: float) -> None:
         self.rate = rate
-        self.chunk = max(MIN_CHUNK, int(rate * STEP))
-        """Bytes to take at a time."""
+        self.chunk = max(MIN_CHUNK, int(rate * STEP))  # bytes per read
         self._free = float("-inf")
 
     def carry(self, now: float, size: int, *, waited: bool) -> float:
-        """When `size` bytes, taken at `now`, are through. `waited`: they follow the ones before without a
-        gap, so that a look that came late (up to SLACK) costs the line nothing."""
+        """The time at which `size` bytes read at `now` have passed. `waited`: they follow the previous bytes without
+        a gap, so that a late read (up to SLACK) costs the line no time."""
         begin = self._free if waited and now - self._free <= SLACK else max(now, self._free)
         self._free = begin + size / self.rate
         return self._free
@@ -62,12 +54,11 @@ class Pace:
 class RadioLine:
     """A radio at the end of a serial line. Use within an event loop, as a context manager or with `close`.
 
-    `baud` is the line's rate and `speed` by how much the building's time is faster than ours: bytes pass at
-    `baud / 10 * speed` a second. A packet is lost with probability `loss`, a byte garbled with `garble`; both
-    repeat with `seed`. `link` is a name for the port that stays the same when the pty does not: a symlink,
-    which replaces one to another pty, and is removed at the end; anything else there is left alone
-    (BadInput). A driver that sets a usual rate other than `baud` and `baud * speed` is received as noise.
-    `on_packet(packet, at)` is called in the event loop; `at` is on its clock, in seconds."""
+    Bytes pass at `baud / 10 * speed` per second; `speed` is the building's. A packet is lost with probability `loss`,
+    a byte garbled with `garble`; both repeat with `seed`. `link` is a stable name for the port: a symlink, which
+    replaces a symlink to another pty and is removed at the end; raises BadInput for anything else there. Drivers that
+    set a usual rate other than `baud` and `baud * speed` are received as noise. `on_packet(packet, at)` is called in
+    the event loop; `at` is on its clock, in seconds."""
 
     def __init__(
         self,
@@ -97,19 +88,17 @@ class RadioLine:
         self._timer: asyncio.TimerHandle | None = None
         self._stopped = False
         self._unplugged_spoiled = 0
-        self.port: str | None = None
-        """The pty that is plugged in now."""
-        self.carried = self.received = self.lost = 0
-        """Bytes that were through, packets that were received, packets that were lost."""
+        self.port: str | None = None  # of the pty, while it is plugged in
+        self.carried = self.received = self.lost = 0  # bytes, packets, packets
         self.plug()
 
     @property
     def spoiled(self) -> int:
-        """Beginnings of packets that came to nothing."""
+        """Incomplete or garbled packets."""
         return self._unplugged_spoiled + self._decoder.spoiled
 
     def plug(self) -> None:
-        """A new pty, behind the same link. Nothing changes where one is plugged in."""
+        """Open a new pty behind the same link, if none is plugged in."""
         if self._ends is not None:
             return
         master, slave = os.openpty()
@@ -124,12 +113,12 @@ class RadioLine:
             os.close(master)
             os.close(slave)
             raise
-        # Our own hold of the driver's end: the line outlives a driver that closes it.
+        # The driver's end stays open here, so that the line outlives a driver.
         self._ends, self.port, self._stopped = (master, slave), port, False
         asyncio.get_running_loop().add_reader(master, self._arrived)
 
     def unplug(self) -> None:
-        """The pty goes, as if the cable was pulled: whoever writes gets an error. Its link goes as well."""
+        """Close the pty as if the cable was pulled, so that writers get an error, and remove its link."""
         if self._ends is None or self.port is None:
             return
         master, slave = self._ends
@@ -155,13 +144,13 @@ class RadioLine:
         self.close()
 
     def _arrived(self) -> None:
-        """Bytes came to a line that was at rest."""
+        """Handle the first bytes on an idle line."""
         if self._ends is not None:
             asyncio.get_running_loop().remove_reader(self._ends[0])
             self._take(waited=False)
 
     def _take(self, *, waited: bool) -> None:
-        """Puts the next bytes on the line, or lets it rest."""
+        """Put the next bytes on the line, or let it idle."""
         if self._ends is None:
             return
         loop, (master, slave) = asyncio.get_running_loop(), self._ends
@@ -187,7 +176,7 @@ class RadioLine:
         self._take(waited=True)
 
     def _hold_back(self, master: int, slave: int) -> None:
-        """Stops the writer while as much waits as a serial port would hold."""
+        """Stop the writer while HOLDS bytes wait."""
         (waiting,) = struct.unpack("i", fcntl.ioctl(master, termios.FIONREAD, bytes(4)))
         if (waiting >= HOLDS) != self._stopped:
             self._stopped = not self._stopped
@@ -207,15 +196,13 @@ class RadioLine:
             termios.tcsetattr(slave, termios.TCSANOW, modes)
 
     def _wrong_rate(self, slave: int) -> bool:
-        """Whether the driver set a rate that is surely not the line's."""
-        if not self._rates:
-            return False
+        """Return True if the driver set a usual rate that is not the line's."""
         rate = termios.tcgetattr(slave)[_SPEED_OUT]
-        return rate in RATES.values() and rate not in self._rates
+        return bool(self._rates) and rate in RATES.values() and rate not in self._rates
 
 
 def _point(link: Path, port: str) -> None:
-    """Makes `link` a symlink to `port`, at once and never by way of a file of others."""
+    """Make `link` a symlink to `port` atomically, never in place of another file."""
     remedy = "give another name for the radio's link"
     if link.is_symlink():
         if not str(link.readlink()).startswith("/dev/pts/"):
@@ -235,6 +222,6 @@ def _point(link: Path, port: str) -> None:
 
 
 def _unpoint(link: Path, port: str) -> None:
-    """Removes `link`, unless it is somebody else's by now."""
+    """Remove `link` if it still leads to `port`."""
     if link.is_symlink() and str(link.readlink()) == port:
         link.unlink(missing_ok=True)

@@ -11,18 +11,14 @@ from numpy.typing import NDArray
 from zscout.simulation.building.solids import Floats
 
 GAMMA: Final = 2.2
-SETTLES: Final = 1.0
-"""Time constant of the exposure, s."""
-TARGET: Final = 0.22
-"""Mean linear level that the exposure aims at; 1 is white."""
+SETTLES: Final = 1.0  # s, time constant of the exposure
+TARGET: Final = 0.22  # mean linear level of the exposure; 1 is white
 LEAST_GAIN: Final = 0.3
 MOST_GAIN: Final = 12.0
-_READ: Final = 0.0012
-"""Noise of a dark pixel at gain 1, linear."""
-_SHOT: Final = 0.00016
-"""Variance per linear light and gain: photons come by chance."""
+_READ: Final = 0.0012  # linear noise of a dark pixel at gain 1
+_SHOT: Final = 0.00016  # variance per linear light and gain (shot noise)
 _STEPS: Final = 4096
-# The first steps of linear light make many grey levels: the table is indexed by the square root.
+# Low linear light makes many grey levels, so the table is indexed by the square root.
 _SHARES: Final = np.arange(_STEPS) / (_STEPS - 1)
 _TABLE: Final[NDArray[np.uint8]] = np.round(255 * _SHARES ** (2 / GAMMA)).astype(np.uint8)
 
@@ -37,30 +33,26 @@ _VIGNETTE: Final = _vignette()
 
 
 class Sensor:
-    """One camera's, with its own noise and exposure."""
-
     def __init__(self, noise: float, rng: np.random.Generator) -> None:
-        self._noise = noise
-        self._rng = rng
-        self.gain = 1.0
-        """Factor on linear light."""
+        self._noise, self._rng = noise, rng
+        self.gain = 1.0  # factor on linear light
         self._last: float | None = None
 
     def flicker(self) -> float:
-        """Where in the lamps' flicker this picture falls, about -1 to 1."""
+        """A random phase of the lamps' flicker, -1 to 1."""
         return float(np.sin(self._rng.uniform(0, 2 * np.pi)))
 
     def expose(self, linear: Floats, now: float) -> NDArray[np.uint8]:
         """The 8-bit picture of linear light (120, 160) at `now`, seconds."""
         linear = cv2.GaussianBlur(linear, (3, 3), 0.6) * _VIGNETTE
-        # A window in the picture shall not turn all else black: what is white counts as white.
+        # Clipped, so that a window in the picture does not turn the rest black.
         mean = float(np.minimum(linear * self.gain, 1.5).mean()) / self.gain
         wanted = float(np.clip(TARGET / max(mean, 1e-6), LEAST_GAIN, MOST_GAIN))
         if self._last is None:
             self.gain = wanted
         elif now > self._last:
             share = 1 - np.exp(-(now - self._last) / SETTLES)
-            # In stops, as apertures and shutters are.
+            # In stops, as for apertures and shutters.
             self.gain *= float((wanted / self.gain) ** share)
         self._last = now
         level = linear * self.gain

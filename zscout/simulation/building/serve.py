@@ -1,7 +1,7 @@
-"""A building served in real time: its radio on a serial line, its cameras over HTTP, its clock with ours.
+"""A building served in real time: its radio on a serial line, its cameras over HTTP.
 
-One thread has the world: it steps it, draws what somebody watches, and lists who is where, one after the other. The
-event loop carries the radio's bytes and the pictures, so that these are quick while a picture is drawn.
+A single thread steps the world, draws watched channels, and lists positions. The event loop carries the radio's bytes
+and the pictures, which stay quick while a picture is drawn.
 """
 
 from __future__ import annotations
@@ -32,24 +32,20 @@ from zscout.types import MAX_CHANNEL
 CHANNELS: Final = 4
 MIN_FRAMES: Final = 0.1
 MAX_FRAMES: Final = 60.0
-QUALITY: Final = 85
-"""Of the JPEGs, 1 to 100."""
-MAX_PACKETS: Final = 1_000
-"""That wait for the next step; older ones go."""
-AT_ONCE: Final = 5
-"""Steps made before others have their turn."""
+QUALITY: Final = 85  # of the JPEGs, 1 to 100
+MAX_PACKETS: Final = 1_000  # that wait for the next step; older packets are dropped
+AT_ONCE: Final = 5  # steps before other work on the thread
 
 T = TypeVar("T")
 
 
 class Served:
-    """A plan in motion that drivers cannot tell from a building. Use as an async context manager.
+    """A plan in motion that looks like a real building to drivers. Use as an async context manager.
 
-    `speed` of its seconds pass in one of ours; `frame_rate` (frames a second) and `baud` (of the radio's
-    line) are in the building's seconds. `loss` is the share of radio packets that no robot receives. `http`
-    is host and port (0: any free one) of the video, `radio_link` a name for the radio's port, `channels` how
-    many video channels have a receiver. Entering raises BadInput where something can't be had.
-    """
+    `speed` is its seconds per second of real time; `frame_rate` (frames a second) and `baud` (of the radio's line)
+    are in the building's seconds. `loss` is the share of radio packets that no robot receives. `http` is host and
+    port (0: any free port) of the video, `radio_link` a name for the radio's port, `channels` the number of video
+    receivers. Entering raises BadInput for a resource that is not available."""
 
     def __init__(
         self,
@@ -78,7 +74,6 @@ class Served:
         self._pace = FramePace(channels, frame_rate)
         self._stack = AsyncExitStack()
         self.frames = 0
-        """Drawn so far."""
 
     async def __aenter__(self) -> Self:
         async with AsyncExitStack() as stack:
@@ -88,7 +83,7 @@ class Served:
                     self._baud, self._on_packet, speed=self.speed, loss=self._loss, seed=self.seed, link=self._link
                 )
             )
-            # Pictures of this size are done sooner than threads are started on them.
+            # For pictures of this size, threads take longer to start than to work.
             cv2.setNumThreads(1)
             self._worker = stack.enter_context(ThreadPoolExecutor(1, "building"))
             await self.in_world(self._make)
@@ -101,58 +96,54 @@ class Served:
     async def __aexit__(self, *exc: object) -> None:
         await self._stack.aclose()
 
-    # What can be asked and done while it runs
-
     @property
     def time(self) -> float:
-        """Of the building, in seconds since it began."""
+        """Seconds of the building since its start."""
         return self.clock.time
 
     @property
     def late(self) -> int:
-        """Frames that somebody waited for and that were left out, for want of time."""
+        """Watched frames that were left out for lack of time."""
         return self._pace.late
 
     def true_speed(self) -> float:
-        """The building's seconds in one of ours, lately: below `speed` where this machine is too busy."""
+        """Recent seconds of the building per second of real time: below `speed` if this machine is too busy."""
         return self.clock.true_speed(asyncio.get_running_loop().time())
 
     def unplug_radio(self) -> None:
-        """The radio's cable is pulled."""
+        """Pull the radio's cable."""
         self.radio.unplug()
 
     def plug_radio(self) -> None:
         self.radio.plug()
 
     def kill(self, robot: str) -> None:
-        """A robot's battery is gone. Raises KeyError for a robot that is not there."""
+        """Empty a robot's battery. Raises KeyError for an unknown robot."""
         self.world.bodies[robot].alive = False
 
     def stall(self, channel: int, *, stalled: bool = True) -> None:
-        """A channel's receiver gives no frames any more, though its connections stay; or goes on."""
+        """Stop the frames of a channel (from 1) with its connections open, or resume them."""
         self.video.stall(channel_name(channel), stalled=stalled)
 
     async def poses(self) -> BuildingPoses:
-        """Who is where now."""
+        """Current positions."""
         return await self.in_world(lambda: poses(self.world, self.speed))
 
     async def map(self) -> BuildingPlan:
-        """The building seen from above."""
+        """The building from above."""
         return await asyncio.to_thread(building_plan, self.plan)
 
     async def in_world(self, work: Callable[[], T]) -> T:
-        """Calls `work` between two steps, on the thread that has the world."""
+        """Call `work` between two steps, on the world's thread."""
         return await asyncio.get_running_loop().run_in_executor(self._worker, work)
 
     async def until(self, time: float) -> None:
-        """Returns when the building's time is `time`, in seconds. Raises what went wrong in the building."""
+        """Wait until the building's time is `time`, in seconds. Raises errors of the building."""
         while self.time < time:
             wait = max(STEP, time - self.time) / self.speed
             done, _ = await asyncio.wait({self._running}, timeout=min(wait, 60.0))
             if done:
                 self._running.result()
-
-    # The loop
 
     def _make(self) -> None:
         self.world = World(self.plan, seed=self.seed)
@@ -205,5 +196,5 @@ class Served:
 
 
 def channel_name(number: int) -> str:
-    """What a video channel is called in addresses: ch1 for channel 1."""
+    """Path segment of a video channel: ch1 for channel 1."""
     return f"ch{number}"

@@ -1,5 +1,4 @@
-"""`zscout simulate`: a building served until its time is over, how to reach it, and who is where, for
-recorders and operators on the mesh."""
+"""`zscout simulate`: serve a building for a time, print how to reach it, and publish positions on the mesh."""
 
 from __future__ import annotations
 
@@ -23,10 +22,8 @@ from zscout.simulation.building.plan import Plan
 from zscout.simulation.building.plan_file import load_plan, shipped_plans
 from zscout.simulation.building.serve import Served
 
-EVERY: Final = 0.2
-"""Seconds of ours between two publications of who is where."""
-SHOWN: Final = 0.5
-"""Seconds from one live line to the next."""
+EVERY: Final = 0.2  # s of real time between two publications of positions
+SHOWN: Final = 0.5  # s between two live lines
 MAX_SECONDS: Final = 1e9
 
 
@@ -41,11 +38,10 @@ async def simulate(
     as_json: bool,
     **of_served: Any,
 ) -> None:
-    """Serves a building, as `of_served` has it, for so many of its seconds, or without end, and prints how to
-    reach everything.
+    """Serve a building (`of_served`: arguments of `Served`) for `seconds` of its time, or without end.
 
-    `mesh_of`: recorders and operators on that fleet's mesh are shown who is where. `node`: a node file with
-    all the devices, of the fleet of `fleet_file`, is written there. Raises BadInput, MeshError."""
+    `mesh_of`: publish positions on that fleet's mesh. `node`: write a node file there with all devices, in the fleet
+    of `fleet_file`. Raises BadInput, MeshError."""
     served = Served(plan, **of_served)
     async with AsyncExitStack() as stack:
         publishing: asyncio.Task[None] | None = None
@@ -71,7 +67,7 @@ async def simulate(
 
 
 async def _until(served: Served, publishing: asyncio.Task[None] | None, seconds: float) -> None:
-    """Until the building's time; raises what went wrong in it, or on its way to the mesh."""
+    """Wait for the building's time; raises errors of the building and of the publications."""
     ending = asyncio.create_task(served.until(seconds))
     try:
         tasks = {ending} | ({publishing} if publishing is not None else set())
@@ -95,7 +91,7 @@ def _write_node(path: Path, text: str) -> None:
 
 
 async def _publish(served: Served, mesh: Mesh) -> None:
-    """Publishes who is where, and answers queries for the plan, until it is cancelled."""
+    """Publish positions and answer queries for the plan until cancelled."""
     plan = await served.map()
 
     def answer(request: IncomingQuery[PlanAsk]) -> None:
@@ -116,11 +112,8 @@ async def _publish(served: Served, mesh: Mesh) -> None:
         queryable.close()
 
 
-# How to reach it
-
-
 def _access(served: Served) -> dict[str, Any]:
-    """How to reach everything, for `--json`."""
+    """The addresses of all devices, for `--json`."""
     link = served.radio.link
     return {
         "building": served.plan.name,
@@ -154,28 +147,24 @@ def _print(access: dict[str, Any]) -> None:
 
 
 def _line(served: Served, rate: float | None = None, cpu: float | None = None) -> str:
-    """How it is, in one line."""
+    """The building's state as a line."""
     radio = served.radio
-    words = [terminal.span(served.time)]
-    if rate is not None:
-        words += [f"speed {served.true_speed():.2f}", f"{rate:.0f} frames/s"]
-    else:
-        words += [f"{served.frames} frames"]
-    words += [f"{radio.received} packets heard, {radio.lost} lost"]
-    if radio.spoiled:
-        words += [f"{radio.spoiled} spoiled"]
-    if served.late:
-        words += [f"{served.late} frames late"]
-    if served.clock.slipped >= 0.05:
-        words += [f"{terminal.span(served.clock.slipped)} behind: this machine is too busy"]
-    if cpu is not None:
-        words += [f"CPU {cpu:.0f} %"]
-    return "  ".join(words)
+    slipped = served.clock.slipped
+    words = (
+        terminal.span(served.time),
+        f"{served.frames} frames" if rate is None else f"speed {served.true_speed():.2f}  {rate:.0f} frames/s",
+        f"{radio.received} packets heard, {radio.lost} lost",
+        f"{radio.spoiled} spoiled" if radio.spoiled else "",
+        f"{served.late} frames late" if served.late else "",
+        f"{terminal.span(slipped)} behind: this machine is too busy" if slipped >= 0.05 else "",
+        f"CPU {cpu:.0f} %" if cpu is not None else "",
+    )
+    return "  ".join(filter(None, words))
 
 
 @contextmanager
 def _live(served: Served) -> Iterator[None]:
-    """A line in place at the terminal, as long as the context lasts."""
+    """Keep a live line at the terminal within the context."""
     from rich.text import Text
 
     process, loop = psutil.Process(), asyncio.get_running_loop()
@@ -199,31 +188,20 @@ def _live(served: Served) -> Iterator[None]:
 
 
 def print_shipped(*, as_json: bool) -> None:
-    """Lists the buildings that are shipped."""
-    rows = [(name, load_plan(path)) for name, path in shipped_plans().items()]
+    plans = {name: load_plan(path) for name, path in shipped_plans().items()}
+    robots = {name: [robot.name for robot in plan.robots] for name, plan in plans.items()}
     if as_json:
         terminal.print_json(
             [
-                {
-                    "building": name,
-                    "width": plan.width,
-                    "depth": plan.depth,
-                    "robots": [robot.name for robot in plan.robots],
-                }
-                for name, plan in rows
+                {"building": name, "width": plan.width, "depth": plan.depth, "robots": robots[name]}
+                for name, plan in plans.items()
             ]
         )
         return
+    rows = [
+        (name, f"{plan.width:g} x {plan.depth:g}", *(str(len(things)) for things in (plan.furniture, plan.people)))
+        for name, plan in plans.items()
+    ]
     terminal.print_table(
-        ("building", "metres", "furniture", "people", "robots"),
-        [
-            (
-                name,
-                f"{plan.width:g} x {plan.depth:g}",
-                str(len(plan.furniture)),
-                str(len(plan.people)),
-                ", ".join(robot.name for robot in plan.robots),
-            )
-            for name, plan in rows
-        ],
+        ("building", "metres", "furniture", "people", "robots"), [(*row, ", ".join(robots[row[0]])) for row in rows]
     )

@@ -1,4 +1,4 @@
-"""What stands in a room as upright boxes: walls and furniture taken apart into what light, robots and cameras meet."""
+"""Walls and furniture as upright boxes, for light, robots and cameras."""
 
 from __future__ import annotations
 
@@ -13,14 +13,12 @@ from zscout.simulation.building.plan import Furniture, Plan, Wall
 
 Floats = NDArray[np.float32]
 
-SLAB: Final = 0.03
-"""Thickness of a table's top and of a chair's seat, m."""
-SEAT: Final = 0.45
-"""Height of a chair's seat, m."""
+SLAB: Final = 0.03  # m, thickness of a table's top and a chair's seat
+SEAT: Final = 0.45  # m, height of a chair's seat
 
 
 class Cuboid(NamedTuple):
-    """One upright box, turned about its middle by `turn`; metres."""
+    """An upright box, turned about its middle by `turn`; metres."""
 
     x: float
     y: float
@@ -34,7 +32,7 @@ class Cuboid(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Cuboids:
-    """Many boxes as arrays of shape (n,), float32: middle, half extents, turn, lower and upper height."""
+    """Boxes as float32 arrays of shape (n,)."""
 
     x: Floats
     y: Floats
@@ -50,7 +48,7 @@ class Cuboids:
         return len(self.x)
 
     def corners(self) -> Floats:
-        """The four corners of each footprint, shape (n, 4, 2), going round."""
+        """The four corners of each footprint in circular order, shape (n, 4, 2)."""
         across = self.half_width[:, None] * np.array([-1, 1, 1, -1], np.float32)
         along = self.half_depth[:, None] * np.array([-1, -1, 1, 1], np.float32)
         x = self.x[:, None] + across * self.cos[:, None] - along * self.sin[:, None]
@@ -58,12 +56,11 @@ class Cuboids:
         return np.stack((x, y), axis=2)
 
     def where(self, chosen: NDArray[np.bool_]) -> Cuboids:
-        """Those of `chosen`, shape (n,)."""
         return Cuboids(*(getattr(self, name)[chosen] for name in self.__slots__))
 
 
 def cuboids_of(plan: Plan) -> Cuboids:
-    """All walls inside and all furniture of a plan. The outer walls are no boxes."""
+    """All inner walls, then all furniture of a plan."""
     found = [_partition(wall, plan.height, plan.wall_shade) for wall in plan.walls]
     for piece in plan.furniture:
         found += parts(piece)
@@ -77,7 +74,6 @@ def as_arrays(boxes: Iterable[Cuboid]) -> Cuboids:
 
 
 def parts(piece: Furniture) -> list[Cuboid]:
-    """The boxes that a piece of furniture is made of."""
     wide, deep = piece.width / 2, piece.depth / 2
     low, high, leg = piece.clearance, piece.height, piece.leg
     match piece.kind:
@@ -109,9 +105,7 @@ def parts(piece: Furniture) -> list[Cuboid]:
 def _legs(piece: Furniture, high: float) -> list[Cuboid]:
     leg = piece.leg / 2
     x, y = piece.width / 2 - leg, piece.depth / 2 - leg
-    if high <= 0:
-        return []
-    return [_part(piece, a * x, b * y, leg, leg, 0, high) for a in (-1, 1) for b in (-1, 1)]
+    return [_part(piece, a * x, b * y, leg, leg, 0, high) for a in (-1, 1) for b in (-1, 1) if high > 0]
 
 
 def _part(

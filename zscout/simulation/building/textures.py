@@ -1,4 +1,4 @@
-"""What floors and surfaces look like, seeded by nothing but the plan: planks, tiles, carpet, grain."""
+"""Textures of floors and surfaces, seeded by the plan's name: planks, tiles, carpet, grain."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ GRAIN_SIZE: Final = 256
 
 @lru_cache(maxsize=1)
 def grain() -> Floats:
-    """Noise of mean 0 that tiles, shape (256, 256), about -0.35 to 0.35: fine and broad scales together."""
+    """Tileable noise of mean 0 at fine and broad scales, shape (256, 256), about -0.35 to 0.35."""
     rng = np.random.default_rng(20010117)
     total = np.zeros((GRAIN_SIZE, GRAIN_SIZE), np.float32)
     for size, weight in ((256, 0.5), (64, 0.8), (16, 0.7)):
         noise = rng.standard_normal((size, size), np.float32)
-        # Three copies side by side, so that the seams fit.
+        # Three copies in a row make the seams fit.
         wide = cv2.resize(np.tile(noise, (3, 3)), (3 * GRAIN_SIZE,) * 2, interpolation=cv2.INTER_CUBIC)
         total += weight * wide[GRAIN_SIZE : 2 * GRAIN_SIZE, GRAIN_SIZE : 2 * GRAIN_SIZE]
     total -= total.mean()
@@ -31,7 +31,7 @@ def grain() -> Floats:
 
 
 def floor_albedo(plan: Plan, cell: float, shape: tuple[int, ...]) -> Floats:
-    """The share of light that each cell of the floor gives back, rugs included; `shape` (rows, columns)."""
+    """The reflected share of light by cell of the floor, with rugs; `shape` is (rows, columns)."""
     rng = np.random.default_rng(zlib.crc32(plan.name.encode()))
     y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     x, y = (x + 0.5) * cell, (y + 0.5) * cell

@@ -1,4 +1,4 @@
-"""Ground truth about light and places: what a robot is measured against, and has no access to."""
+"""Ground truth about light and places, which robots are measured against but cannot read."""
 
 from __future__ import annotations
 
@@ -15,32 +15,24 @@ from zscout.simulation.building.light import Lit, hidden
 from zscout.simulation.building.plan import Plan
 from zscout.simulation.building.solids import Cuboids, Floats
 
-DARK: Final = 0.25
-"""A place is dark below this share of the median light of the open floor."""
-BRIGHTER: Final = 3.0
-"""Floor counts as the lit part if it has this many times the light of the robot's own place ..."""
-FACING: Final = 0.4
-"""... and a robot faces it if this share of its columns shows some."""
+DARK: Final = 0.25  # places are dark below this share of the open floor's median light
+BRIGHTER: Final = 3.0  # floor is lit with this many times the light of the robot's own place
+FACING: Final = 0.4  # a robot faces lit floor if this share of its columns shows some
 _REACH: Final = 4.0
 _COLUMNS: Final = 33
 
 
 class Truth:
-    """The floor of a plan as it is."""
+    """Maps of a plan's floor by cell, each of shape (rows, columns)."""
 
     def __init__(self, plan: Plan, boxes: Cuboids, lit: Lit, obstacles: Obstacles) -> None:
-        self._plan = plan
-        self._boxes = boxes
-        self.cell = lit.cell
+        self._plan, self._boxes, self.cell = plan, boxes, lit.cell
         self.light: Floats = lit.floor.sum(0)
-        """Light on the floor by cell, shape (rows, columns)."""
-        self.standing = obstacles.room_for(RADIUS, lit.cell, self.light.shape)
-        """Cells where a robot's middle can be, shape (rows, columns)."""
-        self.open = self.standing & ~self._covered()
-        """Of these, those with nothing above."""
+        self.standing = obstacles.room_for(RADIUS, lit.cell, self.light.shape)  # where a robot's middle can be
+        self.open = self.standing & ~self._covered()  # standing, and nothing above
         bare = self.light[self.open]
         self.median_light = float(np.median(bare)) if len(bare) else float(np.median(self.light))
-        # Walled in by furniture a robot could go nowhere: starts are on the largest piece of floor.
+        # Starts are on the largest connected floor: elsewhere furniture may enclose a robot.
         _, parts = cv2.connectedComponents(self.standing.astype(np.uint8), connectivity=4)
         counts = np.bincount(parts[self.open])
         start = self.open & (parts == counts.argmax()) if len(counts) else self.open
@@ -49,11 +41,11 @@ class Truth:
 
     @property
     def dark(self) -> NDArray[np.bool_]:
-        """Cells where a robot can stand in a truly dark place."""
+        """Dark cells where a robot's middle can be."""
         return self.standing & (self.light < DARK * self.median_light)
 
     def floor_light(self, x: float, y: float) -> float:
-        """Linear light on the floor there, between the middles of cells; outside, that at the wall."""
+        """Linear light on the floor, interpolated between cells; outside, the light at the wall."""
         rows, columns = self.light.shape
         u = min(max(x / self.cell - 0.5, 0), columns - 1.001)
         v = min(max(y / self.cell - 0.5, 0), rows - 1.001)
@@ -63,9 +55,8 @@ class Truth:
         return float(low * (1 - v) + high * v)
 
     def faces_light(self, x: float, y: float, heading: float) -> bool:
-        """Whether a camera there looks at the lit part: in 40 % of the columns of its field of view or more,
-        floor within 4 m is seen past all furniture that has three times the light of the robot's own place
-        and half of the open floor's median."""
+        """Return True if a camera at (x, y) faces the lit part: at least FACING of the columns of its view show
+        floor within 4 m that has BRIGHTER times the light of its own place and half of the open floor's median."""
         here = self.floor_light(x, y)
         wanted = max(BRIGHTER * here, 0.5 * self.median_light)
         angle = heading + np.linspace(-VIEW / 2, VIEW / 2, _COLUMNS)
@@ -77,16 +68,13 @@ class Truth:
         row = np.clip(at_y / self.cell, 0, self.light.shape[0] - 1).astype(np.intp)
         bright = inside & (self.light[row, column] >= wanted)
         chosen = np.flatnonzero(bright)
-        if not len(chosen):
-            return False
         way = np.stack((at_x[chosen] - x, at_y[chosen] - y, np.full(len(chosen), -EYE)), 1).astype(np.float32)
         origin = np.tile(np.array([x, y, EYE], np.float32), (len(chosen), 1))
         seen = ~hidden(origin, way, np.full(len(chosen), 0.999, np.float32), self._boxes)
-        columns = np.unique(chosen[seen] // len(distance))
-        return len(columns) >= FACING * _COLUMNS
+        return len(np.unique(chosen[seen] // len(distance))) >= FACING * _COLUMNS
 
     def reachable(self, x: float, y: float) -> NDArray[np.bool_]:
-        """Cells that a robot could come to from there, shape (rows, columns)."""
+        """Cells that a robot could reach from (x, y)."""
         _, parts = cv2.connectedComponents(self.standing.astype(np.uint8), connectivity=4)
         row = int(np.clip(y / self.cell, 0, parts.shape[0] - 1))
         column = int(np.clip(x / self.cell, 0, parts.shape[1] - 1))
@@ -94,7 +82,7 @@ class Truth:
         return reached
 
     def random_open(self, rng: np.random.Generator) -> tuple[float, float]:
-        """A place on open, lit floor, of the largest piece that hangs together."""
+        """A place on the largest connected piece of open, lit floor."""
         if not len(self._lit_cells):
             raise ValueError(f"{self._plan.name} has no open floor")
         row, column = self._lit_cells[rng.integers(len(self._lit_cells))]

@@ -1,9 +1,8 @@
-"""MJPEG over HTTP: what the video receivers of a building get, one address for each channel.
+"""MJPEG over HTTP for the video receivers of a building, with an address for each channel.
 
-`/ch1` is a stream without end (multipart/x-mixed-replace, as network cameras send it), `/ch1.jpg` the next
-frame alone, `/` a page with links. A watcher who is slower than the frames misses some, and holds up nobody:
-each is sent the newest frame once the one before has left. Whoever asks for frames is known to `watched`, so
-that nothing need be drawn for channels that nobody looks at.
+`/ch1` is an endless stream (multipart/x-mixed-replace, as network cameras send it), `/ch1.jpg` the next frame alone,
+`/` a page with links. Each watcher is sent the newest frame once the previous frame has left, so a slow watcher
+misses frames and delays no other. `watched` lists the channels worth drawing.
 """
 
 from __future__ import annotations
@@ -21,23 +20,15 @@ from typing import Final, Self
 
 from zscout.config.strict import BadInput
 
-MAX_REQUEST: Final = 8_192
-"""Bytes of a request with its headers."""
+MAX_REQUEST: Final = 8_192  # bytes with headers
 MAX_CLIENTS: Final = 32
-MAX_WAITING: Final = 32
-"""Connections beyond the limit that get an answer saying so; more are just closed."""
-REQUEST_TIME: Final = 5.0
-"""Seconds in which a request must have come whole."""
-SEND_TIME: Final = 10.0
-"""Seconds in which a frame must have left; who reads nothing for longer is cut off."""
-FRAME_TIME: Final = 5.0
-"""Seconds that a single frame is waited for."""
-SEND_BUFFER: Final = 16_384
-"""Bytes that the kernel is asked to hold for a watcher: little, for they are frames that grow old."""
-LINGER: Final = 1.0
-"""Seconds that the rest of a refused request is read and thrown away."""
-MAX_LINGER: Final = 16
-"""And how often."""
+MAX_WAITING: Final = 32  # connections beyond MAX_CLIENTS that get an error; more are closed
+REQUEST_TIME: Final = 5.0  # s to receive a request
+SEND_TIME: Final = 10.0  # s to send a frame before the client is cut off
+FRAME_TIME: Final = 5.0  # s to wait for a single frame
+SEND_BUFFER: Final = 16_384  # bytes in the kernel per watcher: few, since frames grow old there
+LINGER: Final = 1.0  # s that the rest of a refused request is read and discarded
+MAX_LINGER: Final = 16  # reads at most in that time
 BOUNDARY: Final = "frame"
 _REQUEST_LINE: Final = re.compile(rb"([A-Z]{1,16}) (/[!-~]{0,1000}) HTTP/1\.[01]\r\n")
 _PAGE: Final = "text/html; charset=utf-8"
@@ -46,7 +37,7 @@ _STREAM: Final = f"multipart/x-mixed-replace; boundary={BOUNDARY}"
 
 
 class Channel:
-    """The newest frame of one channel, and those who wait for the next."""
+    """The newest frame of a channel, and its watchers."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -57,25 +48,21 @@ class Channel:
 
 
 class StreamClient:
-    """One who looks at a channel."""
-
     def __init__(self) -> None:
         self.news = asyncio.Event()
         self.gone = False
 
 
 class VideoServer:
-    """Serves `channels` (names of one path segment each) once it is entered. `port` 0 is any free one.
-
-    Raises BadInput there where the address can't be served on."""
+    """Serves `channels` (each a path segment). `port` 0 is any free port. Entering raises BadInput for an address
+    that can't be used."""
 
     def __init__(self, channels: Sequence[str], *, host: str = "127.0.0.1", port: int = 0) -> None:
         self._channels = {name: Channel(name) for name in channels}
         self._host, self._port = host, port
         self._server: asyncio.Server | None = None
         self._tasks: set[asyncio.Task[None]] = set()
-        self.sent = self.missed = self.refused = 0
-        """Frames sent, frames that a watcher was too slow for, requests refused."""
+        self.sent = self.missed = self.refused = 0  # frames sent, frames skipped for slow watchers, requests
 
     async def __aenter__(self) -> Self:
         try:
@@ -98,35 +85,33 @@ class VideoServer:
 
     @property
     def page(self) -> str:
-        """The address of the page with the links."""
+        """URL of the page with links."""
         host = f"[{self._host}]" if ":" in self._host else self._host
         if self._host in ("0.0.0.0", "::"):  # noqa: S104 - compared, not bound
             host = socket.gethostname()
         return f"http://{host}:{self._port}/"
 
     def url(self, channel: str) -> str:
-        """The address of a channel's stream."""
         return self.page + self._channels[channel].name
 
     @property
     def clients(self) -> int:
-        """Connections that are open."""
         return len(self._tasks)
 
     @property
     def watched(self) -> tuple[str, ...]:
-        """The channels that somebody waits for frames of, stalled ones left out."""
+        """The channels with watchers, without stalled channels."""
         return tuple(name for name, channel in self._channels.items() if channel.watchers and not channel.stalled)
 
     def show(self, channel: str, jpeg: bytes) -> None:
-        """The newest frame of a channel."""
+        """Send a channel's newest frame."""
         shown = self._channels[channel]
         shown.frame, shown.number = jpeg, shown.number + 1
         for watcher in shown.watchers:
             watcher.news.set()
 
     def stall(self, channel: str, *, stalled: bool = True) -> None:
-        """A channel's receiver stops giving frames, its connections stay open; or it goes on."""
+        """Stop the frames of a channel with its connections open, or resume them."""
         self._channels[channel].stalled = stalled
 
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -134,20 +119,18 @@ class VideoServer:
         assert task is not None  # noqa: S101
         before = len(self._tasks)
         self._tasks.add(task)
-        # With no buffer of our own, `drain` returns once the kernel has it all.
+        # Without a buffer here, `drain` returns once the kernel has all bytes.
         writer.transport.set_write_buffer_limits(high=0)
         try:
             if before < MAX_CLIENTS + MAX_WAITING:
                 await self._answer(reader, writer, full=before >= MAX_CLIENTS)
-        except (OSError, TimeoutError):
-            pass  # the client went away, or took too long
-        except asyncio.CancelledError:
-            # The server ends; asyncio would report each connection that it cancelled.
+        except (OSError, TimeoutError, asyncio.CancelledError):
+            # The client left or was too slow, or the server ends: asyncio would report each cancelled connection.
             pass
         finally:
             self._tasks.discard(task)
             if writer.transport.get_write_buffer_size():
-                writer.transport.abort()  # it would wait for one who does not read
+                writer.transport.abort()  # `close` would wait for clients that do not read
             else:
                 writer.close()
 
@@ -212,7 +195,7 @@ class VideoServer:
     async def _refuse(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, status: HTTPStatus) -> None:
         self.refused += 1
         await _send_whole(writer, status, "text/plain; charset=utf-8", f"{status.phrase}\n".encode())
-        # Closed with something unread, the answer might not arrive.
+        # If the connection is closed with unread bytes, the answer may get lost.
         writer.write_eof()
         with suppress(TimeoutError):
             async with asyncio.timeout(LINGER):
@@ -229,7 +212,7 @@ class VideoServer:
 
 
 async def _request(reader: asyncio.StreamReader) -> tuple[str, str] | HTTPStatus | None:
-    """Method and path that are asked for, or why that can't be answered; None: nobody asked."""
+    """The requested method and path, an error, or None if the client left without a request."""
     try:
         async with asyncio.timeout(REQUEST_TIME):
             head = await reader.readuntil(b"\r\n\r\n")
@@ -247,7 +230,7 @@ async def _request(reader: asyncio.StreamReader) -> tuple[str, str] | HTTPStatus
 
 
 async def _until_gone(reader: asyncio.StreamReader, watcher: StreamClient) -> None:
-    """What a watcher sends is of no interest, but that it leaves is, also while no frame comes."""
+    """Notice that a watcher leaves, even without frames to send; discard its input."""
     with suppress(OSError):
         while await reader.read(MAX_REQUEST):
             pass
@@ -256,13 +239,8 @@ async def _until_gone(reader: asyncio.StreamReader, watcher: StreamClient) -> No
 
 
 def _head(status: HTTPStatus, kind: str, length: int | None = None) -> bytes:
-    lines = [
-        f"HTTP/1.1 {status.value} {status.phrase}",
-        f"Content-Type: {kind}",
-        "Cache-Control: no-store",
-        "X-Content-Type-Options: nosniff",
-        "Connection: close",
-    ]
+    lines = [f"HTTP/1.1 {status.value} {status.phrase}", f"Content-Type: {kind}"]
+    lines += ["Cache-Control: no-store", "X-Content-Type-Options: nosniff", "Connection: close"]
     if length is not None:
         lines.append(f"Content-Length: {length}")
     if status is HTTPStatus.METHOD_NOT_ALLOWED:
@@ -271,7 +249,7 @@ def _head(status: HTTPStatus, kind: str, length: int | None = None) -> bytes:
 
 
 def _part(jpeg: bytes) -> bytes:
-    """A frame with the boundary that ends it: a reader knows at once that it is whole."""
+    """A frame with its closing boundary, so that readers need not wait for the next frame."""
     head = f"Content-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
     return head.encode() + jpeg + f"\r\n--{BOUNDARY}\r\n".encode()
 

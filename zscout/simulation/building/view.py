@@ -1,7 +1,7 @@
-"""A building seen from above, for people: its plan as a picture, and who is where.
+"""A building from above: its plan as a picture, and current positions.
 
-The floor is as bright as its light; what stands on it is solid, what a robot drives under is outlined and
-leaves the shadow below it to be seen; thin lines are the ways that people walk.
+The floor shows its light. Pieces on the floor are solid; pieces that robots drive under are outlined and show the
+shadow below; thin lines are people's paths.
 """
 
 from __future__ import annotations
@@ -21,18 +21,13 @@ from zscout.simulation.building.world import World
 Picture = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
-SCALE: Final = 200.0
-"""Pixels a metre, unless the picture would be larger than MAX_SIDE."""
-MAX_SIDE: Final = 1000
-"""Pixels."""
-MAX_PNG: Final = MAX_PLAN * 7 // 10
-"""Bytes; in JSON they take a third more."""
+SCALE: Final = 200.0  # pixels per metre, if no side gets larger than MAX_SIDE
+MAX_SIDE: Final = 1000  # pixels
+MAX_PNG: Final = MAX_PLAN * 7 // 10  # bytes; JSON takes a third more
 SHRINK: Final = 0.8
-BRIGHT: Final = 1.6
-"""Light at which the floor is drawn white, in medians."""
+BRIGHT: Final = 1.6  # light of a white floor, in medians
 _GAMMA: Final = 1 / 2.2
-_SUB: Final = 4
-"""Bits of a pixel's fraction in OpenCV's drawing."""
+_SUB: Final = 4  # bits of a pixel's fraction in OpenCV's drawing
 _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 
 # Blue, green, red.
@@ -49,7 +44,7 @@ _WAY: Final = (150, 110, 60)
 
 
 def building_plan(plan: Plan) -> BuildingPlan:
-    """The plan as it goes over the mesh, small enough for that."""
+    """The plan as a message, its picture shrunk to MAX_PNG."""
     scale = min(SCALE, MAX_SIDE / max(plan.width, plan.depth))
     while len(png := plan_picture(plan, scale)) > MAX_PNG:
         scale *= SHRINK
@@ -57,7 +52,7 @@ def building_plan(plan: Plan) -> BuildingPlan:
 
 
 def plan_picture(plan: Plan, scale: float = SCALE) -> bytes:
-    """A PNG of the plan at `scale` pixels a metre, x to the right, y up, exactly its outer walls."""
+    """A PNG of the plan within its outer walls, at `scale` pixels per metre, x to the right, y up."""
     picture = _Sheet(plan, scale)
     picture.rugs()
     picture.ways()
@@ -67,12 +62,11 @@ def plan_picture(plan: Plan, scale: float = SCALE) -> bytes:
     for light in plan.lights:
         picture.light(light)
     picture.names()
-    # Reading a PNG takes no longer for being packed well.
     return cv2.imencode(".png", picture.pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9])[1].tobytes()
 
 
 def poses(world: World, speed: float = 1.0) -> BuildingPoses:
-    """Who is where now."""
+    """Current positions."""
     robots = [
         Placed(
             name=name[:64],
@@ -84,24 +78,21 @@ def poses(world: World, speed: float = 1.0) -> BuildingPoses:
         )
         for name, body in list(world.bodies.items())[:MAX_ROBOTS]
     ]
-    return BuildingPoses(time=world.time, speed=speed, robots=robots, people=_people(world))
-
-
-def _people(world: World) -> list[Placed]:
-    names = [person.name[:64] for person in world.plan.people]
-    there = [(name, one) for name, one in zip(names, world.walkers, strict=True) if one.here]
-    return [Placed(name=name, x=one.x, y=one.y) for name, one in there[:MAX_PEOPLE]]
+    people = [
+        Placed(name=person.name[:64], x=walker.x, y=walker.y)
+        for person, walker in zip(world.plan.people, world.walkers, strict=True)
+        if walker.here
+    ]
+    return BuildingPoses(time=world.time, speed=speed, robots=robots, people=people[:MAX_PEOPLE])
 
 
 class _Sheet:
-    """The picture while it is drawn."""
-
     def __init__(self, plan: Plan, scale: float) -> None:
         self.plan, self.scale = plan, scale
         size = max(2, round(plan.width * scale)), max(2, round(plan.depth * scale))
         light = light_of(plan).floor.sum(axis=0)
         share = np.clip(light / max(float(np.median(light)) * BRIGHT, 1e-6), 0, 1) ** _GAMMA
-        # Rows of the map go up, rows of a picture down.
+        # The map's rows go up, a picture's rows down.
         share = cv2.resize(share[::-1].astype(np.float32), size, interpolation=cv2.INTER_CUBIC).clip(0, 1)
         self.pixels: Picture = (_NIGHT + share[..., None] * (_DAY - _NIGHT)).astype(np.uint8)
         self._names: list[tuple[str, float, float, float]] = []
@@ -151,7 +142,7 @@ class _Sheet:
         cv2.circle(self.pixels, (int(x), int(y)), radius, _INK, 1, cv2.LINE_AA, _SUB)
 
     def names(self) -> None:
-        """Last, so that nothing covers them; each with a rim, for dark grounds and light ones."""
+        """Draw last, so that nothing covers names; a rim makes them legible on dark and light floor."""
         high, wide = self.pixels.shape[:2]
         for name, x, y, across in self._names:
             text, size = name.replace("_", " "), 0.5
@@ -163,7 +154,7 @@ class _Sheet:
             left = int(np.clip(x * self.scale - width / 2, 4, max(4, wide - width - 4)))
             low = (self.plan.depth - y) * self.scale + height / 2
             base = left, int(np.clip(low, height + 4, max(height + 4, high - 5)))
-            # Not drawn thicker: in OpenCV 5 a bold text is wider as well.
+            # Not a thicker text below: in OpenCV 5 that is also wider.
             for way_x, way_y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
                 at = base[0] + way_x, base[1] + way_y
                 cv2.putText(self.pixels, text, at, _FONT, size, _PAPER, 1, cv2.LINE_AA)

@@ -1,4 +1,4 @@
-"""The building alive: virtual time in which people walk, robots move and their cameras see."""
+"""People walk, robots move and cameras see, in virtual time."""
 
 from __future__ import annotations
 
@@ -19,52 +19,46 @@ from zscout.simulation.building.sensor import Sensor
 from zscout.simulation.building.solids import cuboids_of
 from zscout.simulation.building.truth import DARK, Truth
 
-MAX_STEP: Final = 0.1
-"""Seconds."""
-_SUBSTEP: Final = 0.02
-"""Seconds in which a robot moves 6 mm at most: less than anything is thick."""
-_GRIP: Final = 0.5
-"""Share of the way along an obstacle that is left to a robot that rubs against it."""
+MAX_STEP: Final = 0.1  # s
+_SUBSTEP: Final = 0.02  # s; a robot moves at most 6 mm, less than the thickness of any obstacle
+_GRIP: Final = 0.5  # share of its way that a robot keeps while it rubs along an obstacle
 
 
 class World:
     """A plan in motion. The same plan, seed, starts and calls give the same world, bit for bit."""
 
     def __init__(self, plan: Plan, *, seed: int = 0, starts: Mapping[str, Pose] | None = None) -> None:
-        """`starts` overrides where the named robots begin. Raises KeyError for one that the plan lacks."""
+        """`starts` overrides the start of the named robots. Raises KeyError for robots that the plan lacks."""
         self.plan = plan
-        self.time = 0.0
-        """Seconds since the beginning."""
+        self.time = 0.0  # s since the beginning
         boxes = cuboids_of(plan)
         lit = light_of(plan)
         self._camera = Camera(plan, boxes, lit)
         self.obstacles = Obstacles(plan, boxes)
         self.truth = Truth(plan, boxes, lit, self.obstacles)
         self.median_light = self.truth.median_light
-        """Of the floor with nothing above it, linear."""
         unknown = set(starts or {}) - {robot.name for robot in plan.robots}
         if unknown:
             raise KeyError(f"the plan has no robot {min(unknown)}")
-        # Each part draws from a stream of its own, so that a look more or a robot less changes no other.
-        streams = np.random.SeedSequence(seed).spawn(3)
-        bodies = [np.random.default_rng(one) for one in streams[0].spawn(len(plan.robots))]
-        sensors = [np.random.default_rng(one) for one in streams[1].spawn(len(plan.robots))]
-        walkers = [np.random.default_rng(one) for one in streams[2].spawn(len(plan.people) + 1)]
+        # Each part has its own stream: an additional picture or a missing robot changes no other part.
+        sizes = (len(plan.robots), len(plan.robots), len(plan.people) + 1)
+        bodies, sensors, walkers = (
+            [np.random.default_rng(seeds) for seeds in stream.spawn(size)]
+            for stream, size in zip(np.random.SeedSequence(seed).spawn(3), sizes, strict=True)
+        )
         self.bodies: dict[str, Body] = {}
-        """By robot name."""
         self._sensors: dict[str, Sensor] = {}
         for robot, rng, sensor_rng in zip(plan.robots, bodies, sensors, strict=True):
             start = (starts or {}).get(robot.name, Pose(robot.x, robot.y, robot.heading))
             self.bodies[robot.name] = Body(robot, start, rng)
             self._sensors[robot.name] = Sensor(plan.noise.sensor, sensor_rng)
+        # Where each robot was last measured, and its distance to walls and furniture there: shorter ways need no test.
         self._room = dict.fromkeys(self.bodies, (0.0, 0.0, 0.0))
-        """Where a robot was when it was last measured, and how far from there it is from touching furniture
-        or a wall: most steps are shorter and need no measuring."""
         self.walkers = [Walker(person, rng) for person, rng in zip(plan.people, walkers, strict=False)]
         self._phase = float(walkers[-1].uniform(0, 2 * np.pi))
 
     def step(self, dt: float) -> None:
-        """Goes on by `dt` seconds, above 0 and at most 0.1."""
+        """Advance by `dt` seconds, above 0 and at most MAX_STEP."""
         if not 0 < dt <= MAX_STEP + 1e-9:
             raise ValueError(f"a step of {dt:g} s; it is above 0 and at most {MAX_STEP:g} s")
         parts = max(1, round(dt / _SUBSTEP))
@@ -72,13 +66,11 @@ class World:
             self._move(dt / parts)
 
     def picture(self, robot: str) -> Picture:
-        """What a robot's camera gives now, before the air: uint8 (120, 160). Its exposure follows the
-        pictures that are taken, so a look is part of what must be repeated for the same world."""
-        body = self.bodies[robot]
-        sensor = self._sensors[robot]
-        noise = self.plan.noise
+        """The robot's camera picture before transmission, uint8 (120, 160). It changes the camera's exposure, so
+        the same world needs the same calls."""
+        sensor, noise = self._sensors[robot], self.plan.noise
         lamps = 1 + noise.flicker * sensor.flicker()
-        linear = self._camera.linear(*body.pose, self._moving(robot), lamps, self._daylight())
+        linear = self._camera.linear(*self.bodies[robot].pose, self._moving(robot), lamps, self._daylight())
         return sensor.expose(linear, self.time)
 
     def _move(self, dt: float) -> None:
@@ -100,12 +92,11 @@ class World:
         forward = (left + right) / 2 * dt
         middle = body.heading + turn / 2
         x, y = body.x + forward * math.cos(middle), body.y + forward * math.sin(middle)
-        others = [(one.x, one.y, RADIUS) for one in self.bodies.values() if one is not body] + feet
+        others = [(other.x, other.y, RADIUS) for other in self.bodies.values() if other is not body] + feet
         body.heading = math.remainder(body.heading + turn, math.tau)
         body.bumped = not self._is_free(body, x, y, others)
         if body.bumped:
             x, y = self.obstacles.push_out(x, y, RADIUS, others)
-            # Rubbing along costs way; the wheels turn on in place.
             if not feet:
                 x, y = body.x + (x - body.x) * _GRIP, body.y + (y - body.y) * _GRIP
             if not self._fits(body, x, y):
@@ -114,7 +105,7 @@ class World:
         body.x, body.y = x, y
 
     def _is_free(self, body: Body, x: float, y: float, others: list[tuple[float, float, float]]) -> bool:
-        """Whether a robot there touches nothing; `others` are circles (x, y, radius)."""
+        """Return True if the robot would touch nothing at (x, y); `others` are circles (x, y, radius)."""
         at_x, at_y, room = self._room[body.name]
         if math.hypot(x - at_x, y - at_y) >= room:
             room = self.obstacles.gap(x, y) - RADIUS
@@ -124,13 +115,11 @@ class World:
         )
 
     def _fits(self, body: Body, x: float, y: float) -> bool:
-        if self.obstacles.gap(x, y) < RADIUS - SLACK:
-            return False
-        return all(
-            (apart := math.hypot(x - one.x, y - one.y)) >= 2 * RADIUS - SLACK
-            or apart >= math.hypot(body.x - one.x, body.y - one.y)
-            for one in self.bodies.values()
-            if one is not body
+        return self.obstacles.gap(x, y) >= RADIUS - SLACK and all(
+            (apart := math.hypot(x - other.x, y - other.y)) >= 2 * RADIUS - SLACK
+            or apart >= math.hypot(body.x - other.x, body.y - other.y)
+            for other in self.bodies.values()
+            if other is not body
         )
 
     def _touches(self, body: Body) -> bool:
@@ -140,7 +129,7 @@ class World:
         shapes: list[Cylinder] = []
         for walker in self.walkers:
             if walker.here:
-                # In a doorway there is no floor to be lit, and yet nobody is black there.
+                # A doorway has no lit floor, but people are not black there.
                 light = max(self.floor_light(walker.x, walker.y), self.median_light * DARK)
                 shapes += walker.shapes(light)
         for body in self.bodies.values():
@@ -153,28 +142,25 @@ class World:
         noise = self.plan.noise
         return 1 + noise.daylight * float(np.sin(2 * np.pi * self.time / noise.daylight_period + self._phase))
 
-    # Ground truth: what no robot knows
+    # Ground truth, unknown to robots
 
     def floor_light(self, x: float, y: float) -> float:
-        """Light on the floor there, linear, lamps and windows at their usual; no robot's shadow counted."""
+        """Linear light on the floor in usual light, without shadows of robots."""
         return self.truth.floor_light(x, y)
 
     def is_dark(self, robot: str) -> bool:
-        """Whether the robot is in a truly dark place: light below a quarter of the open floor's median."""
+        """Return True if the robot's place has less than a quarter of the open floor's median light."""
         body = self.bodies[robot]
         return self.floor_light(body.x, body.y) < self.median_light * DARK
 
     def faces_light(self, robot: str) -> bool:
-        """Whether its camera looks at the lit part of the room; the rule is `Truth.faces_light`'s."""
+        """Return True if the camera looks at the lit part of the room (see `Truth.faces_light`)."""
         return self.truth.faces_light(*self.bodies[robot].pose)
 
     def people_in_view(self, robot: str, pose: Pose | None = None) -> int:
-        """Pixels of the robot's picture that show somebody walking, unhidden; or that would if it stood elsewhere."""
-        if not any(walker.here for walker in self.walkers):
-            return 0
+        """Pixels of the robot's picture that show walking people, from `pose` if given."""
         pose, shapes = pose or self.bodies[robot].pose, self._moving(robot)
-        parts = [columns_of(*pose, shape) for shape in shapes if shape.person]
-        within = [part for part in parts if part is not None]
+        within = [part for shape in shapes if shape.person and (part := columns_of(*pose, shape)) is not None]
         if not within:
             return 0
         columns = slice(min(part.start for part in within), max(part.stop for part in within))
@@ -185,18 +171,16 @@ class World:
         return int(np.count_nonzero(people[moving]))
 
     def shadow_in_view(self, robot: str) -> bool:
-        """Whether somebody who walks stands where his shadow may be seen in the robot's picture, himself or not."""
-        if not any(walker.here for walker in self.walkers):
-            return False
+        """Return True if the robot's picture may show a walking person's shadow."""
         pose = self.bodies[robot].pose
         return any(shape.person and shaded_by(*pose, shape) is not None for shape in self._moving(robot))
 
     def crossing(self, robot: str, least: int = 60) -> bool:
-        """Whether people who walk cover `least` pixels or more of the robot's picture now."""
+        """Return True if walking people cover at least `least` pixels of the robot's picture."""
         return self.people_in_view(robot) >= least
 
     def clear(self, x: float, y: float) -> bool:
-        """Whether a robot could stand there: no wall, furniture, robot or foot in its way."""
+        """Return True if a robot at (x, y) would touch no wall, furniture, robot or foot."""
         circles = [(body.x, body.y, RADIUS) for body in self.bodies.values()]
         circles += [foot for walker in self.walkers for foot in walker.feet()]
         return self.obstacles.gap(x, y) >= RADIUS and all(

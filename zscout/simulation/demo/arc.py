@@ -1,7 +1,7 @@
-"""One behavior of `zscout demo table1`, as a process of its own: it requests its ARC at a signal.
+"""A behavior of `zscout demo table1` in its own process: it requests its ARC at a signal.
 
-Standard input: an `ArcSpec` as one line of JSON; then an empty line is the signal. Standard output:
-`ArcReport`s, one line of JSON each. It ends when it had its time, or when standard input closes.
+Standard input: an `ArcSpec` as a line of JSON, then an empty line as the signal. Standard output: `ArcReport`s,
+a line of JSON each. It ends when its ARC is done, or when standard input closes.
 """
 
 from __future__ import annotations
@@ -20,18 +20,15 @@ Milestone: TypeAlias = Literal["ready", "asked", "answered", "entered", "left", 
 
 
 class ArcSpec(msgspec.Struct, frozen=True):
-    """What to request, and as whom."""
-
     host: str
     arc: str
     needs: tuple[str, ...]
     priority: int
-    min_runtime: Decimal
-    """Seconds."""
+    min_runtime: Decimal  # s
 
 
 class ArcReport(msgspec.Struct, frozen=True):
-    """What happened, and when (ns on the host's clock). `entered` and `left` are the ARC's body."""
+    """`at` in ns on the host's clock; `entered` and `left` are about the ARC's body."""
 
     arc: str
     what: Milestone
@@ -40,8 +37,8 @@ class ArcReport(msgspec.Struct, frozen=True):
 
 
 async def behave(spec: ArcSpec, signal: asyncio.Event) -> None:
-    """Waits for all it needs to be there, reports that, and requests it at the signal."""
-    # Imported late: the demo itself needs only the types above.
+    """Report when the RCM and all needed RCs are present, and request the ARC at the signal."""
+    # Imported late: the demo needs only the types above.
     from zscout.behaviors.client.arc import holds
     from zscout.behaviors.client.client import Client
     from zscout.behaviors.client.request import OpenArc
@@ -79,8 +76,7 @@ async def behave(spec: ArcSpec, signal: asyncio.Event) -> None:
         client.internals.watch(on_state)
         needs: dict[str, dict[str, Decimal]] = {rc: {} for rc in spec.needs}
         how: dict[str, Any] = {"priority": spec.priority, "min_runtime": spec.min_runtime, "keep": False}
-        asking = holds(client, spec.arc, needs, **how)
-        async for attempt in asking:
+        async for attempt in holds(client, spec.arc, needs, **how):
             async with attempt:
                 report("entered")
                 try:
@@ -109,7 +105,7 @@ async def _main(spec: ArcSpec) -> None:
 
 
 def read_line() -> bytes:
-    """The first line of standard input, and not a byte more."""
+    """Read the first line of standard input, and not a byte more."""
     line = b""
     while not line.endswith(b"\n") and len(line) < 65_536 and (byte := os.read(0, 1)):
         line += byte

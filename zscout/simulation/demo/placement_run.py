@@ -1,5 +1,4 @@
-"""`zscout demo placement`: three nodes that each report the load of what they started, and components that
-really work."""
+"""`zscout demo placement`: three nodes that report the load of their own process tree, and components that use CPU."""
 
 from __future__ import annotations
 
@@ -23,99 +22,85 @@ from zscout.simulation.demo.screen import keep_recording
 from zscout.types import Policy
 
 NETS: Final = 3
-NET: Final = ("locate-dark", "servo", "hide", "watch")
-"""The components of one Place Sensor Net, as the paper has it."""
-CPU: Final = 0.05
-"""Share of a core that each component burns."""
-START: Final = 30.0
-"""Seconds within which everything must be there."""
+NET: Final = ("locate-dark", "servo", "hide", "watch")  # the components of a Place Sensor Net in the paper
+CPU: Final = 0.05  # share of a core that each component uses
+START: Final = 30.0  # s until everything must be present
 PLACE: Final = 20.0
 REPORT: Final = 20.0
 GAP: Final = 5.0
-SCENARIOS: Final = {"at-once": 0.0, "staggered": GAP}
-"""Seconds from one net to the next."""
+SCENARIOS: Final = {"at-once": 0.0, "staggered": GAP}  # s between the starts of two nets
 TITLES: Final = {"at-once": "all at once", "staggered": f"one net every {GAP:g} s"}
-SHOWN: Final = 2
-"""Reports of each host while all components work."""
+SHOWN: Final = 2  # reports of each host while all components work
 
 
 @dataclass(slots=True)
 class PlacementTrial:
-    """Three Place Sensor Nets under one policy, and what was seen of them."""
+    """Three Place Sensor Nets under a policy, and the observations."""
 
     policy: Policy
-    gap: float
-    """Seconds from one net to the next; 0: all at once."""
+    gap: float  # s between the starts of two nets; 0: all at once
     placed: dict[str, str] = field(default_factory=dict)
     loads: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
-    """By host: seconds since the first start, cores that its components used."""
+    """By host: (seconds since the first start, cores used by its components)."""
 
     def counts(self) -> dict[str, int]:
-        """Components on each host."""
         hosts = list(self.placed.values())
         return {host: hosts.count(host) for host in HOSTS}
 
     def spread(self) -> int:
-        """Components on the fullest host less those on the emptiest."""
+        """Components on the fullest host less components on the emptiest."""
         counts = self.counts().values()
         return max(counts) - min(counts)
 
     def apart(self) -> float:
-        """Highest less lowest of what components use on a host, in cores, at the end."""
+        """Final difference between the most and the least loaded host, in cores."""
         latest = [curve[-1][1] for curve in self.loads.values() if curve]
         return max(latest) - min(latest) if latest else 0.0
 
 
 class PlacementDemo(DemoRunner):
-    """Three nodes and one trial on them: another trial would begin with the loads that this one left. `zero`
-    is the first start."""
+    """A trial on three fresh nodes, so that no load of an earlier trial remains. `zero` is the first start."""
 
     def __init__(self, folder: Path, trial: PlacementTrial, show: Callable[[float, str], None]) -> None:
         super().__init__(folder, show)
         self.trial = trial
         self._mesh: Mesh | None = None
         self._shown: dict[str, str] = {}
-        self._running: dict[str, set[str]] = {}
-        """Components by host, as its newest report has them."""
+        self._running: dict[str, set[str]] = {}  # by host, components in its newest report
         self._reported = asyncio.Event()
 
     async def play(self) -> None:
-        """Starts three Place Sensor Nets, sees them work, and ends them."""
         mesh = await self._start()
         self.zero = mesh.now()
         names = [[f"{part}-{net + 1}" for part in NET] for net in range(NETS)]
-        if self.trial.gap:
-            for number, net in enumerate(names):
-                if number:
-                    await asyncio.sleep(self.trial.gap)
-                await asyncio.gather(*map(self._place, net))
-        else:
-            await asyncio.gather(*(self._place(name) for net in names for name in net))
-        await self.within(REPORT, self._all_reported(), "no load report told of all components")
+        batches = names if self.trial.gap else [[name for net in names for name in net]]
+        for number, batch in enumerate(batches):
+            if number:
+                await asyncio.sleep(self.trial.gap)
+            await asyncio.gather(*map(self._place, batch))
+        await self.within(REPORT, self._all_reported(), "no load report listed all components")
         await asyncio.gather(*(self._stop(name) for net in names for name in net))
 
     async def _start(self) -> Mesh:
-        """Starts the nodes, and waits until all are there and report."""
+        """Start the nodes and wait until all are present and ranked."""
         await self.start_nodes({}, 'load = "tree"\n')
-        fleet = self.fleet()
-        mesh = self._mesh = await ZenohMesh.open(fleet, Sender("demo", "watch"))
+        mesh = self._mesh = await ZenohMesh.open(self.fleet(), Sender("demo", "watch"))
         self._placer = PlacerClient(mesh)
         mesh.subscribe(mesh.keys.load_any, LoadReport, self._on_load)
         mesh.subscribe(mesh.keys.placements, Placements, self._on_placements)
         await self.within(START, self.all_there(mesh, *HOSTS), "the nodes did not find each other")
-        await self.within(START, self._all_ranked(), "the balancer did not hear of all nodes")
+        await self.within(START, self._all_ranked(mesh), "the balancer did not rank all nodes")
         return mesh
 
-    async def _all_ranked(self) -> None:
-        assert self._mesh is not None  # noqa: S101
+    async def _all_ranked(self, mesh: Mesh) -> None:
         while True:
-            reply = await self._mesh.ask_one(self._mesh.keys.rank, RankAsk(), HostRanking, timeout=1)
+            reply = await mesh.ask_one(mesh.keys.rank, RankAsk(), HostRanking, timeout=1)
             if reply is not None and reply.message is not None and len(reply.message.hosts) == len(HOSTS):
                 return
             await asyncio.sleep(0.1)
 
     async def _all_reported(self) -> None:
-        """Waits until all components were reported, and then SHOWN more reports of each host."""
+        """Wait until all components were reported, then for SHOWN more reports of each host."""
         while sum(map(len, self._running.values())) < len(self.trial.placed):
             self._reported.clear()
             await self._reported.wait()
@@ -140,14 +125,12 @@ class PlacementDemo(DemoRunner):
         except RequestRefused as refused:
             raise DemoFailed(f"{name}: {refused}") from refused
 
-    # What is seen
-
     def _on_placements(self, _key: str, placements: Placements) -> None:
-        for one in placements.components:
-            words = f"{one.component} {one.state}" + (f" on {one.host}" if one.host else "")
-            if self._shown.get(one.component) != words and one.state in ("running", "moving", "given_up"):
-                self.event(f"{words}: {one.reason}" if one.reason else words)
-            self._shown[one.component] = words
+        for placed in placements.components:
+            words = f"{placed.component} {placed.state}" + (f" on {placed.host}" if placed.host else "")
+            if self._shown.get(placed.component) != words and placed.state in ("running", "moving", "given_up"):
+                self.event(f"{words}: {placed.reason}" if placed.reason else words)
+            self._shown[placed.component] = words
 
     def _on_load(self, _key: str, report: LoadReport) -> None:
         if self.zero is not None and report.host in HOSTS:
@@ -161,11 +144,8 @@ class PlacementDemo(DemoRunner):
             await self._mesh.close()
 
 
-# On the screen
-
-
 async def play(chosen: Sequence[tuple[str, Policy]], out: Path | None, *, as_json: bool) -> int:
-    """One trial for each scenario and policy, on fresh nodes; returns the exit code. Raises DemoFailed, MeshError."""
+    """Run each scenario and policy on fresh nodes; returns the exit code. Raises DemoFailed, MeshError."""
     began, done = time.monotonic(), []
 
     def show(at: float, text: str) -> None:
@@ -201,7 +181,7 @@ async def play(chosen: Sequence[tuple[str, Policy]], out: Path | None, *, as_jso
 
 
 def _failure(scenario: str, trial: PlacementTrial) -> str:
-    """What is not as it must be; empty if all is."""
+    """Describe how the trial differs from the paper, "" if it does not."""
     counts = "-".join(map(str, trial.counts().values()))
     if trial.policy == "pending" and trial.spread() > 1:
         return f"pending, {TITLES[scenario]}: {counts} is not within one component"
@@ -214,18 +194,16 @@ def _failure(scenario: str, trial: PlacementTrial) -> str:
 
 def _table(done: list[tuple[str, PlacementTrial]]) -> None:
     hosts = list(done[0][1].counts())
-    rows = []
-    for scenario, trial in done:
-        counts = trial.counts()
-        rows.append(
-            [
-                TITLES[scenario],
-                trial.policy,
-                *(str(counts[host]) for host in hosts),
-                str(trial.spread()),
-                f"{trial.apart():.2f}",
-            ]
-        )
+    rows = [
+        [
+            TITLES[scenario],
+            trial.policy,
+            *map(str, trial.counts().values()),
+            str(trial.spread()),
+            f"{trial.apart():.2f}",
+        ]
+        for scenario, trial in done
+    ]
     terminal.print_table(
         ["started", "policy", *hosts, "spread", "load apart"],
         rows,

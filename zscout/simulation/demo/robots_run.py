@@ -1,7 +1,6 @@
-"""`zscout demo robots`: a building, three nodes with its devices, and a net that is placed.
+"""`zscout demo robots`: a building, three nodes with its devices, and a placed net.
 
-What happens is followed as anybody on the mesh may: what the RCM publishes, what behaviors publish, and,
-because the building is a simulated one, where its robots truly stand.
+The demo observes publications only: of the RCM, of behaviors, and the simulated robots' true positions.
 """
 
 from __future__ import annotations
@@ -26,58 +25,41 @@ from zscout.simulation.demo.runner import BUILDING, HOSTS, DemoRunner, free_port
 from zscout.types import SECOND, Ns
 
 NET: Final = "place_sensor_net"
-BAUD: Final = 1_200
-"""Of the demo's radio: room for the commands of two robots, not for those of three."""
-BOUND: Final = 0.5
-"""Seconds that a packet may wait."""
-FRAME_RATE: Final = 10.0
-"""Of the framegrabbers, frames in a second of the building."""
+BAUD: Final = 1_200  # of the demo's radio: enough for commands of two robots, not of three
+BOUND: Final = 0.5  # s that a packet may wait
+FRAME_RATE: Final = 10.0  # of the framegrabbers, frames per second of the building
 FRAMEGRABBERS: Final = 2
-START: Final = 40.0
-"""Seconds within which everything must be there."""
+START: Final = 40.0  # s until everything must be present
+# Seconds of the building: from the start of the net to the operator's takeover, length of the drive, and least and
+# most time that the hidden net is watched (longest if no person walks by).
 TAKEOVER: Final = 37.5
-"""Seconds of the building from the beginning of the net to the operator's takeover."""
 DRIVES: Final = 9.0
-"""Seconds of the building that the operator drives."""
 GUARDS: Final = (15.0, 60.0)
-"""Seconds of the building that the net is watched once all are hidden: at least, and at most if nobody walks by."""
-WORST: Final = 150.0
-"""Seconds of ours after which the demo ends, placed or not."""
+WORST: Final = 150.0  # s of real time after which the demo ends, placed or not
 PATROL: Final[tuple[tuple[Way, float], ...]] = (("forward", 2.25), ("left", 1.5), ("forward", 2.25), ("right", 1.5))
-"""What the operator does, in seconds of the building."""
+"""The operator's keys, each with its seconds of the building."""
 
 
 @dataclass(slots=True)
 class RobotsObserved:
-    """What the demo saw."""
-
     robots: list[str]
-    hidden: set[str] = field(default_factory=set)
-    """That report so."""
-    truly: set[str] = field(default_factory=set)
-    """That truly stand in the dark, as the building knows."""
+    hidden: set[str] = field(default_factory=set)  # as reported
+    truly: set[str] = field(default_factory=set)  # in a dark place, by the building's ground truth
     watching: set[str] = field(default_factory=set)
-    placed_at: float | None = None
-    """When all were hidden for the first time, in seconds of the demo."""
+    placed_at: float | None = None  # s of the demo until all were hidden for the first time
     alerts: int = 0
     grants: int = 0
     preemptions: int = 0
-    turns: int = 0
-    """Holds that ended because another of the same rank had its turn."""
-    waits: list[float] = field(default_factory=list)
-    """Seconds from a behavior's "wait" to its next report."""
-    takeover: float | None = None
-    """Seconds from the operator's key to the robot's first own command."""
+    turns: int = 0  # holds that ended for an ARC of the same rank
+    waits: list[float] = field(default_factory=list)  # s from a behavior's "wait" to its next report
+    takeover: float | None = None  # s from the operator's key to the robot's first own command
     taken: str = ""
-    resumed_after: float | None = None
-    """Seconds from the operator's release to the robot's behavior going on."""
-    doing: dict[str, str] = field(default_factory=dict)
-    """By robot: what it reports that it does."""
-    simulated: float = 0.0
-    """Seconds of the building."""
+    resumed_after: float | None = None  # s from the operator's release until the robot's behavior resumed
+    doing: dict[str, str] = field(default_factory=dict)  # reported activity by robot
+    simulated: float = 0.0  # s of the building
 
     def summary(self) -> dict[str, Any]:
-        """What came of it, for programs."""
+        """The result for `--json`."""
         waits = sorted(self.waits)
         return {
             "robots": len(self.robots),
@@ -99,7 +81,7 @@ class RobotsObserved:
 
 
 class RobotsDemo(DemoRunner):
-    """The whole demo; `zero` is the beginning of the net."""
+    """The whole demo; `zero` is the start of the net."""
 
     def __init__(
         self,
@@ -111,21 +93,20 @@ class RobotsDemo(DemoRunner):
         speed: float,
         show: Callable[[float, str], None],
     ) -> None:
-        """`building` as `zscout simulate` knows it, `ids` of the robots in it, on the air, by RC."""
+        """`building` is an argument of `zscout simulate`, `ids` the robots' ids on the air by RC."""
         super().__init__(folder, show)
         self._ids = ids
         self.robots = list(ids)
         self.seen = RobotsObserved(self.robots)
         self.building, self.seed, self.speed = building, seed, speed
-        self.driven: str | None = None
-        """The robot that the operator has now."""
+        self.driven: str | None = None  # the robot held by the operator
         self._client: Client | None = None
         self._waiting: dict[str, Ns] = {}
         self._news = asyncio.Event()
         self._returned_at: Ns | None = None
 
     async def play(self) -> None:
-        """Has the net placed, one robot taken over, and the net watched."""
+        """Place the net, take over a robot, and watch the net."""
         client = await self._start()
         spec = ComponentSpec("place_sensor_net", {"robots": self.robots, "speed": self.speed})
         self.zero = clock.now()
@@ -151,7 +132,7 @@ class RobotsDemo(DemoRunner):
             await self._news.wait()
 
     async def _guard(self) -> None:
-        """For a while, and until something was alerted."""
+        """Wait for an alert within the bounds of GUARDS."""
         alerts = self.seen.alerts
         least, most = (seconds / self.speed for seconds in GUARDS)
         await asyncio.sleep(least)
@@ -162,9 +143,9 @@ class RobotsDemo(DemoRunner):
                     await self._news.wait()
 
     async def _operator(self, client: Client) -> None:
-        """In the middle of it, a human takes one robot, drives it about and gives it back."""
+        """Take a robot midway, drive it and give it back."""
         await asyncio.sleep(TAKEOVER / self.speed)
-        robot = next((one for one in self.robots if self.seen.doing.get(one) not in (None, "wait")), self.robots[0])
+        robot = next((name for name in self.robots if self.seen.doing.get(name) not in (None, "wait")), self.robots[0])
         pilot = Pilot(0.5)
         teleop = Teleop(client, RobotNeeds(robot), pilot, priority=client.fleet.operator_priority)
         driving = asyncio.create_task(teleop.run())
@@ -176,7 +157,7 @@ class RobotsDemo(DemoRunner):
                 for way, seconds in PATROL:
                     until = clock.now() + round(seconds / self.speed * SECOND)
                     while clock.now() < min(until, end):
-                        # As a terminal repeats a key that is held down.
+                        # A terminal repeats a key held down.
                         pilot.press(clock.now() / SECOND, way)
                         teleop.take()
                         await asyncio.sleep(0.05)
@@ -189,10 +170,8 @@ class RobotsDemo(DemoRunner):
             driving.cancel()
             await asyncio.gather(driving, return_exceptions=True)
 
-    # Starting
-
     async def _start(self) -> Client:
-        """Starts the building and the nodes, and waits until all are there."""
+        """Start the building and the nodes, and wait until all are present."""
         self.write_fleet()
         (port,) = free_ports(1)
         line = self.folder / "radio0"
@@ -216,8 +195,8 @@ class RobotsDemo(DemoRunner):
         return client
 
     def _devices(self, port: int, line: Path) -> dict[str, str]:
-        """The devices' part of the node files, by host: radio and channels on the first, robots on the
-        second, framegrabbers on first and third."""
+        """TOML of the devices by host: radio and channels on the first, robots on the second, framegrabbers on
+        first and third."""
         tables = device_tables(
             port=str(line),
             baud=BAUD,
@@ -229,17 +208,12 @@ class RobotsDemo(DemoRunner):
             framegrabbers=FRAMEGRABBERS,
         )
         first, second, third = HOSTS
-        return {
-            first: "".join([tables.radio, *tables.videos, tables.framegrabbers[0]]),
-            second: "".join(tables.robots),
-            third: "".join(tables.framegrabbers[1:]),
-        }
+        on_first = "".join([tables.radio, *tables.videos, tables.framegrabbers[0]])
+        return {first: on_first, second: "".join(tables.robots), third: "".join(tables.framegrabbers[1:])}
 
     async def close(self) -> None:
         if self._client is not None:
             await self._client.close()
-
-    # What is seen
 
     def _on_behavior(self, _key: str, status: BehaviorSaid) -> None:
         if status.robot not in self.robots or not status.path.startswith(f"{NET}/"):
@@ -283,4 +257,4 @@ class RobotsDemo(DemoRunner):
 
     def _on_poses(self, _key: str, poses: BuildingPoses) -> None:
         self.seen.simulated = poses.time
-        self.seen.truly = {f"robot/{one.name}" for one in poses.robots if one.hidden} & set(self.robots)
+        self.seen.truly = {f"robot/{placed.name}" for placed in poses.robots if placed.hidden} & set(self.robots)

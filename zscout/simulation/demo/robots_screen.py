@@ -1,4 +1,4 @@
-"""`zscout demo robots` on the screen: what each robot does, and what came of it."""
+"""`zscout demo robots` on the screen: activities of the robots, and the results."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from zscout.simulation.demo.screen import DemoScreen, LiveView, how_to_view
 if TYPE_CHECKING:
     from rich.console import Group
 
-LINES: Final = 12
-"""Events shown below the table at most."""
-ABOVE: Final = 7
-"""Lines of the picture that are neither robots nor events."""
+LINES: Final = 12  # most events below the table
+ABOVE: Final = 7  # lines of the picture that are neither robots nor events
 HARDWARE: Final = "2 framegrabbers, 1 radio, 3 nodes"
 STYLES: Final = {
     "search": "yellow",
@@ -32,15 +30,13 @@ STYLES: Final = {
     "present": "bold black on yellow",
     "wait": "bright_black",
     "lost": "bold red",
-}
-"""What a robot does."""
+}  # by activity
 
 
 async def play(
     building: str, seed: int, speed: float, out: Path | None, *, as_json: bool, live: LiveView | None = None
 ) -> int:
-    """Plays it; returns the exit code. Raises what `RobotsDemo` raises."""
-    # Known to be good before anything is started.
+    """Play the demo; returns the exit code. Raises as `RobotsDemo` does, and BadInput."""
     ids = {f"robot/{robot.name}": robot.id for robot in plan_named(building).robots}
     if not ids:
         raise BadInput(f"--building {building}: there is no robot in it; add a [[robot]]")
@@ -94,7 +90,6 @@ def _takeover(seen: RobotsObserved) -> str:
 
 
 def _picture(demo: RobotsDemo, screen: DemoScreen) -> Group:
-    """What each robot does, and the latest events."""
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
@@ -102,11 +97,9 @@ def _picture(demo: RobotsDemo, screen: DemoScreen) -> Group:
     seen = demo.seen
     title = _title(demo.building, demo.speed, len(demo.robots))
     head = Text(title, style="bold", overflow="ellipsis", no_wrap=True)
-    # A picture that is higher than the terminal can't be drawn over.
+    # A picture higher than the terminal can't be drawn over.
     shown = max(1, min(LINES, terminal.console().height - ABOVE - len(seen.robots)))
-    at = "starting"
-    if demo.zero is not None:
-        at = f"{demo.elapsed():5.1f} s, building {seen.simulated:5.0f} s"
+    at = "starting" if demo.zero is None else f"{demo.elapsed():5.1f} s, building {seen.simulated:5.0f} s"
     table = Table(box=None, padding=(0, 2, 0, 0))
     for column in ("robot", "does", "truly dark"):
         table.add_column(column, header_style="bold")

@@ -1,4 +1,4 @@
-"""What all demos share: nodes in a fleet of their own, watched, recorded, and ended with whoever started them."""
+"""Shared by all demos: nodes in a fleet of their own, watched, recorded, and ended with the demo's process."""
 
 from __future__ import annotations
 
@@ -21,55 +21,45 @@ from zscout.simulation import DemoFailed
 from zscout.types import SECOND, Ns
 
 HOSTS: Final = ("anvil", "bellows", "crucible")
-RECORDS: Final = "crucible"
-"""The host whose node records."""
-RECORDINGS: Final = "recordings"
-"""The folder of its recording, below the demo's."""
-BUILDING: Final = "building"
-"""The process that simulates one, where there is one."""
-GRACE: Final = 45.0
-"""Seconds for the processes to end in order, the recording finished."""
-LIVE: Final = 40.0
-"""Seconds within which the recorder has begun."""
+RECORDS: Final = "crucible"  # the host whose node records
+RECORDINGS: Final = "recordings"  # its folder below the demo's
+BUILDING: Final = "building"  # name of the process that simulates a building
+GRACE: Final = 45.0  # s for the processes to end in order and finish the recording
+LIVE: Final = 40.0  # s until the recorder must serve
 MAX_LINE: Final = 65_536
-SHOWN: Final = 600
-"""Characters of a log that explain a failure."""
+SHOWN: Final = 600  # characters of a log in a failure's message
 
 
 class DemoRunner(ABC):
-    """One run of a demo, whose `play` says what happens. Use as an async context manager: no process is left
-    afterwards.
+    """A run of a demo, implemented by `play`. Use as an async context manager, which leaves no process behind.
 
-    `show(at, text)` gets each event in words, `at` in seconds since `zero`."""
+    `show(at, text)` receives each event in words, `at` in seconds since `zero`."""
 
     def __init__(self, folder: Path, show: Callable[[float, str], None]) -> None:
         self.folder = folder
-        self.zero: Ns | None = None
-        """When what is shown began."""
+        self.zero: Ns | None = None  # origin of the shown times
         self._fleet_file = folder / "fleet.toml"
         self._show = show
+        # Has an exception once a process ends unexpectedly.
         self._failed: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        """Has an exception once a process ended that should not have."""
         self._processes: dict[str, asyncio.subprocess.Process] = {}
         self._supervisor = Supervisor("the demo", self._fail)
         self._ending = False
-        self._ends: dict[str, str] = {}
-        """Where each host's node listens."""
-        self._live = 0
-        """The port of the recorder's live view."""
+        self._ends: dict[str, str] = {}  # address of each host's node
+        self._live = 0  # port of the recorder's live view
         self.on_live: Callable[[str], Awaitable[None]] | None = None
-        """Gets the address of the live view before anything is shown."""
+        """Called with the address of the live view before anything is shown."""
 
     @abstractmethod
     async def play(self) -> None:
-        """Starts what the demo needs, and plays it to its end. Raises DemoFailed, MeshError, BadInput."""
+        """Start the demo's processes and play it to its end. Raises DemoFailed, MeshError, BadInput."""
 
     @abstractmethod
     async def close(self) -> None:
-        """Leaves the mesh, before the processes end."""
+        """Leave the mesh, before the processes end."""
 
     async def run(self) -> None:
-        """Plays the demo. Raises what `play` raises, and DemoFailed as soon as a process ends that should not."""
+        """Play the demo. Raises as `play` does, and DemoFailed as soon as a process ends unexpectedly."""
         task = asyncio.ensure_future(self.play())
         try:
             await asyncio.wait({task, self._failed}, return_when=asyncio.FIRST_COMPLETED)
@@ -81,7 +71,7 @@ class DemoRunner(ABC):
             await asyncio.gather(task, return_exceptions=True)
 
     def event(self, text: str, at: Ns | None = None) -> None:
-        """Shows what happened `at` (default: now)."""
+        """Show an event; `at` defaults to now."""
         self._show(self.elapsed(at), text)
 
     def elapsed(self, at: Ns | None = None) -> float:
@@ -89,24 +79,23 @@ class DemoRunner(ABC):
         return ((clock.now() if at is None else at) - self.zero) / SECOND if self.zero is not None else 0.0
 
     def fleet(self) -> Fleet:
-        """The fleet of the demo's nodes."""
         return load_fleet(self._fleet_file)
 
     def write_fleet(self) -> None:
-        """Writes the fleet file, for those who begin before the nodes."""
+        """Write the fleet file, for processes that start before the nodes."""
         *ports, self._live = free_ports(len(HOSTS) + 1)
         self._ends = {host: f"tcp/127.0.0.1:{port}" for host, port in zip(HOSTS, ports, strict=True)}
         self._fleet_file.write_text(
             f'[fleet]\nname = "demo-{new_instance()}"\ncandidates = {_list(HOSTS)}\n'
             '[mesh]\nmulticast = false\nlease = 5\nlisten = ["tcp/127.0.0.1:0"]\n'
             f"connect = {_list(list(self._ends.values()))}\n"
-            # Nobody fails here unnoticed, and a process of a busy machine may not run for a second.
+            # Failures are noticed otherwise, and on a busy machine a process may stall for a second.
             "[timing]\nhold_lease = 10\n"
         )
 
     async def start_nodes(self, extra: Mapping[str, str], node_table: str = "") -> None:
-        """Starts a node on each of HOSTS, in a fleet of their own on this machine's loopback: `extra` is more
-        text for the node file of a host, `node_table` more lines of its [node] table."""
+        """Start a node for each of HOSTS, on loopback. `extra` is more text for a host's node file, `node_table`
+        more lines of its [node] table."""
         if not self._ends:
             self.write_fleet()
         for host, end in self._ends.items():
@@ -117,7 +106,7 @@ class DemoRunner(ABC):
                 text += f'[recorder]\npath = "{RECORDINGS}"\nport = {self._live}\n'
             file = self.folder / f"{host}.toml"
             file.write_text(text + extra.get(host, ""))
-            # The launcher has the kernel end the node with this process, however that may end.
+            # The launcher has the kernel end the node with this process, even if that is killed.
             node = [*LAUNCH[1:], str(os.getpid()), sys.executable, "-m", "zscout.node", str(file)]
             await self.start(f"node {host}", node)
         if self.on_live is not None:
@@ -125,7 +114,7 @@ class DemoRunner(ABC):
             await self.on_live(f"rerun+http://127.0.0.1:{self._live}/proxy")
 
     async def _served(self) -> None:
-        """Returns once the live view answers."""
+        """Return once the live view answers."""
         while True:
             with suppress(OSError):
                 _, writer = await asyncio.open_connection("127.0.0.1", self._live)
@@ -134,7 +123,7 @@ class DemoRunner(ABC):
             await asyncio.sleep(0.1)
 
     async def start(self, name: str, arguments: Sequence[str], *, piped: bool = False) -> asyncio.subprocess.Process:
-        """Starts a Python process; one that is `piped` talks through pipes, else its output is logged."""
+        """Start a Python process. `piped`: through pipes; otherwise its output is logged."""
         with self._log(name).open("wb") as log:
             process = await asyncio.create_subprocess_exec(
                 sys.executable,
@@ -143,7 +132,7 @@ class DemoRunner(ABC):
                 stdout=asyncio.subprocess.PIPE if piped else log,
                 stderr=log,
                 env=os.environ | {"ZSCOUT_FLEET": str(self._fleet_file)},
-                # Ctrl-C is for this process alone, which then ends the others in their order.
+                # Ctrl-C reaches this process alone, which then ends the others in order.
                 start_new_session=True,
                 limit=MAX_LINE,
             )
@@ -152,16 +141,16 @@ class DemoRunner(ABC):
         return process
 
     def spawn(self, work: Coroutine[Any, Any, None]) -> None:
-        """Runs `work` beside the demo, which fails with it."""
+        """Run `work` beside the demo; the demo fails with it."""
         self._supervisor.spawn(work)
 
     async def all_there(self, mesh: Mesh, *others: str) -> None:
-        """Waits for the tokens of an RCM, the recorder, and `others`: hosts of nodes, names of RCs."""
+        """Wait for the tokens of an RCM, the recorder, and `others` (hosts of nodes, names of RCs)."""
         missing, complete = {Role.RCM, Role.RECORDER, *others}, asyncio.Event()
 
         def seen(token: Token, alive: bool) -> None:
             if alive:
-                # By role: the session of a recorder that has read nothing yet is named like one.
+                # By role: until a recorder has read anything, its session is named like an RC.
                 missing.difference_update((token.role, {Role.NODE: token.host, Role.RC: token.name}.get(token.role)))
             if not missing:
                 complete.set()
@@ -171,7 +160,7 @@ class DemoRunner(ABC):
         watch.close()
 
     async def within(self, seconds: float, what: Awaitable[object], otherwise: str) -> None:
-        """Waits for `what`. Raises DemoFailed with what the logs say, if it takes longer than `seconds`."""
+        """Wait for `what`. Raises DemoFailed with a log's end if that takes longer than `seconds`."""
         try:
             async with asyncio.timeout(seconds):
                 await what
@@ -182,8 +171,7 @@ class DemoRunner(ABC):
 
     async def _watch_end(self, name: str, process: asyncio.subprocess.Process) -> None:
         code = await process.wait()
-        early = bool(code) or name.startswith("node ")
-        if early and not self._ending:
+        if (code or name.startswith("node ")) and not self._ending:
             words = self._log(name).read_text(errors="replace").strip()[-SHOWN:]
             self._fail(DemoFailed(f"{name} ended with code {code}: {words or 'it printed nothing'}"))
 
@@ -215,8 +203,8 @@ class DemoRunner(ABC):
         self._failed.cancel()
 
     async def _end(self) -> None:
-        """The node that records goes first, so that the end of the others is not recorded. The building of
-        their devices, which does not end with its input, goes last."""
+        """End the recording node first, so that the end of the others is not recorded, and the building of their
+        devices last, since it does not end with its input."""
         for process in self._processes.values():
             if process.stdin is not None:
                 process.stdin.close()
@@ -238,7 +226,7 @@ def _list(texts: Sequence[str]) -> str:
 
 
 def free_ports(count: int) -> list[int]:
-    """Ports that nobody has at this moment, all different."""
+    """Different ports that are free at this moment."""
     with ExitStack() as stack:
         servers = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
         return [int(server.getsockname()[1]) for server in servers]

@@ -1,4 +1,4 @@
-"""What the demos share: a run on the screen, and the recording that it leaves."""
+"""Shared by the demos: a run on the screen, and its recording."""
 
 from __future__ import annotations
 
@@ -20,61 +20,54 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 FOLDER: Final = Path("runs")
-FRAMES: Final = 4
-"""Drawings a second at a terminal."""
+FRAMES: Final = 4  # drawings per second at a terminal
 
 D = TypeVar("D", bound="DemoRunner")
 
 
 class LiveView(Protocol):
-    """What shows a demo while it runs, and its recording afterwards."""
+    """Shows a running demo, and its recording afterwards."""
 
     async def open(self, url: str) -> str:
-        """Shows the live view that is served there; returns where people see it, in words."""
+        """Show the live view at `url`; returns where people see it, in words."""
 
     async def finished(self, recording: Path) -> None:
-        """Shows the recording in its place; returns once nobody looks any more."""
+        """Show the recording instead; returns when the last viewer leaves."""
 
 
 class DemoScreen:
-    """Events as lines in a pipe; at a terminal a picture with the latest of them; nothing with `--json`."""
+    """Events as lines in a pipe, as a picture with the latest at a terminal, or not at all with `--json`."""
 
     def __init__(self, *, as_json: bool, decimals: int, live: LiveView | None = None) -> None:
-        """`decimals` of the events' seconds."""
-        self._live = live
-        self._where = ""
-        self._as_json = as_json
+        self._live, self._where = live, ""
+        self._as_json, self._decimals = as_json, decimals
         self._plain = not as_json and not terminal.at_terminal()
         self._drawn = not as_json and not self._plain
-        self._decimals = decimals
         self._events: list[str] = []
 
     def print_line(self, text: str) -> None:
-        """A line of a pipe."""
         if self._plain:
             terminal.print_line(text)
 
     def show(self, at: float, text: str) -> None:
-        """An event, `at` in seconds."""
         self._events.append(f"{at:6.{self._decimals}f} s  {terminal.clean(text)}")
         self.print_line(self._events[-1])
 
     def latest(self, count: int) -> list[Text]:
-        """The latest events, for a picture."""
         from rich.text import Text
 
         lines = [Text(line, overflow="ellipsis", no_wrap=True) for line in self._events[-count:]]
-        # An address that is cut off is none.
+        # Fold the address: cut off, it is useless.
         return [*([Text(self._where, overflow="fold")] if self._where else []), *lines]
 
     async def play(self, make: Callable[[Path], D], draw: Callable[[D], Group], out: Path | None) -> tuple[D, Path]:
-        """Runs the demo that `make` makes for a temporary folder, and returns it and its recording, which
-        stays even where the demo failed. `draw` gives the picture at any moment."""
+        """Run the demo that `make` returns for a temporary folder. Returns it and its recording, which is kept
+        even if the demo fails. `draw` returns the current picture."""
         with _recording(out) as path, tempfile.TemporaryDirectory(prefix="zscout-demo-") as folder:
             demo = make(Path(folder))
             demo.on_live = self._open if self._live is not None else None
             try:
-                # The picture stays until all processes have ended: that takes some seconds.
+                # The picture stays until all processes have ended, some seconds later.
                 with picture(lambda: draw(demo)) if self._drawn else nullcontext():
                     async with demo:
                         await demo.run()
@@ -93,13 +86,12 @@ class DemoScreen:
         self.print_line(self._where)
 
     async def linger(self, path: Path) -> None:
-        """With a live view: shows the recording in it until nobody looks any more."""
+        """Show the recording in the live view, if any, until the last viewer leaves."""
         if self._live is not None:
             await self._live.finished(path)
 
 
 def picture(draw: Callable[[], Group]) -> Live:
-    """What `draw` gives, in place, again and again."""
     from rich.live import Live
 
     return Live(get_renderable=draw, console=terminal.console(), refresh_per_second=FRAMES, transient=True)
@@ -107,7 +99,7 @@ def picture(draw: Callable[[], Group]) -> Live:
 
 @contextmanager
 def _recording(out: Path | None) -> Iterator[Path]:
-    """The recording's file, made beforehand: a bad place is known at once. It goes if it stays empty."""
+    """The recording's file, created first so that a bad path fails at once; removed if it stays empty."""
     from zscout.services.recorder.process import new_recording, prune
 
     path = out or new_recording(FOLDER, "demo")
@@ -121,7 +113,7 @@ def _recording(out: Path | None) -> Iterator[Path]:
 
 
 def keep_recording(folder: Path, path: Path) -> bool:
-    """Moves the recording out of the demo's folder; False if there is none."""
+    """Move the recording out of the demo's folder; returns False if there is none."""
     recorded = next((folder / RECORDINGS).glob("*.rrd"), None)
     if recorded is not None:
         shutil.move(recorded, path)
@@ -129,7 +121,6 @@ def keep_recording(folder: Path, path: Path) -> bool:
 
 
 def how_to_view(path: Path) -> list[str]:
-    """Where the recording is, and how to look at it."""
-    # A newcomer's shell does not find it yet: it lies in .venv/bin.
+    # Without an activated .venv the shell does not find zscout.
     me = "zscout" if shutil.which("zscout") else os.path.relpath(sys.argv[0])
     return [f"Recording: {path}", f"Look at it: {me} view {path}, or in a browser: {me} view --web {path}"]

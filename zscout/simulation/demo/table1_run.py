@@ -1,6 +1,6 @@
-"""`zscout demo table1`: three nodes, the paper's five behaviors, and one process that watches.
+"""`zscout demo table1`: three nodes, the paper's five behaviors, and a process that watches.
 
-It only subscribes once the first ARC has asked: a query to the RCM would be part of what is shown.
+After the first request the watcher only subscribes: its queries to the RCM would be part of the picture.
 """
 
 from __future__ import annotations
@@ -23,23 +23,20 @@ from zscout.simulation.demo.tables import Observed
 from zscout.simulation.workload import Arrival, Workload
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
 
-START: Final = 30.0
-"""Seconds within which everything must be there."""
+START: Final = 30.0  # s until everything must be present
 ANSWER: Final = 5.0
-LATE: Final = 5.0
-"""Seconds that an ARC's end may be late before the demo gives up."""
+LATE: Final = 5.0  # s that an ARC's end may be late
 
 
 class Table1Demo(DemoRunner):
-    """One run of a workload; `zero` is when the first ARC asked."""
+    """A run of a workload; `zero` is the first request."""
 
     def __init__(self, folder: Path, workload: Workload, show: Callable[[float, str], None]) -> None:
         super().__init__(folder, show)
         self.workload = workload
         self.seen = Observed()
         self._behaviors: dict[str, asyncio.subprocess.Process] = {}
-        self._milestones: dict[tuple[str, str], asyncio.Event] = {}
-        """By ARC and what its behavior reported."""
+        self._milestones: dict[tuple[str, str], asyncio.Event] = {}  # by ARC and milestone
         self._mesh: Mesh | None = None
         self._newest: tuple[Term, int] = (NO_TERM, 0)
         self._shown: set[Grant] = set()
@@ -51,13 +48,12 @@ class Table1Demo(DemoRunner):
             {host: "".join(rc_table(rc.name, "exclusive") for rc in rcs) for host, rcs in devices.items()}
         )
         await self._start_arcs()
-        fleet = self.fleet()
-        self._mesh = await ZenohMesh.open(fleet, Sender("demo", "watch"))
+        self._mesh = await ZenohMesh.open(self.fleet(), Sender("demo", "watch"))
         await self.within(START, self._all_ready(self._mesh), "the nodes did not find each other")
         ready = (self._milestone(arrival.request.arc, "ready").wait() for arrival in self.workload.arrivals)
         await self.within(START, asyncio.gather(*ready), "the behaviors did not find the nodes")
         self.event("all nodes, devices and behaviors are there")
-        # In the order of the file; of those at one instant each waits for the answer to the one before.
+        # In the file's order; at the same instant each request waits for the answer to the request before.
         for arrival in sorted(self.workload.arrivals, key=lambda arrival: arrival.at):
             if self.zero is not None:
                 await asyncio.sleep(max(0, arrival.at / SECOND - self.elapsed()))
@@ -67,8 +63,6 @@ class Table1Demo(DemoRunner):
         left = _latest_end(self.workload.arrivals) / SECOND - self.elapsed()
         await self.within(left + LATE, asyncio.gather(*done), "not all ARCs had their time")
         await self.within(ANSWER, self._all_free(), "the RCM did not publish the last end")
-
-    # Processes
 
     async def _all_ready(self, mesh: Mesh) -> None:
         mesh.subscribe(mesh.keys.grants, Grants, self._on_grants)
@@ -102,10 +96,8 @@ class Table1Demo(DemoRunner):
         if self._mesh is not None:
             await self._mesh.close()
 
-    # What happens
-
     async def _signal(self, arc: str) -> None:
-        """Has an ARC ask, and waits for its answer."""
+        """Have an ARC requested, and wait for the answer."""
         stdin = self._behaviors[arc].stdin
         assert stdin is not None  # noqa: S101
         stdin.write(b"\n")
@@ -115,7 +107,6 @@ class Table1Demo(DemoRunner):
         return self._milestones.setdefault((arc, what), asyncio.Event())
 
     async def _follow(self, process: asyncio.subprocess.Process, arc: ArcSpec) -> None:
-        """Reads what a behavior reports."""
         assert process.stdout is not None  # noqa: S101
         while line := await process.stdout.readline():
             report = msgspec.json.decode(line, type=ArcReport)
@@ -131,8 +122,6 @@ class Table1Demo(DemoRunner):
                     self.seen.entered(arc.arc, arc.needs, report.at)
                 case "left":
                     self.seen.left(arc.arc, report.at)
-                case _:
-                    pass
             self._milestone(arc.arc, report.what).set()
 
     def _on_grants(self, _key: str, grants: Grants) -> None:
@@ -163,5 +152,5 @@ class Table1Demo(DemoRunner):
 
 
 def _latest_end(arrivals: Sequence[Arrival]) -> Ns:
-    """When everything is over even if it runs one after the other, each once more after a preemption."""
+    """Latest end if all ran in sequence, from the last arrival (ns)."""
     return max(arrival.at for arrival in arrivals) + sum(arrival.request.min_runtime for arrival in arrivals)

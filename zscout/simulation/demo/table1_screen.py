@@ -1,4 +1,4 @@
-"""`zscout demo table1` on the screen: who holds what, and how that compares with the paper."""
+"""`zscout demo table1` on the screen: the holders over time, compared with the paper."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Group
     from rich.text import Text
 
-LINES: Final = 7
-"""Events shown below the growing table."""
+LINES: Final = 7  # events below the growing table
 STYLES: Final = {
     "0": "white on #4e79a7",
     "1": "black on #f28e2b",
@@ -26,17 +25,15 @@ STYLES: Final = {
     "3": "black on #b58adb",
     "4": "white on #ff1463",
     "-": "bright_black",
-}
-"""The colours of the recording, by ARC."""
+}  # the recording's colours, by ARC
 SOURCES: Final = {"RCM": "what the RCM published", "ARCs": "what the ARCs' bodies saw", "paper": "Table 2 of the paper"}
 LATE: Final = "all came in the order of the paper's Table 2, but late: this machine is busy"
 DIFFERENT: Final = "not in the order of the paper's Table 2"
-WIDE: Final = 26
-"""Columns left of the first second."""
+WIDE: Final = 26  # columns left of the first second
 
 
 async def play(out: Path | None, *, as_json: bool, live: LiveView | None = None) -> int:
-    """Plays it; returns the exit code. Raises what `Table1Demo` raises."""
+    """Play the demo; returns the exit code. Raises as `Table1Demo` does."""
     expected = paper()
     rcs, seconds = list(expected.table), len(next(iter(expected.table.values())))
     began = clock.now()
@@ -97,7 +94,7 @@ def _report(tables: dict[str, Table], wrong: list[Difference], seen: Observed, p
 
 
 def _lines(tables: dict[str, Table], wrong: Set[tuple[str, int]] = frozenset()) -> Iterator[Text]:
-    """A Gantt table: for each RC a row from each source, a column for each second."""
+    """A Gantt table: a row per RC and source, a column per second."""
     from rich.text import Text
 
     seconds = max(len(row) for table in tables.values() for row in table.values())
@@ -114,7 +111,7 @@ def _lines(tables: dict[str, Table], wrong: Set[tuple[str, int]] = frozenset()) 
 
 
 def _picture(demo: Table1Demo, expected: Paper, screen: DemoScreen) -> Group:
-    """Who holds what, growing with time, and the latest events."""
+    """The growing table of holders, and the latest events."""
     from rich.console import Group
     from rich.text import Text
 

@@ -1,11 +1,11 @@
-"""Table 1 and Table 2 of the paper, and who was seen to hold what: the tables of `zscout demo`. Pure."""
+"""Tables 1 and 2 of the paper, and the same tables as observed. Pure."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
-from itertools import groupby
+from itertools import groupby, islice, zip_longest
 from typing import Final, NamedTuple, TypeAlias
 
 from zscout.messages import LoadReport
@@ -14,18 +14,18 @@ from zscout.types import SECOND, Ns
 
 FREE: Final = "-"
 Table: TypeAlias = dict[str, list[str]]
-"""By RC, who holds it in each second: the ARC's name without "arc", FREE for nobody."""
+"""By RC, the holder in each second: the ARC's name without "arc", or FREE."""
 
 
 class Paper(NamedTuple):
-    """What was asked in the paper's example, and what came of it."""
+    """The workload of the paper's example, and its outcome."""
 
     workload: Workload
     table: Table
 
 
 class Difference(NamedTuple):
-    """A cell of Table 2 that came out otherwise."""
+    """A cell that differs from Table 2."""
 
     rc: str
     second: int
@@ -35,7 +35,6 @@ class Difference(NamedTuple):
 
 
 def paper() -> Paper:
-    """The paper's tables, as they are shipped with the package."""
     data = resources.files("zscout.simulation") / "paper"
     workload = parse_workload((data / "table1.toml").read_text(encoding="utf-8"), "table1.toml")
     lines = (data / "table2.csv").read_text(encoding="utf-8").splitlines()
@@ -47,7 +46,7 @@ def paper() -> Paper:
 
 @dataclass(slots=True)
 class ArcBody:
-    """An ARC's body: what it held, from when to when (ns); `end` None while it goes on."""
+    """A run of an ARC's body (times in ns); `end` is None while it runs."""
 
     arc: str
     rcs: tuple[str, ...]
@@ -57,15 +56,12 @@ class ArcBody:
 
 @dataclass(slots=True)
 class Observed:
-    """What was published by the RCM, and what the ARCs' bodies saw, on one host's clock."""
+    """The RCM's publications and the runs of the ARCs' bodies, on the same host's clock."""
 
-    zero: Ns | None = None
-    """When the first ARC asked."""
-    changes: dict[str, list[tuple[Ns, tuple[str, ...]]]] = field(default_factory=dict)
-    """By RC: its holders, and from when on."""
+    zero: Ns | None = None  # time of the first request
+    changes: dict[str, list[tuple[Ns, tuple[str, ...]]]] = field(default_factory=dict)  # by RC: since when, holders
     bodies: list[ArcBody] = field(default_factory=list)
-    loads: dict[str, LoadReport] = field(default_factory=dict)
-    """The newest report of each host."""
+    loads: dict[str, LoadReport] = field(default_factory=dict)  # newest report of each host
 
     def published(self, rc: str, arcs: Sequence[str], at: Ns) -> None:
         self.changes.setdefault(rc, []).append((at, tuple(arcs)))
@@ -80,12 +76,11 @@ class Observed:
 
     @property
     def free(self) -> bool:
-        """Whether nobody holds anything, by the RCM's word."""
+        """Return True if the RCM published no holder."""
         return all(not changes[-1][1] for changes in self.changes.values())
 
     def same_order(self, expected: Table) -> bool:
-        """Whether everything came as in a table, however late: all that the RCM published, one state of all RCs
-        after the other, and on each RC the bodies, one after the other."""
+        """Return True if the RCM's states of all RCs, and the bodies on each RC, came in the table's order."""
         instants = sorted({at for changes in self.changes.values() for at, _ in changes})
         published = zip(*([self._held(rc, at) for at in instants] for rc in expected), strict=True)
         return _order(published) == _order(zip(*expected.values(), strict=True)) and all(
@@ -95,21 +90,15 @@ class Observed:
         )
 
     def by_rcm(self, rcs: Sequence[str], seconds: int, now: Ns) -> Table:
-        """Who held each RC in the middle of each second until `now`, by what the RCM published."""
-
+        """The holders in the middle of each second until `now`, as the RCM published them."""
         return {rc: [self._held(rc, at) for at in self._middles(seconds, now)] for rc in rcs}
 
     def by_bodies(self, rcs: Sequence[str], seconds: int, now: Ns) -> Table:
-        """The same, by the bodies that were entered and left."""
+        """The holders in the middle of each second until `now`, by the bodies that ran."""
 
         def cell(rc: str, at: Ns) -> str:
-            return _cell(
-                [
-                    body.arc
-                    for body in self.bodies
-                    if rc in body.rcs and body.begin <= at and (body.end is None or at < body.end)
-                ]
-            )
+            at_work = (body for body in self.bodies if body.begin <= at and (body.end is None or at < body.end))
+            return _cell([body.arc for body in at_work if rc in body.rcs])
 
         return {rc: [cell(rc, at) for at in self._middles(seconds, now)] for rc in rcs}
 
@@ -117,7 +106,7 @@ class Observed:
         return _cell(next((arcs for since, arcs in reversed(self.changes.get(rc, [])) if since <= at), ()))
 
     def _middles(self, seconds: int, now: Ns) -> list[Ns]:
-        """The middle of each second; of the one that goes on, the present."""
+        """The middle of each second that has begun, or `now` if that is earlier."""
         if self.zero is None:
             return []
         begun = (self.zero + second * SECOND for second in range(seconds))
@@ -125,16 +114,15 @@ class Observed:
 
 
 def differences(expected: Table, published: Table, bodies: Table) -> list[Difference]:
-    """The cells in which either table is not the paper's; a cell that is missing reads "?"."""
-    found = []
-    for rc, cells in expected.items():
-        for second, cell in enumerate(cells):
-            one, two = (
-                row[second] if second < len(row) else "?" for row in (published.get(rc, []), bodies.get(rc, []))
-            )
-            if (one, two) != (cell, cell):
-                found.append(Difference(rc, second, cell, one, two))
-    return found
+    """The cells in which either table differs from the paper's; a missing cell is "?"."""
+    return [
+        Difference(rc, second, cell, *pair)
+        for rc, cells in expected.items()
+        for second, (cell, *pair) in enumerate(
+            islice(zip_longest(cells, published.get(rc, []), bodies.get(rc, []), fillvalue="?"), len(cells))
+        )
+        if pair != [cell, cell]
+    ]
 
 
 def _cell(arcs: Sequence[str]) -> str:
@@ -142,7 +130,7 @@ def _cell(arcs: Sequence[str]) -> str:
 
 
 def _order(states: Iterable[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    """The states of all RCs one after the other, without those before the first hold and after the last."""
+    """The successive states of all RCs from the first hold to the last."""
     order = [state for state, _ in groupby(states)]
     while order and set(order[-1]) == {FREE}:
         order.pop()

@@ -1,4 +1,4 @@
-"""A schedule as a Gantt chart in characters: what stands in each cell."""
+"""The cells of a Gantt chart in characters."""
 
 from __future__ import annotations
 
@@ -11,16 +11,14 @@ from zscout.simulation.replay import HoldRecord
 from zscout.simulation.workload import Workload
 from zscout.types import SECOND, ArcId, Ns, RcName
 
-MAX_SECONDS: Final = 60
-"""Columns of one second each; a longer schedule gets a column per interval between two events."""
+MAX_SECONDS: Final = 60  # of a chart with a column per second
 MAX_COLUMNS: Final = 500
-MAX_CELL: Final = 12
-"""Characters of a cell; a longer ARC name is cut."""
+MAX_CELL: Final = 12  # characters; longer ARC names are cut
 
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """Each column begins at its entry of `starts`; `end` ends the last, and `cut` more are left out."""
+    """Start of each column, end of the last, and how many more (`cut`) are left out."""
 
     starts: tuple[Ns, ...]
     end: Ns
@@ -29,7 +27,7 @@ class Columns:
 
 
 def columns_of(holds: Sequence[HoldRecord]) -> Columns:
-    """A column per second where that says all and fits; otherwise one per interval between two events."""
+    """A column per second if that is exact and fits, otherwise one per interval between two events."""
     times = sorted({time for hold in holds for time in (hold.start, hold.end)})
     if not times:
         return Columns((), 0, by_second=True)
@@ -44,7 +42,7 @@ def columns_of(holds: Sequence[HoldRecord]) -> Columns:
 def rows_of(
     workload: Workload, holds: Sequence[HoldRecord], columns: Columns
 ) -> Iterator[tuple[RcName, list[ArcId | None]]]:
-    """The rows, RCs in the file's order: who holds it in each column. Several holders have a row each."""
+    """The holder of each RC in each column, RCs in the file's order, with a row for each simultaneous holder."""
     index = {start: number for number, start in enumerate((*columns.starts, columns.end))}
     width = len(columns.starts)
     lanes: dict[RcName, list[list[ArcId | None]]] = {rc.name: [[None] * width] for rc in workload.rcs}
@@ -58,13 +56,11 @@ def rows_of(
                 row = [None] * width
                 lanes[rc].append(row)
             row[first:last] = [hold.arc] * (last - first)
-    for rc, rows in lanes.items():
-        for row in rows:
-            yield rc, row
+    return ((rc, row) for rc, rows in lanes.items() for row in rows)
 
 
 def short_names(names: Sequence[ArcId]) -> tuple[dict[ArcId, str], bool]:
-    """How a cell names each ARC, and whether by its number: arc0, arc1 are 0 and 1, as in the paper."""
+    """Cell text of each ARC, and whether that is its number: arc0 and arc1 are 0 and 1, as in the paper."""
     found = [re.fullmatch(r"(.*\D)(\d+)", name) for name in names]
     if len({match[1] if match else None for match in found}) == 1 and found[0] is not None:
         return {match[0]: match[2] for match in found if match}, True

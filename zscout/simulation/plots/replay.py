@@ -14,8 +14,7 @@ from zscout.simulation.replay import HoldRecord, Replay
 from zscout.simulation.workload import Workload
 from zscout.types import SECOND, ArcId, Ns, RcName
 
-MAX_DRAWN: Final = 1_000_000_000 * SECOND
-"""The end of the time that a recording can show."""
+MAX_DRAWN: Final = 1_000_000_000 * SECOND  # end of a recording's time
 
 
 class ReplayRecording:
@@ -23,18 +22,16 @@ class ReplayRecording:
 
     def __init__(self, timeline: Timeline) -> None:
         self.timeline = timeline
-        self._evicted: set[ArcId] = set()
-        """Shown as preempted until they run again."""
+        self._evicted: set[ArcId] = set()  # shown as preempted until they run again
 
     def watch(self, now: Ns, effects: list[Effect]) -> None:
-        """What happened at `now`. Raises BadInput past MAX_DRAWN."""
+        """Record the effects of `now`. Raises BadInput past MAX_DRAWN."""
         if effects and now > MAX_DRAWN:
             raise BadInput(f"a recording ends at {MAX_DRAWN // SECOND} s, and this goes on; leave out --rrd")
         for effect in effects:
             self._draw(now / SECOND, effect)
 
     def _draw(self, at: float, effect: Effect) -> None:
-        """What an ARC does, and the event in words."""
         timeline = self.timeline
         match effect:
             case Granted(arc=arc, rcs=rcs):
@@ -56,7 +53,7 @@ class ReplayRecording:
                 pass
 
     def holders(self, workload: Workload, played: Replay) -> None:
-        """Who held each RC, from when to when."""
+        """Record the holders of each RC over time."""
         operators = default_fleet().operator_priority
         priority = {arrival.request.arc: arrival.request.priority for arrival in workload.arrivals}
         holding: dict[RcName, list[ArcId]] = {rc.name: [] for rc in workload.rcs}

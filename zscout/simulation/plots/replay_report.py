@@ -1,4 +1,4 @@
-"""`zscout replay`: what would become of a workload, as JSON, as a table, and as a recording."""
+"""`zscout replay`: the outcome of a workload as JSON, as a table, and as a recording."""
 
 from __future__ import annotations
 
@@ -19,18 +19,16 @@ from zscout.config.strict import read_text
 from zscout.scheduling.model import Effect, Granted, HoldEnded, Outcome, Queued
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.simulation.plots.gantt import columns_of, rows_of, short_names
-from zscout.simulation.replay import Replay, replay
+from zscout.simulation.replay import HoldRecord, Replay, replay
 from zscout.simulation.workload import MAX_BYTES, Workload, parse_workload
 from zscout.types import SECOND, ArcId, Ns
 
 if TYPE_CHECKING:
     from zscout.simulation.plots.replay import ReplayRecording
 
-MAX_LISTED: Final = 200
-"""Preemptions, and unserved ARCs, that are listed without --json."""
+MAX_LISTED: Final = 200  # preemptions, and unserved ARCs, without --json
 COLOURS: Final = ("blue", "yellow", "green", "magenta", "cyan", "bright_blue", "bright_green")
-OPERATOR: Final = "red"
-"""Kept for what preempted something."""
+OPERATOR: Final = "red"  # for ARCs that preempted others
 
 
 @dataclass(slots=True)
@@ -43,7 +41,7 @@ class _Preemption:
 
 @dataclass(slots=True)
 class _Observer:
-    """What a replay shows beside its holds: who preempted whom, and why the others wait."""
+    """The preemptions of a replay, and why ARCs wait."""
 
     preemptions: list[_Preemption] = field(default_factory=list)
     reasons: dict[ArcId, str] = field(default_factory=dict)
@@ -58,12 +56,10 @@ class _Observer:
                     self.preemptions.append(_Preemption(arc, now, by, now - self.started[arc]))
                 case Queued(arc=arc, reason=reason):
                     self.reasons[arc] = str(reason)
-                case _:
-                    pass
 
 
 def replay_file(file: Path, strategy: StrategyName, rrd: Path | None, *, as_json: bool) -> None:
-    """Replays a workload, and prints what came of it. Raises BadInput."""
+    """Replay a workload and print the outcome. Raises BadInput."""
     workload = parse_workload(read_text(file, max_bytes=MAX_BYTES), str(file))
     observed = _Observer()
     with ExitStack() as stack:
@@ -87,7 +83,7 @@ def replay_file(file: Path, strategy: StrategyName, rrd: Path | None, *, as_json
 
 
 def _recording(stack: ExitStack, rrd: Path, source: Path) -> ReplayRecording:
-    # Rerun is large: it is loaded only for a recording.
+    # Rerun is large: import it only for a recording.
     from zscout.services.recorder.timeline import Timeline
     from zscout.simulation.plots.replay import ReplayRecording
 
@@ -95,24 +91,13 @@ def _recording(stack: ExitStack, rrd: Path, source: Path) -> ReplayRecording:
 
 
 def _as_object(strategy: str, played: Replay) -> dict[str, Any]:
-    """What `--json` prints: times are seconds."""
-    return {
-        "strategy": strategy,
-        "holds": [
-            {
-                "arc": hold.arc,
-                "start": hold.start / SECOND,
-                "end": hold.end / SECOND,
-                "outcome": hold.outcome.value,
-                "rcs": sorted(hold.rcs),
-            }
-            for hold in played.holds
-        ],
-        "unserved": list(played.unserved),
-    }
+    """The output of `--json`; times in seconds."""
 
+    def shown(hold: HoldRecord) -> dict[str, Any]:
+        times = {"start": hold.start / SECOND, "end": hold.end / SECOND}
+        return {"arc": hold.arc, **times, "outcome": hold.outcome.value, "rcs": sorted(hold.rcs)}
 
-# The table
+    return {"strategy": strategy, "holds": [*map(shown, played.holds)], "unserved": list(played.unserved)}
 
 
 def _report(strategy: str, workload: Workload, played: Replay, observed: _Observer) -> Iterator[str]:
@@ -127,7 +112,7 @@ def _report(strategy: str, workload: Workload, played: Replay, observed: _Observ
         yield from _table(workload, played, arcs, {preempted.by for preempted in observed.preemptions})
     if observed.preemptions:
         yield from ("", click.style("Preempted", bold=True))
-        yield from _listed(_preempted(one, workload, played) for one in observed.preemptions)
+        yield from _listed(_preempted(preemption, workload, played) for preemption in observed.preemptions)
     if played.unserved:
         yield from ("", click.style("Unserved (never held all it needs for its minimum runtime)", bold=True))
         yield from _listed(f"{arc}: {observed.reasons.get(arc, '')}" for arc in played.unserved)
@@ -165,16 +150,16 @@ def _table(workload: Workload, played: Replay, arcs: Sequence[ArcId], winners: s
 
 
 def _columns_that_fit(label: int, width: int, count: int) -> int:
-    # Whoever reads a pipe wants whole rows.
+    # Readers of a pipe want whole rows.
     if not sys.stdout.isatty():
         return count
     return max(1, (shutil.get_terminal_size().columns - label - 1) // (width + 1))
 
 
-def _preempted(one: _Preemption, workload: Workload, played: Replay) -> str:
-    request = next(arrival.request for arrival in workload.arrivals if arrival.request.arc == one.arc)
-    text = f"{one.arc} at {_s(one.at)} s by {one.by}, after {_s(one.ran)} of {_s(request.min_runtime)} s"
-    again = next((hold.start for hold in played.holds if hold.arc == one.arc and hold.start >= one.at), None)
+def _preempted(lost: _Preemption, workload: Workload, played: Replay) -> str:
+    request = next(arrival.request for arrival in workload.arrivals if arrival.request.arc == lost.arc)
+    text = f"{lost.arc} at {_s(lost.at)} s by {lost.by}, after {_s(lost.ran)} of {_s(request.min_runtime)} s"
+    again = next((hold.start for hold in played.holds if hold.arc == lost.arc and hold.start >= lost.at), None)
     return f"{text}; ran again from {_s(again)} s" if again is not None else f"{text}; never ran again"
 
 
