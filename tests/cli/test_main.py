@@ -17,7 +17,8 @@ from click.testing import CliRunner
 from tests.cli import tools
 from tests.hang import HANG
 from tests.live.lab import Lab
-from zscout.cli.main import COMMANDS, main
+from zscout.cli.groups import LazyGroup, booking, component
+from zscout.cli.main import HABITS, HEADINGS, INSTEAD, OLD, main
 from zscout.cli.requests.options import gather_needs, parse_duration, parse_need
 from zscout.config.strict import BadInput
 from zscout.terminal import Table, span
@@ -29,6 +30,7 @@ def zscout(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
     return tools.zscout(*args, env=os.environ | env)
 
 
+@pytest.mark.live
 def test_help_loads_nothing_heavy_and_lists_all() -> None:
     script = (
         "import sys; from zscout.cli.main import main\n"
@@ -37,37 +39,101 @@ def test_help_loads_nothing_heavy_and_lists_all() -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=HANG)
     assert (done.returncode, done.stderr) == (0, "")
-    assert all(f"\n  {name} " in done.stdout for name in COMMANDS)
+    shown = [line for line in done.stdout.splitlines() if line.endswith(":") and not line.startswith(" ")]
+    assert shown == ["Options:", *(f"{heading}:" for heading in HEADINGS)]
+    assert all(f"\n  {name} " in done.stdout for name in main.table)
+    assert not any(f"\n  {name} " in done.stdout for name in OLD)
 
 
-@pytest.mark.parametrize("name", list(COMMANDS))
-def test_every_command_is_there_and_its_help_has_examples(name: str) -> None:
-    command = main.get_command(click.Context(main), name)
-    assert command is not None
-    assert command.name == name
-    assert command.help is not None
-    assert "Example" in command.help
+@pytest.mark.parametrize("group", [main, component, booking])
+def test_every_command_is_there_and_its_help_has_examples(group: LazyGroup) -> None:
+    for name in group.list_commands(click.Context(group)):
+        command = group.get_command(click.Context(group), name)
+        assert command is not None
+        assert command.hidden is (name in group.old)
+        assert command.help is not None
+        assert "Example" in command.help, name
 
 
-def test_an_unknown_command_is_one_line_with_a_hint() -> None:
-    done = zscout("requst")
-    assert done.returncode == 2
-    assert done.stderr == "zscout: there is no command 'requst'; did you mean request? (see zscout --help)\n"
+@pytest.mark.parametrize(("old", "new"), [(old, new) for old, new in INSTEAD.items() if old.split()[0] in OLD])
+def test_an_old_spelling_has_the_meaning_and_options_of_the_new(old: str, new: str) -> None:
+    def found(words: str) -> click.Command:
+        command: click.Command = main
+        for word in words.split():
+            if word.startswith("-"):
+                assert word in {name for param in command.params for name in param.opts}
+            else:
+                assert isinstance(command, click.Group)
+                below = command.get_command(click.Context(command), word)
+                assert below is not None
+                command = below
+        return command
+
+    if old == "calendar":  # a group, of which each command has its own line
+        return
+    before, now = found(old), found(new)
+    if old in ("keys", "components --kinds"):
+        assert {name for param in now.params for name in param.opts} >= {"--json"}
+        return
+    assert before.callback is now.callback
+    assert before.params == now.params
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        ("components --json", "zscout components is now called zscout component list"),
+        ("components --kinds a", "zscout components is now called zscout component kinds"),
+        ("calendar export --folder a --out b", "zscout calendar is now called zscout booking export"),
+    ],
+)
+def test_an_old_spelling_names_the_new_at_a_terminal_alone(
+    call: str, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def lines(*, terminal: bool) -> list[str]:
+        monkeypatch.setattr("zscout.cli.groups.at_terminal", lambda: terminal)
+        return CliRunner().invoke(main, ["--fleet", "nowhere.toml", *call.split()]).stderr.splitlines()
+
+    assert lines(terminal=True) == [words, *lines(terminal=False)]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("requst", "; did you mean request?"),
+        ("migrat", "; did you mean component migrate?"),
+        ("ps", "; use zscout status"),
+        ("lock", "; use zscout request"),
+        ("KILL", "; use zscout cancel"),
+        ("xyzzy", ""),
+    ],
+)
+def test_an_unknown_command_is_one_line_with_a_hint(name: str, words: str) -> None:
+    done = CliRunner().invoke(main, [name, "--whatever"])
+    assert done.exit_code == 2
+    assert done.stderr == f'zscout: there is no command "{name}"{words} (see zscout --help)\n'
+
+
+def test_a_habit_leads_to_a_command_that_is_there() -> None:
+    for line in HABITS.strip().splitlines():
+        words, _, names = line.partition(" = ")
+        assert words.split()[0] in main.table or words.startswith("--"), line
+        assert not {*names.split()} & {*main.table, *OLD}, line
 
 
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        (["request"], "Missing argument 'NEED...'"),
+        (["request"], "DEVICE... is missing"),
         (["request", "robot/a", "--"], "no command follows the --"),
-        (["request", "robot/a", "--priority", "high"], "'high' is not a whole number"),
+        (["request", "robot/a", "--priority", "high"], '--priority: "high" is not a whole number (see'),
         (["request", "robot"], "need \"robot\": RC 'robot' is not valid: write kind/name"),
         (["request", "robot/a", "robot/a"], "robot/a is named twice"),
         (["request", "robot/a", "--again"], "--again runs a command again"),
         (["request", "robot/a", "--min-runtime", "0"], "--min-runtime must be positive"),
         (["request", "robot/a", "sleep", "5"], "a command goes after --"),
         (["request", "robot/a:rate"], "rate has no number; write parameter=number"),
-        (["cancel"], "Missing argument 'ARC'"),
+        (["cancel"], "REQUEST is missing"),
         (["cancel", ""], '"" names no ARC; zscout status lists them'),
     ],
 )
@@ -79,6 +145,7 @@ def test_bad_input_is_one_line_and_2(args: list[str], words: str) -> None:
     assert words in done.stderr
 
 
+@pytest.mark.live
 def test_a_fleet_file_that_is_not_there_is_named() -> None:
     done = zscout("--fleet", "nowhere.toml", "cancel", "x")
     assert done.returncode == 2
@@ -98,6 +165,7 @@ def test_a_mesh_without_an_rcm_is_3(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.live
 def test_a_closed_pipe_is_quiet() -> None:
     read, write = os.pipe()
     os.close(read)
@@ -107,6 +175,7 @@ def test_a_closed_pipe_is_quiet() -> None:
     assert (process.returncode, errors) == (1, "")
 
 
+@pytest.mark.live
 @pytest.mark.parametrize(("command", "code"), [("completion fish", 1), ("completion no-such-shell", 2), ("--help", 1)])
 def test_a_terminal_that_is_gone_is_quiet(command: str, code: int) -> None:
     """As where a terminal window is closed and SIGHUP is ignored: all that is written to it fails with EIO."""
@@ -121,6 +190,7 @@ def test_a_terminal_that_is_gone_is_quiet(command: str, code: int) -> None:
     os.close(theirs)
 
 
+@pytest.mark.live
 @pytest.mark.parametrize(("command", "code"), [("--help", 0), ("replay nowhere.toml", 2)])
 @pytest.mark.parametrize("closed", [">&-", "2>&-"])
 def test_a_closed_stream_is_no_error(command: str, code: int, closed: str) -> None:
@@ -129,6 +199,7 @@ def test_a_closed_stream_is_no_error(command: str, code: int, closed: str) -> No
     assert (done.returncode, "Traceback" in done.stdout + done.stderr) == (code, False), done.stderr
 
 
+@pytest.mark.live
 def test_a_full_disk_is_told_in_one_line() -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
@@ -137,12 +208,15 @@ def test_a_full_disk_is_told_in_one_line() -> None:
     assert (done.returncode, done.stderr) == (1, "zscout: No space left on device; free some\n")
 
 
+@pytest.mark.live
 def test_completion_knows_the_commands_without_loading_them() -> None:
     script = zscout("completion", "bash")
     assert script.returncode == 0
     assert "_ZSCOUT_COMPLETE=bash_complete" in script.stdout
     asked = zscout(_ZSCOUT_COMPLETE="bash_complete", COMP_WORDS="zscout re", COMP_CWORD="1")
     assert asked.stdout.split() == ["plain,request", "plain,release", "plain,replay"]
+    below = zscout(_ZSCOUT_COMPLETE="bash_complete", COMP_WORDS="zscout component s", COMP_CWORD="2")
+    assert below.stdout.split() == ["plain,start", "plain,stop"]
     options = zscout(_ZSCOUT_COMPLETE="bash_complete", COMP_WORDS="zscout request --min", COMP_CWORD="2")
     assert options.stdout.split() == ["plain,--min-runtime"]
     script = zscout("completion", "bash", "--program", "zscout-node")
@@ -156,6 +230,7 @@ def test_completion_knows_the_commands_without_loading_them() -> None:
     assert "write one of bash, zsh, fish" in unknown.stderr
 
 
+@pytest.mark.live
 def test_bash_completes_at_tab(tmp_path: Path) -> None:
     """A real bash at a terminal, with `zscout` on its path and the script read."""
     here = tmp_path / "zscout"

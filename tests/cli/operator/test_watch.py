@@ -1,4 +1,4 @@
-"""`zscout watch` as people and programs run it: on files, on a camera over HTTP, and at a terminal."""
+"""`zscout motion` as people and programs run it: on files, on a camera over HTTP, and at a terminal."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.behaviors.perception.scenes import Scene, box_of, overlap
 from tests.cli.tools import COMMAND, Terminal, end, zscout_here
 from tests.drivers.mjpeg import MjpegServer, jpeg
 from tests.hang import HANG
-from zscout.cli.operator.watch import watch as command
+from zscout.cli.operator.watch import motion as command
 
 RATE = 10.0
 COMES, GOES = 5.0, 7.0
@@ -133,6 +133,7 @@ def camera() -> Iterator[MjpegServer]:
         yield server
 
 
+@pytest.mark.live
 def test_a_camera_that_breaks_off_is_opened_again_and_ctrl_c_ends_with_a_summary(camera: MjpegServer) -> None:
     process = subprocess.Popen(
         [*COMMAND, "watch", "--source", camera.url, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -161,6 +162,7 @@ def test_a_camera_that_breaks_off_is_opened_again_and_ctrl_c_ends_with_a_summary
     assert camera.accepted >= 2
 
 
+@pytest.mark.live
 def test_ctrl_c_does_not_wait_for_a_camera_that_is_silent(camera: MjpegServer) -> None:
     camera.mode = "stall"
     process = subprocess.Popen([*COMMAND, "watch", "--source", camera.url], stdout=subprocess.PIPE, text=True)
@@ -175,6 +177,7 @@ def test_ctrl_c_does_not_wait_for_a_camera_that_is_silent(camera: MjpegServer) -
         end(process)
 
 
+@pytest.mark.live
 def test_at_a_terminal_there_is_a_live_line(video: Path) -> None:
     with Terminal("watch", "--source", video) as terminal:
         terminal.until("motion for")
@@ -185,5 +188,5 @@ def test_at_a_terminal_there_is_a_live_line(video: Path) -> None:
 
 def test_help_has_examples() -> None:
     shown = CliRunner().invoke(command, ["--help"]).output
-    assert "zscout watch --source /dev/video0" in shown
+    assert "zscout motion --source /dev/video0" in shown
     assert "--json" in shown

@@ -164,7 +164,7 @@ class BookingsClient:
         keys, me = self._mesh.keys, self._mesh.me
         if keys.closed and (why := self._client.fleet.access.refusal(me.host, "book", USERS)):
             raise RequestRefused(Problem("not_allowed", why))
-        silent = "did not answer; it may be done or not: see zscout bookings, and try again"
+        silent = "did not answer; it may be done or not: see zscout booking list, and try again"
         return await self._until_told(keys.schedule(me), operation, kind, self._timeout, silent)
 
     async def _until_told(self, key: str, question: Message, kind: type[M], within: float, silent: str) -> M:

@@ -90,7 +90,7 @@ class NetParams(SharedParams):
 
 class TreeComponent(Component):
     """A component that performs a tree of behaviors, `root`, and checkpoints it. Their status is published;
-    each new one and each alert is printed, for `zscout logs`."""
+    each new one and each alert is printed, for `zscout component logs`."""
 
     root: Behavior
     speed: float

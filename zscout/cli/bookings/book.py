@@ -145,7 +145,7 @@ async def maintain(rcs: Sequence[str], **rest: Any) -> None:
     """Keep RCs free of everybody from a date on: a drain with a date, by operators.
 
     It is a booking at the fleet's operator priority that nobody takes up: what would not be over by its date does not
-    start there, and who waits is told until when. `zscout unbook` ends it early.
+    start there, and who waits is told until when. `zscout booking cancel` ends it early.
 
     \b
     Examples:

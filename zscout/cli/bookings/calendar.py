@@ -1,4 +1,4 @@
-"""`zscout calendar`: bookings as iCalendar files, and those of others as bookings."""
+"""`zscout booking`: bookings as iCalendar files, and those of others as bookings."""
 
 from __future__ import annotations
 
@@ -40,23 +40,10 @@ LOOK: Final = 1.0
 _NEXT_NEED: Final = re.compile(r",(?=[^,=]*/)")
 
 
-@click.group()
-def calendar() -> None:
-    """Write bookings as iCalendar files, and book what such files have.
-
-    A calendar program can subscribe to what a node serves, too: see [calendar] of its node file.
-
-    \b
-    Examples:
-      zscout calendar export --out fleet.ics
-      zscout calendar import lab.ics --map 'Arm 1=robot/arm1' --dry-run
-    """
-
-
 # Out
 
 
-@calendar.command()
+@click.command()
 @click.option(
     "--rc", type=Parsed("rc", lambda text, _: check_rc(text)), shell_complete=completion.needs, help="Of one RC."
 )
@@ -72,9 +59,9 @@ async def export(rc: str | None, owner: str | None, out: str | None, folder: Pat
 
     \b
     Examples:
-      zscout calendar export > fleet.ics
-      zscout calendar export --rc robot/arm1 --out arm1.ics
-      zscout calendar export --folder calendars
+      zscout booking export > fleet.ics
+      zscout booking export --rc robot/arm1 --out arm1.ics
+      zscout booking export --folder calendars
     """
     if folder is not None and (rc or owner or out):
         raise BadInput("--folder: it has all calendars; leave --rc, --owner and --out out")
@@ -252,7 +239,7 @@ class _Import:
             return None
 
 
-@calendar.command("import")
+@click.command("import")
 @click.argument("file", type=click.Path(path_type=Path, allow_dash=True))
 @click.option(
     "--needs",
@@ -304,9 +291,9 @@ async def import_(
 
     \b
     Examples:
-      zscout calendar import lab.ics --map 'Arm 1=robot/arm1' --map 'Camera=framegrabber/*' --dry-run
-      curl -s URL | zscout calendar import - --calendar lab --needs robot/arm1 --sync
-      zscout calendar import service.ics --needs robot/arm1 --maintenance
+      zscout booking import lab.ics --map 'Arm 1=robot/arm1' --map 'Camera=framegrabber/*' --dry-run
+      curl -s URL | zscout booking import - --calendar lab --needs robot/arm1 --sync
+      zscout booking import service.ics --needs robot/arm1 --maintenance
     """
     if str(file) == "-" and name is None:
         raise BadInput("--calendar: what is read from stdin has no name; write one, and the same each time")

@@ -1,4 +1,4 @@
-"""`zscout bookings` and `zscout unbook`: what is booked, and its end."""
+"""`zscout booking list`, `show` and `cancel`."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: b
 
     \b
     Examples:
-      zscout bookings --mine
-      zscout bookings --rc robot/arm1 --zone UTC
-      zscout bookings --json | jq -r '.bookings[] | .name + " " + .dates[0].start'
+      zscout booking list --mine
+      zscout booking list --rc robot/arm1 --zone UTC
+      zscout booking list --json | jq -r '.bookings[] | .name + " " + .dates[0].start'
     """
     async with common.connected("bookings") as client:
         me = User.of(client)
@@ -87,6 +87,35 @@ async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: b
             terminal.print_line("nothing is booked")
         else:
             _table(found, me, zone).print()
+
+
+@click.command()
+@booking_argument
+@zone_option
+@common.json_option("Print one JSON object.")
+@common.runs
+async def show(booking: str, zone: ZoneInfo | None, as_json: bool) -> None:
+    """Show one booking with all its dates of the next 60 days: by its name, its id, or the beginning of its id.
+
+    \b
+    Examples:
+      zscout booking show survey
+      zscout booking show 3f2a91c0 --json | jq -r .dates[0].start
+    """
+    async with common.connected("booking") as client:
+        told, me = await ask_bookings(client), User.of(client)
+        found = choose(told.bookings, booking, me)
+    if as_json:
+        terminal.print_json(booking_json(found, me))
+        return
+    repeated = f", {_repeated(found, zone)}" if found.every else ""
+    head = f"{found.name} ({found.id}) of {whose(found)}: {rcs_words(found)}, priority {found.priority}{repeated}"
+    terminal.print_line(clean(head))
+    for date in found.dates:
+        bound = f", {rcs_words(found, date)}" if date.bound else ""
+        terminal.print_line(clean(f"  {span_words(date.start, date.end, zone)}: {state_words(found, date)}{bound}"))
+    if not found.dates:
+        terminal.print_line(clean(f"  first on {date_words(found.start, zone)}"))
 
 
 def _may_have(booking: BookingView, matches: Callable[[str], bool], pattern: str) -> bool:
@@ -146,9 +175,9 @@ async def unbook(booking: str, at: WrittenDate | None, zone: ZoneInfo | None, as
 
     \b
     Examples:
-      zscout unbook survey
-      zscout unbook survey --date 2026-12-08
-      zscout unbook 3f2a91c0
+      zscout booking cancel survey
+      zscout booking cancel survey --date 2026-12-08
+      zscout booking cancel 3f2a91c0
     """
     if at is not None:
         zone = zone or host_zone()

@@ -1,4 +1,4 @@
-"""`zscout logs`: what a component wrote, and what it writes."""
+"""`zscout component logs`: what a component wrote, and what it writes."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ async def logs(name: str, follow: bool, lines: int | None, host: str | None) -> 
 
     \b
     Examples:
-      zscout logs counter
-      zscout logs counter --follow --lines 10
-      zscout logs counter --host anvil > before-it-moved.txt
+      zscout component logs counter
+      zscout component logs counter --follow --lines 10
+      zscout component logs counter --host anvil > before-it-moved.txt
     """
     async with common.connected("logs", need_rcm=False) as client:
         with placer_of(client, {name}) as placer:

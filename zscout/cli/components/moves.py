@@ -1,4 +1,4 @@
-"""`zscout migrate`, `drain` and `uncordon`: have components go on elsewhere, empty a host, use it again."""
+"""`zscout component migrate`, `drain` and `uncordon`: have components go on elsewhere, empty a host, use it again."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ async def migrate(name: str, to: str | None, as_json: bool) -> None:
 
     \b
     Examples:
-      zscout migrate counter
-      zscout migrate counter --to bellows --json | jq .dead
+      zscout component migrate counter
+      zscout component migrate counter --to bellows --json | jq .dead
     """
     async with placing.connected("migrate", as_json=as_json) as (shown, placer):
         before = placer.placements.get(name)
         if before is None:
             raise placing.unknown(name, placer.placements)
-        interrupted = f"{name} is moved all the same; zscout components tells how that goes"
+        interrupted = f"{name} is moved all the same; zscout component list tells how that goes"
         async with shown.within(None, str, interrupted):
             after = await _moved(placer, shown, before, to)
     moved = after.moves > before.moves
@@ -131,7 +131,7 @@ async def drain(host: str, timeout: float | None, as_json: bool) -> None:
     for one in moved:
         shown.say(f"{one.component} went to {one.host}{placing.out_of_work(one)}")
     if stay:
-        raise common.Failed(f"{host} is not empty: {_words(stay)}; end them with zscout stop; {cordoned}")
+        raise common.Failed(f"{host} is not empty: {_words(stay)}; end them with zscout component stop; {cordoned}")
     shown.say(f"{host} is empty; {cordoned}")
 
 

@@ -99,7 +99,7 @@ def standing(one: Placement) -> str:
 
 
 def unknown(name: str, known: Iterable[str]) -> common.Failed:
-    return common.unknown("component", name, known, "nor any other; start one: zscout start", "known")
+    return common.unknown("component", name, known, "nor any other; start one: zscout component start", "known")
 
 
 async def unknown_here(placer: PlacerClient, name: str) -> common.Failed:
@@ -128,7 +128,7 @@ def component_named(text: str, _option: str = "") -> str:
     try:
         return check_name(text, "component")
     except ValueError as error:
-        raise BadInput(f"{error}; zscout components lists them") from None
+        raise BadInput(f"{error}; zscout component list lists them") from None
 
 
 COMPONENT: Final = common.Parsed("text", component_named)

@@ -1,4 +1,4 @@
-"""`zscout start` and `zscout stop`: have a component run somewhere, and end it."""
+"""`zscout component start` and `zscout component stop`: have a component run somewhere, and end it."""
 
 from __future__ import annotations
 
@@ -121,9 +121,9 @@ async def start(
 ) -> None:
     """Have a component run on the best host of the fleet, and keep it running.
 
-    KIND is the name of what is installed on the hosts: zscout components --kinds lists them. The component stays placed
+    KIND is the name of what is installed on the hosts: zscout component kinds lists them. The component stays placed
     when this command ends, also by Ctrl-C or --timeout: it is started as soon as a host will do, and elsewhere when its
-    host dies, until zscout stop. Asked for again with the same settings, it is not started twice.
+    host dies, until zscout component stop. Asked for again with the same settings, it is not started twice.
 
     \b
     Exit code: 0 it runs, or has completed already; 1 it was refused or given up, or
@@ -131,16 +131,16 @@ async def start(
 
     \b
     Examples:
-      zscout start counter
-      zscout start counter --name blue --set rc=robot/scout33 --set period=0.5
-      zscout start spin --params '{"cpu": 0.5}' --label gpu --memory 2G --cpu-limit 1
-      zscout start counter --host anvil --restart never --timeout 30
+      zscout component start counter
+      zscout component start counter --name blue --set rc=robot/scout33 --set period=0.5
+      zscout component start spin --params '{"cpu": 0.5}' --label gpu --memory 2G --cpu-limit 1
+      zscout component start counter --host anvil --restart never --timeout 30
     """
     name = kind if name is None else name
     if len(name) > MAX_COMPONENT_NAME:
         raise BadInput(f"the name {quoted(name)} has more than {MAX_COMPONENT_NAME} characters; give a shorter --name")
     spec = gather_spec(kind, **wanted)
-    stays = f"{name} stays placed; to end it: zscout stop {name}"
+    stays = f"{name} stays placed; to end it: zscout component stop {name}"
     async with placing.connected("start", {name}, as_json=as_json) as (shown, placer):
 
         def late() -> str:
@@ -199,7 +199,7 @@ async def _place(placer: PlacerClient, name: str, spec: ComponentSpec, before: P
             raise
         raise common.Failed(
             f"{name} exists already, as another kind or with other settings; give this one another --name, "
-            f"or end that one first: zscout stop {name}"
+            f"or end that one first: zscout component stop {name}"
         ) from None
 
 
@@ -230,11 +230,11 @@ async def stop(names: Sequence[str], timeout: float | None, as_json: bool) -> No
 
     \b
     Examples:
-      zscout stop counter
-      zscout stop blue green --timeout 10
+      zscout component stop counter
+      zscout component stop blue green --timeout 10
     """
     names = sorted(set(names))
-    stays = f"{', '.join(names)} will be stopped all the same; zscout components tells how that goes"
+    stays = f"{', '.join(names)} will be stopped all the same; zscout component list tells how that goes"
     async with placing.connected("stop", names, as_json=as_json) as (shown, placer):
 
         def lasting() -> str:

@@ -1,4 +1,4 @@
-"""`zscout watch`: the motion detector alone, on any source that OpenCV opens, to place a camera."""
+"""`zscout motion`: the motion detector alone, on any source that OpenCV opens, to place a camera."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def sources(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> li
 @click.option(
     "--limit", type=SECONDS, help="End after so long in the source: 90s, 5m. Default: at its end, or at Ctrl-C."
 )
-def watch(source: str, as_json: bool, record: Path | None, limit: float | None) -> None:
+def motion(source: str, as_json: bool, record: Path | None, limit: float | None) -> None:
     """Tell when something moves: one line for each event, as soon as it is over.
 
     A file is read whole, as quickly as it goes, by its own time stamps; of a URL or device the newest picture
@@ -68,9 +68,9 @@ def watch(source: str, as_json: bool, record: Path | None, limit: float | None) 
 
     \b
     Examples:
-      zscout watch --source /dev/video0
-      zscout watch --source http://127.0.0.1:8080/1.mjpg --json | jq 'select(.frames > 10)'
-      zscout watch --source /dev/video0 --limit 600 --record garden.rrd
+      zscout motion --source /dev/video0
+      zscout motion --source http://127.0.0.1:8080/1.mjpg --json | jq 'select(.frames > 10)'
+      zscout motion --source /dev/video0 --limit 600 --record garden.rrd
     """
     ended_by: list[int] = []
     begun = False

@@ -1,4 +1,4 @@
-"""Where `zscout watch` has its pictures from: files, by their own time stamps, and live sources."""
+"""Where `zscout motion` has its pictures from: files, by their own time stamps, and live sources."""
 
 from __future__ import annotations
 

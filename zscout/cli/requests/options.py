@@ -201,7 +201,7 @@ def hold_options(command: F, *, needs_required: bool = True) -> F:
             nargs=-1,
             required=needs_required,
             type=Parsed("need", parse_need),
-            metavar="NEED...",
+            metavar="DEVICE...",
             shell_complete=completion.needs,
         ),
         json_option("Print JSON lines, one for each event."),
@@ -246,7 +246,7 @@ def gather(
 ) -> HoldOptions:
     """Checks what can be checked before anybody is asked. Raises UsageError, BadInput, BadName, Failed."""
     if not needs and not rest.get("booking"):
-        raise click.UsageError("Missing argument 'NEED...'.", click.get_current_context())
+        raise click.UsageError("DEVICE... is missing", click.get_current_context())
     if release_after is not None:
         if rest["min_runtime"] is not None:
             raise BadInput("--release-after and --min-runtime are two times for one hold; give one of them")
@@ -269,4 +269,4 @@ def arc_named(text: str, _option: str) -> str:
     return text
 
 
-arc_argument = click.argument("arc", type=Parsed("text", arc_named), shell_complete=completion.arcs)
+arc_argument = click.argument("arc", metavar="REQUEST", type=Parsed("text", arc_named), shell_complete=completion.arcs)

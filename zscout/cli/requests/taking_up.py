@@ -27,7 +27,9 @@ async def taking_up(client: Client, wanted: HoldOptions, *, name: str | None, pr
     BadInput where NEEDs or a `priority` were given that it has not; Failed, RequestRefused."""
     booking = choose((await ask_bookings(client)).bookings, wanted.booking, User.of(client))
     if booking.maintenance:
-        raise Failed(f"{booking.name} is maintenance, which nobody takes up; to end it: zscout unbook {booking.name}")
+        raise Failed(
+            f"{booking.name} is maintenance, which nobody takes up; to end it: zscout booking cancel {booking.name}"
+        )
     if wanted.needs and wanted.needs != booking.needs:
         raise BadInput(f"{booking.name} is booked with other devices: {rcs_words(booking)}; leave the NEEDs out")
     if priority not in (None, booking.priority):

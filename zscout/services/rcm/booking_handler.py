@@ -248,7 +248,7 @@ class BookingHandler:
     def _unbook(self, query: Query, operation: Unbook, sender: Sender) -> None:
         record = self._keeper.records.get(operation.id)
         if record is None:
-            raise Refused("unknown_booking", f"there is no booking {operation.id}; see zscout bookings")
+            raise Refused("unknown_booking", f"there is no booking {operation.id}; see zscout booking list")
         self._check_owner(sender, record, "unbook it")
         if operation.start is None:
             new = record if record.unbooked else self._dates.change(record, unbooked=True)
@@ -258,7 +258,7 @@ class BookingHandler:
             new = self._dates.change(record, dropped=sorted({*record.dropped, operation.start}))
         else:
             date = told(operation.start, record.zone)
-            raise Refused("bad_date", f"{date} is no date of {record.name}; see zscout bookings")
+            raise Refused("bad_date", f"{date} is no date of {record.name}; see zscout booking list")
         self._dates.reconcile()
         self._answer_kept(query, new)
 
@@ -343,7 +343,9 @@ class BookingHandler:
         if record is None or record.unbooked:
             if goes_on:
                 return ask.booking if record is None and start_of(ask.booking) is not None else ""
-            raise Refused("unknown_booking", f"there is no booking {booking}, or it was given up; see zscout bookings")
+            raise Refused(
+                "unknown_booking", f"there is no booking {booking}, or it was given up; see zscout booking list"
+            )
         self._check_owner(sender, record, "take it up")
         if record.maintenance:
             raise Refused("bad_request", f"{record.name} is maintenance: nobody takes it up")
@@ -356,7 +358,7 @@ class BookingHandler:
         if goes_on:
             return next((date.id for date in self._dates.open_dates(record) if str(date.start) == start), "")
         why = "somebody has taken it up" if dates_ else "its dates are over, or another booking stands"
-        raise Refused("unknown_booking", f"{record.name} can't be taken up: {why}; see zscout bookings")
+        raise Refused("unknown_booking", f"{record.name} can't be taken up: {why}; see zscout booking list")
 
     # Telling
 
