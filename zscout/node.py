@@ -91,7 +91,7 @@ async def run_services(
         # Two nodes of one name would answer each other's questions.
         living = await mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK_FOR_TWIN)
         if any(token.host == me.host for token in living):
-            raise MeshError(f"a node named {me.host} is on the mesh already; set another host under [node]")
+            raise MeshError(f"a node named {me.host} is already on the mesh; end it, or set another host under [node]")
         stall = StallWatch(mesh.now).start()
         stack.callback(stall.stop)
         mesh.watch_links()

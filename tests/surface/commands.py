@@ -110,8 +110,8 @@ CALLS: Final = (
     "replay workload.toml --strategy best", "replay workload.toml --rrd picture.png", "simulate --list",
     "simulate nowhere", "simulate office --http x:y", "simulate office --speed 0", "demo nothing",
     "demo table1 --out picture.png", "demo placement --policy best", "demo robots --building nowhere",
-    "component start", "component list a/b", "component kinds x", "component logs a/b", "booking show", "booking import",
-    "doctor --keys x", "motion --source none.avi", "ps",
+    "component start", "component list a/b", "component kinds x", "component logs a/b", "booking show",
+    "booking import", "doctor --keys x", "motion --source none.avi", "ps",
     "completion bash", "completion tcsh", "node none.toml", "node bad.toml", "node node.toml", "node --log-level loud",
     "node --check node.toml",
 )  # fmt: skip

@@ -36,7 +36,7 @@ BAD: Final = frozenset({"bad_date", "bad_zone", "bad_request"})
 def parse_booking(text: str, option: str) -> str:
     """What may be a booking's name or id. Raises BadInput."""
     if not 1 <= len(text) <= MAX_TEXT or not text.isprintable():
-        raise BadInput(f"{option}: {quoted(text)} names no booking; zscout booking list lists them")
+        raise BadInput(f"{option}: {quoted(text)} can't be the name of a booking; see zscout booking list")
     return text
 
 

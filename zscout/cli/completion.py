@@ -46,7 +46,7 @@ def completion(ctx: click.Context, shell: str | None, program: str) -> None:
     name = shell or Path(os.environ.get("SHELL", "")).name
     found = get_completion_class(name) if name in SHELLS else None
     if found is None:
-        raise click.UsageError(f"$SHELL names no shell that is known here; write one of {', '.join(SHELLS)}", ctx)
+        raise click.UsageError(f"no completion for the shell in $SHELL; write one of {', '.join(SHELLS)}", ctx)
     variable = f"_{program.replace('-', '_')}_COMPLETE".upper()
     click.echo(found(ctx.find_root().command, {}, program, variable).source())
 

@@ -39,7 +39,7 @@ def parse_past(text: str, option: str) -> float:
         try:
             ago = time.time() - datetime.fromisoformat(text).astimezone().timestamp()
         except (ValueError, OverflowError):
-            raise BadInput(f"{option}: {quoted(text)} is no time; write {PAST_FORMS}") from None
+            raise BadInput(f"{option}: {quoted(text)} is not a time; write {PAST_FORMS}") from None
     if option == "--until":
         ago = max(0.0, ago)  # up to now
     if not 0 <= ago <= MAX_AGO:
@@ -55,7 +55,7 @@ PAST: Final = Parsed("time", parse_past)
 def parse_who(text: str, option: str) -> str:
     """A user, or a name of a certificate or host. Raises BadInput."""
     if not 1 <= len(text) <= MAX_NAME:
-        raise BadInput(f"{option}: {quoted(text)} is no name; write 1 to {MAX_NAME} characters")
+        raise BadInput(f"{option}: {quoted(text)} is not a name; write 1 to {MAX_NAME} characters")
     return text
 
 
@@ -77,13 +77,13 @@ def formats(command: F) -> F:
 def check_formats(*, as_json: bool, as_csv: bool) -> None:
     """Raises UsageError."""
     if as_json and as_csv:
-        raise click.UsageError("--json and --csv: write one of them")
+        raise click.UsageError("--json and --csv exclude each other; use only one of them")
 
 
 def check_window(since: float | None, until: float) -> None:
     """Raises BadInput."""
     if since is not None and since <= until:
-        raise BadInput("--since: it is not before --until; write a longer time ago")
+        raise BadInput("--since is not before --until; write an earlier --since")
 
 
 def names_of(fleet: Fleet, users: Sequence[str], group: str | None) -> list[str]:
@@ -91,11 +91,13 @@ def names_of(fleet: Fleet, users: Sequence[str], group: str | None) -> list[str]
     names = [*users]
     if group is not None:
         if not fleet.access.groups.get(group):
-            known = f"known: {', '.join(sorted(fleet.access.groups)[:8])}" if fleet.access.groups else "it has none"
-            raise BadInput(f"--group: {quoted(group)} is no group of the fleet file that has members; {known}")
+            known = (
+                f"known: {', '.join(sorted(fleet.access.groups)[:8])}" if fleet.access.groups else "it has no groups"
+            )
+            raise BadInput(f"--group: the fleet file has no group {quoted(group)} with members; {known}")
         names += fleet.access.groups[group]
     if len(names) > MAX_ASKED_NAMES:
-        raise BadInput(f"{len(names)} names are too many to ask for; {MAX_ASKED_NAMES} are allowed")
+        raise BadInput(f"{len(names)} names are too many; at most {MAX_ASKED_NAMES} are allowed")
     return names
 
 

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Final, Protocol, Self
 
 from msgspec import Struct
 
+from zscout.config.strict import quoted
 from zscout.drivers.holds import HoldTable
 from zscout.drivers.instances import Instances
 from zscout.keyexpr import Role, Sender, Token
@@ -116,11 +117,11 @@ class Driver:
         """Carries out `do` and returns what is answered. Raises Refused for what can't be done.
 
         Returns a Future where the answer takes its time: what comes next does not wait for it."""
-        raise Refused("unknown_command", f"this device does not know {str(do.get('name'))[:64]!r}")
+        raise Refused("unknown_command", f"unknown command {quoted(str(do.get('name'))[:64])}")
 
     async def command_without_grant(self, sender: Sender, do: Mapping[str, Any]) -> Any:
         """Carries out what needs no hold. Raises Refused, by default always."""
-        raise Refused("no_grant", "this RC does nothing without a grant; ask the RCM for it")
+        raise Refused("no_grant", "this device obeys only under a grant; request it")
 
     def vote(self, holders: list[ProposedHolder]) -> str:
         """Why a sharable device can't carry these holders; empty if it can, and any subset of them."""

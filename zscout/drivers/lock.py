@@ -29,6 +29,6 @@ def only_here(fleet: str, host: str, rc: str) -> Iterator[None]:
             if error.errno != errno.EADDRINUSE:
                 raise
             raise MeshError(
-                f"{rc}: another process offers it for host {host} already; end that one, or name it otherwise"
+                f"{rc}: another process on host {host} already serves it; end that process, or rename the device"
             ) from None
         yield

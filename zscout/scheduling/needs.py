@@ -12,7 +12,7 @@ def check_request(name: str, needs: Mapping[Need, Params], min_runtime: Ns) -> N
     """Raises ValueError where there are no needs, the minimum runtime is not positive, a parameter is negative, and as
     `check_patterns` does; `name` says of what."""
     if not needs:
-        raise ValueError(f"{name} needs nothing; name at least one RC")
+        raise ValueError(f"{name} needs nothing; name at least one device")
     if min_runtime <= 0:
         raise ValueError(f"{name}: the minimum runtime must be positive")
     for params in needs.values():
@@ -30,6 +30,6 @@ def check_patterns(needs: Mapping[Need, Params]) -> None:
             continue
         kind = check_need(need).partition("/")[0]
         if asked.setdefault(kind, params) != params:
-            raise ValueError(f"patterns of the kind {kind} have different parameters; give all the same")
+            raise ValueError(f"patterns of the kind {kind} have different parameters; give them all the same")
     if asked and any(map(is_pattern, asked)) and any(asked.values()):
-        raise ValueError("a pattern that any kind of RC meets can't stand beside parameters; name its kind")
+        raise ValueError("a pattern for devices of any kind can't be combined with parameters; name a kind")

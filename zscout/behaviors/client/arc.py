@@ -73,7 +73,7 @@ class Held:
         rc = self.bound.get(need, need)
         if rc not in self.rcs:
             asked = ", ".join(sorted(self.arc.needs))
-            raise KeyError(f"{need} is no need of {self.arc.name}; it asked for {asked}")
+            raise KeyError(f"{need} is not a need of {self.arc.name}; it asked for {asked}")
         return rc
 
     def now(self) -> Ns:

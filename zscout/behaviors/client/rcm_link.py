@@ -193,7 +193,7 @@ class RcmLink:
 
     async def submit(self, arc: OpenArc) -> None:
         """Asks until the RCM has answered; not while the client is paused. Raises RequestRefused."""
-        if self.mesh.keys.closed and (why := self.fleet.access.refusal(self.mesh.me.host, "ask for an ARC", USERS)):
+        if self.mesh.keys.closed and (why := self.fleet.access.refusal(self.mesh.me.host, "request devices", USERS)):
             # Access control lets no such question through: nobody would answer it.
             arc.state = "refused"
             raise RequestRefused(Problem("not_allowed", why))

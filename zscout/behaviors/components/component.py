@@ -144,5 +144,5 @@ def load_kind(kind: str, where: str) -> type[Component]:
         found = getattr(found, attribute, None)
     if not (isinstance(found, type) and issubclass(found, Component)):
         words = f"{where} is no subclass of zscout.behaviors.components.component.Component"
-        raise BadKind(f"kind {kind}: {words}; mend the entry point in the group {GROUP}")
+        raise BadKind(f"kind {kind}: {words}; fix the entry point in the group {GROUP}")
     return found

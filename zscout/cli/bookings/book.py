@@ -67,7 +67,7 @@ DURATION: Final = Parsed("duration", parse_duration)
 
 def _rc(text: str, _option: str) -> str:
     if is_pattern(text):
-        raise BadInput(f"{text} may be any one RC; name those that nobody is to hold")
+        raise BadInput(f"{text} is a pattern; name each device for maintenance")
     return check_rc(text)
 
 
@@ -153,7 +153,7 @@ async def maintain(rcs: Sequence[str], **rest: Any) -> None:
       zscout maintain robot/arm1 robot/arm2 --at "mon 7:00" --for 30m --every week --until 2027-03-31
     """
     if len(set(rcs)) < len(rcs):
-        raise BadInput("an RC is named twice; name each once")
+        raise BadInput("a device is named twice; name each once")
     priority = common.the_fleet().operator_priority
     await _make({rc: {} for rc in rcs}, priority=priority, patience=None, maintenance=True, **rest)
 
@@ -184,22 +184,22 @@ class Asked:
         begins = start.at.timestamp()
         if begins + late <= now:
             raise BadInput(
-                f"--at: {date_words(begins, zone)} is over; by the fleet's clock it is {date_words(now, zone)}"
+                f"--at: {date_words(begins, zone)} is past; by the fleet's clock it is now {date_words(now, zone)}"
             )
         if begins > now + MAX_AHEAD:
             raise BadInput(f"--at: {date_words(begins, zone)} is more than a year ahead; write an earlier date")
         if every is None:
             return cls(start, 0, None, runtime, zone)
         if not start.exists:
-            raise BadInput(f"--at: {start.note}, and so it would go on; let it begin with another date")
+            raise BadInput(f"--at: {start.note}, and every repetition would; begin with another date")
         latest = last = _end_of(in_zone(now + A_YEAR, zone).date(), zone)
         if until is not None:
             day = until.whole_day(now, zone)
             last = until.found(now, zone).at if day is None else _end_of(day, zone)
             if last < start.at:
-                raise BadInput("--until: it is before the first date; write a later one")
+                raise BadInput("--until is before the first date; write a later one")
             if last > latest:
-                raise BadInput(f"--until: at most a year ahead; write {latest:%Y-%m-%d} or an earlier date")
+                raise BadInput(f"--until is more than a year ahead; write {latest:%Y-%m-%d} or an earlier date")
         return cls(start, every, last, runtime, zone)
 
     def remarks(self) -> list[str]:
@@ -240,9 +240,9 @@ async def _make(
     # What is wrong in any case is said before the mesh is joined.
     at.found(clocks.time(), zone)
     if until is not None and every is None:
-        raise BadInput("--until is the end of what is repeated; add --every, or leave it out")
+        raise BadInput("--until ends a repeated booking; add --every, or leave --until out")
     if patience is not None and patience > runtime:
-        raise BadInput(f"--patience: it is over after {span(float(runtime))}; write that or less")
+        raise BadInput(f"--patience is longer than the booking; write at most {span(float(runtime))}")
     name = check_name(name, "--name") if name is not None else None
     async with common.connected("maintain" if maintenance else "book") as client:
         # Others are told its name, and not by which command it was made.

@@ -64,7 +64,7 @@ async def export(rc: str | None, owner: str | None, out: str | None, folder: Pat
       zscout booking export --folder calendars
     """
     if folder is not None and (rc or owner or out):
-        raise BadInput("--folder: it has all calendars; leave --rc, --owner and --out out")
+        raise BadInput("--folder writes all calendars; leave --rc, --owner and --out out")
     async with common.connected("calendar") as client:
         bookings = (await ask_bookings(client)).bookings
         rcs = set[str]()
@@ -117,7 +117,7 @@ def _write(path: Path, text: bytes) -> bool:
 def parse_needs(text: str, option: str) -> Pairs:
     """`robot/arm1,framegrabber/*,radio/rf0:command_rate=5`; a pattern that comes again is one more. Raises BadInput."""
     if not text:
-        raise BadInput(f"{option}: names no RC")
+        raise BadInput(f"{option}: names no device; write one, as in robot/arm1")
     return tuple(gather_needs([parse_need(one, option) for one in _NEXT_NEED.split(text)]).items())
 
 
@@ -125,7 +125,7 @@ def _mapping(text: str, option: str) -> tuple[str, Pairs]:
     """`Arm 1=robot/arm1`. Raises BadInput."""
     words, equals, needs = text.partition("=")
     if not equals or not 1 <= len(words.strip()) <= MAX_WORDS:
-        raise BadInput(f"{option}: {quoted(text)} maps nothing; write words of the calendar, as in 'Arm 1=robot/arm1'")
+        raise BadInput(f"{option}: {quoted(text)} is not a mapping; write WORDS=DEVICE, as in 'Arm 1=robot/arm1'")
     return " ".join(words.split()), parse_needs(needs, option)
 
 
@@ -232,7 +232,7 @@ class _Import:
         try:
             return await BookingsClient(self.client).ask(operation, BookingView)
         except RcmSilent as silent:
-            raise NobodyThere(f"{silent}; what was imported is known again") from None
+            raise NobodyThere(f"{silent}; import the file again: nothing is booked twice") from None
         except RequestRefused as refused:
             row.result = "not free" if refused.code == "not_free" else "refused"
             row.why, row.failed = str(refused), True
@@ -296,7 +296,7 @@ async def import_(
       zscout booking import service.ics --needs robot/arm1 --maintenance
     """
     if str(file) == "-" and name is None:
-        raise BadInput("--calendar: what is read from stdin has no name; write one, and the same each time")
+        raise BadInput("stdin has no file name; name the calendar with --calendar, the same each time")
     data = sys.stdin.buffer.read(MAX_BYTES + 1) if str(file) == "-" else read_bytes(file, max_bytes=MAX_BYTES)
     events = read_calendar(data, "stdin" if str(file) == "-" else str(file))
     zone = zone or host_zone()

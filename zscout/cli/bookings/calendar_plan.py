@@ -116,7 +116,7 @@ def plan_import(events: Iterable[CalendarEvent], options: ImportOptions, now: fl
         except (ValueError, OverflowError, BadInput) as error:
             plan.skipped.append(Skipped(title, str(error), failed=True))
         if len(plan.wanted) > MAX_BOOKINGS:
-            raise BadInput(f"the calendar has more than {MAX_BOOKINGS} bookings to make; export less of it")
+            raise BadInput(f"the calendar would make more than {MAX_BOOKINGS} bookings; export less of it")
     plan.wanted.sort(key=lambda one: one.book is not None and not one.book.every)
     return plan
 
@@ -137,7 +137,7 @@ def _needs(event: CalendarEvent, options: ImportOptions) -> Needs:
         pairs = [parse_need(text) for text in named]
     found = gather_needs([*dict(pairs).items()])
     if options.maintenance and any(map(is_pattern, found)):
-        raise BadInput("maintenance is of RCs by their names, not by pattern")
+        raise BadInput("name each device for maintenance; patterns are not allowed")
     return found
 
 

@@ -71,7 +71,9 @@ async def slots(
         _table(told, zone).print()
     if not told.slots:
         more = "" if told.complete else " that was looked at"
-        raise common.Failed(f"within {span(within)} there is no time{more} at which all are free together")
+        raise common.Failed(
+            f"the devices are not free together{more} within {span(within)}; look further ahead with --within"
+        )
 
 
 def _table(told: SlotsTold, zone: ZoneInfo | None) -> Table:

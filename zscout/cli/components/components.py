@@ -9,19 +9,18 @@ import click
 
 from zscout import terminal
 from zscout.cli import common, completion
-from zscout.cli.components.placing import COMPONENT, placement_object, placer_of, tail_of, unknown_here
+from zscout.cli.components.placing import COMPONENT, ask_nodes, placement_object, placer_of, tail_of, unknown_here
 from zscout.cli.fleet.fleet_view import FIND_LOADS, FleetView, see_hosts
 from zscout.cli.fleet.watching import Overview, show
 from zscout.config.strict import BadInput
 from zscout.keyexpr import Role
-from zscout.messages import ComponentList, ComponentUse, ListComponents, Placement
+from zscout.messages import ComponentUse, ListComponents, Placement
 from zscout.terminal import Table
 from zscout.types import SECOND, Ns
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
 
-ASK_NODES: Final = 1.0
 STYLES: Final = {"running": "green", "waiting": "yellow", "backing_off": "yellow", "ended": "dim", "given_up": "red"}
 
 
@@ -111,7 +110,7 @@ class Listing:
         self._began = {key: began for key, began in self._began.items() if key in running}
         if running <= self._began.keys():
             return
-        for node in await ask_nodes(self.client, ListComponents(self.name)):
+        for node in await ask_nodes(self.client.mesh, ListComponents(self.name)):
             now = self.client.mesh.now()
             for view in node.components:
                 key = (view.component, view.incarnation)
@@ -165,21 +164,12 @@ class Listing:
         return None if began is None else (self.client.mesh.now() - began) / SECOND
 
 
-async def ask_nodes(client: Client, asked: ListComponents) -> list[ComponentList]:
-    """The lists of the nodes that answer in time, by host."""
-    replies = await client.mesh.ask(
-        client.mesh.keys.component_any(client.mesh.me), asked, ComponentList, timeout=ASK_NODES
-    )
-    lists = (reply.message for reply in replies if reply.message is not None)
-    return sorted(lists, key=lambda one: one.host)
-
-
 async def _kinds(*, as_json: bool) -> None:
     async with common.connected("components", need_rcm=False) as client:
         with suppress(common.NobodyThere):
             await common.see_rcm(client)
         await see_hosts(client)
-        nodes = await ask_nodes(client, ListComponents())
+        nodes = await ask_nodes(client.mesh, ListComponents())
         fleet = client.fleet.name
     if not nodes:
         raise common.NobodyThere(

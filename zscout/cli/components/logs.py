@@ -11,7 +11,15 @@ from zscout import terminal
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
 from zscout.cli import common
-from zscout.cli.components.placing import OVER, component_argument, host_option, placer_of, standing, unknown_here
+from zscout.cli.components.placing import (
+    OVER,
+    check_host,
+    component_argument,
+    host_option,
+    placer_of,
+    standing,
+    unknown_here,
+)
 from zscout.cli.fleet.fleet_view import see_hosts
 from zscout.mesh.supervision import done_within
 from zscout.messages import Output, Placement, ReadOutput
@@ -158,12 +166,13 @@ class Reader:
 
     async def _nothing(self) -> common.Failed:
         """What to raise where there is no output."""
-        if self._only:
+        if self._only and self._host is not None:
+            await check_host(self._client.mesh, self._host, "--host: ")
             return common.Failed(
-                f"{self._host} knows no output of {self._name}; leave --host out to see where it ran last"
+                f"{self._host} has no output of {self._name}; leave --host out to read it where it ran last"
             )
         if self._record is not None:
-            return common.Failed(f"no host knows any output of {self._name}: it {standing(self._record)}")
+            return common.Failed(f"no host has output of {self._name}: it {standing(self._record)}")
         return await unknown_here(self._placer, self._name)
 
     def write(self, text: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
 
 import click
 
@@ -13,12 +12,7 @@ from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common
 from zscout.cli.components import placing
 from zscout.cli.requests.options import timeout_option
-from zscout.config.strict import BadInput, quoted
-from zscout.keyexpr import Role
 from zscout.messages import DrainHost, MigrateComponent, Placement, Placements, UncordonHost
-
-LOOK_FOR_HOSTS: Final = 1.0
-"""Seconds in which nodes show themselves."""
 
 
 @click.command()
@@ -67,8 +61,12 @@ async def _moved(placer: PlacerClient, shown: placing.Progress, before: Placemen
         raise
     except RequestRefused as refused:
         if to is not None and refused.code == "unknown_host":
-            await _check_host(placer, to)
-        raise common.Failed(f"{name} was not moved: {refused}") from None
+            await placing.check_host(placer.mesh, to, "--to: ")
+        now = placer.placements.get(name, before)
+        why = str(refused)
+        if refused.code == "not_running" and now.state != "running":
+            why = f"it {placing.standing(now)}; {placing.remedy(now)}"
+        raise common.Failed(f"{name} was not moved: {why}") from None
     if begun(record):
         while record.state not in ("running", *placing.OVER):
             shown.update(f"{name} {placing.standing(record)}")
@@ -77,19 +75,10 @@ async def _moved(placer: PlacerClient, shown: placing.Progress, before: Placemen
         if record.state == "running":
             if record.host != before.host:
                 return record
-            raise common.Failed(f"{name} was not moved, it goes on on {record.host}: {record.reason}")
+            raise common.Failed(f"{name} was not moved, it keeps running on {record.host}: {record.reason}")
     elif to == record.host:
         return record
-    raise common.Failed(f"{name} was not moved: it {placing.standing(record)}")
-
-
-async def _check_host(placer: PlacerClient, host: str) -> None:
-    """Raises BadInput where no node has this name."""
-    mesh = placer.mesh
-    nodes = {token.host for token in await mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK_FOR_HOSTS)}
-    if host not in nodes:
-        hint = common.hint_at(host, nodes, "nor any other; start zscout-node there", "there are")
-        raise BadInput(f"--to: there is no host {quoted(host)}{hint}")
+    raise common.Failed(f"{name} was not moved: it {placing.standing(record)}; {placing.remedy(record)}")
 
 
 @click.command()
@@ -117,7 +106,13 @@ async def drain(host: str, timeout: float | None, as_json: bool) -> None:
             return f"{host} is not empty after {left}: {_words(_there(placer, host))}; {cordoned}"
 
         async with shown.within(timeout, late, cordoned):
-            placer.take(*(await placer.request(DrainHost(host), Placements)).components)
+            try:
+                drained = await placer.request(DrainHost(host), Placements)
+            except RequestRefused as refused:
+                if refused.code == "unknown_host":
+                    await placing.check_host(placer.mesh, host)
+                raise
+            placer.take(*drained.components)
             # What is not running yet is moved when it does.
             while leaving := [one for one in _there(placer, host) if one.movable or one.state != "running"]:
                 shown.update(f"{host}: {_words(leaving)}")
@@ -146,8 +141,10 @@ async def uncordon(host: str, as_json: bool) -> None:
     Example:
       zscout uncordon anvil
     """
-    async with common.connected("uncordon") as client:
-        uncordoned = await placing.placer_of(client).request(UncordonHost(host), Placements)
+    async with placing.connected("uncordon", as_json=as_json) as (_, placer):
+        if host not in placer.cordoned:
+            await placing.check_host(placer.mesh, host)
+        uncordoned = await placer.request(UncordonHost(host), Placements)
     if as_json:
         terminal.print_json({"host": host, "components": list(map(placing.placement_object, uncordoned.components))})
     else:

@@ -46,7 +46,7 @@ def parse_cores(text: str, what: str) -> float:
     with suppress(ValueError):
         cores = float(text)
     if not 0 < cores <= MAX_CORES:
-        raise BadInput(f"{what}: {quoted(text)} is no number of cores; write one, as in 0.5 or 2")
+        raise BadInput(f"{what}: {quoted(text)} is not a number of cores; write one, as in 0.5 or 2")
     return cores
 
 
@@ -55,7 +55,7 @@ def parse_size(text: str, what: str) -> int:
     found = _SIZE.fullmatch(text)
     size = int(Decimal(found[1]) * (1 << _POWERS[found[2].upper()])) if found else 0
     if not 0 < size <= MAX_BYTES:
-        raise BadInput(f"{what}: {quoted(text)} is no size; write bytes, or with a unit: 500M, 1.5G")
+        raise BadInput(f"{what}: {quoted(text)} is not a size; write bytes, or with a unit: 500M, 1.5G")
     return size
 
 
@@ -76,7 +76,7 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
     for setting in settings:
         key, equals, value = setting.partition("=")
         if not key or not equals:
-            raise BadInput(f"--set {quoted(setting)} sets nothing; write KEY=VALUE")
+            raise BadInput(f"--set: {quoted(setting)} has no value; write KEY=VALUE")
         if key in seen:
             raise BadInput(f"--set: {quoted(key)} is given twice; give it once")
         seen.add(key)
@@ -87,9 +87,9 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
     try:
         size = len(msgspec.json.encode(params))
     except BAD_JSON:
-        raise BadInput("the parameters can't be written as JSON; mend --set or --params") from None
+        raise BadInput("the parameters can't be written as JSON; change --set or --params") from None
     if size > MAX_PARAMS_SIZE:
-        raise BadInput(f"the parameters have {size} bytes as JSON; at most {MAX_PARAMS_SIZE} are taken")
+        raise BadInput(f"the parameters have {size} bytes as JSON; at most {MAX_PARAMS_SIZE} are allowed")
     return params
 
 
@@ -149,6 +149,10 @@ async def start(
             return f"{name} does not run after {terminal.span(timeout or 0)}:{now} {stays}"
 
         before = placer.placements.get(name)
+        if before is None or before.state in placing.OVER:
+            await placing.check_kind(placer.mesh, kind)
+            for line in await placing.absent(placer.mesh, spec.hosts or ()):
+                terminal.print_line(line, sys.stderr)
         placement = await _place(placer, name, spec, before)
         if not no_wait:
             async with shown.within(timeout, late, stays):
@@ -158,7 +162,7 @@ async def start(
     if placement.state == "given_up" or (placement.state == "ended" and not placement.wanted):
         for line in placing.tail_of(placement):
             terminal.print_line(line, sys.stderr)
-        raise common.Failed(f"{name} {placing.standing(placement)}")
+        raise common.Failed(f"{name} {placing.standing(placement)}; {placing.remedy(placement)}")
     ran = before is not None and before.state == placement.state == "running"
     shown.say(f"{name} {'already ' if ran else ''}{placing.standing(placement)}")
 
@@ -180,7 +184,7 @@ def gather_spec(
     if len(hosts) > MAX_RANKED:
         raise BadInput(f"{len(hosts)} hosts; name at most {MAX_RANKED}, or give them a label")
     if len(labels) > MAX_LABELS:
-        raise BadInput(f"{len(labels)} labels; at most {MAX_LABELS} are taken")
+        raise BadInput(f"{len(labels)} labels; at most {MAX_LABELS} are allowed")
     given: Any = {"params": gather_params(params, settings), "restart": restart.replace("-", "_")}
     return ComponentSpec(kind=kind, labels=labels, hosts=hosts or None, cpu_limit=cpu_limit or 0.0, **given, **same)
 
@@ -198,8 +202,8 @@ async def _place(placer: PlacerClient, name: str, spec: ComponentSpec, before: P
         if refused.code != "exists":
             raise
         raise common.Failed(
-            f"{name} exists already, as another kind or with other settings; give this one another --name, "
-            f"or end that one first: zscout component stop {name}"
+            f"{name} already exists with another kind or other settings; give this one another --name, "
+            f"or stop the other first: zscout component stop {name}"
         ) from None
 
 

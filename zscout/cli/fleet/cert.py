@@ -44,7 +44,7 @@ def _lasting(text: str, option: str) -> timedelta:
     seconds = strict.parse_duration(f"{text}d") or strict.parse_duration(text)
     if not seconds or not 1 <= seconds <= MAX_DAYS * 86_400:
         raise BadInput(
-            f"{option}: {quoted(text)} is no time up to {MAX_DAYS:,} days; write days, or a unit, as in 90, 12h, 90s"
+            f"{option}: {quoted(text)} is not a time up to {MAX_DAYS:,} days; write days, or a unit: 90, 12h, 90s"
         )
     return timedelta(seconds=float(seconds))
 
@@ -177,7 +177,7 @@ def show(folders: tuple[Path, ...], as_json: bool) -> int:
     if not folders:
         named = os.environ.get(KEYS_VARIABLE)
         if not named:
-            raise BadInput(f"name a folder; ${KEYS_VARIABLE} names none")
+            raise BadInput(f"no folder is given; name one, or set ${KEYS_VARIABLE}")
         folders = (Path(named),)
     now = datetime.now(UTC)
     found = [one for folder in folders for one in _found(folder, now)]
@@ -235,7 +235,7 @@ def _authority(folder: Path) -> CertificateAuthority:
 def _check_free(folder: Path, names: tuple[str, ...], force: bool) -> None:
     there = [name for name in names if (folder / name).exists()]
     if there and not force:
-        raise BadInput(f"{folder}: has {' and '.join(there)} already; name another folder, or overwrite with --force")
+        raise BadInput(f"{folder}: already has {' and '.join(there)}; name another folder, or overwrite with --force")
 
 
 @contextmanager

@@ -22,7 +22,7 @@ COLUMNS = (
 def parse_arc(text: str, option: str) -> str:
     """The name or id of an ARC. Raises BadInput."""
     if not 1 <= len(text) <= MAX_ARC_NAME:
-        raise BadInput(f"{option}: {quoted(text)} names no ARC; write 1 to {MAX_ARC_NAME} characters")
+        raise BadInput(f"{option}: {quoted(text)} can't be the name of a request; write 1 to {MAX_ARC_NAME} characters")
     return text
 
 

@@ -61,7 +61,7 @@ class Selection:
         name = next((name for name in self.names if name not in self._met), None)
         if name is None:
             return None
-        return common.unknown("RC, ARC or host", name, self._all, "and nothing is there", "known")
+        return common.unknown("device, request or host", name, self._all, "and there are none", "known")
 
     def _means(self, *known: str) -> bool:
         """Whether something of these names is meant. The first of them is what a hint shows."""

@@ -64,7 +64,7 @@ def parse_recorded_past(text: str, option: str) -> Ns:
     found = parse_duration(text)
     if found is None or found > MAX_PAST:
         raise BadInput(
-            f"{option}: {quoted(text)} is no such duration; write {DURATIONS}, at most {MAX_PAST // 86_400}d"
+            f"{option}: {quoted(text)} is not a duration, or too long; write {DURATIONS}, at most {MAX_PAST // 86_400}d"
         )
     return int(found * SECOND)
 
@@ -120,7 +120,7 @@ async def view(
     if file is not None:
         file = _checked(file)
     if not web and not has_display():
-        raise common.Failed("no display is here (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web, and a browser")
+        raise common.Failed("there is no display (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web and a browser")
     # The page comes last, so what it shows needs its own port first.
     async with _source(file, bind, None if web else port, out, past) as (recording, recorder):
         if not as_json and file is None:
@@ -239,7 +239,7 @@ def _checked(file: Path) -> Path:
     """The whole path of FILE, which may begin with a dash. Raises BadInput where it can't be a recording."""
     try:
         if not file.is_file():
-            raise BadInput(f"{file}: there is no such file; recordings of nodes and of zscout view lie in runs/")
+            raise BadInput(f"{file}: there is no such file; recordings of nodes and of zscout view are in runs/")
         with file.open("rb") as recording:
             begin = recording.read(len(MAGIC))
     except OSError as error:
@@ -247,7 +247,7 @@ def _checked(file: Path) -> Path:
     if begin != MAGIC:
         raise BadInput(f"{file}: is not a Rerun recording; name a .rrd file")
     if file.suffix != ".rrd":
-        raise BadInput(f"{file}: the viewer knows a recording by its name; rename it to end in .rrd")
+        raise BadInput(f"{file}: the name does not end in .rrd; rename it")
     return file.absolute()
 
 

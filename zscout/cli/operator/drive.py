@@ -109,7 +109,7 @@ async def drive(
       zscout drive robot/scout33 --pad /dev/input/js0 --record runs/scout33.rrd
     """
     if not sys.stdin.isatty():
-        raise BadInput("zscout drive reads keys: run it at a terminal, its standard input is none")
+        raise BadInput("standard input is not a terminal, and zscout drive reads keys; run it at a terminal")
     common.check_recording("--record", record)
     from zscout.behaviors.sensor_net.held_robot import RobotNeeds
     from zscout.behaviors.teleop import Pilot, Teleop
@@ -120,7 +120,8 @@ async def drive(
         state = await common.state_of(client)
         if all(rc.rc != robot for rc in state.rcs):
             there = sorted(rc.rc for rc in state.rcs if rc.rc.startswith("robot/"))
-            raise BadInput(f"there is no {quoted(robot)} on the mesh; there are: {', '.join(there) or 'no robots'}")
+            hint = common.hint_at(robot, there, "and there are none on the mesh", "known")
+            raise BadInput(f"unknown robot {quoted(robot)}{hint}")
         pilot, end = Pilot(speed), asyncio.Event()
         needs = RobotNeeds(robot, radio, video, framegrabber, rate)
         console = stack.enter_context(_Console(robot, as_json=as_json))

@@ -152,7 +152,7 @@ async def _agree(client: Client, wanted: HoldOptions, *, yes: bool) -> None:
         if not asks:
             return
         if not possible:
-            raise Failed("nobody can be asked here whether to preempt others; add --yes")
+            raise Failed("stdin is not a terminal, so I can't ask before preempting; add --yes")
         sys.stderr.write(f"Take {', '.join(sorted(wanted.needs))}? [y/N] ")
         sys.stderr.flush()
         if (await _answer()).strip().lower() not in ("y", "yes"):

@@ -98,14 +98,16 @@ def _choose(state: RcmState, named: str, word: str, *, every: bool) -> list[Targ
         matching = [Target(request, check_name(request, "id"), str(client_of(client)), "queued")]
     found = [target for target in matching if word == "cancel" or target.was == "running"]
     if matching and not found:
-        raise common.Failed(f"{quoted(named)} holds nothing, it waits; to end that: zscout cancel {named}")
+        raise common.Failed(f"request {quoted(named)} holds nothing, it waits; to cancel it: zscout cancel {named}")
     if not found:
-        more = f"; {state.more} more wait: name it <host>/<client>/<id>" if state.more else ""
-        raise common.Failed(f"no ARC {quoted(named)} runs or waits{more}; see zscout status")
+        more = f"; {state.more} more wait: name them <host>/<client>/<id>" if state.more else ""
+        raise common.Failed(f"no request {quoted(named)} holds or waits{more}; see zscout status")
     if len(found) > 1 and not every:
         listed = ", ".join(target.full_name for target in found[:MAX_LISTED])
         rest = f" and {len(found) - MAX_LISTED} more" if len(found) > MAX_LISTED else ""
-        raise common.Failed(f"{len(found)} ARCs are called {quoted(named)}: {listed}{rest}; name one so, or add --all")
+        raise common.Failed(
+            f"{len(found)} requests are called {quoted(named)}: {listed}{rest}; write one of these names, or add --all"
+        )
     return found
 
 
@@ -123,4 +125,6 @@ async def _operate(client: Client, target: Target, word: str) -> Notice:
         problem = next((reply.problem for reply in replies if reply.problem is not None), None)
         if problem is not None and problem.code not in TRY_AGAIN:
             raise common.Failed(f"{target.full_name} was not ended: {problem.message}")
-    raise common.NobodyThere("the RCM did not answer: it may be done or not; see zscout status, and try again")
+    raise common.NobodyThere(
+        "the leader did not answer: it may or may not have been done; see zscout status, and try again"
+    )

@@ -107,7 +107,7 @@ async def request(
       zscout request --booking survey -- sleep 7200
     """
     if keep and rest["release_after"] is not None:
-        raise BadInput("--keep and --release-after contradict each other; give one of them")
+        raise BadInput("--keep and --release-after exclude each other; use only one of them")
     if booking is not None:
         check_options(dry_run=dry_run, **rest)
     wanted = gather(needs, name, priority=priority, keep=True, booking=booking or "", **rest)
@@ -324,7 +324,7 @@ async def _foresee(client: Client, wanted: HoldOptions) -> int:
     RequestRefused, NobodyThere."""
     foretold = await client.foresee(wanted.name, wanted.needs, **wanted.terms())
     if foretold is None:
-        raise common.NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again")
+        raise common.NobodyThere(f"the leader of fleet {client.fleet.name} did not answer; try again")
     if wanted.as_json:
         found = {name: getattr(foretold, name) for name in ("starts_in", "preempts", "victims", "reason", "why")}
         print_json({"arc": wanted.name, **found})

@@ -87,9 +87,9 @@ def _check_live(web: bool, view: bool) -> None:
     from zscout.cli.fleet.view import has_display
 
     if web and view:
-        raise BadInput("--web and --view: one of them shows it; leave one out")
+        raise BadInput("--web and --view exclude each other; use only one of them")
     if view and not has_display():
-        raise common.Failed("no display is here (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web, and a browser")
+        raise common.Failed("there is no display (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web and a browser")
 
 
 def recording_option(command: F) -> F:

@@ -29,7 +29,7 @@ def parse_address(text: str, option: str) -> tuple[str, int]:
     """Host and port of `HOST:PORT` or `PORT`. Raises BadInput."""
     found = _ADDRESS.fullmatch(text)
     if found is None or int(found["port"]) > 65_535:
-        raise BadInput(f"{option} {quoted(text)}: write HOST:PORT, as in 127.0.0.1:8080")
+        raise BadInput(f"{option}: {quoted(text)} is not an address; write HOST:PORT, as in 127.0.0.1:8080")
     return (found["host"] or "127.0.0.1").strip("[]"), int(found["port"])
 
 
@@ -107,7 +107,7 @@ def simulate(building: str | None, listing: bool, mesh: bool, as_json: bool, **o
         print_shipped(as_json=as_json)
         return
     if building is None:
-        raise BadInput(f"which building? name one of {known_buildings()}, or a file")
+        raise BadInput(f"no building is given; name one of {known_buildings()}, or a file")
     plan = plan_named(building)
     from zscout.simulation.building.simulate import simulate as serve
 
