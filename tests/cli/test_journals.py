@@ -18,17 +18,17 @@ from zscout.services.journal.merging import Span
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("history --since soon", '--since: "soon" is no time; write a number of seconds'),
+        ("history --since soon", '--since: "soon" is not a time; write a number of seconds'),
         ("history --since 2999-01-01", "is in the future"),
-        ("history --since 1h --until 2h", "--since: it is not before --until"),
-        ("history --rc robot", "write kind/name, like robot/scout33"),
-        ("history --user ''", "is no name"),
-        ("history --group arms", '--group: "arms" is no group of the fleet file that has members; it has none'),
-        ("history --limit 0", "0 is not in the range"),
-        ("history --json --csv", "--json and --csv: write one of them"),
-        ("usage --by weekday", "'weekday' is not one of"),
+        ("history --since 1h --until 2h", "--since is not before --until"),
+        ("history --rc robot", "write kind/name, as in robot/scout33"),
+        ("history --user ''", "is not a name"),
+        ("history --group arms", '--group: the fleet file has no group "arms" with members; it has no groups'),
+        ("history --limit 0", "0 is out of range"),
+        ("history --json --csv", "--json and --csv exclude each other; use only one of them"),
+        ("usage --by weekday", '--by: "weekday" is unknown; write one of'),
         ("usage --by group", "the fleet file has no [groups]"),
-        ("usage --until 30d", "--since: it is not before --until"),
+        ("usage --until 30d", "--since is not before --until"),
     ],
 )
 def test_bad_input_is_one_line(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:

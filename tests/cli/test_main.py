@@ -127,14 +127,14 @@ def test_a_habit_leads_to_a_command_that_is_there() -> None:
         (["request"], "DEVICE... is missing"),
         (["request", "robot/a", "--"], "no command follows the --"),
         (["request", "robot/a", "--priority", "high"], '--priority: "high" is not a whole number (see'),
-        (["request", "robot"], "need \"robot\": RC 'robot' is not valid: write kind/name"),
+        (["request", "robot"], 'zscout: device "robot" is not valid; write kind/name'),
         (["request", "robot/a", "robot/a"], "robot/a is named twice"),
-        (["request", "robot/a", "--again"], "--again runs a command again"),
+        (["request", "robot/a", "--again"], "--again repeats a command"),
         (["request", "robot/a", "--min-runtime", "0"], "--min-runtime must be positive"),
         (["request", "robot/a", "sleep", "5"], "a command goes after --"),
         (["request", "robot/a:rate"], "rate has no number; write parameter=number"),
         (["cancel"], "REQUEST is missing"),
-        (["cancel", ""], '"" names no ARC; zscout status lists them'),
+        (["cancel", ""], '"" can\'t be the name of a request; see zscout status'),
     ],
 )
 def test_bad_input_is_one_line_and_2(args: list[str], words: str) -> None:
@@ -161,7 +161,7 @@ def test_a_mesh_without_an_rcm_is_3(tmp_path: Path) -> None:
     done = zscout("--fleet", str(lab.fleet_file), "request", "robot/a")
     assert done.returncode == 3
     who = "(no other program either); start zscout-node"
-    assert done.stderr.startswith(f"zscout: no RCM is on the mesh of fleet {lab.fleet.name} {who}")
+    assert done.stderr.startswith(f"zscout: no leader is on the mesh of fleet {lab.fleet.name} {who}")
     assert done.stderr.count("\n") == 1
 
 
@@ -293,11 +293,11 @@ def test_a_pattern_that_comes_again_is_numbered() -> None:
 @pytest.mark.parametrize(
     ("texts", "message"),
     [
-        (["robot/a", "fg/*", "robot/a"], "robot/a is named twice; name each RC once"),
-        (["fg/*#2", "fg/*#2"], "fg/*#2 is named twice; leave the numbers out, and they are given"),
-        (["radio/*:rate=2", "radio/*:rate=3"], "different parameters; give all the same"),
-        (["radio/*:rate=2", "*/x"], "name its kind"),
-        (["fg/*"] * 65, "65 RCs; at most 64 are allowed"),
+        (["robot/a", "fg/*", "robot/a"], "robot/a is named twice; name each device once"),
+        (["fg/*#2", "fg/*#2"], "fg/*#2 is named twice; leave the numbers out: zscout numbers them"),
+        (["radio/*:rate=2", "radio/*:rate=3"], "different parameters; give them all the same"),
+        (["radio/*:rate=2", "*/x"], "name a kind"),
+        (["fg/*"] * 65, "65 devices; at most 64 are allowed"),
     ],
 )
 def test_needs_that_do_not_go_together(texts: list[str], message: str) -> None:
@@ -312,7 +312,7 @@ def test_needs_that_do_not_go_together(texts: list[str], message: str) -> None:
      "*", "a/**", "a/b*", "a/*/*", "a/*#", "a/*#0", "a/*#2#3", "a/*#100", "a/b#2", "a/*:rate", "a/* "],
 )  # fmt: skip
 def test_what_is_no_need_is_refused(text: str) -> None:
-    with pytest.raises(BadInput, match="need "):
+    with pytest.raises(BadInput):
         parse_need(text)
 
 

@@ -22,7 +22,7 @@ from zscout.config.strict import DURATIONS, BadInput
 from zscout.types import SECOND
 
 CLOSED = '[security]\nfolder = "k"\n[roles]\nmanager = ["a"]\n'
-SYNTAX = "mend the TOML there or just before"
+SYNTAX = "fix the TOML there or just before"
 
 BAD_FLEETS = {
     # TOML itself
@@ -30,7 +30,7 @@ BAD_FLEETS = {
     "x = 1\nx = 2": f"line 2, column 6, the end: Cannot overwrite a value; {SYNTAX}",
     "\n[fleet\nname = 1": f"line 2, column 7: Expected ']' at the end of a table declaration; {SYNTAX}",
     "x = " + "1" * 5000: "a whole number has thousands of digits; shorten it",
-    "x = " + "[" * 5000: "is nested too deep; no key goes deeper than a few tables",
+    "x = " + "[" * 5000: "is nested too deep; use fewer levels",
     "\n" + ".".join(["a"] * 300_000) + " = 1": "line 2 has a dotted key of more than 32 parts; shorten it",
     "[" + " . ".join(['"\\""', "'b'"] * 60_000) + "]": "line 1 has a dotted key of more than 32 parts; shorten it",
     # Keys and tables
@@ -50,7 +50,7 @@ BAD_FLEETS = {
     '[fleet]\ncandidates = "anvil"': 'fleet.candidates: is the text "anvil"; write a list',
     '[fleet]\ncandidates = ["a", 1]': "fleet.candidates[1]: is 1; write a text in quotes",
     '[fleet]\ncandidates = ["a", "b", "a"]': (
-        'fleet.candidates[2]: "a" stands at fleet.candidates[0] already; rename or remove one of the two'
+        'fleet.candidates[2]: "a" is already at fleet.candidates[0]; rename or remove one of the two'
     ),
     f"[fleet]\ncandidates = {['a'] * 1001}": "fleet.candidates: has 1,001 entries; at most 1,000 are allowed",
     '[fleet]\nstrategy = "fifo"': ('fleet.strategy: is the text "fifo"; write "adaptive", "optimal" or "priority"'),
@@ -72,10 +72,10 @@ BAD_FLEETS = {
         "fair_shares.patience: is 100 s, less than fleet.patience (142 s); write as much, or more"
     ),
     '[roles]\nclient = ["bob"]\n[groups]\narms = ["bob"]\n[fair_shares.weights]\nbob = 2': (
-        'fair_shares.weights.bob: "bob" is of the group arms, and counts there; give the group a weight'
+        'fair_shares.weights.bob: "bob" belongs to the group arms, and counts there; give the group a weight'
     ),
     '[roles]\nclient = ["bob"]\n[fair_shares.weights]\nlegs = 2': (
-        'fair_shares.weights.legs: "legs" is no group and has no role; name it under [groups], or mend the name'
+        'fair_shares.weights.legs: "legs" is not a group and has no role; name it under [groups], or correct the name'
     ),
     "[fleet]\noperator_priority = 1.0": ("fleet.operator_priority: is 1.0; write a whole number from 0 to 1000000000"),
     "[fleet]\noperator_priority = true": (
@@ -101,7 +101,7 @@ BAD_FLEETS = {
         'mesh.listen[0]: "tcp/anvil:70000" has no valid port; write one from 0 to 65535'
     ),
     '[mesh]\nconnect = ["tcp/a:1", "tcp/a:1"]': (
-        'mesh.connect[1]: "tcp/a:1" stands at mesh.connect[0] already; rename or remove one of the two'
+        'mesh.connect[1]: "tcp/a:1" is already at mesh.connect[0]; rename or remove one of the two'
     ),
     "[mesh]\nmulticast = 1": "mesh.multicast: is 1; write true or false",
     '[mesh]\nmulticast_address = "10.0.0.1:7446"': (
@@ -125,33 +125,33 @@ BAD_FLEETS = {
     "multicast_address, site",
     # Security
     "[security]": "security.folder: is missing; add it",
-    '[security]\nfolder = ""': 'security.folder: "" is no folder; name one, as in folder = "/etc/zscout/keys"',
+    '[security]\nfolder = ""': 'security.folder: "" is not a folder; name one, as in folder = "/etc/zscout/keys"',
     '[security]\nfolder = "k"': (
-        'roles: [security] is there, and no host may lead; write manager = ["anvil"] under [roles]'
+        'roles: no host may lead, though there is [security]; write manager = ["anvil"] under [roles]'
     ),
     CLOSED + '[mesh]\nlisten = ["tcp/0.0.0.0:7447"]': (
         'mesh.listen[0]: "tcp/0.0.0.0:7447" is not TLS; write tls/host:port, or remove [security]'
     ),
-    CLOSED + '[fleet]\ncandidates = ["b"]': "fleet.candidates[0]: b is no manager; name it so under [roles]",
+    CLOSED + '[fleet]\ncandidates = ["b"]': "fleet.candidates[0]: b is not a manager; name it as one under [roles]",
     CLOSED + '[devices]\nb = ["robot/x"]': "devices.b: b may not serve robot/x; name it under [roles.node], b",
     '[roles]\nviewer = ["a"]\nclient = ["a"]': (
-        'roles.client: "a" is viewer already; a name has one role: make it one of the two'
+        'roles.client: "a" already has the role viewer; a name has one role: make it one of the two'
     ),
     '[roles]\noperator = ["a"]\nmanager = ["a"]': (
-        'roles.manager: "a" is operator already; a name has one role: make it a machine or a person'
+        'roles.manager: "a" already has the role operator; a name has one role: make it a machine or a person'
     ),
     '[roles.node]\na = ["robot"]': (
-        'roles.node.a[0]: "robot" names no RC; '
+        'roles.node.a[0]: "robot" does not name a device; '
         'write kind/name with * for any part, as in "robot/scout33" or "robot/arm*"'
     ),
-    '[groups]\narms = ["a"]': 'groups.arms[0]: "a" has no role; name it under [roles], or mend the name',
-    '[roles]\nclient = ["a"]\n[groups]\na = ["a"]': ('groups.a: "a" is a name with a role; call the group otherwise'),
+    '[groups]\narms = ["a"]': 'groups.arms[0]: "a" has no role; name it under [roles], or correct the name',
+    '[roles]\nclient = ["a"]\n[groups]\na = ["a"]': ('groups.a: "a" is also a name with a role; rename the group'),
     '[access]\n"robot/x" = ["arms"]': (
-        'access."robot/x"[0]: "arms" has no role; name it under [roles], or mend the name'
+        'access."robot/x"[0]: "arms" has no role; name it under [roles], or correct the name'
     ),
-    "[quotas]\na = { rcs = 1 }": 'quotas[0]: "a" has no role; name it under [roles], or mend the name',
+    "[quotas]\na = { rcs = 1 }": 'quotas[0]: "a" has no role; name it under [roles], or correct the name',
     "[ceilings.viewer]\npriority = 1": (
-        'ceilings.viewer: only ARCs of clients and operators have a ceiling; write "client"'
+        'ceilings.viewer: only requests of clients and operators have a ceiling; write "client"'
     ),
 }
 

@@ -99,7 +99,11 @@ def test_who_is_heard_by_a_radio_and_what_a_radio_and_a_channel_carry(tmp_path: 
 
             # What a gang must have for a robot to do as it is told.
             for needs, do, word in (
-                ({"robot/r1": {}}, TURN, "your ARC holds no radio: nothing reaches the robot; ask also for radio/rf0"),
+                (
+                    {"robot/r1": {}},
+                    TURN,
+                    "your request holds no radio, so nothing reaches the robot; request radio/rf0",
+                ),
                 ({"robot/r1": {}, **RADIO}, {"name": "camera", "on": True}, "ask also for video/*"),
                 (GANG | {"video/ch2": {}}, {"name": "camera", "on": True}, "one transmitter"),
                 ({"robot/r1": {}, "video/ch3": {}, **RADIO}, {"name": "camera", "on": True}, "no channel of video/ch3"),

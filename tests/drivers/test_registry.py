@@ -55,7 +55,7 @@ BAD = {
     'arm\nport = "x"\njoints = [1, 2.5]': "rc[0].joints[1] (arm/a): is 2.5; write a whole number",
     'arm\nport = "x"\nsped = 1': "rc[0].sped (arm/a): unknown key; did you mean speed?",
     'arm\nport = "x"\nbaud = 1': "rc[0].baud (arm/a): unknown key; known here: joints, port, speed",
-    'arm\nport = "x"\nspeed = 101': "rc[0] (arm/a): speed is above 100, which bends it; write less; mend it",
+    'arm\nport = "x"\nspeed = 101': "rc[0] (arm/a): speed is above 100, which bends it; write less; correct it",
     'arm\nport = "gone"': (
         "rc[0].driver (arm/a): zscout_arm.Arm can't be made: KeyError: 'gone'; "
         "mend that package, or install what it needs; --log-level debug shows more"
@@ -63,10 +63,10 @@ BAD = {
     "bare\nport = 1": "rc[0].port (arm/a): unknown key; known here: none",
     'odd\nport = "x"': (
         "rc[0].driver (arm/a): the options of zscout_arm.Odd can't be read: rc[0].port has a type that no file can be "
-        "read into: BytesType(min_length=None, max_length=None); mend its class Options"
+        "read into: BytesType(min_length=None, max_length=None); fix its class Options"
     ),
     "nodriver": (
-        "rc[0].driver (arm/a): zscout_arm:NoDriver of package zscout_arm 1.0 is no driver; "
+        "rc[0].driver (arm/a): zscout_arm:NoDriver of package zscout_arm 1.0 is not a driver; "
         "name a subclass of zscout.drivers.driver.Driver there"
     ),
     "amr": (
@@ -86,7 +86,7 @@ BAD = {
         "mend that package, or install what it needs; --log-level debug shows more"
     ),
     "twice": (
-        'rc[0].driver (arm/a): "twice" is brought by one:Arm of package one 1.0 and two:Arm of package two 1.0; '
+        'rc[0].driver (arm/a): "twice" comes with one:Arm of package one 1.0 and two:Arm of package two 1.0; '
         "uninstall one of them"
     ),
 }

@@ -170,8 +170,8 @@ def test_a_standing_hold_must_tell_what_it_holds() -> None:
     [
         ({"fg/**": {}}, "not valid"),
         ({"radio/*": {"rate": Fraction(1)}, "radio/*#2": {"rate": Fraction(2)}}, "different parameters"),
-        ({"radio/*": {"rate": Fraction(1)}, "*/rf0": {}}, "name its kind"),
-        ({"*/*": {"rate": Fraction(1)}}, "name its kind"),
+        ({"radio/*": {"rate": Fraction(1)}, "*/rf0": {}}, "name a kind"),
+        ({"*/*": {"rate": Fraction(1)}}, "name a kind"),
     ],
 )
 def test_what_no_request_may_ask(needs: dict[str, Params], message: str) -> None:

@@ -106,7 +106,7 @@ def test_what_meets_a_pattern_is_what_the_newest_hold_says() -> None:
     assert first.rc("fg/*") == "fg/b"
     assert known.ask(NOW).needs.keys() == {"fg/*", "fg/*#2", "robot/x"}
     for unasked in ("fg/*#3", "video/*", "robot/y", "fg/b"):
-        with pytest.raises(KeyError, match=re.escape(f"{unasked} is no need of survey; it asked for fg/*,")):
+        with pytest.raises(KeyError, match=re.escape(f"{unasked} is not a need of survey; it asked for fg/*,")):
             again.rc(unasked)
 
 

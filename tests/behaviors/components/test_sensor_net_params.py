@@ -17,18 +17,18 @@ ONE: dict[str, Any] = {"robot": "robot/scout33"}
 TWO: dict[str, Any] = {"robots": ["robot/scout33", "robot/scout35"]}
 
 SHARED: list[tuple[dict[str, Any], str]] = [
-    ({"radio": "robot/scout33"}, 'radio: "robot/scout33" is no radio; name one, or a pattern, as in "radio/*"'),
-    ({"radio": "rf0"}, 'radio: "rf0" is no radio; name one, or a pattern, as in "radio/*"'),
+    ({"radio": "robot/scout33"}, 'radio: "robot/scout33" is not a radio; name one, or a pattern, as in "radio/*"'),
+    ({"radio": "rf0"}, 'radio: "rf0" is not a radio; name one, or a pattern, as in "radio/*"'),
     ({"video": None}, "video: is null; write a text in quotes"),
-    ({"video": "video/**"}, 'video: "video/**" is no video; name one, or a pattern, as in "video/*"'),
+    ({"video": "video/**"}, 'video: "video/**" is not a video; name one, or a pattern, as in "video/*"'),
     ({"framegrabber": ["framegrabber/fgrab1"]}, "framegrabber: is a list; write a text in quotes"),
     (
         {"framegrabber": "framegrabber/a/b"},
-        'framegrabber: "framegrabber/a/b" is no framegrabber; name one, or a pattern, as in "framegrabber/*"',
+        'framegrabber: "framegrabber/a/b" is not a framegrabber; name one, or a pattern, as in "framegrabber/*"',
     ),
     (
         {"framegrabber": "framegrabber/"},
-        'framegrabber: "framegrabber/" is no framegrabber; name one, or a pattern, as in "framegrabber/*"',
+        'framegrabber: "framegrabber/" is not a framegrabber; name one, or a pattern, as in "framegrabber/*"',
     ),
     ({"command_rate": 0}, "command_rate: is 0; write a number from 0.5 to 50"),
     ({"command_rate": 50.1}, "command_rate: is 50.1; write a number from 0.5 to 50"),
@@ -48,12 +48,12 @@ SHARED: list[tuple[dict[str, Any], str]] = [
 OF_ONE: list[tuple[dict[str, Any], str]] = [
     ({}, "robot: is missing; add one, as in robot/scout33"),
     ({"robot": None}, "robot: is null; write a text in quotes"),
-    ({"robot": "scout33"}, f'robot: "scout33" is not the name of an RC; {RC_RULE}'),
-    ({"robot": "radio/rf0"}, 'robot: "radio/rf0" is no robot; name one, as in "robot/..."'),
-    ({"robot": "robot/*"}, f'robot: "robot/*" is not the name of an RC; {RC_RULE}'),
+    ({"robot": "scout33"}, f'robot: "scout33" is not the name of a device; {RC_RULE}'),
+    ({"robot": "radio/rf0"}, 'robot: "radio/rf0" is not a robot; name one, as in "robot/..."'),
+    ({"robot": "robot/*"}, f'robot: "robot/*" is not the name of a device; {RC_RULE}'),
     ({"robot": ["robot/scout33"]}, "robot: is a list; write a text in quotes"),
     (ONE | {"above": 3}, "above: is 3; write a text in quotes"),
-    (ONE | {"above": "x" * 101}, "Expected `str` of length <= 100 - at `$.above`; mend it"),
+    (ONE | {"above": "x" * 101}, "Expected `str` of length <= 100 - at `$.above`; correct it"),
     (TWO, "robots: unknown key; did you mean robot?"),
 ]
 
@@ -65,11 +65,14 @@ OF_NET: list[tuple[dict[str, Any], str]] = [
     ({"robots": {"robot/scout33": 1}}, "robots: is a table; write a list"),
     ({"robots": [f"robot/scout{number}" for number in range(65)]}, "robots: has 65 entries; at most 64 are allowed"),
     ({"robots": ["robot/scout33", 35]}, "robots[1]: is 35; write a text in quotes"),
-    ({"robots": ["framegrabber/fgrab1"]}, 'robots[0]: "framegrabber/fgrab1" is no robot; name one, as in "robot/..."'),
-    ({"robots": ["robot/*"]}, f'robots[0]: "robot/*" is not the name of an RC; {RC_RULE}'),
+    (
+        {"robots": ["framegrabber/fgrab1"]},
+        'robots[0]: "framegrabber/fgrab1" is not a robot; name one, as in "robot/..."',
+    ),
+    ({"robots": ["robot/*"]}, f'robots[0]: "robot/*" is not the name of a device; {RC_RULE}'),
     (
         {"robots": ["robot/scout33", "robot/scout35", "robot/scout33"]},
-        'robots[2]: "robot/scout33" stands at robots[0] already; rename or remove one of the two',
+        'robots[2]: "robot/scout33" is already at robots[0]; rename or remove one of the two',
     ),
     (TWO | {"wanted": 0}, "wanted: is 0; write a whole number from 1 to 2"),
     (TWO | {"wanted": 3}, "wanted: is 3; write a whole number from 1 to 2"),

@@ -39,17 +39,17 @@ def test_the_last_day_is_one_on_which_it_may_begin() -> None:
 def test_what_began_can_be_booked_for_as_long_as_it_can_be_taken_up() -> None:
     written = parse_date("2026-11-26 11:50", "--at")
     assert Asked.of(written, HOUR, None, None, BERLIN, NOW, 900).start.at.minute == 50
-    with pytest.raises(BadInput, match="11:50 is over"):
+    with pytest.raises(BadInput, match="11:50 is past"):
         Asked.of(written, HOUR, None, None, BERLIN, NOW, 600)
 
 
 @pytest.mark.parametrize(
     ("at", "every", "until", "why"),
     [
-        ("2026-11-26 11:59", None, None, "--at: .* 11:59 is over; by the fleet's clock it is Thu 2026-11-26 12:00"),
+        ("2026-11-26 11:59", None, None, "--at: .* 11:59 is past; by the fleet's clock it is now Thu 2026-11-26 12:00"),
         ("2028-01-01 10:00", None, None, "--at: .* is more than a year ahead"),
-        ("tue 14:00", 7, "2026-11-30", "--until: it is before the first date"),
-        ("tue 14:00", 7, "2027-12-30", "--until: at most a year ahead; write 2027-11-26 or an earlier"),
+        ("tue 14:00", 7, "2026-11-30", "--until is before the first date"),
+        ("tue 14:00", 7, "2027-12-30", "--until is more than a year ahead; write 2027-11-26 or an earlier"),
         ("2027-03-28 02:30", 1, None, "--at: 2027-03-28 02:30 does not exist .* begin with another date"),
     ],
 )  # fmt: skip
@@ -81,30 +81,33 @@ AT = ("--for", "1h", "--at", "tue 14:00")
 @pytest.mark.parametrize(
     ("args", "why"),
     [
-        (("book", "robot/a", "--for", "1h"), "Missing option '--at'"),
-        (("book", *AT), "Missing argument 'NEED...'"),
+        (("book", "robot/a", "--for", "1h"), "--at is missing"),
+        (("book", *AT), "DEVICE... is missing"),
         (("book", "robot/a", "--for", "1h", "--at", "tue"), '--at: "tue" has no time of day; write "tue 14:00"'),
         (("book", "robot/a", "--for", "soon", "--at", "9:00"), '--for: "soon" is not a duration'),
         (("book", "robot/a", "--for", "1h", "--at", "9999-12-31 23:59"), "is more than a year ahead; write an earlier"),
-        (("book", "robot/a", "--for", "1h", "--at", "0001-01-01"), "is long past; write a later one"),
+        (("book", "robot/a", "--for", "1h", "--at", "0001-01-01"), "is long past; write a later date"),
         (("book", "robot", *AT), 'need "robot": '),
-        (("book", "robot/a", *AT, "--until", "2026-12-24"), "--until is the end of what is repeated"),
-        (("book", "robot/a", *AT, "--every", "month"), '--every: "month" is not from 1 to 366 days'),
-        (("book", "robot/a", *AT, "--patience", "2h"), "--patience: it is over after 1 h"),
+        (("book", "robot/a", *AT, "--until", "2026-12-24"), "--until ends a repeated booking"),
+        (("book", "robot/a", *AT, "--every", "month"), '--every: "month" is not 1 to 366 days'),
+        (("book", "robot/a", *AT, "--patience", "2h"), "--patience is longer than the booking; write at most 1 h"),
         (("book", "robot/a", *AT, "--zone", "Berlin"), "did you mean Europe/Berlin?"),
         (("book", "robot/a", "robot/a", *AT), "robot/a is named twice"),
         (("book", "robot/a", *AT, "--name", "a b"), "--name"),
-        (("maintain", "robot/*", *AT), "robot/* may be any one RC; name those"),
-        (("maintain", "robot/a", "robot/a", *AT), "an RC is named twice"),
-        (("slots", "robot/a", "--for", "1h", "--within", "500d"), "--within: 500 d is not from 1.0 s to 366 d; write"),
+        (("maintain", "robot/*", *AT), "robot/* is a pattern; name each"),
+        (("maintain", "robot/a", "robot/a", *AT), "a device is named twice"),
+        (
+            ("slots", "robot/a", "--for", "1h", "--within", "500d"),
+            "--within: 500 d is not within 1.0 s and 366 d; write",
+        ),
         (("slots", "robot/a", "--for", "1h", "--limit", "0"), "--limit"),
-        (("unbook", "x" * 65), "names no booking"),
+        (("unbook", "x" * 65), "can't be the name of a booking"),
         (("unbook", "x", "--date", "someday"), "--date: "),
-        (("request",), "Missing argument 'NEED...'"),
-        (("request", "--booking", "x", "--min-runtime", "5"), "--min-runtime is not for --booking"),
-        (("request", "--booking", "x", "--release-after", "5"), "--release-after is not for --booking"),
-        (("request", "--booking", "x", "--dry-run"), "--dry-run is not for --booking"),
-        (("take",), "Missing argument 'NEED...'"),
+        (("request",), "DEVICE... is missing"),
+        (("request", "--booking", "x", "--min-runtime", "5"), "--min-runtime can't be used with --booking"),
+        (("request", "--booking", "x", "--release-after", "5"), "--release-after can't be used with --booking"),
+        (("request", "--booking", "x", "--dry-run"), "--dry-run can't be used with --booking"),
+        (("take",), "DEVICE... is missing"),
     ],
 )
 def test_bad_input_is_one_line_and_code_2(

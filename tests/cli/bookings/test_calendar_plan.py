@@ -110,7 +110,9 @@ def test_a_calendar_of_outlook() -> None:
         "Arm-1-Wartung Tue 01-05 16:00 for 60 min: robot/arm1", "Arm-1-Wartung Tue 02-02 16:00 for 60 min: robot/arm1",
         "Arm-1-Wartung Tue 03-02 16:00 for 60 min: robot/arm1",
     ]  # fmt: skip
-    assert skipped(found) == ['Arm 1 Besuch: its zone "Customized Time Zone 1" is none of the IANA database (failed)']
+    assert skipped(found) == [
+        'Arm 1 Besuch: its time zone "Customized Time Zone 1" is not in the IANA database (failed)'
+    ]
 
 
 def test_a_calendar_of_nextcloud() -> None:
@@ -161,7 +163,7 @@ def test_maintenance_is_of_rcs_by_name() -> None:
     assert one.book.maintenance
     assert one.book.patience == 3600
     refused = plan_of(event, maintenance=True, needs=(("robot/*", {}),))
-    assert skipped(refused) == ["arm 1: maintenance is of RCs by their names, not by pattern (failed)"]
+    assert skipped(refused) == ["arm 1: name each device for maintenance; patterns are not allowed (failed)"]
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ def test_sizes(text: str, size: int) -> None:
 
 @pytest.mark.parametrize("text", ["", "0", "M", "-1", "1e3", "5P", "1 M", "0.0001", "9" * 30, "2000000T", "٣"])
 def test_what_is_no_size_is_refused(text: str) -> None:
-    with pytest.raises(BadInput, match=r"--memory: .* is no size; write bytes, or with a unit"):
+    with pytest.raises(BadInput, match=r"--memory: .* is not a size; write bytes, or with a unit"):
         parse_size(text, "--memory")
 
 
@@ -42,10 +42,10 @@ def test_parameters_are_json_or_else_text() -> None:
         ('{"a": 1e999}', [], "is not a JSON object"),
         ("{'a': 1}", [], "is not a JSON object"),
         ("[" * 100_000, [], "is not a JSON object"),
-        (None, ["a"], '--set "a" sets nothing; write KEY=VALUE'),
-        (None, ["=1"], '--set "=1" sets nothing'),
+        (None, ["a"], '--set "a" has no value; write KEY=VALUE'),
+        (None, ["=1"], '--set "=1" has no value'),
         (None, ["a=1", "a=2"], '"a" is given twice'),
-        (None, ["a=" + "x" * 17_000], "at most 16384 are taken"),
+        (None, ["a=" + "x" * 17_000], "at most 16384 are allowed"),
     ],
 )
 def test_bad_parameters(given: str | None, settings: list[str], words: str) -> None:
@@ -57,30 +57,30 @@ def test_bad_parameters(given: str | None, settings: list[str], words: str) -> N
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        (["start"], "Missing argument 'KIND'"),
-        (["start", "a/b"], "kind 'a/b' is not valid"),
-        (["start", "counter", "--name", "a b"], "--name 'a b' is not valid"),
-        (["start", "counter", "--name", ""], "--name '' is not valid"),
+        (["start"], "KIND is missing"),
+        (["start", "a/b"], 'kind "a/b" is not valid'),
+        (["start", "counter", "--name", "a b"], '--name "a b" is not valid'),
+        (["start", "counter", "--name", ""], '--name "" is not valid'),
         (["start", "k" * 49], "has more than 48 characters; give a shorter --name"),
-        (["start", "counter", "--host", "a*"], "--host 'a*' is not valid"),
-        (["start", "counter", "--label", "a/b"], "--label 'a/b' is not valid"),
-        (["start", "counter", "--memory", "much"], '--memory: "much" is no size'),
-        (["start", "counter", "--memory-limit", "-5"], '--memory-limit: "-5" is no size'),
-        (["start", "counter", "--cpu-limit", "nan"], '--cpu-limit: "nan" is no number of cores'),
-        (["start", "counter", "--cpu-limit", "0"], '--cpu-limit: "0" is no number of cores'),
-        (["start", "counter", "--restart", "maybe"], "'maybe' is not one of"),
+        (["start", "counter", "--host", "a*"], '--host "a*" is not valid'),
+        (["start", "counter", "--label", "a/b"], '--label "a/b" is not valid'),
+        (["start", "counter", "--memory", "much"], '--memory: "much" is not a size'),
+        (["start", "counter", "--memory-limit", "-5"], '--memory-limit: "-5" is not a size'),
+        (["start", "counter", "--cpu-limit", "nan"], '--cpu-limit: "nan" is not a number of cores'),
+        (["start", "counter", "--cpu-limit", "0"], '--cpu-limit: "0" is not a number of cores'),
+        (["start", "counter", "--restart", "maybe"], '--restart: "maybe" is unknown; write one of'),
         (["start", "counter", "--timeout", "soon"], '--timeout: "soon" is not a duration'),
         (["start", "counter", *[f"--label=l{n}" for n in range(33)]], "33 labels; at most 32"),
         (["start", "counter", *[f"--host=h{n}" for n in range(257)]], "257 hosts; name at most 256"),
-        (["stop"], "Missing argument 'NAME...'"),
-        (["stop", "a/b"], "component 'a/b' is not valid"),
-        (["logs", "*"], "zscout components lists them"),
-        (["logs", "counter", "--lines", "-1"], "-1 is not in the range"),
-        (["migrate", "counter", "--to", "a/b"], "--to 'a/b' is not valid"),
-        (["drain", "*"], "host '*' is not valid"),
-        (["uncordon", ""], "host '' is not valid"),
+        (["stop"], "NAME... is missing"),
+        (["stop", "a/b"], 'component "a/b" is not valid'),
+        (["logs", "*"], "see zscout component list"),
+        (["logs", "counter", "--lines", "-1"], "-1 is out of range"),
+        (["migrate", "counter", "--to", "a/b"], '--to "a/b" is not valid'),
+        (["drain", "*"], 'host "*" is not valid'),
+        (["uncordon", ""], 'host "" is not valid'),
         (["components", "--kinds", "--watch"], "leave NAME and --watch out"),
-        (["components", "a b"], "component 'a b' is not valid"),
+        (["components", "a b"], 'component "a b" is not valid'),
     ],
 )
 def test_bad_input_is_one_line_and_2(args: list[str], words: str) -> None:
@@ -121,6 +121,6 @@ def test_the_last_lines() -> None:
 
 def test_an_unknown_name_is_told_what_there_is() -> None:
     assert str(unknown("cuonter", ["spin", "counter"])).endswith("did you mean counter?")
-    assert str(unknown("x", [])).endswith("nor any other; start one: zscout start")
+    assert str(unknown("x", [])).endswith("and there are none; start one: zscout component start KIND")
     many = str(unknown("zzz", [f"a{number}" for number in range(10)]))
     assert many.endswith("known: a0, a1, a2, a3, a4, a5, a6, a7 and 2 more")

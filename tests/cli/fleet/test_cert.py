@@ -158,7 +158,7 @@ def test_show_prints_a_line_for_each_and_takes_the_folder_that_the_environment_n
     zscout_here("cert", "show", "zscout-ca", "nowhere", "anvil")
     lines = capsys.readouterr().out.splitlines()[1:]
     assert lines[0].endswith(" CA")
-    assert "nowhere: no certificate is there; copy there what `zscout cert issue` made, or name your own" in lines[1]
+    assert "nowhere: has no certificate; copy there what `zscout cert issue` made, or name your own" in lines[1]
     assert "trusts zscout CA " in lines[2]
 
 

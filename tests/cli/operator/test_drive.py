@@ -170,4 +170,4 @@ def test_without_a_terminal_nothing_is_driven(robot: str) -> None:
         [ZSCOUT, "drive", robot], stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False
     )
     assert done.returncode == 2
-    assert done.stderr.startswith("zscout: zscout drive reads keys: run it at a terminal")
+    assert done.stderr.startswith("zscout: standard input is not a terminal, and zscout drive reads keys")

@@ -172,11 +172,11 @@ def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
     ("args", "line"),
     [
         (("request", "framegrabber/**"), "need \"framegrabber/**\": need 'framegrabber/**' is not valid: write"),
-        (("request", "framegrabber/f*"), "write kind/name with * for a whole name or $* for a part of one"),
-        (("take", "framegrabber/*#0"), "#2, #3 and so on behind it for a second and third"),
-        (("request", "radio/*:rate=1", "radio/*:rate=2"), "have different parameters; give all the same"),
-        (("request", "*/x", "radio/*:rate=2"), "can't stand beside parameters; name its kind"),
-        (("request", "fg/*#2", "fg/*#2"), "fg/*#2 is named twice; leave the numbers out, and they are given"),
+        (("request", "framegrabber/f*"), "write kind/name with * for a whole name or $* for a part of a name"),
+        (("take", "framegrabber/*#0"), "#2, #3 and so on at the end for a second and third"),
+        (("request", "radio/*:rate=1", "radio/*:rate=2"), "have different parameters; give them all the same"),
+        (("request", "*/x", "radio/*:rate=2"), "can't be combined with parameters; name a kind"),
+        (("request", "fg/*#2", "fg/*#2"), "fg/*#2 is named twice; leave the numbers out: zscout numbers them"),
     ],
 )
 def test_bad_patterns_are_one_line_with_the_remedy(

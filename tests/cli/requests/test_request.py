@@ -298,13 +298,13 @@ def test_what_can_never_start_is_refused_at_once_with_code_2(fleet: CliFleet) ->
     for command in (("request",), ("request", "--dry-run"), ("take", "--yes")):
         much = fleet.zscout(*command, "radio/rf0:rate=50")
         assert (much.returncode, much.stdout) == (2, "")
-        assert much.stderr == "zscout: can never start: rate 50 of 10 at radio/rf0; ask for less\n"
+        assert much.stderr == "zscout: can never start: rate 50 of 10 at radio/rf0; request less\n"
         typo = fleet.zscout(*command, "radio/rf0:rat=5")
         assert typo.returncode == 2
-        assert typo.stderr == "zscout: radio/rf0 knows no parameter rat; did you mean rate?\n"
+        assert typo.stderr == "zscout: radio/rf0 has no parameter rat; did you mean rate?\n"
     none = fleet.zscout("request", "robot/a:speed=1", "--", "true")
     assert none.returncode == 2
-    assert none.stderr == "zscout: robot/a knows no parameter speed; it takes none\n"
+    assert none.stderr == "zscout: robot/a has no parameter speed; it has none\n"
     fleet.state(lambda state: not state.queue and not state.holds)
 
 

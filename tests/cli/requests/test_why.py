@@ -92,7 +92,7 @@ def test_the_story_of_an_arc(tmp_path: Path) -> None:
 def test_what_names_no_arc_is_bad_input(capsys: pytest.CaptureFixture[str]) -> None:
     for name in ("", "a\nb", "x" * 300):
         assert zscout_here("why", name) == 2
-        assert capsys.readouterr().err.endswith("names no ARC; zscout status lists them\n")
+        assert capsys.readouterr().err.endswith("can't be the name of a request; see zscout status\n")
 
 
 def test_how_long_such_holds_usually_last_is_told(tmp_path: Path) -> None:

@@ -199,7 +199,7 @@ def test_what_can_t_be_done_is_one_line_and_code_2(
         ("[[rc", "line 1"),
         ('[[arc]]\nname = "a"\nat = -1\npriority = 1\nmin_runtime = 1\n[arc.needs]\n"x/y" = {}', "arc[0].at"),
         ('[[arc]]\nname = "a"\nat = nan\npriority = 1\nmin_runtime = 1\n[arc.needs]\n"x/y" = {}', "arc[0].at"),
-        ('[[arc]]\nname = "a"\nat = 0\npriority = 1\nmin_runtime = 1\n[arc.needs]', "at least one RC"),
+        ('[[arc]]\nname = "a"\nat = 0\npriority = 1\nmin_runtime = 1\n[arc.needs]', "at least one device"),
     ],
 )
 def test_a_bad_workload_is_one_line_that_names_the_file_and_code_2(

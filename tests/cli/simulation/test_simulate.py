@@ -172,13 +172,13 @@ def test_a_building_is_drawn_by_its_seed() -> None:
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        ((), "which building? name one of living_room, office, random:SEED, or a file"),
-        (("castle",), 'there is no building "castle"; name one of living_room, office'),
+        ((), "no building is given; name one of living_room, office, random:SEED, or a file"),
+        (("castle",), 'unknown building "castle"; name one of living_room, office'),
         (("castle.toml",), "castle.toml"),
         (("random:x",), "write random: and a number"),
         (("living_room", "--http", "nowhere"), "write HOST:PORT, as in"),
         (("living_room", "--http", "127.0.0.1:99999"), "write HOST:PORT, as in"),
-        (("living_room", "--radio", "/dev/null"), "/dev/null: is there already; give another name"),
+        (("living_room", "--radio", "/dev/null"), "/dev/null: already exists; give another name"),
         (("living_room", "--node", "/no/such/folder/lab.toml"), "can't be written"),
     ],
 )

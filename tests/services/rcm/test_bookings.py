@@ -247,7 +247,7 @@ async def test_maintenance_goes_before_what_is_booked_and_both_are_told() -> Non
     assert states(views["m"]) == ["open"]
     assert states(views["b"]) == ["conflict"]
     assert views["b"].dates[0].danger == "m of desk stands"
-    with pytest.raises(Refusal, match=r"bad_request.*nobody takes it up"):
+    with pytest.raises(Refusal, match=r"bad_request.*no request can use"):
         await client.ask("mine", "robot/a", "robot/b", booking="m", priority=drain.priority)
     kept = await client.ask("kept", "robot/b", seconds=30, keep=True)
     late = await client.ask("late", "robot/a", seconds=250, estimate=True)

@@ -80,7 +80,7 @@ BAD = {
     ("depth = 3.0", 'depth = 3.0\ncovering = "grass"'): (
         'covering: is the text "grass"; write "carpet", "plain", "planks" or "tiles"'
     ),
-    ("start = [2.6, 3.0]", "start = [2.6]"): ("wall[0].start: has 1 number(s); write a place as [x, y]"),
+    ("start = [2.6, 3.0]", "start = [2.6]"): ("wall[0].start: is not two numbers; write a place as [x, y]"),
     ("start = [2.6, 3.0]", "start = [2.6, 3.5]"): (
         "wall[0].start: (2.6, 3.5) is outside; write x from 0 to 4, y from 0 to 3"
     ),
@@ -99,9 +99,9 @@ BAD = {
     ),
     ("width = 1.0\n", "width = 0.05\n"): ("furniture[1].leg (desk): is 0.05 m; write at most 0.025, half of the piece"),
     ('name = "desk"', 'name = "couch"'): (
-        'furniture[1].name: "couch" stands at furniture[0] already; rename or remove one of the two'
+        'furniture[1].name: "couch" is already at furniture[0]; rename or remove one of the two'
     ),
-    ("x = 0.0\n", "x = 0.5\n"): ("light[1] (window): is a window in no outer wall; put its x or y on an outer wall"),
+    ("x = 0.0\n", "x = 0.5\n"): ("light[1] (window): is not in an outer wall; put its x or y on an outer wall"),
     ("z = 1.5", "z = 0.4"): (
         "light[1].z (window): is 0.4 m, so the window leaves its wall; "
         "give the height of its middle, half its depth or more from floor and ceiling"
@@ -110,25 +110,25 @@ BAD = {
         "light[0].z (ceiling): is 2.6 m; write at most 2.5, the room's height"
     ),
     ("path = [[-0.5, 1.0], [3.0, 1.0]]", "path = [[-0.5, 1.0]]"): (
-        "person[0].path (ada): has 1 point(s); write two or more, as in [[0.5, 1], [3, 1]]"
+        "person[0].path (ada): has less than two points; write two or more, as in [[0.5, 1], [3, 1]]"
     ),
     ("[3.0, 1.0]]", "[5.5, 1.0]]"): (
         "person[0].path[1] (ada): (5.5, 1) is outside; write x from -1 to 5, y from -1 to 4"
     ),
-    ("[3.0, 1.0]]", "[-0.45, 1.0]]"): ("person[0].path (ada): leads nowhere; move one of its points by 0.1 m or more"),
+    ("[3.0, 1.0]]", "[-0.45, 1.0]]"): ("person[0].path (ada): has no length; move one of its points by 0.1 m or more"),
     ("[3.0, 1.0]]", "[1, 2, 3]]"): ("person[0].path[1] (ada): has 3 entries; at most 2 are allowed"),
     ("id = 33", "id = 255"): ("robot[0].id (scout33): is 255; write a whole number from 0 to 254"),
-    ("id = 33", "id = 35"): ('robot[1].id (35): "35" stands at robot[0] already; rename or remove one of the two'),
+    ("id = 33", "id = 35"): ('robot[1].id (35): "35" is already at robot[0]; rename or remove one of the two'),
     ("id = 33", "id = true"): ("robot[0].id (scout33): is true; write a whole number from 0 to 254"),
     ('name = "ada"', 'name = "ada"\nspeed = 0'): ("person[0].speed (ada): is 0; write a number from 0.1 to 3"),
     ("x = 1.0\ny = 1.0", "x = 2.6\ny = 1.62"): (
-        "robot[0] (scout33): (2.6, 1.62) is in a wall or furniture, or touches it; leave 0.06 m around its middle"
+        "robot[0] (scout33): (2.6, 1.62) is in or touches a wall or furniture; leave 0.06 m around its middle"
     ),
     ("x = 1.0\ny = 1.0", "x = 2.1\ny = 1.0"): (
         "robot[1] (scout35): stands in scout33; leave 0.12 m between their middles"
     ),
     ("x = 1.0\ny = 1.0", "x = 0.05\ny = 1.0"): (
-        "robot[0] (scout33): (0.05, 1) is in a wall or furniture, or touches it; leave 0.06 m around its middle"
+        "robot[0] (scout33): (0.05, 1) is in or touches a wall or furniture; leave 0.06 m around its middle"
     ),
     ("[[person]]", "[[noise]]\nsensor = 1\n\n[[person]]"): ("noise: is a list; write a table, under [noise]"),
 }
@@ -194,4 +194,4 @@ def test_every_shipped_building_is_good() -> None:
 
 def test_a_building_without_light_is_refused(tmp_path: Path) -> None:
     dark = GOOD[: GOOD.index("[[light]]")] + GOOD[GOOD.index("[[person]]") :]
-    assert read(tmp_path, dark) == "light: there is none; add a [[light]]: cameras see nothing without"
+    assert read(tmp_path, dark) == "light: is missing; add a [[light]]: cameras see nothing without one"

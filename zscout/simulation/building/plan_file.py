@@ -95,7 +95,7 @@ def check_plan(plan: Plan, top: Where) -> None:
     for number, person in enumerate(plan.people):
         where = (top / "person").item(number, person.name) / "path"
         if len(person.path) < 2:
-            raise where.bad(f"has {len(person.path)} points", "write two or more, as in [[0.5, 1], [3, 1]]")
+            raise where.bad("has less than two points", "write two or more, as in [[0.5, 1], [3, 1]]")
         for corner, point in enumerate(person.path):
             _check_point(point, plan, where.item(corner, person.name), PORCH)
         if all(math.dist(person.path[0], point) < 0.1 for point in person.path):
@@ -104,7 +104,7 @@ def check_plan(plan: Plan, top: Where) -> None:
 
 def _check_point(point: tuple[float, ...], plan: Plan, where: Where, beyond: float = 0.0) -> None:
     if len(point) != 2:
-        raise where.bad(f"has {len(point)} numbers", "write a place as [x, y]")
+        raise where.bad("is not two numbers", "write a place as [x, y]")
     x, y = point
     if not (-beyond <= x <= plan.width + beyond and -beyond <= y <= plan.depth + beyond):
         raise where.bad(
