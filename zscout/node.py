@@ -277,15 +277,14 @@ def _end() -> None:
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
 @click.argument("file", required=False, type=click.Path(path_type=Path))
-@click.option("--check", is_flag=True, help="Say whether FILE can be used here, with its drivers, and begin nothing.")
+@click.option("--check", is_flag=True, help="Check FILE and its drivers on this host, and start nothing.")
 @click.option("--log-level", type=click.Choice(["debug", "info", "warning", "error"]), default="info")
 @click.version_option(__version__)
 def main(file: Path | None, check: bool, log_level: str) -> None:
-    """Runs this host's part of a fleet, as the node FILE (TOML) says.
+    """Run this host's part of a fleet, as the node FILE (TOML) says.
 
-    Without FILE the node stands as a candidate for the RCM of the fleet "zscout" and reports the host's load.
-    `zscout simulate --node lab.toml` writes one for a simulated building; docs/reference/configuration.md has
-    all settings.
+    Without FILE the node may lead the fleet "zscout", and reports the host's load. `zscout simulate --node lab.toml`
+    writes a node file for a simulated building; docs/reference/configuration.md lists all settings.
 
     \b
     Examples:

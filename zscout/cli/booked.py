@@ -47,7 +47,7 @@ booking_argument = click.argument("booking", type=BOOKING, metavar="NAME|ID", sh
 
 def zone_option(command: F) -> F:
     """`--zone`; None: this host's."""
-    text = "Zone of the dates, as in Europe/Berlin. Default: this host's."
+    text = "Time zone of the dates, as in Europe/Berlin. Default: this host's."
     return click.option("--zone", type=ZONE, help=text)(command)
 
 

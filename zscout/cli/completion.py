@@ -34,7 +34,7 @@ SHELLS: Final = ("bash", "zsh", "fish")
 def completion(ctx: click.Context, shell: str | None, program: str) -> None:
     """Print the completion script for a shell; without SHELL, for the one in $SHELL.
 
-    At Tab it offers commands and options, and the RCs, ARCs, hosts, components and kinds of the fleet as it is then.
+    At Tab it offers commands and options, and the current devices, requests, hosts, components and kinds of the fleet.
 
     \b
     Examples:

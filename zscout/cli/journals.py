@@ -70,7 +70,7 @@ RC: Final = Parsed("text", parse_rc_pattern)
 
 def formats(command: F) -> F:
     """`--json` and `--csv`; the parameters are `as_json` and `as_csv`."""
-    command = click.option("--csv", "as_csv", is_flag=True, help="Print CSV, with a line of names.")(command)
+    command = click.option("--csv", "as_csv", is_flag=True, help="Print CSV, with a header line.")(command)
     return click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")(command)
 
 
@@ -232,5 +232,5 @@ def holds_table(title: str, told: Told, holds: Sequence[PastHold], *, proven: bo
         styles.append(
             {"preempted": "red", "lost": "red", "client_lost": "red"}.get(hold.outcome, "" if hold.ended else "bold")
         )
-    columns = ("BEGAN", "HELD", "ARC", "WHO", "PRIORITY", "WAITED", "END", "RCS")
+    columns = ("BEGAN", "HELD", "REQUEST", "WHO", "PRIORITY", "WAITED", "END", "DEVICES")
     return Table(title, columns, rows, styles, spare={"PRIORITY", "WAITED"}, cut={"END"})

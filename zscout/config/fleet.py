@@ -343,7 +343,9 @@ def _fair_shares(file: FleetFile, access: AccessPolicy, at: Where) -> FairShares
                 f"{quoted(name)} belongs to the group {groups[0]}, and counts there", "give the group a weight"
             )
         if access.ranks and name not in access.groups and name not in access.ranks:
-            raise here.bad(f"{quoted(name)} is not a group and has no role", "name it under [groups], or mend the name")
+            raise here.bad(
+                f"{quoted(name)} is not a group and has no role", "name it under [groups], or correct the name"
+            )
     if table.patience < file.fleet.patience:
         what = f"is {table.patience / SECOND:g} s, less than fleet.patience ({file.fleet.patience / SECOND:g} s)"
         raise (at / "patience").bad(what, "write as much, or more")

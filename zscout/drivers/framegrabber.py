@@ -189,7 +189,7 @@ class FramegrabberDriver(Driver):
             return None, f"it does not receive {', '.join(videos)}; it receives {self._receives}"
         if len(self._sources) == 1:
             return next(iter(self._sources)), ""
-        return None, f"no video RC is in its gang; tune it to one of {self._receives}"
+        return None, f"no video channel is in its hold; tune it to one of {self._receives}"
 
     def _wanted(self, holder: Holder, to: object) -> str:
         if "" in self._sources:

@@ -194,7 +194,7 @@ class TransmitQueue:
         if member.bucket is None:
             raise Refused("bad_command", "this request has command_rate 0: only stops and halts are sent; request more")
         if waiting.size > member.share.size:
-            sizes = f"{waiting.size} bytes, and this ARC asked for {float(member.share.size):g}"
+            sizes = f"{waiting.size} bytes, and this request has {float(member.share.size):g}"
             raise Refused("bad_command", f"this packet has {sizes}; request packet_size = {MAX_PACKET}")
         self._release(now)
         if isinstance(command, RadioDrive):

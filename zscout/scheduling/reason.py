@@ -216,7 +216,7 @@ _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
         if one.detail and one.number == 1
         else f"{_listed(one)} not on the mesh{_because(one)}"
     ),
-    ReasonCode.NO_MATCH: lambda one: f"no RC on the mesh is left for {_listed(one)}{_because(one)}",
+    ReasonCode.NO_MATCH: lambda one: f"no device on the mesh is left for {_listed(one)}{_because(one)}",
     ReasonCode.SILENT: lambda one: f"{_listed(one)} does not answer",
     ReasonCode.UNCONFIRMED: lambda one: f"{_listed(one)} did not confirm the grant",
     ReasonCode.CLAIMED: lambda one: f"{one.detail} claims it as well",
@@ -226,15 +226,15 @@ _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
     ReasonCode.BOOKED: lambda one: f"{one.rcs[0]} is booked by {one.by[0]} before this would be over",
     ReasonCode.MAINTENANCE: lambda one: f"maintenance of {one.rcs[0]} by {one.by[0]}",
     ReasonCode.NOT_YET: lambda _: "the time of its booking is still to come",
-    ReasonCode.QUOTA: lambda one: f"host {one.detail} has {one.number} ARCs running, its quota",
-    ReasonCode.RC_QUOTA: lambda one: f"{one.detail} may hold {one.number} RCs at one time",
+    ReasonCode.QUOTA: lambda one: f"host {one.detail} has {one.number} requests running, its quota",
+    ReasonCode.RC_QUOTA: lambda one: f"{one.detail} may hold {one.number} devices at one time",
     ReasonCode.VOTING: lambda _: "votes are out",
     ReasonCode.SEARCHING: lambda _: "a better schedule is sought",
     ReasonCode.EXPIRED: lambda _: "its minimum runtime is over",
     ReasonCode.LIMIT: lambda _: "it had the longest time that this fleet gives a hold (max_runtime)",
     ReasonCode.PREEMPTED: lambda one: f"preempted by {one.by[0]}, priority {one.by[0].priority}{one.by[0].comment}",
     ReasonCode.DISPLACED: lambda one: (
-        f"its minimum runtime is over and {one.by[0]}, priority {one.by[0].priority}, needs its RCs{one.by[0].comment}"
+        f"its minimum runtime is over, and {one.by[0]}, priority {one.by[0].priority}, needs it{one.by[0].comment}"
     ),
     ReasonCode.CANCELLED: lambda one: f"cancelled by {one.detail}",
     ReasonCode.RELEASED: lambda one: f"released by {one.detail}",

@@ -112,7 +112,7 @@ def _rc(rc: _Rc, where: Where) -> WorkloadRc:
         return WorkloadRc(rc.name, rc.sharable)
     if not rc.sharable:
         raise (where / "capacity").bad(
-            "an exclusive device has one holder and no capacity", "add sharable = true, or remove it"
+            "an exclusive device has one holder, no capacity", "add sharable = true, or remove it"
         )
     _check_texts(where / "capacity", *rc.capacity)
     return WorkloadRc(rc.name, rc.sharable, amounts(rc.capacity, where / "capacity"))

@@ -87,7 +87,7 @@ AT = ("--for", "1h", "--at", "tue 14:00")
         (("book", "robot/a", "--for", "soon", "--at", "9:00"), '--for: "soon" is not a duration'),
         (("book", "robot/a", "--for", "1h", "--at", "9999-12-31 23:59"), "is more than a year ahead; write an earlier"),
         (("book", "robot/a", "--for", "1h", "--at", "0001-01-01"), "is long past; write a later date"),
-        (("book", "robot", *AT), 'need "robot": '),
+        (("book", "robot", *AT), 'device "robot" is not valid'),
         (("book", "robot/a", *AT, "--until", "2026-12-24"), "--until ends a repeated booking"),
         (("book", "robot/a", *AT, "--every", "month"), '--every: "month" is not 1 to 366 days'),
         (("book", "robot/a", *AT, "--patience", "2h"), "--patience is longer than the booking; write at most 1 h"),

@@ -96,7 +96,7 @@ def test_nothing_is_overwritten_unless_that_is_said(words: tuple[str, ...], caps
     before = {path: path.read_bytes() for path in Path().rglob("*.pem")}
     capsys.readouterr()
     assert zscout_here("cert", *words) == 2
-    assert "already; name another folder, or overwrite with --force" in capsys.readouterr().err
+    assert "; name another folder, or overwrite with --force" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in Path().rglob("*.pem")} == before
     assert zscout_here("cert", *words, "--force") == 0
     assert {path: path.read_bytes() for path in before} != before

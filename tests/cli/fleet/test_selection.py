@@ -93,4 +93,4 @@ def test_a_name_that_nothing_has() -> None:
     assert Selection(["robot/a", "anvil"], STATE, HOMES, {"anvil": Host()}).missing() is None
     missing = Selection(["robot/a", "survy"], STATE, HOMES, {"anvil": Host()}).missing()
     assert missing is not None
-    assert 'no RC, ARC or host "survy" is known; did you mean survey?' in str(missing)
+    assert 'unknown device, request or host "survy"; did you mean survey?' in str(missing)

@@ -171,7 +171,7 @@ def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
 @pytest.mark.parametrize(
     ("args", "line"),
     [
-        (("request", "framegrabber/**"), "need \"framegrabber/**\": need 'framegrabber/**' is not valid: write"),
+        (("request", "framegrabber/**"), 'pattern "framegrabber/**" is not valid; write'),
         (("request", "framegrabber/f*"), "write kind/name with * for a whole name or $* for a part of a name"),
         (("take", "framegrabber/*#0"), "#2, #3 and so on at the end for a second and third"),
         (("request", "radio/*:rate=1", "radio/*:rate=2"), "have different parameters; give them all the same"),

@@ -79,7 +79,7 @@ def test_what_can_never_start_is_refused_with_what_to_mend(need: str, params: di
         (["radio/*", "robot/arm1"], ""),
         (
             ["radio/*", "radio/*#2", "radio/*#3"],
-            "unknown_device: 3 devices that match radio/* are requested, but only radio/rf0, radio/rf1 can be used for it",
+            "unknown_device: 3 devices that match radio/* are requested, but only radio/rf0, radio/rf1 can be used",
         ),
         (["robot/*", "robot/arm1"], "unknown_device: robot/* is requested, but none but those you named"),
         (["tank/x"], "unknown_device: unknown device tank/x; zscout status lists"),

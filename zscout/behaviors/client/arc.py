@@ -171,7 +171,7 @@ class Attempt:
             async with asyncio.timeout(self._timeout):
                 grant = await self._client.granted(await self.asked(), confirmed=self._confirmed)
         except (asyncio.CancelledError, TimeoutError) as error:
-            why = self.arc.reason if self.arc is not None else "no RCM has answered"
+            why = self.arc.reason if self.arc is not None else "no leader has answered"
             if self.arc is not None:
                 await self._client.end(self.arc)
             if isinstance(error, asyncio.CancelledError):

@@ -189,7 +189,7 @@ class MovableClient:
             raise RuntimeError("pause() the client before it hands over everything: it would ask for it again")
         arcs = sorted(self._store.acknowledged, key=lambda arc: arc.grant is None)
         if len(arcs) > MAX_OTHERS + 1:
-            words = f"{len(arcs)} ARCs can't be handed over at once; {MAX_OTHERS + 1} can"
+            words = f"{len(arcs)} requests can't be handed over at once; {MAX_OTHERS + 1} can"
             raise RequestRefused(Problem("too_many", words))
         try:
             async with asyncio.timeout(HAND_OVER):
@@ -198,7 +198,7 @@ class MovableClient:
             self._store.undecided = {arc.id for arc in arcs if arc.open}
             if isinstance(error, RequestRefused):
                 raise
-            unknown = f"no RCM told within {HAND_OVER:g} s whether {to} has taken over; ask again"
+            unknown = f"no leader reported within {HAND_OVER:g} s whether {to} took over; try again"
             raise RequestRefused(Problem("unknown", unknown)) from None
 
     async def _hand_over(self, arcs: list[OpenArc], to: Sender) -> None:

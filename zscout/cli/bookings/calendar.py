@@ -45,17 +45,21 @@ _NEXT_NEED: Final = re.compile(r",(?=[^,=]*/)")
 
 @click.command()
 @click.option(
-    "--rc", type=Parsed("rc", lambda text, _: check_rc(text)), shell_complete=completion.needs, help="Of one RC."
+    "--rc",
+    type=Parsed("rc", lambda text, _: check_rc(text)),
+    shell_complete=completion.needs,
+    help="Only bookings of this device.",
 )
-@click.option("--owner", metavar="NAME", help="Of one host, or person by certificate.")
-@click.option("--out", metavar="FILE", help="The file, written as a whole; without it, or with -, stdout.")
+@click.option("--owner", metavar="NAME", help="Only bookings of one host, or of a person by certificate.")
+@click.option("--out", metavar="FILE", help="The file to write. Default, or -: stdout.")
 @click.option("--folder", type=click.Path(path_type=Path), help="Write all calendars below this folder.")
 @common.runs
 async def export(rc: str | None, owner: str | None, out: str | None, folder: Path | None) -> None:
     """Write the bookings that are not over as an iCalendar file.
 
-    With --folder it writes fleet.ics, rc/KIND/NAME.ics for each RC and owner/NAME.ics for each owner, for a web server;
-    one that has no bookings any more stays, empty. Files are replaced as a whole, and only where bookings changed.
+    With --folder it writes fleet.ics, rc/KIND/NAME.ics for each device and owner/NAME.ics for each owner, for a web
+    server; the file of a device or owner without bookings stays, empty. Files are replaced as a whole, and only if
+    bookings changed. To let calendar programs subscribe to a node, see [calendar] of the node file.
 
     \b
     Examples:
@@ -246,24 +250,26 @@ class _Import:
     "needs",
     multiple=True,
     type=Parsed("needs", parse_needs),
-    help="What every event needs: robot/a,'camera/*'.",
+    help="Devices for every event: robot/a,'camera/*'.",
 )
 @click.option(
     "--map",
     "mapped",
     multiple=True,
-    metavar="WORDS=NEEDS",
+    metavar="WORDS=DEVICES",
     type=Parsed("mapping", _mapping),
-    help="What an event needs whose title, place or resources have these words.",
+    help="Devices for events with these words in title, place or resources.",
 )
 @zone_option
-@click.option("--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="Of all.")
-@click.option("--patience", type=Parsed("duration", parse_duration), help="As of zscout book. Default: 15 min.")
-@click.option("--maintenance", is_flag=True, help="Keep the RCs free of everybody then, as an operator.")
-@click.option("--calendar", "name", metavar="NAME", help="What this calendar is called. Default: the file's name.")
-@click.option("--sync", is_flag=True, help="Give up what was imported from it and is not in it any more.")
-@click.option("--again", is_flag=True, help="Book again what was imported, and unbooked since.")
-@click.option("--dry-run", is_flag=True, help="Only say what would be done.")
+@click.option(
+    "--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="Priority of every booking."
+)
+@click.option("--patience", type=Parsed("duration", parse_duration), help="Patience of every booking. Default: 15 min.")
+@click.option("--maintenance", is_flag=True, help="Make each booking a maintenance, as an operator.")
+@click.option("--calendar", "name", metavar="NAME", help="Name of this calendar. Default: the file's name.")
+@click.option("--sync", is_flag=True, help="Cancel bookings whose events are no longer in the calendar.")
+@click.option("--again", is_flag=True, help="Book again events that were imported and cancelled since.")
+@click.option("--dry-run", is_flag=True, help="Print what would be done, and do nothing.")
 @common.json_option("Print one JSON object.")
 @common.runs
 async def import_(
@@ -280,14 +286,14 @@ async def import_(
     dry_run: bool,
     as_json: bool,
 ) -> int:
-    """Book the events of an iCalendar FILE (- is stdin): of Google, Outlook, Nextcloud and others.
+    """Book the events of an iCalendar FILE (- is stdin), from Google, Outlook, Nextcloud and others.
 
-    What an event needs is what --needs and --map say; where they say nothing, the RCs that its resources name. Others
-    are left out, as are events that are over, cancelled, or whose people are free then. To import it again books
-    nothing twice; what was changed in it is another booking, so that --sync is wanted then. Times without a zone, and
-    whole days, are of --zone.
+    --needs and --map say which devices an event needs; without either, the devices that its resources name. Other
+    events are left out, as are those that are over, cancelled, or marked as free. Importing again books nothing
+    twice; an event that changed is another booking, so use --sync then. Times without a zone, and whole days, are in
+    --zone.
 
-    The exit code is 1 where something was not booked that should have been.
+    Exit code 1: an event could not be booked.
 
     \b
     Examples:

@@ -107,9 +107,7 @@ def _components(lines: Contentlines, where: Where) -> Iterator[dict[str, list[Co
         name = named[1].upper() if named is not None else ""
         if not inside and name != "BEGIN":
             if line.strip():
-                raise where.bad(
-                    "is not an iCalendar file", "export it as .ics; such a file begins with BEGIN:VCALENDAR"
-                )
+                raise where.bad("is not an iCalendar file", "export it as .ics, beginning with BEGIN:VCALENDAR")
         elif name == "BEGIN":
             inside.append(line.partition(":")[2].strip().upper()[:32])
             if inside[0] != "VCALENDAR" or len(inside) > MAX_DEPTH:
@@ -231,4 +229,4 @@ def _zone(named: str) -> ZoneInfo:
             return zone_of("/".join(parts[-count:])[:64])
         except ValueError:
             continue
-    raise ValueError(f"its time zone {quoted(name)} is not in the IANA database")
+    raise ValueError(f"its time zone {quoted(name)} is not an IANA zone")

@@ -35,7 +35,7 @@ TIMES: Final = 8
 LOOK_BACK: Final = 31 * DAY
 """Seconds: what began so long ago may not be over yet."""
 OVER, FREE, CANCELLED = "over, or begun", "of people who are free then", "cancelled"
-NO_RC = "naming no RC"
+NO_RC = "naming no device"
 NO_DATE = "without a date to come"
 LATER = "more than a year ahead: import it again then"
 

@@ -39,22 +39,22 @@ from zscout.terminal import Table, clean
 
 
 @click.command()
-@click.option("--mine", is_flag=True, help="Only your own.")
+@click.option("--mine", is_flag=True, help="Only your own bookings.")
 @click.option(
     "--rc",
     type=journals.RC,
     shell_complete=completion.needs,
-    help="Only those that may have this RC, or one of a pattern: robot/*.",
+    help="Only bookings that may have this device, or a device of a pattern: robot/*.",
 )
 @zone_option
 @common.json_option("Print one JSON object.")
 @common.runs
 async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: bool) -> None:
-    """List bookings, the next date first: who has which devices from when to when, and what endangers that.
+    """List bookings, the next date first: owner, devices, times, and what endangers them.
 
-    Of what is repeated the next date is listed, and those of the next 60 days that are in danger; --json has all of
-    these. A state is `open` until somebody has taken the date up, then `taken`; in `conflict` is what another one
-    stands in the way of: maintenance, or what was booked in the other half of a fleet.
+    A repeated booking shows its next date, and those of the next 60 days that are in danger; --json has all of them.
+    A date is `open` until a request uses it, then `taken`; in `conflict` another booking takes precedence:
+    maintenance, or a booking made in the other half of a split fleet.
 
     \b
     Examples:
@@ -135,7 +135,7 @@ def _table(found: Sequence[BookingView], me: User, zone: ZoneInfo | None) -> Tab
             row = (one.name, short(one), whose(one), date_words(one.start, zone), "later", str(one.priority))
             lines.append((one.start, (*row, _repeated(one, zone), rcs_words(one)), ""))
     lines.sort(key=lambda line: line[0])
-    columns = ("NAME", "ID", "WHO", "WHEN", "STATE", "PRIORITY", "REPEATED", "RCS")
+    columns = ("NAME", "ID", "WHO", "WHEN", "STATE", "PRIORITY", "REPEATED", "DEVICES")
     rows, styles = [line[1] for line in lines], [line[2] for line in lines]
     return Table("", columns, rows, styles, spare={"PRIORITY", "REPEATED"})
 
@@ -163,15 +163,16 @@ def _style(booking: BookingView, date: BookedDate, me: User) -> str:
 
 @click.command()
 @booking_argument
-@click.option("--date", "at", type=DATE, help="Of what is repeated only this date: a day, or a day and a time.")
+@click.option("--date", "at", type=DATE, help="Only this date of a repeated booking: a day, or a day and a time.")
 @zone_option
 @common.json_option("Print one JSON object.")
 @common.runs
 async def unbook(booking: str, at: WrittenDate | None, zone: ZoneInfo | None, as_json: bool) -> None:
-    """Give up a booking, or one date of it: by its name, its id, or the beginning of its id.
+    """Cancel a booking, or one date of it: by its name, its id, or the beginning of its id.
 
-    A name is one of your own bookings, if you have one called so, else anybody's; who may end it the fleet says. Who
-    has taken it up goes on. A name that several have is refused with the list of them.
+    A name means your own booking, if you have one of that name, else anybody's; the fleet decides who may cancel it.
+    A request that already uses the booking keeps running. If several bookings have the name, it is refused with the
+    list of them.
 
     \b
     Examples:

@@ -33,15 +33,16 @@ UNKNOWN: Final = 3
 
 @click.command()
 @component_argument
-@click.option("-f", "--follow", is_flag=True, help="Go on until it has ended, wherever it moves.")
-@click.option("--lines", type=click.IntRange(0, 100_000), help="Only the last so many lines of what there is.")
-@host_option("--host", "What it wrote there; else where it ran last.")
+@click.option("-f", "--follow", is_flag=True, help="Print new output until the component ends, on any host.")
+@click.option("--lines", type=click.IntRange(0, 100_000), help="Print only the last so many lines.")
+@host_option("--host", "Output on this host. Default: where it ran last.")
 @common.runs
 async def logs(name: str, follow: bool, lines: int | None, host: str | None) -> None:
-    """Print the output of a component, of its running or its last incarnation.
+    """Print the output of a component: of its running or its last incarnation.
 
-    Its host keeps the last 64 KiB of each, until zscout-node ends there. With --follow also what comes, on whichever
-    host it goes on; changes of host and its end are told on stderr. At a terminal control characters are left out.
+    Its host keeps the last 64 KiB of each incarnation, until zscout-node ends there. --follow prints new output as
+    well, on whichever host the component continues; moves and its end are reported on stderr. At a terminal control
+    characters are left out.
 
     \b
     Examples:
@@ -125,7 +126,7 @@ class Reader:
         if output.incarnation > self._incarnation:
             begun, self._incarnation = self._incarnation, output.incarnation
             if begun:
-                self._tell(f"{self._name} goes on on {self._host}")
+                self._tell(f"{self._name} continues on {self._host}")
             if self._at:
                 self._at = 0
                 return await self._read()

@@ -17,14 +17,15 @@ from zscout.messages import DrainHost, MigrateComponent, Placement, Placements, 
 
 @click.command()
 @placing.component_argument
-@placing.host_option("--to", "Where to. Default: the best other host.")
+@placing.host_option("--to", "Host to move to. Default: the best other host.")
 @common.json_option("Print one JSON object.")
 @common.runs
 async def migrate(name: str, to: str | None, as_json: bool) -> None:
-    """Move a running component to another host, with its state and all that it holds.
+    """Move a running component to another host, with its state and its holds.
 
-    Only what can give and take a checkpoint can be moved. Says where it went, and for how long it was out of
-    work. If it fails, the component goes on where it was. Exit code 2: there is no host of that name.
+    Only a kind with checkpoint() and restore() can be moved. Prints the new host, and for how long the component was
+    out of work. If the move fails, the component keeps running where it was. Exit code 2: there is no host of that
+    name.
 
     \b
     Examples:
@@ -83,14 +84,14 @@ async def _moved(placer: PlacerClient, shown: placing.Progress, before: Placemen
 
 @click.command()
 @placing.host_argument
-@timeout_option("Wait at most so long until it is empty, then exit with 1.")
+@timeout_option("Wait this long until it is empty, then exit with 1.")
 @common.json_option("Print one JSON object.")
 @common.runs
 async def drain(host: str, timeout: float | None, as_json: bool) -> None:
-    """Place nothing on a host any more, and move away what can be moved.
+    """Place nothing on a host any more, and move away every component that can be moved.
 
-    Ends when no movable component is left; exit code 1 names what stays, and why. The host stays cordoned,
-    also after Ctrl-C or --timeout, until zscout uncordon.
+    Ends when no movable component is left; exit code 1 names those that stay, and why. The host stays cordoned, also
+    after Ctrl-C or --timeout, until zscout uncordon.
 
     \b
     Examples:
@@ -135,7 +136,7 @@ async def drain(host: str, timeout: float | None, as_json: bool) -> None:
 @common.json_option("Print one JSON object.")
 @common.runs
 async def uncordon(host: str, as_json: bool) -> None:
-    """Use a host again that was drained. Nothing moves back by itself.
+    """Use a drained host again. Components that left it do not move back by themselves.
 
     \b
     Example:

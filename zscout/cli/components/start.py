@@ -95,39 +95,39 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
 
 @click.command(context_settings={"show_default": False})
 @click.argument("kind", type=common.NAME, shell_complete=completion.kinds)
-@click.option("--name", metavar="NAME", type=common.NAME, help="What the component is called. Default: its kind.")
+@click.option("--name", metavar="NAME", type=common.NAME, help="Name of the component. Default: its kind.")
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="A parameter; a VALUE may be JSON.")
 @click.option("--params", metavar="JSON", help="All parameters, as a JSON object.")
-@placing.host_option("--host", "Run nowhere but there; given several times, on one of them.", multiple=True)
-@click.option("--label", metavar="LABEL", type=common.NAME, multiple=True, help="What its host must have.")
-@click.option("--memory", type=SIZE, default=0, help="What its host must have available, as in 500M.")
-@click.option("--metric", type=click.Choice(METRICS), default="composite", help="What hosts are judged by.")
-@click.option("--policy", type=click.Choice(POLICIES), default="pending", help="How one is chosen of them.")
+@placing.host_option("--host", "Run only on this host; repeat it for several.", multiple=True)
+@click.option("--label", metavar="LABEL", type=common.NAME, multiple=True, help="A label that its host must have.")
+@click.option("--memory", type=SIZE, default=0, help="Memory that its host must have available, as in 500M.")
+@click.option("--metric", type=click.Choice(METRICS), default="composite", help="Figure by which hosts are compared.")
+@click.option("--policy", type=click.Choice(POLICIES), default="pending", help="How a host is chosen.")
 @click.option(
     "--restart",
     type=click.Choice(["never", "on-failure", "always"]),
     default="on-failure",
     show_default=True,
-    help="Whether it is started again when it has ended.",
+    help="When to start it again after it ended.",
 )
-@click.option("--memory-limit", type=SIZE, default=0, help="What it may use at most, as in 500M.")
-@click.option("--cpu-limit", type=CORES, help="Cores that it may use at most, as in 0.5.")
+@click.option("--memory-limit", type=SIZE, default=0, help="Memory that it may use, as in 500M.")
+@click.option("--cpu-limit", type=CORES, help="Cores that it may use, as in 0.5.")
 @click.option("--no-wait", is_flag=True, help="Don't wait until it runs.")
-@timeout_option("Wait at most so long until it runs, then exit with 1.")
+@timeout_option("Wait this long until it runs, then exit with 1.")
 @common.json_option("Print one JSON object.")
 @common.runs
 async def start(
     kind: str, name: str | None, no_wait: bool, timeout: float | None, as_json: bool, **wanted: Any
 ) -> None:
-    """Have a component run on the best host of the fleet, and keep it running.
+    """Run a component on the best host of the fleet, and keep it running.
 
-    KIND is the name of what is installed on the hosts: zscout component kinds lists them. The component stays placed
-    when this command ends, also by Ctrl-C or --timeout: it is started as soon as a host will do, and elsewhere when its
-    host dies, until zscout component stop. Asked for again with the same settings, it is not started twice.
+    KIND is the name of a kind that is installed on a host: see zscout component kinds. The component stays placed when
+    this command ends, also by Ctrl-C or --timeout: it starts as soon as a host can run it, and on another host when its
+    host dies, until zscout component stop. Starting it again with the same settings does not start it twice.
 
     \b
-    Exit code: 0 it runs, or has completed already; 1 it was refused or given up, or
-    did not run in time; 3 no RCM. The last output of one that is given up goes to stderr.
+    Exit code: 0 it runs, or has completed; 1 it was refused or given up, or did not run
+    in time; 3 no leader. If it is given up, its last output goes to stderr.
 
     \b
     Examples:
@@ -224,13 +224,13 @@ async def _until_settled(placer: PlacerClient, shown: placing.Progress, name: st
 @click.argument(
     "names", type=placing.COMPONENT, nargs=-1, required=True, metavar="NAME...", shell_complete=completion.components
 )
-@timeout_option("Wait at most so long for the end, then exit with 1.")
+@timeout_option("Wait this long for the end, then exit with 1.")
 @common.json_option("Print one JSON object.")
 @common.runs
 async def stop(names: Sequence[str], timeout: float | None, as_json: bool) -> None:
-    """End components for good: they are asked to end, and killed if they don't.
+    """End components for good: each is asked to end, and killed if it does not.
 
-    Returns when they have ended. What they held is given back. One that has ended before is no error.
+    Returns when all have ended; what they held is given back. A component that has already ended is no error.
 
     \b
     Examples:

@@ -231,7 +231,7 @@ def _member(address: str, certificate: Validity, objection: str, seen: Evidence)
     """A host whose certificate is of a CA of ours."""
     name = f"{certificate.name} ({address})"
     if seen.at >= certificate.ends:
-        says = f"the certificate of {name} has ended on {shown(certificate.ends)}"
+        says = f"the certificate of {name} expired on {shown(certificate.ends)}"
         yield Finding("security", "mend", says, "renew it (zscout cert renew), and restart its node if that is alone")
     elif seen.at < certificate.begins:
         says = f"the certificate of {name} is valid from {shown(certificate.begins)} on"
@@ -370,7 +370,7 @@ def _devices(seen: Evidence) -> Iterator[Finding]:
         says = f"not there: {_listed(rcs)} of {home or 'no known host'}" + (f" ({why})" if why else "")
         yield Finding("devices", "mend", says, f"{remedy}{'' if there else ','} or {else_do}")
     if well and not missing:
-        yield Finding("devices", "ok", f"{many(well, 'RC')} there and well")
+        yield Finding("devices", "ok", f"{many(well, 'device')} there and well")
 
 
 def _hosts(seen: Evidence) -> Iterator[Finding]:

@@ -76,7 +76,7 @@ def parse_recorded_past(text: str, option: str) -> Ns:
     "--bind",
     metavar="IP",
     default="127.0.0.1",
-    help="Where web page and live stream are served; anything but loopback shows them to other hosts.",
+    help="Address for the web page and live stream; anything but loopback shows them to other hosts.",
 )
 @click.option(
     "--port",
@@ -87,12 +87,12 @@ def parse_recorded_past(text: str, option: str) -> Ns:
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
     default=Path("runs"),
-    help="Where no node of this host records: the folder of the live recording.",
+    help="Folder of the live recording, if no node of this host records.",
 )
 @click.option(
     "--past",
     type=common.Parsed("duration", parse_recorded_past),
-    help="Likewise: for how long before now it shows what the journals tell; 0: nothing. [default: 24h]",
+    help="Show this much of the past from the journals, if no node of this host records; 0: none. [default: 24h]",
 )
 @common.json_option("Print one JSON object as soon as it is served or recorded: url, live, file.")
 @common.runs
@@ -101,10 +101,10 @@ async def view(
 ) -> None:
     """Open the recording FILE (.rrd), or show the fleet live.
 
-    Where a node of this host records (the table [recorder] in its file), its recording is shown with its past;
-    elsewhere the fleet is recorded from now on. What was held before a recording is shown as the journals tell it. The
-    viewer is a window of its own, which ends the command when it is closed. On a host without a display use --web.
-    Ctrl-C ends everything that was started; a recording that was started here is complete then.
+    If a node of this host records (table [recorder] in its file), its recording is shown with its past; else the
+    fleet is recorded from now on, and earlier holds come from the journals. The viewer is a window of its own;
+    closing it ends the command. On a host without a display use --web. Ctrl-C ends everything that was started, and
+    completes a recording that was started here.
 
     \b
     Examples:

@@ -33,16 +33,16 @@ MAX_ANSWER = 4_096
 @click.option("-y", "--yes", is_flag=True, help="Don't ask.")
 @click.option("--no-keep", is_flag=True, hidden=True, help="--min-runtime is what --release-after is.")
 @click.option(
-    "--reason", type=Parsed("text", parse_comment), default="", help="Why: shown to whom it preempts, and in status."
+    "--reason", type=Parsed("text", parse_comment), default="", help="The reason, shown to the preempted and in status."
 )
 @hold_options
 @common.runs
 async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, reason: str, comment: str, **rest: Any) -> int:
     """Take devices at the fleet's operator priority, and keep them.
 
-    Says who will be preempted and asks, on stderr; without a terminal it needs --yes. Then it waits, holds and runs a
-    COMMAND as `zscout request` does, with the same exit codes; 1 also where the question was not answered with y. A
-    NEED is written as there, and refused for the same reasons (2).
+    It prints whom it will preempt and asks on stderr; if stdin is not a terminal, add --yes. Then it waits, holds and
+    runs a COMMAND as `zscout request` does, with the same exit codes; 1 also if you did not answer y. A DEVICE is
+    written as for `zscout request`, and refused for the same reasons (2).
 
     \b
     Examples:

@@ -19,7 +19,7 @@ MAX_LISTED: Final = 20
 TRIES: Final = 3
 TIMEOUT: Final = 1.0
 
-every_option = click.option("--all", "every", is_flag=True, help="All ARCs of that name, not only one.")
+every_option = click.option("--all", "every", is_flag=True, help="All requests of that name, not only one.")
 
 
 @click.command()
@@ -28,10 +28,10 @@ every_option = click.option("--all", "every", is_flag=True, help="All ARCs of th
 @common.json_option("Print one JSON object.")
 @common.runs
 async def cancel(arc: str, every: bool, as_json: bool) -> None:
-    """End an ARC, whether it runs or waits: by name, id, or <host>/<client>/<id>.
+    """End a request, whether it holds or waits: by name, id, or <host>/<client>/<id>.
 
-    Its program is told; one that `zscout request` runs is stopped. A name that
-    several ARCs have is refused with the list of them, unless --all is given.
+    Its program is notified; a program that `zscout request` runs is stopped. If several requests have the name, it is
+    refused with the list of them, unless --all is given.
 
     \b
     Examples:
@@ -48,10 +48,10 @@ async def cancel(arc: str, every: bool, as_json: bool) -> None:
 @common.json_option("Print one JSON object.")
 @common.runs
 async def release(arc: str, every: bool, as_json: bool) -> None:
-    """End the hold of a running ARC: by name, id, or <host>/<client>/<id>.
+    """End the hold of a request: by name, id, or <host>/<client>/<id>.
 
-    The same as `zscout cancel`, but only for ARCs that run: one that waits is
-    left alone. A name that several have is refused, unless --all is given.
+    The same as `zscout cancel`, but it leaves a waiting request alone. If several requests have the name, it is
+    refused, unless --all is given.
 
     \b
     Examples:

@@ -205,37 +205,33 @@ def hold_options(command: F, *, needs_required: bool = True) -> F:
             shell_complete=completion.needs,
         ),
         json_option("Print JSON lines, one for each event."),
-        click.option("--wait-for-device", is_flag=True, help="Wait for a device that nobody knows, too."),
-        click.option(
-            "--again", is_flag=True, help="Ask again and run the command again, when it was ended for others."
-        ),
+        click.option("--wait-for-device", is_flag=True, help="Wait for devices that are unknown, too."),
+        click.option("--again", is_flag=True, help="Repeat request and command if the devices were taken away."),
         click.option(
             "--release-after",
             type=Parsed("duration", parse_duration),
-            help="Give back after so long, though nobody waits; instead of --min-runtime.",
+            help="Give the devices back after this time, even if nobody waits; instead of --min-runtime.",
         ),
         click.option(
             "--grace",
             type=Parsed("duration", partial(parse_duration, zero=True)),
-            help="Between SIGTERM and SIGKILL to the command: at most, and by default, nine tenths of what its devices "
+            help="Time from SIGTERM to SIGKILL for the command: at most, and by default, nine tenths of what devices "
             "settle (`settle`, 5 s).",
         ),
-        timeout_option("Wait at most so long for a grant, then exit with 1."),
+        timeout_option("Wait this long for a grant, then exit with 1."),
         click.option(
             "--min-runtime",
             type=Parsed("duration", parse_duration),
-            help="For how long it is yours against all of equal priority: 90s, 5m, 2h, 1d12h. Default: the "
+            help="Protect the hold this long from requests of equal priority: 90s, 5m, 2h, 1d12h. Default: the "
             "fleet's, 60 s.",
         ),
         click.option(
             "--comment",
             type=Parsed("text", parse_comment),
             default="",
-            help="What others are to know: shown in status and to who waits for it.",
+            help="A comment, shown in status and to requests that wait for the devices.",
         ),
-        click.option(
-            "--name", help="What the ARC is called. Default: the command's name, else request (take: operator)."
-        ),
+        click.option("--name", help="Name of the request. Default: the command's name, else request (take: operator)."),
     ):
         command = option(command)
     return command

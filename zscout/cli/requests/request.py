@@ -46,13 +46,16 @@ REFRESH: Final = 1.0
 
 @click.command(cls=CommandAfterDashes)
 @click.option(
-    "--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="Higher ones preempt lower ones."
+    "--priority",
+    type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY),
+    default=0,
+    help="Higher priorities preempt lower ones.",
 )
 @click.option("--keep", is_flag=True, hidden=True, help="What happens without it as well.")
+@click.option("--booking", type=BOOKING, shell_complete=completion.bookings, help="Use this booking: its name or id.")
 @click.option(
-    "--booking", type=BOOKING, shell_complete=completion.bookings, help="Take this booking up: its name or id."
+    "--dry-run", is_flag=True, help="Print when it would start and what it would preempt at once, and request nothing."
 )
-@click.option("--dry-run", is_flag=True, help="Only say when it would start, and whom it would preempt at once.")
 @partial(hold_options, needs_required=False)
 @common.runs
 async def request(
@@ -60,40 +63,41 @@ async def request(
 ) -> int:
     """Wait until all of the devices are granted at once, then hold them.
 
-    A NEED is kind/name, and for a sharable device how it will be used: radio/rf0:command_rate=5,other=1. With a * it is
-    met by any one device whose name matches: 'framegrabber/*' is any framegrabber, 'robot/scout$*' any robot whose name
-    begins so; twice the same is two of them. Quote it for the shell.
+    A DEVICE is kind/name; for a sharable device add its use: radio/rf0:command_rate=5,other=1. A * stands
+    for any name: 'framegrabber/*' is any one framegrabber, 'robot/scout$*' any one robot whose name begins with
+    scout. Write a pattern twice to get two devices, and quote it for the shell.
 
-    They are yours for the minimum runtime, in which only a higher priority takes them, and after it until somebody of
-    the same or a higher priority waits for one of them. --release-after gives them back though nobody waits.
+    Your hold is protected for the minimum runtime: until then only a request of higher priority takes the devices.
+    After that you keep them until a request of equal or higher priority waits for one of them. --release-after
+    gives them back even if nobody waits.
 
-    With --booking, a booking is taken up, which has its own NEEDs, priority and time: it waits for its next date.
+    With --booking the request uses a booking, with its devices, priority and time, and waits for its next date.
 
-    With a COMMAND, they are held while it runs, and given back as soon as nothing of it is left. When its time is over
-    or the grant is taken away, the command and all that it started get SIGTERM, and SIGKILL after the grace; so they do
-    when this program dies or hangs. The next holder waits until nothing is left. --again asks anew then, and runs it
-    again. Without a COMMAND, they are held until Ctrl-C or until their time is over.
+    With a COMMAND the devices are held while it runs, and given back when none of its processes is left. When its
+    time is over or the grant is taken away, the command and its processes get SIGTERM, and SIGKILL after the grace;
+    the same happens if zscout dies or hangs. The next holder waits until no process is left. --again then repeats
+    request and command. Without a COMMAND the devices are held until Ctrl-C or until the time is over.
 
     \b
     The command finds in its environment:
-      ZSCOUT_ARC, ZSCOUT_ARC_ID  the ARC's name and id
+      ZSCOUT_ARC, ZSCOUT_ARC_ID  name and id of the request
       ZSCOUT_RCS                 the devices, with spaces between
-      ZSCOUT_BOUND               which of them meets which pattern, as JSON:
+      ZSCOUT_BOUND               the device for each pattern, as JSON:
                                  {"framegrabber/*": "framegrabber/fgrab1"}
-      ZSCOUT_GRANT               the grant as JSON, to be sent with each command
-      ZSCOUT_CLIENT              who holds it: <host>/<client>
+      ZSCOUT_GRANT               the grant as JSON, to send with each command
+      ZSCOUT_CLIENT              the holder: <host>/<client>
       ZSCOUT_REMAINING           seconds until the minimum runtime is over
       ZSCOUT_FLEET_NAME          the fleet; ZSCOUT_FLEET its file, if there is one
 
     \b
     Exit code: the command's own (128 + n: ended by signal n), or
       75   the grant was taken away before its time
-      124  its time was over: somebody waited after the minimum runtime, or --release-after
+      124  its time was over: another request waited after the minimum runtime, or --release-after
       126  it can't be executed           127  there is no such command
-      1    not granted; without a command also: taken away    3  no RCM
-      2    it can never start: a device that nobody knows, a parameter that it does not know, or too much of one
+      1    not granted; without a command also: taken away    3  no leader
+      2    it can never start: an unknown device or parameter, or too much of one
 
-    With a COMMAND all lines of zscout go to stderr.
+    With a COMMAND zscout prints to stderr only.
 
     \b
     Examples:
@@ -267,7 +271,7 @@ async def _tell_who_is_old(report: Report, held: Held, client: Client, direct: D
     reply = await client.mesh.ask_one(key, asked, RcmState, timeout=QUERY_TIMEOUT)
     state, who = reply.message if reply is not None else None, [] if direct is None else direct.never_settle
     if state is not None and any(hold.grant == held.grant and not hold.direct for hold in state.holds):
-        who = [f"the RCM at {state.host} ({version_words(state.version)}, this is {VERSION})", *who]
+        who = [f"the leader at {state.host} ({version_words(state.version)}, this is {VERSION})", *who]
     if who:
         told = f"the next holder may begin before the command is gone: {', '.join(who)} can't make it wait; upgrade"
         report.event("not_settling", told, who=who)
@@ -396,7 +400,7 @@ class Report(LiveLine):
             self.changed.clear()
             arc = self._arc
             if arc is None:
-                self.draw(f"{self._name}: asking the RCM")
+                self.draw(f"{self._name}: asking the leader")
             elif arc.state == "running" and arc.settling == arc.grant:
                 self._show_settling(arc)
             elif arc.state in ("asking", "queued") and arc.reason:

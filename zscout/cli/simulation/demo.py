@@ -108,12 +108,9 @@ def recording_option(command: F) -> F:
     default="living_room",
     help="As in zscout simulate: a name, a TOML file, or random:SEED.",
 )
-@click.option("--seed", type=click.IntRange(0), default=1, help="Of noise, slip and people.")
+@click.option("--seed", type=click.IntRange(0), default=1, help="Seed of noise, slip and people.")
 @click.option(
-    "--speed",
-    type=click.FloatRange(0.2, 4.0),
-    default=1.5,
-    help="How many of the building's seconds pass in one of ours.",
+    "--speed", type=click.FloatRange(0.2, 4.0), default=1.5, help="Seconds of the building in one real second."
 )
 @recording_option
 @live_options
@@ -121,13 +118,10 @@ def recording_option(command: F) -> F:
 def robots(building: str, seed: int, speed: float, out: Path | None, web: bool, view: bool, as_json: bool) -> int:
     """Hide the robots of a building in the dark, and have them watch.
 
-    There are four of them, two framegrabbers and one radio. It serves a simulated building, starts three
-    nodes with its devices on this machine, apart from every other fleet, and has the component placer place
-    a sensor net. In the middle an operator takes one robot, drives it and gives it back. It ends when all
-    robots are hidden and somebody has walked by, or a minute of the building later, at the latest after two
-    and a half minutes of ours. It leaves nothing but a recording; so does Ctrl-C.
-
-    Exit code: 0 all robots came to be hidden; 1 not all of them did.
+    It serves a simulated building with four robots, two framegrabbers and one radio, starts three nodes with these
+    devices on this machine, apart from every other fleet, and places a sensor net. Halfway an operator takes one robot,
+    drives it and gives it back. It ends when all robots are hidden and a person has walked by, or a minute of the
+    building later, after at most two and a half minutes. Only a recording is left, also after Ctrl-C.
 
     \b
     Examples:

@@ -55,7 +55,7 @@ def _too_few(pattern: str, left: Sequence[RcName], wanted: Mapping[str, int]) ->
         else f"{pattern} is requested"
     )
     there = f"only {', '.join(left[:MAX_NAMED])}" if left else "none but those you named"
-    return Refused("unknown_device", f"{what}, but {there} can be used for it; request fewer")
+    return Refused("unknown_device", f"{what}, but {there} can be used; request fewer")
 
 
 def _unknown(need: Need, known: Collection[RcName], *, may_wait: bool) -> Refused:
