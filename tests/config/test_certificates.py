@@ -63,7 +63,11 @@ def test_it_can_be_used_by_whom_it_names_from_a_while_ago_until_its_end(anvil: P
     for now, name, words in (
         (NOW - timedelta(minutes=61), "anvil", "is not valid before 2030-05-01 11:00 UTC; set this host's clock"),
         (found.ends, "anvil", "expired on 2030-07-30 12:00 UTC; renew it"),
-        (NOW, "bellows", 'is the certificate of "anvil", and this is "bellows"; put that of "bellows" there'),
+        (
+            NOW,
+            "bellows",
+            'is the certificate of "anvil", but this host is "bellows"; put the certificate of "bellows" there',
+        ),
     ):
         with pytest.raises(BadInput) as error:
             found.check(now, name)

@@ -75,7 +75,7 @@ def runs(bound: dict[str, str], step: int = 2, grant: Grant = FIRST) -> Notice:
             [RUNS, AGAIN],
             "running",
             SECOND_GRANT,
-            ("lost", "the RCM took this client for gone; it is granted anew", None),
+            ("lost", "the leader took this client for gone; it is granted again", None),
         ),
         ([RUNS, notice(3, "ended", outcome="completed")], "ended", None, ("completed", "", None)),
         ([RUNS, notice(1)], "running", FIRST, None),

@@ -93,7 +93,7 @@ def test_a_certificate_that_ends_soon_is_told_of_every_host_and_of_ones_own_once
         "bellows", Role.NODE, Role.LOAD, certificate_ends_in=-60.0, renew=True, version=VERSION
     )
     ends = [
-        "the certificate of anvil ends in 1 d; renew it (zscout cert renew)",
+        "the certificate of anvil expires in 1 d; renew it (zscout cert renew)",
         "the certificate of bellows has ended 1 min ago; renew it (zscout cert renew)",
     ]
     for own in (certificates("anvil", lasts=40 * DAY, begun=39 * DAY), certificates()):

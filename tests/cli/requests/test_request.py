@@ -162,7 +162,7 @@ def test_a_command_goes_on_past_its_minimum_runtime_until_an_equal_waits(fleet: 
     lines = out_of(kept).read()
     assert kept.wait(HANG) == 124
     assert "told" in lines
-    why = f"its minimum runtime is over and {by('true')}, priority 0, needs its RCs"
+    why = f"its minimum runtime is over, and {by('true')}, priority 0, needs it"
     assert f"the time of kept is over: {why}\n" in lines
     assert fleet.idle("robot/a")
 

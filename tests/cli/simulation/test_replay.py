@@ -97,7 +97,7 @@ def test_table_1_gives_table_2_as_a_table(table1: Path) -> None:
     assert head == ["seconds", *map(str, range(18))]
     assert [(row[0], " ".join(row[1:])) for row in rows] == list(TABLE2.items())
     assert "arc2 at 11 s by arc4, after 3 of 4 s; ran again from 14 s" in shown.stdout
-    assert "0 ARCs unserved" in shown.stdout
+    assert "0 requests unserved" in shown.stdout
     assert "\x1b" not in shown.stdout
 
 
@@ -166,7 +166,7 @@ def test_nothing_at_all_is_said_in_one_line(tmp_path: Path, capsys: pytest.Captu
     file = tmp_path / "empty.toml"
     file.write_text("")
     assert zscout_here("replay", file) == 0
-    summary = "Strategy priority: 0 ARCs on 0 RCs; 0 holds, 0 preempted, over 0 s; 0 ARCs unserved\n"
+    summary = "Strategy priority: 0 requests on 0 devices; 0 holds, 0 preempted, over 0 s; 0 requests unserved\n"
     assert capsys.readouterr().out == summary
     assert zscout_here("replay", file, "--json") == 0
     assert capsys.readouterr().out == '{"strategy": "priority", "holds": [], "unserved": []}\n'
