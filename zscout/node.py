@@ -247,9 +247,7 @@ def _places_key(fleet: Fleet) -> bytes | None:
 
 def _say_if_alone(mesh: Mesh) -> None:
     if mesh.links() == 0:
-        log.warning(
-            "no link to any other node or program yet; if there should be, `zscout doctor` with the node file says why"
-        )
+        log.warning("no link to any other node or program yet; if you expect one, run zscout doctor NODE_FILE")
 
 
 async def _main(node: Node, read: Callable[[], Node], manager: ServiceManager) -> None:

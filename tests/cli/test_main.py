@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from tests.cli import tools
 from tests.hang import HANG
 from tests.live.lab import Lab
-from zscout.cli.groups import LazyGroup, booking, component
+from zscout.cli.groups import LazyGroup, booking, component, instead
 from zscout.cli.main import HABITS, HEADINGS, INSTEAD, OLD, main
 from zscout.cli.requests.options import gather_needs, parse_duration, parse_need
 from zscout.config.strict import BadInput
@@ -69,8 +69,6 @@ def test_an_old_spelling_has_the_meaning_and_options_of_the_new(old: str, new: s
                 command = below
         return command
 
-    if old == "calendar":  # a group, of which each command has its own line
-        return
     before, now = found(old), found(new)
     if old in ("keys", "components --kinds"):
         assert {name for param in now.params for name in param.opts} >= {"--json"}
@@ -115,10 +113,9 @@ def test_an_unknown_command_is_one_line_with_a_hint(name: str, words: str) -> No
 
 
 def test_a_habit_leads_to_a_command_that_is_there() -> None:
-    for line in HABITS.strip().splitlines():
-        words, _, names = line.partition(" = ")
-        assert words.split()[0] in main.table or words.startswith("--"), line
-        assert not {*names.split()} & {*main.table, *OLD}, line
+    for name, words in instead(HABITS).items():
+        assert words.split()[0] in main.table or words.startswith("--"), name
+        assert name not in {*main.table, *OLD}
 
 
 @pytest.mark.parametrize(

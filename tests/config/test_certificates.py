@@ -147,13 +147,10 @@ def _long(folder: Path) -> None:
         (_other_key, "key.pem: is not the key of cert.pem; "),
         (_other_ca, "cert.pem: was not issued by a CA in ca.pem (zscout CA "),
         (_leaf_as_ca, "ca.pem: has a certificate that is not a CA's; "),
-        (lambda folder: (folder / "key.pem").chmod(0o644), "key.pem: may be read by others (mode 644); chmod 640 "),
-        (lambda folder: (folder / "key.pem").chmod(0o620), "key.pem: may be written by others (mode 620); chmod 640 "),
-        (lambda folder: (folder / "ca.pem").chmod(0o666), "ca.pem: may be written by others (mode 666); chmod 644 "),
-        (
-            lambda folder: (folder / "cert.pem").chmod(0o646),
-            "cert.pem: may be written by others (mode 646); chmod 644 ",
-        ),
+        (lambda folder: (folder / "key.pem").chmod(0o644), "key.pem: may be read by others (644); chmod 640 "),
+        (lambda folder: (folder / "key.pem").chmod(0o620), "key.pem: may be written by others (620); chmod 640 "),
+        (lambda folder: (folder / "ca.pem").chmod(0o666), "ca.pem: may be written by others (666); chmod 644 "),
+        (lambda folder: (folder / "cert.pem").chmod(0o646), "cert.pem: may be written by others (646); chmod 644 "),
     ],
 )
 def test_what_can_not_be_used_is_told_in_one_line(anvil: Path, spoil: Callable[[Path], object], words: str) -> None:
@@ -252,7 +249,7 @@ def test_a_ca_that_is_broken_open_or_expired_issues_nothing(ca: CertificateAutho
     with pytest.raises(BadInput, match=r"ca.pem: this CA expired on 2040-04-28 12:00 UTC; "):
         CertificateAuthority.read(ca.folder, NOW + YEARS)
     key.chmod(0o640)
-    with pytest.raises(BadInput, match=r"ca-key.pem: may be read by others \(mode 640\); chmod 600 "):
+    with pytest.raises(BadInput, match=r"ca-key.pem: may be read by others \(640\); chmod 600 "):
         CertificateAuthority.read(ca.folder, NOW)
     key.chmod(0o600)
     other = authority(tmp_path / "other-ca")

@@ -72,10 +72,10 @@ BAD_FLEETS = {
         "fair_shares.patience: is 100 s, less than fleet.patience (142 s); write as much, or more"
     ),
     '[roles]\nclient = ["bob"]\n[groups]\narms = ["bob"]\n[fair_shares.weights]\nbob = 2': (
-        'fair_shares.weights.bob: "bob" belongs to the group arms, and counts there; give the group a weight'
+        'fair_shares.weights.bob: "bob" belongs to the group arms; give the group a weight'
     ),
     '[roles]\nclient = ["bob"]\n[fair_shares.weights]\nlegs = 2': (
-        'fair_shares.weights.legs: "legs" is not a group and has no role; name it under [groups], or correct the name'
+        'fair_shares.weights.legs: "legs" is not a group and has no role; add it under [groups], or correct it'
     ),
     "[fleet]\noperator_priority = 1.0": ("fleet.operator_priority: is 1.0; write a whole number from 0 to 1000000000"),
     "[fleet]\noperator_priority = true": (
@@ -126,9 +126,7 @@ BAD_FLEETS = {
     # Security
     "[security]": "security.folder: is missing; add it",
     '[security]\nfolder = ""': 'security.folder: "" is not a folder; name one, as in folder = "/etc/zscout/keys"',
-    '[security]\nfolder = "k"': (
-        'roles: no host may lead, though there is [security]; write manager = ["anvil"] under [roles]'
-    ),
+    '[security]\nfolder = "k"': ('roles: with [security], no host may lead; write manager = ["anvil"] under [roles]'),
     CLOSED + '[mesh]\nlisten = ["tcp/0.0.0.0:7447"]': (
         'mesh.listen[0]: "tcp/0.0.0.0:7447" is not TLS; write tls/host:port, or remove [security]'
     ),
@@ -150,9 +148,7 @@ BAD_FLEETS = {
         'access."robot/x"[0]: "arms" has no role; name it under [roles], or correct the name'
     ),
     "[quotas]\na = { rcs = 1 }": 'quotas[0]: "a" has no role; name it under [roles], or correct the name',
-    "[ceilings.viewer]\npriority = 1": (
-        'ceilings.viewer: only requests of clients and operators have a ceiling; write "client"'
-    ),
+    "[ceilings.viewer]\npriority = 1": ('ceilings.viewer: only clients and operators have a ceiling; write "client"'),
 }
 
 

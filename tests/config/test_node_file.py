@@ -25,7 +25,7 @@ BAD_NODES = {
     '[node]\nload = "yes"': 'node.load: is the text "yes"; write true, false or "tree"',
     "[notify]": "notify: sends nothing to anybody; name urls or users, or remove the table",
     '[node]\ncandidate = false\n[notify]\nurls = ["json://a"]': "notify: this host never leads, "
-    "and only the leader sends notices; move the table to a host that may lead",
+    "and only the leader sends notices; move it to a candidate",
     # No secret is shown.
     '[notify]\nurls = "json://user:secret@a"': f"notify.urls: {UNSHOWN}; "
     'write texts in a list, as in ["mailtos://user:password@example.org"]',

@@ -58,7 +58,7 @@ BAD = {
     'arm\nport = "x"\nspeed = 101': "rc[0] (arm/a): speed is above 100, which bends it; write less; correct it",
     'arm\nport = "gone"': (
         "rc[0].driver (arm/a): zscout_arm.Arm can't be made: KeyError: 'gone'; "
-        "mend that package, or install what it needs; --log-level debug shows more"
+        "fix that package, or install its needs; --log-level debug shows more"
     ),
     "bare\nport = 1": "rc[0].port (arm/a): unknown key; known here: none",
     'odd\nport = "x"': (
@@ -79,11 +79,11 @@ BAD = {
     ),
     "broken": (
         "rc[0].driver (arm/a): broken:Arm of package broken 1.0 can't be loaded: ModuleNotFoundError: No module named "
-        "'no_such_vendor'; mend that package, or install what it needs; --log-level debug shows more"
+        "'no_such_vendor'; fix that package, or install its needs; --log-level debug shows more"
     ),
     "quits": (
         "rc[0].driver (arm/a): quits:Arm of package quits 1.0 can't be loaded: SystemExit: no licence\\x1b[2J; "
-        "mend that package, or install what it needs; --log-level debug shows more"
+        "fix that package, or install its needs; --log-level debug shows more"
     ),
     "twice": (
         'rc[0].driver (arm/a): "twice" comes with one:Arm of package one 1.0 and two:Arm of package two 1.0; '

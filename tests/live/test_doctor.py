@@ -247,9 +247,9 @@ async def test_a_name_that_is_not_the_certificates_is_told_before_joining(tmp_pa
     lab.node("cart")
     await lab.logged("cart", "is on the mesh")
     (keys / "key.pem").chmod(0o644)
-    await mends(lab, [f"{keys}/key.pem: may be read by others (mode 644)"], file)
+    await mends(lab, [f"{keys}/key.pem: may be read by others (644)"], file)
     (keys / "ca.pem").chmod(0o666)
-    await mends(lab, [f"{keys}/ca.pem: may be written by others (mode 666)"], file)
+    await mends(lab, [f"{keys}/ca.pem: may be written by others (666)"], file)
 
 
 async def test_status_and_doctor_warn_of_every_certificate_that_ends_soon(tmp_path: Path, lab: ClosedLab) -> None:

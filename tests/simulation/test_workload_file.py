@@ -82,7 +82,7 @@ BAD = {
     ),
     RC + "sharable = 1": "rc[0].sharable (robot/a): is 1; write true or false",
     RC + "capacity = {rate = 1}": (
-        "rc[0].capacity (robot/a): an exclusive device has one holder, no capacity; add sharable = true, or remove it"
+        "rc[0].capacity (robot/a): an exclusive device has no capacity; add sharable = true, or remove it"
     ),
     RADIO + "capacity = 1": "rc[0].capacity (radio/r): is 1; write a table",
     RADIO + "capacity = {rate = -0.1}": "rc[0].capacity.rate (radio/r): is -0.1; write 0 or more",

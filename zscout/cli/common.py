@@ -95,7 +95,6 @@ def run(main: Coroutine[Any, Any, T]) -> T:
 
 
 def runs(main: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
-    """Lets a coroutine function be a command's."""
 
     @wraps(main)
     def command(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -171,7 +170,6 @@ async def until(true: Callable[[], bool], changed: asyncio.Event, seconds: float
 
 @asynccontextmanager
 async def beside(work: Coroutine[Any, Any, Any]) -> AsyncIterator[None]:
-    """Runs `work` for as long as the context lasts."""
     task = asyncio.ensure_future(work)
     try:
         yield

@@ -104,13 +104,11 @@ async def rcs(mesh: Mesh, kind: str) -> Iterable[str]:
 
 @_on_mesh
 async def needs(mesh: Mesh, _parameter: str) -> Iterable[str]:
-    """RCs of all kinds."""
     return await _rc_names(mesh)
 
 
 @_on_mesh
 async def arcs(mesh: Mesh, _parameter: str) -> Iterable[str]:
-    """Names of ARCs that are open."""
     return _arc_names(await _state(mesh))
 
 

@@ -67,9 +67,7 @@ class WrittenDate:
             unit = 1 if self.after < SOON else 60
             return Found(datetime.fromtimestamp(math.ceil((now + self.after) / unit) * unit, zone))
         if self.time is None:
-            raise BadInput(
-                f"{self.option}: {quoted(self.text)} has no time of day; write {quoted(f'{self.text} 14:00')}"
-            )
+            raise BadInput(f"{self.option}: {quoted(self.text)} has no time; write {quoted(f'{self.text} 14:00')}")
         today = datetime.fromtimestamp(now, zone).date()
         found = local(datetime.combine(self._day(today), self.time), zone)
         if found.at.timestamp() <= now and (self.day is None or isinstance(self.day, int)):
@@ -153,7 +151,6 @@ def _time(text: str, bad: BadInput) -> time:
 
 
 def local(naive: datetime, zone: ZoneInfo) -> Found:
-    """The instant of a local time."""
     first, second = (naive.replace(tzinfo=zone, fold=fold) for fold in (0, 1))
     before, after = first.utcoffset(), second.utcoffset()
     if before is None or after is None or before == after:
@@ -185,7 +182,6 @@ def parse_every(text: str, option: str) -> int:
 
 
 def every_words(days: int) -> str:
-    """`every day`, `every week`, `every 2 weeks`, `every 10 days`."""
     count, unit = (days // 7, "week") if days % 7 == 0 else (days, "day")
     return f"every {unit}" if count == 1 else f"every {count} {unit}s"
 
@@ -230,7 +226,6 @@ def in_zone(at: float, zone: ZoneInfo | None) -> datetime:
 
 
 def date_words(at: float, zone: ZoneInfo | None) -> str:
-    """`Tue 2026-12-01 14:00`, with seconds where there are any."""
     there = in_zone(at, zone)
     return f"{there:%a %Y-%m-%d %H:%M}" + (f":{there:%S}" if there.second else "")
 

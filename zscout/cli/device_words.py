@@ -14,7 +14,6 @@ def ending(name: str, left: float) -> str:
 
 
 def absence(view: RcView) -> str:
-    """Why it is not there, as far as that is known."""
     if view.present or not view.reason:
         return ""
     return view.reason if view.gone is None else f"{view.reason} since {clock(-view.gone)}"

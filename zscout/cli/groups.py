@@ -26,14 +26,14 @@ def at_terminal() -> bool:
 
 
 def instead(text: str) -> dict[str, str]:
-    """Name: what to write instead, from lines such as `status = ps queue`."""
-    lines = (line.partition(" = ") for line in text.split("\n") if line)
-    return {name: words for words, _, names in lines for name in names.split()}
+    """Name: what to write instead, from a text such as `status = ps queue; book = reserve`."""
+    parts = (part.strip().partition(" = ") for part in text.replace("\n", ";").split(";"))
+    return {name: words for words, _, names in parts for name in names.split()}
 
 
 class LazyGroup(click.Group):
-    """The commands of `headings`, and hidden ones for `old` spellings (name: the command). `instead` has what to
-    write for an old spelling or for a name that never was a command; `old OPTION` may differ from `old`."""
+    """The commands of `headings`, and hidden ones for `old` spellings (name: the new words), of which `own` have a
+    command of their own. `instead` has what to write for old spellings, with an option too, and for habits."""
 
     def __init__(
         self,
@@ -41,25 +41,30 @@ class LazyGroup(click.Group):
         headings: Headings,
         instead: Mapping[str, str],
         old: Mapping[str, str] | None = None,
+        own: Mapping[str, str] | None = None,
         **more: Any,
     ) -> None:
         super().__init__(*args, **more)
-        self.headings, self.instead, self.old = headings, instead, old or {}
+        self.headings, self.instead, self.old, self.own = headings, instead, old or {}, own or {}
         self.table = {name: entry for part in headings.values() for name, entry in part.items()}
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return [*self.table, *self.old]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        found = self.table[cmd_name][0] if cmd_name in self.table else self.old.get(cmd_name)
-        if found is None:
+        command: Any = self
+        if cmd_name in self.table or cmd_name in self.own:
+            module, _, attribute = (self.own.get(cmd_name) or self.table[cmd_name][0]).partition(":")
+            command = getattr(import_module(f"zscout.{module}"), attribute)
+        elif cmd_name in self.old:
+            for word in self.old[cmd_name].split():
+                command = command.get_command(ctx, word)
+        else:
             return None
-        module, _, attribute = found.partition(":")
-        command: click.Command = getattr(import_module(f"zscout.{module}"), attribute)
         if cmd_name in self.old:
             command = copy(command)
             command.hidden = True
-        return command
+        return command  # type: ignore[no-any-return]
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -105,12 +110,8 @@ component = LazyGroup(
         }
     },
     instead=instead("""
-list = ls ps status show top
-logs = log output tail
-stop = kill rm remove delete end cancel
-start = run add create launch place
-migrate = move mv
-kinds = kind types available
+list = ls ps status show top; logs = log output tail; stop = kill rm remove delete end cancel
+start = run add create launch place; migrate = move mv; kinds = kind types available
 """),
     help="""Start programs by name on the best host, keep them running, and move them.
 
@@ -122,11 +123,6 @@ kinds = kind types available
     """,
 )
 
-_CALENDARS: Final = {
-    "export": ("cli.bookings.calendar:export", "Write bookings as iCalendar files."),
-    "import": ("cli.bookings.calendar:import_", "Book the events of an iCalendar file."),
-}
-
 booking = LazyGroup(
     "booking",
     headings={
@@ -134,14 +130,11 @@ booking = LazyGroup(
             "list": ("cli.bookings.listing:bookings", "List bookings: who has which devices, and when."),
             "show": ("cli.bookings.listing:show", "Show one booking with all its dates."),
             "cancel": ("cli.bookings.listing:unbook", "Cancel a booking, or one date of it."),
-            **_CALENDARS,
+            "export": ("cli.bookings.calendar:export", "Write bookings as iCalendar files."),
+            "import": ("cli.bookings.calendar:import_", "Book the events of an iCalendar file."),
         }
     },
-    instead=instead("""
-list = ls all
-show = info get
-cancel = rm remove delete unbook end
-"""),
+    instead=instead("list = ls all; show = info get; cancel = rm remove delete unbook end"),
     help="""List, show and cancel bookings, and exchange them with calendar programs.
 
     To book devices: zscout book.
@@ -150,19 +143,6 @@ cancel = rm remove delete unbook end
     Examples:
       zscout booking list --mine
       zscout booking cancel survey --date 2026-12-08
-      zscout booking export --out fleet.ics
-      zscout booking import lab.ics --map 'Arm 1=robot/arm1' --dry-run
-    """,
-)
-
-calendar = LazyGroup(
-    "calendar",
-    headings={"Commands": _CALENDARS},
-    instead={},
-    help="""Write bookings as iCalendar files, and book what such files have: now `zscout booking export` and `import`.
-
-    \b
-    Examples:
       zscout booking export --out fleet.ics
       zscout booking import lab.ics --map 'Arm 1=robot/arm1' --dry-run
     """,

@@ -43,9 +43,7 @@ def parse_past(text: str, option: str) -> float:
     if option == "--until":
         ago = max(0.0, ago)  # up to now
     if not 0 <= ago <= MAX_AGO:
-        raise BadInput(
-            f"{option}: {quoted(text)} is {'in the future' if ago < 0 else 'too long ago'}; write {PAST_FORMS}"
-        )
+        raise BadInput(f"{option}: {quoted(text)} is {'in future' if ago < 0 else 'too far back'}; write {PAST_FORMS}")
     return ago
 
 
@@ -91,9 +89,7 @@ def names_of(fleet: Fleet, users: Sequence[str], group: str | None) -> list[str]
     names = [*users]
     if group is not None:
         if not fleet.access.groups.get(group):
-            known = (
-                f"known: {', '.join(sorted(fleet.access.groups)[:8])}" if fleet.access.groups else "it has no groups"
-            )
+            known = f"known: {', '.join(sorted(fleet.access.groups)[:8])}" if fleet.access.groups else "there are none"
             raise BadInput(f"--group: the fleet file has no group {quoted(group)} with members; {known}")
         names += fleet.access.groups[group]
     if len(names) > MAX_ASKED_NAMES:
@@ -117,7 +113,6 @@ async def ask_journals(client: Client, asked: HistoryAsk, most: int) -> Told:
 
 
 def remarks(told: Told) -> Iterable[str]:
-    """What is not known, in lines."""
     for one in told.unknown:
         yield f"from {local(one.began)} to {local(one.ended)} not all is known: {told.causes(one)}"
     if told.without:
@@ -125,7 +120,6 @@ def remarks(told: Told) -> Iterable[str]:
 
 
 def as_json(told: Told, fleet: str, **of: object) -> dict[str, Any]:
-    """As `--json` prints it, with what is told `of` the window."""
     candidates: list[dict[str, Any]] = [
         {
             "host": host,
@@ -146,12 +140,10 @@ def as_json(told: Told, fleet: str, **of: object) -> dict[str, Any]:
 
 
 def utc(at: float) -> str:
-    """For programs: `2026-11-20T14:30:05.123Z`."""
     return datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def local(at: float) -> str:
-    """For people, by this host's zone: `2026-11-20 14:30:05`."""
     return f"{datetime.fromtimestamp(at).astimezone():%Y-%m-%d %H:%M:%S}"
 
 
@@ -163,7 +155,6 @@ def person(hold: PastHold, *, proven: bool) -> str:
 
 
 def held(hold: PastHold, now: float) -> float:
-    """Seconds for which it stood, or has stood until now."""
     return max(0.0, (now if hold.ended is None else hold.ended) - hold.began)
 
 
@@ -180,7 +171,6 @@ def used_sum(hold: PastHold, now: float) -> float | None:
 
 
 def ending(hold: PastHold) -> str:
-    """How it ended, in a few words."""
     if hold.ended is None:
         return "stands"
     words = {"unheard": "end not heard", "client_lost": "client lost", "handed_over": "handed over"}
@@ -192,7 +182,6 @@ def ending(hold: PastHold) -> str:
 
 
 def hold_json(hold: PastHold, now: float) -> dict[str, Any]:
-    """As `--json` prints it: times in UTC, spans in seconds."""
     spans = {"held": round(held(hold, now), 3), "used": used(hold, now), "used_rc_seconds": used_sum(hold, now)}
     return structs.asdict(hold) | _times(hold.began, hold.ended) | spans
 

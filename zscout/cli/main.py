@@ -63,59 +63,33 @@ HEADINGS: Final[Headings] = {
     },
 }
 OLD: Final = {
-    "bookings": "cli.bookings.listing:bookings",
-    "unbook": "cli.bookings.listing:unbook",
-    "calendar": "cli.groups:calendar",
-    "start": "cli.components.start:start",
-    "stop": "cli.components.start:stop",
-    "components": "cli.components.components:components",
-    "logs": "cli.components.logs:logs",
-    "migrate": "cli.components.moves:migrate",
-    "keys": "cli.fleet.keys:keys",
-    "watch": "cli.operator.watch:motion",
+    "bookings": "booking list",
+    "unbook": "booking cancel",
+    "calendar": "booking",
+    **{name: f"component {name}" for name in ("start", "stop", "logs", "migrate")},
+    "components": "component list",
+    "keys": "doctor --keys",
+    "watch": "motion",
 }
+"""What to write instead of old spellings."""
 HABITS: Final = """
-status = ps list ls queue squeue sinfo who show info jobs stat state devices nodes hosts
-status --watch = top htop monitor
+status = ps list ls queue squeue sinfo who show info jobs stat state devices nodes hosts; status --watch = top htop
 request = lock acquire hold get grab claim alloc allocate salloc ask wait checkout submit
-request DEVICE -- COMMAND = run exec srun sbatch
-book = reserve schedule
-release = unlock free return give drop yield
-cancel = kill scancel abort end rm delete remove
-take = preempt steal seize takeover
-component logs = log output tail
-component migrate = move mv
-component kinds = kinds types
-why = explain reason
-view = timeline viewer gui ui rerun
-view --web = web dashboard
-history = sacct events journal past
-booking export = export ics
-booking import = import
-maintain = maintenance
-drain = cordon
-uncordon = undrain resume
-doctor = check diagnose debug ping
-node = daemon serve up agent server
-cert = certs certificate login
-simulate = sim simulator
-motion = detect camera
---version = version
---help = help commands
+request DEVICE -- COMMAND = run exec srun sbatch; book = reserve schedule; take = preempt steal seize takeover
+release = unlock free return give drop yield; cancel = kill scancel abort end rm delete remove
+component logs = log output tail; component migrate = move mv; component kinds = kinds types
+why = explain reason; view = timeline viewer gui ui rerun; view --web = web dashboard
+history = sacct events journal past; booking export = export ics; booking import = import; maintain = maintenance
+drain = cordon; uncordon = undrain resume; doctor = check diagnose debug ping; node = daemon serve up agent server
+cert = certs certificate login; simulate = sim simulator; motion = detect camera; --version = version; --help = help
 """
 """What to write, and names that people try for it and that never were commands."""
 INSTEAD: Final = {
-    "bookings": "booking list",
-    "unbook": "booking cancel",
-    "calendar": "booking export, or import",
-    "calendar export": "booking export",
-    "calendar import": "booking import",
-    **{name: f"component {name}" for name in ("start", "stop", "logs", "migrate")},
-    "components": "component list",
+    **instead(HABITS),
+    **OLD,
     "components --kinds": "component kinds",
-    "keys": "doctor --keys",
-    "watch": "motion",
-} | instead(HABITS)
+    **{f"calendar {name}": f"booking {name}" for name in ("export", "import")},
+}
 
 OK, COULD_NOT, BAD_INPUT, NOBODY, INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -282,6 +256,7 @@ def _drop_unwritten() -> None:
     headings=HEADINGS,
     instead=INSTEAD,
     old=OLD,
+    own={"keys": "cli.fleet.keys:keys"},
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100, "show_default": True},
 )
 @click.option(

@@ -158,9 +158,7 @@ def check_access(policy: AccessPolicy, at: Where) -> None:
     _check_known(policy.quotas, known, at / "quotas")
     for rank in policy.ceilings:
         if rank not in ("client", "operator"):
-            raise (at / "ceilings" / rank).bad(
-                "only requests of clients and operators have a ceiling", 'write "client"'
-            )
+            raise (at / "ceilings" / rank).bad("only clients and operators have a ceiling", 'write "client"')
 
 
 def _check_known(names: Collection[str], known: Collection[str], at: Where) -> None:

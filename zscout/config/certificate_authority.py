@@ -94,9 +94,7 @@ class CertificateAuthority:
         if own is None:
             raise key_where.bad(f"does not match any certificate in {CA}", _COPY)
         if now >= own.not_valid_after_utc:
-            raise where.bad(
-                f"this CA expired on {shown(own.not_valid_after_utc)}", "make a new CA with `zscout cert ca`"
-            )
+            raise where.bad(f"this CA expired on {shown(own.not_valid_after_utc)}", "make a new one: zscout cert ca")
         return cls(folder, own, key, trusted)
 
     def issue(self, name: str, folder: Path, lasts: timedelta, now: datetime, *, manager: bool = False) -> datetime:
@@ -117,9 +115,7 @@ class CertificateAuthority:
         where = Where(str(folder / CERT))
         old = _parsed(read_text(folder / CERT, max_bytes=MAX_FILE).encode(), where)[0]
         if not any(_has_issued(ca, old) for ca in _parsed(self._trusted, Where(str(self.folder / CA)))):
-            raise where.bad(
-                f"was not issued by a CA in {self.folder / CA}", "name the folder of its CA by --ca, or issue it again"
-            )
+            raise where.bad(f"was not issued by a CA in {self.folder / CA}", "name its CA by --ca, or issue it again")
         name = ", ".join(str(one.value) for one in old.subject.get_attributes_for_oid(NameOID.COMMON_NAME))
         check_name(name, where)
         if new_key:

@@ -125,9 +125,7 @@ def read_certificates(folder: Path) -> Certificates:
             side.load_cert_chain(folder / CERT, folder / KEY)
     except ssl.SSLError as error:
         if "MISMATCH" in (error.reason or ""):
-            raise key.bad(
-                f"is not the key of {CERT}", "copy both from one folder that `zscout cert issue` made"
-            ) from None
+            raise key.bad(f"is not the key of {CERT}", "copy both from one folder of `zscout cert issue`") from None
         raise key.bad("has no readable private key", _MAKE) from None
     except OSError as error:
         raise key.bad(f"can't be read: {error.strerror}", "check its permissions") from None
@@ -136,9 +134,7 @@ def read_certificates(folder: Path) -> Certificates:
     except ssl.SSLCertVerificationError as error:
         if error.verify_code in UNKNOWN_ISSUER:
             known = ", ".join(one.name for one in cas)
-            raise cert.bad(
-                f"was not issued by a CA in {CA} ({known})", f"copy {CA} and {CERT} from one folder"
-            ) from None
+            raise cert.bad(f"was not issued by a CA in {CA} ({known})", "copy both from one folder") from None
         raise cert.bad(f"can't be used for zscout: {error.verify_message}", _MAKE) from None
     except ssl.SSLError as error:
         raise cert.bad(f"can't be used: {error.reason or error}", _MAKE) from None
@@ -157,9 +153,7 @@ def read_places_key(folder: Path) -> bytes | None:
     with suppress(ValueError):
         if len(key := bytes.fromhex(read_text(path, max_bytes=MAX_FILE))) == PLACES_KEY_BYTES:
             return key
-    raise Where(str(path)).bad(
-        f"is not {PLACES_KEY_BYTES} bytes in hexadecimal", f"copy {PLACES_KEY} from the CA's folder"
-    )
+    raise Where(str(path)).bad(f"is not {PLACES_KEY_BYTES} hex bytes", f"copy {PLACES_KEY} from the CA's folder")
 
 
 def read_cas(path: Path) -> list[Validity]:
@@ -183,9 +177,7 @@ def check_mode(path: Path, forbidden: int, remedy: str) -> None:
         raise
     if mode & forbidden:
         done = "read" if mode & forbidden & 0o044 else "written" if mode & forbidden & 0o022 else "used"
-        raise Where(str(path)).bad(
-            f"may be {done} by others (mode {mode:03o})", f"chmod {remedy} {shlex.quote(str(path))}"
-        )
+        raise Where(str(path)).bad(f"may be {done} by others ({mode:03o})", f"chmod {remedy} {shlex.quote(str(path))}")
 
 
 def shown(at: datetime) -> str:

@@ -222,6 +222,4 @@ def _check_words(words: Words, at: Where) -> None:
         raise at.bad("has no program", f"name one first, as in {A_COMMAND}")
     for number, word in enumerate(words):
         if "\0" in word or len(word) > MAX_SOURCE:
-            raise at.item(number).bad(
-                f"{quoted(word)} can't be an argument", f"write {MAX_SOURCE:,} characters at most"
-            )
+            raise at.item(number).bad(f"{quoted(word)} can't be an argument", f"{MAX_SOURCE:,} characters at most")

@@ -339,13 +339,9 @@ def _fair_shares(file: FleetFile, access: AccessPolicy, at: Where) -> FairShares
         here = at / "weights" / name
         check_name(name, here)
         if groups := access.groups_of(name):
-            raise here.bad(
-                f"{quoted(name)} belongs to the group {groups[0]}, and counts there", "give the group a weight"
-            )
+            raise here.bad(f"{quoted(name)} belongs to the group {groups[0]}", "give the group a weight")
         if access.ranks and name not in access.groups and name not in access.ranks:
-            raise here.bad(
-                f"{quoted(name)} is not a group and has no role", "name it under [groups], or correct the name"
-            )
+            raise here.bad(f"{quoted(name)} is not a group and has no role", "add it under [groups], or correct it")
     if table.patience < file.fleet.patience:
         what = f"is {table.patience / SECOND:g} s, less than fleet.patience ({file.fleet.patience / SECOND:g} s)"
         raise (at / "patience").bad(what, "write as much, or more")
@@ -369,9 +365,7 @@ def check_security(fleet: Fleet, top: Where) -> None:
         return
     access = fleet.access
     if not access.roles.manager:
-        raise (top / "roles").bad(
-            "no host may lead, though there is [security]", 'write manager = ["anvil"] under [roles]'
-        )
+        raise (top / "roles").bad("with [security], no host may lead", 'write manager = ["anvil"] under [roles]')
     for name in ("listen", "connect"):
         for number, endpoint in enumerate(getattr(fleet.mesh, name)):
             if not endpoint.startswith("tls/"):

@@ -241,9 +241,7 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
         _check_roles(host, (rc.name for rc in rcs), fleet.access, top)
         leads = leads and "manager" in fleet.access.ranks_of(host)
     if file.notify is not None and not leads:
-        raise (top / "notify").bad(
-            "this host never leads, and only the leader sends notices", "move the table to a host that may lead"
-        )
+        raise (top / "notify").bad("only the leader sends notices, and this host never leads", "move it to a candidate")
     return Node(
         host=host,
         fleet=fleet,

@@ -94,9 +94,7 @@ def robot_command(do: Mapping[str, Any]) -> RobotCommand:
 def _read(do: Mapping[str, Any], kind: Any, names: tuple[str, ...]) -> Any:
     name = do.get("name")
     if name not in names:
-        raise Refused(
-            "unknown_command", f"unknown command {quoted(str(name)[:64])}; this device knows {', '.join(names)}"
-        )
+        raise Refused("unknown_command", f"unknown command {quoted(str(name)[:64])}; there are {', '.join(names)}")
     try:
         return msgspec.convert(do, kind)
     except msgspec.ValidationError as error:

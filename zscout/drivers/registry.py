@@ -112,6 +112,4 @@ def _unfit(at: Where, what: str, error: BaseException) -> BadInput:
     log.debug("%s: %s", at.key, what, exc_info=error)
     remedy = f"it {missing}" if isinstance(error, ImportError) and (missing := how_to_get(error)) else ""
     words = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-    return at.bad(
-        f"{what}: {words}", remedy or "mend that package, or install what it needs; --log-level debug shows more"
-    )
+    return at.bad(f"{what}: {words}", remedy or "fix that package, or install its needs; --log-level debug shows more")

@@ -431,15 +431,11 @@ class ResourceController:
         problem = self.holds.check(grant, client, self.mesh.now())
         if self._missed and problem is not None and problem.code in ("free", "not_holder"):
             # What is being read may name it.
-            return structs.replace(
-                problem, code="not_yet", message=f"{self.name} has missed a publication and is catching up; try again"
-            )
+            return structs.replace(problem, code="not_yet", message=f"{self.name} is catching up; try again")
         if problem is None and grant in self._held_back and query.message.do.get("name") not in NEVER_HELD_BACK:
             until = max(self.holds.settles(grant) or 0, 0 if self._making_safe is None else self._safe_by)
             left = max(0.0, (until - self.mesh.now()) / SECOND)
-            words = (
-                f"{self.name} is settling, as a former holder's program may still touch it; wait at most {left:.1f} s"
-            )
+            words = f"{self.name} is settling: a former holder may still touch it; wait at most {left:.1f} s"
             return messages.Problem("settling", words, left=left)
         if (
             problem is None

@@ -61,9 +61,7 @@ class Lifecycle:
             # It is being stopped; what is requested now comes after that.
             self._reset(record, spec)
         elif record.spec != spec:
-            message = (
-                f"{component} is already placed with another kind or other settings; stop it first, or use another name"
-            )
+            message = f"{component} is already placed with other settings; stop it first, or use another name"
             state.refuse(component, "exists", message)
             return
         state.mark_changed(component, always=True)

@@ -56,9 +56,7 @@ class Migrations:
             message = f"{component} has just started: it is not yet known whether {record.host} can move it"
             state.refuse(component, "busy", f"{message}; ask again")
         elif not record.movable:
-            state.refuse(
-                component, "not_movable", f"{component} can't be moved: its kind has no checkpoint() and restore()"
-            )
+            state.refuse(component, "not_movable", f"{component} can't be moved: its kind has no checkpoint()")
         else:
             hosts, why_none = state.eligible_hosts(record.spec, other_than=record.host, only=to)
             if hosts:

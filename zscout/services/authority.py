@@ -87,9 +87,7 @@ class Authority:
                     f"{owner} may hold {quota.rcs} devices at one time, and this request needs more; name fewer",
                 )
             if quota.arcs is not None and open_by(members) >= quota.arcs:
-                raise Refused(
-                    "not_allowed", f"{owner} has {quota.arcs} open requests, its quota; release or cancel one"
-                )
+                raise Refused("not_allowed", f"{owner} has {quota.arcs} open requests, its quota; cancel one")
 
     def known_as(self, sender: Sender, who: Who | None) -> Who | None:
         """Who asks, as people are told it: whoever it says to be, its user is the one that its certificate names."""

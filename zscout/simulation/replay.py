@@ -68,7 +68,6 @@ def replay(
         return model.Vote(asked.proposal, accept=not reason, reason=reason)
 
     def step(now: Ns, events: Iterable[model.Event]) -> None:
-        """One instant."""
         for effects in play_instant(core, now, events, vote):
             if watch is not None:
                 watch(now, core, effects)

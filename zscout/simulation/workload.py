@@ -111,9 +111,7 @@ def _rc(rc: _Rc, where: Where) -> WorkloadRc:
     if rc.capacity is None:
         return WorkloadRc(rc.name, rc.sharable)
     if not rc.sharable:
-        raise (where / "capacity").bad(
-            "an exclusive device has one holder, no capacity", "add sharable = true, or remove it"
-        )
+        raise (where / "capacity").bad("an exclusive device has no capacity", "add sharable = true, or remove it")
     _check_texts(where / "capacity", *rc.capacity)
     return WorkloadRc(rc.name, rc.sharable, amounts(rc.capacity, where / "capacity"))
 

@@ -83,8 +83,8 @@ def test_what_nextcloud_exports() -> None:
         (b"BEGIN:VCALENDAR\nEND:VEVENT\n", "has an END without its BEGIN; export it again"),
         (b"BEGIN:VCALENDAR\n" * 100_000, "is not an iCalendar file, or is nested too deep; export it as .ics again"),
         (b"BEGIN:VCALENDAR\n" + b"BEGIN:VEVENT\nEND:VEVENT\n" * (MAX_EVENTS + 1) + b"END:VCALENDAR\n",
-         "has more than 5000 events; export less, for example only the coming year"),
-        (b"x" * (MAX_BYTES + 1), "has more than 5,000,000 bytes; export less, for example only the coming year"),
+         "has more than 5000 events; export less, such as only the coming year"),
+        (b"x" * (MAX_BYTES + 1), "has more than 5,000,000 bytes; export less, such as only the coming year"),
     ],
 )  # fmt: skip
 def test_what_is_no_calendar(data: bytes, why: str) -> None:

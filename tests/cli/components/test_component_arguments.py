@@ -121,6 +121,6 @@ def test_the_last_lines() -> None:
 
 def test_an_unknown_name_is_told_what_there_is() -> None:
     assert str(unknown("cuonter", ["spin", "counter"])).endswith("did you mean counter?")
-    assert str(unknown("x", [])).endswith("and there are none; start one: zscout component start KIND")
+    assert str(unknown("x", [])).endswith("and there are none; see zscout component start")
     many = str(unknown("zzz", [f"a{number}" for number in range(10)]))
     assert many.endswith("known: a0, a1, a2, a3, a4, a5, a6, a7 and 2 more")

@@ -141,7 +141,7 @@ def test_show_tells_each_state_and_its_exit_code_whether_all_can_be_used(capsys:
     code, (valid, broken) = shown(capsys, "anvil", "broken")
     assert code == 1
     assert (valid["name"], valid["trusted"], valid["problem"]) == ("anvil", [valid["issuer"]], None)
-    assert broken["problem"] == "broken/key.pem: may be read by others (mode 644); chmod 640 broken/key.pem"
+    assert broken["problem"] == "broken/key.pem: may be read by others (644); chmod 640 broken/key.pem"
 
 
 def test_show_prints_a_line_for_each_and_takes_the_folder_that_the_environment_names(

@@ -199,9 +199,7 @@ class Attempt:
                 # By our clock it had its time. An RCM that takes the lead as it clears up would queue it again.
                 self._client.expire(held.arc)
             await asyncio.sleep(max(0, direct.gone_by - held.now()) / SECOND)
-            log.warning(
-                "%s clears up for too long after its hold, and is interrupted: the next holder begins", held.arc.name
-            )
+            log.warning("%s cleans up too long after its hold; interrupting it, the next holder begins", held.arc.name)
             self._cancel(body)
 
     def _cancel(self, body: asyncio.Task[Any]) -> None:

@@ -60,9 +60,7 @@ class MovableClient:
         What has come and was not asked for within 10 s is given back. Raises BadName, and ValueError for more
         than 256 of them, or for one that is open here."""
         if len(requests) > MAX_OTHERS + 1:
-            raise ValueError(
-                f"{len(requests)} requests are too many to take over at once; at most {MAX_OTHERS + 1} are"
-            )
+            raise ValueError(f"{len(requests)} requests are too many to take over; at most {MAX_OTHERS + 1} are")
         now = self.mesh.now()
         arcs = {request.id: OpenArc.expected(request, now) for request in requests}
         if here := arcs.keys() & self._store.arcs.keys():
@@ -115,9 +113,7 @@ class MovableClient:
                 while arc.id in self._store.expected:
                     await self._store.changed(arc)
         except TimeoutError:
-            log.warning(
-                "nothing was heard of %s for %g s, handed over to here; it is asked for", arc.name, EXPECT_TIMEOUT
-            )
+            log.warning("%s was handed over to here, but not granted for %g s; requesting it", arc.name, EXPECT_TIMEOUT)
             self._store.adopt(arc)
 
     async def _await_again(self, arc: OpenArc) -> None:

@@ -183,9 +183,7 @@ class Asked:
         start, last = at.found(now, zone), None
         begins = start.at.timestamp()
         if begins + late <= now:
-            raise BadInput(
-                f"--at: {date_words(begins, zone)} is past; by the fleet's clock it is now {date_words(now, zone)}"
-            )
+            raise BadInput(f"--at: {date_words(begins, zone)} is past; the fleet's clock has {date_words(now, zone)}")
         if begins > now + MAX_AHEAD:
             raise BadInput(f"--at: {date_words(begins, zone)} is more than a year ahead; write an earlier date")
         if every is None:
@@ -286,7 +284,6 @@ def _named_after(needs: Needs) -> str:
 
 
 async def _instead(client: Client, refused: RequestRefused, needs: Needs, asked: Asked, priority: int) -> str:
-    """That they are not free then, and when they are."""
     start = asked.start.at
     try:
         how: dict[str, Any] = {"start": start, "priority": priority, "limit": OTHERS}

@@ -166,7 +166,7 @@ class _Import:
                 elif sync:
                     await self._unbook(view, words)
                 else:
-                    self.rows.append(Row(words, "kept", "it is not in the calendar any more; --sync gives it up", view))
+                    self.rows.append(Row(words, "kept", "it is no longer in the calendar; --sync gives it up", view))
         by_id = {one.id: one for one in self.known if not one.unbooked}
         for wanted in plan.wanted:
             await self._want(wanted, next((by_id[one] for one in wanted.ids if one in by_id), None))
@@ -223,9 +223,7 @@ class _Import:
         return None
 
     async def _unbook(self, view: BookingView, words: str) -> None:
-        row = Row(
-            words, "would be given up" if self.dry_run else "given up", "it is not in the calendar any more", view
-        )
+        row = Row(words, "would be given up" if self.dry_run else "given up", "it is no longer in the calendar", view)
         self.rows.append(row)
         self.makes_room = True
         if not self.dry_run:
@@ -261,9 +259,7 @@ class _Import:
     help="Devices for events with these words in title, place or resources.",
 )
 @zone_option
-@click.option(
-    "--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="Priority of every booking."
-)
+@click.option("--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="The bookings' priority.")
 @click.option("--patience", type=Parsed("duration", parse_duration), help="Patience of every booking. Default: 15 min.")
 @click.option("--maintenance", is_flag=True, help="Make each booking a maintenance, as an operator.")
 @click.option("--calendar", "name", metavar="NAME", help="Name of this calendar. Default: the file's name.")
@@ -335,7 +331,6 @@ async def import_(
 
 
 def _merged(mapped: Iterable[tuple[str, Pairs]]) -> dict[str, Pairs]:
-    """Words may be given more than once."""
     found: dict[str, Pairs] = {}
     for words, needs in mapped:
         found[words] = (*found.get(words, ()), *needs)

@@ -84,7 +84,7 @@ def read_calendar(data: bytes, source: str) -> list[CalendarEvent]:
     at all, or too much of one."""
     where = Where(source)
     if len(data) > MAX_BYTES:
-        raise where.bad(f"has more than {MAX_BYTES:,} bytes", "export less, for example only the coming year")
+        raise where.bad(f"has more than {MAX_BYTES:,} bytes", "export less, such as only the coming year")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -115,9 +115,7 @@ def _components(lines: Contentlines, where: Where) -> Iterator[dict[str, list[Co
             if inside == ["VCALENDAR", "VEVENT"]:
                 events, found = events + 1, {}
                 if events > MAX_EVENTS:
-                    raise where.bad(
-                        f"has more than {MAX_EVENTS} events", "export less, for example only the coming year"
-                    )
+                    raise where.bad(f"has more than {MAX_EVENTS} events", "export less, such as only the coming year")
         elif name == "END":
             if inside.pop() != line.partition(":")[2].strip().upper()[:32]:
                 raise where.bad("has an END without its BEGIN", "export it again")
@@ -145,7 +143,6 @@ def _event(lines: Mapping[str, list[Contentline]]) -> CalendarEvent:
 
 
 def _parts(line: Contentline) -> tuple[Mapping[str, Any], str]:
-    """Parameters and value, as it is written."""
     _, params, value = line.raw_parts()
     return params, value.strip()
 
@@ -173,7 +170,6 @@ def _read_words(event: CalendarEvent, values: _Values) -> None:
 
 
 def _plain(text: str) -> str:
-    """A TEXT without its escapes."""
     return re.sub(r"\\(.)", lambda found: " " if found[1] in "nN" else found[1], text)
 
 

@@ -312,7 +312,6 @@ class _Planned:
 
 
 def _half_year(at: datetime) -> tuple[datetime, datetime]:
-    """Its begin and its end."""
     second = at.month > 6
     begin = datetime(at.year, 7 if second else 1, 1)  # noqa: DTZ001 - local times
     return begin, datetime(at.year + second, 1 if second else 7, 1)  # noqa: DTZ001

@@ -27,9 +27,7 @@ from zscout.terminal import Table, span
 @click.option("--within", type=seconds_within(1, MAX_AHEAD), default="7d", help="Search this far ahead.")
 @click.option("--from", "since", type=DATE, help="Search from this date on. Default: from now on.")
 @click.option("--limit", type=click.IntRange(1, MAX_SLOTS), default=5, help="List at most so many.")
-@click.option(
-    "--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="Priority of the booking."
-)
+@click.option("--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="The booking's priority.")
 @zone_option
 @common.json_option("Print one JSON object.")
 @common.runs
@@ -73,9 +71,7 @@ async def slots(
         _table(told, zone).print()
     if not told.slots:
         more = "" if told.complete else " that was looked at"
-        raise common.Failed(
-            f"the devices are not free together{more} within {span(within)}; look further ahead with --within"
-        )
+        raise common.Failed(f"the devices are not free together{more} within {span(within)}; raise --within")
 
 
 def _table(told: SlotsTold, zone: ZoneInfo | None) -> Table:

@@ -172,9 +172,7 @@ async def _kinds(*, as_json: bool) -> None:
         nodes = await ask_nodes(client.mesh, ListComponents())
         fleet = client.fleet.name
     if not nodes:
-        raise common.NobodyThere(
-            f"no host of fleet {fleet} listed what it can start; start zscout-node there, or see its log"
-        )
+        raise common.NobodyThere(f"no node of fleet {fleet} answered; start zscout-node, or see its log")
     if as_json:
         hosts = [{"host": one.host, "kinds": sorted(one.kinds or ())} for one in nodes]
         terminal.print_json({"fleet": fleet, "hosts": hosts})

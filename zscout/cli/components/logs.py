@@ -97,7 +97,6 @@ class Reader:
             await self._placer.wait_changed()
 
     async def follow(self, output: Output) -> None:
-        """Writes what comes until it has ended for good."""
         found: Output | None = output
         while True:
             # Without an answer its host is gone or busy, or has forgotten it; the placer knows which.
@@ -169,9 +168,7 @@ class Reader:
         """What to raise where there is no output."""
         if self._only and self._host is not None:
             await check_host(self._client.mesh, self._host, "--host: ")
-            return common.Failed(
-                f"{self._host} has no output of {self._name}; leave --host out to read it where it ran last"
-            )
+            return common.Failed(f"{self._host} has no output of {self._name}; leave --host out to read its last host")
         if self._record is not None:
             return common.Failed(f"no host has output of {self._name}: it {standing(self._record)}")
         return await unknown_here(self._placer, self._name)

@@ -153,7 +153,6 @@ async def uncordon(host: str, as_json: bool) -> None:
 
 
 def _there(placer: PlacerClient, host: str) -> list[Placement]:
-    """What is on a host, or coming to it."""
     found = (one for _, one in sorted(placer.placements.items()))
     return [one for one in found if host in (one.host, one.to) and one.state not in placing.OVER]
 

@@ -56,7 +56,6 @@ class Progress(terminal.LiveLine):
         self._said = ""
 
     def update(self, text: str) -> None:
-        """How it stands now."""
         self.draw(text)
         if text != self._said and not (self.watched or self._quiet):
             self.print(text)
@@ -96,13 +95,11 @@ STANDING: Final = {
 
 
 def standing(one: Placement) -> str:
-    """How a component stands, in words that follow its name."""
     why = f": {one.reason}" if one.reason else ""
     return STANDING[one.state].format(host=one.host or "no host", to=one.to or "another host", why=why)
 
 
 def remedy(placement: Placement) -> str:
-    """What to do about a component that is not running."""
     name, kind = placement.component, placement.spec.kind
     if placement.state in OVER:
         again = kind if kind == name else f"{kind} --name {name}"
@@ -113,7 +110,6 @@ def remedy(placement: Placement) -> str:
 
 
 async def nodes_of(mesh: Mesh) -> set[str]:
-    """The hosts whose nodes are on the mesh."""
     return {token.host for token in await mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK_FOR_HOSTS)}
 
 
@@ -135,7 +131,6 @@ async def check_host(mesh: Mesh, host: str, option: str = "") -> None:
 
 
 async def ask_nodes(mesh: Mesh, asked: ListComponents) -> list[ComponentList]:
-    """The lists of the nodes that answer in time, by host."""
     replies = await mesh.ask(mesh.keys.component_any(mesh.me), asked, ComponentList, timeout=LOOK_FOR_HOSTS)
     lists = (reply.message for reply in replies if reply.message is not None)
     return sorted(lists, key=lambda answer: answer.host)
@@ -154,9 +149,7 @@ async def check_kind(mesh: Mesh, kind: str) -> None:
 
 
 def unknown(name: str, known: Iterable[str]) -> common.Failed:
-    return common.unknown(
-        "component", name, known, "and there are none; start one: zscout component start KIND", "known"
-    )
+    return common.unknown("component", name, known, "and there are none; see zscout component start", "known")
 
 
 async def unknown_here(placer: PlacerClient, name: str) -> common.Failed:
@@ -166,7 +159,6 @@ async def unknown_here(placer: PlacerClient, name: str) -> common.Failed:
 
 
 def out_of_work(placement: Placement) -> str:
-    """For how long its last move kept it from working, in words."""
     return "" if placement.dead is None else f", out of work for {placement.dead * 1000:.0f} ms"
 
 

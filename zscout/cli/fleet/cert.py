@@ -43,18 +43,14 @@ FOLDER: Final = click.Path(file_okay=False, path_type=Path)
 def _lasting(text: str, option: str) -> timedelta:
     seconds = strict.parse_duration(f"{text}d") or strict.parse_duration(text)
     if not seconds or not 1 <= seconds <= MAX_DAYS * 86_400:
-        raise BadInput(
-            f"{option}: {quoted(text)} is not a time up to {MAX_DAYS:,} days; write days, or a unit: 90, 12h, 90s"
-        )
+        raise BadInput(f"{option}: {quoted(text)} is not a time up to {MAX_DAYS:,} days; write it as in 90, 12h, 90s")
     return timedelta(seconds=float(seconds))
 
 
 def days_option(default: str) -> Callable[[F], F]:
     """`--days`; the parameter is `lasts`."""
     kind = Parsed("days", _lasting)
-    return click.option(
-        "--days", "lasts", type=kind, default=default, help="How long it is valid, in days, or with a unit, as 12h."
-    )
+    return click.option("--days", "lasts", type=kind, default=default, help="Days that it is valid; or as in 12h.")
 
 
 ca_option = click.option(
@@ -81,9 +77,7 @@ def cert() -> None:
 @cert.command()
 @click.argument("folder", type=FOLDER, default=CA_FOLDER)
 @days_option("3650")
-@click.option(
-    "--force", is_flag=True, help="Overwrite an existing CA: certificates that it issued can't be renewed then."
-)
+@click.option("--force", is_flag=True, help="Overwrite a CA: certificates that it issued can't be renewed then.")
 def ca(folder: Path, lasts: timedelta, force: bool) -> None:
     """Make a CA in FOLDER. Keep its key secret.
 

@@ -140,7 +140,6 @@ def _look_at_certificates(seen: Evidence, fleet: Fleet) -> str:
 
 
 def _look_at_drivers(seen: Evidence, node: Node) -> None:
-    """As `zscout-node --check`."""
     from zscout.drivers.registry import driver_for
 
     try:
@@ -162,7 +161,6 @@ def _may_join(seen: Evidence, fleet: Fleet) -> bool:
 
 
 async def _join(seen: Evidence, fleet: Fleet) -> None:
-    """What is seen from inside."""
     from zscout.cli.fleet.fleet_view import Devices, FleetView
     from zscout.mesh import MeshError, probing
 

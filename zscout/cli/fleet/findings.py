@@ -78,7 +78,6 @@ class Evidence:
 
 
 def findings(seen: Evidence) -> list[Finding]:
-    """All that is to be said, causes before what comes of them."""
     found = [_bad(about, error) for about, error in seen.bad]
     if seen.fleet is None:
         return [*found, *_clock(seen)]
@@ -198,7 +197,6 @@ def _host_in(address: str) -> str:
 
 
 def _security(seen: Evidence) -> Iterator[Finding]:
-    """Plain against TLS, and certificates that do not fit."""
     fleet = _the_fleet(seen)
     closed = [one for one in seen.answers if one.speaks == "tls"]
     # Two fleets on one network, of which one is secured, are well: it is told whose hosts they are by their names.
@@ -374,7 +372,6 @@ def _devices(seen: Evidence) -> Iterator[Finding]:
 
 
 def _hosts(seen: Evidence) -> Iterator[Finding]:
-    """What they say of themselves."""
     reports = {name: host.load for name, host in sorted(seen.hosts.items()) if host.load is not None}
     own = seen.certificates.name if seen.certificates is not None and seen.certificates.soon(seen.at) else ""
     for name, report in reports.items():

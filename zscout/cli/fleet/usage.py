@@ -101,7 +101,6 @@ def _table(found: list[Account], by: str, told: Told) -> Table:
 
 
 def _unknown_use(found: list[Account]) -> str:
-    """How much of it is not in what was used; empty: nothing."""
     some = [f"{one.key} {one.used_unknown} of {one.holds}" for one in found if one.used_unknown]
     more = f", and {len(some) - MAX_NAMED} more" if len(some) > MAX_NAMED else ""
     words = "holds whose devices did not all report their use, which is not counted"

@@ -63,9 +63,7 @@ def parse_recorded_past(text: str, option: str) -> Ns:
     """Raises BadInput."""
     found = parse_duration(text)
     if found is None or found > MAX_PAST:
-        raise BadInput(
-            f"{option}: {quoted(text)} is not a duration, or too long; write {DURATIONS}, at most {MAX_PAST // 86_400}d"
-        )
+        raise BadInput(f"{option}: {quoted(text)} is not a duration up to {MAX_PAST // 86_400}d; write {DURATIONS}")
     return int(found * SECOND)
 
 
@@ -174,9 +172,7 @@ async def _source(
     joined, alone = await _recorded_here(fleet, bind)
     if joined is not None:
         if past is not None:
-            terminal.print_line(
-                "zscout: --past: a node records; what it shows of before stands in its file", sys.stderr
-            )
+            terminal.print_line("zscout: --past: a node records; its file sets what it shows of before", sys.stderr)
         yield joined, None
         return
     host = os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
@@ -312,7 +308,6 @@ class Child:
             raise common.Failed(f"{self.what} did not start within {START:g} s; is this host overloaded?") from None
 
     async def failed(self) -> Exception:
-        """Why it ended, in its own last words."""
         code = await self.process.wait()
         await self._log
         words = self.lines[-1] if self.lines else "without a word"
@@ -335,7 +330,6 @@ class Child:
                 return
 
     async def end(self) -> None:
-        """Ends it, at first by asking; returns when it is gone."""
         process = self.process
         if process.returncode is None:
             # A recorder ends with its input, a viewer by its signal.

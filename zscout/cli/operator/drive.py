@@ -71,14 +71,10 @@ def _rc_option(kind: str) -> Callable[[common.F], common.F]:
 )
 @click.option("--speed", type=click.FloatRange(0.1, 1.0), default=0.6, help="Share of the robot's top speed.")
 @click.option("--stand-by", is_flag=True, help="Take the robot at the first driving key, not at once.")
-@click.option(
-    "--pad", type=click.Path(path_type=Path), metavar="DEVICE", help="Drive by a game pad's left stick as well."
-)
+@click.option("--pad", type=click.Path(path_type=Path), metavar="DEVICE", help="Drive by a game pad's stick as well.")
 @click.option("--no-picture", is_flag=True, help="Drive without looking.")
 @click.option("--no-view", is_flag=True, help="Open no viewer; print the picture's address.")
-@click.option(
-    "--record", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE.rrd", help="Record the pictures."
-)
+@click.option("--record", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE.rrd", help="Record pictures.")
 @common.json_option("Print JSON lines: taken, waiting, free, and what came of it.")
 @common.runs
 async def drive(
@@ -197,7 +193,6 @@ class _Console(terminal.LiveLine):
             self.print(words)
 
     def update(self, teleop: Teleop) -> None:
-        """The state has changed, or the first command was obeyed."""
         now = (teleop.state, teleop.why, teleop.takeover)
         if now == self._told:
             return

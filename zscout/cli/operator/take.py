@@ -32,9 +32,7 @@ MAX_ANSWER = 4_096
 @click.command(cls=CommandAfterDashes)
 @click.option("-y", "--yes", is_flag=True, help="Don't ask.")
 @click.option("--no-keep", is_flag=True, hidden=True, help="--min-runtime is what --release-after is.")
-@click.option(
-    "--reason", type=Parsed("text", parse_comment), default="", help="The reason, shown to the preempted and in status."
-)
+@click.option("--reason", type=Parsed("text", parse_comment), default="", help="Shown in status and to the preempted.")
 @hold_options
 @common.runs
 async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, reason: str, comment: str, **rest: Any) -> int:

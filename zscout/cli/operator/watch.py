@@ -54,9 +54,7 @@ def sources(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> li
     type=click.Path(path_type=Path, dir_okay=False),
     help="Write pictures, boxes and events as a Rerun recording; look at it with `zscout view FILE`.",
 )
-@click.option(
-    "--limit", type=SECONDS, help="End after this much of the source: 90s, 5m. Default: at its end, or at Ctrl-C."
-)
+@click.option("--limit", type=SECONDS, help="End after this much of the source. Default: at its end, or at Ctrl-C.")
 def motion(source: str, as_json: bool, record: Path | None, limit: float | None) -> None:
     """Report motion: one line for each event, when the event ends.
 
@@ -159,7 +157,6 @@ class _WatchReport(LiveLine):
             terminal.print_line(text)
 
     def say(self, text: str) -> None:
-        """A word about the source, on stderr."""
         text = terminal.clean(text)
         if self.recording is not None:
             self.recording.words(self.at, text)
@@ -169,7 +166,6 @@ class _WatchReport(LiveLine):
             terminal.print_line(text, sys.stderr)
 
     def show(self, duration: float | None, event: Event | None) -> None:
-        """The live line, now and then."""
         now = clock.now()
         if not self.watched or now - self._drawn < DRAWN * SECOND:
             return

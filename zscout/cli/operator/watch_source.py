@@ -83,7 +83,6 @@ class VideoFile:
         """Seconds; None where nobody knows."""
 
     def shots(self) -> Iterator[Shot]:
-        """All pictures, to the end of the file."""
         picture, zero, last = self._first, self._stamp(), 0.0
         self._first = None
         while picture is not None:

@@ -105,9 +105,7 @@ def _choose(state: RcmState, named: str, word: str, *, every: bool) -> list[Targ
     if len(found) > 1 and not every:
         listed = ", ".join(target.full_name for target in found[:MAX_LISTED])
         rest = f" and {len(found) - MAX_LISTED} more" if len(found) > MAX_LISTED else ""
-        raise common.Failed(
-            f"{len(found)} requests are called {quoted(named)}: {listed}{rest}; write one of these names, or add --all"
-        )
+        raise common.Failed(f"{len(found)} requests are called {quoted(named)}: {listed}{rest}; name one, or add --all")
     return found
 
 
@@ -125,6 +123,4 @@ async def _operate(client: Client, target: Target, word: str) -> Notice:
         problem = next((reply.problem for reply in replies if reply.problem is not None), None)
         if problem is not None and problem.code not in TRY_AGAIN:
             raise common.Failed(f"{target.full_name} was not ended: {problem.message}")
-    raise common.NobodyThere(
-        "the leader did not answer: it may or may not have been done; see zscout status, and try again"
-    )
+    raise common.NobodyThere("the leader did not answer; it may or may not have been done: see zscout status")

@@ -50,7 +50,6 @@ def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:
 
 
 def timeout_option(help: str) -> Callable[[F], F]:  # noqa: A002 - click's word
-    """`--timeout`, in seconds."""
     return click.option("--timeout", type=SECONDS, help=help)
 
 
@@ -188,7 +187,6 @@ class HoldOptions:
         return replace(who, command=bounded(shlex.join(self.command) if self.command else own))
 
     def terms(self) -> dict[str, Any]:
-        """How its needs are to be held."""
         terms = {"priority": self.priority, "min_runtime": self.min_runtime, "keep": self.keep}
         return terms | {"wait_for_device": self.wait_for_device}
 

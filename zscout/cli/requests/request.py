@@ -53,9 +53,7 @@ REFRESH: Final = 1.0
 )
 @click.option("--keep", is_flag=True, hidden=True, help="What happens without it as well.")
 @click.option("--booking", type=BOOKING, shell_complete=completion.bookings, help="Use this booking: its name or id.")
-@click.option(
-    "--dry-run", is_flag=True, help="Print when it would start and what it would preempt at once, and request nothing."
-)
+@click.option("--dry-run", is_flag=True, help="Only print when it would start, and what it would preempt.")
 @partial(hold_options, needs_required=False)
 @common.runs
 async def request(
@@ -319,7 +317,6 @@ def _kept(longest: Ns | None) -> str:
 
 
 def _ending(arc: OpenArc) -> HoldEnd:
-    """How its last hold came to its end."""
     return arc.ending or HoldEnd("lost", "")
 
 
@@ -378,7 +375,6 @@ class Report(LiveLine):
                 self.print(text)
 
     def news(self, arc: OpenArc) -> None:
-        """A watcher for the client."""
         self._arc = arc
         self.changed.set()
 
@@ -392,7 +388,6 @@ class Report(LiveLine):
             self.hide()
 
     async def follow_wait(self) -> None:
-        """Shows how the request waits, until cancelled."""
         while True:
             if self._looked is not None and self._arc is not None and self._arc.state == "queued":
                 # One look per REFRESH: news may come in a crowd.

@@ -19,9 +19,7 @@ def check_options(**options: Any) -> None:
     """That none is given that says for how long. Raises BadInput."""
     for name in OWN:
         if options[name] not in (None, False):
-            raise BadInput(
-                f"--{name.replace('_', '-')} can't be used with --booking, whose time is fixed; leave it out"
-            )
+            raise BadInput(f"--{name.replace('_', '-')} can't be used with --booking; leave it out")
 
 
 async def taking_up(client: Client, wanted: HoldOptions, *, name: str | None, priority: int | None) -> HoldOptions:
@@ -29,9 +27,7 @@ async def taking_up(client: Client, wanted: HoldOptions, *, name: str | None, pr
     BadInput where NEEDs or a `priority` were given that it has not; Failed, RequestRefused."""
     booking = choose((await ask_bookings(client)).bookings, wanted.booking, User.of(client))
     if booking.maintenance:
-        raise Failed(
-            f"{booking.name} is maintenance, which no request can use; to end it: zscout booking cancel {booking.name}"
-        )
+        raise Failed(f"{booking.name} is maintenance, not for requests; end it: zscout booking cancel {booking.name}")
     if wanted.needs and wanted.needs != booking.needs:
         raise BadInput(f"{booking.name} is booked with other devices: {rcs_words(booking)}; leave the devices out")
     if priority not in (None, booking.priority):

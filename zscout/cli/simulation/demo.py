@@ -73,7 +73,6 @@ class _Live:
 
 
 def live_options(command: F) -> F:
-    """`--web` and `--view`."""
     command = click.option("--view", is_flag=True, help="Show it live in the Rerun viewer's window.")(command)
     return click.option("--web", is_flag=True, help="Show it live in a browser: prints the address to open.")(command)
 
@@ -93,7 +92,6 @@ def _check_live(web: bool, view: bool) -> None:
 
 
 def recording_option(command: F) -> F:
-    """`--out FILE`."""
     return click.option(
         "--out", metavar="FILE", type=click.Path(path_type=Path), help="The recording. Default: runs/demo-….rrd"
     )(command)
@@ -109,9 +107,7 @@ def recording_option(command: F) -> F:
     help="As in zscout simulate: a name, a TOML file, or random:SEED.",
 )
 @click.option("--seed", type=click.IntRange(0), default=1, help="Seed of noise, slip and people.")
-@click.option(
-    "--speed", type=click.FloatRange(0.2, 4.0), default=1.5, help="Seconds of the building in one real second."
-)
+@click.option("--speed", type=click.FloatRange(0.2, 4.0), default=1.5, help="Building's seconds per real second.")
 @recording_option
 @live_options
 @common.json_option("Print the summary as one JSON object.")

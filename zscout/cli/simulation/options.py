@@ -47,6 +47,4 @@ def check_rrd(rrd: Path | None, *, writable: bool = True) -> None:
         if writable:
             rrd.open("ab").close()
     except OSError as error:
-        raise BadInput(
-            f"--rrd {rrd}: can't be written ({error.strerror}); give a file in a folder that exists"
-        ) from None
+        raise BadInput(f"--rrd {rrd}: can't be written ({error.strerror}); choose an existing folder") from None

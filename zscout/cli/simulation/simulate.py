@@ -83,13 +83,9 @@ def parse_address(text: str, option: str) -> tuple[str, int]:
     type=click.Path(path_type=Path, dir_okay=False),
     help="Write a node file with all the devices: zscout node FILE serves them.",
 )
-@click.option(
-    "--framegrabbers", type=click.IntRange(1, MAX_FRAMEGRABBERS), default=2, help="Framegrabbers in the node file."
-)
+@click.option("--framegrabbers", type=click.IntRange(1, MAX_FRAMEGRABBERS), default=2, help="Number in the node file.")
 @click.option("--mesh", is_flag=True, help="Publish positions on the mesh, for recorders and operators.")
-@click.option(
-    "--for", "seconds", type=SECONDS, help="End after this much time in the building: 90s, 5m. Default: at Ctrl-C."
-)
+@click.option("--for", "seconds", type=SECONDS, help="End after this time in the building: 90s. Default: at Ctrl-C.")
 @common.json_option("Print how to reach everything as one JSON object.")
 def simulate(building: str | None, listing: bool, mesh: bool, as_json: bool, **options: Any) -> None:
     """Serve a simulated building: a radio on a serial port, cameras as MJPEG over HTTP, in real time.

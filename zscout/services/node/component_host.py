@@ -200,9 +200,7 @@ class ComponentHost:
             raise Refused("not_allowed", message[: messages.MAX_ERROR])
         size = len(msgspec.json.encode(start.spec.params))
         if size > messages.MAX_PARAMS_SIZE:
-            raise Refused(
-                "too_large", f"params are {size} bytes as JSON; at most {messages.MAX_PARAMS_SIZE} are allowed"
-            )
+            raise Refused("too_large", f"params are {size} bytes as JSON; write at most {messages.MAX_PARAMS_SIZE}")
 
     async def _list(self, component: str | None) -> messages.ComponentList:
         kinds = await asyncio.to_thread(self._kinds)

@@ -348,9 +348,7 @@ class BookingHandler:
         if record.maintenance:
             raise Refused("bad_request", f"{record.name} is maintenance, which no request can use")
         if ask.needs != record.needs or ask.priority != record.priority:
-            raise Refused(
-                "bad_request", f"needs and priority differ from those of booking {record.name}; leave them out"
-            )
+            raise Refused("bad_request", f"needs or priority differ from booking {record.name}; leave them out")
         dates_ = [date for date in self._dates.standing(record) if not start or str(date.start) == start]
         free = [date for date in dates_ if self._dates.taken_by(date) is None]
         if free:

@@ -304,15 +304,10 @@ class RequestHandler:
             raise Refused("queue_full", f"{self.limits.max_queued} requests already wait; try again later")
         most = self.limits.max_requests_per_client
         if coming.count(client) + self.core.count_of(client) >= most:
-            raise Refused(
-                "too_many", f"{client} already has {most} open requests, the most allowed; release or cancel one"
-            )
+            raise Refused("too_many", f"{client} already has {most} open requests, the most; cancel one")
         most = self.limits.max_requests_per_host
         if self.core.count_of_owner(host) + sum(one.startswith(f"{host}/") for one in coming) >= most:
-            raise Refused(
-                "too_many",
-                f"the clients of {host} already have {most} open requests, the most allowed; release or cancel one",
-            )
+            raise Refused("too_many", f"clients of {host} already have {most} open requests, the most; cancel one")
 
     def _forecast(self, query: Query, asked: Foresee, sender: Sender) -> None:
         self.flush()

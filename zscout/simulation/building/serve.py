@@ -118,7 +118,6 @@ class Served:
         return self.clock.true_speed(asyncio.get_running_loop().time())
 
     def unplug_radio(self) -> None:
-        """The radio's cable is pulled."""
         self.radio.unplug()
 
     def plug_radio(self) -> None:
@@ -133,7 +132,6 @@ class Served:
         self.video.stall(channel_name(channel), stalled=stalled)
 
     async def poses(self) -> BuildingPoses:
-        """Who is where now."""
         return await self.in_world(lambda: poses(self.world, self.speed))
 
     async def map(self) -> BuildingPlan:

@@ -154,7 +154,6 @@ def _print(access: dict[str, Any]) -> None:
 
 
 def _line(served: Served, rate: float | None = None, cpu: float | None = None) -> str:
-    """How it is, in one line."""
     radio = served.radio
     words = [terminal.span(served.time)]
     if rate is not None:
@@ -199,7 +198,6 @@ def _live(served: Served) -> Iterator[None]:
 
 
 def print_shipped(*, as_json: bool) -> None:
-    """Lists the buildings that are shipped."""
     rows = [(name, load_plan(path)) for name, path in shipped_plans().items()]
     if as_json:
         terminal.print_json(

@@ -98,14 +98,12 @@ class VideoServer:
 
     @property
     def page(self) -> str:
-        """The address of the page with the links."""
         host = f"[{self._host}]" if ":" in self._host else self._host
         if self._host in ("0.0.0.0", "::"):  # noqa: S104 - compared, not bound
             host = socket.gethostname()
         return f"http://{host}:{self._port}/"
 
     def url(self, channel: str) -> str:
-        """The address of a channel's stream."""
         return self.page + self._channels[channel].name
 
     @property
@@ -119,7 +117,6 @@ class VideoServer:
         return tuple(name for name, channel in self._channels.items() if channel.watchers and not channel.stalled)
 
     def show(self, channel: str, jpeg: bytes) -> None:
-        """The newest frame of a channel."""
         shown = self._channels[channel]
         shown.frame, shown.number = jpeg, shown.number + 1
         for watcher in shown.watchers:

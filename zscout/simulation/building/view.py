@@ -49,7 +49,6 @@ _WAY: Final = (150, 110, 60)
 
 
 def building_plan(plan: Plan) -> BuildingPlan:
-    """The plan as it goes over the mesh, small enough for that."""
     scale = min(SCALE, MAX_SIDE / max(plan.width, plan.depth))
     while len(png := plan_picture(plan, scale)) > MAX_PNG:
         scale *= SHRINK
@@ -72,7 +71,6 @@ def plan_picture(plan: Plan, scale: float = SCALE) -> bytes:
 
 
 def poses(world: World, speed: float = 1.0) -> BuildingPoses:
-    """Who is where now."""
     robots = [
         Placed(
             name=name[:64],

@@ -51,7 +51,6 @@ class PlacementTrial:
     """By host: seconds since the first start, cores that its components used."""
 
     def counts(self) -> dict[str, int]:
-        """Components on each host."""
         hosts = list(self.placed.values())
         return {host: hosts.count(host) for host in HOSTS}
 

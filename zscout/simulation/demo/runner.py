@@ -81,7 +81,6 @@ class DemoRunner(ABC):
             await asyncio.gather(task, return_exceptions=True)
 
     def event(self, text: str, at: Ns | None = None) -> None:
-        """Shows what happened `at` (default: now)."""
         self._show(self.elapsed(at), text)
 
     def elapsed(self, at: Ns | None = None) -> float:
@@ -89,7 +88,6 @@ class DemoRunner(ABC):
         return ((clock.now() if at is None else at) - self.zero) / SECOND if self.zero is not None else 0.0
 
     def fleet(self) -> Fleet:
-        """The fleet of the demo's nodes."""
         return load_fleet(self._fleet_file)
 
     def write_fleet(self) -> None:

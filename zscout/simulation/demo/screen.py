@@ -50,7 +50,6 @@ class DemoScreen:
         self._events: list[str] = []
 
     def print_line(self, text: str) -> None:
-        """A line of a pipe."""
         if self._plain:
             terminal.print_line(text)
 
@@ -99,7 +98,6 @@ class DemoScreen:
 
 
 def picture(draw: Callable[[], Group]) -> Live:
-    """What `draw` gives, in place, again and again."""
     from rich.live import Live
 
     return Live(get_renderable=draw, console=terminal.console(), refresh_per_second=FRAMES, transient=True)

@@ -29,9 +29,7 @@ class ReplayRecording:
     def watch(self, now: Ns, effects: list[Effect]) -> None:
         """What happened at `now`. Raises BadInput past MAX_DRAWN."""
         if effects and now > MAX_DRAWN:
-            raise BadInput(
-                f"a recording can have at most {MAX_DRAWN // SECOND} s, and this workload is longer; leave out --rrd"
-            )
+            raise BadInput(f"this workload is longer than {MAX_DRAWN // SECOND} s; leave out --rrd")
         for effect in effects:
             self._draw(now / SECOND, effect)
 

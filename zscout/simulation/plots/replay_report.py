@@ -95,7 +95,6 @@ def _recording(stack: ExitStack, rrd: Path, source: Path) -> ReplayRecording:
 
 
 def _as_object(strategy: str, played: Replay) -> dict[str, Any]:
-    """What `--json` prints: times are seconds."""
     return {
         "strategy": strategy,
         "holds": [
