@@ -1,4 +1,4 @@
-"""What mkdocs adds to the pages: the command reference is the help that the commands print."""
+"""The hook of mkdocs that builds the command reference from the help of each command."""
 
 from __future__ import annotations
 

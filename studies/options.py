@@ -58,7 +58,9 @@ def parse_seeds(text: str, most: int | None = None, option: str = "--seeds") -> 
     first, last = int(found[1] or 0), int(found[2])
     seeds = range(first, last + 1) if found[1] else range(last)
     if not seeds:
-        raise BadInput(f"{option} {quoted(text)} is no seed at all; write at least 1, or the smaller one first")
+        raise BadInput(
+            f"{option}: {quoted(text)} is an empty range of seeds; write a number from 1, or the smaller seed first"
+        )
     if seeds[-1] > MAX_SEED:
         raise BadInput(f"{option} {quoted(text)}: a seed is at most {MAX_SEED}")
     if most is not None and len(seeds) > most:

@@ -29,11 +29,15 @@ class BadName(ValueError):
     """A name or a key that can't stand in the key space; the message says which and why."""
 
 
+def _quoted(text: str) -> str:
+    return '"{}"'.format(repr(text[:130])[1:-1].replace("\\'", "'").replace('"', '\\"'))
+
+
 @lru_cache(REMEMBERED)
 def check_name(name: str, what: str = "name") -> str:
     """`name` itself if it may stand in a key; raises BadName otherwise."""
     if NAME.fullmatch(name) is None:
-        raise BadName(f"{what} {name[:80]!r} is not valid: use 1 to 64 of A-Z a-z 0-9 _ . -")
+        raise BadName(f"{what} {_quoted(name)} is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -")
     return name
 
 
@@ -42,9 +46,9 @@ def check_rc(name: str) -> str:
     """`kind/name` itself if it names an RC; raises BadName otherwise."""
     kind, slash, rest = name.partition("/")
     if not slash:
-        raise BadName(f"RC {name[:130]!r} is not valid: write kind/name, like robot/scout33")
-    check_name(kind, "RC kind")
-    check_name(rest, "RC name")
+        raise BadName(f"device {_quoted(name)} is not valid; write kind/name, as in robot/scout33")
+    check_name(kind, "kind")
+    check_name(rest, "device name")
     return name
 
 
@@ -61,8 +65,8 @@ def check_need(need: str) -> str:
         return check_rc(need)
     if _PATTERN.fullmatch(need) is None:
         raise BadName(
-            f"need {need[:130]!r} is not valid: write kind/name with * for a whole name or $* for a part of "
-            "one, like framegrabber/*, and #2, #3 and so on behind it for a second and third"
+            f"pattern {_quoted(need)} is not valid; write kind/name with * for a whole name or $* for a part of "
+            "a name, as in framegrabber/*, and #2, #3 and so on at the end for a second and third device"
         )
     return need
 
@@ -116,7 +120,7 @@ def incarnation_of(instance: str) -> int:
     """Which start of a component its token stands for: `<incarnation>-<any>`. Raises BadName."""
     number = instance.partition("-")[0]
     if not (number.isascii() and number.isdigit() and len(number) <= MAX_DIGITS and int(number) > 0):
-        raise BadName(f"{instance[:80]!r} does not begin with an incarnation")
+        raise BadName(f"{_quoted(instance)} does not begin with an incarnation")
     return int(number)
 
 
@@ -296,13 +300,13 @@ class Keys:
         match self._chunks(key):
             case ["rc", kind, name, *_]:
                 return check_rc(f"{kind}/{name}")
-        raise BadName(f"{key[:200]!r} is not the key of an RC")
+        raise BadName(f"{_quoted(key)} is not the key of an RC")
 
     def host_of(self, key: str) -> str:
         match self._chunks(key):
             case ["host", host, *_]:
                 return check_name(host, "host")
-        raise BadName(f"{key[:200]!r} is not the key of a host")
+        raise BadName(f"{_quoted(key)} is not the key of a host")
 
     def token_of(self, key: str) -> Token:
         match self._chunks(key):
@@ -311,13 +315,13 @@ class Keys:
             case ["alive", host, role, name, instance] if role != Role.RC:
                 token = Token(host, role, name, instance)
             case _:
-                raise BadName(f"{key[:200]!r} is not the key of a liveliness token")
+                raise BadName(f"{_quoted(key)} is not the key of a liveliness token")
         self.alive(token)
         return token
 
     def _chunks(self, key: str) -> list[str]:
         if not key.startswith(f"{self.base}/"):
-            raise BadName(f"{key[:200]!r} is not a key of fleet {self.fleet}")
+            raise BadName(f"{_quoted(key)} is not a key of fleet {self.fleet}")
         return key[len(self.base) + 1 :].split("/")
 
 
@@ -333,7 +337,7 @@ def _sender_of(keys: Keys, key: str) -> Sender:
             | ["host", _, "component" | "confirm" | "history", host, client]
         ):
             return Sender(check_name(host, "host"), check_name(client, "client"))
-    raise BadName(f"{key[:200]!r} does not name its sender")
+    raise BadName(f"{_quoted(key)} does not name its sender")
 
 
 def client_of(text: str) -> Sender:

@@ -91,7 +91,7 @@ async def run_services(
         # Two nodes of one name would answer each other's questions.
         living = await mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK_FOR_TWIN)
         if any(token.host == me.host for token in living):
-            raise MeshError(f"a node named {me.host} is on the mesh already; set another host under [node]")
+            raise MeshError(f"a node named {me.host} is already on the mesh; end it, or set another host under [node]")
         stall = StallWatch(mesh.now).start()
         stack.callback(stall.stop)
         mesh.watch_links()
@@ -247,9 +247,7 @@ def _places_key(fleet: Fleet) -> bytes | None:
 
 def _say_if_alone(mesh: Mesh) -> None:
     if mesh.links() == 0:
-        log.warning(
-            "no link to any other node or program yet; if there should be, `zscout doctor` with the node file says why"
-        )
+        log.warning("no link to any other node or program yet; if you expect one, run zscout doctor NODE_FILE")
 
 
 async def _main(node: Node, read: Callable[[], Node], manager: ServiceManager) -> None:
@@ -277,15 +275,14 @@ def _end() -> None:
 
 @click.command(context_settings={"help_option_names": ["-h", "--help"]})
 @click.argument("file", required=False, type=click.Path(path_type=Path))
-@click.option("--check", is_flag=True, help="Say whether FILE can be used here, with its drivers, and begin nothing.")
+@click.option("--check", is_flag=True, help="Check FILE and its drivers on this host, and start nothing.")
 @click.option("--log-level", type=click.Choice(["debug", "info", "warning", "error"]), default="info")
 @click.version_option(__version__)
 def main(file: Path | None, check: bool, log_level: str) -> None:
-    """Runs this host's part of a fleet, as the node FILE (TOML) says.
+    """Run this host's part of a fleet, as the node FILE (TOML) says.
 
-    Without FILE the node stands as a candidate for the RCM of the fleet "zscout" and reports the host's load.
-    `zscout simulate --node lab.toml` writes one for a simulated building; docs/reference/configuration.md has
-    all settings.
+    Without FILE the node may lead the fleet "zscout", and reports the host's load. `zscout simulate --node lab.toml`
+    writes a node file for a simulated building; docs/reference/configuration.md lists all settings.
 
     \b
     Examples:

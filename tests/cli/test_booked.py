@@ -76,9 +76,9 @@ def test_a_name_of_several_is_refused_with_all_of_them() -> None:
 
 
 def test_what_nobody_booked_is_told_with_what_may_be_meant() -> None:
-    with pytest.raises(Failed, match='no booking "survy" is known; did you mean survey'):
+    with pytest.raises(Failed, match='unknown booking "survy"; did you mean survey'):
         choose([A], "survy", ALICE)
-    with pytest.raises(Failed, match='no booking "x" is known, and there are none'):
+    with pytest.raises(Failed, match='unknown booking "x", and there are none'):
         choose([], "x", ALICE)
 
 

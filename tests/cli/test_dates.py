@@ -189,7 +189,7 @@ def test_words() -> None:
 def test_a_zone_is_one_of_the_database() -> None:
     assert parse_zone("Europe/Berlin", "--zone").key == "Europe/Berlin"
     for text in ("Europe/Berlinn", "Europe", "../etc/passwd", "", "/etc/localtime", "x" * 500, "a\0b"):
-        with pytest.raises(BadInput, match=r"^--zone: .* is no zone"):
+        with pytest.raises(BadInput, match=r"^--zone: .* is not a time zone"):
             parse_zone(text, "--zone")
     with pytest.raises(BadInput, match="did you mean Europe/Berlin"):
         parse_zone("Europe/Berlinn", "--zone")

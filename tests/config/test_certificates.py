@@ -61,9 +61,13 @@ def test_it_can_be_used_by_whom_it_names_from_a_while_ago_until_its_end(anvil: P
     found.check(NOW - timedelta(minutes=59), "anvil")
     found.check(found.ends - timedelta(seconds=1))
     for now, name, words in (
-        (NOW - timedelta(minutes=61), "anvil", "is valid from 2030-05-01 11:00 UTC on; set this host's clock"),
-        (found.ends, "anvil", "has ended on 2030-07-30 12:00 UTC; renew it"),
-        (NOW, "bellows", 'is the certificate of "anvil", and this is "bellows"; put that of "bellows" there'),
+        (NOW - timedelta(minutes=61), "anvil", "is not valid before 2030-05-01 11:00 UTC; set this host's clock"),
+        (found.ends, "anvil", "expired on 2030-07-30 12:00 UTC; renew it"),
+        (
+            NOW,
+            "bellows",
+            'is the certificate of "anvil", but this host is "bellows"; put the certificate of "bellows" there',
+        ),
     ):
         with pytest.raises(BadInput) as error:
             found.check(now, name)
@@ -81,7 +85,7 @@ def test_its_end_is_told_from_two_weeks_before_of_a_short_life_in_its_last_third
         one.expires_soon(one.ends - left) for one, left in ((found, 14 * DAY + second), (short, 3 * DAY + second))
     ] == ["", ""]
     assert found.expires_soon(found.ends - 14 * DAY) == (
-        f"{anvil}/cert.pem: ends on 2030-07-30 12:00 UTC; renew it (zscout cert renew)"
+        f"{anvil}/cert.pem: expires on 2030-07-30 12:00 UTC; renew it (zscout cert renew)"
     )
     assert short.expires_soon(short.ends - 3 * DAY)
     assert found.expires_soon(found.ends) == ""
@@ -135,24 +139,18 @@ def _long(folder: Path) -> None:
         (lambda folder: (folder / "ca.pem").unlink(), "ca.pem: there is no such file; "),
         (lambda folder: (folder / "cert.pem").unlink(), "cert.pem: there is no such file; "),
         (lambda folder: (folder / "key.pem").unlink(), "key.pem: there is no such file; "),
-        (lambda folder: (folder / "ca.pem").write_text(""), "ca.pem: holds no certificate in PEM that can be read; "),
-        (
-            lambda folder: (folder / "cert.pem").write_text("x"),
-            "cert.pem: holds no certificate in PEM that can be read; ",
-        ),
-        (lambda folder: (folder / "key.pem").write_text("x"), "key.pem: holds no private key that can be read; "),
+        (lambda folder: (folder / "ca.pem").write_text(""), "ca.pem: has no readable PEM certificate; "),
+        (lambda folder: (folder / "cert.pem").write_text("x"), "cert.pem: has no readable PEM certificate; "),
+        (lambda folder: (folder / "key.pem").write_text("x"), "key.pem: has no readable private key; "),
         (_long, "cert.pem: has more than 65,536 bytes; "),
-        (_passphrase, "key.pem: has a passphrase, and nobody is there to type it; "),
+        (_passphrase, "key.pem: has a passphrase, which zscout can't enter; "),
         (_other_key, "key.pem: is not the key of cert.pem; "),
-        (_other_ca, "cert.pem: was issued by no CA in ca.pem (zscout CA "),
-        (_leaf_as_ca, "ca.pem: holds a certificate that is no CA's; "),
-        (lambda folder: (folder / "key.pem").chmod(0o644), "key.pem: may be read by others (mode 644); chmod 640 "),
-        (lambda folder: (folder / "key.pem").chmod(0o620), "key.pem: may be written by others (mode 620); chmod 640 "),
-        (lambda folder: (folder / "ca.pem").chmod(0o666), "ca.pem: may be written by others (mode 666); chmod 644 "),
-        (
-            lambda folder: (folder / "cert.pem").chmod(0o646),
-            "cert.pem: may be written by others (mode 646); chmod 644 ",
-        ),
+        (_other_ca, "cert.pem: was not issued by a CA in ca.pem (zscout CA "),
+        (_leaf_as_ca, "ca.pem: has a certificate that is not a CA's; "),
+        (lambda folder: (folder / "key.pem").chmod(0o644), "key.pem: may be read by others (644); chmod 640 "),
+        (lambda folder: (folder / "key.pem").chmod(0o620), "key.pem: may be written by others (620); chmod 640 "),
+        (lambda folder: (folder / "ca.pem").chmod(0o666), "ca.pem: may be written by others (666); chmod 644 "),
+        (lambda folder: (folder / "cert.pem").chmod(0o646), "cert.pem: may be written by others (646); chmod 644 "),
     ],
 )
 def test_what_can_not_be_used_is_told_in_one_line(anvil: Path, spoil: Callable[[Path], object], words: str) -> None:
@@ -200,7 +198,7 @@ def test_a_certificate_is_of_one_name_that_may_stand_in_a_key(
 
 def test_a_certificate_is_for_both_ends_of_a_link(ca: CertificateAuthority, anvil: Path) -> None:
     _signed(ca, anvil, lambda one: _like(one, purposes="server"))
-    with pytest.raises(BadInput, match=r"cert.pem: is not fit for this: "):
+    with pytest.raises(BadInput, match=r"cert.pem: can't be used for zscout: "):
         read_certificates(anvil)
 
 
@@ -235,7 +233,7 @@ def test_a_ca_renews_only_what_itself_or_one_beside_it_has_issued(ca: Certificat
     other = authority(tmp_path / "other-ca")
     other.issue("anvil", tmp_path / "anvil", DAY, NOW)
     before = (tmp_path / "anvil" / "cert.pem").read_bytes()
-    with pytest.raises(BadInput, match=r"anvil/cert.pem: was issued by no CA in .*/ca/ca.pem; "):
+    with pytest.raises(BadInput, match=r"anvil/cert.pem: was not issued by a CA in .*/ca/ca.pem; "):
         ca.renew(tmp_path / "anvil", DAY, NOW)
     assert (tmp_path / "anvil" / "cert.pem").read_bytes() == before
     with (ca.folder / "ca.pem").open("a") as file:
@@ -248,16 +246,16 @@ def test_a_ca_renews_only_what_itself_or_one_beside_it_has_issued(ca: Certificat
 
 def test_a_ca_that_is_broken_open_or_expired_issues_nothing(ca: CertificateAuthority, tmp_path: Path) -> None:
     key = ca.folder / "ca-key.pem"
-    with pytest.raises(BadInput, match=r"ca.pem: this CA has ended on 2040-04-28 12:00 UTC; "):
+    with pytest.raises(BadInput, match=r"ca.pem: this CA expired on 2040-04-28 12:00 UTC; "):
         CertificateAuthority.read(ca.folder, NOW + YEARS)
     key.chmod(0o640)
-    with pytest.raises(BadInput, match=r"ca-key.pem: may be read by others \(mode 640\); chmod 600 "):
+    with pytest.raises(BadInput, match=r"ca-key.pem: may be read by others \(640\); chmod 600 "):
         CertificateAuthority.read(ca.folder, NOW)
     key.chmod(0o600)
     other = authority(tmp_path / "other-ca")
     key.write_bytes((other.folder / "ca-key.pem").read_bytes())
-    with pytest.raises(BadInput, match=r"ca-key.pem: is the key of no certificate in ca.pem; "):
+    with pytest.raises(BadInput, match=r"ca-key.pem: does not match any certificate in ca.pem; "):
         CertificateAuthority.read(ca.folder, NOW)
     key.write_text("x")
-    with pytest.raises(BadInput, match=r"ca-key.pem: holds no private key that can be read; "):
+    with pytest.raises(BadInput, match=r"ca-key.pem: has no readable private key; "):
         CertificateAuthority.read(ca.folder, NOW)

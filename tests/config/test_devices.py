@@ -46,17 +46,17 @@ BAD = {
         'rc[0].port (radio/r): "\\x00" can\'t be opened; name what to open, as in port = "/dev/ttyUSB0"'
     ),
     radio(capacity="{ command_rate = 1 }"): (
-        'rc[0].capacity (radio/r): the driver "radio" has none; remove it, or write driver = "capacity"'
+        'rc[0].capacity (radio/r): driver "radio" does not take it; remove it, or write driver = "capacity"'
     ),
     radio(activation="1"): (
-        'rc[0].activation (radio/r): the driver "radio" has none; '
+        'rc[0].activation (radio/r): driver "radio" does not take it; '
         'remove it, or write driver = "exclusive", "capacity" or "command"'
     ),
     table("radio/r", driver="capacity", capacity="{ a = 1 }", port='"/dev/x"'): (
-        'rc[0].port (radio/r): the driver "capacity" has none; remove it, or write driver = "radio"'
+        'rc[0].port (radio/r): driver "capacity" does not take it; remove it, or write driver = "radio"'
     ),
     table("mast/r", driver="radio", port='"/dev/x"'): (
-        'rc[0].name: "mast/r" is no radio, as driver = "radio" says; name it radio/r, or choose another driver'
+        'rc[0].name: "mast/r" does not fit driver = "radio"; name it radio/r, or choose another driver'
     ),
     table("robot/a", radio='"radio/r"'): (
         "rc[0].id (robot/a): is missing; add the id that its packets carry, as in id = 33"
@@ -64,26 +64,26 @@ BAD = {
     table("robot/a", id="33"): (
         'rc[0].radio (robot/a): is missing; add the radio that carries its halt, as in radio = "radio/rf0"'
     ),
-    robot(radio='"r"'): f'rc[0].radio (robot/a): "r" is not the name of an RC; {RC_RULE}',
-    robot(radio='"video/r"'): ('rc[0].radio (robot/a): "video/r" is no radio; name one, as in "radio/..."'),
+    robot(radio='"r"'): f'rc[0].radio (robot/a): "r" is not the name of a device; {RC_RULE}',
+    robot(radio='"video/r"'): ('rc[0].radio (robot/a): "video/r" is not a radio; name one, as in "radio/..."'),
     robot(channels='{ "radio/r" = 1 }'): (
-        'rc[0].channels."radio/r" (robot/a): "radio/r" is no video; name one, as in "video/..."'
+        'rc[0].channels."radio/r" (robot/a): "radio/r" is not a video; name one, as in "video/..."'
     ),
     robot(channels='{ "video/1" = 1, "video/2" = 1 }'): (
-        'rc[0].channels."video/2" (robot/a): is 1, as video/1 is; give each its own channel'
+        'rc[0].channels."video/2" (robot/a): 1 is also the channel of video/1; give each its own channel'
     ),
     robot(warmup="1"): "rc[0].warmup (robot/a): unknown key; did you mean warm_up?",
     table("framegrabber/f"): (
         'rc[0].source (framegrabber/f): is missing; add it, as in source = "/dev/video0", or a table sources'
     ),
     table("framegrabber/f", source='"a"', sources='{ "video/1" = "b" }'): (
-        "rc[0].sources (framegrabber/f): stands beside source; remove one of the two"
+        "rc[0].sources (framegrabber/f): can't be used with source; remove one of the two"
     ),
     table("framegrabber/f", sources="{}"): (
         'rc[0].sources (framegrabber/f): is empty; add one, as in "video/ch1" = "/dev/video0"'
     ),
     table("framegrabber/f", sources='{ ch1 = "b" }'): (
-        f'rc[0].sources.ch1 (framegrabber/f): "ch1" is not the name of an RC; {RC_RULE}'
+        f'rc[0].sources.ch1 (framegrabber/f): "ch1" is not the name of a device; {RC_RULE}'
     ),
 }
 

@@ -22,7 +22,7 @@ from zscout.config.strict import BadInput
 from zscout.types import SECOND
 
 CLOSED = '[security]\nfolder = "k"\n[roles]\nmanager = ["a"]\n'
-SYNTAX = "mend the TOML there or just before"
+SYNTAX = "fix the TOML there or just before"
 
 BAD_FLEETS = """
 x =  | line 1, column 5, the end: Invalid value; mend the TOML there or just before
@@ -82,7 +82,7 @@ fleet = "lab" | fleet: is the text "lab"; write a table, under [fleet]
 BAD_FLEETS_BY_TEXT = {
     "\n[fleet\nname = 1": f"line 2, column 7: Expected ']' at the end of a table declaration; {SYNTAX}",
     "x = " + "1" * 5000: "a whole number has thousands of digits; shorten it",
-    "x = " + "[" * 5000: "is nested too deep; no key goes deeper than a few tables",
+    "x = " + "[" * 5000: "is nested too deep; use fewer levels",
     "\n" + ".".join(["a"] * 300_000) + " = 1": "line 2 has a dotted key of more than 32 parts; shorten it",
     "[" + " . ".join(['"\\""', "'b'"] * 60_000) + "]": "line 1 has a dotted key of more than 32 parts; shorten it",
     '"a\\u001b\\nb" = 1': r'"a\x1b\nb": unknown key; known here: access, ceilings, devices, fair_shares, '
@@ -103,10 +103,10 @@ BAD_FLEETS_BY_TEXT = {
         'write strategy = "adaptive" under [fleet], or remove the table'
     ),
     '[roles]\nclient = ["bob"]\n[groups]\narms = ["bob"]\n[fair_shares.weights]\nbob = 2': (
-        'fair_shares.weights.bob: "bob" is of the group arms, and counts there; give the group a weight'
+        'fair_shares.weights.bob: "bob" belongs to the group arms; give the group a weight'
     ),
     '[roles]\nclient = ["bob"]\n[fair_shares.weights]\nlegs = 2': (
-        'fair_shares.weights.legs: "legs" is no group and has no role; name it under [groups], or mend the name'
+        'fair_shares.weights.legs: "legs" is not a group and has no role; add it under [groups], or correct it'
     ),
     '[mesh]\nconnect = ["tcp/[::fff1:1:2:3:4:5:6:7:8]:7"]': (
         f'mesh.connect[0]: "tcp/[::fff1:1:2:3:4:5:6:7:8]:7" is not an endpoint; {ENDPOINT_RULE}'
@@ -114,7 +114,7 @@ BAD_FLEETS_BY_TEXT = {
     CLOSED + '[mesh]\nlisten = ["tcp/0.0.0.0:7447"]': (
         'mesh.listen[0]: "tcp/0.0.0.0:7447" is not TLS; write tls/host:port, or remove [security]'
     ),
-    CLOSED + '[fleet]\ncandidates = ["b"]': "fleet.candidates[0]: b is no manager; name it so under [roles]",
+    CLOSED + '[fleet]\ncandidates = ["b"]': "fleet.candidates[0]: b is not a manager; name it as one under [roles]",
     CLOSED + '[devices]\nb = ["robot/x"]': "devices.b: b may not serve robot/x; name it under [roles.node], b",
 }
 

@@ -16,16 +16,16 @@ from zscout.config.node import Node, RecorderConfig, default_node, load_node
 from zscout.config.strict import BadInput, Where
 
 ROBOT = '[[rc]]\nname = "robot/a"\ndriver = "exclusive"\n'
-UNSHOWN = "is of the wrong form, and not shown, as it may hold a secret"
+UNSHOWN = "has the wrong form (not shown, it may be a secret)"
 RADIO = '[[rc]]\nname = "radio/r"\ndriver = "capacity"\n'
 
 BAD_NODES = {
     '[node]\nhots = "a"': "node.hots: unknown key; did you mean host?",
     '[node]\nhost = "a/b"': f'node.host: "a/b" is not a name; {NAME_RULE}',
     '[node]\nload = "yes"': 'node.load: is the text "yes"; write true, false or "tree"',
-    "[notify]": "notify: tells nobody; name urls or users, or remove the table",
+    "[notify]": "notify: sends nothing to anybody; name urls or users, or remove the table",
     '[node]\ncandidate = false\n[notify]\nurls = ["json://a"]': "notify: this host never leads, "
-    "and only who leads tells anybody; move it to one that does",
+    "and only the leader sends notices; move it to a candidate",
     # No secret is shown.
     '[notify]\nurls = "json://user:secret@a"': f"notify.urls: {UNSHOWN}; "
     'write texts in a list, as in ["mailtos://user:password@example.org"]',
@@ -35,24 +35,23 @@ BAD_NODES = {
     "a file; write one, as in mailtos://user:password@example.org",
     f"[node]\nlabels = {['a'] * 33}": "node.labels: has 33 entries; at most 32 are allowed",
     "[mesh]\nlease = 1": "mesh.lease: unknown key; known here: connect, interface, listen, relay, site",
-    '[mesh]\nrelay = ["a"]': 'mesh.relay: joins a to nothing; name the sites, as in ["north", "south"]',
-    '[mesh]\nrelay = ["a", "b"]\n[recorder]': "recorder: its process would be a second relay; "
-    "let the node of a site record",
-    '[mesh]\nsite = "a"\nrelay = ["a", "b"]': "mesh.site: a relay is of none of its sites; remove site, or relay",
-    '[mesh]\ninterface = "a b"': 'mesh.interface: "a b" names no interface; write "auto", or as in "eth0"',
+    '[mesh]\nrelay = ["a"]': 'mesh.relay: joins a to no other site; name the sites, as in ["north", "south"]',
+    '[mesh]\nrelay = ["a", "b"]\n[recorder]': "recorder: a relay can't record; record on the node of a site",
+    '[mesh]\nsite = "a"\nrelay = ["a", "b"]': "mesh.site: a relay belongs to no single site; remove site, or relay",
+    '[mesh]\ninterface = "a b"': 'mesh.interface: "a b" is not an interface; write "auto", or as in "eth0"',
     '[rc]\nname = "robot/a"': "rc: is a table; write tables, each under [[rc]]",
     "rc = [1]": "rc[0]: is 1; write a table",
     '[[rc]]\ndriver = "exclusive"': "rc[0].name: is missing; add it",
     '[[rc]]\nname = "robot/a"': "rc[0].driver (robot/a): is missing; add it",
-    '[[rc]]\nname = "robot"\ndriver = "exclusive"': (f'rc[0].name: "robot" is not the name of an RC; {RC_RULE}'),
-    '[[rc]]\nname = "a/b/c"\ndriver = "exclusive"': (f'rc[0].name: "a/b/c" is not the name of an RC; {RC_RULE}'),
+    '[[rc]]\nname = "robot"\ndriver = "exclusive"': (f'rc[0].name: "robot" is not the name of a device; {RC_RULE}'),
+    '[[rc]]\nname = "a/b/c"\ndriver = "exclusive"': (f'rc[0].name: "a/b/c" is not the name of a device; {RC_RULE}'),
     '[[rc]]\nname = "robot/a"\ndriver = "very fast"': f'rc[0].driver (robot/a): "very fast" is not a name; {NAME_RULE}',
-    '[[rc]]\nname = "robot"\ndriver = "fast"': f'rc[0].name: "robot" is not the name of an RC; {RC_RULE}',
+    '[[rc]]\nname = "robot"\ndriver = "fast"': f'rc[0].name: "robot" is not the name of a device; {RC_RULE}',
     ROBOT + RADIO + "capacity = { a = 1 }\n" + ROBOT: (
-        'rc[2].name: "robot/a" stands at rc[0] already; rename or remove one of the two'
+        'rc[2].name: "robot/a" is already at rc[0]; rename or remove one of the two'
     ),
     ROBOT + "capacity = {}": (
-        'rc[0].capacity (robot/a): the driver "exclusive" has none; remove it, or write driver = "capacity"'
+        'rc[0].capacity (robot/a): driver "exclusive" does not take it; remove it, or write driver = "capacity"'
     ),
     ROBOT + RADIO: ("rc[1].capacity (radio/r): is missing or empty; add one, as in capacity = { command_rate = 10 }"),
     RADIO + "capacity = { rate = -1 }": "rc[0].capacity.rate (radio/r): is -1; write 0 or more",
@@ -63,7 +62,7 @@ BAD_NODES = {
         'write "127.0.0.1", or add allow_remote = true if that is meant'
     ),
     '[recorder]\nbind = "anvil"': ('recorder.bind: "anvil" is not an IP address; write one, as in "127.0.0.1"'),
-    '[recorder]\npath = ""': 'recorder.path: "" is no folder; name one, as in path = "runs"',
+    '[recorder]\npath = ""': 'recorder.path: "" is not a folder; name one, as in path = "runs"',
 }
 
 
@@ -85,7 +84,7 @@ def test_a_url_that_apprise_can_not_use_is_not_shown() -> None:
         node('[notify]\nurls = ["none://user:secret@a"]')
     assert str(caught.value) == (
         "node.toml: notify.urls[0]: is no URL that Apprise can use (not shown: it may hold a secret); "
-        "see https://appriseit.com for how each service's is written"
+        "https://appriseit.com shows the form for each service"
     )
 
 

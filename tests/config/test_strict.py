@@ -50,7 +50,7 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     write("closed", "").chmod(0)
     with nobody():
         found = line(tmp_path / "closed")
-    assert found == f"{tmp_path}/closed: may not be read by this user; change its permissions, or the user"
+    assert found == f"{tmp_path}/closed: may not be read by this user; change its permissions, or run as another user"
 
 
 @pytest.mark.parametrize(

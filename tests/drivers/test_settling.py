@@ -285,7 +285,7 @@ async def test_whom_a_device_begins_for_does_not_enter_before_it_has_begun() -> 
         refused = await at.refusal(2)
         assert refused.code == "settling"
         assert refused.left == pytest.approx(4, abs=0.1)
-        assert refused.message == "robot/x is being started, for 4.0 s at most"
+        assert refused.message == "robot/x is starting; wait at most 4.0 s"
         assert await at.word(at.other, 2, ECHO) == "settling"
         assert await at.word(at.other, 2, {"name": "stop"}) == "done"
         assert await at.word(at.client, 1) == "ended"

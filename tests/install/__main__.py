@@ -259,7 +259,7 @@ def check_host(wheel: Path, folder: Path) -> None:
         expect(not host.path("/etc/zscout").exists(), "a bad node file leaves something in /etc")
         host.write("/srv/new/anvil.toml", '[node]\nhost = "anvil"\nfleet = "fleet.toml"\n')
         ended = host.fails(*words, timeout=INSTALL)
-        expect("zscout-node does not run: /etc/zscout/keys: no certificate is there" in ended, f"no keys: {ended}")
+        expect("zscout-node does not run: /etc/zscout/keys: has no certificate" in ended, f"no keys: {ended}")
         host.run("rm", "-r", "/etc/zscout", "/etc/systemd/system/zscout-node.service")
         words += ["--keys", "/srv/new/anvil"]
         said = host.run(*words, timeout=INSTALL)

@@ -97,7 +97,7 @@ QUERIES: list[tuple[str, str, bytes | None, str, str]] = [
     ("no metric of ours", RANK, b'{"metric": "luck"}', "malformed", "Invalid enum value 'luck'"),
     ("no policy of ours", RANK, b'{"policy": 7}', "malformed", "at `$.policy`"),
     ("no host to be named", RANK, b'{"at_most": 0}', "malformed", "at `$.at_most`"),
-    ("hosts by pattern", RANK, b'{"hosts": ["*"]}', "bad_name", "host '*' is not valid"),
+    ("hosts by pattern", RANK, b'{"hosts": ["*"]}', "bad_name", "host \"*\" is not valid"),
     ("a thousand hosts", RANK, json.dumps({"hosts": ["h"] * 1000}).encode(), "malformed", "at `$.hosts`"),
     ("less than no memory", RANK, b'{"memory": -1}', "malformed", "at `$.memory`"),
     ("a place of a future term", SCHEDULE, bad(place=[[HIGH, "f"], 1]), "bad_request", "place is of a term"),

@@ -288,7 +288,7 @@ def test_without_an_rcm_it_says_so_and_what_to_do(tmp_path: Path) -> None:
     seconds, _, told = line.partition(" ")
     assert float(seconds) >= 3
     assert told.startswith(
-        f"no RCM is on the mesh of fleet {lab.fleet.name} (no other program either); start zscout-node"
+        f"no leader is on the mesh of fleet {lab.fleet.name} (no other program either); start zscout-node"
     )
 
 

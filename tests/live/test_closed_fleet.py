@@ -65,7 +65,7 @@ async def test_what_roles_say_is_enforced_and_taken_anew_at_sighup(lab: ClosedLa
     lab.node("anvil", "robot/a", "robot/b")
     bob, ada = await lab.person("bob"), await lab.person("ada")
     await lab.ready(bob, "robot/a", "robot/b")
-    with pytest.raises(RequestRefused, match=r"bob \(client\) may not ask for priority 10; at most 9; ada may"):
+    with pytest.raises(RequestRefused, match=r"bob \(client\) may not request priority 10; at most 9; ada may"):
         async with hold(bob, "survey", {"robot/a": {}}, priority=10):
             pass
 
@@ -80,7 +80,7 @@ async def test_what_roles_say_is_enforced_and_taken_anew_at_sighup(lab: ClosedLa
 
     with pytest.raises(Revoked, match="the fleet file, which names its owner under no role"):
         await survey()
-    with pytest.raises(RequestRefused, match="bob, who has no role here, may not ask for an ARC"):
+    with pytest.raises(RequestRefused, match="bob, which has no role here, may not request devices"):
         async with hold(bob, "survey", {"robot/a": {}}):
             pass
     # Who was not touched, and who is named from now on, goes on.

@@ -35,7 +35,7 @@ async def test_a_slow_start_is_waited_for_and_told_of(tmp_path: Path, lab: Lab) 
     assert "and waits: psu/bench is being started, for " in held.stderr
     for asked, why in (
         ({"voltage": 31}, "can never start: voltage 31 of 30 at psu/bench"),
-        ({"current": 1}, "psu/bench knows no parameter current; it knows voltage"),
+        ({"current": 1}, "psu/bench has no parameter current; it has voltage"),
     ):
         with pytest.raises(RequestRefused, match=why):
             await client.request("bench", {"psu/bench": asked}, min_runtime=1)

@@ -228,12 +228,12 @@ async def test_certificates_of_another_ca_are_told_by_both_sides_and_expired_one
     lab.authority.issue("eve", keys / "late", timedelta(seconds=1), now - DAY)
     told = await doctor(lab, ZSCOUT_KEYS=keys / "late")
     assert len(told.mends()) == 1
-    assert told.of("certificate")[0][1].startswith(f"{keys}/late/cert.pem: has ended on ")
+    assert told.of("certificate")[0][1].startswith(f"{keys}/late/cert.pem: expired on ")
     assert not told.of("links")
 
     lab.authority.issue("bench", keys / "early", DAY, now - 2 * DAY)
     with bare(lab, tls=tls(keys / "early")):
-        ended = r"the certificate of bench \(tls/.*\) has ended on .*"
+        ended = r"the certificate of bench \(tls/.*\) expired on .*"
         told = await told_of(lab, "security", ended, ZSCOUT_KEYS=keys / "ada")
     assert len(told.mends()) == 1
 
@@ -249,9 +249,9 @@ async def test_a_name_that_is_not_the_certificates_is_told_before_joining(tmp_pa
     lab.node("cart")
     await lab.logged("cart", "is on the mesh")
     (keys / "key.pem").chmod(0o644)
-    await mends(lab, [f"{keys}/key.pem: may be read by others (mode 644)"], file)
+    await mends(lab, [f"{keys}/key.pem: may be read by others (644)"], file)
     (keys / "ca.pem").chmod(0o666)
-    await mends(lab, [f"{keys}/ca.pem: may be written by others (mode 666)"], file)
+    await mends(lab, [f"{keys}/ca.pem: may be written by others (666)"], file)
 
 
 @pytest.mark.slow

@@ -185,7 +185,7 @@ async def test_journals_answer_while_nobody_leads(tmp_path: Path) -> None:
 async def test_where_nobody_is_there_nobody_answers(lab: Lab) -> None:
     done = await zscout_soon("history", env=lab.env)
     assert done.returncode == 3
-    assert done.stderr.startswith(f"zscout: no RCM is on the mesh of fleet {lab.fleet.name} (no other program")
+    assert done.stderr.startswith(f"zscout: no leader is on the mesh of fleet {lab.fleet.name} (no other program")
 
 
 async def test_a_fleet_without_a_journal_says_so(lab: Lab) -> None:

@@ -48,7 +48,7 @@ async def test_a_capacity_is_filled_and_never_exceeded(lab: Lab) -> None:
     await comes_to(two, "running")
     three = await ask(client, "three", "0.1")
     await comes_to(three, "queued", ": radio/rf refuses more: rate would be 0.4 of 0.3")
-    with pytest.raises(RequestRefused, match=r"can never start: rate 0\.31 of 0\.3 at radio/rf; ask for less"):
+    with pytest.raises(RequestRefused, match=r"can never start: rate 0\.31 of 0\.3 at radio/rf; request less"):
         await ask(client, "too-much", "0.31", priority=9)
     # What asks for nothing that is scarce fits beside them.
     await comes_to(await ask(client, "idle", "0"), "running")

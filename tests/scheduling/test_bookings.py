@@ -405,5 +405,5 @@ def test_a_date_that_runs_is_in_the_way_where_it_is_and_not_where_it_was_to_be()
 
 
 def test_maintenance_is_of_rcs_by_name() -> None:
-    with pytest.raises(ValueError, match=r"booking m: maintenance needs RCs by name, not robot/\*"):
+    with pytest.raises(ValueError, match=r"booking m: maintenance needs devices by name, not robot/\*"):
         Booking("m", {"robot/*": {}}, 10, 10, 10, 5, 0, maintenance=True)

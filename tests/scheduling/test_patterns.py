@@ -80,7 +80,9 @@ def test_several_are_counted_by_naming(strategy: StrategyName) -> None:
     assert len(held(core)) == 1
     assert len(held(core)["two"]) == 2
     core.handle(0, Requested(request("four", *(f"fg/*#{n}" for n in range(1, 5)))))
-    assert str(core._state.queued["four"].reason) == ("no RC on the mesh is left for fg/*#1, fg/*#2, fg/*#3 and 1 more")
+    assert str(core._state.queued["four"].reason) == (
+        "no device on the mesh is left for fg/*#1, fg/*#2, fg/*#3 and 1 more"
+    )
     core.handle(0, RcJoined("fg/d", sharable=False))
     assert sorted(held(core)) == ["also", "two"]
 
@@ -172,8 +174,8 @@ def test_a_standing_hold_must_tell_what_it_holds() -> None:
     [
         ({"fg/**": {}}, "not valid"),
         ({"radio/*": {"rate": Fraction(1)}, "radio/*#2": {"rate": Fraction(2)}}, "different parameters"),
-        ({"radio/*": {"rate": Fraction(1)}, "*/rf0": {}}, "name its kind"),
-        ({"*/*": {"rate": Fraction(1)}}, "name its kind"),
+        ({"radio/*": {"rate": Fraction(1)}, "*/rf0": {}}, "name a kind"),
+        ({"*/*": {"rate": Fraction(1)}}, "name a kind"),
     ],
 )
 def test_what_no_request_may_ask(needs: dict[str, Params], message: str) -> None:

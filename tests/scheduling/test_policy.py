@@ -147,7 +147,7 @@ def test_a_host_has_its_quota(strategy: StrategyName) -> None:
     core.handle(0, *(Requested(request(f"mine{rc}", f"robot/{rc}", host="greedy")) for rc in "ab"))
     core.handle(0, Requested(request("theirs", "robot/c", host="modest")))
     assert running(core) == {"minea", "theirs"}
-    assert str(core._state.queued["mineb"].reason) == "host greedy has 1 ARCs running, its quota"
+    assert str(core._state.queued["mineb"].reason) == "host greedy has 1 requests running, its quota"
     core.handle(SECOND, Requested(request("operator", "robot/b", priority=10, host="greedy")))
     assert running(core) == {"minea", "theirs", "operator"}
     core.handle(2 * SECOND, Released("operator"))
@@ -169,7 +169,7 @@ def test_a_group_has_its_quota_of_rcs(strategy: StrategyName) -> None:
     core.handle(0, Requested(request("third", "robot/c", host="ada")))
     core.handle(0, Requested(request("theirs", "robot/d", host="eve")))
     assert running(core) == {"one", "two", "theirs"}
-    assert str(core._state.queued["third"].reason) == "arms may hold 2 RCs at one time"
+    assert str(core._state.queued["third"].reason) == "arms may hold 2 devices at one time"
     core.handle(SECOND, Requested(request("operator", "robot/c", priority=10, host="bob")))
     assert running(core) == {"one", "two", "theirs"}
     core.handle(2 * SECOND, Released("two"))

@@ -108,8 +108,7 @@ def test_to_whom_it_was_lost_and_why_is_told_once() -> None:
     assert ended("preempted", str(preempted)) == "preempted by bob@ws2 (zscout take), priority 10: the gripper is stuck"
     displaced = Reason(ReasonCode.DISPLACED, by=(TAKE,))
     assert ended("completed", str(displaced)) == (
-        "completed: its minimum runtime is over and bob@ws2 (zscout take), priority 10, needs its RCs: "
-        "the gripper is stuck"
+        "completed: its minimum runtime is over, and bob@ws2 (zscout take), priority 10, needs it: the gripper is stuck"
     )
     assert ended("cancelled", "cancelled by its client") == "cancelled by its client"
     assert ended("client_lost", "its client left the mesh") == "client lost: its client left the mesh"

@@ -76,7 +76,7 @@ def test_who_is_in_several_groups_counts_in_the_first(tmp_path: Path) -> None:
     ("name", "asked", "why"),
     [
         ("bob", ask("robot/scout1", priority=9), ""),
-        ("bob", ask("robot/scout1", priority=10), "bob (client) may not ask for priority 10; at most 9; ada may"),
+        ("bob", ask("robot/scout1", priority=10), "bob (client) may not request priority 10; at most 9; ada may"),
         ("ada", ask("robot/scout1", priority=10, keep=True, min_runtime=600), ""),
         ("anvil", ask("robot/scout1", priority=10), "anvil (manager) may not ask for priority 10; at most 9; ada may"),
         ("wall", ask("robot/scout1"), "wall (viewer) may not ask for an ARC" + OTHERS_MAY),
@@ -97,7 +97,7 @@ def test_what_a_name_may_ask_for(tmp_path: Path, name: str, asked: Ask, why: str
 def test_a_name_has_no_more_arcs_open_than_its_quota(tmp_path: Path) -> None:
     told = authority(tmp_path)
     told.check_ask(Sender("bob", "c1"), ask("robot/scout1"), lambda names: len(names))
-    with pytest.raises(Refused, match="bob has 2 ARCs open, its quota; release or cancel one"):
+    with pytest.raises(Refused, match="bob has 2 open requests, its quota; cancel one"):
         told.check_ask(Sender("bob", "c1"), ask("robot/scout1"), lambda names: 2 * len(names))
 
 
@@ -112,9 +112,9 @@ def given(*needs: str, priority: int = 1, keep: bool = False, runs: bool = False
     ("to", "arcs", "why"),
     [
         ("bob", [given("robot/s1")], ""),
-        ("bob", [given("robot/s1"), given("robot/s2")], "bob may have 2 ARCs open, and would have more"),
+        ("bob", [given("robot/s1"), given("robot/s2")], "bob may have 2 open requests, and would have more"),
         ("bob", [given("robot/arm1")], "bob (client) may not hold robot/arm1; ada, eve may"),
-        ("bob", [given("robot/s1", priority=10)], "bob (client) may not ask for priority 10; at most 9; ada may"),
+        ("bob", [given("robot/s1", priority=10)], "bob (client) may not request priority 10; at most 9; ada may"),
         ("bob", [given("robot/s1", keep=True)], "bob (client) may not keep a hold; ada may"),
         ("wall", [given("robot/s1")], "wall (viewer) may not take over an ARC" + OTHERS_MAY),
         # Of one group: it has no more than before.
@@ -133,7 +133,7 @@ def test_who_is_handed_a_hold_has_no_more_rcs_than_its_quota(tmp_path: Path) -> 
     told, to, arcs = authority(tmp_path), Sender("eve", "c1"), [given("a/1", runs=True)]
     told.check_hand_over(Sender("bob", "c1"), to, arcs, lambda _: 0, lambda _: 2)
     told.check_hand_over(Sender("bob", "c1"), to, [given("a/1")], lambda _: 0, lambda _: 3)
-    with pytest.raises(Refused, match="arms may hold 3 RCs at one time, and would hold more"):
+    with pytest.raises(Refused, match="arms may hold 3 devices at one time, and would hold more"):
         told.check_hand_over(Sender("bob", "c1"), to, arcs, lambda _: 0, lambda _: 3)
 
 
@@ -151,7 +151,7 @@ def test_who_is_named_no_more_has_no_rights_once_the_file_is_read_again(tmp_path
     (tmp_path / "fleet.toml").write_text(FILE.replace('"bob", "eve"', '"eve"').replace("bob = { arcs = 2 }", ""))
     told.reload(load_fleet(tmp_path / "fleet.toml"))
     assert told.is_removed("bob/c1")
-    with pytest.raises(Refused, match="bob, who has no role here, may not ask for an ARC"):
+    with pytest.raises(Refused, match="bob, which has no role here, may not request devices"):
         told.check_ask(Sender("bob", "c1"), ask("robot/scout1"), lambda _: 0)
 
 

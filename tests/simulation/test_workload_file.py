@@ -29,7 +29,7 @@ def arc(arc_name: str = "arc0", /, **keys: str) -> str:
 
 
 BAD = {
-    "[[arc]": "line 1, column 6: Expected ']]' at the end of an array declaration; mend the TOML there or just before",
+    "[[arc]": "line 1, column 6: Expected ']]' at the end of an array declaration; fix the TOML there or just before",
     # Keys
     "[[arcs]]": "arcs: unknown key; did you mean arc or rc?",
     "[rc]": "rc: is a table; write tables, each under [[rc]]",
@@ -38,8 +38,8 @@ BAD = {
     arc(name=""): "arc[0].name: is missing; add it",
     arc(needs=""): "arc[0].needs (arc0): is missing; add it",
     # Names
-    RC + RC: f'rc[1].name: "robot/a" stands at rc[0] already; {TWICE}',
-    arc() + arc("arc1") + arc(): f'arc[2].name: "arc0" stands at arc[0] already; {TWICE}',
+    RC + RC: f'rc[1].name: "robot/a" is already at rc[0]; {TWICE}',
+    arc() + arc("arc1") + arc(): f'arc[2].name: "arc0" is already at arc[0]; {TWICE}',
     '[[rc]]\nname = ""': 'rc[0].name: "" is not a name; write 1 to 130 printable characters',
     '[[rc]]\nname = "a\\tb"': r'rc[0].name: "a\tb" is not a name; write 1 to 130 printable characters',
     arc("a" * 131): f'arc[0].name: "{"a" * 60}..." is not a name; write 1 to 130 printable characters',
@@ -67,7 +67,7 @@ BAD = {
     ),
     RC + "sharable = 1": "rc[0].sharable (robot/a): is 1; write true or false",
     RC + "capacity = {rate = 1}": (
-        "rc[0].capacity (robot/a): an exclusive RC has one holder and no capacity; add sharable = true, or remove it"
+        "rc[0].capacity (robot/a): an exclusive device has no capacity; add sharable = true, or remove it"
     ),
     RADIO + "capacity = {rate = -0.1}": "rc[0].capacity.rate (radio/r): is -0.1; write 0 or more",
     RADIO + "capacity = {rate = 1e-101}": ("rc[0].capacity.rate (radio/r): has more than 100 decimal places; round it"),

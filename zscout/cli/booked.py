@@ -36,7 +36,7 @@ BAD: Final = frozenset({"bad_date", "bad_zone", "bad_request"})
 def parse_booking(text: str, option: str) -> str:
     """What may be a booking's name or id. Raises BadInput."""
     if not 1 <= len(text) <= MAX_TEXT or not text.isprintable():
-        raise BadInput(f"{option}: {quoted(text)} names no booking; zscout bookings lists them")
+        raise BadInput(f"{option}: {quoted(text)} can't be the name of a booking; see zscout booking list")
     return text
 
 
@@ -47,7 +47,7 @@ booking_argument = click.argument("booking", type=BOOKING, metavar="NAME|ID", sh
 
 def zone_option(command: F) -> F:
     """`--zone`; None: this host's."""
-    text = "Zone of the dates, as in Europe/Berlin. Default: this host's."
+    text = "Time zone of the dates, as in Europe/Berlin. Default: this host's."
     return click.option("--zone", type=ZONE, help=text)(command)
 
 
@@ -68,7 +68,6 @@ async def look(client: Client) -> BookingsTold | None:
 
 
 def soon(told: BookingsTold | None) -> int:
-    """How many dates begin within a day."""
     return (
         0
         if told is None
@@ -169,12 +168,10 @@ def rcs_words(booking: BookingView, date: BookedDate | None = None) -> str:
 
 
 def in_words(seconds: float) -> str:
-    """`now`, `in 3 h`."""
     return f"in {span(seconds)}" if seconds >= 1 else "now"
 
 
 def state_words(booking: BookingView, date: BookedDate) -> str:
-    """How one date stands, and what endangers it."""
     words = "maintenance" if booking.maintenance and date.state == "open" else date.state
     return f"{words}: {date.danger}" if date.danger else words
 
@@ -185,12 +182,10 @@ def _next(booking: BookingView) -> str:
 
 
 def clock_words(host: str, differs: float) -> str:
-    """That a host's clock is not the fleet's."""
     return f"the clock of {host} is {span(abs(differs))} {'before' if differs > 0 else 'behind'} the fleet's"
 
 
 def utc(at: float) -> str:
-    """For programs: `2026-12-01T13:00:00Z`."""
     return datetime.fromtimestamp(at, UTC).isoformat(timespec="seconds").replace("+00:00", "Z")
 
 

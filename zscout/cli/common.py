@@ -95,7 +95,6 @@ def run(main: Coroutine[Any, Any, T]) -> T:
 
 
 def runs(main: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
-    """Lets a coroutine function be a command's."""
 
     @wraps(main)
     def command(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -156,7 +155,7 @@ async def state_of(client: Client, arc: str | None = None, *, forecast: bool = F
         state = await client.state(arc, forecast=forecast)
         if state is not None:
             return state
-    raise NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again, or see its log")
+    raise NobodyThere(f"the leader of fleet {client.fleet.name} did not answer; try again, or see its log")
 
 
 async def until(true: Callable[[], bool], changed: asyncio.Event, seconds: float) -> bool:
@@ -171,7 +170,6 @@ async def until(true: Callable[[], bool], changed: asyncio.Event, seconds: float
 
 @asynccontextmanager
 async def beside(work: Coroutine[Any, Any, Any]) -> AsyncIterator[None]:
-    """Runs `work` for as long as the context lasts."""
     task = asyncio.ensure_future(work)
     try:
         yield
@@ -200,7 +198,7 @@ async def first_of(*works: Coroutine[Any, Any, Any]) -> list[bool]:
 def unknown(what: str, name: str, known: Iterable[str], nothing: str, listed: str, more: int = 0) -> Failed:
     """What to raise where nobody knows a `name`: it lists names like it, or those that are known (the word is
     `listed`) and how many `more` there are, or it says that there is `nothing`."""
-    return Failed(f"no {what} {quoted(name)} is known{hint_at(name, known, nothing, listed, more)}")
+    return Failed(f"unknown {what} {quoted(name)}{hint_at(name, known, nothing, listed, more)}")
 
 
 def hint_at(name: str, known: Iterable[str], nothing: str, listed: str, more: int = 0) -> str:
@@ -246,7 +244,7 @@ def check_recording(option: str, path: Path | None) -> None:
     if path is None:
         return
     if path.suffix != ".rrd":
-        raise BadInput(f"{option} {path}: viewers know a recording by its name; let it end in .rrd")
+        raise BadInput(f"{option} {path}: not the name of a recording; end it in .rrd")
     there = path.exists()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -34,7 +34,7 @@ SHELLS: Final = ("bash", "zsh", "fish")
 def completion(ctx: click.Context, shell: str | None, program: str) -> None:
     """Print the completion script for a shell; without SHELL, for the one in $SHELL.
 
-    At Tab it offers commands and options, and the RCs, ARCs, hosts, components and kinds of the fleet as it is then.
+    At Tab it offers commands and options, and the current devices, requests, hosts, components and kinds of the fleet.
 
     \b
     Examples:
@@ -46,7 +46,7 @@ def completion(ctx: click.Context, shell: str | None, program: str) -> None:
     name = shell or Path(os.environ.get("SHELL", "")).name
     found = get_completion_class(name) if name in SHELLS else None
     if found is None:
-        raise click.UsageError(f"$SHELL names no shell that is known here; write one of {', '.join(SHELLS)}", ctx)
+        raise click.UsageError(f"no completion for the shell in $SHELL; write one of {', '.join(SHELLS)}", ctx)
     variable = f"_{program.replace('-', '_')}_COMPLETE".upper()
     click.echo(found(ctx.find_root().command, {}, program, variable).source())
 
@@ -104,13 +104,11 @@ async def rcs(mesh: Mesh, kind: str) -> Iterable[str]:
 
 @_on_mesh
 async def needs(mesh: Mesh, _parameter: str) -> Iterable[str]:
-    """RCs of all kinds."""
     return await _rc_names(mesh)
 
 
 @_on_mesh
 async def arcs(mesh: Mesh, _parameter: str) -> Iterable[str]:
-    """Names of ARCs that are open."""
     return _arc_names(await _state(mesh))
 
 

@@ -67,9 +67,7 @@ class WrittenDate:
             unit = 1 if self.after < SOON else 60
             return Found(datetime.fromtimestamp(math.ceil((now + self.after) / unit) * unit, zone))
         if self.time is None:
-            raise BadInput(
-                f"{self.option}: {quoted(self.text)} has no time of day; write {quoted(f'{self.text} 14:00')}"
-            )
+            raise BadInput(f"{self.option}: {quoted(self.text)} has no time; write {quoted(f'{self.text} 14:00')}")
         today = datetime.fromtimestamp(now, zone).date()
         found = local(datetime.combine(self._day(today), self.time), zone)
         if found.at.timestamp() <= now and (self.day is None or isinstance(self.day, int)):
@@ -96,14 +94,14 @@ class WrittenDate:
 def parse_date(text: str, option: str) -> WrittenDate:
     """What people write for a date. Raises BadInput."""
     words = " ".join(text.lower().split())
-    bad = BadInput(f"{option}: {quoted(text)} is no date; write {DATE_FORMS}")
+    bad = BadInput(f"{option}: {quoted(text)} is not a date; write {DATE_FORMS}")
     if words == "now":
         return WrittenDate(text, option, after=0.0)
     if words.startswith("in "):
         if (seconds := parse_duration(words.removeprefix("in ").replace(" ", ""))) is None:
             raise bad
         if seconds > MAX_AHEAD:
-            raise BadInput(f"{option}: {quoted(text)} is more than a year ahead; write an earlier one")
+            raise BadInput(f"{option}: {quoted(text)} is more than a year ahead; write an earlier date")
         return WrittenDate(text, option, after=float(seconds))
     try:
         if (whole := _INSTANT.fullmatch(words)) is not None:
@@ -126,8 +124,8 @@ def parse_date(text: str, option: str) -> WrittenDate:
 
 def _out_of_reach(text: str, option: str, year: int) -> BadInput:
     if year < YEARS.start:
-        return BadInput(f"{option}: {quoted(text)} is long past; write a later one")
-    return BadInput(f"{option}: {quoted(text)} is more than a year ahead; write an earlier one")
+        return BadInput(f"{option}: {quoted(text)} is long past; write a later date")
+    return BadInput(f"{option}: {quoted(text)} is more than a year ahead; write an earlier date")
 
 
 def _named_day(name: str, bad: BadInput) -> int | str:
@@ -153,7 +151,6 @@ def _time(text: str, bad: BadInput) -> time:
 
 
 def local(naive: datetime, zone: ZoneInfo) -> Found:
-    """The instant of a local time."""
     first, second = (naive.replace(tzinfo=zone, fold=fold) for fold in (0, 1))
     before, after = first.utcoffset(), second.utcoffset()
     if before is None or after is None or before == after:
@@ -180,12 +177,11 @@ def parse_every(text: str, option: str) -> int:
     found = _EVERY.fullmatch(words)
     days = 0 if found is None else int(found[1] or 1) * (7 if found[2].startswith("w") else 1)
     if not 1 <= days <= DAYS:
-        raise BadInput(f"{option}: {quoted(text)} is not from 1 to {DAYS} days; write {EVERY_FORMS}")
+        raise BadInput(f"{option}: {quoted(text)} is not 1 to {DAYS} days; write {EVERY_FORMS}")
     return days
 
 
 def every_words(days: int) -> str:
-    """`every day`, `every week`, `every 2 weeks`, `every 10 days`."""
     count, unit = (days // 7, "week") if days % 7 == 0 else (days, "day")
     return f"every {unit}" if count == 1 else f"every {count} {unit}s"
 
@@ -200,7 +196,7 @@ def parse_zone(text: str, option: str) -> ZoneInfo:
     except (LookupError, ValueError, OSError):  # none; `../etc`; `Europe`, which is a folder
         near = difflib.get_close_matches(text, available_timezones(), n=3)
         hint = f"did you mean {' or '.join(near)}?" if near else "write one as Europe/Berlin or UTC"
-        raise BadInput(f"{option}: {quoted(text)} is no zone of the IANA database; {hint}") from None
+        raise BadInput(f"{option}: {quoted(text)} is not a time zone of the IANA database; {hint}") from None
 
 
 def host_zone(environ: Mapping[str, str] = os.environ, etc: Path = Path("/etc")) -> ZoneInfo:
@@ -218,7 +214,7 @@ def host_zone(environ: Mapping[str, str] = os.environ, etc: Path = Path("/etc"))
             continue
     if not environ.get("TZ") and not clocks.daylight and clocks.timezone == 0:
         return ZoneInfo("UTC")
-    raise BadInput("this host does not tell the name of its zone; write it: --zone Europe/Berlin, or set TZ")
+    raise BadInput("this host's time zone has no name; write --zone Europe/Berlin, or set TZ")
 
 
 # Words
@@ -230,7 +226,6 @@ def in_zone(at: float, zone: ZoneInfo | None) -> datetime:
 
 
 def date_words(at: float, zone: ZoneInfo | None) -> str:
-    """`Tue 2026-12-01 14:00`, with seconds where there are any."""
     there = in_zone(at, zone)
     return f"{there:%a %Y-%m-%d %H:%M}" + (f":{there:%S}" if there.second else "")
 

@@ -10,7 +10,7 @@ from zscout.terminal import clock, span
 
 def ending(name: str, left: float) -> str:
     """A warning that the certificate of this machine or person ends in `left` seconds."""
-    return f"the certificate of {name} " + (f"ends in {span(left)}" if left > 0 else f"has ended {span(-left)} ago")
+    return f"the certificate of {name} " + (f"expires in {span(left)}" if left > 0 else f"expired {span(-left)} ago")
 
 
 def absence(view: RcView) -> str:

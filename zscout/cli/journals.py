@@ -39,13 +39,11 @@ def parse_past(text: str, option: str) -> float:
         try:
             ago = time.time() - datetime.fromisoformat(text).astimezone().timestamp()
         except (ValueError, OverflowError):
-            raise BadInput(f"{option}: {quoted(text)} is no time; write {PAST_FORMS}") from None
+            raise BadInput(f"{option}: {quoted(text)} is not a time; write {PAST_FORMS}") from None
     if option == "--until":
         ago = max(0.0, ago)  # up to now
     if not 0 <= ago <= MAX_AGO:
-        raise BadInput(
-            f"{option}: {quoted(text)} is {'in the future' if ago < 0 else 'too long ago'}; write {PAST_FORMS}"
-        )
+        raise BadInput(f"{option}: {quoted(text)} is {'in future' if ago < 0 else 'too far back'}; write {PAST_FORMS}")
     return ago
 
 
@@ -55,7 +53,7 @@ PAST: Final = Parsed("time", parse_past)
 def parse_who(text: str, option: str) -> str:
     """A user, or a name of a certificate or host. Raises BadInput."""
     if not 1 <= len(text) <= MAX_NAME:
-        raise BadInput(f"{option}: {quoted(text)} is no name; write 1 to {MAX_NAME} characters")
+        raise BadInput(f"{option}: {quoted(text)} is not a name; write 1 to {MAX_NAME} characters")
     return text
 
 
@@ -70,20 +68,20 @@ RC: Final = Parsed("text", parse_rc_pattern)
 
 def formats(command: F) -> F:
     """`--json` and `--csv`; the parameters are `as_json` and `as_csv`."""
-    command = click.option("--csv", "as_csv", is_flag=True, help="Print CSV, with a line of names.")(command)
+    command = click.option("--csv", "as_csv", is_flag=True, help="Print CSV, with a header line.")(command)
     return click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")(command)
 
 
 def check_formats(*, as_json: bool, as_csv: bool) -> None:
     """Raises UsageError."""
     if as_json and as_csv:
-        raise click.UsageError("--json and --csv: write one of them")
+        raise click.UsageError("--json and --csv exclude each other; use only one of them")
 
 
 def check_window(since: float | None, until: float) -> None:
     """Raises BadInput."""
     if since is not None and since <= until:
-        raise BadInput("--since: it is not before --until; write a longer time ago")
+        raise BadInput("--since is not before --until; write an earlier --since")
 
 
 def names_of(fleet: Fleet, users: Sequence[str], group: str | None) -> list[str]:
@@ -91,11 +89,11 @@ def names_of(fleet: Fleet, users: Sequence[str], group: str | None) -> list[str]
     names = [*users]
     if group is not None:
         if not fleet.access.groups.get(group):
-            known = f"known: {', '.join(sorted(fleet.access.groups)[:8])}" if fleet.access.groups else "it has none"
-            raise BadInput(f"--group: {quoted(group)} is no group of the fleet file that has members; {known}")
+            known = f"known: {', '.join(sorted(fleet.access.groups)[:8])}" if fleet.access.groups else "there are none"
+            raise BadInput(f"--group: the fleet file has no group {quoted(group)} with members; {known}")
         names += fleet.access.groups[group]
     if len(names) > MAX_ASKED_NAMES:
-        raise BadInput(f"{len(names)} names are too many to ask for; {MAX_ASKED_NAMES} are allowed")
+        raise BadInput(f"{len(names)} names are too many; at most {MAX_ASKED_NAMES} are allowed")
     return names
 
 
@@ -115,7 +113,6 @@ async def ask_journals(client: Client, asked: HistoryAsk, most: int) -> Told:
 
 
 def remarks(told: Told) -> Iterable[str]:
-    """What is not known, in lines."""
     for one in told.unknown:
         yield f"from {local(one.began)} to {local(one.ended)} not all is known: {told.causes(one)}"
     if told.without:
@@ -123,7 +120,6 @@ def remarks(told: Told) -> Iterable[str]:
 
 
 def as_json(told: Told, fleet: str, **of: object) -> dict[str, Any]:
-    """As `--json` prints it, with what is told `of` the window."""
     candidates: list[dict[str, Any]] = [
         {
             "host": host,
@@ -144,12 +140,10 @@ def as_json(told: Told, fleet: str, **of: object) -> dict[str, Any]:
 
 
 def utc(at: float) -> str:
-    """For programs: `2026-11-20T14:30:05.123Z`."""
     return datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def local(at: float) -> str:
-    """For people, by this host's zone: `2026-11-20 14:30:05`."""
     return f"{datetime.fromtimestamp(at).astimezone():%Y-%m-%d %H:%M:%S}"
 
 
@@ -161,7 +155,6 @@ def person(hold: PastHold, *, proven: bool) -> str:
 
 
 def held(hold: PastHold, now: float) -> float:
-    """Seconds for which it stood, or has stood until now."""
     return max(0.0, (now if hold.ended is None else hold.ended) - hold.began)
 
 
@@ -178,7 +171,6 @@ def used_sum(hold: PastHold, now: float) -> float | None:
 
 
 def ending(hold: PastHold) -> str:
-    """How it ended, in a few words."""
     if hold.ended is None:
         return "stands"
     words = {"unheard": "end not heard", "client_lost": "client lost", "handed_over": "handed over"}
@@ -190,7 +182,6 @@ def ending(hold: PastHold) -> str:
 
 
 def hold_json(hold: PastHold, now: float) -> dict[str, Any]:
-    """As `--json` prints it: times in UTC, spans in seconds."""
     spans = {"held": round(held(hold, now), 3), "used": used(hold, now), "used_rc_seconds": used_sum(hold, now)}
     return structs.asdict(hold) | _times(hold.began, hold.ended) | spans
 
@@ -230,5 +221,5 @@ def holds_table(title: str, told: Told, holds: Sequence[PastHold], *, proven: bo
         styles.append(
             {"preempted": "red", "lost": "red", "client_lost": "red"}.get(hold.outcome, "" if hold.ended else "bold")
         )
-    columns = ("BEGAN", "HELD", "ARC", "WHO", "PRIORITY", "WAITED", "END", "RCS")
+    columns = ("BEGAN", "HELD", "REQUEST", "WHO", "PRIORITY", "WAITED", "END", "DEVICES")
     return Table(title, columns, rows, styles, spare=("PRIORITY", "WAITED"), cut={"END"})

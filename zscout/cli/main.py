@@ -9,89 +9,93 @@ Every error ends here as one line on stderr and an exit code:
 
 from __future__ import annotations
 
-import difflib
 import errno
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from importlib import import_module
 from pathlib import Path
 from typing import IO, Any, Final
 
 import click
-from click.shell_completion import CompletionItem
 
 from zscout import __version__
+from zscout.cli.groups import Headings, LazyGroup, instead
 
-COMMANDS: Final[dict[str, tuple[str, str]]] = {
-    "request": ("requests.request", "Wait for devices; hold them, or run a command that needs them."),
-    "take": ("operator.take", "Take devices at an operator's priority, preempting who holds them."),
-    "book": ("bookings.book", "Book devices together, from a date on."),
-    "slots": ("bookings.slots", "List the first times at which devices are free together."),
-    "bookings": ("bookings.listing", "List who has booked what."),
-    "unbook": ("bookings.listing", "Give up a booking, or one date of it."),
-    "maintain": ("bookings.book", "Keep RCs free of everybody, from a date on."),
-    "drive": ("operator.drive", "Take a robot and drive it from the keyboard, seeing what it sees."),
-    "watch": ("operator.watch", "Tell when something moves in the pictures of a camera or video."),
-    "release": ("requests.cancel", "End the hold of a running ARC."),
-    "cancel": ("requests.cancel", "End an ARC, running or waiting."),
-    "status": ("fleet.status", "Show devices, holders, the queue and the hosts."),
-    "why": ("requests.why", "Tell the story of an ARC: what it waits for, and who is in its way."),
-    "history": ("fleet.history", "List who held what, from the journals of the candidates."),
-    "usage": ("fleet.usage", "Sum up who held what for how long, by user, group or RC."),
-    "start": ("components.start", "Have a component run on the best host, and keep it running."),
-    "stop": ("components.start", "End components for good."),
-    "calendar": ("bookings.calendar", "Write bookings as iCalendar files, and book what such files have."),
-    "components": ("components.components", "List components: where each runs, and what it uses."),
-    "logs": ("components.logs", "Print or follow the output of a component."),
-    "migrate": ("components.moves", "Move a running component to another host."),
-    "drain": ("components.moves", "Empty a host of components, and place none there any more."),
-    "uncordon": ("components.moves", "Use a drained host again."),
-    "keys": ("fleet.keys", "List what is alive on the mesh, and the keys it serves."),
-    "doctor": ("fleet.doctor", "Find out why there is no link, no leader or no device."),
-    "cert": ("fleet.cert", "Make, renew and show the certificates of a secured fleet."),
-    "view": ("fleet.view", "Watch the fleet live on a timeline, or open a recording."),
-    "replay": ("simulation.replay", "Schedule a workload file under virtual time."),
-    "simulate": ("simulation.simulate", "Serve a simulated building with robots, radio and cameras."),
-    "demo": ("simulation.demo", "Show what zscout does, on a live mesh on this machine."),
-    "completion": ("completion", "Print the completion script for bash, zsh or fish."),
+HEADINGS: Final[Headings] = {
+    "Use devices": {
+        "request": ("cli.requests.request:request", "Wait for devices; hold them, or run a command that needs them."),
+        "take": ("cli.operator.take:take", "Take devices at an operator's priority, preempting their holders."),
+        "drive": ("cli.operator.drive:drive", "Take a robot and drive it from the keyboard, seeing what it sees."),
+        "release": ("cli.requests.cancel:release", "End the hold of a request; leave what waits alone."),
+        "cancel": ("cli.requests.cancel:cancel", "End a request, whether it holds or waits."),
+    },
+    "Look": {
+        "status": ("cli.fleet.status:status", "Show devices, holders, the queue and the hosts."),
+        "why": ("cli.requests.why:why", "Explain what a request waits for, and which others are in its way."),
+        "view": ("cli.fleet.view:view", "Watch the fleet live on a timeline, or open a recording."),
+        "history": ("cli.fleet.history:history", "List past holds, from the journals of the nodes."),
+        "usage": ("cli.fleet.usage:usage", "Sum up hold times by user, group or device."),
+    },
+    "Book": {
+        "book": ("cli.bookings.book:book", "Book devices together for a date."),
+        "slots": ("cli.bookings.slots:slots", "List the first times at which devices are free together."),
+        "booking": ("cli.groups:booking", "List, show, cancel, export and import bookings."),
+        "maintain": ("cli.bookings.book:maintain", "Reserve devices for maintenance."),
+    },
+    "Components": {
+        "component": ("cli.groups:component", "Start, stop, list and move programs that zscout keeps running.")
+    },
+    "Operate": {
+        "node": ("node:main", "Run this host's part of a fleet (the same as zscout-node)."),
+        "drain": ("cli.components.moves:drain", "Move components off a host, and place none there."),
+        "uncordon": ("cli.components.moves:uncordon", "Use a drained host again."),
+        "doctor": ("cli.fleet.doctor:doctor", "Find out why there is no link, no leader or no device."),
+        "cert": ("cli.fleet.cert:cert", "Make, renew and show the certificates of a secured fleet."),
+        "completion": ("cli.completion:completion", "Print the completion script for bash, zsh or fish."),
+    },
+    "Try": {
+        "demo": ("cli.simulation.demo:demo", "Show what zscout does, on a live mesh on this machine."),
+        "simulate": ("cli.simulation.simulate:simulate", "Serve a simulated building with robots, radio and cameras."),
+        "replay": ("cli.simulation.replay:replay", "Schedule a workload file under virtual time."),
+        "motion": ("cli.operator.watch:motion", "Report motion in the pictures of a camera or video."),
+    },
 }
-"""Name: the module below zscout.cli that has the click command of that name, and its line in the help."""
+OLD: Final = {
+    "bookings": "booking list",
+    "unbook": "booking cancel",
+    "calendar": "booking",
+    **{name: f"component {name}" for name in ("start", "stop", "logs", "migrate")},
+    "components": "component list",
+    "keys": "doctor --keys",
+    "watch": "motion",
+}
+"""What to write instead of old spellings."""
+HABITS: Final = """
+status = ps list ls queue squeue sinfo who show info jobs stat state devices nodes hosts; status --watch = top htop
+request = lock acquire hold get grab claim alloc allocate salloc ask wait checkout submit
+request DEVICE -- COMMAND = run exec srun sbatch; book = reserve schedule; take = preempt steal seize takeover
+release = unlock free return give drop yield; cancel = kill scancel abort end rm delete remove
+component logs = log output tail; component migrate = move mv; component kinds = kinds types
+why = explain reason; view = timeline viewer gui ui rerun; view --web = web dashboard
+history = sacct events journal past; booking export = export ics; booking import = import; maintain = maintenance
+drain = cordon; uncordon = undrain resume; doctor = check diagnose debug ping; node = daemon serve up agent server
+cert = certs certificate login; simulate = sim simulator; motion = detect camera; --version = version; --help = help
+"""
+"""What to write, and names that people try for it and that never were commands."""
+INSTEAD: Final = {
+    **instead(HABITS),
+    **OLD,
+    "components --kinds": "component kinds",
+    **{f"calendar {name}": f"booking {name}" for name in ("export", "import")},
+}
 
 OK, COULD_NOT, BAD_INPUT, NOBODY, INTERRUPTED = 0, 1, 2, 3, 130
 
 
-class LazyGroup(click.Group):
-    """The commands of `COMMANDS`. An int that a command returns is the exit code."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name not in COMMANDS:
-            return None
-        command: click.Command = getattr(import_module(f"zscout.cli.{COMMANDS[cmd_name][0]}"), cmd_name)
-        return command
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        name = args[0]
-        if name not in COMMANDS and not name.startswith("-"):
-            near = difflib.get_close_matches(name[:40], COMMANDS, n=3)
-            hint = f"did you mean {' or '.join(near)}?" if near else f"known: {', '.join(COMMANDS)}"
-            raise click.UsageError(f"there is no command {name[:40]!r}; {hint}", ctx)
-        return super().resolve_command(ctx, args)
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
-
-    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
-        names = [name for name in COMMANDS if name.startswith(incomplete)]
-        found = [CompletionItem(name, help=COMMANDS[name][1]) for name in names]
-        return found + click.Command.shell_complete(self, ctx, incomplete)
+class OneLineErrors(LazyGroup):
+    """Prints errors as one line. An int that a command returns is the exit code."""
 
     def main(
         self,
@@ -139,9 +143,7 @@ def explain(error: BaseException) -> tuple[int, str] | None:
         return BAD_INPUT, error.format_message()
     if isinstance(error, click.UsageError):
         path = error.ctx.command_path if error.ctx is not None else "zscout"
-        # Click's own words for a bounded number say that the text is no range.
-        words = _line(error.format_message()).replace("not a valid integer range", "not a whole number")
-        return BAD_INPUT, f"{path}: {words.removesuffix('.')} (see {path} --help)"
+        return BAD_INPUT, f"zscout: {_line(usage_words(error))} (see {path} --help)"
     if isinstance(error, click.ClickException):
         return error.exit_code, f"zscout: {_line(error.format_message())}"
     if isinstance(error, (click.Abort, KeyboardInterrupt)):
@@ -179,6 +181,45 @@ def explain(error: BaseException) -> tuple[int, str] | None:
     return None
 
 
+def usage_words(error: click.UsageError) -> str:
+    """The words of an error of click's in the voice of the others: the option, what is wrong, what to write."""
+    words = error.message
+    param, hint = getattr(error, "param", None), getattr(error, "param_hint", None)
+    name = hint if isinstance(hint, str) else ""
+    if isinstance(param, click.Option):
+        name = max(param.opts, key=len)
+    elif param is not None and error.ctx is not None:
+        name = param.make_metavar(error.ctx)
+    match error:
+        case click.MissingParameter():
+            words = f"{name} is missing"
+        case click.NoSuchOption(possibilities=near):
+            words = f"there is no option {error.option_name}"
+            words += f"; did you mean {' or '.join(sorted(near))}?" if near else ""
+        case click.BadOptionUsage():
+            words = f"{error.option_name} needs a value" if "requires an argument" in words else words
+        case click.BadParameter() if name:
+            words = f"{name}: {words}"
+    for pattern, better in _CLICK_WORDS:
+        words = re.sub(pattern, better, words)
+    return words.removesuffix(".")
+
+
+_CLICK_WORDS: Final = (
+    (r"'((?:[^'\\]|\\.)*)'", r'"\1"'),
+    (r"not a valid (?:integer range|integer)", "not a whole number"),
+    (r"not a valid (?:float range|float)", "not a number"),
+    (r"is not in the range (\S+?)<=?x<=?(\S+?)\.?$", r"is out of range; write \1 to \2"),
+    (r"is not in the range x>=?(\S+?)\.?$", r"is too small; write at least \1"),
+    (r"is not in the range x<=?(\S+?)\.?$", r"is too large; write at most \1"),
+    (r"is not one of (.*?)\.?$", r"is unknown; write one of \1"),
+    (r"Got unexpected extra arguments? \((.*)\)", r'too many arguments: "\1"'),
+    (r"^No such command (\"[^\"]*\")", r"there is no command \1"),
+    (r"^Option (\S+) does not take a value", r"\1 takes no value"),
+)
+"""Words of click's, and those that are printed instead."""
+
+
 def _line(text: str) -> str:
     from zscout.terminal import clean
 
@@ -211,7 +252,11 @@ def _drop_unwritten() -> None:
 
 
 @click.group(
-    cls=LazyGroup,
+    cls=OneLineErrors,
+    headings=HEADINGS,
+    instead=INSTEAD,
+    old=OLD,
+    own={"keys": "cli.fleet.keys:keys"},
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100, "show_default": True},
 )
 @click.option(
@@ -222,16 +267,24 @@ def _drop_unwritten() -> None:
 )
 @click.option("-v", "--verbose", is_flag=True, help="Log to stderr what the mesh client does.")
 @click.version_option(__version__, "--version", message="%(prog)s %(version)s")
-def main(verbose: bool, **_: Any) -> None:
-    """All the devices a program asked for, or none, over a Zenoh mesh.
+@click.pass_context
+def main(ctx: click.Context, fleet: Path | None, verbose: bool) -> None:
+    """Give each program all the devices it asked for, or none, over a Zenoh mesh.
+
+    A fleet begins with a node on each host: `zscout node lab.toml` serves the devices that lab.toml lists.
+    Then request devices from any host: your command starts as soon as it has them all.
 
     \b
     Examples:
+      zscout node
       zscout request robot/scout33 radio/rf0:command_rate=5 -- bash
-      zscout take robot/scout33
       zscout status --watch
       zscout why survey
     """
+    if ctx.invoked_subcommand == "node":  # it has its own log, and its file names the fleet
+        if fleet is not None:
+            raise click.UsageError('--fleet is for other commands; write fleet = "FILE" under [node] in the node file')
+        return
     import logging
 
     level = logging.INFO if verbose else logging.ERROR

@@ -127,7 +127,7 @@ class AccessPolicy(Struct, frozen=True, dict=True):
     def told(self, name: str, what: str, could: Collection[str]) -> str:
         """That `name` may not do `what`, and who could."""
         ranks, names = self.ranks_of(name), sorted(could)
-        title = f"{name} ({', '.join(sorted(ranks))})" if ranks else f"{name}, who has no role here,"
+        title = f"{name} ({', '.join(sorted(ranks))})" if ranks else f"{name}, which has no role here,"
         more = f" and {len(names) - MAX_TOLD} more" if len(names) > MAX_TOLD else ""
         return f"{title} may not {what}; {', '.join(names[:MAX_TOLD]) + more or 'nobody'} may"
 
@@ -142,14 +142,14 @@ def check_access(policy: AccessPolicy, at: Where) -> None:
             other = seen.setdefault(name, rank)
             if other != rank and not {other, rank} <= {"node", "manager"}:
                 what = "a machine or a person" if (other in PEOPLE) != (rank in PEOPLE) else "one of the two"
-                raise here.bad(f"{quoted(name)} is {other} already", f"a name has one role: make it {what}")
+                raise here.bad(f"{quoted(name)} already has the role {other}", f"a name has one role: make it {what}")
     for host, patterns in policy.roles.node.items():
         for number, pattern in enumerate(patterns):
             _check_pattern(pattern, (at / "roles" / "node" / host).item(number))
     for group, members in policy.groups.items():
         check_name(group, at / "groups" / group)
         if group in seen:
-            raise (at / "groups" / group).bad(f"{quoted(group)} is a name with a role", "call the group otherwise")
+            raise (at / "groups" / group).bad(f"{quoted(group)} is also a name with a role", "rename the group")
         _check_known(members, seen, at / "groups" / group)
     known = {*seen, *policy.groups}
     for pattern, names in policy.access.items():
@@ -158,17 +158,17 @@ def check_access(policy: AccessPolicy, at: Where) -> None:
     _check_known(policy.quotas, known, at / "quotas")
     for rank in policy.ceilings:
         if rank not in ("client", "operator"):
-            raise (at / "ceilings" / rank).bad("only ARCs of clients and operators have a ceiling", 'write "client"')
+            raise (at / "ceilings" / rank).bad("only clients and operators have a ceiling", 'write "client"')
 
 
 def _check_known(names: Collection[str], known: Collection[str], at: Where) -> None:
     for number, name in enumerate(names):
         check_name(name, at.item(number))
         if name not in known:
-            raise at.item(number).bad(f"{quoted(name)} has no role", "name it under [roles], or mend the name")
+            raise at.item(number).bad(f"{quoted(name)} has no role", "name it under [roles], or correct the name")
 
 
 def _check_pattern(pattern: str, at: Where) -> None:
     if not _RC.fullmatch(pattern) or "**" in pattern:
         remedy = 'write kind/name with * for any part, as in "robot/scout33" or "robot/arm*"'
-        raise at.bad(f"{quoted(pattern)} names no RC", remedy)
+        raise at.bad(f"{quoted(pattern)} does not name a device", remedy)

@@ -86,17 +86,15 @@ class CertificateAuthority:
         try:
             key = load_pem_private_key(read_text(folder / CA_KEY, max_bytes=MAX_FILE).encode(), None)
         except (ValueError, TypeError, UnsupportedAlgorithm):
-            raise key_where.bad("holds no private key that can be read", _COPY) from None
+            raise key_where.bad("has no readable private key", _COPY) from None
         if not isinstance(key, ec.EllipticCurvePrivateKey):
-            raise key_where.bad("is not a key on an elliptic curve", "make a CA with `zscout cert ca`")
+            raise key_where.bad("is not an elliptic-curve key", "make a CA with `zscout cert ca`")
         public = _public(key.public_key())
         own = next((one for one in _parsed(trusted, where) if _public(one.public_key()) == public), None)
         if own is None:
-            raise key_where.bad(f"is the key of no certificate in {CA}", _COPY)
+            raise key_where.bad(f"does not match any certificate in {CA}", _COPY)
         if now >= own.not_valid_after_utc:
-            raise where.bad(
-                f"this CA has ended on {shown(own.not_valid_after_utc)}", "make a new one, as for a change of CA"
-            )
+            raise where.bad(f"this CA expired on {shown(own.not_valid_after_utc)}", "make a new one: zscout cert ca")
         return cls(folder, own, key, trusted)
 
     def issue(self, name: str, folder: Path, lasts: timedelta, now: datetime, *, manager: bool = False) -> datetime:
@@ -117,16 +115,14 @@ class CertificateAuthority:
         where = Where(str(folder / CERT))
         old = _parsed(read_text(folder / CERT, max_bytes=MAX_FILE).encode(), where)[0]
         if not any(_has_issued(ca, old) for ca in _parsed(self._trusted, Where(str(self.folder / CA)))):
-            raise where.bad(
-                f"was issued by no CA in {self.folder / CA}", "name the folder of its CA by --ca, or issue it anew"
-            )
+            raise where.bad(f"was not issued by a CA in {self.folder / CA}", "name its CA by --ca, or issue it again")
         name = ", ".join(str(one.value) for one in old.subject.get_attributes_for_oid(NameOID.COMMON_NAME))
         check_name(name, where)
         if new_key:
             return self._write(folder, name, lasts, now, _new_key())
         public = old.public_key()
         if not isinstance(public, ec.EllipticCurvePublicKey):
-            raise where.bad("is of a key that is on no elliptic curve", "renew it with --new-key")
+            raise where.bad("its key is not an elliptic-curve key", "renew it with --new-key")
         return self._write(folder, name, lasts, now, public)
 
     def _write(
@@ -165,7 +161,7 @@ def _parsed(text: bytes, where: Where) -> list[x509.Certificate]:
     try:
         return x509.load_pem_x509_certificates(text)
     except ValueError:
-        raise where.bad("holds no certificate in PEM that can be read", "copy it anew") from None
+        raise where.bad("has no readable PEM certificate", "copy it again") from None
 
 
 def _has_issued(ca: x509.Certificate, one: x509.Certificate) -> bool:

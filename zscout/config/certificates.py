@@ -86,21 +86,19 @@ class Certificates(Validity):
         where = Where(str(self.cert))
         if name is not None and self.name != name:
             raise where.bad(
-                f"is the certificate of {quoted(self.name)}, and this is {quoted(name)}",
-                f"put that of {quoted(name)} there, or mend the name",
+                f"is the certificate of {quoted(self.name)}, but this host is {quoted(name)}",
+                f"put the certificate of {quoted(name)} there, or correct the host's name",
             )
         if now < self.begins:
-            raise where.bad(f"is valid from {shown(self.begins)} on", "set this host's clock, or wait")
+            raise where.bad(f"is not valid before {shown(self.begins)}", "set this host's clock, or wait")
         if now >= self.ends:
-            raise where.bad(
-                f"has ended on {shown(self.ends)}", "renew it (zscout cert renew), or set this host's clock"
-            )
+            raise where.bad(f"expired on {shown(self.ends)}", "renew it (zscout cert renew), or set this host's clock")
 
     def expires_soon(self, now: datetime) -> str:
         """What to tell people while its end is near, until then; else empty."""
         if not self.soon(now):
             return ""
-        return f"{self.cert}: ends on {shown(self.ends)}; renew it (zscout cert renew)"
+        return f"{self.cert}: expires on {shown(self.ends)}; renew it (zscout cert renew)"
 
 
 def read_certificates(folder: Path) -> Certificates:
@@ -111,17 +109,15 @@ def read_certificates(folder: Path) -> Certificates:
     instead = f"or name your own folder by ${KEYS_VARIABLE}"
     try:
         if not any((folder / name).exists() for name in (CA, CERT, KEY)):
-            raise Where(str(folder)).bad(
-                "no certificate is there", f"copy there what `zscout cert issue` made, {instead}"
-            )
+            raise Where(str(folder)).bad("has no certificate", f"copy there what `zscout cert issue` made, {instead}")
     except PermissionError:
-        raise Where(str(folder)).bad("may not be entered by this user", f"mend its mode, {instead}") from None
+        raise Where(str(folder)).bad("may not be entered by this user", f"change its mode, {instead}") from None
     cas = read_cas(folder / CA)
     cert, key = Where(str(folder / CERT)), Where(str(folder / KEY))
     check_mode(folder / CERT, 0o002, "644")
     check_mode(folder / KEY, 0o027, "640")
     if "ENCRYPTED" in read_text(folder / KEY, max_bytes=MAX_FILE):
-        raise key.bad("has a passphrase, and nobody is there to type it", f"write it without one: {_MAKE}")
+        raise key.bad("has a passphrase, which zscout can't enter", f"write it without one: {_MAKE}")
     _store(folder / CERT)
     sides = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT), ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
@@ -129,10 +125,8 @@ def read_certificates(folder: Path) -> Certificates:
             side.load_cert_chain(folder / CERT, folder / KEY)
     except ssl.SSLError as error:
         if "MISMATCH" in (error.reason or ""):
-            raise key.bad(
-                f"is not the key of {CERT}", "copy both from one folder that `zscout cert issue` made"
-            ) from None
-        raise key.bad("holds no private key that can be read", _MAKE) from None
+            raise key.bad(f"is not the key of {CERT}", "copy both from one folder of `zscout cert issue`") from None
+        raise key.bad("has no readable private key", _MAKE) from None
     except OSError as error:
         raise key.bad(f"can't be read: {error.strerror}", "check its permissions") from None
     try:
@@ -140,8 +134,8 @@ def read_certificates(folder: Path) -> Certificates:
     except ssl.SSLCertVerificationError as error:
         if error.verify_code in UNKNOWN_ISSUER:
             known = ", ".join(one.name for one in cas)
-            raise cert.bad(f"was issued by no CA in {CA} ({known})", f"copy {CA} and {CERT} from one folder") from None
-        raise cert.bad(f"is not fit for this: {error.verify_message}", _MAKE) from None
+            raise cert.bad(f"was not issued by a CA in {CA} ({known})", "copy both from one folder") from None
+        raise cert.bad(f"can't be used for zscout: {error.verify_message}", _MAKE) from None
     except ssl.SSLError as error:
         raise cert.bad(f"can't be used: {error.reason or error}", _MAKE) from None
     own, issuer = validity(told, cert), common_name(told["issuer"])
@@ -159,9 +153,7 @@ def read_places_key(folder: Path) -> bytes | None:
     with suppress(ValueError):
         if len(key := bytes.fromhex(read_text(path, max_bytes=MAX_FILE))) == PLACES_KEY_BYTES:
             return key
-    raise Where(str(path)).bad(
-        f"is not {PLACES_KEY_BYTES} bytes in hexadecimal", f"copy {PLACES_KEY} from the CA's folder"
-    )
+    raise Where(str(path)).bad(f"is not {PLACES_KEY_BYTES} hex bytes", f"copy {PLACES_KEY} from the CA's folder")
 
 
 def read_cas(path: Path) -> list[Validity]:
@@ -172,7 +164,7 @@ def read_cas(path: Path) -> list[Validity]:
     count = store.cert_store_stats()
     where = Where(str(path))
     if count["x509"] != count["x509_ca"]:
-        raise where.bad("holds a certificate that is no CA's", f"copy {CA} from the folder of the CA")
+        raise where.bad("has a certificate that is not a CA's", f"copy {CA} from the folder of the CA")
     return [validity(one, where) for one in store.get_ca_certs()]
 
 
@@ -185,9 +177,7 @@ def check_mode(path: Path, forbidden: int, remedy: str) -> None:
         raise
     if mode & forbidden:
         done = "read" if mode & forbidden & 0o044 else "written" if mode & forbidden & 0o022 else "used"
-        raise Where(str(path)).bad(
-            f"may be {done} by others (mode {mode:03o})", f"chmod {remedy} {shlex.quote(str(path))}"
-        )
+        raise Where(str(path)).bad(f"may be {done} by others ({mode:03o})", f"chmod {remedy} {shlex.quote(str(path))}")
 
 
 def shown(at: datetime) -> str:
@@ -206,7 +196,7 @@ def _store(path: Path) -> ssl.SSLContext:
     try:
         store.load_verify_locations(cadata=text)
     except (ssl.SSLError, ValueError):
-        raise Where(str(path)).bad("holds no certificate in PEM that can be read", _MAKE) from None
+        raise Where(str(path)).bad("has no readable PEM certificate", _MAKE) from None
     return store
 
 
@@ -237,7 +227,7 @@ def validity(told: Mapping[str, Any], where: Where) -> Validity:
             datetime.fromtimestamp(cert_time_to_seconds(told[key]), UTC) for key in ("notBefore", "notAfter")
         )
     except (KeyError, ValueError, OverflowError):
-        raise where.bad("has times that can't be read", _MAKE) from None
+        raise where.bad("has unreadable times", _MAKE) from None
     return Validity(common_name(told["subject"]), begins, ends)
 
 

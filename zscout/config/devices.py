@@ -167,7 +167,7 @@ def _check_rc(rc: BuiltInRc, at: Where) -> None:
         kind, _, name = rc.name.partition("/")
         if kind != driver:
             raise (at / "name").bad(
-                f'{quoted(rc.name)} is no {driver}, as driver = "{driver}" says',
+                f'{quoted(rc.name)} does not fit driver = "{driver}"',
                 f"name it {driver}/{name}, or choose another driver",
             )
     match rc:
@@ -179,7 +179,7 @@ def _check_rc(rc: BuiltInRc, at: Where) -> None:
             amounts(rc.capacity, at / "capacity")
         case CommandRc():
             if not (rc.start or rc.stop or rc.safe or rc.health):
-                raise (at / "safe").bad("is missing, and every other command too", f"add one, as in {A_COMMAND}")
+                raise (at / "safe").bad("and every other command are missing", f"add one, as in {A_COMMAND}")
             for name in ("start", "stop", "safe", "health"):
                 _check_words(getattr(rc, name), at / name)
             for parameter in rc.parameters:
@@ -194,11 +194,11 @@ def _check_rc(rc: BuiltInRc, at: Where) -> None:
                 here = at / "channels" / video
                 check_rc_name(video, here, "video")
                 if channel in channels:
-                    raise here.bad(f"is {channel}, as {channels[channel]} is", "give each its own channel")
+                    raise here.bad(f"{channel} is also the channel of {channels[channel]}", "give each its own channel")
                 channels[channel] = video
         case FramegrabberRc():
             if rc.source is not None and rc.sources is not None:
-                raise (at / "sources").bad("stands beside source", "remove one of the two")
+                raise (at / "sources").bad("can't be used with source", "remove one of the two")
             if rc.source is not None:
                 _check_source(rc.source, at / "source", A_SOURCE)
             elif rc.sources is None:
@@ -222,6 +222,4 @@ def _check_words(words: Words, at: Where) -> None:
         raise at.bad("has no program", f"name one first, as in {A_COMMAND}")
     for number, word in enumerate(words):
         if "\0" in word or len(word) > MAX_SOURCE:
-            raise at.item(number).bad(
-                f"{quoted(word)} can't be an argument", f"write {MAX_SOURCE:,} characters at most"
-            )
+            raise at.item(number).bad(f"{quoted(word)} can't be an argument", f"{MAX_SOURCE:,} characters at most")

@@ -339,9 +339,9 @@ def _fair_shares(file: FleetFile, access: AccessPolicy, at: Where) -> FairShares
         here = at / "weights" / name
         check_name(name, here)
         if groups := access.groups_of(name):
-            raise here.bad(f"{quoted(name)} is of the group {groups[0]}, and counts there", "give the group a weight")
+            raise here.bad(f"{quoted(name)} belongs to the group {groups[0]}", "give the group a weight")
         if access.ranks and name not in access.groups and name not in access.ranks:
-            raise here.bad(f"{quoted(name)} is no group and has no role", "name it under [groups], or mend the name")
+            raise here.bad(f"{quoted(name)} is not a group and has no role", "add it under [groups], or correct it")
     if table.patience < file.fleet.patience:
         what = f"is {table.patience / SECOND:g} s, less than fleet.patience ({file.fleet.patience / SECOND:g} s)"
         raise (at / "patience").bad(what, "write as much, or more")
@@ -352,11 +352,11 @@ def keys_folder(table: SecurityTable, beside: Path, top: Where) -> Path:
     """The folder of the certificate that this process is to show. Raises BadInput."""
     text, at = os.environ.get(KEYS_VARIABLE) or table.folder, top / "security" / "folder"
     if not text or "\0" in text:
-        raise at.bad(f"{quoted(text)} is no folder", f"name one, as in {KEYS}")
+        raise at.bad(f"{quoted(text)} is not a folder", f"name one, as in {KEYS}")
     try:
         return beside / Path(text).expanduser()
     except RuntimeError:
-        raise at.bad(f"{quoted(text)} is in nobody's home", f"name a folder, as in {KEYS}") from None
+        raise at.bad(f"{quoted(text)} names no user's home", f"name a folder, as in {KEYS}") from None
 
 
 def check_security(fleet: Fleet, top: Where) -> None:
@@ -365,9 +365,7 @@ def check_security(fleet: Fleet, top: Where) -> None:
         return
     access = fleet.access
     if not access.roles.manager:
-        raise (top / "roles").bad(
-            "[security] is there, and no host may lead", 'write manager = ["anvil"] under [roles]'
-        )
+        raise (top / "roles").bad("with [security], no host may lead", 'write manager = ["anvil"] under [roles]')
     for name in ("listen", "connect"):
         for number, endpoint in enumerate(getattr(fleet.mesh, name)):
             if not endpoint.startswith("tls/"):
@@ -375,7 +373,11 @@ def check_security(fleet: Fleet, top: Where) -> None:
                 raise (top / "mesh" / name).item(number).bad(f"{quoted(endpoint)} is not TLS", remedy)
     for number, host in enumerate(fleet.candidates):
         if "manager" not in access.ranks_of(host):
-            raise (top / "fleet" / "candidates").item(number).bad(f"{host} is no manager", "name it so under [roles]")
+            raise (
+                (top / "fleet" / "candidates")
+                .item(number)
+                .bad(f"{host} is not a manager", "name it as one under [roles]")
+            )
     for host, rcs in fleet.devices.items():
         for rc in rcs:
             if not access.may_serve(host, rc):
@@ -390,7 +392,7 @@ def _check_devices(devices: Mapping[str, tuple[str, ...]], at: Where) -> None:
             here = (at / host).item(number)
             check_rc_name(rc, here)
             if rc in homes:
-                raise here.bad(f"{quoted(rc)} stands at {homes[rc]} already", "name its one home")
+                raise here.bad(f"{quoted(rc)} is already at {homes[rc]}", "name one home for it")
             homes[rc] = host
 
 
@@ -421,7 +423,7 @@ def check_links(listen: tuple[str, ...], connect: tuple[str, ...], interface: st
                 raise where.bad(f"{quoted(endpoint)} has no valid port", f"write one from {lowest_port} to 65535")
         check_unique(endpoints, at / name)
     if not _INTERFACE.fullmatch(interface):
-        raise (at / "interface").bad(f"{quoted(interface)} names no interface", 'write "auto", or as in "eth0"')
+        raise (at / "interface").bad(f"{quoted(interface)} is not an interface", 'write "auto", or as in "eth0"')
 
 
 def check_sites(mesh: MeshConfig, at: Where) -> None:
@@ -430,9 +432,9 @@ def check_sites(mesh: MeshConfig, at: Where) -> None:
         check_name(mesh.site, at / "site")
     check_names(mesh.relay, at / "relay")
     if len(mesh.relay) == 1:
-        raise (at / "relay").bad(f"joins {mesh.relay[0]} to nothing", 'name the sites, as in ["north", "south"]')
+        raise (at / "relay").bad(f"joins {mesh.relay[0]} to no other site", 'name the sites, as in ["north", "south"]')
     if mesh.relay and mesh.site is not None:
-        raise (at / "site").bad("a relay is of none of its sites", "remove site, or relay")
+        raise (at / "site").bad("a relay belongs to no single site", "remove site, or relay")
 
 
 def check_multicast(address: str, where: Where) -> None:

@@ -227,7 +227,7 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
     check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
     check_sites(mesh, top / "mesh")
     if mesh.relay and file.recorder is not None:
-        raise (top / "recorder").bad("its process would be a second relay", "let the node of a site record")
+        raise (top / "recorder").bad("a relay can't record", "record on the node of a site")
     security = fleet.security if file.security is None else keys_folder(file.security, folder, top)
     fleet = structs.replace(fleet, mesh=mesh, security=security)
     check_security(fleet, top)
@@ -241,9 +241,7 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
         _check_roles(host, (rc.name for rc in rcs), fleet.access, top)
         leads = leads and "manager" in fleet.access.ranks_of(host)
     if file.notify is not None and not leads:
-        raise (top / "notify").bad(
-            "this host never leads, and only who leads tells anybody", "move it to one that does"
-        )
+        raise (top / "notify").bad("only the leader sends notices, and this host never leads", "move it to a candidate")
     return Node(
         host=host,
         fleet=fleet,
@@ -265,7 +263,7 @@ def _check_roles(host: str, rcs: Iterable[str], access: AccessPolicy, top: Where
     """Raises BadInput."""
     if not access.ranks_of(host) & MACHINES:
         remedy = "name it under [roles] of the fleet file, as manager or under node"
-        raise (top / "node" / "host").bad(f"{quoted(host)} is no machine of this fleet", remedy)
+        raise (top / "node" / "host").bad(f"{quoted(host)} is not a machine of this fleet", remedy)
     for number, rc in enumerate(rcs):
         if not access.may_serve(host, rc):
             remedy = f"name it at {host} under [roles.node] of the fleet file"
@@ -275,7 +273,7 @@ def _check_roles(host: str, rcs: Iterable[str], access: AccessPolicy, top: Where
 def _folder(text: str, folder: Path, at: Where, example: str) -> Path:
     """The folder of this name, relative to that of the file. Raises BadInput."""
     if not text or "\0" in text:
-        raise at.bad(f"{quoted(text)} is no folder", f"name one, as in {example}")
+        raise at.bad(f"{quoted(text)} is not a folder", f"name one, as in {example}")
     return folder / text
 
 

@@ -79,17 +79,17 @@ def read_notify(table: NotifyTable, folder: Path, at: Where) -> NotifyConfig:
     """The table, with what its files hold; `folder` is that of the node file. Raises BadInput."""
     check_installed("apprise", at)
     if not table.urls and not table.users:
-        raise at.bad("tells nobody", "name urls or users, or remove the table")
+        raise at.bad("sends nothing to anybody", "name urls or users, or remove the table")
     for user in table.users:
         if not user or len(user) > MAX_NAME or not user.isprintable():
-            raise (at / "users").bad(f"{quoted(user)} is no user", f"write 1 to {MAX_NAME} printable characters")
+            raise (at / "users").bad(f"{quoted(user)} is not a user", f"write 1 to {MAX_NAME} printable characters")
     heard = [*_written(table.urls, folder, at / "urls")]
     by_user = {user: [*_written(urls, folder, at / "users" / user)] for user, urls in table.users.items()}
     every = dict.fromkeys(one.url for some in (heard, *by_user.values()) for one in some)
     try:
         known = {url for url, is_one in zip(every, usable([*every]), strict=True) if is_one}
     except NoAnswer as error:
-        raise at.bad(f"can't be checked: {error}", "try apprise by hand, as in apprise --dry-run -b test URL") from None
+        raise at.bad(f"can't be checked: {error}", "try apprise yourself: apprise --dry-run -b test URL") from None
     users = {user: tuple(_address(one, known) for one in some) for user, some in by_user.items()}
     urls = tuple(_address(one, known) for one in heard)
     return NotifyConfig(urls, table.events, users, table.after, table.per_minute)
@@ -110,7 +110,7 @@ def _written(urls: tuple[str, ...], folder: Path, at: Where) -> Iterator[_Writte
         found = [(count, line.strip()) for count, line in enumerate(lines, 1)]
         found = [(count, line) for count, line in found if line and not line.startswith("#")]
         if not 0 < len(found) <= MAX_URLS:
-            raise here.bad(f"{quoted(url)} holds {len(found)} URLs", f"write 1 to {MAX_URLS}, each on a line")
+            raise here.bad(f"{quoted(url)} has {len(found)} URLs", f"write 1 to {MAX_URLS}, one on each line")
         for count, line in found:
             yield _Written(line, Where(str(folder / url)), f"line {count} ")
 
@@ -130,5 +130,5 @@ def _address(written: _Written, known: Container[str]) -> Address:
     elif url not in known:
         what = "is no URL that Apprise can use (not shown: it may hold a secret)"
     if what:
-        raise at.bad(f"{line}{what}", "see https://appriseit.com for how each service's is written")
+        raise at.bad(f"{line}{what}", "https://appriseit.com shows the form for each service")
     return Address(at.key or f"{at.source} {line}".strip(), url)

@@ -107,7 +107,7 @@ def read_bytes(path: Path, *, max_bytes: int) -> bytes:
     except IsADirectoryError:
         raise where.bad("is a directory", "name a file in it") from None
     except PermissionError:
-        raise where.bad("may not be read by this user", "change its permissions, or the user") from None
+        raise where.bad("may not be read by this user", "change its permissions, or run as another user") from None
     except OSError as error:
         raise where.bad(f"can't be read: {error.strerror}", "check the path") from None
     except ValueError:  # a NUL or a lone surrogate
@@ -151,9 +151,9 @@ def parse_toml(text: str, source: str, type: type[T]) -> T:  # noqa: A002 - msgs
         else:
             line = text.count("\n") + 1
             place = f"line {line}, column {len(text) - text.rfind(chr(10))}, the end"
-        raise BadInput(f"{source}: {place}: {what}; mend the TOML there or just before") from None
+        raise BadInput(f"{source}: {place}: {what}; fix the TOML there or just before") from None
     except RecursionError:
-        raise where.bad("is nested too deep", "no key goes deeper than a few tables") from None
+        raise where.bad("is nested too deep", "use fewer levels") from None
     except ValueError:  # Python's limit of digits, the only one that tomllib does not turn into its own error
         raise where.bad("a whole number has thousands of digits", "shorten it") from None
     return convert(data, type, where)
@@ -165,7 +165,7 @@ def convert(data: object, type: type[T], where: Where) -> T:  # noqa: A002 - msg
     try:
         return msgspec.convert(_checked(_type_info(kind), data, where), type)
     except msgspec.ValidationError as error:  # what only msgspec knows of, as other bounds than `key` gives
-        raise where.bad(str(error), "mend it") from None
+        raise where.bad(str(error), "correct it") from None
 
 
 @cache
@@ -185,9 +185,9 @@ def check_rc_name(value: str, where: Where, of: str = "") -> None:
     kind, _, name = value.partition("/")
     if not (NAME.fullmatch(kind) and NAME.fullmatch(name)):
         remedy = f'write kind/name, as in "robot/scout33", each of {_NAME_RULE}'
-        raise where.bad(f"{quoted(value)} is not the name of an RC", remedy)
+        raise where.bad(f"{quoted(value)} is not the name of a device", remedy)
     if of not in ("", kind):
-        raise where.bad(f"{quoted(value)} is no {of}", f'name one, as in "{of}/..."')
+        raise where.bad(f"{quoted(value)} is not a {of}", f'name one, as in "{of}/..."')
 
 
 def check_names(values: Iterable[str], where: Where) -> None:
@@ -204,7 +204,7 @@ def check_unique(values: Iterable[str], where: Where, key: str = "") -> None:
         earlier = first.setdefault(value, number)
         if earlier != number:
             here = where.item(number, value) / key if key else where.item(number)
-            what = f"{quoted(value)} stands at {where.item(earlier).key} already"
+            what = f"{quoted(value)} is already at {where.item(earlier).key}"
             raise here.bad(what, "rename or remove one of the two")
 
 
@@ -288,9 +288,7 @@ def _checked(kind: inspect.Type, value: object, where: Where) -> object:
             try:
                 return _checked(of, value, where)
             except BadInput:
-                raise where.bad(
-                    "is of the wrong form, and not shown, as it may hold a secret", f"write {wanted}"
-                ) from None
+                raise where.bad("has the wrong form (not shown, it may be a secret)", f"write {wanted}") from None
         case inspect.Metadata(type=inspect.FloatType() as of, extra={"unit": "s"}):
             return _checked(of, _seconds(value, where), where)
         case inspect.Metadata(type=of):
@@ -351,7 +349,7 @@ def _tagged(structs: Iterable[inspect.Type], table: Mapping[str, object], where:
         others = [name for name, one in known.items() if any(key == field.encode_name for field in one.fields)]
         if others and tag not in others:
             raise (where / key).bad(
-                f"the {tag_field} {quoted(str(tag))} has none",
+                f"{tag_field} {quoted(str(tag))} does not take it",
                 f"remove it, or write {tag_field} = {_either(map(quoted, others))}",
             )
     return known[str(tag)]

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Final, TypeAlias
 
 import msgspec
 
+from zscout.config.strict import quoted
 from zscout.drivers.packets import TICKS
 from zscout.keyexpr import BadName, check_rc
 from zscout.mesh import Refused
@@ -93,7 +94,7 @@ def robot_command(do: Mapping[str, Any]) -> RobotCommand:
 def _read(do: Mapping[str, Any], kind: Any, names: tuple[str, ...]) -> Any:
     name = do.get("name")
     if name not in names:
-        raise Refused("unknown_command", f"this device does not know {str(name)[:64]!r}; it knows {', '.join(names)}")
+        raise Refused("unknown_command", f"unknown command {quoted(str(name)[:64])}; there are {', '.join(names)}")
     try:
         return msgspec.convert(do, kind)
     except msgspec.ValidationError as error:

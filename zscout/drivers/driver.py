@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self
 
 from msgspec import Struct
 
+from zscout.config.strict import quoted
 from zscout.keyexpr import Sender
 from zscout.mesh import Refused, Supervisor
 from zscout.messages import Amounts, Figures, FrameHead, Holder, Parameter, ProposedHolder
@@ -115,11 +116,11 @@ class Driver:
     async def command(self, holder: Holder, do: Mapping[str, Any]) -> Any:
         """Carry out the command `do` and return its result. Raise Refused if it can't be done. Return a Future if the
         result takes time: other calls do not wait for it."""
-        raise Refused("unknown_command", f"this device does not know {str(do.get('name'))[:64]!r}")
+        raise Refused("unknown_command", f"unknown command {quoted(str(do.get('name'))[:64])}")
 
     async def command_without_grant(self, sender: Sender, do: Mapping[str, Any]) -> Any:
         """Carry out a command that needs no hold. Raises Refused by default."""
-        raise Refused("no_grant", "this RC does nothing without a grant; ask the RCM for it")
+        raise Refused("no_grant", "this device obeys only under a grant; request it")
 
     def vote(self, holders: list[ProposedHolder]) -> str:
         """Return why a sharable device can't serve these holders together, or an empty string if it can serve them

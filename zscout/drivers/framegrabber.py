@@ -189,16 +189,16 @@ class FramegrabberDriver(Driver):
             return None, f"it does not receive {', '.join(videos)}; it receives {self._receives}"
         if len(self._sources) == 1:
             return next(iter(self._sources)), ""
-        return None, f"no video RC is in its gang; tune it to one of {self._receives}"
+        return None, f"no video channel is in its hold; tune it to one of {self._receives}"
 
     def _wanted(self, holder: Holder, to: object) -> str:
         if "" in self._sources:
-            raise Refused("bad_command", f"{self._rc.name} has one source only; there is nothing to tune")
+            raise Refused("bad_command", f"{self._rc.name} has only one source; there is nothing to tune")
         if not isinstance(to, str) or to not in self._sources:
             raise Refused("bad_command", f"{self._rc.name} receives {self._receives}; set `to` to one of them")
         videos = [rc for rc in holder.rcs if rc.startswith("video/")]
         if videos and to not in videos:
-            raise Refused("bad_command", f"your ARC holds {', '.join(videos)}, not {to}; ask the RCM for {to} also")
+            raise Refused("bad_command", f"your request holds {', '.join(videos)}, not {to}; request {to} as well")
         return to
 
     def _tune(self, source: str, holder: Holder) -> None:

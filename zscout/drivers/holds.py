@@ -168,7 +168,7 @@ class HoldTable:
         # An RCM that names none means whoever hears it.
         change.named = grants.instances.get(self.rc, self.instance)
         if change.named != self.instance:
-            self._end_all("another instance of this RC serves", change, now)
+            self._end_all("another instance of this device serves", change, now)
             return change
         if len(holders) > 1 and not sharable:
             holders = [max(holders, key=lambda holder: holder.grant)]
@@ -180,7 +180,7 @@ class HoldTable:
         wanted = {holder.grant: holder for holder in holders[:MAX_HOLDERS]}
         self._awaited.clear()
         for grant in [grant for grant in self.held if grant not in wanted]:
-            self._remove(grant, reasons.get(grant, "the RCM gave it to another"), change, now, to=wanted.values())
+            self._remove(grant, reasons.get(grant, "the leader gave it to another"), change, now, to=wanted.values())
         for grant, holder in wanted.items():
             if grant in self._ended:
                 change.announce = True
@@ -200,7 +200,7 @@ class HoldTable:
             return change
         change.named, change.named_host = state.instances.get(self.rc, (None, None))
         if change.named not in (None, self.instance):
-            self._end_all("another instance of this RC serves", change, now)
+            self._end_all("another instance of this device serves", change, now)
             return change
         known = {view.grant for view in state.holds if self.rc in view.needs}
         change.announce = any(grant not in known for grant in self.held)
@@ -262,7 +262,7 @@ class HoldTable:
         lease_over = lease and self.held and now - self.last_contact >= self.hold_lease
         for grant, held in list(self.held.items()):
             if lease_over:
-                self._remove(grant, "lease: no RCM was heard for too long", change, now, expired="lease")
+                self._remove(grant, "lease: no leader published for too long", change, now, expired="lease")
             elif now >= held.end and not held.holder.keep:
                 self._remove(grant, "its time is over", change, now, expired="time")
         for grant in [grant for grant, settling in self.settling.items() if now >= settling.gone_by]:
@@ -349,7 +349,7 @@ class HoldTable:
         elif newer or grant in self._awaited:
             code, why = "not_yet", f"{self.rc} has not heard of this grant"
         elif not self.held:
-            code, why = "free", f"{self.rc} is held by nobody; ask the RCM for it"
+            code, why = "free", f"{self.rc} is held by nobody; request it"
         else:
             holders = ", ".join(sorted(_named(held.holder) for held in self.held.values()))
             code, why = "not_holder", f"{self.rc} is held by {holders}"

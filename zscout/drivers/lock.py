@@ -28,7 +28,5 @@ def only_here(fleet: str, host: str, rc: str) -> Iterator[None]:
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
                 raise
-            raise MeshError(
-                f"{rc}: another process offers it for host {host} already; end that one, or name it otherwise"
-            ) from None
+            raise MeshError(f"{rc}: another process on {host} serves it already; end that, or rename this") from None
         yield

@@ -138,7 +138,7 @@ class RadioDriver(Driver):
         order = radio_command(do)
         owner = self._robots.get(order.robot)
         if owner is not None and owner not in holder.rcs and self._is_offered(owner):
-            raise Refused("not_yours", f"robot {order.robot} is {owner}, which this ARC does not hold")
+            raise Refused("not_yours", f"robot {order.robot} is {owner}, which is not held; request it as well")
         if self._down:
             raise Refused("down", self._down)
         if isinstance(order, RadioStop | RadioHalt):

@@ -78,14 +78,14 @@ def _plugin(rc: PluginRc) -> type[Driver]:
         )
     if len(places) > 1:
         packages = " and ".join(map(_origin, places))
-        raise at.bad(f"{quoted(rc.driver)} is brought by {packages}", "uninstall one of them")
+        raise at.bad(f"{quoted(rc.driver)} comes with {packages}", "uninstall one of them")
     (entry,) = places
     try:
         found = entry.load()
     except (Exception, SystemExit) as error:
         raise _unfit(at, f"{_origin(entry)} can't be loaded", error) from error
     if not (isinstance(found, type) and issubclass(found, Driver)):
-        raise at.bad(f"{_origin(entry)} is no driver", "name a subclass of zscout.drivers.driver.Driver there")
+        raise at.bad(f"{_origin(entry)} is not a driver", "name a subclass of zscout.drivers.driver.Driver there")
     return found
 
 
@@ -94,11 +94,11 @@ def _make(rc: PluginRc, driver: type[Driver]) -> Driver:
         options: Any = convert(dict(rc.options), driver.Options, rc.at)
     except TypeError as error:
         what = f"the options of {driver.__module__}.{driver.__qualname__} can't be read: {error}"
-        raise (rc.at / "driver").bad(what, "mend its class Options") from error
+        raise (rc.at / "driver").bad(what, "fix its class Options") from error
     try:
         return driver.configured(options)
     except ValueError as error:
-        raise rc.at.bad(str(error) or "a value that its driver does not take", "mend it") from error
+        raise rc.at.bad(str(error) or "the driver does not accept a value", "correct it") from error
     except Exception as error:
         raise _unfit(rc.at / "driver", f"{driver.__module__}.{driver.__qualname__} can't be made", error) from error
 
@@ -112,6 +112,4 @@ def _unfit(at: Where, what: str, error: BaseException) -> BadInput:
     log.debug("%s: %s", at.key, what, exc_info=error)
     remedy = f"it {missing}" if isinstance(error, ImportError) and (missing := how_to_get(error)) else ""
     words = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-    return at.bad(
-        f"{what}: {words}", remedy or "mend that package, or install what it needs; --log-level debug shows more"
-    )
+    return at.bad(f"{what}: {words}", remedy or "fix that package, or install its needs; --log-level debug shows more")

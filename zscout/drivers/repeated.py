@@ -30,7 +30,7 @@ class CommandMemory:
         known, name = self._of(sender.host), (sender.client, query.message.id)
         if (before := known.get(name)) is not None:
             if len(before.waiting) >= MAX_WAITING:
-                raise Refused("busy", "this command came before, and is not done yet; wait for its answer")
+                raise Refused("busy", "this command is already being carried out; wait for its answer")
             before.join(query)
             return False
         query.outcome = known[name] = Answered()

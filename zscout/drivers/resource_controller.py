@@ -336,12 +336,12 @@ class ResourceController:
         # What stops a robot is let in where commands are not.
         room = COMMAND_QUEUE if query.message.grant is not None else 2 * COMMAND_QUEUE
         if self.queue.commands >= room:
-            raise Refused("busy", f"{self.name} has {COMMAND_QUEUE} commands waiting; ask again")
+            raise Refused("busy", f"{self.name} has {COMMAND_QUEUE} commands waiting; try again")
         if not 0 < query.message.ttl <= MAX_TTL:
             raise Refused("bad_command", f"ttl must lie between 0 and {MAX_TTL:g} seconds")
         # Nor does what stops one wait for what else its host has sent.
         if not self.queue.put_command(query, sender.host if query.message.grant is not None else ""):
-            raise Refused("busy", f"{COMMANDS_PER_HOST} commands of {sender.host} to {self.name} wait; ask again")
+            raise Refused("busy", f"{COMMANDS_PER_HOST} commands of {sender.host} to {self.name} wait; try again")
 
     async def _worker(self) -> None:
         """Carries out changes of holders and commands, one at a time."""
@@ -356,7 +356,7 @@ class ResourceController:
                 left = work.message.ttl - self._waited(work) / SECOND
                 self.supervisor.call_later(max(0.0, min(EARLY, left)), self._read_for_early)
             else:
-                work.refuse(Refused("busy", f"too many commands to {self.name} are early; ask again").problem)
+                work.refuse(Refused("busy", f"too many early commands for {self.name}; try again").problem)
 
     def _read_for_early(self) -> None:
         if self.queue.early:
@@ -381,7 +381,7 @@ class ResourceController:
         self._trace("command", grant=command.grant)
         warming = max(0.0, (self._warm_at - self.mesh.now()) / SECOND)
         if warming and not self.driver.usable_cold(command.do):
-            raise Refused("warming", f"{self.name} is warming up; {warming:.1f} s are left")
+            raise Refused("warming", f"{self.name} is warming up; wait {warming:.1f} s")
         grant, began = command.grant, self.mesh.now()
         result = await self.driver.command(self.holds.held[grant].holder, command.do)
         if isinstance(result, asyncio.Future):
@@ -444,18 +444,18 @@ class ResourceController:
         problem = self.holds.check(grant, client, self.mesh.now())
         if self._missed and problem is not None and problem.code in ("free", "not_holder"):
             # What is being read may name it.
-            return structs.replace(problem, code="not_yet", message=f"{self.name} has missed something, and reads it")
+            return structs.replace(problem, code="not_yet", message=f"{self.name} is catching up; try again")
         if problem is None and grant in self._held_back and query.message.do.get("name") not in NEVER_HELD_BACK:
             until = max(self.holds.settles(grant) or 0, 0 if self._making_safe is None else self._safe_by)
             left = max(0.0, (until - self.mesh.now()) / SECOND)
-            words = f"{self.name} settles: a former holder's program may still touch it; {left:.1f} s are left at most"
+            words = f"{self.name} is settling: a former holder may still touch it; wait at most {left:.1f} s"
             return messages.Problem("settling", words, left=left)
         if (
             problem is None
             and (left := self.driver.begins_for())
             and query.message.do.get("name") not in NEVER_HELD_BACK
         ):
-            return messages.Problem("settling", f"{self.name} is being started, for {left:.1f} s at most", left=left)
+            return messages.Problem("settling", f"{self.name} is starting; wait at most {left:.1f} s", left=left)
         return problem
 
     def _waited(self, query: CommandQuery) -> Ns:

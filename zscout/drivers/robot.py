@@ -96,7 +96,7 @@ class RobotDriver(Driver):
     async def open(self, rc: RcHandle) -> None:
         rc = own(rc)
         self._rc, self._mesh = rc, rc.mesh
-        rc.fail(f"{self._radio} has not taken its halt yet")
+        rc.fail(f"{self._radio} has not yet accepted its halt")
         self._directory = RcDirectory(rc.mesh, self._on_directory_change)
         state = rc.mesh.keys.rc_state(self._radio)
         self._declared = [self._directory.watch(), rc.mesh.subscribe(state, RcState, self._on_radio_state)]
@@ -144,20 +144,20 @@ class RobotDriver(Driver):
         if len(radios) == 1:
             return radios[0]
         holds = "holds no radio" if not radios else f"holds {' and '.join(radios)}, and not its own"
-        raise Refused("no_radio", f"your ARC {holds}: nothing reaches the robot; ask also for {self._radio}")
+        raise Refused("no_radio", f"your request {holds}, so nothing reaches the robot; request {self._radio} as well")
 
     def _channel_of(self, holder: Holder) -> int:
         """The channel of the video RC in the robot's gang."""
         videos = [rc for rc in holder.rcs if rc.startswith("video/")]
         if not videos:
-            raise Refused("no_video", "your ARC holds no video channel to transmit on; ask also for video/*")
+            raise Refused("no_video", "your request holds no video channel to transmit on; request video/* as well")
         if len(videos) > 1:
-            why = f"your ARC holds {' and '.join(videos)}, and the camera has one transmitter; ask for one"
+            why = f"your request holds {' and '.join(videos)}, but the camera has one transmitter; request one of them"
             raise Refused("no_video", why)
         channel = self._channels.get(videos[0])
         if channel is None:
             known = ", ".join(sorted(self._channels)) or "none"
-            raise Refused("no_video", f"this robot knows no channel of {videos[0]}; it knows {known}")
+            raise Refused("no_video", f"this robot has no channel for {videos[0]}; it has {known}")
         return channel
 
     async def _send_all(self) -> None:

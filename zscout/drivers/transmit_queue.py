@@ -192,10 +192,10 @@ class TransmitQueue:
         member = self.members[place]
         waiting = QueuedPacket(place, grant, command, now)
         if member.bucket is None:
-            raise Refused("bad_command", "this ARC asked for command_rate 0: only stops and halts go out")
+            raise Refused("bad_command", "this request has command_rate 0: only stops and halts are sent; request more")
         if waiting.size > member.share.size:
-            sizes = f"{waiting.size} bytes, and this ARC asked for {float(member.share.size):g}"
-            raise Refused("bad_command", f"this packet has {sizes}; ask for packet_size = {MAX_PACKET}")
+            sizes = f"{waiting.size} bytes, and this request has {float(member.share.size):g}"
+            raise Refused("bad_command", f"this packet has {sizes}; request packet_size = {MAX_PACKET}")
         self._release(now)
         if isinstance(command, RadioDrive):
             # Driven under a newer hold: the end of an older one that is learned of late halts it no more.
@@ -211,7 +211,7 @@ class TransmitQueue:
                 break
         else:
             if len(member.waiting) >= MAX_WAITING:
-                raise Refused("busy", "too many packets of this ARC wait; send fewer")
+                raise Refused("busy", "too many packets of this request wait; send fewer")
             member.waiting.append(waiting)
             self._release(now)
         if waiting in self._queue:

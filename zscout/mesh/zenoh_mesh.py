@@ -207,7 +207,7 @@ def _security(fleet: Fleet, keys: Keys, me: Sender) -> Security:
     own = read_certificates(fleet.security)
     own.check(datetime.now(UTC), me.host)
     if not fleet.access.ranks_of(me.host):
-        raise BadInput(f"{own.cert}: {me.host} has no role in fleet {fleet.name}; name it under [roles] of its file")
+        raise BadInput(f"{own.cert}: {me.host} has no role in fleet {fleet.name}; name it in the fleet file's [roles]")
     return Security(own, keys, tuple(fleet.access.members()))
 
 

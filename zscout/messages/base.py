@@ -181,7 +181,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) != len(pairs):
         twice, _ = Counter(name for name, _ in pairs).most_common(1)[0]
-        raise ValueError(f"{twice[:80]!r} stands more than once in one object; write it once")
+        raise ValueError(f'"{twice[:80]}" is given more than once; give it once')
     return found
 
 

@@ -39,7 +39,11 @@ class Lifecycle:
         if record is None:
             record = ComponentRecord(component, spec, asked_at=state.now)
             if not state.add(record):
-                state.refuse(component, "too_many", f"{len(state.components)} components are placed already")
+                state.refuse(
+                    component,
+                    "too_many",
+                    f"{len(state.components)} components are placed, the most allowed; stop one first",
+                )
                 return
             self.place_again(record)
         elif record.state in OVER:
@@ -51,7 +55,7 @@ class Lifecycle:
             # It is placed again after its stop.
             self._reset(record, spec)
         elif record.spec != spec:
-            message = f"{component} is placed already, and is another: stop it first, or take another name"
+            message = f"{component} is already placed with other settings; stop it first, or use another name"
             state.refuse(component, "exists", message)
             return
         state.mark_changed(component, always=True)
@@ -144,7 +148,7 @@ class Lifecycle:
             return
         for host in before[:AT_ONCE]:
             self.probes.add(host, record.component)
-        record.reason = f"the hosts are asked whether they have kind {kind} by now"
+        record.reason = f"no host had kind {kind}; asking the hosts again"
         state.wake(record, record.asked_at + ASK_KINDS)
 
     def _start_on(self, record: ComponentRecord, chosen: RankedHost) -> None:

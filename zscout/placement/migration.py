@@ -39,18 +39,18 @@ class Migrations:
             if to in (None, record.migration.to):
                 state.mark_changed(component, always=True)
             else:
-                message = f"{component} is moving to {record.migration.to} already: wait for that"
+                message = f"{component} is already moving to {record.migration.to}; wait until it is there"
                 state.refuse(component, "move_failed", message)
         elif record.state != "running":
-            message = f"{component} does not run: it is {record.state.replace('_', ' ')}"
+            message = f"{component} is not running, it is {record.state.replace('_', ' ')}"
             state.refuse(component, "not_running", message)
         elif to == record.host:
             state.mark_changed(component, always=True)
         elif not record.movable and not record.confirmed:
-            message = f"{component} has just started: {record.host} has not said yet whether it can be moved"
+            message = f"{component} has just started: it is not yet known whether {record.host} can move it"
             state.refuse(component, "busy", f"{message}; ask again")
         elif not record.movable:
-            state.refuse(component, "not_movable", f"{component} gives no checkpoint: it can't be moved")
+            state.refuse(component, "not_movable", f"{component} can't be moved: its kind has no checkpoint()")
         else:
             hosts, why_none = state.eligible_hosts(record.spec, other_than=record.host, only=to)
             if hosts:
@@ -267,7 +267,11 @@ class Migrations:
                 state.refuse(host, "unknown_host", f"there is no host {host}")
                 return
             if len(cordoned) >= MAX_HOSTS:
-                state.refuse(host, "too_many", f"{len(cordoned)} hosts are drained already")
+                state.refuse(
+                    host,
+                    "too_many",
+                    f"{len(cordoned)} hosts are drained, the most allowed; use one again with zscout uncordon",
+                )
                 return
         cordoned.add(host)
         state.rankings.begin(state.now)

@@ -39,7 +39,7 @@ class Booking(Struct, frozen=True):
     def __post_init__(self) -> None:
         check_request(f"booking {self.id}", self.needs, self.runtime)
         if self.maintenance and (patterns := sorted(filter(is_pattern, self.needs))):
-            raise ValueError(f"booking {self.id}: maintenance needs RCs by name, not {patterns[0]}")
+            raise ValueError(f"booking {self.id}: maintenance needs devices by name, not {patterns[0]}")
 
     @property
     def end(self) -> Ns:

@@ -10,7 +10,7 @@ def check_request(name: str, needs: Mapping[Need, Params], min_runtime: Ns) -> N
     """Raises ValueError if needs are empty, the minimum runtime is not positive or a parameter is negative, and as
     `check_patterns`."""
     if not needs:
-        raise ValueError(f"{name} needs nothing; name at least one RC")
+        raise ValueError(f"{name} needs nothing; name at least one device")
     if min_runtime <= 0:
         raise ValueError(f"{name}: the minimum runtime must be positive")
     for params in needs.values():
@@ -27,6 +27,6 @@ def check_patterns(needs: Mapping[Need, Params]) -> None:
             continue
         kind = check_need(need).partition("/")[0]
         if asked.setdefault(kind, params) != params:
-            raise ValueError(f"patterns of the kind {kind} have different parameters; give all the same")
+            raise ValueError(f"patterns of the kind {kind} have different parameters; give them all the same")
     if asked and any(map(is_pattern, asked)) and any(asked.values()):
-        raise ValueError("a pattern that any kind of RC meets can't stand beside parameters; name its kind")
+        raise ValueError("a pattern for devices of any kind can't be combined with parameters; name a kind")

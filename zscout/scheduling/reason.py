@@ -203,7 +203,7 @@ _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
         if why.detail and why.number == 1
         else f"{_listed(why)} not on the mesh{_because(why)}"
     ),
-    ReasonCode.NO_MATCH: lambda why: f"no RC on the mesh is left for {_listed(why)}{_because(why)}",
+    ReasonCode.NO_MATCH: lambda why: f"no device on the mesh is left for {_listed(why)}{_because(why)}",
     ReasonCode.SILENT: lambda why: f"{_listed(why)} does not answer",
     ReasonCode.UNCONFIRMED: lambda why: f"{_listed(why)} did not confirm the grant",
     ReasonCode.CLAIMED: lambda why: f"{why.detail} claims it as well",
@@ -213,15 +213,15 @@ _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
     ReasonCode.BOOKED: lambda why: f"{why.rcs[0]} is booked by {why.by[0]} before this would be over",
     ReasonCode.MAINTENANCE: lambda why: f"maintenance of {why.rcs[0]} by {why.by[0]}",
     ReasonCode.NOT_YET: lambda _: "the time of its booking is still to come",
-    ReasonCode.QUOTA: lambda why: f"host {why.detail} has {why.number} ARCs running, its quota",
-    ReasonCode.RC_QUOTA: lambda why: f"{why.detail} may hold {why.number} RCs at one time",
+    ReasonCode.QUOTA: lambda why: f"host {why.detail} has {why.number} requests running, its quota",
+    ReasonCode.RC_QUOTA: lambda why: f"{why.detail} may hold {why.number} devices at why time",
     ReasonCode.VOTING: lambda _: "votes are out",
     ReasonCode.SEARCHING: lambda _: "a better schedule is sought",
     ReasonCode.EXPIRED: lambda _: "its minimum runtime is over",
     ReasonCode.LIMIT: lambda _: "it had the longest time that this fleet gives a hold (max_runtime)",
     ReasonCode.PREEMPTED: lambda why: f"preempted by {why.by[0]}, priority {why.by[0].priority}{why.by[0].comment}",
     ReasonCode.DISPLACED: lambda why: (
-        f"its minimum runtime is over and {why.by[0]}, priority {why.by[0].priority}, needs its RCs{why.by[0].comment}"
+        f"its minimum runtime is over, and {why.by[0]}, priority {why.by[0].priority}, needs it{why.by[0].comment}"
     ),
     ReasonCode.CANCELLED: lambda why: f"cancelled by {why.detail}",
     ReasonCode.RELEASED: lambda why: f"released by {why.detail}",

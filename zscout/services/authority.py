@@ -63,28 +63,31 @@ class Authority:
         if not self._enforced:
             return
         name = sender.host
-        self._check_rank(name, "ask for an ARC", USERS)
+        self._check_rank(name, "request devices", USERS)
         ceiling, most = self._policy.ceiling(name), None
         if "operator" not in self._policy.ranks_of(name):
             most = self._operator_priority - 1
         if ceiling.priority is not None:
             most = ceiling.priority if most is None else min(most, ceiling.priority)
         if most is not None and ask.priority > most:
-            raise self._refused(name, f"ask for priority {ask.priority}; at most {most}")
+            raise self._refused(name, f"request priority {ask.priority}; at most {most}")
         if ceiling.runtime:
             if ask.keep:
                 raise self._refused(name, "keep a hold")
             if duration(ask.min_runtime, "min_runtime") > ceiling.runtime:
-                what = f"ask for {ask.min_runtime} s; at most {ceiling.runtime / 1e9:g}"
+                what = f"request {ask.min_runtime} s; at most {ceiling.runtime / 1e9:g}"
                 raise self._refused(name, what)
         for need in ask.needs:
             if not is_pattern(need) and not self.may_hold(name, need):
                 raise self._not_its(name, need)
         for owner, members, quota in self._policy.quotas_of(name):
             if quota.rcs is not None and len(ask.needs) > quota.rcs:
-                raise Refused("not_allowed", f"{owner} may hold {quota.rcs} RCs at one time, and this asks for more")
+                raise Refused(
+                    "not_allowed",
+                    f"{owner} may hold {quota.rcs} devices at one time, and this request needs more; name fewer",
+                )
             if quota.arcs is not None and open_by(members) >= quota.arcs:
-                raise Refused("not_allowed", f"{owner} has {quota.arcs} ARCs open, its quota; release or cancel one")
+                raise Refused("not_allowed", f"{owner} has {quota.arcs} open requests, its quota; cancel one")
 
     def known_as(self, sender: Sender, who: Who | None) -> Who | None:
         """Who asks, as people are told it: whoever it says to be, its user is the one that its certificate names."""
@@ -102,7 +105,7 @@ class Authority:
         names have open, and how many RCs they hold."""
         if not self._enforced:
             return
-        self._check_rank(to.host, "take over an ARC", USERS)
+        self._check_rank(to.host, "take over a request", USERS)
         for arc in arcs:
             request = arc.request
             wanted: dict[str, Amounts] = {need: {} for need in (request.needs if arc.hold is None else arc.needs)}
@@ -113,9 +116,9 @@ class Authority:
             if sender.host in members:
                 continue  # it has no more than before
             if quota.arcs is not None and open_by(members) + len(arcs) > quota.arcs:
-                raise Refused("not_allowed", f"{owner} may have {quota.arcs} ARCs open, and would have more")
+                raise Refused("not_allowed", f"{owner} may have {quota.arcs} open requests, and would have more")
             if running and quota.rcs is not None and held_by(members) + running > quota.rcs:
-                raise Refused("not_allowed", f"{owner} may hold {quota.rcs} RCs at one time, and would hold more")
+                raise Refused("not_allowed", f"{owner} may hold {quota.rcs} devices at one time, and would hold more")
 
     def check_operator(self, sender: Sender, what: str) -> None:
         """Raises Refused for all but operators. `what` stands behind `may not`."""

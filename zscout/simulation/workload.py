@@ -99,13 +99,11 @@ def parse_workload(text: str, source: str) -> Workload:
 def _rc(rc: _Rc, where: Where) -> WorkloadRc:
     _check_texts(where / "name", rc.name)
     if is_pattern(rc.name):
-        raise (where / "name").bad(f"{quoted(rc.name)} is a pattern", "leave out the *; only needs may have it")
+        raise (where / "name").bad(f"{quoted(rc.name)} is a pattern", "leave out the *; only needs may have one")
     if rc.capacity is None:
         return WorkloadRc(rc.name, rc.sharable)
     if not rc.sharable:
-        raise (where / "capacity").bad(
-            "an exclusive RC has one holder and no capacity", "add sharable = true, or remove it"
-        )
+        raise (where / "capacity").bad("an exclusive device has no capacity", "add sharable = true, or remove it")
     _check_texts(where / "capacity", *rc.capacity)
     return WorkloadRc(rc.name, rc.sharable, amounts(rc.capacity, where / "capacity"))
 
@@ -115,7 +113,7 @@ def _arrival(arc: _Arc, where: Where) -> Arrival:
     at = seconds_to_ns(arc.at, where / "at")
     min_runtime = seconds_to_ns(arc.min_runtime, where / "min_runtime", low=Decimal("0.000000001"))
     if not arc.needs:
-        raise (where / "needs").bad("an ARC needs at least one RC", "name one, with {} for no parameters")
+        raise (where / "needs").bad("a request needs at least one device", "name one, with {} for no parameters")
     needs: dict[RcName, Params] = {}
     for rc, parameters in arc.needs.items():
         _check_texts(where / "needs", rc)

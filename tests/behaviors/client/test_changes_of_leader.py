@@ -37,7 +37,7 @@ async def test_a_queued_request_that_the_next_leader_refuses_ends(monkeypatch: p
         link.loss = 0.0
         await until(lambda: waits.state == "ended", within=20)
         assert waits.outcome == "lost"
-        assert waits.reason == "the RCM refuses it: priority must lie between -4 and 4"
+        assert waits.reason == "the leader refuses it: priority must lie between -4 and 4"
         assert await two.granted(waits) is None
         assert two.internals.open_requests() == []
 

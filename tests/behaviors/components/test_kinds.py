@@ -50,7 +50,7 @@ def test_a_name_that_means_two_things_or_none_is_no_kind(tmp_path: Path, monkeyp
     "where", ["zscout.behaviors.components.shipped:PAGE", "zscout.behaviors.components.shipped:No.such", "json"]
 )
 def test_what_is_no_component_is_refused_in_one_line(where: str) -> None:
-    with pytest.raises(BadKind, match=r"kind x: .* no subclass of .*; mend the entry point") as caught:
+    with pytest.raises(BadKind, match=r"kind x: .* not a subclass of .*; fix the entry point") as caught:
         load_kind("x", where)
     assert "\n" not in str(caught.value)
 

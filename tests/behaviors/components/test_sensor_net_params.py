@@ -46,7 +46,7 @@ OF_ONE: list[tuple[dict[str, Any], str]] = [
     ({"robot": "robot/*"}, 'robot: "robot/*" is not the name of an RC;'),
     ({"robot": ["robot/scout33"]}, "robot: is a list;"),
     (ONE | {"above": 3}, "above: is 3; write a text in quotes"),
-    (ONE | {"above": "x" * 101}, "Expected `str` of length <= 100 - at `$.above`; mend it"),
+    (ONE | {"above": "x" * 101}, "Expected `str` of length <= 100 - at `$.above`; correct it"),
     (TWO, "robots: unknown key; did you mean robot?"),
 ]
 

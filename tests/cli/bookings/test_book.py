@@ -38,17 +38,17 @@ def test_the_last_day_is_one_on_which_it_may_begin() -> None:
 def test_what_began_can_be_booked_for_as_long_as_it_can_be_taken_up() -> None:
     written = parse_date("2026-11-26 11:50", "--at")
     assert Asked.of(written, HOUR, None, None, BERLIN, NOW, 900).start.at.minute == 50
-    with pytest.raises(BadInput, match="11:50 is over"):
+    with pytest.raises(BadInput, match="11:50 is past"):
         Asked.of(written, HOUR, None, None, BERLIN, NOW, 600)
 
 
 @pytest.mark.parametrize(
     ("at", "every", "until", "why"),
     [
-        ("2026-11-26 11:59", None, None, "--at: .* 11:59 is over; by the fleet's clock it is Thu 2026-11-26 12:00"),
+        ("2026-11-26 11:59", None, None, "--at: .* 11:59 is past; the fleet's clock has Thu 2026-11-26 12:00"),
         ("2028-01-01 10:00", None, None, "--at: .* is more than a year ahead"),
-        ("tue 14:00", 7, "2026-11-30", "--until: it is before the first date"),
-        ("tue 14:00", 7, "2027-12-30", "--until: at most a year ahead; write 2027-11-26 or an earlier"),
+        ("tue 14:00", 7, "2026-11-30", "--until is before the first date"),
+        ("tue 14:00", 7, "2027-12-30", "--until is more than a year ahead; write 2027-11-26 or an earlier"),
         ("2027-03-28 02:30", 1, None, "--at: 2027-03-28 02:30 does not exist .* begin with another date"),
     ],
 )  # fmt: skip

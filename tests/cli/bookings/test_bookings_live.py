@@ -112,7 +112,7 @@ def test_at_its_date_it_is_held_and_the_command_runs(fleet: CliFleet) -> None:
 def test_a_booking_has_its_own_needs_and_priority(fleet: CliFleet) -> None:
     said(fleet, "book", "robot/b", "--for", "1h", "--at", "in 1d", "--name", "fixed", "--priority", "2")
     other = said(fleet, "request", "robot/c", "--booking", "fixed", "--", "true", code=2)
-    assert other == "zscout: fixed is booked with other devices: robot/b; leave the NEEDs out\n"
+    assert other == "zscout: fixed is booked with other devices: robot/b; leave the devices out\n"
     higher = said(fleet, "request", "--booking", "fixed", "--priority", "3", "--", "true", code=2)
     assert higher == "zscout: --priority: fixed is booked at 2; leave it out\n"
     same = said(fleet, "request", "robot/b", "--booking", "fixed", "--priority", "2", "--timeout", "0.5", code=1)

@@ -92,7 +92,7 @@ def test_a_calendar_of_google() -> None:
     ]
     assert skipped(found) == [
         "Holiday, arm 1 is off: of people who are free then",
-        "Lunch: naming no RC",
+        "Lunch: naming no device",
         "Arm 1 demo: cancelled",
         "Arm 1 demo: over, or begun",
     ]
@@ -111,7 +111,7 @@ def test_a_calendar_of_outlook() -> None:
         "Arm-1-Wartung Tue 01-05 16:00 for 60 min: robot/arm1", "Arm-1-Wartung Tue 02-02 16:00 for 60 min: robot/arm1",
         "Arm-1-Wartung Tue 03-02 16:00 for 60 min: robot/arm1",
     ]  # fmt: skip
-    assert skipped(found) == ['Arm 1 Besuch: its zone "Customized Time Zone 1" is none of the IANA database (failed)']
+    assert skipped(found) == ['Arm 1 Besuch: its time zone "Customized Time Zone 1" is not an IANA zone (failed)']
 
 
 def test_a_calendar_of_nextcloud() -> None:
@@ -162,7 +162,7 @@ def test_maintenance_is_of_rcs_by_name() -> None:
     assert one.book.maintenance
     assert one.book.patience == 3600
     refused = plan_of(event, maintenance=True, needs=(("robot/*", {}),))
-    assert skipped(refused) == ["arm 1: maintenance is of RCs by their names, not by pattern (failed)"]
+    assert skipped(refused) == ["arm 1: name each device for maintenance; patterns are not allowed (failed)"]
 
 
 @pytest.mark.parametrize(
@@ -240,7 +240,7 @@ def test_too_many_are_refused() -> None:
         for day in range(1, 29)
         for hour in (1, 2, 3, 4)
     ]
-    with pytest.raises(BadInput, match=f"the calendar has more than {MAX_BOOKINGS} bookings to make"):
+    with pytest.raises(BadInput, match=f"the calendar would make more than {MAX_BOOKINGS} bookings"):
         plan_of(*monthly)
 
 

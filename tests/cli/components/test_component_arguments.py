@@ -21,7 +21,7 @@ def test_sizes(text: str, size: int) -> None:
 
 @pytest.mark.parametrize("text", ["", "0", "M", "-1", "1e3", "5P", "1 M", "0.0001", "9" * 30, "2000000T", "٣"])
 def test_what_is_no_size_is_refused(text: str) -> None:
-    with pytest.raises(BadInput, match=r"--memory: .* is no size; write bytes, or with a unit"):
+    with pytest.raises(BadInput, match=r"--memory: .* is not a size; write bytes, or with a unit"):
         parse_size(text, "--memory")
 
 
@@ -40,10 +40,10 @@ def test_parameters_are_json_or_else_text() -> None:
         ('{"a": 1e999}', [], "is not a JSON object"),
         ("{'a': 1}", [], "is not a JSON object"),
         ("[" * 100_000, [], "is not a JSON object"),
-        (None, ["a"], '--set "a" sets nothing; write KEY=VALUE'),
-        (None, ["=1"], '--set "=1" sets nothing'),
+        (None, ["a"], '--set: "a" has no value; write KEY=VALUE'),
+        (None, ["=1"], '--set: "=1" has no value'),
         (None, ["a=1", "a=2"], '"a" is given twice'),
-        (None, ["a=" + "x" * 17_000], "at most 16384 are taken"),
+        (None, ["a=" + "x" * 17_000], "at most 16384 are allowed"),
     ],
 )
 def test_bad_parameters(given: str | None, settings: list[str], words: str) -> None:
@@ -83,6 +83,6 @@ def test_the_last_lines() -> None:
 
 def test_an_unknown_name_is_told_what_there_is() -> None:
     assert str(unknown("cuonter", ["spin", "counter"])).endswith("did you mean counter?")
-    assert str(unknown("x", [])).endswith("nor any other; start one: zscout start")
+    assert str(unknown("x", [])).endswith("and there are none; see zscout component start")
     many = str(unknown("zzz", [f"a{number}" for number in range(10)]))
     assert many.endswith("known: a0, a1, a2, a3, a4, a5, a6, a7 and 2 more")

@@ -237,7 +237,7 @@ def test_logs_of_what_runs_and_of_what_has_ended(fleet: CliFleet) -> None:
     assert some.stdout.splitlines() == every.stdout.splitlines()[-2:]
     elsewhere = fleet.zscout("logs", "speaker", "--host", OTHER[here])
     assert (elsewhere.returncode, elsewhere.stdout) == (1, "")
-    assert elsewhere.stderr.startswith(f"zscout: {OTHER[here]} knows no output of speaker; leave --host out")
+    assert elsewhere.stderr.startswith(f"zscout: {OTHER[here]} has no output of speaker; leave --host out")
     nobody = fleet.zscout("logs", "nobody")
     assert nobody.returncode == 1
     assert nobody.stderr.startswith('zscout: no component "nobody" is known; ')
@@ -249,7 +249,7 @@ def test_followed_output_begins_when_the_component_does(fleet: CliFleet) -> None
     assert begun.returncode == 0, begun.stderr
     none = fleet.zscout("logs", "later")
     assert none.returncode == 1
-    assert "no host knows any output of later: it waits for a host: " in none.stderr
+    assert "no host has output of later: it waits for a host: " in none.stderr
     follower = follow(fleet, "later")
     clamp = fleet.lab.node("clamp")
     try:

@@ -191,7 +191,7 @@ def test_kinds(fleet: CliFleet) -> None:
 def test_status_names_components_and_cordoned_hosts(fleet: CliFleet) -> None:
     assert fleet.zscout("start", "still", "--name", "seen").returncode == 0
     moved = fleet.zscout("migrate", "seen")
-    assert moved.stderr == "zscout: seen was not moved: seen gives no checkpoint: it can't be moved\n"
+    assert moved.stderr == "zscout: seen was not moved: seen can't be moved: its kind has no checkpoint()\n"
     # What can't be moved is not waited for.
     drained = fleet.zscout("drain", "anvil")
     assert drained.returncode == 1

@@ -96,7 +96,7 @@ def test_nothing_is_overwritten_unless_that_is_said(words: tuple[str, ...], caps
     before = {path: path.read_bytes() for path in Path().rglob("*.pem")}
     capsys.readouterr()
     assert zscout_here("cert", *words) == 2
-    assert "already; name another folder, or overwrite with --force" in capsys.readouterr().err
+    assert "; name another folder, or overwrite with --force" in capsys.readouterr().err
     assert {path: path.read_bytes() for path in Path().rglob("*.pem")} == before
     assert zscout_here("cert", *words, "--force") == 0
     assert {path: path.read_bytes() for path in before} != before
@@ -141,7 +141,7 @@ def test_show_tells_each_state_and_its_exit_code_whether_all_can_be_used(capsys:
     code, (valid, broken) = shown(capsys, "anvil", "broken")
     assert code == 1
     assert (valid["name"], valid["trusted"], valid["problem"]) == ("anvil", [valid["issuer"]], None)
-    assert broken["problem"] == "broken/key.pem: may be read by others (mode 644); chmod 640 broken/key.pem"
+    assert broken["problem"] == "broken/key.pem: may be read by others (644); chmod 640 broken/key.pem"
 
 
 def test_show_prints_a_line_for_each_and_takes_the_folder_that_the_environment_names(
@@ -158,7 +158,7 @@ def test_show_prints_a_line_for_each_and_takes_the_folder_that_the_environment_n
     zscout_here("cert", "show", "zscout-ca", "nowhere", "anvil")
     lines = capsys.readouterr().out.splitlines()[1:]
     assert lines[0].endswith(" CA")
-    assert "nowhere: no certificate is there; copy there what `zscout cert issue` made, or name your own" in lines[1]
+    assert "nowhere: has no certificate; copy there what `zscout cert issue` made, or name your own" in lines[1]
     assert "trusts zscout CA " in lines[2]
 
 

@@ -93,7 +93,7 @@ def test_a_certificate_that_ends_soon_is_told_of_every_host_and_of_ones_own_once
         "bellows", Role.NODE, Role.LOAD, certificate_ends_in=-60.0, renew=True, version=VERSION
     )
     ends = [
-        "the certificate of anvil ends in 1 d; renew it (zscout cert renew)",
+        "the certificate of anvil expires in 1 d; renew it (zscout cert renew)",
         "the certificate of bellows has ended 1 min ago; renew it (zscout cert renew)",
     ]
     for own in (certificates("anvil", lasts=40 * DAY, begun=39 * DAY), certificates()):
@@ -194,7 +194,7 @@ def test_plain_hosts_of_a_secured_fleet_are_named() -> None:
         ),
         (
             Called("tls/b:1", "tls", "", shown("bellows", ends=-DAY), "CA one", trusted=True),
-            "the certificate of bellows (tls/b:1) has ended on 2026-04-30 12:00 UTC",
+            "the certificate of bellows (tls/b:1) expired on 2026-04-30 12:00 UTC",
         ),
         (
             Called("tls/b:1", "tls", "", shown("bellows", begins=DAY), "CA one", trusted=True),
@@ -218,17 +218,17 @@ def test_another_secured_fleet_on_the_network_is_well() -> None:
 
 
 def test_an_own_certificate_that_is_bad_is_not_told_again_by_those_who_refuse_it() -> None:
-    bad = [("certificate", BadInput("keys/cert.pem: has ended on x; renew it"))]
+    bad = [("certificate", BadInput("keys/cert.pem: expired on x; renew it"))]
     refuses = Called("tls/b:1", "tls", "", shown("bellows"), "CA one", trusted=True, objection="certificate expired")
     shut_out = seen(CLOSED, bad=bad, certificates=certificates(), answers=[refuses], links=None, hosts={}, state=None)
-    assert mends(shut_out) == [("certificate", "keys/cert.pem: has ended on x; renew it")]
+    assert mends(shut_out) == [("certificate", "keys/cert.pem: expired on x; renew it")]
 
 
 def test_where_keys_cannot_be_read_it_is_told_once() -> None:
-    bad = [("certificate", BadInput("keys: may not be entered by this user; mend its mode"))]
+    bad = [("certificate", BadInput("keys: may not be entered by this user; change its mode"))]
     foreign = [Called(f"tls/{name}:1", "tls", "", shown(name), "CA one") for name in ("anvil", "bellows", "x")]
     told = seen(CLOSED, bad=bad, answers=foreign, links=None, hosts={}, state=None)
-    assert mends(told) == [("certificate", "keys: may not be entered by this user; mend its mode")]
+    assert mends(told) == [("certificate", "keys: may not be entered by this user; change its mode")]
     assert not [one for one in findings(told) if one.about == "security"]
 
 

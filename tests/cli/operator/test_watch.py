@@ -1,4 +1,4 @@
-"""`zscout watch` as people and programs run it: on files, on a camera over HTTP, and at a terminal."""
+"""`zscout motion` as people and programs run it: on files, on a camera over HTTP, and at a terminal."""
 
 from __future__ import annotations
 
@@ -80,13 +80,13 @@ def test_a_recording_has_pictures_boxes_and_events(video: Path, tmp_path: Path) 
     ("source", "words"),
     [
         ("none.avi", "can't be read (No such file or directory); name a video file"),
-        (".", "is no file; name a video file"),
+        (".", "is not a file; name a video file"),
         ("notes.txt", "there is no video in"),
         ("empty.avi", "there is no video in"),
-        ("", "--source: it is empty"),
+        ("", "--source is empty"),
         ("http://127.0.0.1:1/video", "can't be opened: does its server run, and is the address right?"),
         ("/dev/video97", "can't be opened: No such file or directory"),
-        ("tiny.avi", "are 4 by 4 pixels; give it ones of 8 to"),
+        ("tiny.avi", "are 4 by 4 pixels; each side must have 8 to"),
     ],
 )
 def test_a_source_that_gives_nothing_is_one_line_and_exit_code_2(

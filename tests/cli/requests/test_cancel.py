@@ -57,7 +57,7 @@ def test_a_name_of_several_is_refused_with_the_list(fleet: CliFleet) -> None:
     assert refused.stderr.count("\n") == 1
     holds = fleet.state(lambda state: len(state.holds) == 2).holds
     names = [f"{hold.client}/{hold.id}" for hold in holds]
-    assert refused.stderr.startswith('zscout: 2 ARCs are called "twin": ')
+    assert refused.stderr.startswith('zscout: 2 requests are called "twin": ')
     assert all(name in refused.stderr for name in names)
     assert fleet.zscout("cancel", names[0]).returncode == 0
     (left,) = fleet.state(lambda state: len(state.holds) == 1).holds
@@ -71,4 +71,4 @@ def test_a_name_of_several_is_refused_with_the_list(fleet: CliFleet) -> None:
 def test_an_unknown_arc_is_one_line(fleet: CliFleet) -> None:
     done = fleet.zscout("cancel", "nobody")
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == 'zscout: no ARC "nobody" runs or waits; see zscout status\n'
+    assert done.stderr == 'zscout: no ARC "nobody" holds or waits; see zscout status\n'

@@ -123,7 +123,7 @@ def test_why_tells_of_all_that_match(fleet: CliFleet) -> None:
     assert "\n  robot/a: no other request holds it\n" in text
     assert "\n  video/*: not on the mesh\n" in text
     assert " ago)  asked for framegrabber/*, robot/a, video/* at priority 0\n" in text
-    assert re.search(r"no RC on the mesh is left for .*video/\*", text)
+    assert re.search(r"no device on the mesh is left for .*video/\*", text)
     (told,) = json.loads(fleet.zscout("why", "next", "--json").stdout)["arcs"]
     assert [(need["need"], need["rc"], need["present"]) for need in told["needs"]] == [
         (ANY, None, True),
@@ -151,7 +151,7 @@ def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
     assert (at_once.returncode, at_once.stdout) == (0, "request would start at once\n")
     never = fleet.zscout("request", ANY, ANY, ANY, "--dry-run", "--json")
     assert never.returncode == 1
-    assert "no RC on the mesh is left for framegrabber/*" in json.loads(never.stdout)["reason"]
+    assert "no device on the mesh is left for framegrabber/*" in json.loads(never.stdout)["reason"]
 
     low, high = fleet.holder("low", F1), fleet.holder("high", ANY, "--priority", "1")
     would = fleet.zscout("request", ANY, "--priority", "5", "--dry-run")

@@ -164,7 +164,7 @@ def test_a_command_goes_on_past_its_minimum_runtime_until_an_equal_waits(fleet: 
     lines = out_of(kept).read()
     assert kept.wait(HANG) == 124
     assert "told" in lines
-    why = f"its minimum runtime is over and {by('true')}, priority 0, needs its RCs"
+    why = f"its minimum runtime is over, and {by('true')}, priority 0, needs it"
     assert f"the time of kept is over: {why}\n" in lines
     assert fleet.idle("robot/a")
 
@@ -306,7 +306,7 @@ def test_what_can_never_start_is_refused_at_once_with_code_2(fleet: CliFleet) ->
     assert (typo.returncode, typo.stderr) == (2, "zscout: radio/rf0 knows no parameter rat; did you mean rate?\n")
     none = fleet.zscout("request", "robot/a:speed=1", "--", "true")
     assert none.returncode == 2
-    assert none.stderr == "zscout: robot/a knows no parameter speed; it takes none\n"
+    assert none.stderr == "zscout: robot/a has no parameter speed; it has none\n"
     fleet.state(lambda state: not state.queue and not state.holds)
 
 

@@ -162,7 +162,7 @@ def test_nothing_at_all_is_said_in_one_line(tmp_path: Path, capsys: pytest.Captu
     file = tmp_path / "empty.toml"
     file.write_text("")
     assert zscout_here("replay", file) == 0
-    summary = "Strategy priority: 0 ARCs on 0 RCs; 0 holds, 0 preempted, over 0 s; 0 ARCs unserved\n"
+    summary = "Strategy priority: 0 requests on 0 devices; 0 holds, 0 preempted, over 0 s; 0 requests unserved\n"
     assert capsys.readouterr().out == summary
     assert zscout_here("replay", file, "--json") == 0
     assert capsys.readouterr().out == '{"strategy": "priority", "holds": [], "unserved": []}\n'

@@ -82,7 +82,7 @@ def test_what_nobody_takes_waits_for_a_restart_and_is_told(files: Files, caplog:
     ("spoil", "said"),
     [
         (lambda text: text.replace("max = 3", "max = 0"), "components.max: is 0; write a whole number from 1 to 256"),
-        (lambda text: text + "oops = [", "mend the TOML there"),
+        (lambda text: text + "oops = [", "fix the TOML there"),
         (lambda text: text.replace('"exclusive"', '"laser"'), 'no driver "laser" is installed here'),
         (lambda text: text.replace("fleet.toml", "none.toml"), "none.toml"),
     ],

@@ -104,7 +104,7 @@ def test_wanted_is_the_runnable_where_nobody_tells_who_waited(proc: Proc) -> Non
 
 
 def test_without_proc_there_is_one_clear_line(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="does not tell of process 10; mount it, or set load = true"):
+    with pytest.raises(OSError, match="does not show process 10; mount it, or set load = true"):
         TreeMeter(10, proc=tmp_path)
 
 

@@ -91,7 +91,10 @@ def test_a_certificate_that_ends_soon_is_told_once_and_again_after_it_was_renewe
     soon = report("anvil", 12.25 * 86_400, renew=True)
     (told,) = notices.look([soon, report("bellows", 9e6, renew=False), report("plain", None, renew=False)])
     assert told == Notification(
-        "certificate_ends", "", "zscout lab: the certificate of anvil ends in 12.2 days", "renew it: zscout cert renew"
+        "certificate_ends",
+        "",
+        "zscout lab: the certificate of anvil expires in 12.2 days",
+        "renew it: zscout cert renew",
     )
     assert notices.look([soon]) == []
     assert notices.look([report("anvil", 9e6, renew=False)]) == []

@@ -123,7 +123,7 @@ async def test_certificates_are_looked_at_while_this_node_leads() -> None:
         reports.append(report("anvil", 86_400, renew=True))
         await asyncio.to_thread(lab.until, lambda: len(lab.heard) == 1)
         telling.stop()
-        assert lab.titles == ["zscout lab: the certificate of anvil ends in 1.0 days"]
+        assert lab.titles == ["zscout lab: the certificate of anvil expires in 1.0 days"]
 
 
 def test_a_url_is_in_no_repr() -> None:

@@ -150,7 +150,7 @@ async def test_two_halves_book_the_same_and_the_earlier_of_the_higher_priority_s
         "higher": ["open"],
         "lower": ["conflict"],
     }
-    assert views["low"].dates[0].danger == "higher of y stands"
+    assert views["low"].dates[0].danger == "higher of y takes precedence"
     # Where that one is given up the other stands.
     await do(there, Unbook("higher"), BookingView)
     await asyncio.sleep(1)
@@ -246,8 +246,8 @@ async def test_maintenance_goes_before_what_is_booked_and_both_are_told() -> Non
     views = await fleet.bookings()
     assert states(views["m"]) == ["open"]
     assert states(views["b"]) == ["conflict"]
-    assert views["b"].dates[0].danger == "m of desk stands"
-    with pytest.raises(Refusal, match=r"bad_request.*nobody takes it up"):
+    assert views["b"].dates[0].danger == "m of desk takes precedence"
+    with pytest.raises(Refusal, match=r"bad_request.*no request can use"):
         await client.ask("mine", "robot/a", "robot/b", booking="m", priority=drain.priority)
     kept = await client.ask("kept", "robot/b", seconds=30, keep=True)
     late = await client.ask("late", "robot/a", seconds=250, estimate=True)

@@ -59,17 +59,13 @@ def test_what_may_start_is_let_in(need: str, params: dict[str, float]) -> None:
 @pytest.mark.parametrize(
     ("need", "params", "words"),
     [
-        ("robot/arn1", {}, "unknown_device: nobody knows robot/arn1; did you mean robot/arm1? to wait until it comes"),
-        ("tank/*", {}, "unknown_device: nobody knows an RC that meets tank/*; to wait"),
+        ("robot/arn1", {}, "unknown_device: unknown device robot/arn1; did you mean robot/arm1? to wait for it anyway"),
+        ("tank/*", {}, "unknown_device: no device matches tank/*; to wait"),
         ("radio/rf0", {"command_rate": 50}, "too_much: can never start: command_rate 50 of 10 packets/s at radio/rf0"),
         ("radio/*", {"command_rate": 101}, "too_much: can never start: command_rate 101 of 10"),
-        ("radio/rf0", {"comand_rate": 5}, "unknown_parameter: radio/rf0 knows no parameter comand_rate; did you mean"),
-        (
-            "radio/rf0",
-            {"x": 5},
-            "unknown_parameter: radio/rf0 knows no parameter x; it knows command_rate, packet_size",
-        ),
-        ("robot/arm1", {"speed": 1}, "unknown_parameter: robot/arm1 knows no parameter speed; it takes none"),
+        ("radio/rf0", {"comand_rate": 5}, "unknown_parameter: radio/rf0 has no parameter comand_rate; did you mean"),
+        ("radio/rf0", {"x": 5}, "unknown_parameter: radio/rf0 has no parameter x; it has command_rate, packet_size"),
+        ("robot/arm1", {"speed": 1}, "unknown_parameter: robot/arm1 has no parameter speed; it has none"),
     ],
 )
 def test_what_can_never_start_is_refused_with_what_to_mend(need: str, params: dict[str, float], words: str) -> None:
@@ -83,10 +79,10 @@ def test_what_can_never_start_is_refused_with_what_to_mend(need: str, params: di
         (["radio/*", "robot/arm1"], ""),
         (
             ["radio/*", "radio/*#2", "radio/*#3"],
-            "unknown_device: 3 RCs that meet radio/* are asked for, and only radio/rf0, radio/rf1 can be had for it",
+            "unknown_device: 3 devices that match radio/* are requested, but only radio/rf0, radio/rf1 can be used",
         ),
-        (["robot/*", "robot/arm1"], "unknown_device: robot/* is asked for, and none but those that are named"),
-        (["tank/x"], "unknown_device: nobody knows tank/x; zscout status lists"),
+        (["robot/*", "robot/arm1"], "unknown_device: robot/* is requested, but none but those you named"),
+        (["tank/x"], "unknown_device: unknown device tank/x; zscout status lists"),
     ],
 )
 def test_what_never_waits_for_a_device_is_refused_where_too_few_meet_a_pattern(needs: list[str], words: str) -> None:
@@ -116,7 +112,7 @@ async def test_the_leader_refuses_what_it_knows_only_to_who_asks_for_that() -> N
     # So soon it may not know all devices yet.
     assert (await client.ask("early", "robot/arn1", check=True)).state == "queued"
     await asyncio.sleep(fleet.fleet.timing.hold_lease / SECOND)
-    with pytest.raises(Refusal, match="unknown_device: nobody knows robot/arn2; did you mean robot/arm1"):
+    with pytest.raises(Refusal, match="unknown_device: unknown device robot/arn2; did you mean robot/arm1"):
         await client.ask("typo", "robot/arn2", check=True)
     assert (await client.ask("patient", "robot/arn2", check=True, wait_for_device=True)).state == "queued"
     again = await client.ask("patient", "robot/arn2", check=True)

@@ -123,7 +123,7 @@ def tell(observer: RuntimeObserver, number: int, lasted: float, outcome: str, re
         ("cancelled", "cancelled by its client", None),
         ("preempted", "preempted by bob", None),
         ("lost", "robot/a was lost", None),
-        ("completed", "its minimum runtime is over and bob, priority 0, needs its RCs", None),
+        ("completed", "its minimum runtime is over, and bob, priority 0, needs it", None),
         ("completed", EXPIRED, None),  # all that was asked for
         ("handed_over", "handed over to ws2/c", None),
     ],

@@ -338,5 +338,5 @@ async def test_an_arc_that_is_open_at_its_new_client_already_counts_once_against
     assert (await new.ask("a", "robot/a")).state == "queued"
     assert (await old.do(HandOver("a", new.name))).client == new.name
     await old.ask("b", "robot/b")
-    with pytest.raises(Refusal, match="not_allowed: h2 may have 1 ARCs open, and would have more"):
+    with pytest.raises(Refusal, match="not_allowed: h2 may have 1 open requests, and would have more"):
         await old.do(HandOver("b", new.name))

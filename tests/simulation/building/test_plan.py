@@ -40,7 +40,7 @@ BAD = {
     ("depth = 3.0", 'depth = 3.0\ncovering = "grass"'): (
         'covering: is the text "grass"; write "carpet", "plain", "planks" or "tiles"'
     ),
-    ("start = [2.6, 3.0]", "start = [2.6]"): ("wall[0].start: has 1 number(s); write a place as [x, y]"),
+    ("start = [2.6, 3.0]", "start = [2.6]"): ("wall[0].start: is not two numbers; write a place as [x, y]"),
     ("start = [2.6, 3.0]", "start = [2.6, 3.5]"): (
         "wall[0].start: (2.6, 3.5) is outside; write x from 0 to 4, y from 0 to 3"
     ),
@@ -67,12 +67,12 @@ BAD = {
         "light[0].z (ceiling): is 2.6 m; write at most 2.5, the room's height"
     ),
     ("path = [[-0.5, 1.0], [3.0, 1.0]]", "path = [[-0.5, 1.0]]"): (
-        "person[0].path (ada): has 1 point(s); write two or more, as in [[0.5, 1], [3, 1]]"
+        "person[0].path (ada): has less than two points; write two or more, as in [[0.5, 1], [3, 1]]"
     ),
     ("[3.0, 1.0]]", "[5.5, 1.0]]"): (
         "person[0].path[1] (ada): (5.5, 1) is outside; write x from -1 to 5, y from -1 to 4"
     ),
-    ("[3.0, 1.0]]", "[-0.45, 1.0]]"): ("person[0].path (ada): leads nowhere; move one of its points by 0.1 m or more"),
+    ("[3.0, 1.0]]", "[-0.45, 1.0]]"): ("person[0].path (ada): has no length; move one of its points by 0.1 m or more"),
     ("[3.0, 1.0]]", "[1, 2, 3]]"): ("person[0].path[1] (ada): has 3 entries; at most 2 are allowed"),
     ("id = 33", "id = 255"): ("robot[0].id (scout33): is 255; write a whole number from 0 to 254"),
     ("id = 33", "id = 35"): ('robot[1].id (35): "35" stands at robot[0] already; rename or remove one of the two'),

@@ -56,7 +56,7 @@ class Held:
         rc = self.bound.get(need, need)
         if rc not in self.rcs:
             asked = ", ".join(sorted(self.arc.needs))
-            raise KeyError(f"{need} is no need of {self.arc.name}; it asked for {asked}")
+            raise KeyError(f"{need} is not a need of {self.arc.name}; it asked for {asked}")
         return rc
 
     def now(self) -> Ns:
@@ -156,7 +156,7 @@ class Attempt:
             async with asyncio.timeout(self._timeout):
                 grant = await self._client.granted(await self.asked(), confirmed=self._confirmed)
         except (asyncio.CancelledError, TimeoutError) as error:
-            why = self.arc.reason if self.arc is not None else "no RCM has answered"
+            why = self.arc.reason if self.arc is not None else "no leader has answered"
             if self.arc is not None:
                 await self._client.end(self.arc)
             if isinstance(error, asyncio.CancelledError):
@@ -184,9 +184,7 @@ class Attempt:
                 # By our clock it had its time. An RCM that takes the lead as it clears up would queue it again.
                 self._client.internals.expire(held.arc)
             await asyncio.sleep(max(0, direct.gone_by - held.now()) / SECOND)
-            log.warning(
-                "%s clears up for too long after its hold, and is interrupted: the next holder begins", held.arc.name
-            )
+            log.warning("%s cleans up too long after its hold; interrupting it, the next holder begins", held.arc.name)
             self._cancel(body)
 
     def _cancel(self, body: asyncio.Task[Any]) -> None:

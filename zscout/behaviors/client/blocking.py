@@ -162,7 +162,7 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
         if direct is not None:
             await asyncio.sleep(max(0, direct.gone_by - held._held.now()) / SECOND)
             log.warning(
-                "%s clears up for too long after its hold, and is interrupted: the next holder begins", direct.arc.name
+                "%s cleans up too long after its hold; interrupting it, the next holder begins", direct.arc.name
             )
             held._body.told = False
             await held._body.interrupt()

@@ -169,7 +169,7 @@ class BookingsClient:
         keys, me = self._mesh.keys, self._mesh.me
         if keys.closed and (why := self._client.fleet.access.refusal(me.host, "book", USERS)):
             raise RequestRefused(Problem("not_allowed", why))
-        silent = "did not answer; it may be done or not: see zscout bookings, and try again"
+        silent = "did not answer; it may or may not have been done: see zscout booking list, and try again"
         return await self._until_told(keys.schedule(me), operation, kind, self._timeout, silent)
 
     async def _until_told(self, key: str, question: Message, kind: type[M], within: float, silent: str) -> M:
@@ -183,12 +183,12 @@ class BookingsClient:
                     return reply.message
             problem = next((reply.problem for reply in replies), problem)
             if replies and problem is not None and problem.code not in TRY_AGAIN:
-                who = "the RCM" if self._client.leader is None else f"the RCM at {self._client.leader}"
+                who = "the leader" if self._client.leader is None else f"the leader at {self._client.leader}"
                 named = naming_versions(replies[0], who)
                 raise RequestRefused(problem if named is None or named.problem is None else named.problem)
             if self._mesh.now() > deadline:
                 why = "" if problem is None else f" ({problem.message})"
-                raise RcmSilent(Problem("unknown", f"the RCM of fleet {self._client.fleet.name} {silent}{why}"))
+                raise RcmSilent(Problem("unknown", f"the leader of fleet {self._client.fleet.name} {silent}{why}"))
             await asyncio.sleep(pause)
             pause = min(longest, pause * 2)
 
@@ -213,5 +213,5 @@ def _zone(start: datetime, every: int) -> str:
     if isinstance(start.tzinfo, ZoneInfo):
         return start.tzinfo.key
     if every and start.utcoffset() != timedelta(0):
-        raise ValueError("what is repeated keeps its hour in a zone; write start with a ZoneInfo('Europe/Berlin')")
+        raise ValueError("a repeated booking keeps its hour in a zone; write start with a ZoneInfo('Europe/Berlin')")
     return "UTC"

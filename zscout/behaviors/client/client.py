@@ -133,15 +133,15 @@ class Client:
                 return
             if candidates and await done_within(max(0.0, takeover - seconds), seen.wait()):
                 return
-        nobody = f"no RCM is on the mesh of fleet {self.fleet.name}"
+        nobody = f"no leader is on the mesh of fleet {self.fleet.name}"
         if candidates:
             names = ", ".join(sorted(token.host for token in candidates)[:MAX_NAMED])
             raise NoRcm(f"{nobody}, though {names} could lead; see the log of zscout-node there")
         links = self.mesh.links()
         who = f"{links} link{'s' * (links > 1)} to other programs" if links else "no other program either"
         raise NoRcm(
-            f"{nobody} ({who}); start zscout-node on a host, or check the fleet's file (--fleet, ${FLEET_VARIABLE}): "
-            "`zscout doctor` says what keeps them apart"
+            f"{nobody} ({who}); start zscout-node on a host, or check the fleet file (--fleet, ${FLEET_VARIABLE}): "
+            "`zscout doctor` finds the cause"
         )
 
     # Requests
@@ -252,7 +252,7 @@ class Client:
         """Pass one request, queued or running, to the client `to`. Raises RequestRefused."""
         reply = await self._rcm.query(messages.HandOver(id=arc.id, to=str(to)))
         if reply is None or reply.message is None:
-            unknown = Problem("unknown", "the RCM did not answer; ask how the ARC stands")
+            unknown = Problem("unknown", "the leader did not answer; ask how the request stands")
             raise RequestRefused(reply.problem or unknown if reply is not None else unknown)
 
     # Operators' questions
@@ -315,7 +315,7 @@ class Client:
         command = messages.Command(grant=grant, do=dict(do), ttl=ttl, id=id_)
         reply = await self.mesh.ask_one(key, command, Done, timeout=timeout)
         if reply is None:
-            raise CommandRefused(rc, Problem("unknown", "no answer; it may have been done or not"))
+            raise CommandRefused(rc, Problem("unknown", "no answer; it may or may not have been done"))
         if reply.message is None:
             refused = CommandRefused(rc, reply.problem or Problem("unknown", "no reason given"))
             arc = next((arc for arc in self._store.open if arc.grant == grant), None)

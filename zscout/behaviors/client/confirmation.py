@@ -112,7 +112,7 @@ class Confirmations:
         grant = one.grant
         if grant == arc.left:
             # Its RCs have been told that its program leaves, whatever a new RCM has found.
-            over = Problem("ended", "its program was told to leave")
+            over = Problem("ended", "its program was asked to end")
             refusals = [CommandRefused(rc, over) for rc in arc.rcs]
         else:
             refusals = await self._confirm(arc, grant)

@@ -60,11 +60,11 @@ class MovableClient:
         What has come and was not asked for within 10 s is given back. Raises BadName, and ValueError for more
         than 256 of them, or for one that is open here."""
         if len(requests) > MAX_OTHERS + 1:
-            raise ValueError(f"{len(requests)} ARCs are too many to take over; at most {MAX_OTHERS + 1} are")
+            raise ValueError(f"{len(requests)} requests are too many to take over; at most {MAX_OTHERS + 1} are")
         now = self.mesh.now()
         arcs = {request.id: OpenArc.expected(request, now) for request in requests}
         if here := arcs.keys() & self._store.arcs.keys():
-            raise ValueError(f"request {min(here)} is open here already; nobody else can hand it over")
+            raise ValueError(f"request {min(here)} is already open here; no other client can hand it over")
         for arc in list(self._store.expected.values()):
             self._unclaimed.pop(arc.id, None)
             self._store.forget(arc)
@@ -113,9 +113,7 @@ class MovableClient:
                 while arc.id in self._store.expected:
                     await self._store.changed(arc)
         except TimeoutError:
-            log.warning(
-                "nothing was heard of %s for %g s, handed over to here; it is asked for", arc.name, EXPECT_TIMEOUT
-            )
+            log.warning("%s was handed over to here, but not granted for %g s; requesting it", arc.name, EXPECT_TIMEOUT)
             self._store.adopt(arc)
 
     async def _await_again(self, arc: OpenArc) -> None:
@@ -184,10 +182,10 @@ class MovableClient:
         again; or see to it that the other client is gone, which an RCM before may have told all the same, and
         `take_back`."""
         if not self.paused:
-            raise RuntimeError("pause() the client before it hands over all: it would ask for it again")
+            raise RuntimeError("pause() the client before it hands over everything: it would ask for it again")
         arcs = sorted(self._store.acknowledged, key=lambda arc: arc.grant is None)
         if len(arcs) > MAX_OTHERS + 1:
-            words = f"{len(arcs)} ARCs can't be handed over at once; {MAX_OTHERS + 1} can"
+            words = f"{len(arcs)} requests can't be handed over at once; {MAX_OTHERS + 1} can"
             raise RequestRefused(Problem("too_many", words))
         try:
             async with asyncio.timeout(HAND_OVER):
@@ -196,7 +194,7 @@ class MovableClient:
             self._store.undecided = {arc.id for arc in arcs if arc.open}
             if isinstance(error, RequestRefused):
                 raise
-            unknown = f"no RCM told within {HAND_OVER:g} s whether {to} has taken over; ask again"
+            unknown = f"no leader reported within {HAND_OVER:g} s whether {to} took over; try again"
             raise RequestRefused(Problem("unknown", unknown)) from None
 
     async def _hand_over(self, arcs: list[OpenArc], to: Sender) -> None:

@@ -28,7 +28,7 @@ def checked_comment(text: str) -> str:
     """A comment as it is sent. Raises ValueError where it is too long."""
     text = " ".join(clean(text).split())
     if len(text) > MAX_COMMENT:
-        raise ValueError(f"a comment of {len(text)} characters; at most {MAX_COMMENT} are shown, write a shorter one")
+        raise ValueError(f"the comment has {len(text)} characters; write at most {MAX_COMMENT}")
     return text
 
 

@@ -82,7 +82,7 @@ class PlacerClient:
             placement = self.placements.get(operation.component)
             return placement if placement is not None and done(placement) else None
 
-        silent = "the component placer did not answer: it may be done or not; see zscout components"
+        silent = "the component placer did not answer: it may or may not have been done; see zscout component list"
         return await self._until(attempt, silent)
 
     async def _until(self, attempt: Callable[[], Awaitable[R | None]], silent: str) -> R:

@@ -109,7 +109,7 @@ class RcmLink:
     @property
     def who(self) -> str:
         """Whom this asks, for people."""
-        return "the RCM" if self.leader is None else f"the RCM at {self.leader}"
+        return "the leader" if self.leader is None else f"the leader at {self.leader}"
 
     async def leader_within(self, seconds: float) -> bool:
         """Waits so long for a leader to appear since `leader_came` was cleared. False: none did."""
@@ -160,7 +160,7 @@ class RcmLink:
                 continue
             for arc in self.store.open:
                 if arc.state == "running":
-                    arc.lose("no RCM was heard for the hold lease", now)
+                    arc.lose("no leader published within the hold lease", now)
                     self.store.notify(arc)
 
     # Requests
@@ -193,7 +193,7 @@ class RcmLink:
 
     async def submit(self, arc: OpenArc) -> None:
         """Asks until the RCM has answered; not while the client is paused. Raises RequestRefused."""
-        if self.mesh.keys.closed and (why := self.fleet.access.refusal(self.mesh.me.host, "ask for an ARC", USERS)):
+        if self.mesh.keys.closed and (why := self.fleet.access.refusal(self.mesh.me.host, "request devices", USERS)):
             # Access control lets no such question through: nobody would answer it.
             arc.state = "refused"
             raise RequestRefused(Problem("not_allowed", why))
@@ -210,7 +210,7 @@ class RcmLink:
                     arc.state = "refused"
                     raise RequestRefused(problem)
             elif self.leader is None:
-                arc.reason = "no RCM is on the mesh; start zscout-node"
+                arc.reason = "no leader is on the mesh; start zscout-node"
             self.store.notify(arc)
             if not await self.leader_within(pause * RANDOM.get().uniform(0.8, 1.2)):
                 pause = min(longest, pause * 2)
@@ -250,7 +250,7 @@ class RcmLink:
                     if problem is not None and problem.code not in TRY_AGAIN and arc.state == "queued":
                         # It will be refused each time, though an earlier RCM took it.
                         self.store.withdrawn[arc.id] = Cancel(id=arc.id)
-                        arc.finish("lost", f"the RCM refuses it: {problem.message}", self.mesh.now())
+                        arc.finish("lost", f"the leader refuses it: {problem.message}", self.mesh.now())
                         self.store.notify(arc)
                         self.store.forget(arc)
             for request_id in list(self.store.withdrawn):

@@ -160,7 +160,7 @@ class OpenArc:
         if notice.state != "running":
             self._close(HoldEnd(notice.outcome or "lost", notice.reason, notice.by), now)
         elif notice.grant != self.grant:
-            self._close(HoldEnd("lost", "the RCM took this client for gone; it is granted anew"), now)
+            self._close(HoldEnd("lost", "the leader took this client for gone; it is granted again"), now)
         self.state = notice.state
         self.reason, self.why = notice.reason, notice.why
         self.outcome, self.by = notice.outcome, notice.by
@@ -206,7 +206,7 @@ class OpenArc:
 
     def not_served(self, grant: Grant | None, now: Ns) -> None:
         """The time of this grant went by while RCs of it settled: it is asked for once more, at its place."""
-        self.lose("its time went by while its RCs settled", now)
+        self.lose("its time passed while its devices settled", now)
         self.unserved, self.settling = grant, None
 
     def finish(self, outcome: str, reason: str, now: Ns) -> None:

@@ -125,4 +125,4 @@ def _unpack(body: bytes, kind: Any) -> Any:
     try:
         return msgspec.json.decode(body, type=kind)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise BadFrame(f"a frame is not understood: {str(error)[:200]}") from None
+        raise BadFrame(f"can't read a frame: {str(error)[:200]}") from None

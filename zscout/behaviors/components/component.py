@@ -143,6 +143,6 @@ def load_kind(kind: str, where: str) -> type[Component]:
     for attribute in attributes.partition("[")[0].strip().split("."):
         found = getattr(found, attribute, None)
     if not (isinstance(found, type) and issubclass(found, Component)):
-        words = f"{where} is no subclass of zscout.behaviors.components.component.Component"
-        raise BadKind(f"kind {kind}: {words}; mend the entry point in the group {GROUP}")
+        words = f"{where} is not a subclass of zscout.behaviors.components.component.Component"
+        raise BadKind(f"kind {kind}: {words}; fix the entry point in the group {GROUP}")
     return found

@@ -179,7 +179,7 @@ class ComponentLifecycle:
         try:
             return kind(self._job.start.spec.params)
         except ValueError as error:
-            raise BadParams(f"these parameters are no good: {_words(error, named=False)}") from None
+            raise BadParams(f"bad parameters: {_words(error, named=False)}") from None
         except Exception as error:  # noqa: BLE001 - the author's code
             traceback.print_exc()
             raise BadKind(f"it can't be made: {_words(error)}") from None
@@ -223,7 +223,7 @@ class ComponentLifecycle:
         component, client = self._component, self._client
         fits = self._job.start.standby and not self._running if standby else self._running
         if component is None or client is None or not fits:
-            raise NotMoved("bad_request", "it does not stand by" if standby else "it does not run")
+            raise NotMoved("bad_request", "it is not standing by" if standby else "it is not running")
         if not is_movable(component):
             raise NotMoved("not_movable", "it can't be moved: its kind has no checkpoint() and restore()")
         return component, client
@@ -232,7 +232,7 @@ class ComponentLifecycle:
         component, _ = self._movable()
         async with self._holding:
             if not await self._gate.hold(channel.PATIENCE):
-                raise NotMoved("not_safe", f"it came to no safe point within {channel.PATIENCE:g} s")
+                raise NotMoved("not_safe", f"it reached no safe point within {channel.PATIENCE:g} s")
             try:
                 state = state_of(component)
             finally:

@@ -47,7 +47,7 @@ def state_of(component: Component) -> bytes:
     if not isinstance(state, bytes):
         raise NotMoved("move_failed", f"checkpoint() gave {type(state).__name__}; return bytes")
     if len(state) > MAX_CHECKPOINT:
-        raise NotMoved("too_large", f"checkpoint() gave {len(state)} bytes; at most {MAX_CHECKPOINT} are carried")
+        raise NotMoved("too_large", f"checkpoint() gave {len(state)} bytes; at most {MAX_CHECKPOINT} can be moved")
     return state
 
 
@@ -70,7 +70,7 @@ class OutgoingMove:
         then, and to give up nothing. Raises NotMoved where it goes on here."""
         await self._lives()
         if not await self._gate.hold(self._patience):
-            raise NotMoved("not_safe", f"it came to no safe point within {self._patience:g} s")
+            raise NotMoved("not_safe", f"it reached no safe point within {self._patience:g} s")
         began, self.began = self._client.mesh.now(), True
         self._client.internals.pause()
         try:
@@ -110,7 +110,7 @@ class OutgoingMove:
     async def _give(self, state: bytes, requests: list[OpenRequest]) -> None:
         order = messages.RestoreComponent(self._name, self.incarnation, state, requests)
         if len(messages.encode(order)) > MAX_MOVE:
-            raise NotMoved("too_large", f"state and {len(requests)} requests are over {MAX_MOVE} bytes")
+            raise NotMoved("too_large", f"state and {len(requests)} requests are more than {MAX_MOVE} bytes")
         deadline = self._client.mesh.now() + round(RESTORE_TIMEOUT * SECOND)
         pause, longest = PAUSES
         left = RESTORE_TIMEOUT

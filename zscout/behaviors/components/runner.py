@@ -36,7 +36,7 @@ REPORT_LAST: Final = 2.0
 def main() -> None:
     """Exit codes: 0 where the component ended well, 1 where it failed, BAD_PARAMS where its parameters are no good."""
     if len(sys.argv) != 2 or not sys.argv[1].isdecimal() or os.getpgrp() != os.getpid():
-        sys.exit("zscout: this program is started by a node; `zscout start` starts a component")
+        sys.exit("zscout: this program is started by a node; `zscout component start` starts a component")
     logging.basicConfig(level="WARNING", format="%(levelname)s %(message)s", stream=sys.stderr)
     # A process that stands still sees no end of file: the end of its parent wakes it.
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT, 0, 0, 0)

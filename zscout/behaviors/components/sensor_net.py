@@ -49,7 +49,7 @@ class SharedParams(Struct, kw_only=True):
             with suppress(BadName):
                 if check_need(need).startswith(f"{kind}/"):
                     continue
-            raise (PARAMS / kind).bad(f"{quoted(need)} is no {kind}", f'name one, or a pattern, as in "{kind}/*"')
+            raise (PARAMS / kind).bad(f"{quoted(need)} is not a {kind}", f'name one, or a pattern, as in "{kind}/*"')
         return RobotNeeds(robot, self.radio, self.video, self.framegrabber, self.command_rate)
 
 
@@ -90,7 +90,7 @@ class NetParams(SharedParams):
 
 class TreeComponent(Component):
     """A component that performs a tree of behaviors, `root`, and checkpoints it. Their status is published;
-    each new one and each alert is printed, for `zscout logs`."""
+    each new one and each alert is printed, for `zscout component logs`."""
 
     root: Behavior
     speed: float

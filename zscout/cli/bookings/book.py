@@ -67,7 +67,7 @@ DURATION: Final = Parsed("duration", parse_duration)
 
 def _rc(text: str, _option: str) -> str:
     if is_pattern(text):
-        raise BadInput(f"{text} may be any one RC; name those that nobody is to hold")
+        raise BadInput(f"{text} is a pattern; name each device for maintenance")
     return check_rc(text)
 
 
@@ -75,12 +75,10 @@ def date_options(command: F) -> F:
     """When, for how long and how often; and what both commands have besides."""
     for option in (
         common.json_option("Print one JSON object."),
-        click.option(
-            "--comment", type=Parsed("text", parse_comment), default="", help="What others are to know: shown to them."
-        ),
-        click.option("--name", help="What it is called. Default: after its first device; maintenance."),
+        click.option("--comment", type=Parsed("text", parse_comment), default="", help="A comment shown to others."),
+        click.option("--name", help="Name of the booking. Default: its first device; for maintenance: maintenance."),
         zone_option,
-        click.option("--until", type=DATE, help="The last day, or date, of what is repeated. Default: after a year."),
+        click.option("--until", type=DATE, help="Last day or date of the repetition. Default: a year ahead."),
         click.option("--every", type=Parsed("days", parse_every), help=f"Repeat it at the same hour: {EVERY_FORMS}."),
         click.option("--for", "runtime", type=DURATION, required=True, help="For how long: 90s, 5m, 2h, 1d12h."),
         click.option("--at", type=DATE, required=True, help=f"When: {DATE_FORMS}."),
@@ -94,7 +92,7 @@ needs_argument = click.argument(
     nargs=-1,
     required=True,
     type=Parsed("need", parse_need),
-    metavar="NEED...",
+    metavar="DEVICE...",
     shell_complete=completion.needs,
 )
 
@@ -105,26 +103,27 @@ needs_argument = click.argument(
     "--priority",
     type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY),
     default=0,
-    help="That of the request that takes it up.",
+    help="Priority of the request that uses it.",
 )
 @click.option(
     "--patience",
     type=DURATION,
-    help="It lapses when nobody has taken it up so long after its date. Default: 15 min, or its whole time.",
+    help="The booking lapses if no request uses it this long after its date. Default: 15 min, or its whole time.",
 )
 @date_options
 @common.runs
 async def book(needs: Any, priority: int, patience: Decimal | None, **rest: Any) -> None:
-    """Book devices together, from a date on.
+    """Book devices together for a date.
 
-    A NEED is written as for `zscout request`. Until it is over nobody of the same or a lower priority starts on them
-    what would not be over by its date, or would not yield. `zscout request --booking NAME -- COMMAND` takes it up: at
-    its date, or before, and waits; then it holds them until the booking's end. What nobody takes up lapses.
+    A DEVICE is written as for `zscout request`. Before the booking no request of equal or lower priority starts on the
+    devices unless it will be over by the date, or will yield. `zscout request --booking NAME -- COMMAND` uses the
+    booking: run it at its date or earlier, when it waits; it then holds the devices until the booking's end. A
+    booking that no request uses lapses.
 
-    A date is by the clock and in the zone of this host, if none is written; a zone keeps the hour of what is repeated
-    over summer time. A local time that comes twice is the first, one that does not exist an hour later; either is said.
+    A date without a zone is in the zone of this host; a repeated booking keeps its hour over summer time. A local
+    time that occurs twice is the first; a local time that does not exist moves an hour later, with a note.
 
-    If something is in the way, it says what, and when they are free instead (exit code 1).
+    If the devices are not free, it prints why, and when they are free instead (exit code 1).
 
     \b
     Examples:
@@ -137,15 +136,16 @@ async def book(needs: Any, priority: int, patience: Decimal | None, **rest: Any)
 
 @click.command()
 @click.argument(
-    "rcs", nargs=-1, required=True, type=Parsed("rc", _rc), metavar="RC...", shell_complete=completion.needs
+    "rcs", nargs=-1, required=True, type=Parsed("rc", _rc), metavar="DEVICE...", shell_complete=completion.needs
 )
 @date_options
 @common.runs
 async def maintain(rcs: Sequence[str], **rest: Any) -> None:
-    """Keep RCs free of everybody from a date on: a drain with a date, by operators.
+    """Reserve devices for maintenance, as an operator: a drain with a date.
 
-    It is a booking at the fleet's operator priority that nobody takes up: what would not be over by its date does not
-    start there, and who waits is told until when. `zscout unbook` ends it early.
+    Maintenance is a booking at the fleet's operator priority that no request can use. Requests that would not be over
+    by its date do not start on the devices; requests that wait are shown until when. `zscout booking cancel` ends it
+    early.
 
     \b
     Examples:
@@ -153,7 +153,7 @@ async def maintain(rcs: Sequence[str], **rest: Any) -> None:
       zscout maintain robot/arm1 robot/arm2 --at "mon 7:00" --for 30m --every week --until 2027-03-31
     """
     if len(set(rcs)) < len(rcs):
-        raise BadInput("an RC is named twice; name each once")
+        raise BadInput("a device is named twice; name each once")
     priority = common.the_fleet().operator_priority
     await _make({rc: {} for rc in rcs}, priority=priority, patience=None, maintenance=True, **rest)
 
@@ -183,23 +183,21 @@ class Asked:
         start, last = at.found(now, zone), None
         begins = start.at.timestamp()
         if begins + late <= now:
-            raise BadInput(
-                f"--at: {date_words(begins, zone)} is over; by the fleet's clock it is {date_words(now, zone)}"
-            )
+            raise BadInput(f"--at: {date_words(begins, zone)} is past; the fleet's clock has {date_words(now, zone)}")
         if begins > now + MAX_AHEAD:
             raise BadInput(f"--at: {date_words(begins, zone)} is more than a year ahead; write an earlier date")
         if every is None:
             return cls(start, 0, None, runtime, zone)
         if not start.exists:
-            raise BadInput(f"--at: {start.note}, and so it would go on; let it begin with another date")
+            raise BadInput(f"--at: {start.note}, and every repetition would; begin with another date")
         latest = last = _end_of(in_zone(now + A_YEAR, zone).date(), zone)
         if until is not None:
             day = until.whole_day(now, zone)
             last = until.found(now, zone).at if day is None else _end_of(day, zone)
             if last < start.at:
-                raise BadInput("--until: it is before the first date; write a later one")
+                raise BadInput("--until is before the first date; write a later one")
             if last > latest:
-                raise BadInput(f"--until: at most a year ahead; write {latest:%Y-%m-%d} or an earlier date")
+                raise BadInput(f"--until is more than a year ahead; write {latest:%Y-%m-%d} or an earlier date")
         return cls(start, every, last, runtime, zone)
 
     def remarks(self) -> list[str]:
@@ -240,9 +238,9 @@ async def _make(
     # What is wrong in any case is said before the mesh is joined.
     at.found(clocks.time(), zone)
     if until is not None and every is None:
-        raise BadInput("--until is the end of what is repeated; add --every, or leave it out")
+        raise BadInput("--until ends a repeated booking; add --every, or leave --until out")
     if patience is not None and patience > runtime:
-        raise BadInput(f"--patience: it is over after {span(float(runtime))}; write that or less")
+        raise BadInput(f"--patience is longer than the booking; write at most {span(float(runtime))}")
     name = check_name(name, "--name") if name is not None else None
     async with common.connected("maintain" if maintenance else "book") as client:
         # Others are told its name, and not by which command it was made.
@@ -286,7 +284,6 @@ def _named_after(needs: Needs) -> str:
 
 
 async def _instead(client: Client, refused: RequestRefused, needs: Needs, asked: Asked, priority: int) -> str:
-    """That they are not free then, and when they are."""
     start = asked.start.at
     try:
         how: dict[str, Any] = {"start": start, "priority": priority, "limit": OTHERS}

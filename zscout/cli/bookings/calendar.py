@@ -1,4 +1,4 @@
-"""`zscout calendar`: bookings as iCalendar files, and those of others as bookings."""
+"""`zscout booking`: bookings as iCalendar files, and those of others as bookings."""
 
 from __future__ import annotations
 
@@ -40,44 +40,35 @@ LOOK: Final = 1.0
 _NEXT_NEED: Final = re.compile(r",(?=[^,=]*/)")
 
 
-@click.group()
-def calendar() -> None:
-    """Write bookings as iCalendar files, and book what such files have.
-
-    A calendar program can subscribe to what a node serves, too: see [calendar] of its node file.
-
-    \b
-    Examples:
-      zscout calendar export --out fleet.ics
-      zscout calendar import lab.ics --map 'Arm 1=robot/arm1' --dry-run
-    """
-
-
 # Out
 
 
-@calendar.command()
+@click.command()
 @click.option(
-    "--rc", type=Parsed("rc", lambda text, _: check_rc(text)), shell_complete=completion.needs, help="Of one RC."
+    "--rc",
+    type=Parsed("rc", lambda text, _: check_rc(text)),
+    shell_complete=completion.needs,
+    help="Only bookings of this device.",
 )
-@click.option("--owner", metavar="NAME", help="Of one host, or person by certificate.")
-@click.option("--out", metavar="FILE", help="The file, written as a whole; without it, or with -, stdout.")
+@click.option("--owner", metavar="NAME", help="Only bookings of one host, or of a person by certificate.")
+@click.option("--out", metavar="FILE", help="The file to write. Default, or -: stdout.")
 @click.option("--folder", type=click.Path(path_type=Path), help="Write all calendars below this folder.")
 @common.runs
 async def export(rc: str | None, owner: str | None, out: str | None, folder: Path | None) -> None:
     """Write the bookings that are not over as an iCalendar file.
 
-    With --folder it writes fleet.ics, rc/KIND/NAME.ics for each RC and owner/NAME.ics for each owner, for a web server;
-    one that has no bookings any more stays, empty. Files are replaced as a whole, and only where bookings changed.
+    With --folder it writes fleet.ics, rc/KIND/NAME.ics for each device and owner/NAME.ics for each owner, for a web
+    server; the file of a device or owner without bookings stays, empty. Files are replaced as a whole, and only if
+    bookings changed. To let calendar programs subscribe to a node, see [calendar] of the node file.
 
     \b
     Examples:
-      zscout calendar export > fleet.ics
-      zscout calendar export --rc robot/arm1 --out arm1.ics
-      zscout calendar export --folder calendars
+      zscout booking export > fleet.ics
+      zscout booking export --rc robot/arm1 --out arm1.ics
+      zscout booking export --folder calendars
     """
     if folder is not None and (rc or owner or out):
-        raise BadInput("--folder: it has all calendars; leave --rc, --owner and --out out")
+        raise BadInput("--folder writes all calendars; leave --rc, --owner and --out out")
     async with common.connected("calendar") as client:
         bookings = (await ask_bookings(client)).bookings
         rcs = set[str]()
@@ -130,7 +121,7 @@ def _write(path: Path, text: bytes) -> bool:
 def parse_needs(text: str, option: str) -> Pairs:
     """`robot/arm1,framegrabber/*,radio/rf0:command_rate=5`; a pattern that comes again is one more. Raises BadInput."""
     if not text:
-        raise BadInput(f"{option}: names no RC")
+        raise BadInput(f"{option}: names no device; write one, as in robot/arm1")
     return tuple(gather_needs([parse_need(one, option) for one in _NEXT_NEED.split(text)]).items())
 
 
@@ -138,7 +129,7 @@ def _mapping(text: str, option: str) -> tuple[str, Pairs]:
     """`Arm 1=robot/arm1`. Raises BadInput."""
     words, equals, needs = text.partition("=")
     if not equals or not 1 <= len(words.strip()) <= MAX_WORDS:
-        raise BadInput(f"{option}: {quoted(text)} maps nothing; write words of the calendar, as in 'Arm 1=robot/arm1'")
+        raise BadInput(f"{option}: {quoted(text)} is not a mapping; write WORDS=DEVICE, as in 'Arm 1=robot/arm1'")
     return " ".join(words.split()), parse_needs(needs, option)
 
 
@@ -175,7 +166,7 @@ class _Import:
                 elif sync:
                     await self._unbook(view, words)
                 else:
-                    self.rows.append(Row(words, "kept", "it is not in the calendar any more; --sync gives it up", view))
+                    self.rows.append(Row(words, "kept", "it is no longer in the calendar; --sync gives it up", view))
         by_id = {one.id: one for one in self.known if not one.unbooked}
         for wanted in plan.wanted:
             await self._want(wanted, next((by_id[one] for one in wanted.ids if one in by_id), None))
@@ -232,9 +223,7 @@ class _Import:
         return None
 
     async def _unbook(self, view: BookingView, words: str) -> None:
-        row = Row(
-            words, "would be given up" if self.dry_run else "given up", "it is not in the calendar any more", view
-        )
+        row = Row(words, "would be given up" if self.dry_run else "given up", "it is no longer in the calendar", view)
         self.rows.append(row)
         self.makes_room = True
         if not self.dry_run:
@@ -245,38 +234,38 @@ class _Import:
         try:
             return await BookingsClient(self.client).ask(operation, BookingView)
         except RcmSilent as silent:
-            raise NobodyThere(f"{silent}; what was imported is known again") from None
+            raise NobodyThere(f"{silent}; import the file again: nothing is booked twice") from None
         except RequestRefused as refused:
             row.result = "not free" if refused.code == "not_free" else "refused"
             row.why, row.failed = str(refused), True
             return None
 
 
-@calendar.command("import")
+@click.command("import")
 @click.argument("file", type=click.Path(path_type=Path, allow_dash=True))
 @click.option(
     "--needs",
     "needs",
     multiple=True,
     type=Parsed("needs", parse_needs),
-    help="What every event needs: robot/a,'camera/*'.",
+    help="Devices for every event: robot/a,'camera/*'.",
 )
 @click.option(
     "--map",
     "mapped",
     multiple=True,
-    metavar="WORDS=NEEDS",
+    metavar="WORDS=DEVICES",
     type=Parsed("mapping", _mapping),
-    help="What an event needs whose title, place or resources have these words.",
+    help="Devices for events with these words in title, place or resources.",
 )
 @zone_option
-@click.option("--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="Of all.")
-@click.option("--patience", type=Parsed("duration", parse_duration), help="As of zscout book. Default: 15 min.")
-@click.option("--maintenance", is_flag=True, help="Keep the RCs free of everybody then, as an operator.")
-@click.option("--calendar", "name", metavar="NAME", help="What this calendar is called. Default: the file's name.")
-@click.option("--sync", is_flag=True, help="Give up what was imported from it and is not in it any more.")
-@click.option("--again", is_flag=True, help="Book again what was imported, and unbooked since.")
-@click.option("--dry-run", is_flag=True, help="Only say what would be done.")
+@click.option("--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="The bookings' priority.")
+@click.option("--patience", type=Parsed("duration", parse_duration), help="Patience of every booking. Default: 15 min.")
+@click.option("--maintenance", is_flag=True, help="Make each booking a maintenance, as an operator.")
+@click.option("--calendar", "name", metavar="NAME", help="Name of this calendar. Default: the file's name.")
+@click.option("--sync", is_flag=True, help="Cancel bookings whose events are no longer in the calendar.")
+@click.option("--again", is_flag=True, help="Book again events that were imported and cancelled since.")
+@click.option("--dry-run", is_flag=True, help="Print what would be done, and do nothing.")
 @common.json_option("Print one JSON object.")
 @common.runs
 async def import_(
@@ -293,23 +282,23 @@ async def import_(
     dry_run: bool,
     as_json: bool,
 ) -> int:
-    """Book the events of an iCalendar FILE (- is stdin): of Google, Outlook, Nextcloud and others.
+    """Book the events of an iCalendar FILE (- is stdin), from Google, Outlook, Nextcloud and others.
 
-    What an event needs is what --needs and --map say; where they say nothing, the RCs that its resources name. Others
-    are left out, as are events that are over, cancelled, or whose people are free then. To import it again books
-    nothing twice; what was changed in it is another booking, so that --sync is wanted then. Times without a zone, and
-    whole days, are of --zone.
+    --needs and --map say which devices an event needs; without either, the devices that its resources name. Other
+    events are left out, as are those that are over, cancelled, or marked as free. Importing again books nothing
+    twice; an event that changed is another booking, so use --sync then. Times without a zone, and whole days, are in
+    --zone.
 
-    The exit code is 1 where something was not booked that should have been.
+    Exit code 1: an event could not be booked.
 
     \b
     Examples:
-      zscout calendar import lab.ics --map 'Arm 1=robot/arm1' --map 'Camera=framegrabber/*' --dry-run
-      curl -s URL | zscout calendar import - --calendar lab --needs robot/arm1 --sync
-      zscout calendar import service.ics --needs robot/arm1 --maintenance
+      zscout booking import lab.ics --map 'Arm 1=robot/arm1' --map 'Camera=framegrabber/*' --dry-run
+      curl -s URL | zscout booking import - --calendar lab --needs robot/arm1 --sync
+      zscout booking import service.ics --needs robot/arm1 --maintenance
     """
     if str(file) == "-" and name is None:
-        raise BadInput("--calendar: what is read from stdin has no name; write one, and the same each time")
+        raise BadInput("stdin has no file name; name the calendar with --calendar, the same each time")
     data = sys.stdin.buffer.read(MAX_BYTES + 1) if str(file) == "-" else read_bytes(file, max_bytes=MAX_BYTES)
     events = read_calendar(data, "stdin" if str(file) == "-" else str(file))
     zone = zone or host_zone()
@@ -342,7 +331,6 @@ async def import_(
 
 
 def _merged(mapped: Iterable[tuple[str, Pairs]]) -> dict[str, Pairs]:
-    """Words may be given more than once."""
     found: dict[str, Pairs] = {}
     for words, needs in mapped:
         found[words] = (*found.get(words, ()), *needs)

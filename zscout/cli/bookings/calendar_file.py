@@ -84,11 +84,11 @@ def read_calendar(data: bytes, source: str) -> list[CalendarEvent]:
     at all, or too much of one."""
     where = Where(source)
     if len(data) > MAX_BYTES:
-        raise where.bad(f"has more than {MAX_BYTES:,} bytes", "export less, as the coming year only")
+        raise where.bad(f"has more than {MAX_BYTES:,} bytes", "export less, such as only the coming year")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise where.bad("is not UTF-8, so it is no iCalendar file", "export it as .ics again") from None
+        raise where.bad("is not UTF-8, so it is not an iCalendar file", "export it as .ics again") from None
     return [_event(lines) for lines in _components(_lines(text), where)]
 
 
@@ -107,18 +107,18 @@ def _components(lines: Contentlines, where: Where) -> Iterator[dict[str, list[Co
         name = named[1].upper() if named is not None else ""
         if not inside and name != "BEGIN":
             if line.strip():
-                raise where.bad("is no iCalendar file", "export it as .ics; it begins with BEGIN:VCALENDAR")
+                raise where.bad("is not an iCalendar file", "export it as .ics, beginning with BEGIN:VCALENDAR")
         elif name == "BEGIN":
             inside.append(line.partition(":")[2].strip().upper()[:32])
             if inside[0] != "VCALENDAR" or len(inside) > MAX_DEPTH:
-                raise where.bad("is no iCalendar file, or nested too deep", "export it as .ics again")
+                raise where.bad("is not an iCalendar file, or is nested too deep", "export it as .ics again")
             if inside == ["VCALENDAR", "VEVENT"]:
                 events, found = events + 1, {}
                 if events > MAX_EVENTS:
-                    raise where.bad(f"has more than {MAX_EVENTS} events", "export less, as the coming year only")
+                    raise where.bad(f"has more than {MAX_EVENTS} events", "export less, such as only the coming year")
         elif name == "END":
             if inside.pop() != line.partition(":")[2].strip().upper()[:32]:
-                raise where.bad("has an END of what did not begin", "export it again")
+                raise where.bad("has an END without its BEGIN", "export it again")
             calendars += not inside
             if inside == ["VCALENDAR"] and line.upper().endswith("VEVENT"):
                 yield found
@@ -143,7 +143,6 @@ def _event(lines: Mapping[str, list[Contentline]]) -> CalendarEvent:
 
 
 def _parts(line: Contentline) -> tuple[Mapping[str, Any], str]:
-    """Parameters and value, as it is written."""
     _, params, value = line.raw_parts()
     return params, value.strip()
 
@@ -171,7 +170,6 @@ def _read_words(event: CalendarEvent, values: _Values) -> None:
 
 
 def _plain(text: str) -> str:
-    """A TEXT without its escapes."""
     return re.sub(r"\\(.)", lambda found: " " if found[1] in "nN" else found[1], text)
 
 
@@ -183,7 +181,7 @@ def _read_dates(event: CalendarEvent, values: _Values) -> None:
     if "RECURRENCE-ID" in values:
         params, value = values["RECURRENCE-ID"][0]
         if "RANGE" in params:
-            raise ValueError("it is in the place of many dates (RANGE), which can't be booked")
+            raise ValueError("it replaces a whole range of dates (RANGE), which zscout can't import")
         event.instead_of = _moment(params, value)
     if "DTSTART" not in values:
         raise ValueError("it has no DTSTART")
@@ -209,7 +207,7 @@ def _moment(params: Mapping[str, Any], value: str) -> Moment:
     """Raises ValueError."""
     at = vDDDTypes.from_ical(value)  # type: ignore[no-untyped-call]
     if not isinstance(at, date) or at.year not in YEARS:
-        raise ValueError(f"{quoted(value)} is no date")
+        raise ValueError(f"{quoted(value)} is not a date")
     if not isinstance(at, datetime):
         return Moment(datetime(at.year, at.month, at.day), None, whole_day=True)  # noqa: DTZ001 - a local time
     if at.tzinfo is not None:
@@ -227,4 +225,4 @@ def _zone(named: str) -> ZoneInfo:
             return zone_of("/".join(parts[-count:])[:64])
         except ValueError:
             continue
-    raise ValueError(f"its zone {quoted(name)} is none of the IANA database")
+    raise ValueError(f"its time zone {quoted(name)} is not an IANA zone")

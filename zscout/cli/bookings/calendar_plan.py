@@ -35,7 +35,7 @@ TIMES: Final = 8
 LOOK_BACK: Final = 31 * DAY
 """Seconds: what began so long ago may not be over yet."""
 OVER, FREE, CANCELLED = "over, or begun", "of people who are free then", "cancelled"
-NO_RC = "naming no RC"
+NO_RC = "naming no device"
 NO_DATE = "without a date to come"
 LATER = "more than a year ahead: import it again then"
 
@@ -116,7 +116,7 @@ def plan_import(events: Iterable[CalendarEvent], options: ImportOptions, now: fl
         except (ValueError, OverflowError, BadInput) as error:
             plan.skipped.append(Skipped(title, str(error), failed=True))
         if len(plan.wanted) > MAX_BOOKINGS:
-            raise BadInput(f"the calendar has more than {MAX_BOOKINGS} bookings to make; export less of it")
+            raise BadInput(f"the calendar would make more than {MAX_BOOKINGS} bookings; export less of it")
     plan.wanted.sort(key=lambda one: one.book is not None and not one.book.every)
     return plan
 
@@ -137,7 +137,7 @@ def _needs(event: CalendarEvent, options: ImportOptions) -> Needs:
         pairs = [parse_need(text) for text in named]
     found = gather_needs([*dict(pairs).items()])
     if options.maintenance and any(map(is_pattern, found)):
-        raise BadInput("maintenance is of RCs by their names, not by pattern")
+        raise BadInput("name each device for maintenance; patterns are not allowed")
     return found
 
 
@@ -312,7 +312,6 @@ class _Planned:
 
 
 def _half_year(at: datetime) -> tuple[datetime, datetime]:
-    """Its begin and its end."""
     second = at.month > 6
     begin = datetime(at.year, 7 if second else 1, 1)  # noqa: DTZ001 - local times
     return begin, datetime(at.year + second, 1 if second else 7, 1)  # noqa: DTZ001

@@ -1,4 +1,4 @@
-"""`zscout bookings` and `zscout unbook`: what is booked, and its end."""
+"""`zscout booking list`, `show` and `cancel`."""
 
 from __future__ import annotations
 
@@ -39,28 +39,28 @@ from zscout.terminal import Table, clean
 
 
 @click.command()
-@click.option("--mine", is_flag=True, help="Only your own.")
+@click.option("--mine", is_flag=True, help="Only your own bookings.")
 @click.option(
     "--rc",
     type=journals.RC,
     shell_complete=completion.needs,
-    help="Only those that may have this RC, or one of a pattern: robot/*.",
+    help="Only bookings that may have this device, or a device of a pattern: robot/*.",
 )
 @zone_option
 @common.json_option("Print one JSON object.")
 @common.runs
 async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: bool) -> None:
-    """List bookings, the next date first: who has which devices from when to when, and what endangers that.
+    """List bookings, the next date first: owner, devices, times, and what endangers them.
 
-    Of what is repeated the next date is listed, and those of the next 60 days that are in danger; --json has all of
-    these. A state is `open` until somebody has taken the date up, then `taken`; in `conflict` is what another one
-    stands in the way of: maintenance, or what was booked in the other half of a fleet.
+    A repeated booking shows its next date, and those of the next 60 days that are in danger; --json has all of them.
+    A date is `open` until a request uses it, then `taken`; in `conflict` another booking takes precedence:
+    maintenance, or a booking made in the other half of a split fleet.
 
     \b
     Examples:
-      zscout bookings --mine
-      zscout bookings --rc robot/arm1 --zone UTC
-      zscout bookings --json | jq -r '.bookings[] | .name + " " + .dates[0].start'
+      zscout booking list --mine
+      zscout booking list --rc robot/arm1 --zone UTC
+      zscout booking list --json | jq -r '.bookings[] | .name + " " + .dates[0].start'
     """
     async with common.connected("bookings") as client:
         me = User.of(client)
@@ -89,6 +89,35 @@ async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: b
             _table(found, me, zone).print()
 
 
+@click.command()
+@booking_argument
+@zone_option
+@common.json_option("Print one JSON object.")
+@common.runs
+async def show(booking: str, zone: ZoneInfo | None, as_json: bool) -> None:
+    """Show one booking with all its dates of the next 60 days: by its name, its id, or the beginning of its id.
+
+    \b
+    Examples:
+      zscout booking show survey
+      zscout booking show 3f2a91c0 --json | jq -r .dates[0].start
+    """
+    async with common.connected("booking") as client:
+        told, me = await ask_bookings(client), User.of(client)
+        found = choose(told.bookings, booking, me)
+    if as_json:
+        terminal.print_json(booking_json(found, me))
+        return
+    repeated = f", {_repeated(found, zone)}" if found.every else ""
+    head = f"{found.name} ({found.id}) of {whose(found)}: {rcs_words(found)}, priority {found.priority}{repeated}"
+    terminal.print_line(clean(head))
+    for date in found.dates:
+        bound = f", {rcs_words(found, date)}" if date.bound else ""
+        terminal.print_line(clean(f"  {span_words(date.start, date.end, zone)}: {state_words(found, date)}{bound}"))
+    if not found.dates:
+        terminal.print_line(clean(f"  first on {date_words(found.start, zone)}"))
+
+
 def _may_have(booking: BookingView, matches: Callable[[str], bool], pattern: str) -> bool:
     """Whether it is of an RC that matches, or by that pattern."""
     bound = {rc for date in booking.dates for rc in date.bound.values()}
@@ -106,7 +135,7 @@ def _table(found: Sequence[BookingView], me: User, zone: ZoneInfo | None) -> Tab
             row = (one.name, short(one), whose(one), date_words(one.start, zone), "later", str(one.priority))
             lines.append((one.start, (*row, _repeated(one, zone), rcs_words(one)), ""))
     lines.sort(key=lambda line: line[0])
-    columns = ("NAME", "ID", "WHO", "WHEN", "STATE", "PRIORITY", "REPEATED", "RCS")
+    columns = ("NAME", "ID", "WHO", "WHEN", "STATE", "PRIORITY", "REPEATED", "DEVICES")
     rows, styles = [line[1] for line in lines], [line[2] for line in lines]
     return Table("", columns, rows, styles, spare=("REPEATED", "PRIORITY"))
 
@@ -134,21 +163,22 @@ def _style(booking: BookingView, date: BookedDate, me: User) -> str:
 
 @click.command()
 @booking_argument
-@click.option("--date", "at", type=DATE, help="Of what is repeated only this date: a day, or a day and a time.")
+@click.option("--date", "at", type=DATE, help="Only this date of a repeated booking: a day, or a day and a time.")
 @zone_option
 @common.json_option("Print one JSON object.")
 @common.runs
 async def unbook(booking: str, at: WrittenDate | None, zone: ZoneInfo | None, as_json: bool) -> None:
-    """Give up a booking, or one date of it: by its name, its id, or the beginning of its id.
+    """Cancel a booking, or one date of it: by its name, its id, or the beginning of its id.
 
-    A name is one of your own bookings, if you have one called so, else anybody's; who may end it the fleet says. Who
-    has taken it up goes on. A name that several have is refused with the list of them.
+    A name means your own booking, if you have one of that name, else anybody's; the fleet decides who may cancel it.
+    A request that already uses the booking keeps running. If several bookings have the name, it is refused with the
+    list of them.
 
     \b
     Examples:
-      zscout unbook survey
-      zscout unbook survey --date 2026-12-08
-      zscout unbook 3f2a91c0
+      zscout booking cancel survey
+      zscout booking cancel survey --date 2026-12-08
+      zscout booking cancel 3f2a91c0
     """
     if at is not None:
         zone = zone or host_zone()

@@ -58,9 +58,9 @@ def parse_rule(parts: Mapping[str, Sequence[Any]]) -> RepeatRule:
         freq = "WEEKLY"  # as some write it
     allowed = PARTS.get(freq)
     if allowed is None:
-        raise ValueError(f"it is repeated {freq or 'in no known way'}, which can't be booked")
+        raise ValueError(f"its repetition {freq or 'is unknown: it'} can't be booked")
     if odd := sorted(found.keys() - allowed - {"FREQ", "INTERVAL", "COUNT", "UNTIL"}):
-        raise ValueError(f"it is repeated {freq} by {', '.join(odd)}, which can't be booked")
+        raise ValueError(f"its repetition {freq} with {', '.join(odd)} can't be booked")
     if any(len(values) > MAX_LISTED for values in found.values()):
         raise ValueError("its rule is too long")
     interval, most = _one(found, "INTERVAL", 1), _one(found, "COUNT", None)
@@ -79,11 +79,11 @@ def parse_rule(parts: Mapping[str, Sequence[Any]]) -> RepeatRule:
         DAYS_OF_WEEK.index(str(_one(found, "WKST", "MO"))),
     )
     if rule.until is not None and not isinstance(rule.until, date):
-        raise ValueError("its UNTIL is no date")
+        raise ValueError("its UNTIL is not a date")
     if freq == "WEEKLY" and any(which for which, _ in days):
-        raise ValueError("it is repeated WEEKLY by numbered days, which no rule may be")
+        raise ValueError("it repeats WEEKLY on numbered days, which no rule may do")
     if freq == "YEARLY" and (days or rule.by_monthday) and not rule.by_month:
-        raise ValueError("it is repeated YEARLY by days of no month, which can't be booked")
+        raise ValueError("it repeats YEARLY on days without a month, which can't be booked")
     return rule
 
 
@@ -91,7 +91,7 @@ def _one(parts: Mapping[str, Sequence[Any]], name: str, default: Any) -> Any:
     """Raises ValueError where there are several."""
     values = parts.get(name, [default])
     if len(values) != 1:
-        raise ValueError(f"its rule has several {name}")
+        raise ValueError(f"its rule has more than one {name}")
     return values[0]
 
 

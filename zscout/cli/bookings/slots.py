@@ -24,10 +24,10 @@ from zscout.terminal import Table, span
 @click.command()
 @needs_argument
 @click.option("--for", "runtime", type=DURATION, required=True, help="For how long: 90s, 5m, 2h, 1d12h.")
-@click.option("--within", type=seconds_within(1, MAX_AHEAD), default="7d", help="To begin within so long.")
-@click.option("--from", "since", type=DATE, help="Not before this date. Default: from now on.")
-@click.option("--limit", type=click.IntRange(1, MAX_SLOTS), default=5, help="The first so many.")
-@click.option("--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="For such a booking.")
+@click.option("--within", type=seconds_within(1, MAX_AHEAD), default="7d", help="Search this far ahead.")
+@click.option("--from", "since", type=DATE, help="Search from this date on. Default: from now on.")
+@click.option("--limit", type=click.IntRange(1, MAX_SLOTS), default=5, help="List at most so many.")
+@click.option("--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="The booking's priority.")
 @zone_option
 @common.json_option("Print one JSON object.")
 @common.runs
@@ -43,8 +43,8 @@ async def slots(
 ) -> None:
     """List the first times at which all of the devices can be booked together.
 
-    Each line is a stretch of time: a booking may begin at any time of it. What is in the way is known now: other
-    bookings, and what is held and would not yield. Exit code 1: there is none within that time.
+    Each line is a stretch of time: a booking may begin at any moment of it. Other bookings, and holds that would not
+    yield, are taken into account. Exit code 1: there is no such time.
 
     \b
     Examples:
@@ -71,7 +71,7 @@ async def slots(
         _table(told, zone).print()
     if not told.slots:
         more = "" if told.complete else " that was looked at"
-        raise common.Failed(f"within {span(within)} there is no time{more} at which all are free together")
+        raise common.Failed(f"the devices are not free together{more} within {span(within)}; raise --within")
 
 
 def _table(told: SlotsTold, zone: ZoneInfo | None) -> Table:

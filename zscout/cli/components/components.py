@@ -1,4 +1,4 @@
-"""`zscout components`: what runs where and how it does, and what each host can start."""
+"""`zscout component list` and `kinds`: components, where they run, and what each host can start."""
 
 from __future__ import annotations
 
@@ -9,43 +9,41 @@ import click
 
 from zscout import terminal
 from zscout.cli import common, completion
-from zscout.cli.components.placing import COMPONENT, placement_object, placer_of, tail_of, unknown_here
+from zscout.cli.components.placing import COMPONENT, ask_nodes, placement_object, placer_of, tail_of, unknown_here
 from zscout.cli.fleet.fleet_view import FIND_LOADS, FleetView, see_hosts
 from zscout.cli.fleet.watching import Overview, show
 from zscout.config.strict import BadInput
 from zscout.keyexpr import Role
-from zscout.messages import ComponentList, ComponentUse, ListComponents, Placement
+from zscout.messages import ComponentUse, ListComponents, Placement
 from zscout.terminal import Table
 from zscout.types import SECOND, Ns
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
 
-ASK_NODES: Final = 1.0
 STYLES: Final = {"running": "green", "waiting": "yellow", "backing_off": "yellow", "ended": "dim", "given_up": "red"}
 
 
 @click.command()
 @click.argument("name", type=COMPONENT, required=False, shell_complete=completion.components)
-@click.option("--kinds", is_flag=True, help="List what can be started, and on which hosts.")
-@click.option("--watch", is_flag=True, help="Go on showing it; q or Ctrl-C ends.")
+@click.option("--kinds", "only_kinds", is_flag=True, hidden=True, help="The same as zscout component kinds.")
+@click.option("--watch", is_flag=True, help="Update the list until q or Ctrl-C.")
 @common.json_option("Print one JSON object; with --watch, one on each line.")
 @common.runs
-async def components(name: str | None, kinds: bool, watch: bool, as_json: bool) -> None:
+async def components(name: str | None, only_kinds: bool, watch: bool, as_json: bool) -> None:
     """List the components of the fleet: where each runs, since when, what it uses, and why it is there.
 
-    Ended ones are listed for an hour. RESTARTS are those in a row, CORES and MEMORY what it uses with all its
-    processes; MOVES has the time that the last one took. With NAME only that one, and the end of its output
-    where it has failed. Exit code 3: no RCM.
+    Ended components are listed for an hour. RESTARTS counts restarts in a row; CORES and MEMORY include all
+    processes of the component; MOVES shows how long the last move took. With NAME the list has that component
+    alone, and the end of its output if it failed. Exit code 3: no leader.
 
     \b
     Examples:
-      zscout components
-      zscout components --watch
-      zscout components counter --json | jq -r .components[0].host
-      zscout components --kinds
+      zscout component list
+      zscout component list --watch
+      zscout component list counter --json | jq -r .components[0].host
     """
-    if kinds:
+    if only_kinds:
         if name is not None or watch:
             raise BadInput("--kinds lists what can be started; leave NAME and --watch out")
         await _kinds(as_json=as_json)
@@ -59,6 +57,20 @@ async def components(name: str | None, kinds: bool, watch: bool, as_json: bool) 
         if name is not None and not (watch or as_json) and (tail := tail_of(placer.placements[name])):
             for line in ("\nThe end of its output:", *tail):
                 terminal.print_line(line)
+
+
+@click.command()
+@common.json_option("Print one JSON object.")
+@common.runs
+async def kinds(as_json: bool) -> None:
+    """List the kinds of component that can be started, and the hosts that have each.
+
+    \b
+    Examples:
+      zscout component kinds
+      zscout component kinds --json | jq -r '.hosts[].kinds[]'
+    """
+    await _kinds(as_json=as_json)
 
 
 class Listing:
@@ -98,7 +110,7 @@ class Listing:
         self._began = {key: began for key, began in self._began.items() if key in running}
         if running <= self._began.keys():
             return
-        for node in await ask_nodes(self.client, ListComponents(self.name)):
+        for node in await ask_nodes(self.client.mesh, ListComponents(self.name)):
             now = self.client.mesh.now()
             for view in node.components:
                 key = (view.component, view.incarnation)
@@ -152,26 +164,15 @@ class Listing:
         return None if began is None else (self.client.mesh.now() - began) / SECOND
 
 
-async def ask_nodes(client: Client, asked: ListComponents) -> list[ComponentList]:
-    """The lists of the nodes that answer in time, by host."""
-    replies = await client.mesh.ask(
-        client.mesh.keys.component_any(client.mesh.me), asked, ComponentList, timeout=ASK_NODES
-    )
-    lists = (reply.message for reply in replies if reply.message is not None)
-    return sorted(lists, key=lambda one: one.host)
-
-
 async def _kinds(*, as_json: bool) -> None:
     async with common.connected("components", need_rcm=False) as client:
         with suppress(common.NobodyThere):
             await common.see_rcm(client)
         await see_hosts(client)
-        nodes = await ask_nodes(client, ListComponents())
+        nodes = await ask_nodes(client.mesh, ListComponents())
         fleet = client.fleet.name
     if not nodes:
-        raise common.NobodyThere(
-            f"no host of fleet {fleet} told what it can start; start zscout-node there, or see its log"
-        )
+        raise common.NobodyThere(f"no node of fleet {fleet} answered; start zscout-node, or see its log")
     if as_json:
         hosts = [{"host": one.host, "kinds": sorted(one.kinds or ())} for one in nodes]
         terminal.print_json({"fleet": fleet, "hosts": hosts})

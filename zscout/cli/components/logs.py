@@ -1,4 +1,4 @@
-"""`zscout logs`: what a component wrote, and what it writes."""
+"""`zscout component logs`: what a component wrote, and what it writes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,15 @@ from zscout import terminal
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
 from zscout.cli import common
-from zscout.cli.components.placing import OVER, component_argument, host_option, placer_of, standing, unknown_here
+from zscout.cli.components.placing import (
+    OVER,
+    check_host,
+    component_argument,
+    host_option,
+    placer_of,
+    standing,
+    unknown_here,
+)
 from zscout.cli.fleet.fleet_view import see_hosts
 from zscout.mesh.supervision import done_within
 from zscout.messages import Output, Placement, ReadOutput
@@ -25,21 +33,22 @@ UNKNOWN: Final = 3
 
 @click.command()
 @component_argument
-@click.option("-f", "--follow", is_flag=True, help="Go on until it has ended, wherever it moves.")
-@click.option("--lines", type=click.IntRange(0, 100_000), help="Only the last so many lines of what there is.")
-@host_option("--host", "What it wrote there; else where it ran last.")
+@click.option("-f", "--follow", is_flag=True, help="Print new output until the component ends, on any host.")
+@click.option("--lines", type=click.IntRange(0, 100_000), help="Print only the last so many lines.")
+@host_option("--host", "Output on this host. Default: where it ran last.")
 @common.runs
 async def logs(name: str, follow: bool, lines: int | None, host: str | None) -> None:
-    """Print the output of a component, of its running or its last incarnation.
+    """Print the output of a component: of its running or its last incarnation.
 
-    Its host keeps the last 64 KiB of each, until zscout-node ends there. With --follow also what comes, on whichever
-    host it goes on; changes of host and its end are told on stderr. At a terminal control characters are left out.
+    Its host keeps the last 64 KiB of each incarnation, until zscout-node ends there. --follow prints new output as
+    well, on whichever host the component continues; moves and its end are reported on stderr. At a terminal control
+    characters are left out.
 
     \b
     Examples:
-      zscout logs counter
-      zscout logs counter --follow --lines 10
-      zscout logs counter --host anvil > before-it-moved.txt
+      zscout component logs counter
+      zscout component logs counter --follow --lines 10
+      zscout component logs counter --host anvil > before-it-moved.txt
     """
     async with common.connected("logs", need_rcm=False) as client:
         with placer_of(client, {name}) as placer:
@@ -88,7 +97,6 @@ class Reader:
             await self._placer.wait_changed()
 
     async def follow(self, output: Output) -> None:
-        """Writes what comes until it has ended for good."""
         found: Output | None = output
         while True:
             # Without an answer its host is gone or busy, or has forgotten it; the placer knows which.
@@ -117,7 +125,7 @@ class Reader:
         if output.incarnation > self._incarnation:
             begun, self._incarnation = self._incarnation, output.incarnation
             if begun:
-                self._tell(f"{self._name} goes on on {self._host}")
+                self._tell(f"{self._name} continues on {self._host}")
             if self._at:
                 self._at = 0
                 return await self._read()
@@ -158,12 +166,11 @@ class Reader:
 
     async def _nothing(self) -> common.Failed:
         """What to raise where there is no output."""
-        if self._only:
-            return common.Failed(
-                f"{self._host} knows no output of {self._name}; leave --host out to see where it ran last"
-            )
+        if self._only and self._host is not None:
+            await check_host(self._client.mesh, self._host, "--host: ")
+            return common.Failed(f"{self._host} has no output of {self._name}; leave --host out to read its last host")
         if self._record is not None:
-            return common.Failed(f"no host knows any output of {self._name}: it {standing(self._record)}")
+            return common.Failed(f"no host has output of {self._name}: it {standing(self._record)}")
         return await unknown_here(self._placer, self._name)
 
     def write(self, text: str) -> None:

@@ -1,9 +1,8 @@
-"""`zscout migrate`, `drain` and `uncordon`: have components go on elsewhere, empty a host, use it again."""
+"""`zscout component migrate`, `drain` and `uncordon`: have components go on elsewhere, empty a host, use it again."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
 
 import click
 
@@ -13,35 +12,31 @@ from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common
 from zscout.cli.components import placing
 from zscout.cli.requests.options import timeout_option
-from zscout.config.strict import BadInput, quoted
-from zscout.keyexpr import Role
 from zscout.messages import DrainHost, MigrateComponent, Placement, Placements, UncordonHost
-
-LOOK_FOR_HOSTS: Final = 1.0
-"""Seconds in which nodes show themselves."""
 
 
 @click.command()
 @placing.component_argument
-@placing.host_option("--to", "Where to. Default: the best other host.")
+@placing.host_option("--to", "Host to move to. Default: the best other host.")
 @common.json_option("Print one JSON object.")
 @common.runs
 async def migrate(name: str, to: str | None, as_json: bool) -> None:
-    """Move a running component to another host, with its state and all that it holds.
+    """Move a running component to another host, with its state and its holds.
 
-    Only what can give and take a checkpoint can be moved. Says where it went, and for how long it was out of
-    work. If it fails, the component goes on where it was. Exit code 2: there is no host of that name.
+    Only a kind with checkpoint() and restore() can be moved. Prints the new host, and for how long the component was
+    out of work. If the move fails, the component keeps running where it was. Exit code 2: there is no host of that
+    name.
 
     \b
     Examples:
-      zscout migrate counter
-      zscout migrate counter --to bellows --json | jq .dead
+      zscout component migrate counter
+      zscout component migrate counter --to bellows --json | jq .dead
     """
     async with placing.connected("migrate", as_json=as_json) as (shown, placer):
         before = placer.placements.get(name)
         if before is None:
             raise placing.unknown(name, placer.placements)
-        interrupted = f"{name} is moved all the same; zscout components tells how that goes"
+        interrupted = f"{name} is moved all the same; zscout component list tells how that goes"
         async with shown.within(None, str, interrupted):
             after = await _moved(placer, shown, before, to)
     moved = after.moves > before.moves
@@ -67,8 +62,12 @@ async def _moved(placer: PlacerClient, shown: placing.Progress, before: Placemen
         raise
     except RequestRefused as refused:
         if to is not None and refused.code == "unknown_host":
-            await _check_host(placer, to)
-        raise common.Failed(f"{name} was not moved: {refused}") from None
+            await placing.check_host(placer.mesh, to, "--to: ")
+        now = placer.placements.get(name, before)
+        why = str(refused)
+        if refused.code == "not_running" and now.state != "running":
+            why = f"it {placing.standing(now)}; {placing.remedy(now)}"
+        raise common.Failed(f"{name} was not moved: {why}") from None
     if begun(record):
         while record.state not in ("running", *placing.OVER):
             shown.update(f"{name} {placing.standing(record)}")
@@ -77,31 +76,22 @@ async def _moved(placer: PlacerClient, shown: placing.Progress, before: Placemen
         if record.state == "running":
             if record.host != before.host:
                 return record
-            raise common.Failed(f"{name} was not moved, it goes on on {record.host}: {record.reason}")
+            raise common.Failed(f"{name} was not moved, it keeps running on {record.host}: {record.reason}")
     elif to == record.host:
         return record
-    raise common.Failed(f"{name} was not moved: it {placing.standing(record)}")
-
-
-async def _check_host(placer: PlacerClient, host: str) -> None:
-    """Raises BadInput where no node has this name."""
-    mesh = placer.mesh
-    nodes = {token.host for token in await mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK_FOR_HOSTS)}
-    if host not in nodes:
-        hint = common.hint_at(host, nodes, "nor any other; start zscout-node there", "there are")
-        raise BadInput(f"--to: there is no host {quoted(host)}{hint}")
+    raise common.Failed(f"{name} was not moved: it {placing.standing(record)}; {placing.remedy(record)}")
 
 
 @click.command()
 @placing.host_argument
-@timeout_option("Wait at most so long until it is empty, then exit with 1.")
+@timeout_option("Wait this long until it is empty, then exit with 1.")
 @common.json_option("Print one JSON object.")
 @common.runs
 async def drain(host: str, timeout: float | None, as_json: bool) -> None:
-    """Place nothing on a host any more, and move away what can be moved.
+    """Place nothing on a host any more, and move away every component that can be moved.
 
-    Ends when no movable component is left; exit code 1 names what stays, and why. The host stays cordoned,
-    also after Ctrl-C or --timeout, until zscout uncordon.
+    Ends when no movable component is left; exit code 1 names those that stay, and why. The host stays cordoned, also
+    after Ctrl-C or --timeout, until zscout uncordon.
 
     \b
     Examples:
@@ -117,7 +107,13 @@ async def drain(host: str, timeout: float | None, as_json: bool) -> None:
             return f"{host} is not empty after {left}: {_words(_there(placer, host))}; {cordoned}"
 
         async with shown.within(timeout, late, cordoned):
-            placer.take(*(await placer.request(DrainHost(host), Placements)).components)
+            try:
+                drained = await placer.request(DrainHost(host), Placements)
+            except RequestRefused as refused:
+                if refused.code == "unknown_host":
+                    await placing.check_host(placer.mesh, host)
+                raise
+            placer.take(*drained.components)
             # What is not running yet is moved when it does.
             while leaving := [one for one in _there(placer, host) if one.movable or one.state != "running"]:
                 shown.update(f"{host}: {_words(leaving)}")
@@ -131,7 +127,7 @@ async def drain(host: str, timeout: float | None, as_json: bool) -> None:
     for one in moved:
         shown.say(f"{one.component} went to {one.host}{placing.out_of_work(one)}")
     if stay:
-        raise common.Failed(f"{host} is not empty: {_words(stay)}; end them with zscout stop; {cordoned}")
+        raise common.Failed(f"{host} is not empty: {_words(stay)}; end them with zscout component stop; {cordoned}")
     shown.say(f"{host} is empty; {cordoned}")
 
 
@@ -140,14 +136,16 @@ async def drain(host: str, timeout: float | None, as_json: bool) -> None:
 @common.json_option("Print one JSON object.")
 @common.runs
 async def uncordon(host: str, as_json: bool) -> None:
-    """Use a host again that was drained. Nothing moves back by itself.
+    """Use a drained host again. Components that left it do not move back by themselves.
 
     \b
     Example:
       zscout uncordon anvil
     """
-    async with common.connected("uncordon") as client:
-        uncordoned = await placing.placer_of(client).request(UncordonHost(host), Placements)
+    async with placing.connected("uncordon", as_json=as_json) as (_, placer):
+        if host not in placer.cordoned:
+            await placing.check_host(placer.mesh, host)
+        uncordoned = await placer.request(UncordonHost(host), Placements)
     if as_json:
         terminal.print_json({"host": host, "components": list(map(placing.placement_object, uncordoned.components))})
     else:
@@ -155,7 +153,6 @@ async def uncordon(host: str, as_json: bool) -> None:
 
 
 def _there(placer: PlacerClient, host: str) -> list[Placement]:
-    """What is on a host, or coming to it."""
     found = (one for _, one in sorted(placer.placements.items()))
     return [one for one in found if host in (one.host, one.to) and one.state not in placing.OVER]
 

@@ -14,16 +14,19 @@ from msgspec import structs
 from zscout import terminal
 from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.cli import common, completion
-from zscout.config.strict import BadInput
-from zscout.keyexpr import check_name
-from zscout.messages import ListPlacements, Placement, Placements
+from zscout.config.strict import BadInput, quoted
+from zscout.keyexpr import Role, check_name
+from zscout.messages import ComponentList, ListComponents, ListPlacements, Placement, Placements
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
+    from zscout.mesh import Mesh
 
 
 PATIENCE: Final = 15.0
 """Seconds within which a placer answers, though the lead changes meanwhile."""
+LOOK_FOR_HOSTS: Final = 1.0
+"""Seconds in which nodes answer, and show themselves."""
 OVER: Final = frozenset({"ended", "given_up"})
 """States of a component that will not run again by itself."""
 
@@ -53,7 +56,6 @@ class Progress(terminal.LiveLine):
         self._said = ""
 
     def update(self, text: str) -> None:
-        """How it stands now."""
         self.draw(text)
         if text != self._said and not (self.watched or self._quiet):
             self.print(text)
@@ -93,13 +95,61 @@ STANDING: Final = {
 
 
 def standing(one: Placement) -> str:
-    """How a component stands, in words that follow its name."""
     why = f": {one.reason}" if one.reason else ""
     return STANDING[one.state].format(host=one.host or "no host", to=one.to or "another host", why=why)
 
 
+def remedy(placement: Placement) -> str:
+    name, kind = placement.component, placement.spec.kind
+    if placement.state in OVER:
+        again = kind if kind == name else f"{kind} --name {name}"
+        return f"see zscout component logs {name}, then start it again: zscout component start {again}"
+    if placement.state in ("waiting", "backing_off"):
+        return f"zscout component list {name} shows when it runs"
+    return "try again when it runs"
+
+
+async def nodes_of(mesh: Mesh) -> set[str]:
+    return {token.host for token in await mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK_FOR_HOSTS)}
+
+
+async def absent(mesh: Mesh, hosts: Collection[str]) -> list[str]:
+    """A line for each of these hosts that is not on the mesh, with names like it."""
+    nodes = await nodes_of(mesh) if hosts else set()
+    hints = {
+        host: common.hint_at(host, nodes, "and there are none; start zscout-node there", "there are")
+        for host in hosts
+        if host not in nodes
+    }
+    return [f"unknown host {quoted(host)}{hint}" for host, hint in hints.items()]
+
+
+async def check_host(mesh: Mesh, host: str, option: str = "") -> None:
+    """Raises BadInput where no node has this name."""
+    for line in await absent(mesh, [host]):
+        raise BadInput(f"{option}{line}")
+
+
+async def ask_nodes(mesh: Mesh, asked: ListComponents) -> list[ComponentList]:
+    replies = await mesh.ask(mesh.keys.component_any(mesh.me), asked, ComponentList, timeout=LOOK_FOR_HOSTS)
+    lists = (reply.message for reply in replies if reply.message is not None)
+    return sorted(lists, key=lambda answer: answer.host)
+
+
+async def check_kind(mesh: Mesh, kind: str) -> None:
+    """Raises Failed where all nodes answer that they lack this kind."""
+    nodes = await nodes_of(mesh)
+    answers = {answer.host: answer.kinds for answer in await ask_nodes(mesh, ListComponents())}
+    kinds: set[str] = set()
+    for host in nodes | answers.keys():
+        if (found := answers.get(host)) is None or kind in found:
+            return
+        kinds |= set(found)
+    raise common.unknown("kind", kind, kinds, "and no host has any kind; install it there", "kinds")
+
+
 def unknown(name: str, known: Iterable[str]) -> common.Failed:
-    return common.unknown("component", name, known, "nor any other; start one: zscout start", "known")
+    return common.unknown("component", name, known, "and there are none; see zscout component start", "known")
 
 
 async def unknown_here(placer: PlacerClient, name: str) -> common.Failed:
@@ -109,7 +159,6 @@ async def unknown_here(placer: PlacerClient, name: str) -> common.Failed:
 
 
 def out_of_work(placement: Placement) -> str:
-    """For how long its last move kept it from working, in words."""
     return "" if placement.dead is None else f", out of work for {placement.dead * 1000:.0f} ms"
 
 
@@ -128,7 +177,7 @@ def component_named(text: str, _option: str = "") -> str:
     try:
         return check_name(text, "component")
     except ValueError as error:
-        raise BadInput(f"{error}; zscout components lists them") from None
+        raise BadInput(f"{error}; see zscout component list") from None
 
 
 COMPONENT: Final = common.Parsed("text", component_named)

@@ -1,4 +1,4 @@
-"""`zscout start` and `zscout stop`: have a component run somewhere, and end it."""
+"""`zscout component start` and `zscout component stop`: have a component run somewhere, and end it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def parse_cores(text: str, what: str) -> float:
     with suppress(ValueError):
         cores = float(text)
     if not 0 < cores <= MAX_CORES:
-        raise BadInput(f"{what}: {quoted(text)} is no number of cores; write one, as in 0.5 or 2")
+        raise BadInput(f"{what}: {quoted(text)} is not a number of cores; write one, as in 0.5 or 2")
     return cores
 
 
@@ -55,7 +55,7 @@ def parse_size(text: str, what: str) -> int:
     found = _SIZE.fullmatch(text)
     size = int(Decimal(found[1]) * (1 << _POWERS[found[2].upper()])) if found else 0
     if not 0 < size <= MAX_BYTES:
-        raise BadInput(f"{what}: {quoted(text)} is no size; write bytes, or with a unit: 500M, 1.5G")
+        raise BadInput(f"{what}: {quoted(text)} is not a size; write bytes, or with a unit: 500M, 1.5G")
     return size
 
 
@@ -76,7 +76,7 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
     for setting in settings:
         key, equals, value = setting.partition("=")
         if not key or not equals:
-            raise BadInput(f"--set {quoted(setting)} sets nothing; write KEY=VALUE")
+            raise BadInput(f"--set: {quoted(setting)} has no value; write KEY=VALUE")
         if key in seen:
             raise BadInput(f"--set: {quoted(key)} is given twice; give it once")
         seen.add(key)
@@ -87,60 +87,60 @@ def gather_params(given: str | None, settings: Sequence[str]) -> dict[str, Any]:
     try:
         size = len(msgspec.json.encode(params))
     except BAD_JSON:
-        raise BadInput("the parameters can't be written as JSON; mend --set or --params") from None
+        raise BadInput("the parameters can't be written as JSON; change --set or --params") from None
     if size > MAX_PARAMS_SIZE:
-        raise BadInput(f"the parameters have {size} bytes as JSON; at most {MAX_PARAMS_SIZE} are taken")
+        raise BadInput(f"the parameters have {size} bytes as JSON; at most {MAX_PARAMS_SIZE} are allowed")
     return params
 
 
 @click.command(context_settings={"show_default": False})
 @click.argument("kind", type=common.NAME, shell_complete=completion.kinds)
-@click.option("--name", metavar="NAME", type=common.NAME, help="What the component is called. Default: its kind.")
+@click.option("--name", metavar="NAME", type=common.NAME, help="Name of the component. Default: its kind.")
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="A parameter; a VALUE may be JSON.")
 @click.option("--params", metavar="JSON", help="All parameters, as a JSON object.")
-@placing.host_option("--host", "Run nowhere but there; given several times, on one of them.", multiple=True)
-@click.option("--label", metavar="LABEL", type=common.NAME, multiple=True, help="What its host must have.")
-@click.option("--memory", type=SIZE, default=0, help="What its host must have available, as in 500M.")
-@click.option("--metric", type=click.Choice(METRICS), default="composite", help="What hosts are judged by.")
-@click.option("--policy", type=click.Choice(POLICIES), default="pending", help="How one is chosen of them.")
+@placing.host_option("--host", "Run only on this host; repeat it for several.", multiple=True)
+@click.option("--label", metavar="LABEL", type=common.NAME, multiple=True, help="A label that its host must have.")
+@click.option("--memory", type=SIZE, default=0, help="Memory that its host must have available, as in 500M.")
+@click.option("--metric", type=click.Choice(METRICS), default="composite", help="Figure by which hosts are compared.")
+@click.option("--policy", type=click.Choice(POLICIES), default="pending", help="How a host is chosen.")
 @click.option(
     "--restart",
     type=click.Choice(["never", "on-failure", "always"]),
     default="on-failure",
     show_default=True,
-    help="Whether it is started again when it has ended.",
+    help="When to start it again after it ended.",
 )
-@click.option("--memory-limit", type=SIZE, default=0, help="What it may use at most, as in 500M.")
-@click.option("--cpu-limit", type=CORES, help="Cores that it may use at most, as in 0.5.")
+@click.option("--memory-limit", type=SIZE, default=0, help="Memory that it may use, as in 500M.")
+@click.option("--cpu-limit", type=CORES, help="Cores that it may use, as in 0.5.")
 @click.option("--no-wait", is_flag=True, help="Don't wait until it runs.")
-@timeout_option("Wait at most so long until it runs, then exit with 1.")
+@timeout_option("Wait this long until it runs, then exit with 1.")
 @common.json_option("Print one JSON object.")
 @common.runs
 async def start(
     kind: str, name: str | None, no_wait: bool, timeout: float | None, as_json: bool, **wanted: Any
 ) -> None:
-    """Have a component run on the best host of the fleet, and keep it running.
+    """Run a component on the best host of the fleet, and keep it running.
 
-    KIND is the name of what is installed on the hosts: zscout components --kinds lists them. The component stays placed
-    when this command ends, also by Ctrl-C or --timeout: it is started as soon as a host will do, and elsewhere when its
-    host dies, until zscout stop. Asked for again with the same settings, it is not started twice.
+    KIND is the name of a kind that is installed on a host: see zscout component kinds. The component stays placed when
+    this command ends, also by Ctrl-C or --timeout: it starts as soon as a host can run it, and on another host when its
+    host dies, until zscout component stop. Starting it again with the same settings does not start it twice.
 
     \b
-    Exit code: 0 it runs, or has completed already; 1 it was refused or given up, or
-    did not run in time; 3 no RCM. The last output of one that is given up goes to stderr.
+    Exit code: 0 it runs, or has completed; 1 it was refused or given up, or did not run
+    in time; 3 no leader. If it is given up, its last output goes to stderr.
 
     \b
     Examples:
-      zscout start counter
-      zscout start counter --name blue --set rc=robot/scout33 --set period=0.5
-      zscout start spin --params '{"cpu": 0.5}' --label gpu --memory 2G --cpu-limit 1
-      zscout start counter --host anvil --restart never --timeout 30
+      zscout component start counter
+      zscout component start counter --name blue --set rc=robot/scout33 --set period=0.5
+      zscout component start spin --params '{"cpu": 0.5}' --label gpu --memory 2G --cpu-limit 1
+      zscout component start counter --host anvil --restart never --timeout 30
     """
     name = kind if name is None else name
     if len(name) > MAX_COMPONENT_NAME:
         raise BadInput(f"the name {quoted(name)} has more than {MAX_COMPONENT_NAME} characters; give a shorter --name")
     spec = gather_spec(kind, **wanted)
-    stays = f"{name} stays placed; to end it: zscout stop {name}"
+    stays = f"{name} stays placed; to end it: zscout component stop {name}"
     async with placing.connected("start", {name}, as_json=as_json) as (shown, placer):
 
         def late() -> str:
@@ -149,6 +149,10 @@ async def start(
             return f"{name} does not run after {terminal.span(timeout or 0)}:{now} {stays}"
 
         before = placer.placements.get(name)
+        if before is None or before.state in placing.OVER:
+            await placing.check_kind(placer.mesh, kind)
+            for line in await placing.absent(placer.mesh, spec.hosts or ()):
+                terminal.print_line(line, sys.stderr)
         placement = await _place(placer, name, spec, before)
         if not no_wait:
             async with shown.within(timeout, late, stays):
@@ -158,7 +162,7 @@ async def start(
     if placement.state == "given_up" or (placement.state == "ended" and not placement.wanted):
         for line in placing.tail_of(placement):
             terminal.print_line(line, sys.stderr)
-        raise common.Failed(f"{name} {placing.standing(placement)}")
+        raise common.Failed(f"{name} {placing.standing(placement)}; {placing.remedy(placement)}")
     ran = before is not None and before.state == placement.state == "running"
     shown.say(f"{name} {'already ' if ran else ''}{placing.standing(placement)}")
 
@@ -180,7 +184,7 @@ def gather_spec(
     if len(hosts) > MAX_RANKED:
         raise BadInput(f"{len(hosts)} hosts; name at most {MAX_RANKED}, or give them a label")
     if len(labels) > MAX_LABELS:
-        raise BadInput(f"{len(labels)} labels; at most {MAX_LABELS} are taken")
+        raise BadInput(f"{len(labels)} labels; at most {MAX_LABELS} are allowed")
     given: Any = {"params": gather_params(params, settings), "restart": restart.replace("-", "_")}
     return ComponentSpec(kind=kind, labels=labels, hosts=hosts or None, cpu_limit=cpu_limit or 0.0, **given, **same)
 
@@ -198,8 +202,8 @@ async def _place(placer: PlacerClient, name: str, spec: ComponentSpec, before: P
         if refused.code != "exists":
             raise
         raise common.Failed(
-            f"{name} exists already, as another kind or with other settings; give this one another --name, "
-            f"or end that one first: zscout stop {name}"
+            f"{name} already exists with another kind or other settings; give this one another --name, "
+            f"or stop the other first: zscout component stop {name}"
         ) from None
 
 
@@ -220,21 +224,21 @@ async def _until_settled(placer: PlacerClient, shown: placing.Progress, name: st
 @click.argument(
     "names", type=placing.COMPONENT, nargs=-1, required=True, metavar="NAME...", shell_complete=completion.components
 )
-@timeout_option("Wait at most so long for the end, then exit with 1.")
+@timeout_option("Wait this long for the end, then exit with 1.")
 @common.json_option("Print one JSON object.")
 @common.runs
 async def stop(names: Sequence[str], timeout: float | None, as_json: bool) -> None:
-    """End components for good: they are asked to end, and killed if they don't.
+    """End components for good: each is asked to end, and killed if it does not.
 
-    Returns when they have ended. What they held is given back. One that has ended before is no error.
+    Returns when all have ended; what they held is given back. A component that has already ended is no error.
 
     \b
     Examples:
-      zscout stop counter
-      zscout stop blue green --timeout 10
+      zscout component stop counter
+      zscout component stop blue green --timeout 10
     """
     names = sorted(set(names))
-    stays = f"{', '.join(names)} will be stopped all the same; zscout components tells how that goes"
+    stays = f"{', '.join(names)} will be stopped all the same; zscout component list tells how that goes"
     async with placing.connected("stop", names, as_json=as_json) as (shown, placer):
 
         def lasting() -> str:

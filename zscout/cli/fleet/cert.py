@@ -43,18 +43,14 @@ FOLDER: Final = click.Path(file_okay=False, path_type=Path)
 def _lasting(text: str, option: str) -> timedelta:
     seconds = strict.parse_duration(f"{text}d") or strict.parse_duration(text)
     if not seconds or not 1 <= seconds <= MAX_DAYS * 86_400:
-        raise BadInput(
-            f"{option}: {quoted(text)} is no time up to {MAX_DAYS:,} days; write days, or a unit, as in 90, 12h, 90s"
-        )
+        raise BadInput(f"{option}: {quoted(text)} is not a time up to {MAX_DAYS:,} days; write it as in 90, 12h, 90s")
     return timedelta(seconds=float(seconds))
 
 
 def days_option(default: str) -> Callable[[F], F]:
     """`--days`; the parameter is `lasts`."""
     kind = Parsed("days", _lasting)
-    return click.option(
-        "--days", "lasts", type=kind, default=default, help="How long from now on; or with a unit, as 12h."
-    )
+    return click.option("--days", "lasts", type=kind, default=default, help="Days that it is valid; or as in 12h.")
 
 
 ca_option = click.option(
@@ -81,11 +77,11 @@ def cert() -> None:
 @cert.command()
 @click.argument("folder", type=FOLDER, default=CA_FOLDER)
 @days_option("3650")
-@click.option("--force", is_flag=True, help="Overwrite one that is there: nothing that it issued can be renewed then.")
+@click.option("--force", is_flag=True, help="Overwrite a CA: certificates that it issued can't be renewed then.")
 def ca(folder: Path, lasts: timedelta, force: bool) -> None:
-    """Make a CA in FOLDER, with a key that is to be kept secret.
+    """Make a CA in FOLDER. Keep its key secret.
 
-    Who has ca-key.pem can issue a certificate to anybody. Keep it on one machine, best none of the fleet's.
+    Whoever has ca-key.pem can issue certificates in any name: keep it on one machine, best outside the fleet.
 
     \b
     Examples:
@@ -103,7 +99,7 @@ def ca(folder: Path, lasts: timedelta, force: bool) -> None:
 @cert.command()
 @click.argument("name", type=common.NAME, nargs=-1)
 @ca_option
-@click.option("--to", type=FOLDER, default=Path(), help="Where to make the folder NAME.")
+@click.option("--to", type=FOLDER, default=Path(), help="Make the folder NAME here.")
 @days_option("365")
 @click.option(
     "--manager",
@@ -111,14 +107,14 @@ def ca(folder: Path, lasts: timedelta, force: bool) -> None:
     metavar="NAME",
     type=common.NAME,
     multiple=True,
-    help="Also for NAME, a host that may lead: with the key by which managers seal places.",
+    help="A NAME that may lead: its folder also gets the key by which managers seal places.",
 )
-@click.option("--force", is_flag=True, help="Overwrite a certificate that is there.")
+@click.option("--force", is_flag=True, help="Overwrite an existing certificate.")
 def issue(name: tuple[str, ...], ca: Path, to: Path, lasts: timedelta, managers: tuple[str, ...], force: bool) -> None:
-    """Make a folder NAME with a certificate, for each machine or person of this name.
+    """Make a folder NAME with a certificate, for each of these machines or persons.
 
-    A machine's is named as its host in the node file, a person's as in the roles of the fleet file. Nobody else
-    can send what says that it is of NAME: no two may have one name.
+    A machine has the name of its host in the node file, a person the name under [roles] of the fleet file. The
+    certificate proves the name of a sender: give each machine and person a name of its own.
 
     \b
     Examples:
@@ -144,8 +140,8 @@ def issue(name: tuple[str, ...], ca: Path, to: Path, lasts: timedelta, managers:
 def renew(folders: tuple[Path, ...], ca: Path, lasts: timedelta, new_key: bool) -> None:
     """Renew the certificates in these folders in place, expired ones as well.
 
-    The key stays, so that cert.pem and ca.pem are all that need be copied to where they are used; key.pem need not
-    be here. What runs uses the new one for its next links, and keeps those it has.
+    The key stays, so copy only cert.pem and ca.pem to the hosts; key.pem need not be here. Running programs use the new
+    certificate for new links, and keep their present links.
 
     \b
     Examples:
@@ -163,10 +159,10 @@ def renew(folders: tuple[Path, ...], ca: Path, lasts: timedelta, new_key: bool) 
 @click.argument("folders", metavar="[FOLDER]...", type=FOLDER, nargs=-1)
 @common.json_option("Print one JSON object.")
 def show(folders: tuple[Path, ...], as_json: bool) -> int:
-    """Show whose certificates these folders hold, until when, and what is wrong with them.
+    """Show the name and the end of the certificates in these folders, and what is wrong with them.
 
-    Without FOLDER it is the one that $ZSCOUT_KEYS names. Also for the folder of a CA. Exit code 1: one is expired,
-    not valid yet, or can't be used.
+    Without FOLDER it shows the folder that $ZSCOUT_KEYS names. FOLDER may be a CA's. Exit code 1: a certificate is
+    expired, not valid yet, or can't be used.
 
     \b
     Examples:
@@ -177,7 +173,7 @@ def show(folders: tuple[Path, ...], as_json: bool) -> int:
     if not folders:
         named = os.environ.get(KEYS_VARIABLE)
         if not named:
-            raise BadInput(f"name a folder; ${KEYS_VARIABLE} names none")
+            raise BadInput(f"no folder is given; name one, or set ${KEYS_VARIABLE}")
         folders = (Path(named),)
     now = datetime.now(UTC)
     found = [one for folder in folders for one in _found(folder, now)]
@@ -235,7 +231,7 @@ def _authority(folder: Path) -> CertificateAuthority:
 def _check_free(folder: Path, names: tuple[str, ...], force: bool) -> None:
     there = [name for name in names if (folder / name).exists()]
     if there and not force:
-        raise BadInput(f"{folder}: has {' and '.join(there)} already; name another folder, or overwrite with --force")
+        raise BadInput(f"{folder}: already has {' and '.join(there)}; name another folder, or overwrite with --force")
 
 
 @contextmanager

@@ -18,6 +18,7 @@ import click
 from zscout import terminal
 from zscout.cli import common
 from zscout.cli.fleet.findings import Evidence, Finding, findings
+from zscout.cli.fleet.keys import show_keys
 from zscout.config.certificates import MAX_FILE, read_cas, read_certificates, read_places_key
 from zscout.config.fleet import Fleet
 from zscout.config.node import Node, load_node
@@ -40,23 +41,34 @@ STYLES: Final = {"ok": "green", "note": "yellow", "mend": "bold red"}
 
 @click.command()
 @click.argument("file", required=False, type=click.Path(path_type=Path))
+@click.option("--keys", "only_keys", is_flag=True, help="List what is alive on the mesh, and the keys of each.")
 @common.json_option("Print one JSON object.")
 @common.runs
-async def doctor(file: Path | None, as_json: bool) -> int:
-    """Find out why there is no link, no leader or no device, and how to mend it.
+async def doctor(file: Path | None, only_keys: bool, as_json: bool) -> int:
+    """Find out why there is no link, no leader or no device, and how to fix it.
 
-    FILE is a node's: looks as that node would, by its own files and certificate; without it, by the fleet's file, as
-    any command. Takes up to ten seconds, and needs nobody to be there.
+    With FILE, a node file, it looks as that node would, with its files and certificate; without FILE, as any
+    command, with the fleet file. It takes up to ten seconds, and works when nothing else runs.
 
-    Each line is `ok`, a `note`, or something to `mend`, causes first. Exit code 0: nothing is to be mended, 1:
-    something is, a mistake in a file as well.
+    Each line is `ok`, a `note`, or something to `mend`, causes first. Exit code 0: nothing has to be fixed; 1:
+    something has to, or a file has a mistake.
+
+    With --keys it lists the participants on the mesh by host, and their keys, to see whether two hosts see each
+    other, to write a client in another language, or to write access rules. HOW: `query` keys are answered, `put`
+    keys are published, `hear` keys are subscribed to. Exit code 3: nobody is there.
 
     \b
     Examples:
       zscout doctor
       zscout doctor lab.toml
       zscout doctor --json | jq -r '.findings[] | select(.state == "mend").says'
+      zscout doctor --keys
     """
+    if only_keys:
+        if file is not None:
+            raise BadInput("--keys uses the fleet file; leave FILE out")
+        await show_keys(as_json=as_json)
+        return 0
     seen = await _look(file)
     found = findings(seen)
     bad = [one for one in found if one.state == "mend"]
@@ -128,7 +140,6 @@ def _look_at_certificates(seen: Evidence, fleet: Fleet) -> str:
 
 
 def _look_at_drivers(seen: Evidence, node: Node) -> None:
-    """As `zscout-node --check`."""
     from zscout.drivers.registry import driver_for
 
     try:
@@ -150,7 +161,6 @@ def _may_join(seen: Evidence, fleet: Fleet) -> bool:
 
 
 async def _join(seen: Evidence, fleet: Fleet) -> None:
-    """What is seen from inside."""
     from zscout.cli.fleet.fleet_view import Devices, FleetView
     from zscout.mesh import MeshError, probing
 

@@ -78,7 +78,6 @@ class Evidence:
 
 
 def findings(seen: Evidence) -> list[Finding]:
-    """All that is to be said, causes before what comes of them."""
     found = [_bad(about, error) for about, error in seen.bad]
     if seen.fleet is None:
         return [*found, *_clock(seen)]
@@ -198,7 +197,6 @@ def _host_in(address: str) -> str:
 
 
 def _security(seen: Evidence) -> Iterator[Finding]:
-    """Plain against TLS, and certificates that do not fit."""
     fleet = _the_fleet(seen)
     closed = [one for one in seen.answers if one.speaks == "tls"]
     # Two fleets on one network, of which one is secured, are well: it is told whose hosts they are by their names.
@@ -231,7 +229,7 @@ def _member(address: str, certificate: Validity, objection: str, seen: Evidence)
     """A host whose certificate is of a CA of ours."""
     name = f"{certificate.name} ({address})"
     if seen.at >= certificate.ends:
-        says = f"the certificate of {name} has ended on {shown(certificate.ends)}"
+        says = f"the certificate of {name} expired on {shown(certificate.ends)}"
         yield Finding("security", "mend", says, "renew it (zscout cert renew), and restart its node if that is alone")
     elif seen.at < certificate.begins:
         says = f"the certificate of {name} is valid from {shown(certificate.begins)} on"
@@ -370,11 +368,10 @@ def _devices(seen: Evidence) -> Iterator[Finding]:
         says = f"not there: {_listed(rcs)} of {home or 'no known host'}" + (f" ({why})" if why else "")
         yield Finding("devices", "mend", says, f"{remedy}{'' if there else ','} or {else_do}")
     if well and not missing:
-        yield Finding("devices", "ok", f"{many(well, 'RC')} there and well")
+        yield Finding("devices", "ok", f"{many(well, 'device')} there and well")
 
 
 def _hosts(seen: Evidence) -> Iterator[Finding]:
-    """What they say of themselves."""
     reports = {name: host.load for name, host in sorted(seen.hosts.items()) if host.load is not None}
     own = seen.certificates.name if seen.certificates is not None and seen.certificates.soon(seen.at) else ""
     for name, report in reports.items():

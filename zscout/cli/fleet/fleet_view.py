@@ -49,7 +49,6 @@ class Host:
 
     @property
     def components(self) -> list[str]:
-        """Names of those that run there."""
         return sorted({token.name for token in self.tokens if token.role == Role.COMPONENT})
 
 

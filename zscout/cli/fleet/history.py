@@ -22,7 +22,7 @@ COLUMNS = (
 def parse_arc(text: str, option: str) -> str:
     """The name or id of an ARC. Raises BadInput."""
     if not 1 <= len(text) <= MAX_ARC_NAME:
-        raise BadInput(f"{option}: {quoted(text)} names no ARC; write 1 to {MAX_ARC_NAME} characters")
+        raise BadInput(f"{option}: {quoted(text)} can't be the name of a request; write 1 to {MAX_ARC_NAME} characters")
     return text
 
 
@@ -30,12 +30,12 @@ ARC = common.Parsed("text", parse_arc)
 
 
 @click.command()
-@click.option("--rc", type=journals.RC, shell_complete=completion.needs, help="Only of this RC, or pattern of RCs.")
-@click.option("--user", "users", type=journals.WHO, multiple=True, help="Only of this user, person or host.")
-@click.option("--group", help="Only of the names of this group of the fleet file.")
-@click.option("--arc", type=ARC, help="Only of this ARC: its name or id.")
-@click.option("--since", type=journals.PAST, help="Not what ended before: a time ago (7d) or a date.")
-@click.option("--until", type=journals.PAST, default="0s", help="Not what began after.")
+@click.option("--rc", type=journals.RC, shell_complete=completion.needs, help="Only holds of this device, or pattern.")
+@click.option("--user", "users", type=journals.WHO, multiple=True, help="Only holds of this user, person or host.")
+@click.option("--group", help="Only holds of this group of the fleet file.")
+@click.option("--arc", type=ARC, help="Only holds of this request: its name or id.")
+@click.option("--since", type=journals.PAST, help="Leave out holds that ended before: a time ago (7d) or a date.")
+@click.option("--until", type=journals.PAST, default="0s", help="Leave out holds that began after.")
 @click.option("--limit", type=click.IntRange(1, MAX_LIMIT), default=100, show_default=True, help="The latest so many.")
 @journals.formats
 @common.runs
@@ -50,15 +50,15 @@ async def history(
     as_json: bool,
     as_csv: bool,
 ) -> None:
-    """List the holds that were and are, newest last: who held which RCs for how long, and how that ended.
+    """List past and present holds, newest last: holder, devices, duration, and how each ended.
 
-    Every node that may lead keeps a journal; all that are there are asked, and a hold that several know is shown once.
-    Times are by the clocks of those hosts. Lines tell of what times no journal knows all. What was granted in the last
-    second may be missing, and a request that never held anything is not listed.
+    Every node that may lead keeps a journal; all journals are asked, and a hold in several of them is shown once.
+    Times are by the clocks of those hosts. Lines name the times for which no journal is complete. A hold granted in
+    the last second may be missing, and a request that never held anything is not listed.
 
-    --json and --csv tell as `used` for how many seconds each RC was used: from the beginning of the first command that
-    it carried out under the hold (or picture that it published) to the end of the last; all of a hold that is direct.
-    It is null, or empty, where the RC did not tell. `used_rc_seconds` is the sum.
+    --json and --csv have `used`: for how many seconds each device was used, from the beginning of the first command
+    that it carried out under the hold (or picture that it published) to the end of the last; for a direct hold all of
+    it. It is null, or empty, if the device did not report it. `used_rc_seconds` is the sum.
 
     \b
     Examples:

@@ -1,4 +1,4 @@
-"""`zscout keys`: what is alive on the mesh, and the key expressions that each serves."""
+"""`zscout doctor --keys`: what is alive on the mesh, and the key expressions that each serves."""
 
 from __future__ import annotations
 
@@ -16,16 +16,18 @@ from zscout.keyexpr import Keys, Role, Sender, Token
 @common.json_option("Print one JSON object.")
 @common.runs
 async def keys(as_json: bool) -> None:
-    """List who is alive on the mesh, by host, and the keys that each serves, publishes or hears.
-
-    For writing a client in another language, or access rules, and to see whether two hosts see each other.
-    HOW: `query` is answered, `put` published, `hear` subscribed to. Exit code 3: nobody is there.
+    """List the participants on the mesh, by host, and the keys of each: now `zscout doctor --keys`.
 
     \b
     Examples:
-      zscout keys
-      zscout keys --json | jq -r '.alive[].keys[].key'
+      zscout doctor --keys
+      zscout doctor --keys --json | jq -r '.alive[].keys[].key'
     """
+    await show_keys(as_json=as_json)
+
+
+async def show_keys(*, as_json: bool) -> None:
+    """Raises NobodyThere."""
     async with common.connected("keys", need_rcm=False) as client:
         sharable: set[str] | None = None
         with FleetView(client) as fleet_view:
@@ -56,8 +58,8 @@ def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str,
                 ("query", own.schedule_any, "request, cancel, release, hand over, book, unbook, slots"),
                 ("query", own.rcm_state, "who holds, who waits and why"),
                 ("query", own.rcm_bookings, "what is booked"),
-                ("put", own.grants, "holders of each RC touched, revocations, heartbeat"),
-                ("put", own.notice_any, "what becomes of each ARC, to its client"),
+                ("put", own.grants, "holders of each device touched, revocations, heartbeat"),
+                ("put", own.notice_any, "what becomes of each request, to its client"),
                 ("query", own.rank, "the best hosts for a component"),
                 ("query", own.served_placer()[0], "place, stop, migrate, drain, uncordon, list"),
                 ("put", own.placements, "how components stand, at each change"),

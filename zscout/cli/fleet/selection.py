@@ -62,7 +62,7 @@ class Selection:
         name = next((name for name in self.names if name not in self._met), None)
         if name is None:
             return None
-        return common.unknown("device, request or host", name, self._all, "and nothing is there", "known")
+        return common.unknown("device, request or host", name, self._all, "and there are none", "known")
 
     def _means(self, *known: str) -> bool:
         """Return True if the user means something of these names. A hint shows the first of them."""

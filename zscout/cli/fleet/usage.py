@@ -24,29 +24,27 @@ MAX_NAMED = 8
 
 
 @click.command()
-@click.option(
-    "--by", type=click.Choice(["user", "group", "rc"]), default="user", show_default=True, help="Whose accounts."
-)
+@click.option("--by", type=click.Choice(["user", "group", "rc"]), default="user", show_default=True, help="Accounts.")
 @click.option("--since", type=journals.PAST, default="7d", show_default=True, help="A time ago (7d) or a date.")
-@click.option("--until", type=journals.PAST, default="0s", help="Likewise.")
+@click.option("--until", type=journals.PAST, default="0s", help="A time ago or a date. Default: now.")
 @journals.formats
 @common.runs
 async def usage(by: str, since: float, until: float, as_json: bool, as_csv: bool) -> None:
-    """Sum up who held what for how long, and how much of that was used. Spans are counted within the time that is asked
-    for, and told in seconds by --json and --csv.
+    """Sum up hold times, and how much of them was used. Only times within --since and --until count; --json and
+    --csv print seconds.
 
     \b
-    HOLDS        holds that stood at some time of it
-    HELD         for how long, two at one time counted twice
-    RC TIME      the same for each RC of them: 3 RCs for 10 s are 30 s
-    USED         how much of that: at each RC from the beginning of the first command that it carried out under a hold
-                 (or picture that it published) to the end of the last; all of a hold that is direct
-    WAITED       in the queue before those that began in it; of requests that never held anything nothing is known
-    PREEMPTED    how many were taken for another ARC before their minimum runtime was over, and how long they had stood
-    THROWN AWAY  for how long those had stood that ended before their minimum runtime, preempted or by a lost RC
+    HOLDS        number of holds within the time
+    HELD         their duration; two holds at one time count twice
+    DEVICE TIME  the same for each device: 3 devices for 10 s are 30 s
+    USED         how much of that: at each device from the beginning of the first command of a hold
+                 (or picture that it published) to the end of the last; for a direct hold all of it
+    WAITED       time in the queue before holds that began within it; requests that never held anything are unknown
+    PREEMPTED    holds taken for another request before their minimum runtime was over, and their duration
+    THROWN AWAY  duration of holds that ended before their minimum runtime, preempted or lost
 
-    A user is the name of the certificate in a secured fleet, else what programs say; who is in several groups is
-    counted in each. What RCs did not tell of their use is not counted, and a line says of how many holds.
+    A user is the name of the certificate in a secured fleet, else the name that programs give; a member of several
+    groups is counted in each. Use that devices did not report is not counted; a line says for how many holds.
 
     \b
     Examples:
@@ -97,16 +95,15 @@ def _table(found: list[Account], by: str, told: Told) -> Table:
         )
         for one in found
     ]
-    columns = (by.upper(), "HOLDS", "HELD", "RC TIME", "USED", "WAITED", "PREEMPTED", "THROWN AWAY")
+    columns = (by.upper(), "HOLDS", "HELD", "DEVICE TIME", "USED", "WAITED", "PREEMPTED", "THROWN AWAY")
     title = f"Usage from {journals.local(told.window.began)} to {journals.local(told.window.ended)}"
     return Table(title, columns, rows)
 
 
 def _unknown_use(found: list[Account]) -> str:
-    """How much of it is not in what was used; empty: nothing."""
     some = [f"{one.key} {one.used_unknown} of {one.holds}" for one in found if one.used_unknown]
     more = f", and {len(some) - MAX_NAMED} more" if len(some) > MAX_NAMED else ""
-    words = "holds whose RCs did not all tell how much they were used, which is not counted then"
+    words = "holds whose devices did not all report their use, which is not counted"
     return f"{words}: {', '.join(some[:MAX_NAMED])}{more}" if some else ""
 
 

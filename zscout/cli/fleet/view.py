@@ -63,9 +63,7 @@ def parse_recorded_past(text: str, option: str) -> Ns:
     """Raises BadInput."""
     found = parse_duration(text)
     if found is None or found > MAX_PAST:
-        raise BadInput(
-            f"{option}: {quoted(text)} is no such duration; write {DURATIONS}, at most {MAX_PAST // 86_400}d"
-        )
+        raise BadInput(f"{option}: {quoted(text)} is not a duration up to {MAX_PAST // 86_400}d; write {DURATIONS}")
     return int(found * SECOND)
 
 
@@ -76,7 +74,7 @@ def parse_recorded_past(text: str, option: str) -> Ns:
     "--bind",
     metavar="IP",
     default="127.0.0.1",
-    help="Where web page and live stream are served; anything but loopback shows them to other hosts.",
+    help="Address for the web page and live stream; anything but loopback shows them to other hosts.",
 )
 @click.option(
     "--port",
@@ -87,12 +85,12 @@ def parse_recorded_past(text: str, option: str) -> Ns:
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
     default=Path("runs"),
-    help="Where no node of this host records: the folder of the live recording.",
+    help="Folder of the live recording, if no node of this host records.",
 )
 @click.option(
     "--past",
     type=common.Parsed("duration", parse_recorded_past),
-    help="Likewise: for how long before now it shows what the journals tell; 0: nothing. [default: 24h]",
+    help="Show this much of the past from the journals, if no node of this host records; 0: none. [default: 24h]",
 )
 @common.json_option("Print one JSON object as soon as it is served or recorded: url, live, file.")
 @common.runs
@@ -101,10 +99,10 @@ async def view(
 ) -> None:
     """Open the recording FILE (.rrd), or show the fleet live.
 
-    Where a node of this host records (the table [recorder] in its file), its recording is shown with its past;
-    elsewhere the fleet is recorded from now on. What was held before a recording is shown as the journals tell it. The
-    viewer is a window of its own, which ends the command when it is closed. On a host without a display use --web.
-    Ctrl-C ends everything that was started; a recording that was started here is complete then.
+    If a node of this host records (table [recorder] in its file), its recording is shown with its past; else the
+    fleet is recorded from now on, and earlier holds come from the journals. The viewer is a window of its own;
+    closing it ends the command. On a host without a display use --web. Ctrl-C ends everything that was started, and
+    completes a recording that was started here.
 
     \b
     Examples:
@@ -120,7 +118,7 @@ async def view(
     if file is not None:
         file = _checked(file)
     if not web and not has_display():
-        raise common.Failed("no display is here (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web, and a browser")
+        raise common.Failed("there is no display (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web and a browser")
     # The page comes last, so what it shows needs its own port first.
     async with _source(file, bind, None if web else port, out, past) as (recording, recorder):
         if not as_json and file is None:
@@ -174,9 +172,7 @@ async def _source(
     joined, alone = await _recorded_here(fleet, bind)
     if joined is not None:
         if past is not None:
-            terminal.print_line(
-                "zscout: --past: a node records; what it shows of before stands in its file", sys.stderr
-            )
+            terminal.print_line("zscout: --past: a node records; its file sets what it shows of before", sys.stderr)
         yield joined, None
         return
     host = os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
@@ -239,7 +235,7 @@ def _checked(file: Path) -> Path:
     """The whole path of FILE, which may begin with a dash. Raises BadInput where it can't be a recording."""
     try:
         if not file.is_file():
-            raise BadInput(f"{file}: there is no such file; recordings of nodes and of zscout view lie in runs/")
+            raise BadInput(f"{file}: there is no such file; recordings of nodes and of zscout view are in runs/")
         with file.open("rb") as recording:
             begin = recording.read(len(MAGIC))
     except OSError as error:
@@ -247,7 +243,7 @@ def _checked(file: Path) -> Path:
     if begin != MAGIC:
         raise BadInput(f"{file}: is not a Rerun recording; name a .rrd file")
     if file.suffix != ".rrd":
-        raise BadInput(f"{file}: the viewer knows a recording by its name; rename it to end in .rrd")
+        raise BadInput(f"{file}: the name does not end in .rrd; rename it")
     return file.absolute()
 
 
@@ -312,7 +308,6 @@ class Child:
             raise common.Failed(f"{self.what} did not start within {START:g} s; is this host overloaded?") from None
 
     async def failed(self) -> Exception:
-        """Why it ended, in its own last words."""
         code = await self.process.wait()
         await self._log
         words = self.lines[-1] if self.lines else "without a word"
@@ -335,7 +330,6 @@ class Child:
                 return
 
     async def end(self) -> None:
-        """Ends it, at first by asking; returns when it is gone."""
         process = self.process
         if process.returncode is None:
             # A recorder ends with its input, a viewer by its signal.

@@ -67,16 +67,14 @@ def _rc_option(kind: str) -> Callable[[common.F], common.F]:
     "--rate",
     type=click.FloatRange(0.5, MAX_RATE),
     default=5.0,
-    help="Commands a second: the share of the radio that is asked for.",
+    help="Commands per second: the share of the radio to request.",
 )
-@click.option("--speed", type=click.FloatRange(0.1, 1.0), default=0.6, help="Of the robot's top speed.")
-@click.option("--stand-by", is_flag=True, help="Take the robot at the first key that drives, not at once.")
-@click.option("--pad", type=click.Path(path_type=Path), metavar="DEVICE", help="A game pad's left stick as well.")
+@click.option("--speed", type=click.FloatRange(0.1, 1.0), default=0.6, help="Share of the robot's top speed.")
+@click.option("--stand-by", is_flag=True, help="Take the robot at the first driving key, not at once.")
+@click.option("--pad", type=click.Path(path_type=Path), metavar="DEVICE", help="Drive by a game pad's stick as well.")
 @click.option("--no-picture", is_flag=True, help="Drive without looking.")
-@click.option("--no-view", is_flag=True, help="Open no viewer; the picture's address is printed.")
-@click.option(
-    "--record", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE.rrd", help="Keep what was seen."
-)
+@click.option("--no-view", is_flag=True, help="Open no viewer; print the picture's address.")
+@click.option("--record", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE.rrd", help="Record pictures.")
 @common.json_option("Print JSON lines: taken, waiting, free, and what came of it.")
 @common.runs
 async def drive(
@@ -93,14 +91,14 @@ async def drive(
     record: Path | None,
     as_json: bool,
 ) -> None:
-    """Take ROBOT with radio, video channel and framegrabber, and drive it.
+    """Take ROBOT with a radio, a video channel and a framegrabber, and drive it.
 
-    Asks at the fleet's operator priority, without a question: who holds them is preempted, and goes on when you give
-    back: with g or q, or when this terminal dies. The robot stops whenever you let go of the keys. The picture is shown
-    in the Rerun viewer; its address is printed, for a host without a display.
+    It takes them at the fleet's operator priority without asking: a preempted holder continues when you give them
+    back, with g or q, or when this terminal closes. The robot stops whenever you release the keys. The Rerun viewer
+    shows the picture; for a host without a display its address is printed.
 
-    Keys: arrows or w a s d drive, space stops, + and - change the speed, g gives the robot back and the next key that
-    drives takes it again, q ends. On a pad the left stick drives, button 0 stops, button 1 gives back.
+    Keys: arrows or w a s d drive, space stops, + and - change the speed, g gives the robot back and the next driving
+    key takes it again, q ends. On a pad the left stick drives, button 0 stops, button 1 gives back.
 
     \b
     Examples:
@@ -109,7 +107,7 @@ async def drive(
       zscout drive robot/scout33 --pad /dev/input/js0 --record runs/scout33.rrd
     """
     if not sys.stdin.isatty():
-        raise BadInput("zscout drive reads keys: run it at a terminal, its standard input is none")
+        raise BadInput("standard input is not a terminal, and zscout drive reads keys; run it at a terminal")
     common.check_recording("--record", record)
     from zscout.behaviors.sensor_net.held_robot import RobotNeeds
     from zscout.behaviors.teleop import Pilot, Teleop
@@ -120,7 +118,8 @@ async def drive(
         state = await common.state_of(client)
         if all(rc.rc != robot for rc in state.rcs):
             there = sorted(rc.rc for rc in state.rcs if rc.rc.startswith("robot/"))
-            raise BadInput(f"there is no {quoted(robot)} on the mesh; there are: {', '.join(there) or 'no robots'}")
+            hint = common.hint_at(robot, there, "and there are none on the mesh", "known")
+            raise BadInput(f"unknown robot {quoted(robot)}{hint}")
         pilot, end = Pilot(speed), asyncio.Event()
         needs = RobotNeeds(robot, radio, video, framegrabber, rate)
         console = stack.enter_context(_Console(robot, as_json=as_json))
@@ -194,7 +193,6 @@ class _Console(terminal.LiveLine):
             self.print(words)
 
     def update(self, teleop: Teleop) -> None:
-        """The state has changed, or the first command was obeyed."""
         now = (teleop.state, teleop.why, teleop.takeover)
         if now == self._told:
             return

@@ -1,4 +1,4 @@
-"""What `zscout drive` and `zscout watch` see of a camera, as a Rerun recording of its own."""
+"""What `zscout drive` and `zscout motion` see of a camera, as a Rerun recording of its own."""
 
 from __future__ import annotations
 

@@ -32,17 +32,15 @@ MAX_ANSWER = 4_096
 @click.command(cls=CommandAfterDashes)
 @click.option("-y", "--yes", is_flag=True, help="Don't ask.")
 @click.option("--no-keep", is_flag=True, hidden=True, help="--min-runtime is what --release-after is.")
-@click.option(
-    "--reason", type=Parsed("text", parse_comment), default="", help="Why: shown to whom it preempts, and in status."
-)
+@click.option("--reason", type=Parsed("text", parse_comment), default="", help="Shown in status and to the preempted.")
 @hold_options
 @common.runs
 async def take(needs: Any, yes: bool, no_keep: bool, name: str | None, reason: str, comment: str, **rest: Any) -> int:
     """Take devices at the fleet's operator priority, and keep them.
 
-    Says who will be preempted and asks, on stderr; without a terminal it needs --yes. Then it waits, holds and runs a
-    COMMAND as `zscout request` does, with the same exit codes; 1 also where the question was not answered with y. A
-    NEED is written as there, and refused for the same reasons (2).
+    It prints whom it will preempt and asks on stderr; if stdin is not a terminal, add --yes. Then it waits, holds and
+    runs a COMMAND as `zscout request` does, with the same exit codes; 1 also if you did not answer y. A DEVICE is
+    written as for `zscout request`, and refused for the same reasons (2).
 
     \b
     Examples:
@@ -152,7 +150,7 @@ async def _agree(client: Client, wanted: HoldOptions, *, yes: bool) -> None:
         if not asks:
             return
         if not possible:
-            raise Failed("nobody can be asked here whether to preempt others; add --yes")
+            raise Failed("stdin is not a terminal, so I can't ask before preempting; add --yes")
         sys.stderr.write(f"Take {', '.join(sorted(wanted.needs))}? [y/N] ")
         sys.stderr.flush()
         if (await _answer()).strip().lower() not in ("y", "yes"):

@@ -1,4 +1,4 @@
-"""`zscout watch`: the motion detector alone, on any source that OpenCV opens, to place a camera."""
+"""`zscout motion`: the motion detector alone, on any source that OpenCV opens, to place a camera."""
 
 from __future__ import annotations
 
@@ -47,30 +47,28 @@ def sources(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> li
     required=True,
     help="A video file, an http:// or rtsp:// address, /dev/videoN or its number.",
 )
-@common.json_option("Print one JSON object a line for each event; the summary goes to stderr.")
+@common.json_option("Print one JSON object on a line for each event; the summary goes to stderr.")
 @click.option(
     "--record",
     metavar="FILE",
     type=click.Path(path_type=Path, dir_okay=False),
     help="Write pictures, boxes and events as a Rerun recording; look at it with `zscout view FILE`.",
 )
-@click.option(
-    "--limit", type=SECONDS, help="End after so long in the source: 90s, 5m. Default: at its end, or at Ctrl-C."
-)
-def watch(source: str, as_json: bool, record: Path | None, limit: float | None) -> None:
-    """Tell when something moves: one line for each event, as soon as it is over.
+@click.option("--limit", type=SECONDS, help="End after this much of the source. Default: at its end, or at Ctrl-C.")
+def motion(source: str, as_json: bool, record: Path | None, limit: float | None) -> None:
+    """Report motion: one line for each event, when the event ends.
 
-    A file is read whole, as quickly as it goes, by its own time stamps; of a URL or device the newest picture
-    counts, and it is opened again when it fails. An event ends when nothing moved for a second. Its `start`,
-    `end` and `peak` are seconds of the source; `boxes`, [x, y, width, height] in its pixels, are what moved
-    at the peak, when that covered most; `area` is around all that moved; `frames` counts its pictures.
-    The detector adapts to the scene and has nothing to tune; docs/watching.md says what it can do.
+    A file is read whole, as fast as possible, by its own time stamps; of a URL or camera the newest picture counts, and
+    it is opened again when it fails. An event ends when nothing moved for a second. Its `start`, `end` and `peak` are
+    seconds of the source; `boxes`, [x, y, width, height] in its pixels, surround motion at the peak; `area` surrounds
+    all motion; `frames` counts the pictures with motion. The detector adapts to the scene and needs no tuning;
+    docs/watching.md describes what it can do.
 
     \b
     Examples:
-      zscout watch --source /dev/video0
-      zscout watch --source http://127.0.0.1:8080/1.mjpg --json | jq 'select(.frames > 10)'
-      zscout watch --source /dev/video0 --limit 600 --record garden.rrd
+      zscout motion --source /dev/video0
+      zscout motion --source http://127.0.0.1:8080/1.mjpg --json | jq 'select(.frames > 10)'
+      zscout motion --source /dev/video0 --limit 600 --record garden.rrd
     """
     ended_by: list[int] = []
     begun = False
@@ -159,7 +157,6 @@ class _WatchReport(LiveLine):
             terminal.print_line(text)
 
     def say(self, text: str) -> None:
-        """A word about the source, on stderr."""
         text = terminal.clean(text)
         if self.recording is not None:
             self.recording.words(self.at, text)
@@ -169,7 +166,6 @@ class _WatchReport(LiveLine):
             terminal.print_line(text, sys.stderr)
 
     def show(self, duration: float | None, event: Event | None) -> None:
-        """The live line, now and then."""
         now = clock.now()
         if not self.watched or now - self._drawn < DRAWN * SECOND:
             return

@@ -1,4 +1,4 @@
-"""Where `zscout watch` has its pictures from: files, by their own time stamps, and live sources."""
+"""Where `zscout motion` has its pictures from: files, by their own time stamps, and live sources."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Shot(NamedTuple):
 def open_source(source: str, report: Callable[[str], None]) -> VideoFile | LiveSource:
     """Opens a file, URL or device. `report` is given what becomes of a live one. Raises BadInput."""
     if not source or "\0" in source:
-        raise BadInput("--source: it is empty; name a file, a URL or a device like /dev/video0")
+        raise BadInput("--source is empty; name a file, a URL or a device like /dev/video0")
     if kind_of(source) == "file":
         return VideoFile(Path(source))
     return LiveSource(source, report)
@@ -55,7 +55,7 @@ class VideoFile:
         self.name = str(path)
         try:
             if not stat.S_ISREG(path.stat().st_mode):
-                raise BadInput(f"{quoted(self.name)} is no file; name a video file, a URL or a device")
+                raise BadInput(f"{quoted(self.name)} is not a file; name a video file, a URL or a device")
             with path.open("rb") as file:
                 head = file.read(HEAD)
         except (OSError, ValueError) as error:
@@ -83,7 +83,6 @@ class VideoFile:
         """Seconds; None where nobody knows."""
 
     def shots(self) -> Iterator[Shot]:
-        """All pictures, to the end of the file."""
         picture, zero, last = self._first, self._stamp(), 0.0
         self._first = None
         while picture is not None:
@@ -126,7 +125,7 @@ class LiveSource:
                 first = self._capture.wait(0, LOOK)
                 health = self._capture.health
                 if first is None and health not in (*UNTRIED, "ok"):
-                    raise BadInput(f"{health}; name a source that gives pictures")
+                    raise BadInput(f"{health}; name a source that delivers pictures")
             _check(first.picture, self.name)
         except BaseException:
             self.close()
@@ -161,6 +160,6 @@ def _check(picture: NDArray[np.uint8], name: str) -> None:
     height, width = picture.shape[:2]
     if min(height, width) < LEAST_SIDE or max(height, width) > MAX_SIDE or height * width > MAX_PIXELS:
         raise BadInput(
-            f"the pictures of {quoted(name)} are {width} by {height} pixels; give it ones of {LEAST_SIDE} to "
-            f"{MAX_SIDE} a side, {MAX_PIXELS // 1_000_000} million at most"
+            f"the pictures of {quoted(name)} are {width} by {height} pixels; each side must have {LEAST_SIDE} to "
+            f"{MAX_SIDE} pixels, and all at most {MAX_PIXELS // 1_000_000} million"
         )

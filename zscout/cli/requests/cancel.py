@@ -19,7 +19,7 @@ MAX_LISTED: Final = 20
 TRIES: Final = 3
 TIMEOUT: Final = 1.0
 
-every_option = click.option("--all", "every", is_flag=True, help="All ARCs of that name, not only one.")
+every_option = click.option("--all", "every", is_flag=True, help="All requests of that name, not only one.")
 
 
 @click.command()
@@ -28,10 +28,10 @@ every_option = click.option("--all", "every", is_flag=True, help="All ARCs of th
 @common.json_option("Print one JSON object.")
 @common.runs
 async def cancel(arc: str, every: bool, as_json: bool) -> None:
-    """End an ARC, whether it runs or waits: by name, id, or <host>/<client>/<id>.
+    """End a request, whether it holds or waits: by name, id, or <host>/<client>/<id>.
 
-    Its program is told; one that `zscout request` runs is stopped. A name that
-    several ARCs have is refused with the list of them, unless --all is given.
+    Its program is notified; a program that `zscout request` runs is stopped. If several requests have the name, it is
+    refused with the list of them, unless --all is given.
 
     \b
     Examples:
@@ -48,10 +48,10 @@ async def cancel(arc: str, every: bool, as_json: bool) -> None:
 @common.json_option("Print one JSON object.")
 @common.runs
 async def release(arc: str, every: bool, as_json: bool) -> None:
-    """End the hold of a running ARC: by name, id, or <host>/<client>/<id>.
+    """End the hold of a request: by name, id, or <host>/<client>/<id>.
 
-    The same as `zscout cancel`, but only for ARCs that run: one that waits is
-    left alone. A name that several have is refused, unless --all is given.
+    The same as `zscout cancel`, but it leaves a waiting request alone. If several requests have the name, it is
+    refused, unless --all is given.
 
     \b
     Examples:
@@ -98,14 +98,14 @@ def _choose(state: RcmState, named: str, word: str, *, every: bool) -> list[Targ
         matching = [Target(request, check_name(request, "id"), str(client_of(client)), "queued")]
     found = [target for target in matching if word == "cancel" or target.was == "running"]
     if matching and not found:
-        raise common.Failed(f"{quoted(named)} holds nothing, it waits; to end that: zscout cancel {named}")
+        raise common.Failed(f"request {quoted(named)} holds nothing, it waits; to cancel it: zscout cancel {named}")
     if not found:
-        more = f"; {state.more} more wait: name it <host>/<client>/<id>" if state.more else ""
-        raise common.Failed(f"no ARC {quoted(named)} runs or waits{more}; see zscout status")
+        more = f"; {state.more} more wait: name them <host>/<client>/<id>" if state.more else ""
+        raise common.Failed(f"no request {quoted(named)} holds or waits{more}; see zscout status")
     if len(found) > 1 and not every:
         listed = ", ".join(target.full_name for target in found[:MAX_LISTED])
         rest = f" and {len(found) - MAX_LISTED} more" if len(found) > MAX_LISTED else ""
-        raise common.Failed(f"{len(found)} ARCs are called {quoted(named)}: {listed}{rest}; name one so, or add --all")
+        raise common.Failed(f"{len(found)} requests are called {quoted(named)}: {listed}{rest}; name one, or add --all")
     return found
 
 
@@ -123,4 +123,4 @@ async def _operate(client: Client, target: Target, word: str) -> Notice:
         problem = next((reply.problem for reply in replies if reply.problem is not None), None)
         if problem is not None and problem.code not in TRY_AGAIN:
             raise common.Failed(f"{target.full_name} was not ended: {problem.message}")
-    raise common.NobodyThere("the RCM did not answer: it may be done or not; see zscout status, and try again")
+    raise common.NobodyThere("the leader did not answer; it may or may not have been done: see zscout status")

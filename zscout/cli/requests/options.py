@@ -50,7 +50,6 @@ def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:
 
 
 def timeout_option(help: str) -> Callable[[F], F]:  # noqa: A002 - click's word
-    """`--timeout`, in seconds."""
     return click.option("--timeout", type=SECONDS, help=help)
 
 
@@ -60,7 +59,7 @@ def seconds_within(low: float, high: float) -> Parsed[float]:
     def parse(text: str, option: str) -> float:
         seconds = float(parse_duration(text, option))
         if not low <= seconds <= high:
-            raise BadInput(f"{option}: {span(seconds)} is not from {span(low)} to {span(high)}; write {DURATIONS}")
+            raise BadInput(f"{option}: {span(seconds)} is not within {span(low)} and {span(high)}; write {DURATIONS}")
         return seconds
 
     return Parsed("duration", parse)
@@ -82,7 +81,7 @@ def parse_rc(text: str, kind: str, *, pattern: bool = False) -> str:
     """An RC of one kind: `robot/scout33` or `scout33`, with `pattern` also `robot/*`. Raises BadInput, BadName."""
     rc = text if "/" in text else f"{kind}/{text}"
     if rc.partition("/")[0] != kind or (is_pattern(rc) and not pattern):
-        raise BadInput(f"{quoted(text)} is no {kind}; name one, as in {kind}/NAME")
+        raise BadInput(f"{quoted(text)} is not a {kind}; name one, as in {kind}/NAME")
     check_need(rc)
     return rc
 
@@ -111,7 +110,7 @@ def parse_need(text: str, _option: str = "") -> tuple[str, dict[str, Decimal]]:
     except ValueError as error:
         context = click.get_current_context(silent=True)
         no_dashes = "/" not in text and context is not None and context.meta.get("command") == ()
-        raise BadInput(f"need {quoted(text)}: {error}{'; a command goes after --' if no_dashes else ''}") from None
+        raise BadInput(f"{error}{'; a command goes after --' if no_dashes else ''}") from None
     return rc, params
 
 
@@ -119,7 +118,7 @@ def gather_needs(pairs: Sequence[tuple[str, dict[str, Decimal]]]) -> Needs:
     """The needs of one ARC; a pattern that comes again is numbered: `framegrabber/*#2` is the second. Raises BadInput
     where there are too many, one RC is named twice, or patterns contradict each other."""
     if len(pairs) > MAX_NEEDS:
-        raise BadInput(f"{len(pairs)} RCs; at most {MAX_NEEDS} are allowed in one request")
+        raise BadInput(f"{len(pairs)} devices; at most {MAX_NEEDS} are allowed in one request")
     needs: Needs = {}
     # Numbers that are written out are not given to others.
     written = {need for need, _ in pairs}
@@ -127,9 +126,9 @@ def gather_needs(pairs: Sequence[tuple[str, dict[str, Decimal]]]) -> Needs:
         name = need
         if need in needs:
             if not is_pattern(need):
-                raise BadInput(f"{need} is named twice; name each RC once, all its parameters after one colon")
+                raise BadInput(f"{need} is named twice; name each device once, with all its parameters after one colon")
             if "#" in need:
-                raise BadInput(f"{need} is named twice; leave the numbers out, and they are given")
+                raise BadInput(f"{need} is named twice; leave the numbers out: zscout numbers them")
             numbered = (f"{need}#{number}" for number in range(2, MAX_NEEDS + 2))
             name = next(one for one in numbered if one not in needs and one not in written)
         needs[name] = params
@@ -188,7 +187,6 @@ class HoldOptions:
         return replace(who, command=bounded(shlex.join(self.command) if self.command else own))
 
     def terms(self) -> dict[str, Any]:
-        """How its needs are to be held."""
         terms = {"priority": self.priority, "min_runtime": self.min_runtime, "keep": self.keep}
         return terms | {"wait_for_device": self.wait_for_device}
 
@@ -201,41 +199,37 @@ def hold_options(command: F, *, needs_required: bool = True) -> F:
             nargs=-1,
             required=needs_required,
             type=Parsed("need", parse_need),
-            metavar="NEED...",
+            metavar="DEVICE...",
             shell_complete=completion.needs,
         ),
         json_option("Print JSON lines, one for each event."),
-        click.option("--wait-for-device", is_flag=True, help="Wait for a device that nobody knows, too."),
-        click.option(
-            "--again", is_flag=True, help="Ask again and run the command again, when it was ended for others."
-        ),
+        click.option("--wait-for-device", is_flag=True, help="Wait for devices that are unknown, too."),
+        click.option("--again", is_flag=True, help="Repeat request and command if the devices were taken away."),
         click.option(
             "--release-after",
             type=Parsed("duration", parse_duration),
-            help="Give back after so long, though nobody waits; instead of --min-runtime.",
+            help="Give the devices back after this time, even if nobody waits; instead of --min-runtime.",
         ),
         click.option(
             "--grace",
             type=Parsed("duration", partial(parse_duration, zero=True)),
-            help="Between SIGTERM and SIGKILL to the command: at most, and by default, nine tenths of what its devices "
+            help="Time from SIGTERM to SIGKILL for the command: at most, and by default, nine tenths of what devices "
             "settle (`settle`, 5 s).",
         ),
-        timeout_option("Wait at most so long for a grant, then exit with 1."),
+        timeout_option("Wait this long for a grant, then exit with 1."),
         click.option(
             "--min-runtime",
             type=Parsed("duration", parse_duration),
-            help="For how long it is yours against all of equal priority: 90s, 5m, 2h, 1d12h. Default: the "
+            help="Protect the hold this long from requests of equal priority: 90s, 5m, 2h, 1d12h. Default: the "
             "fleet's, 60 s.",
         ),
         click.option(
             "--comment",
             type=Parsed("text", parse_comment),
             default="",
-            help="What others are to know: shown in status and to who waits for it.",
+            help="A comment, shown in status and to requests that wait for the devices.",
         ),
-        click.option(
-            "--name", help="What the ARC is called. Default: the command's name, else request (take: operator)."
-        ),
+        click.option("--name", help="Name of the request. Default: the command's name, else request (take: operator)."),
     ):
         command = option(command)
     return command
@@ -246,17 +240,17 @@ def gather(
 ) -> HoldOptions:
     """Checks what can be checked before anybody is asked. Raises UsageError, BadInput, BadName, Failed."""
     if not needs and not rest.get("booking"):
-        raise click.UsageError("Missing argument 'NEED...'.", click.get_current_context())
+        raise click.UsageError("DEVICE... is missing", click.get_current_context())
     if release_after is not None:
         if rest["min_runtime"] is not None:
-            raise BadInput("--release-after and --min-runtime are two times for one hold; give one of them")
+            raise BadInput("--release-after and --min-runtime exclude each other; use only one of them")
         keep, rest["min_runtime"] = False, release_after
     command: tuple[str, ...] = click.get_current_context().meta["command"]
     if command:
         check_command(command)
         default_name = valid_name(Path(command[0]).name)
     if rest["again"] and not command:
-        raise BadInput("--again runs a command again; add one after --")
+        raise BadInput("--again repeats a command; add one after --")
     return HoldOptions(
         name=check_name(name or default_name, "--name"), needs=gather_needs(needs), command=command, keep=keep, **rest
     )
@@ -265,8 +259,8 @@ def gather(
 def arc_named(text: str, _option: str) -> str:
     """What may be an ARC's name, its id or `<host>/<client>/<id>`. Raises BadInput."""
     if not text or len(text) > MAX_ARC_NAME or not text.isprintable():
-        raise BadInput(f"{quoted(text)} names no ARC; zscout status lists them")
+        raise BadInput(f"{quoted(text)} can't be the name of a request; see zscout status")
     return text
 
 
-arc_argument = click.argument("arc", type=Parsed("text", arc_named), shell_complete=completion.arcs)
+arc_argument = click.argument("arc", metavar="REQUEST", type=Parsed("text", arc_named), shell_complete=completion.arcs)

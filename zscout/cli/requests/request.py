@@ -46,13 +46,14 @@ REFRESH: Final = 1.0
 
 @click.command(cls=CommandAfterDashes)
 @click.option(
-    "--priority", type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY), default=0, help="Higher ones preempt lower ones."
+    "--priority",
+    type=click.IntRange(-MAX_PRIORITY, MAX_PRIORITY),
+    default=0,
+    help="Higher priorities preempt lower ones.",
 )
 @click.option("--keep", is_flag=True, hidden=True, help="What happens without it as well.")
-@click.option(
-    "--booking", type=BOOKING, shell_complete=completion.bookings, help="Take this booking up: its name or id."
-)
-@click.option("--dry-run", is_flag=True, help="Only say when it would start, and whom it would preempt at once.")
+@click.option("--booking", type=BOOKING, shell_complete=completion.bookings, help="Use this booking: its name or id.")
+@click.option("--dry-run", is_flag=True, help="Only print when it would start, and what it would preempt.")
 @partial(hold_options, needs_required=False)
 @common.runs
 async def request(
@@ -60,40 +61,41 @@ async def request(
 ) -> int:
     """Wait until all of the devices are granted at once, then hold them.
 
-    A NEED is kind/name, and for a sharable device how it will be used: radio/rf0:command_rate=5,other=1. With a * it is
-    met by any one device whose name matches: 'framegrabber/*' is any framegrabber, 'robot/scout$*' any robot whose name
-    begins so; twice the same is two of them. Quote it for the shell.
+    A DEVICE is kind/name; for a sharable device add its use: radio/rf0:command_rate=5,other=1. A * stands
+    for any name: 'framegrabber/*' is any one framegrabber, 'robot/scout$*' any one robot whose name begins with
+    scout. Write a pattern twice to get two devices, and quote it for the shell.
 
-    They are yours for the minimum runtime, in which only a higher priority takes them, and after it until somebody of
-    the same or a higher priority waits for one of them. --release-after gives them back though nobody waits.
+    Your hold is protected for the minimum runtime: until then only a request of higher priority takes the devices.
+    After that you keep them until a request of equal or higher priority waits for one of them. --release-after
+    gives them back even if nobody waits.
 
-    With --booking, a booking is taken up, which has its own NEEDs, priority and time: it waits for its next date.
+    With --booking the request uses a booking, with its devices, priority and time, and waits for its next date.
 
-    With a COMMAND, they are held while it runs, and given back as soon as nothing of it is left. When its time is over
-    or the grant is taken away, the command and all that it started get SIGTERM, and SIGKILL after the grace; so they do
-    when this program dies or hangs. The next holder waits until nothing is left. --again asks anew then, and runs it
-    again. Without a COMMAND, they are held until Ctrl-C or until their time is over.
+    With a COMMAND the devices are held while it runs, and given back when none of its processes is left. When its
+    time is over or the grant is taken away, the command and its processes get SIGTERM, and SIGKILL after the grace;
+    the same happens if zscout dies or hangs. The next holder waits until no process is left. --again then repeats
+    request and command. Without a COMMAND the devices are held until Ctrl-C or until the time is over.
 
     \b
     The command finds in its environment:
-      ZSCOUT_ARC, ZSCOUT_ARC_ID  the ARC's name and id
+      ZSCOUT_ARC, ZSCOUT_ARC_ID  name and id of the request
       ZSCOUT_RCS                 the devices, with spaces between
-      ZSCOUT_BOUND               which of them meets which pattern, as JSON:
+      ZSCOUT_BOUND               the device for each pattern, as JSON:
                                  {"framegrabber/*": "framegrabber/fgrab1"}
-      ZSCOUT_GRANT               the grant as JSON, to be sent with each command
-      ZSCOUT_CLIENT              who holds it: <host>/<client>
+      ZSCOUT_GRANT               the grant as JSON, to send with each command
+      ZSCOUT_CLIENT              the holder: <host>/<client>
       ZSCOUT_REMAINING           seconds until the minimum runtime is over
       ZSCOUT_FLEET_NAME          the fleet; ZSCOUT_FLEET its file, if there is one
 
     \b
     Exit code: the command's own (128 + n: ended by signal n), or
       75   the grant was taken away before its time
-      124  its time was over: somebody waited after the minimum runtime, or --release-after
+      124  its time was over: another request waited after the minimum runtime, or --release-after
       126  it can't be executed           127  there is no such command
-      1    not granted; without a command also: taken away    3  no RCM
-      2    it can never start: a device that nobody knows, a parameter that it does not know, or too much of one
+      1    not granted; without a command also: taken away    3  no leader
+      2    it can never start: an unknown device or parameter, or too much of one
 
-    With a COMMAND all lines of zscout go to stderr.
+    With a COMMAND zscout prints to stderr only.
 
     \b
     Examples:
@@ -107,7 +109,7 @@ async def request(
       zscout request --booking survey -- sleep 7200
     """
     if keep and rest["release_after"] is not None:
-        raise BadInput("--keep and --release-after contradict each other; give one of them")
+        raise BadInput("--keep and --release-after exclude each other; use only one of them")
     if booking is not None:
         check_options(dry_run=dry_run, **rest)
     wanted = gather(needs, name, priority=priority, keep=True, booking=booking or "", **rest)
@@ -267,7 +269,7 @@ async def _tell_who_is_old(report: Report, held: Held, client: Client, direct: D
     reply = await client.mesh.ask_one(key, asked, RcmState, timeout=QUERY_TIMEOUT)
     state, who = reply.message if reply is not None else None, [] if direct is None else direct.never_settle
     if state is not None and any(hold.grant == held.grant and not hold.direct for hold in state.holds):
-        who = [f"the RCM at {state.host} ({version_words(state.version)}, this is {VERSION})", *who]
+        who = [f"the leader at {state.host} ({version_words(state.version)}, this is {VERSION})", *who]
     if who:
         told = f"the next holder may begin before the command is gone: {', '.join(who)} can't make it wait; upgrade"
         report.event("not_settling", told, who=who)
@@ -315,7 +317,6 @@ def _kept(longest: Ns | None) -> str:
 
 
 def _ending(arc: OpenArc) -> HoldEnd:
-    """How its last hold came to its end."""
     return arc.ending or HoldEnd("lost", "")
 
 
@@ -324,7 +325,7 @@ async def _foresee(client: Client, wanted: HoldOptions) -> int:
     RequestRefused, NobodyThere."""
     foretold = await client.foresee(wanted.name, wanted.needs, **wanted.terms())
     if foretold is None:
-        raise common.NobodyThere(f"the RCM of fleet {client.fleet.name} did not answer; try again")
+        raise common.NobodyThere(f"the leader of fleet {client.fleet.name} did not answer; try again")
     if wanted.as_json:
         found = {name: getattr(foretold, name) for name in ("starts_in", "preempts", "victims", "reason", "why")}
         print_json({"arc": wanted.name, **found})
@@ -374,7 +375,6 @@ class Report(LiveLine):
                 self.print(text)
 
     def news(self, arc: OpenArc) -> None:
-        """A watcher for the client."""
         self._arc = arc
         self.changed.set()
 
@@ -388,7 +388,6 @@ class Report(LiveLine):
             self.hide()
 
     async def follow_wait(self) -> None:
-        """Shows how the request waits, until cancelled."""
         while True:
             if self._looked is not None and self._arc is not None and self._arc.state == "queued":
                 # One look per REFRESH: news may come in a crowd.
@@ -396,7 +395,7 @@ class Report(LiveLine):
             self.changed.clear()
             arc = self._arc
             if arc is None:
-                self.draw(f"{self._name}: asking the RCM")
+                self.draw(f"{self._name}: asking the leader")
             elif arc.state == "running" and arc.settling == arc.grant:
                 self._show_settling(arc)
             elif arc.state in ("asking", "queued") and arc.reason:

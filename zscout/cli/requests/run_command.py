@@ -127,7 +127,6 @@ class RunningCommand:
 
     @property
     def gone(self) -> bool:
-        """Whether nothing of it is left."""
         return self._gone.done()
 
     def terminate(self, at: Ns) -> None:
@@ -205,7 +204,6 @@ class RunningCommand:
             self._gone.set_result(None)
 
     def _sweep(self, pause: float) -> None:
-        """The guardian was killed: what it guarded is, too."""
         left = descendants(os.getpid())
         for one in left:
             with contextlib.suppress(PermissionError):

@@ -19,7 +19,7 @@ def check_options(**options: Any) -> None:
     """That none is given that says for how long. Raises BadInput."""
     for name in OWN:
         if options[name] not in (None, False):
-            raise BadInput(f"--{name.replace('_', '-')} is not for --booking, which has its own time; leave it out")
+            raise BadInput(f"--{name.replace('_', '-')} can't be used with --booking; leave it out")
 
 
 async def taking_up(client: Client, wanted: HoldOptions, *, name: str | None, priority: int | None) -> HoldOptions:
@@ -27,11 +27,11 @@ async def taking_up(client: Client, wanted: HoldOptions, *, name: str | None, pr
     BadInput where NEEDs or a `priority` were given that it has not; Failed, RequestRefused."""
     booking = choose((await ask_bookings(client)).bookings, wanted.booking, User.of(client))
     if booking.maintenance:
-        raise Failed(f"{booking.name} is maintenance, which nobody takes up; to end it: zscout unbook {booking.name}")
+        raise Failed(f"{booking.name} is maintenance, not for requests; end it: zscout booking cancel {booking.name}")
     if wanted.needs and wanted.needs != booking.needs:
-        raise BadInput(f"{booking.name} is booked with other devices: {rcs_words(booking)}; leave the NEEDs out")
+        raise BadInput(f"{booking.name} is booked with other devices: {rcs_words(booking)}; leave the devices out")
     if priority not in (None, booking.priority):
-        raise BadInput(f"--priority: {booking.name} is booked at {booking.priority}; leave it out")
+        raise BadInput(f"--priority: {booking.name} is booked with priority {booking.priority}; leave --priority out")
     return replace(
         wanted,
         name=wanted.name if name is not None else valid_name(booking.name),

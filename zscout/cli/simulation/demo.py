@@ -73,7 +73,6 @@ class _Live:
 
 
 def live_options(command: F) -> F:
-    """`--web` and `--view`."""
     command = click.option("--view", is_flag=True, help="Show it live in the Rerun viewer's window.")(command)
     return click.option("--web", is_flag=True, help="Show it live in a browser: prints the address to open.")(command)
 
@@ -87,13 +86,12 @@ def _check_live(web: bool, view: bool) -> None:
     from zscout.cli.fleet.view import has_display
 
     if web and view:
-        raise BadInput("--web and --view: one of them shows it; leave one out")
+        raise BadInput("--web and --view exclude each other; use only one of them")
     if view and not has_display():
-        raise common.Failed("no display is here (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web, and a browser")
+        raise common.Failed("there is no display (neither DISPLAY nor WAYLAND_DISPLAY is set); use --web and a browser")
 
 
 def recording_option(command: F) -> F:
-    """`--out FILE`."""
     return click.option(
         "--out", metavar="FILE", type=click.Path(path_type=Path), help="The recording. Default: runs/demo-….rrd"
     )(command)
@@ -108,26 +106,18 @@ def recording_option(command: F) -> F:
     default="living_room",
     help="As in zscout simulate: a name, a TOML file, or random:SEED.",
 )
-@click.option("--seed", type=click.IntRange(0), default=1, help="Of noise, slip and people.")
-@click.option(
-    "--speed",
-    type=click.FloatRange(0.2, 4.0),
-    default=1.5,
-    help="How many of the building's seconds pass in one of ours.",
-)
+@click.option("--seed", type=click.IntRange(0), default=1, help="Seed of noise, slip and people.")
+@click.option("--speed", type=click.FloatRange(0.2, 4.0), default=1.5, help="Building's seconds per real second.")
 @recording_option
 @live_options
 @common.json_option("Print the summary as one JSON object.")
 def robots(building: str, seed: int, speed: float, out: Path | None, web: bool, view: bool, as_json: bool) -> int:
     """Hide the robots of a building in the dark, and have them watch.
 
-    There are four of them, two framegrabbers and one radio. It serves a simulated building, starts three
-    nodes with its devices on this machine, apart from every other fleet, and has the component placer place
-    a sensor net. In the middle an operator takes one robot, drives it and gives it back. It ends when all
-    robots are hidden and somebody has walked by, or a minute of the building later, at the latest after two
-    and a half minutes of ours. It leaves nothing but a recording; so does Ctrl-C.
-
-    Exit code: 0 all robots came to be hidden; 1 not all of them did.
+    It serves a simulated building with four robots, two framegrabbers and one radio, starts three nodes with these
+    devices on this machine, apart from every other fleet, and places a sensor net. Halfway an operator takes one robot,
+    drives it and gives it back. It ends when all robots are hidden and a person has walked by, or a minute of the
+    building later, after at most two and a half minutes. Only a recording is left, also after Ctrl-C.
 
     \b
     Examples:

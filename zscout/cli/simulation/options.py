@@ -42,11 +42,9 @@ def check_rrd(rrd: Path | None, *, writable: bool = True) -> None:
     if rrd is None:
         return
     if rrd.suffix != ".rrd":
-        raise BadInput(f"--rrd {rrd}: the viewer knows a recording by its name; end it in .rrd")
+        raise BadInput(f"--rrd {rrd}: not the name of a recording; end it in .rrd")
     try:
         if writable:
             rrd.open("ab").close()
     except OSError as error:
-        raise BadInput(
-            f"--rrd {rrd}: it can't be written ({error.strerror}); give a file in a folder that is there"
-        ) from None
+        raise BadInput(f"--rrd {rrd}: can't be written ({error.strerror}); choose an existing folder") from None

@@ -15,16 +15,16 @@ from zscout.scheduling.strategies import STRATEGIES
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option("--strategy", type=click.Choice(list(STRATEGIES)), default="priority", help="How RCs are shared out.")
+@click.option("--strategy", type=click.Choice(list(STRATEGIES)), default="priority", help="Scheduling strategy.")
 @common.json_option("Print one JSON object instead of the table.")
 @rrd_option(what="")
 def replay(file: Path, strategy: StrategyName, as_json: bool, rrd: Path | None) -> None:
-    """Show who would hold what, and when, if the requests in FILE came.
+    """Show who would hold which devices, and when, for the requests in FILE.
 
-    FILE is a workload: RCs, and ARCs with the time at which they ask (TOML). table1.toml, the paper's, comes with
-    zscout: where there is no other file of that name it is taken. No mesh is needed, and no time
-    passes. Without --json, a table with a row for each RC (a sharable one has a row for each holder) and a
-    column for each second, or for each interval between two events where a second is not the right step.
+    FILE is a workload (TOML): devices, and requests with their times. table1.toml, of the paper, comes with zscout and
+    is used if there is no other file of that name. No mesh is needed, and no time passes. Without --json it prints a
+    table with a row for each device (for each holder of a sharable device) and a column for each second, or for each
+    interval between two events if seconds are not the right step.
 
     \b
     Examples:

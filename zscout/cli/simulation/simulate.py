@@ -29,46 +29,47 @@ def parse_address(text: str, option: str) -> tuple[str, int]:
     """Host and port of `HOST:PORT` or `PORT`. Raises BadInput."""
     found = _ADDRESS.fullmatch(text)
     if found is None or int(found["port"]) > 65_535:
-        raise BadInput(f"{option} {quoted(text)}: write HOST:PORT, as in 127.0.0.1:8080")
+        raise BadInput(f"{option}: {quoted(text)} is not an address; write HOST:PORT, as in 127.0.0.1:8080")
     return (found["host"] or "127.0.0.1").strip("[]"), int(found["port"])
 
 
 @click.command()
 @click.argument("building", type=BUILDING, required=False, shell_complete=buildings)
-@click.option("--list", "listing", is_flag=True, help="List the buildings that are shipped, and end.")
+@click.option("--list", "listing", is_flag=True, help="List the shipped buildings, and end.")
 @click.option(
     "--seed",
     type=click.IntRange(0, MAX_SEED),
     default=0,
-    help="Of all that is random in it: the same seed, the same building and noise.",
+    help="Seed of everything random: the same seed gives the same building and noise.",
 )
 @click.option(
-    "--speed", type=click.FloatRange(0, 100, min_open=True), default=1.0, help="The building's seconds in one of ours."
+    "--speed",
+    type=click.FloatRange(0, 100, min_open=True),
+    default=1.0,
+    help="Seconds of the building in one real second.",
 )
 @click.option(
     "--frames",
     "frame_rate",
     type=click.FloatRange(0.1, 60),
     default=10.0,
-    help="Pictures of each channel in a second of the building.",
+    help="Pictures of each channel per second of the building.",
 )
 @click.option(
     "--http",
     metavar="HOST:PORT",
     type=common.Parsed("text", parse_address),
     default="127.0.0.1:0",
-    help="Where cameras are served; port 0 is any free one.",
+    help="Address at which cameras are served; port 0 is any free port.",
 )
 @click.option("--channels", type=click.IntRange(1, 15), default=4, help="Video channels served.")
 @click.option(
     "--baud",
     type=click.IntRange(300, 1_000_000),
     default=9600,
-    help="Rate of the radio's line; the line is as much faster as the building is.",
+    help="Rate of the radio's line; --speed makes the line faster, too.",
 )
-@click.option(
-    "--loss", type=click.FloatRange(0, 1), default=0.0, help="Share of the radio's packets that no robot hears."
-)
+@click.option("--loss", type=click.FloatRange(0, 1), default=0.0, help="Share of the radio's packets that are lost.")
 @click.option(
     "--radio",
     "radio_link",
@@ -80,20 +81,18 @@ def parse_address(text: str, option: str) -> tuple[str, int]:
     "--node",
     metavar="FILE",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Write a node file with all the devices: zscout-node FILE serves them.",
+    help="Write a node file with all the devices: zscout node FILE serves them.",
 )
-@click.option(
-    "--framegrabbers", type=click.IntRange(1, MAX_FRAMEGRABBERS), default=2, help="How many the node file has."
-)
-@click.option("--mesh", is_flag=True, help="Show recorders and operators on the mesh who is where.")
-@click.option("--for", "seconds", type=SECONDS, help="End after so long in the building: 90s, 5m. Default: at Ctrl-C.")
+@click.option("--framegrabbers", type=click.IntRange(1, MAX_FRAMEGRABBERS), default=2, help="Number in the node file.")
+@click.option("--mesh", is_flag=True, help="Publish positions on the mesh, for recorders and operators.")
+@click.option("--for", "seconds", type=SECONDS, help="End after this time in the building: 90s. Default: at Ctrl-C.")
 @common.json_option("Print how to reach everything as one JSON object.")
 def simulate(building: str | None, listing: bool, mesh: bool, as_json: bool, **options: Any) -> None:
-    """Serves a simulated building: a radio on a serial port, cameras as MJPEG over HTTP, in real time.
+    """Serve a simulated building: a radio on a serial port, cameras as MJPEG over HTTP, in real time.
 
-    BUILDING is the name of one that is shipped (--list), a TOML file, or random:SEED for one that is drawn.
-    Robots move and see as packets over the radio tell them to; docs/simulation.md says what is true to life
-    in it, and how a building is written.
+    BUILDING is the name of a shipped building (--list), a TOML file, or random:SEED for a random one. Robots move
+    and see as packets over the radio order them to; docs/simulation.md describes what is realistic, and how to
+    write a building.
 
     \b
     Examples:
@@ -107,7 +106,7 @@ def simulate(building: str | None, listing: bool, mesh: bool, as_json: bool, **o
         print_shipped(as_json=as_json)
         return
     if building is None:
-        raise BadInput(f"which building? name one of {known_buildings()}, or a file")
+        raise BadInput(f"no building is given; name one of {known_buildings()}, or a file")
     plan = plan_named(building)
     from zscout.simulation.building.simulate import simulate as serve
 

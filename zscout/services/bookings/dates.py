@@ -13,6 +13,7 @@ from itertools import dropwhile, takewhile
 from typing import Final
 from zoneinfo import ZoneInfo
 
+from zscout.config.strict import quoted
 from zscout.messages import MAX_AHEAD, BookingRecord, Instant
 
 DAY: Final = 86_400
@@ -24,7 +25,7 @@ def zone_of(name: str) -> ZoneInfo:
     try:
         return ZoneInfo(name)
     except (ValueError, KeyError, OSError):
-        raise ValueError(f"{name[:80]!r} is no time zone; write one as in Europe/Berlin, or UTC") from None
+        raise ValueError(f"{quoted(name[:80])} is not a time zone; write one, as in Europe/Berlin or UTC") from None
 
 
 def dates(booking: BookingRecord, after: float, before: float) -> list[Instant]:

@@ -217,7 +217,7 @@ class BookingKeeper:
     def _on_shared(self, query: IncomingQuery[ShareBookings]) -> None:
         self._asked = self.mesh.now()
         if self._waiting >= MAX_SAVING:
-            raise Refused("busy", "this host is still writing bookings to its disk; ask again")
+            raise Refused("busy", "this host is still writing bookings to its disk; try again")
         if query.message.time is not None:
             self.records.forget_old(query.message.time)
         if self.records.take(query.message.records):

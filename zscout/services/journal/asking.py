@@ -87,9 +87,9 @@ async def ask_journals(
     candidate comes into sight; `wall`: seconds since 1970, UTC. Raises NoJournal where none answers, or one does not
     go on."""
     hosts = await _candidates(mesh, fleet, look)
-    why = f"fleet {fleet.name} has no journal that could be asked"
+    why = f"no journal of fleet {fleet.name} can be read"
     if not hosts:
-        raise NoCandidate(f"{why}: no candidate is seen; see [journal] of a node file")
+        raise NoCandidate(f"{why}: no node that keeps one is seen; see [journal] of a node file")
     slots = asyncio.Semaphore(AT_ONCE)
 
     async def page(host: HostName, question: HistoryAsk) -> History | None:
@@ -103,7 +103,7 @@ async def ask_journals(
         while question is not None and len(found) < most:
             answer = await page(host, question)
             if answer is None:
-                raise NoJournal(f"{host} did not go on to tell its journal; try again")
+                raise NoJournal(f"{host} stopped answering halfway; try again")
             found += answer.holds
             # What does not go on would never end.
             ahead = answer.next is not None and answer.next != question.before
@@ -114,7 +114,7 @@ async def ask_journals(
     journals = {host: first for host, first in zip(hosts, firsts, strict=True) if first is not None}
     if not journals:
         count = "1 candidate" if len(hosts) == 1 else f"{len(hosts)} candidates"
-        raise NoJournal(f"{why}: none of its {count} answers; see [journal] of a node file")
+        raise NoJournal(f"{why}: none of {count} answered; see [journal] of a node file")
     now = wall()
     begins = [one.since for one in journals.values() if one.since is not None]
     began = now - asked.since if asked.since is not None else min(begins, default=now)

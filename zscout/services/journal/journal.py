@@ -236,7 +236,7 @@ class Journal:
         if query.message.rc is not None:
             check_need(query.message.rc)
         if self._asking >= MAX_ASKING:
-            raise Refused("busy", "this journal has many questions to answer; ask again")
+            raise Refused("busy", "this journal has too many questions to answer; try again")
         self._asking += 1
         self._supervisor.spawn(self._answer(query))
 

@@ -14,6 +14,7 @@ from zscout import messages
 from zscout.behaviors.components.component import installed_kinds
 from zscout.config.fleet import Fleet, beside
 from zscout.config.node import MAX_KINDS, ComponentsConfig
+from zscout.config.strict import quoted
 from zscout.keyexpr import BadName, check_name
 from zscout.mesh import IncomingQuery, Mesh, Refused, Supervisor
 from zscout.mesh.supervision import done_within
@@ -92,7 +93,7 @@ class ComponentHost:
 
     def _on_request(self, request: IncomingQuery[messages.ComponentOperation]) -> None:
         if self._underway >= MAX_UNDERWAY:
-            raise Refused("busy", "too many operations are under way here; ask again")
+            raise Refused("busy", "too many operations are running here; try again")
         if self.mesh.keys.closed and not isinstance(request.message, messages.ListComponents | messages.ReadOutput):
             self._authority.check_machine(self.mesh.keys.sender_of(request.key), "tell a node to do this")
         self._underway += 1
@@ -130,7 +131,7 @@ class ComponentHost:
             case messages.MoveComponent():
                 check_name(operation.to, "host")
                 if operation.to == self.mesh.me.host or operation.to_incarnation <= operation.incarnation:
-                    raise Refused("bad_request", "it moves to another host, and gets a higher incarnation there")
+                    raise Refused("bad_request", "it is moving to another host, and gets a higher incarnation there")
                 return await self._find(operation.component, operation.incarnation).move(operation)
             case messages.RestoreComponent():
                 return await self._find(operation.component, operation.incarnation).restore(operation)
@@ -155,10 +156,10 @@ class ComponentHost:
         where = kinds.get(start.spec.kind)
         if where is None:
             there = ", ".join(self._startable(kinds)) or "none"
-            message = f"no kind {start.spec.kind!r} is installed here; there are {there}"
+            message = f"unknown kind {quoted(start.spec.kind)}; installed here: {there}"
             raise Refused("unknown_kind", message[: messages.MAX_ERROR])
         if len(self._living) >= self._rules.max:
-            raise Refused("too_many", f"{len(self._living)} components run here; [components] max allows no more")
+            raise Refused("too_many", f"{len(self._living)} components run here, the most that [components] max allows")
         if self._stopping:
             raise Refused("not_allowed", "this node is stopping")
         name = start.component
@@ -183,7 +184,7 @@ class ComponentHost:
             return process
         known = self._known.get(name, 0)
         if start.incarnation <= known:
-            raise Refused("old_incarnation", f"{name} was started here as incarnation {known} already")
+            raise Refused("old_incarnation", f"{name} was already started here as incarnation {known}")
         if name in self._living:
             raise Refused("runs_already", f"incarnation {known} of {name} lives here; stop it first")
         return None
@@ -195,11 +196,11 @@ class ComponentHost:
             raise Refused("not_allowed", "this host starts no components: [components] allow is false")
         if kinds is not None and start.spec.kind not in kinds:
             allowed = ", ".join(kinds) or "none"
-            message = f"this host starts no {start.spec.kind!r}; [components] kinds names {allowed}"
+            message = f"this host does not start kind {quoted(start.spec.kind)}; [components] kinds allows {allowed}"
             raise Refused("not_allowed", message[: messages.MAX_ERROR])
         size = len(msgspec.json.encode(start.spec.params))
         if size > messages.MAX_PARAMS_SIZE:
-            raise Refused("too_large", f"params are {size} bytes as JSON; at most {messages.MAX_PARAMS_SIZE} are taken")
+            raise Refused("too_large", f"params are {size} bytes as JSON; write at most {messages.MAX_PARAMS_SIZE}")
 
     async def _list(self, component: str | None) -> messages.ComponentList:
         kinds = await asyncio.to_thread(self._kinds)
@@ -217,7 +218,7 @@ class ComponentHost:
         """`old` is the code where a higher incarnation was started here: the one that is meant has ended."""
         process = self._living.get(name) or self._ended.get(name)
         if process is None:
-            raise Refused("unknown_component", f"there is no component {name[:80]!r} on this host")
+            raise Refused("unknown_component", f"there is no component {quoted(name[:80])} on this host")
         own = process.start.incarnation
         if incarnation is not None and incarnation != own:
             code = old if incarnation < own else "unknown_component"

@@ -138,7 +138,7 @@ class ComponentProcess:
             return self.moved
         if self._moving is not None and not self._moving[1].done():
             if self._moving[0].to_incarnation != order.to_incarnation:
-                raise Refused("move_failed", f"it is moving to {self._moving[0].to} already")
+                raise Refused("move_failed", f"it is already moving to {self._moving[0].to}")
         else:
             self._check_runs()
             self._moving = order, asyncio.get_running_loop().create_task(self._move(order))
@@ -154,7 +154,7 @@ class ComponentProcess:
 
     async def restore(self, order: RestoreComponent) -> ComponentView:
         if self.phase != "standby":
-            raise Refused("move_failed", f"it is {self.phase} here; only one that stands by is restored")
+            raise Refused("move_failed", f"it is {self.phase} here; only a component that is standing by is restored")
         await self._ask(order, SLACK)
         return self.view()
 

@@ -169,7 +169,7 @@ class TreeMeter:
         # A child that ended keeps its time until somebody waits for it, and then hands it on.
         trees = _trees(self._proc, self._now(), [self._root], ended=True)
         if self._root not in trees:
-            raise OSError(f"{self._proc} does not tell of process {self._root}; mount it, or set load = true")
+            raise OSError(f"{self._proc} does not show process {self._root}; mount it, or set load = true")
         return trees[self._root]
 
 

@@ -83,7 +83,7 @@ class CertificateNotices:
                 self._told.discard(report.host)
             elif report.host not in self._told:
                 self._told.add(report.host)
-                end = f"ends in {left / DAY:.1f} days" if left > 0 else "has ended"
+                end = f"expires in {left / DAY:.1f} days" if left > 0 else "has expired"
                 title = f"zscout {self._fleet}: the certificate of {report.host} {end}"
                 found.append(notification("certificate_ends", "", title, "renew it: zscout cert renew"))
         return found

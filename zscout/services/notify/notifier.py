@@ -62,7 +62,6 @@ class Notifier:
         self._supervisor.call_later(self._look_every, self._look)
 
     def stop(self) -> None:
-        """What is not sent yet is left out."""
         self._stopping.set()
         self._supervisor.cancel()
 
@@ -76,7 +75,6 @@ class Notifier:
             self._full.warning("", "%d notifications wait to be sent: one is left out", QUEUE)
 
     def on_danger(self, danger: BookedDanger) -> None:
-        """A booking may not be kept, or is safe again."""
         self.tell(booking_notice(self._fleet, danger))
 
     def _addresses(self, about: Notification) -> tuple[Address, ...]:

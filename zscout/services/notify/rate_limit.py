@@ -18,7 +18,6 @@ class RateLimit:
         self._level, self._at = self._most, 0
 
     def allows(self, now: Ns) -> bool:
-        """Takes one, if there is one."""
         self._level = min(self._most, self._level + (now - self._at) * self._gain)
         self._at = now
         if self._level < MINUTE:

@@ -65,7 +65,7 @@ class PlacerRequestHandler:
             query.answer(self.placements(operation.component))
             return
         if len(self._early) + len(self._waiting) >= MAX_WAITING:
-            raise Refused("busy", "too many operations are waiting here; ask again")
+            raise Refused("busy", "too many operations are waiting here; try again")
         event = _event_of(operation)
         if self._keys.closed:
             event = self._allowed(event, self._keys.sender_of(query.key))
@@ -97,7 +97,7 @@ class PlacerRequestHandler:
 
     def close(self) -> None:
         """Refuses what still waits: another placer has to be asked."""
-        problem = Refused("not_leading", "this placer stopped leading; ask again").problem
+        problem = Refused("not_leading", "this placer stopped leading; try again").problem
         for query in (*(query for query, _ in self._early), *self._waiting):
             query.refuse(problem)
         self._early, self._waiting = [], {}
@@ -126,7 +126,7 @@ class PlacerRequestHandler:
                 continue
             self._pop(query)
             if status is None:
-                query.refuse(Refused("unknown_component", "nothing is known of it").problem)
+                query.refuse(Refused("unknown_component", "there is no component of this name").problem)
             elif isinstance(operation, messages.MigrateComponent) and waiting.host == status.host != operation.to:
                 reason = status.reason or f"it goes on on {status.host}"
                 query.refuse(Refused("move_failed", reason).problem)
@@ -174,6 +174,6 @@ def _checked(spec: messages.ComponentSpec) -> messages.ComponentSpec:
         check_name(label, "label")
     size = len(msgspec.json.encode(spec.params))
     if size > messages.MAX_PARAMS_SIZE:
-        raise Refused("too_large", f"the parameters have {size} bytes; at most {messages.MAX_PARAMS_SIZE} are taken")
+        raise Refused("too_large", f"the parameters have {size} bytes; at most {messages.MAX_PARAMS_SIZE} are allowed")
     hosts = None if spec.hosts is None else sorted(set(spec.hosts))
     return structs.replace(spec, labels=sorted(set(spec.labels)), hosts=hosts, owner="")

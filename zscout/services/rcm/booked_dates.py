@@ -351,7 +351,7 @@ class BookedDates:
         return None if record is None else Date(record, int(start))
 
     def _conflict(self, by: str) -> str:
-        return f"{self._name(by)} stands" if by else "no RC that would do is free then"
+        return f"{self._name(by)} takes precedence" if by else "no matching device is free then"
 
     # For people and programs
 
@@ -367,7 +367,7 @@ class BookedDates:
             state: DateState = "conflict" if by is not None else "open" if taken is None else "taken"
             danger = self._danger.get(date.id, "") if by is None else self._conflict(by)
             if kept is None and by is None and self._waits_for_votes:
-                danger = "an RC that is shared has yet to say whether it would carry it"
+                danger = "a shared device has not yet answered whether it can carry it"
             bound = dict(kept.bound) if kept is not None else date.bound
             told.append(BookedDate(date.start, date.start + runtime, state, bound, taken, danger))
         fields = {name: getattr(record, name) for name in BookingView.__struct_fields__ if name != "dates"}

@@ -95,14 +95,14 @@ class BookingHandler:
 
     def close(self) -> None:
         for one in self._undecided:
-            one.query.refuse(Refused("not_leading", "this RCM stopped leading; ask again").problem)
+            one.query.refuse(Refused("not_leading", "this manager stopped leading; try again").problem)
 
     def on_operation(self, query: Query) -> None:
         if self._fleet.strategy != "adaptive":
-            words = f'this fleet schedules by "{self._fleet.strategy}", which keeps no bookings; only "adaptive" does'
+            words = f'strategy "{self._fleet.strategy}" has no bookings; set strategy = "adaptive" under [fleet]'
             raise Refused("wrong_strategy", words)
         if not self._settled():
-            raise Refused("busy", "after a restart of the whole fleet its dates are not known yet; ask again")
+            raise Refused("busy", "the whole fleet restarted and its bookings are not known yet; try again")
         sender = self._keys.sender_of(query.key)
         match query.message:
             case Book():
@@ -135,7 +135,7 @@ class BookingHandler:
             zone_of(wanted.zone)
             runtime, patience = duration(wanted.runtime, "runtime"), duration(wanted.patience, "patience")
             if wanted.maintenance and any(map(is_pattern, wanted.needs)):
-                raise ValueError("maintenance is of RCs by their names, not by pattern")
+                raise ValueError("name each device for maintenance; patterns are not allowed")
         except (BadName, ValueError) as error:
             raise Refused("bad_request", str(error)) from None
         if not -MAX_PRIORITY <= wanted.priority <= MAX_PRIORITY:
@@ -144,16 +144,16 @@ class BookingHandler:
         over = wanted.start + min(patience, runtime) / SECOND
         if over <= time:
             date, now = told(wanted.start, wanted.zone), told(time, wanted.zone)
-            raise Refused("bad_date", f"{date} is past; it is {now} by fleet time")
+            raise Refused("bad_date", f"{date} is in the past; by the fleet's clock it is {now}")
         last = wanted.until if wanted.every and wanted.until is not None else wanted.start
         if max(last, wanted.start) > time + MAX_AHEAD:
-            raise Refused("bad_date", "nothing is booked more than a year ahead")
+            raise Refused("bad_date", "a booking can't be more than a year ahead; ask for an earlier date")
         if wanted.every and wanted.until is None:
-            raise Refused("bad_date", "what is repeated needs an end: give until")
+            raise Refused("bad_date", "a repeated booking needs an end; give until")
         if wanted.every and last < wanted.start:
-            raise Refused("bad_date", "until is before the first date")
+            raise Refused("bad_date", "until is before the first date; give a later one")
         if wanted.every and runtime > (wanted.every * DAY - 3_600) * SECOND:
-            raise Refused("bad_date", "it would overlap its own next date; make it shorter, or less often")
+            raise Refused("bad_date", "each date would overlap the next; make it shorter, or less often")
         made = self._dates.number()
         fields = {name: getattr(wanted, name) for name in Book.__struct_fields__}
         fields["who"] = self._authority.known_as(sender, wanted.who)
@@ -163,11 +163,11 @@ class BookingHandler:
 
     def _check_length(self, runtime: Decimal) -> None:
         if runtime > MAX_AHEAD:
-            raise Refused("bad_date", "nothing is booked for longer than a year; ask for less")
+            raise Refused("bad_date", "a booking can't be longer than a year; ask for less")
 
     def _check_allowed(self, wanted: Book | FindSlots, sender: Sender) -> None:
         if isinstance(wanted, Book) and wanted.maintenance:
-            self._authority.check_operator(sender, "have RCs in maintenance")
+            self._authority.check_operator(sender, "put devices in maintenance")
             return
         asked = Foresee(wanted.id, wanted.id, wanted.needs, wanted.priority, wanted.runtime)
         self._authority.check_ask(sender, asked, lambda _: 0)
@@ -176,11 +176,11 @@ class BookingHandler:
         records, owner = self._keeper.records, record.owner
         most = self._fleet.limits.max_bookings_per_host
         if sum(one.owner == owner and not one.unbooked for one in records) >= most:
-            raise Refused("too_many", f"{owner} has {most} bookings; unbook one")
+            raise Refused("too_many", f"{owner} has {most} bookings, the most allowed; cancel one")
         if len(records) >= MAX_BOOKINGS or records.size >= MAX_KEPT:
-            raise Refused("too_many", f"this fleet keeps {len(records)} bookings already; unbook some")
+            raise Refused("too_many", f"this fleet already has {len(records)} bookings; cancel some")
         if len(self._core.bookings()) + len(self._dates.open_dates(record)) > MAX_CLAIMS:
-            raise Refused("too_many", f"{MAX_CLAIMS} dates are booked; repeat it less often")
+            raise Refused("too_many", f"{MAX_CLAIMS} dates are booked, the most allowed; repeat it less often")
 
     def _decide(self, query: Query, record: BookingRecord) -> bool:
         """Whether it is decided: all its dates that are kept free from now on are free, or one is not."""
@@ -223,7 +223,7 @@ class BookingHandler:
     def _answer_kept(self, query: Query, record: BookingRecord, *, withdraw: bool = False) -> None:
         """Answers once it is kept; `withdraw`: forgets it where it can't be."""
         if self._keeping >= MAX_UNDECIDED:
-            raise Refused("busy", f"{MAX_UNDECIDED} bookings are being kept already; ask again")
+            raise Refused("busy", f"{MAX_UNDECIDED} bookings are already being stored; try again")
         self._keeping += 1
         self._supervisor.spawn(self._keep(query, record.id, withdraw=withdraw))
 
@@ -239,7 +239,7 @@ class BookingHandler:
                 # Not given up, which is final: another leader may have made it as well, or may have heard of it.
                 self._keeper.records.remove(booking)
                 self._dates.reconcile()
-            query.refuse(Refused("not_kept", f"nobody else keeps this booking: {why}").problem)
+            query.refuse(Refused("not_kept", f"no other host stored this booking: {why}").problem)
             return
         query.answer(self._dates.view(record))
 
@@ -248,7 +248,7 @@ class BookingHandler:
     def _unbook(self, query: Query, operation: Unbook, sender: Sender) -> None:
         record = self._keeper.records.get(operation.id)
         if record is None:
-            raise Refused("unknown_booking", f"there is no booking {operation.id}; see zscout bookings")
+            raise Refused("unknown_booking", f"there is no booking {operation.id}; see zscout booking list")
         self._check_owner(sender, record, "unbook it")
         if operation.start is None:
             new = record if record.unbooked else self._dates.change(record, unbooked=True)
@@ -258,7 +258,7 @@ class BookingHandler:
             new = self._dates.change(record, dropped=sorted({*record.dropped, operation.start}))
         else:
             date = told(operation.start, record.zone)
-            raise Refused("bad_date", f"{date} is no date of {record.name}; see zscout bookings")
+            raise Refused("bad_date", f"{date} is not a date of {record.name}; see zscout booking list")
         self._dates.reconcile()
         self._answer_kept(query, new)
 
@@ -282,7 +282,7 @@ class BookingHandler:
         start = self._dates.local(max(asked.start or 0, -(-self._dates.to_fleet(now) // SECOND)))
         within = min(asked.within, MAX_AHEAD - (start - now) / SECOND)
         if within < 0:
-            raise Refused("bad_date", "nothing is booked more than a year ahead; ask for earlier times")
+            raise Refused("bad_date", "a booking can't be more than a year ahead; ask for earlier times")
         wanted = Booking(asked.id, needs, asked.priority, start, runtime, runtime, now, owner=sender.host)
         self._try(_Undecided(query, lambda: self._answer_slots(query, asked, wanted, start + round(within * SECOND))))
 
@@ -307,7 +307,7 @@ class BookingHandler:
 
     def _try(self, undecided: _Undecided) -> None:
         if len(self._undecided) >= MAX_UNDECIDED:
-            raise Refused("busy", f"{MAX_UNDECIDED} bookings wait for votes already; ask again")
+            raise Refused("busy", f"{MAX_UNDECIDED} bookings already wait for votes; try again")
         if not undecided.decide():
             undecided.until = self._now() + round(DECIDE_WITHIN * SECOND)
             self._undecided.append(undecided)
@@ -324,7 +324,7 @@ class BookingHandler:
                 one.query.refuse(refused.problem)
                 continue
             if self._now() >= one.until:
-                one.query.refuse(Refused("busy", "an RC that is shared does not say what it would carry").problem)
+                one.query.refuse(Refused("busy", "a shared device did not answer what it can carry; try again").problem)
             else:
                 self._undecided.append(one)
 
@@ -343,20 +343,20 @@ class BookingHandler:
         if record is None or record.unbooked:
             if goes_on:
                 return ask.booking if record is None and start_of(ask.booking) is not None else ""
-            raise Refused("unknown_booking", f"there is no booking {booking}, or it was given up; see zscout bookings")
+            raise Refused("unknown_booking", f"no booking {booking}, or it was cancelled; see zscout booking list")
         self._check_owner(sender, record, "take it up")
         if record.maintenance:
-            raise Refused("bad_request", f"{record.name} is maintenance: nobody takes it up")
+            raise Refused("bad_request", f"{record.name} is maintenance, which no request can use")
         if ask.needs != record.needs or ask.priority != record.priority:
-            raise Refused("bad_request", f"its needs and priority are not those of booking {record.name}")
+            raise Refused("bad_request", f"needs or priority differ from booking {record.name}; leave them out")
         dates_ = [date for date in self._dates.standing(record) if not start or str(date.start) == start]
         free = [date for date in dates_ if self._dates.taken_by(date) is None]
         if free:
             return free[0].id
         if goes_on:
             return next((date.id for date in self._dates.open_dates(record) if str(date.start) == start), "")
-        why = "somebody has taken it up" if dates_ else "its dates are over, or another booking stands"
-        raise Refused("unknown_booking", f"{record.name} can't be taken up: {why}; see zscout bookings")
+        why = "another request uses it" if dates_ else "its dates are over, or another booking takes precedence"
+        raise Refused("unknown_booking", f"booking {record.name} can't be used: {why}; see zscout booking list")
 
     # Telling
 

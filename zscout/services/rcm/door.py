@@ -50,20 +50,20 @@ def check_door(
 
 def _too_few(pattern: str, left: Sequence[RcName], wanted: Mapping[str, int]) -> Refused:
     what = (
-        f"{wanted[pattern]} RCs that meet {pattern} are asked for" if wanted[pattern] > 1 else f"{pattern} is asked for"
+        f"{wanted[pattern]} devices that match {pattern} are requested"
+        if wanted[pattern] > 1
+        else f"{pattern} is requested"
     )
-    there = f"only {', '.join(left[:MAX_NAMED])}" if left else "none but those that are named"
-    return Refused("unknown_device", f"{what}, and {there} can be had for it; ask for less")
+    there = f"only {', '.join(left[:MAX_NAMED])}" if left else "none but those you named"
+    return Refused("unknown_device", f"{what}, but {there} can be used; request fewer")
 
 
 def _unknown(need: Need, known: Collection[RcName], *, may_wait: bool) -> Refused:
     near = difflib.get_close_matches(need, known, n=3)
     hint = f"did you mean {' or '.join(near)}? " if near else ""
-    what = f"an RC that meets {need}" if is_pattern(need) else need
-    remedy = (
-        "to wait until it comes, say so (--wait-for-device)" if may_wait else "zscout status lists all that are known"
-    )
-    return Refused("unknown_device", f"nobody knows {what}; {hint}{remedy}")
+    what = f"no device matches {need}" if is_pattern(need) else f"unknown device {need}"
+    remedy = "to wait for it anyway, add --wait-for-device" if may_wait else "zscout status lists all devices"
+    return Refused("unknown_device", f"{what}; {hint}{remedy}")
 
 
 def _objection(rc: RcName, params: Amounts, parameters: Parameters | None) -> Refused | None:
@@ -76,14 +76,14 @@ def _objection(rc: RcName, params: Amounts, parameters: Parameters | None) -> Re
             names = sorted(bounds)
             near = difflib.get_close_matches(name, names, n=1)
             more = f" and {len(names) - MAX_NAMED} more" if len(names) > MAX_NAMED else ""
-            takes = f"it knows {', '.join(names[:MAX_NAMED])}{more}" if names else "it takes none"
+            takes = f"it has {', '.join(names[:MAX_NAMED])}{more}" if names else "it has none"
             hint = f"did you mean {near[0]}?" if near else takes
-            return Refused("unknown_parameter", f"{rc} knows no parameter {name}; {hint}")
+            return Refused("unknown_parameter", f"{rc} has no parameter {name}; {hint}")
         one = bounds[name]
         if one.bound is not None and value > one.bound and not any(other in params for other in one.unless):
             unit = f" {one.unit}" if one.unit else ""
             asked = f"{name} {_text(value)} of {_text(one.bound)}{unit} at {rc}"
-            return Refused("too_much", f"can never start: {asked}; ask for less")
+            return Refused("too_much", f"can never start: {asked}; request less")
     return None
 
 

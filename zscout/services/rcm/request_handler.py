@@ -128,7 +128,7 @@ class RequestHandler:
             *self._deferred,
             *(query for queries in self.waiting.values() for query in queries),
         ):
-            query.refuse(Refused("not_leading", "this RCM stopped leading; ask again").problem)
+            query.refuse(Refused("not_leading", "this manager stopped leading; try again").problem)
 
     # Operations
 
@@ -301,19 +301,19 @@ class RequestHandler:
         """Refuses what is too much at once; what this burst has brought already counts."""
         coming = self._coming() if self._batch else []
         if self.core.waiting + len(coming) >= self.limits.max_queued:
-            raise Refused("queue_full", f"{self.limits.max_queued} ARCs wait already; ask again later")
+            raise Refused("queue_full", f"{self.limits.max_queued} requests already wait; try again later")
         most = self.limits.max_requests_per_client
         if coming.count(client) + self.core.count_of(client) >= most:
-            raise Refused("too_many", f"{client} has {most} requests open already")
+            raise Refused("too_many", f"{client} already has {most} open requests, the most; cancel one")
         most = self.limits.max_requests_per_host
         if self.core.count_of_owner(host) + sum(one.startswith(f"{host}/") for one in coming) >= most:
-            raise Refused("too_many", f"the clients of {host} have {most} requests open already")
+            raise Refused("too_many", f"clients of {host} already have {most} open requests, the most; cancel one")
 
     def _forecast(self, query: Query, asked: Foresee, sender: Sender) -> None:
         self.flush()
         arc = arc_id(str(sender), asked.id)
         if self.core.arc(arc) is not None:
-            raise Refused("bad_request", f"{asked.id} is a request already; ask how it stands")
+            raise Refused("bad_request", f"{asked.id} is already a request; ask how it stands")
         now = self.mesh.now()
         self._authority.check_ask(sender, asked, lambda names: self._open_of(names, arc))
         request = admit(asked, str(sender), arc, self.core, self.limits)
@@ -418,7 +418,7 @@ class RequestHandler:
             self._hand_over(query, operation, sender, to)
             return
         if len(self._moving) >= MAX_BATCH:
-            raise Refused("busy", f"{MAX_BATCH} hand-overs wait here already; ask again")
+            raise Refused("busy", f"{MAX_BATCH} hand-overs already wait here; try again")
         self._moving[query] = None
         self._membership.find(to, partial(self._on_new_client, query, operation, sender, to))
 
@@ -480,7 +480,7 @@ class RequestHandler:
             taken = self.core.arc(renamed)
             if taken is not None and (taken.request.needs != arc.request.needs or taken.place < arc.place):
                 # Else it is the same: its new client has asked for it, and could not prove that it has its place.
-                raise Refused("bad_request", f"{to} has a request {name} already; ask under random ids")
+                raise Refused("bad_request", f"{to} already has a request {name}; use random ids")
             moves.append(HandedOver(arc.id, to, renamed))
         return moves
 
@@ -498,11 +498,11 @@ class RequestHandler:
 def check_place(place: Place, core: Core) -> None:
     """Raises Refused for a place that no RCM can have given."""
     if absurd(place.term, core.term):
-        raise Refused("bad_request", "place is of a term that has not been; leave it out")
+        raise Refused("bad_request", "place has a future term; omit it")
     if place.term > core.term:
-        raise Refused("old_term", "place is of a higher term than this RCM's", core.term)
+        raise Refused("old_term", "place has a higher term than this manager", core.term)
     if place.arrival < 1 or not core.could_have_issued(place):
-        raise Refused("bad_request", "place was never given; leave it out")
+        raise Refused("bad_request", "place was never given; omit it")
 
 
 def admit(
@@ -510,7 +510,7 @@ def admit(
 ) -> ArcRequest:
     """The request, if it may be made. Raises Refused with what is wrong and how to mend it."""
     if not ask.needs:
-        raise Refused("bad_request", "needs is empty; name at least one RC")
+        raise Refused("bad_request", "needs is empty; name at least one device")
     if len(ask.needs) > limits.max_needs:
         raise Refused("bad_request", f"{len(ask.needs)} needs; at most {limits.max_needs} are allowed")
     if not -MAX_PRIORITY <= ask.priority <= MAX_PRIORITY:

@@ -72,7 +72,7 @@ def drawn_plan(seed: int, *, robots: int = 4) -> Plan:
         if len(hiding_places(plan)) >= HIDES:
             with suppress(ValueError):
                 return with_robots(plan, robots, seed=seed)
-    raise ValueError(f"no room of {TRIES} drawn from seed {seed} had {HIDES} places to hide; take another seed")
+    raise ValueError(f"no room of {TRIES} drawn from seed {seed} had {HIDES} places to hide; use another seed")
 
 
 def with_robots(plan: Plan, count: int, *, seed: int = 0) -> Plan:

@@ -49,7 +49,7 @@ def plan_named(name: str) -> Plan:
         return drawn_plan(int(seed))
     path = Path(name)
     if path.suffix != ".toml" and not path.is_file():
-        raise BadInput(f"there is no building {quoted(name)}; name one of {known_buildings()}, or a file")
+        raise BadInput(f"unknown building {quoted(name)}; name one of {known_buildings()}, or a file")
     return load_plan(path)
 
 
@@ -57,7 +57,7 @@ def check_plan(plan: Plan, top: Where) -> None:
     """Raises BadInput for an inconsistent plan."""
     check_name(plan.name, top / "name")
     if not plan.lights:
-        raise (top / "light").bad("there is none", "add a [[light]]: cameras see nothing without")
+        raise (top / "light").bad("is missing", "add a [[light]]: cameras see nothing without one")
     named: tuple[tuple[str, Sequence[Furniture | Light | Person | Robot]], ...] = (
         ("furniture", plan.furniture),
         ("light", plan.lights),
@@ -91,16 +91,16 @@ def check_plan(plan: Plan, top: Where) -> None:
     for number, person in enumerate(plan.people):
         where = (top / "person").item(number, person.name) / "path"
         if len(person.path) < 2:
-            raise where.bad(f"has {len(person.path)} point(s)", "write two or more, as in [[0.5, 1], [3, 1]]")
+            raise where.bad("has less than two points", "write two or more, as in [[0.5, 1], [3, 1]]")
         for corner, point in enumerate(person.path):
             _check_point(point, plan, where.item(corner, person.name), PORCH)
         if all(math.dist(person.path[0], point) < 0.1 for point in person.path):
-            raise where.bad("leads nowhere", "move one of its points by 0.1 m or more")
+            raise where.bad("has no length", "move one of its points by 0.1 m or more")
 
 
 def _check_point(point: tuple[float, ...], plan: Plan, where: Where, beyond: float = 0.0) -> None:
     if len(point) != 2:
-        raise where.bad(f"has {len(point)} number(s)", "write a place as [x, y]")
+        raise where.bad("is not two numbers", "write a place as [x, y]")
     x, y = point
     if not (-beyond <= x <= plan.width + beyond and -beyond <= y <= plan.depth + beyond):
         ends = [f"from {0 - beyond:g} to {size + beyond:g}" for size in (plan.width, plan.depth)]
@@ -126,7 +126,7 @@ def _check_light(light: Light, plan: Plan, where: Where) -> None:
     if light.kind == "window":
         edge = min(light.x, plan.width - light.x, light.y, plan.depth - light.y)
         if edge > 0.01:
-            raise where.bad("is a window in no outer wall", "put its x or y on an outer wall")
+            raise where.bad("is not in an outer wall", "put its x or y on an outer wall")
         if not light.depth / 2 <= light.z <= plan.height - light.depth / 2:
             raise (where / "z").bad(
                 f"is {light.z:g} m, so the window leaves its wall",
@@ -146,7 +146,7 @@ def check_starts(plan: Plan, top: Where) -> None:
         where = (top / "robot").item(number, robot.name)
         if obstacles.gap(robot.x, robot.y) < RADIUS:
             raise where.bad(
-                f"({robot.x:g}, {robot.y:g}) is in a wall or furniture, or touches it",
+                f"({robot.x:g}, {robot.y:g}) is in or touches a wall or furniture",
                 f"leave {RADIUS:g} m around its middle",
             )
         for other in plan.robots[:number]:

@@ -206,9 +206,9 @@ def _point(link: Path, port: str) -> None:
     remedy = "give another name for the radio's link"
     if link.is_symlink():
         if not str(link.readlink()).startswith("/dev/pts/"):
-            raise BadInput(f"{link}: is a link to something else; {remedy}")
+            raise BadInput(f"{link}: links to something else; {remedy}")
     elif link.exists():
-        raise BadInput(f"{link}: is there already; {remedy}")
+        raise BadInput(f"{link}: already exists; {remedy}")
     beside = link.with_name(f"{link.name[:200]}.{os.getpid()}")
     try:
         beside.symlink_to(port)

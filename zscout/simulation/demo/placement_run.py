@@ -116,7 +116,7 @@ class PlacementDemo(DemoRunner):
         except RequestRefused as refused:
             raise DemoFailed(f"{name}: {refused}") from refused
         if placement.state != "running" or placement.host is None:
-            raise DemoFailed(f"{name} does not run: {placement.reason or placement.state} {placement.tail}")
+            raise DemoFailed(f"{name} is not running: {placement.reason or placement.state} {placement.tail}")
         self.trial.placed[name] = placement.host
 
     async def _stop(self, name: str) -> None:

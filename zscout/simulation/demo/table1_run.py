@@ -61,8 +61,8 @@ class Table1Demo(DemoRunner):
         done = [self._milestone(arrival.request.arc, "done").wait() for arrival in self.workload.arrivals]
         assert self.zero is not None  # noqa: S101
         left = _latest_end(self.workload.arrivals) / SECOND - self.elapsed()
-        await self.within(left + LATE, asyncio.gather(*done), "not all ARCs had their time")
-        await self.within(ANSWER, self._all_free(), "the RCM did not publish the last end")
+        await self.within(left + LATE, asyncio.gather(*done), "not all requests had their time")
+        await self.within(ANSWER, self._all_free(), "the leader did not publish the last end")
 
     async def _all_ready(self, mesh: Mesh) -> None:
         mesh.subscribe(mesh.keys.grants, Grants, self._on_grants)

@@ -26,7 +26,11 @@ STYLES: Final = {
     "4": "white on #ff1463",
     "-": "bright_black",
 }  # the recording's colours, by ARC
-SOURCES: Final = {"RCM": "what the RCM published", "ARCs": "what the ARCs' bodies saw", "paper": "Table 2 of the paper"}
+SOURCES: Final = {
+    "RCM": "what the leader published",
+    "ARCs": "what request bodies saw",
+    "paper": "Table 2 of the paper",
+}
 LATE: Final = "all came in the order of the paper's Table 2, but late: this machine is busy"
 DIFFERENT: Final = "not in the order of the paper's Table 2"
 WIDE: Final = 26  # columns left of the first second
@@ -86,7 +90,7 @@ def _report(tables: dict[str, Table], wrong: list[Difference], seen: Observed, p
     terminal.print_line("")
     if wrong:
         for item in wrong:
-            words = f"the RCM {item.published}, the ARCs {item.bodies}, the paper {item.paper}"
+            words = f"the leader {item.published}, the requests {item.bodies}, the paper {item.paper}"
             terminal.print_line(f"differs: {item.rc} in second {item.second}: {words}")
     else:
         cells = sum(len(row) for row in tables["paper"].values())

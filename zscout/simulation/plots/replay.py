@@ -27,7 +27,7 @@ class ReplayRecording:
     def watch(self, now: Ns, effects: list[Effect]) -> None:
         """Record the effects of `now`. Raises BadInput past MAX_DRAWN."""
         if effects and now > MAX_DRAWN:
-            raise BadInput(f"a recording ends at {MAX_DRAWN // SECOND} s, and this goes on; leave out --rrd")
+            raise BadInput(f"this workload is longer than {MAX_DRAWN // SECOND} s; leave out --rrd")
         for effect in effects:
             self._draw(now / SECOND, effect)
 

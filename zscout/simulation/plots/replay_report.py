@@ -104,8 +104,8 @@ def _report(strategy: str, workload: Workload, played: Replay, observed: _Observ
     arcs = [arrival.request.arc for arrival in workload.arrivals]
     end = max((hold.end for hold in played.holds), default=0)
     yield (
-        f"Strategy {strategy}: {len(arcs)} ARCs on {len(workload.rcs)} RCs; {len(played.holds)} holds, "
-        f"{len(observed.preemptions)} preempted, over {_s(end)} s; {len(played.unserved)} ARCs unserved"
+        f"Strategy {strategy}: {len(arcs)} requests on {len(workload.rcs)} devices; {len(played.holds)} holds, "
+        f"{len(observed.preemptions)} preempted, over {_s(end)} s; {len(played.unserved)} requests unserved"
     )
     if played.holds:
         yield ""

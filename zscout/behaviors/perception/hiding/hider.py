@@ -179,7 +179,7 @@ class Hider:
         try:
             robot = msgspec.msgpack.decode(data, type=HidingState)
         except (msgspec.MsgspecError, UnicodeDecodeError) as problem:
-            raise BadCheckpoint(f"is no checkpoint of a hider: {problem}") from problem
+            raise BadCheckpoint(f"not a checkpoint of a hider: {problem}") from problem
         if robot.form != FORM:
             raise BadCheckpoint(f"a checkpoint of form {robot.form}, not {FORM}: start anew")
         if {len(robot.tones), len(robot.anchor_tones)} - {0, BANDS * COLUMNS}:
