@@ -1,4 +1,4 @@
-"""The mesh over Zenoh: its settings, with every trap taken into account, and a session as a transport."""
+"""The mesh over Zenoh: its settings, and a session as a transport."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from zscout.mesh.transport import Collector, OnSample, Quality, Transport, Trans
 log = logging.getLogger(__name__)
 
 CONTROL_BATCHES = 8
-"""Control messages under way to one peer: with fewer, an answer waits until the message before it is out."""
+"""Control messages in flight per peer: with fewer, an answer waits for the message before it."""
 SCOUTING_DELAY_MS = 200
 GREATER_CONNECTS = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
 CLOSE_TIMEOUT = 3.0
@@ -49,18 +49,18 @@ QUALITIES: dict[Quality, dict[str, Any]] = {
 }
 QUERY: Any = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE, **CONTROL}
 MAX_QUERIERS = 256
-"""Of one session: what is declared for a key is never given back."""
+"""Per session: Zenoh never frees a key's declaration."""
 MAX_MESSAGE = 17_000_000
-"""Bytes: a little more than any message of zscout's has."""
+"""Bytes: a little more than zscout's largest message."""
 LOOK_AT_CERTIFICATES = 2.0
-"""Seconds from one look at whether they were renewed to the next."""
+"""Seconds between two checks for renewed certificates."""
 ANY_TLS = "tls/0.0.0.0:0"
 T = TypeVar("T")
 _PORT = re.compile(r":\d+$")
 
 
 class Security(NamedTuple):
-    """What makes a session one of a closed fleet."""
+    """The certificates, keys and members of a closed fleet."""
 
     certificates: Certificates
     keys: Keys
@@ -68,7 +68,7 @@ class Security(NamedTuple):
 
 
 def zenoh_config(config: MeshConfig, security: Security | None = None) -> zenoh.Config:
-    """The Zenoh settings behind a `[mesh]` table, for one session."""
+    """The Zenoh settings for a `[mesh]` table, for one session."""
     settings: dict[str, Any] = {
         "mode": "router" if config.relay else "peer",
         "id": increasing_id(),
@@ -76,15 +76,15 @@ def zenoh_config(config: MeshConfig, security: Security | None = None) -> zenoh.
         "scouting/multicast/address": config.multicast_address,
         "scouting/multicast/interface": config.interface,
         "scouting/delay": SCOUTING_DELAY_MS,
-        # Of two peers always the same one makes their link, and there is one, not two (docs/zenoh.md).
+        # Of two peers always the same one makes the only link (docs/zenoh.md).
         "scouting/multicast/autoconnect_strategy": GREATER_CONNECTS,
         "scouting/gossip/autoconnect_strategy": GREATER_CONNECTS,
         "transport/link/tx/lease": round(config.lease * 1000),
-        # A peer is given up no sooner for not reading than for being silent: on a host that stalls, or is short of
-        # processor time, Zenoh's own sending threads stand still as well, and any burst would cost a sound link.
+        # Peers get as long to read as to be silent: on a stalled or busy host Zenoh's sending threads stop too, and any
+        # burst would cost a sound link.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(config.lease * 1_000_000),
         "transport/link/tx/queue/size": {"interactive_high": CONTROL_BATCHES},
-        # What is greater is not read to its end: whoever sends it would fill this process's memory.
+        # Larger messages are cut off: a sender could fill this process's memory.
         "transport/link/rx/max_message_size": MAX_MESSAGE,
         "transport/shared_memory/enabled": False,
         "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5},
@@ -109,10 +109,10 @@ def zenoh_config(config: MeshConfig, security: Security | None = None) -> zenoh.
 
 
 def _closed(security: Security) -> dict[str, Any]:
-    """That only members of the fleet are let in, and what each may send. Each of these is needed."""
+    """Settings that admit members of the fleet alone, and limit what each may send. Each is needed."""
     own = security.certificates
     return {
-        # Else a peer dials whoever is announced at an address without TLS, and talks to it.
+        # Otherwise a peer links to announced addresses without TLS.
         "transport/link/protocols": ["tls"],
         "transport/link/tls": {
             "root_ca_certificate": str(own.ca),
@@ -121,9 +121,9 @@ def _closed(security: Security) -> dict[str, Any]:
             "connect_private_key": str(own.key),
             "connect_certificate": str(own.cert),
             "enable_mtls": True,
-            # A name stands for a machine or a person, not for an address: the rules below go by it.
+            # A name means a machine or a person, not an address; the rules below use it.
             "verify_name_on_connect": False,
-            # A link that was good when it was made stays: certificates are renewed in place.
+            # Links outlive the certificate they began with: certificates are renewed in place.
             "close_link_on_expiration": False,
         },
         "access_control": access_control(security.keys, security.members),
@@ -132,28 +132,25 @@ def _closed(security: Security) -> dict[str, Any]:
 
 @dataclass(slots=True)
 class _Door:
-    """By what the next session of a process is opened."""
+    """The security for the next session of a process."""
 
     security: Security | None
 
 
 class ZenohMesh(Mesh):
-    """The mesh over a Zenoh session of this process."""
-
     _door: _Door
     _watching: asyncio.Task[NoReturn] | None = None
 
     @classmethod
     async def open(cls, fleet: Fleet, me: Sender) -> Self:
-        """Joins the mesh of `fleet`. Raises MeshError where an address can't be had, BadInput for certificates that are
-        none or another's."""
+        """Join the mesh of `fleet`. Raises MeshError if an address can't be had, BadInput for bad certificates."""
         config, keys = fleet.mesh, Keys(fleet.name, closed=fleet.security is not None)
         security = None if fleet.security is None else _security(fleet, keys, me)
         door = _Door(security)
         openings = [lambda: _open(config, door.security)]
         if config.listen:
-            # Its addresses are to be had again once the session that listens there is closed. Until then one on other
-            # ports hears from that session who else is there.
+            # Its ports are free again once the old session is closed. Until then a session on other ports learns the
+            # peers from it.
             own = tuple(one.replace("0.0.0.0", "127.0.0.1").replace("[::]", "[::1]") for one in config.listen)  # noqa: S104
             ports = tuple(_PORT.sub(":0", one) for one in config.listen)
             beside = replace(config, listen=ports, connect=(*config.connect, *own))
@@ -171,8 +168,8 @@ class ZenohMesh(Mesh):
         await super().close()
 
     async def _watch_certificates(self, known: Certificates) -> NoReturn:
-        """Joins anew when they were renewed: a session that listens goes on showing what it was opened with, and who
-        comes when that has ended would not link to it. Says when an end is near."""
+        """Renew the session with the certificates: a session keeps those it was opened with, and peers would refuse it
+        after their end. Warn before they end."""
         told: str | None = None
         warned = ""
         while True:
@@ -212,9 +209,8 @@ def _security(fleet: Fleet, keys: Keys, me: Sender) -> Security:
 
 
 def increasing_id() -> str:
-    """The id of a session, greater than those of sessions that began before, so that whoever joins makes the links.
-
-    Zenoh compares ids from the last byte on, and prints them as a number."""
+    """A session id greater than those of earlier sessions, so that the newcomer makes the links. Zenoh compares ids
+    from the last byte on, and prints them as a number."""
     return f"1{secrets.token_hex(9)}0{time.time_ns().to_bytes(8, 'little').hex()[4:]}"
 
 
@@ -223,7 +219,7 @@ async def _open(config: MeshConfig, security: Security | None) -> Transport:
     try:
         session = await asyncio.wrap_future(opening)
     except asyncio.CancelledError:
-        # In a thread of its own: this may be the event loop's.
+        # In a thread: this may be the event loop's.
         opening.add_done_callback(
             lambda opened: opened.exception() or in_thread("closes the mesh", opened.result().close)
         )
@@ -231,7 +227,7 @@ async def _open(config: MeshConfig, security: Security | None) -> Transport:
     except zenoh.ZError as error:
         raise MeshError(f"the mesh can't be joined: {error}; check listen and connect under [mesh]") from None
     try:
-        # A relay leaves it to its sites, which know where it is.
+        # A relay leaves relinking to its sites, which know its address.
         relinks = config.multicast and not config.relay
         return ZenohTransport(session, _relinking(session, config, security) if relinks else None)
     except BaseException:
@@ -250,7 +246,7 @@ def _relinking(session: zenoh.Session, config: MeshConfig, security: Security | 
 
 
 def in_thread(name: str, call: Callable[[], T]) -> Future[T]:
-    """Calls in a daemon thread: one of asyncio's own would be joined when the loop ends, however long it takes."""
+    """Call in a daemon thread: asyncio would join its own at the end of the loop, however long that takes."""
     future: Future[T] = Future()
     future.set_running_or_notify_cancel()
 
@@ -265,8 +261,7 @@ def in_thread(name: str, call: Callable[[], T]) -> Future[T]:
 
 
 class ZenohTransport(Transport):
-    # Every callback is direct: it runs on a thread of Zenoh's, where a plain function would get a thread of
-    # its own per declaration and per query.
+    # Callbacks are direct, on Zenoh's threads: a plain function would get its own thread per declaration and query.
 
     def __init__(self, session: zenoh.Session, relinking: Relinking | None = None) -> None:
         self._session, self._relinking = session, relinking
@@ -313,7 +308,7 @@ class ZenohTransport(Transport):
             raise MeshError(f"{key} can't be asked: {error}") from None
 
     def _querier(self, key: str, timeout: float) -> zenoh.Querier | None:
-        """Declared for what is asked a second time, which is quicker from then on; None for others."""
+        """The querier for a key asked before, faster than a get; None for others."""
         asked = key, timeout
         if (known := self._queriers.get(asked)) is not None or "*" in key or len(self._queriers) >= MAX_QUERIERS:
             return known
@@ -422,7 +417,7 @@ class ZenohPublisher(TransportPublisher):
     def match(self, on_matching: Callable[[bool], None]) -> bool:
         callback = _direct(lambda status: on_matching(bool(status.matching)))
         self._listener = self._publisher.declare_matching_listener(callback)
-        # The package's own types call it a bool; the object it gives is true in either case.
+        # Typed as a bool, but the object it gives is true in either case.
         status: Any = self._publisher.matching_status
         return bool(status.matching)
 
@@ -435,7 +430,7 @@ def _encoding(kind: type | None) -> zenoh.Encoding:
 
 
 def _is_publication(sample: zenoh.Sample) -> bool:
-    """Not a delete, nor of a key with a wildcard, by which one message would pass for everybody's."""
+    """Return True for puts on concrete keys: one on a wildcard would pass for everybody's."""
     return sample.kind == zenoh.SampleKind.PUT and "*" not in str(sample.key_expr)
 
 
