@@ -49,7 +49,6 @@ _ALERT: Final = re.compile(r"alert ([a-z ]*[a-z])")
 _ADDRESS: Final = re.compile(r"(tcp|tls)/([^#?]+):(\d+)(?:[?#].*)?")
 
 
-
 def multicast_problems(config: MeshConfig) -> dict[str, str]:
     """The interfaces for multicast, each with its problem, empty if a test packet could be sent."""
     host, _, port = config.multicast_address.rpartition(":")
@@ -113,7 +112,6 @@ async def heard(config: MeshConfig) -> list[Heard]:
 
 def _own_addresses() -> set[str]:
     return {one.address.partition("%")[0] for several in psutil.net_if_addrs().values() for one in several}
-
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,7 +247,6 @@ def _answer(address: str, shaken: _Shaken | None, *, trusted: bool) -> Called:
 def _reason(error: OSError) -> str:
     """The cause without the address: all addresses of a name failed alike."""
     return os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror or "can't be called"
-
 
 
 def plain_fleets(addresses: Sequence[str]) -> dict[str, set[str]]:

@@ -1,8 +1,7 @@
-"""A Scout's camera: its pictures, where a pixel looks, how bright it is. Pure.
+"""A Scout's camera: its pictures, bearings of pixels, brightness. Pure.
 
-A pinhole, 4 cm above the floor, level: row 59.5 looks straight ahead, a point of the floor at distance d
-appears `RISE / d` rows below it. Bearings are radians, to the left positive; distances metres along the axis.
-"""
+A pinhole, 4 cm above the floor, level: row 59.5 looks straight ahead, a floor point at distance d appears `RISE / d`
+rows below it. Bearings are radians, to the left positive; distances metres along the axis."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ RISE: Final = FOCAL * EYE
 """Rows below the horizon, times metres."""
 GAMMA: Final = 2.2
 MAX_PIXELS: Final = 4_000_000
-"""Of a JPEG picture; a larger one is not decoded."""
+"""Larger JPEG pictures are not decoded."""
 
 Picture = NDArray[np.uint8]
 """Grey, shape (120, 160), row 0 at the top, gamma 2.2."""
@@ -37,7 +36,7 @@ _LINEAR: Final = ((np.arange(256) / 255.0) ** GAMMA).astype(np.float32)
 
 
 def grey_picture(data: bytes) -> NDArray[np.uint8] | None:
-    """A JPEG picture from outside, grey, of shape (height, width); None for what is none or has over MAX_PIXELS."""
+    """An outside JPEG picture in grey, shape (height, width); None if it is invalid or exceeds MAX_PIXELS."""
     size = jpeg_size(data)
     if size is None or size[0] * size[1] > MAX_PIXELS:
         return None
@@ -46,7 +45,7 @@ def grey_picture(data: bytes) -> NDArray[np.uint8] | None:
 
 
 def linear(picture: Picture) -> NDArray[np.float32]:
-    """Brightness 0 to 1 without the gamma, same shape: proportional to the light that came in."""
+    """Brightness 0 to 1 without the gamma: proportional to the light."""
     return _LINEAR[picture]
 
 

@@ -1,7 +1,7 @@
-"""Records of bookings, merged one by one: whoever has heard of the same ones knows the same, in whatever order. Pure.
+"""Records of bookings, merged to the same result in any order. Pure.
 
-What changes of a record only grows: it is given up, or dates of it are, or are over. So nothing that was given up
-comes back from a host that was away, however old its copy is."""
+Changes only accumulate: a record, or dates of it, are given up or over. So an old copy on a host that was away brings
+nothing back."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from zscout.messages import MAX_MERGED, BookingRecord, encode
 from zscout.services.bookings.dates import DAY, last_end
 
 MAX_BYTES: Final = 12_000_000
-"""Of all records: one answer, and a file, has room for them."""
+"""Of all records: the limit of one answer, and of a file."""
 KEEP: Final = DAY
-"""Seconds for which a record is kept beyond its last end: clocks may differ."""
+"""Seconds a record is kept after its last end: clocks may differ."""
 
 
 def merged(one: BookingRecord, other: BookingRecord) -> BookingRecord:
-    """What both tell of one booking. The newer tells all but what is final."""
+    """Merge two records of one booking: the newer, with the final facts of both."""
     newer = max(one, other, key=lambda record: (record.changed, _changing(record)))
     return replace(
         newer,
@@ -33,7 +33,7 @@ def merged(one: BookingRecord, other: BookingRecord) -> BookingRecord:
 
 
 def _changing(record: BookingRecord) -> bytes:
-    """What the newer tells."""
+    """The parts taken from the newer record."""
     return encode(replace(record, made=record.changed, unbooked=False, dropped=[], over=[]))
 
 
@@ -43,7 +43,7 @@ class Records:
     def __init__(self) -> None:
         self._records: dict[str, BookingRecord] = {}
         self.size = 0
-        """In bytes, as they are sent."""
+        """Encoded bytes."""
         self._digest: str | None = None
 
     def __iter__(self) -> Iterator[BookingRecord]:
@@ -56,7 +56,7 @@ class Records:
         return self._records.get(booking)
 
     def take(self, records: Iterable[BookingRecord]) -> list[BookingRecord]:
-        """Merges these, as far as there is room; returns what is not as it was."""
+        """Merge records while there is room; return the changed ones."""
         changed = []
         for record in records:
             known = self._records.get(record.id)
@@ -73,20 +73,20 @@ class Records:
         return changed
 
     def remove(self, booking: str) -> None:
-        """As if it had never been made."""
+        """Remove it without a trace."""
         if (record := self._records.pop(booking, None)) is not None:
             self.size -= len(encode(record))
             self._digest = None
 
     def forget_old(self, time: float) -> bool:
-        """Forgets those that were over a day ago, by fleet time; whether there were any."""
+        """Forget records that ended a day ago, by fleet time; return True if there were any."""
         old = [record.id for record in self if last_end(record) + KEEP < time]
         for booking in old:
             self.remove(booking)
         return bool(old)
 
     def digest(self) -> str:
-        """The same for who knows the same."""
+        """Equal for equal records."""
         if self._digest is None:
             found = hashlib.sha256()
             for _, record in sorted(self._records.items()):

@@ -1,6 +1,4 @@
-"""Who held what for how long, and how much of it was used, from a list of holds: pure.
-
-All times are seconds within the window that is accounted for; what lies outside is not counted."""
+"""Usage accounts from a list of holds. Pure. All times are seconds within the window; others are not counted."""
 
 from __future__ import annotations
 
@@ -12,7 +10,7 @@ from zscout.messages import PastHold
 from zscout.services.journal.merging import Span
 
 THROWN_AWAY: Final = frozenset({"preempted", "lost"})
-"""Outcomes of holds that are taken back without their holder's doing."""
+"""Outcomes of holds ended against the holder's will."""
 
 
 @dataclass(slots=True)
@@ -21,33 +19,31 @@ class Account:
 
     key: str
     holds: int = 0
-    """Holds that stood at some time of the window."""
+    """Holds with some time in the window."""
     held: float = 0.0
-    """Seconds for which they stood; two at one time count twice."""
+    """Seconds held; simultaneous holds count twice."""
     rc_seconds: float = 0.0
-    """The same for each RC of them: a hold of three RCs for 10 s is 30. Of an RC's own account it is `held`."""
+    """Seconds times RCs: three RCs for 10 s are 30. Equals `held` in an RC's own account."""
     waited: float = 0.0
-    """Seconds in the queue before the holds that began in the window, as far as they were told: whole, though the wait
-    began before. Waits that no hold ended are not known."""
+    """Known seconds in the queue, in full, of holds that began in the window. Waits without a hold are unknown."""
     preempted: int = 0
-    """Holds that ended in the window because they were taken for another ARC before their minimum runtime was over."""
+    """Holds preempted in the window before their minimum runtime."""
     preempted_seconds: float = 0.0
-    """Seconds for which those had stood."""
+    """Seconds held by those."""
     thrown_away: float = 0.0
-    """Seconds for which holds had stood that ended in the window, before their minimum runtime, because they were
-    preempted or an RC was lost. What their programs had done until then is counted as lost, though some keep it."""
+    """Seconds of holds that ended in the window, before their minimum runtime, by preemption or a lost RC. The
+    programs' work counts as lost, though some keep it."""
     used: float | None = None
-    """Of `rc_seconds`, for how much RCs were used, as far as they told; None: none told anything. Of a hold that lies
-    partly in the window the same part."""
+    """Reported seconds of use within `rc_seconds`, prorated for holds partly in the window; None without any report."""
     used_unknown: int = 0
-    """Holds of which not all of these RCs told it: what the others did is not counted."""
+    """Holds with some RC's use unreported; the other RCs' use counts."""
 
 
 def accounts(
     holds: Iterable[PastHold], keys: Callable[[PastHold], Iterable[str]], window: Span, *, by_rc: bool = False
 ) -> list[Account]:
-    """An account for each of `keys` of any hold, those that held most first. A hold that still stands is counted up to
-    the end of the window; of one whose end was not heard, only what is known. `by_rc`: its keys are its RCs."""
+    """An account for each of `keys` of any hold, by seconds held, descending. Present holds count up to the window's
+    end; ends that were missed count as far as known. `by_rc`: the keys are RCs."""
     found: dict[str, Account] = {}
     for hold in holds:
         ended = window.ended if hold.ended is None else hold.ended

@@ -1,8 +1,8 @@
-"""What a candidate hears, as changes of its journal: pure; times are passed in.
+"""Turns messages that a candidate receives into changes of its journal. Pure; times are passed in.
 
-A publication tells that holds begin and end. Where some were missed, the RCM's state is read: what stands there and is
-not known began unheard, what is known and does not stand there has ended unheard. RCs tell for how long they were used
-under a hold, which may be before it is heard of, or after its end."""
+Publications report starts and ends of holds. After a gap the RCM's state is read: unknown holds in it began unnoticed,
+known ones not in it ended unnoticed. RCs report the use of a hold, possibly before its start is known, or after its
+end."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ from zscout.types import NO_TERM, Grant, RcName, clean
 N = TypeVar("N", int, Decimal)
 
 MAX_OPEN: Final = 20_000
-"""Holds that are followed at one time. More are kept, but may be written again and again."""
+"""Holds followed at one time. Further ones are kept, but may be written repeatedly."""
 MAX_EARLY: Final = 2_000
-"""Words of RCs that are kept for holds which are still to be heard of."""
+"""Reports of use kept for holds not known yet."""
 MAX_TEXT: Final = 200
-"""Characters that are kept of a name or a reason."""
+"""Characters kept of a name or a reason."""
 MAX_RCS: Final = 1_000
-"""RCs that are kept of one hold: no fleet allows more."""
+"""RCs kept per hold: no fleet allows more."""
 MAX_NUMBER: Final = 10**9
-"""Of a priority or a duration."""
+"""Limit of a priority or a duration."""
 MAX_SEQ: Final = 2**63 - 1
 
 
 class PublicationHeard(NamedTuple):
-    """A publication, `silence` seconds after the one before (heartbeats included)."""
+    """A publication, `silence` seconds after the previous one or heartbeat."""
 
     at: float
     """Seconds since 1970, UTC."""
@@ -51,45 +51,45 @@ class PublicationHeard(NamedTuple):
 
 
 class StateRead(NamedTuple):
-    """The RCM's state, read when publications had been missed."""
+    """The RCM's state, read after missed publications."""
 
     at: float
     state: RcmState
 
 
 class UseHeard(NamedTuple):
-    """RCs told for how long they were used: (RC, grant, seconds), each as the key told which RC it is."""
+    """Use reported by RCs: (RC, grant, seconds), with the RC of the report's key."""
 
     words: Sequence[tuple[RcName, Grant, float]]
 
 
 class HoldSeen(NamedTuple):
-    """A hold stands; it may be known already."""
+    """A present hold, possibly known already."""
 
     hold: PastHold
 
 
 class HoldOver(NamedTuple):
-    """A hold is over; `hold` has all that is to be kept of it if it is not known yet."""
+    """A hold ended; `hold` holds the whole record in case it is unknown."""
 
     hold: PastHold
 
 
 class EndUnheard(NamedTuple):
-    """A hold is over, since `at` or later."""
+    """A hold ended at `at` or later."""
 
     grant: Grant
     at: float
 
 
 class GapSeen(NamedTuple):
-    """Time of which not all is known."""
+    """A time with incomplete records."""
 
     gap: JournalGap
 
 
 class HoldUsed(NamedTuple):
-    """An RC was used under a hold for `seconds` or longer, if that hold is known and the RC is one of it."""
+    """An RC was used under a hold for at least `seconds`, if both are known."""
 
     grant: Grant
     rc: RcName
@@ -101,24 +101,24 @@ Change: TypeAlias = HoldSeen | HoldOver | EndUnheard | HoldUsed | GapSeen
 
 
 class Follower:
-    """Follows one fleet. `silent`: seconds without a heartbeat after which no RCM was heard."""
+    """Follows one fleet. `silent`: seconds without a heartbeat that mean a lost RCM."""
 
     def __init__(self, silent: float, open_holds: Iterable[Grant] = (), heard: float | None = None) -> None:
-        """`open_holds` and `heard`: what stood, and when the last publication came, as the journal was left."""
+        """`open_holds`, `heard`: holds and time of the last publication when the journal was closed."""
         self._silent = silent
         self._open: dict[Grant, None] = dict.fromkeys(open_holds)
         self._term, self._seq = NO_TERM, 0
         self._left = heard
-        """When the journal was left, until something is heard again."""
+        """Time of that close, until the next publication."""
         self._doubt: float | None = None
-        """Since when ends may have been missed."""
+        """Since then ends may have been missed."""
         self._early: OrderedDict[tuple[Grant, RcName], float] = OrderedDict()
-        """Uses under grants that are not followed: over by now, or not heard of yet. The last MAX_EARLY."""
+        """Use under unfollowed grants, ended or not known yet; the last MAX_EARLY."""
         self.must_read = False
-        """Whether the RCM's state is to be read, and told with a `StateRead`."""
+        """True while the RCM's state must be read, and passed as a `StateRead`."""
 
     def take(self, event: Heard) -> Iterator[Change]:
-        """What is to be kept of it; nothing of what an RCM of an earlier term says."""
+        """The resulting changes; none for an earlier term."""
         match event:
             case PublicationHeard():
                 return self._heard(event)
@@ -134,7 +134,7 @@ class Follower:
         if (gap := self._gap_before(event)) is not None:
             self._doubt = gap.began if self._doubt is None else min(self._doubt, gap.began)
             yield GapSeen(gap)
-        # A new term may begin with ends that nobody publishes.
+        # A new term may begin with unpublished ends.
         self.must_read |= gap is not None or grants.term != self._term
         self._seq = max(self._seq, grants.seq) if grants.term == self._term else grants.seq
         self._term, self._left = grants.term, None
@@ -165,7 +165,7 @@ class Follower:
 
     def _read(self, event: StateRead) -> Iterator[Change]:
         at, state = event.at, event.state
-        # Only what an RCM publishes is believed of its term; what is older is read again.
+        # Only a publication introduces a term; older states are read again.
         if state.term != self._term or not self._seq <= state.seq <= MAX_SEQ:
             return
         self._seq = state.seq
@@ -179,7 +179,7 @@ class Follower:
                 yield from self._stands(_viewed(hold, at))
 
     def lost(self, gap: JournalGap) -> Iterator[Change]:
-        """Changes could not be kept: ends may be among them."""
+        """Changes could not be kept, possibly ends."""
         self._doubt, self.must_read = gap.began if self._doubt is None else min(self._doubt, gap.began), True
         yield GapSeen(gap)
 
@@ -206,7 +206,7 @@ class Follower:
 
 
 def _is_sane(grant: Grant) -> bool:
-    """Whether a grant can be kept: numbers of the mesh have any size."""
+    """Return True if a grant fits the file: numbers on the mesh have any size."""
     (counter, rcm), seq = grant
     return 0 <= seq <= MAX_SEQ and 0 <= counter <= MAX_COUNTER and _text(rcm) == rcm
 
@@ -255,7 +255,7 @@ def _names(number: str, arc: str, client: str, grant: Grant, rcs: list[str]) -> 
 
 
 def _user(who: Who | None) -> Who | None:
-    """Without the comment, which is of no use later."""
+    """Without the comment."""
     if who is None or not (who.user or who.host or who.command):
         return None
     return Who(clean(who.user)[:MAX_WHO], clean(who.host)[:MAX_WHO], clean(who.command)[:MAX_WHO])
@@ -266,5 +266,5 @@ def _text(text: str) -> str:
 
 
 def _number(number: N) -> N:
-    """One that others can read in an answer."""
+    """A number that readers of an answer accept."""
     return max(min(number, type(number)(MAX_NUMBER)), type(number)(-MAX_NUMBER))

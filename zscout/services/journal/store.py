@@ -1,7 +1,7 @@
 """A candidate's journal on disk: one SQLite file, bounded in size and age.
 
-All of it blocks, and is called from threads, one call at a time. The file is in WAL mode with a sync at each commit:
-what is committed outlives the process and the host."""
+All calls block, and come from threads, one at a time. WAL mode with a sync at each commit: commits survive the process
+and the host."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ log = logging.getLogger(__name__)
 
 FILE: Final = "journal.sqlite"
 ASIDE: Final = "journal.damaged.sqlite"
-"""What could not be read: of several the last, so that they do not fill the disk."""
+"""Unreadable files; the last one only, to bound the disk."""
 FORMAT: Final = 1
 """`user_version` of the file."""
 PRUNED_AT_ONCE: Final = 5_000
-"""Holds that one commit removes: more would keep the next waiting."""
+"""Holds that one commit removes, so that the next does not wait long."""
 ROOM: Final = 0.95
-"""Of the size that is allowed: what is left after a commit that removed holds."""
+"""Share of the allowed size after a removal."""
 MAX_KEPT_GAPS: Final = 10_000
 WAL: Final = 4_000_000
-"""Bytes that the log beside the file has at most between commits."""
+"""Bytes of the write-ahead log between commits."""
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 _SCHEMA: Final = """
@@ -64,8 +64,7 @@ CREATE TABLE gaps (began REAL NOT NULL, ended REAL NOT NULL, cause TEXT NOT NULL
 CREATE TABLE facts (name TEXT PRIMARY KEY, at REAL NOT NULL);
 """
 _USED: Final = "ALTER TABLE holds ADD COLUMN used TEXT"
-"""Seconds, in a line for each RC of `rcs`; an empty one: not known. A journal without that column gets it when it is
-opened; versions that do not know it read on."""
+"""Seconds, one line per RC of `rcs`, empty if unknown. Added to older files when opened; older versions ignore it."""
 _COLUMNS: Final = (
     "term, rcm, seq, request, arc, client, owner, rcs, began, late, ended, outcome, reason, taken_for, priority, "
     "min_runtime, waited, user, host, command, used"
@@ -73,7 +72,7 @@ _COLUMNS: Final = (
 _INSERT: Final = (
     f"INSERT INTO holds ({_COLUMNS}) VALUES ({', '.join('?' * 21)}) ON CONFLICT (term, rcm, seq) DO UPDATE SET "  # noqa: S608 - constants
 )
-# What was taken for over, or known by its end alone, is told in full now.
+# Complete a hold assumed ended, or known by its end alone.
 _BEGAN: Final = f"""{_INSERT}
     arc = excluded.arc, began = min(began, excluded.began), late = min(late, excluded.late),
     priority = excluded.priority, min_runtime = excluded.min_runtime, waited = coalesce(excluded.waited, waited),
@@ -91,11 +90,11 @@ _PARTY: Final = msgspec.json.Decoder(ReasonParty)
 
 
 class Unwritable(Exception):
-    """The journal can't be kept at present; the message says why. What was to be committed may be tried again."""
+    """The journal can't be kept at present; the message gives the reason. A commit may be retried."""
 
 
 class Damaged(Unwritable):
-    """Nor read: the file has been set aside, and what it told is gone."""
+    """The file was unreadable, and set aside with its contents."""
 
 
 class JournalStore:
@@ -108,8 +107,8 @@ class JournalStore:
         self._one = threading.Lock()
 
     def open(self) -> tuple[list[Grant], float | None]:
-        """What stood when it was left, and when something was heard last. A file that can't be read is set aside, and a
-        new one begun. Raises Unwritable."""
+        """Open holds, and the time of the last publication, when it was closed. Sets an unreadable file aside, and
+        begins a new one. Raises Unwritable."""
         with self._one:
             try:
                 db = self._opened()
@@ -119,8 +118,8 @@ class JournalStore:
             return [Grant(Term(term, rcm), seq) for term, rcm, seq in rows], self._fact("heard")
 
     def commit(self, changes: Iterable[Change], first: float, heard: float, now: float) -> None:
-        """Keeps these changes, all or none, and that something was heard last at `heard`; removes what is too old or
-        too much. A new journal begins at `first`. Raises Unwritable."""
+        """Keep all changes or none, and the time `heard` of the last publication; remove what is too old or too much. A
+        new journal begins at `first`. Raises Unwritable."""
         with self._one:
             try:
                 db = self._opened()
@@ -135,7 +134,7 @@ class JournalStore:
                 raise self._failed(error) from None
 
     def answer(self, host: str, asked: HistoryAsk, now: float) -> History:
-        """A page. Raises Unwritable, BadName for a pattern that is none."""
+        """A page. Raises Unwritable, BadName for an invalid pattern."""
         with self._one:
             try:
                 return self._answer(host, asked, now)
@@ -143,7 +142,7 @@ class JournalStore:
                 raise self._failed(error) from None
 
     def latest(self, limit: int) -> list[PastHold]:
-        """The last holds whose beginning and end were heard, the oldest first. Raises Unwritable."""
+        """The last holds with known start and end, oldest first. Raises Unwritable."""
         heard = f"ended IS NOT NULL AND late = 0 AND outcome <> '{UNHEARD}'"
         sql = f"SELECT {_COLUMNS} FROM holds WHERE {heard} ORDER BY ended DESC LIMIT ?"  # noqa: S608 - constants
         with self._one:
@@ -153,15 +152,13 @@ class JournalStore:
                 raise self._failed(error) from None
 
     def size(self) -> int:
-        """Bytes of the file that are in use."""
+        """Bytes of the file in use."""
         with self._one:
             return _used(self._opened())
 
     def close(self) -> None:
         with self._one:
             self._forget()
-
-    # The file
 
     def _opened(self) -> sqlite3.Connection:
         if self._db is None:
@@ -197,7 +194,7 @@ class JournalStore:
         return db
 
     def _failed(self, error: sqlite3.Error) -> Unwritable:
-        """What to raise; a file that is damaged has been set aside then."""
+        """The error to raise; sets a damaged file aside."""
         if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
             self._forget()
             aside = self.path.with_name(ASIDE)
@@ -222,7 +219,7 @@ class JournalStore:
         return None if row is None else float(row[0])
 
     def _prune(self, db: sqlite3.Connection, now: float) -> None:
-        """Removes what ended longest ago; what stands is kept. The journal knows nothing before that any more."""
+        """Remove the holds that ended first; the journal knows nothing before them. Open holds stay."""
         oldest = now - self._max_age
         over = "SELECT id, ended FROM holds WHERE ended IS NOT NULL"
         gone = db.execute(f"{over} AND ended < ? ORDER BY ended LIMIT ?", (oldest, PRUNED_AT_ONCE)).fetchall()
@@ -237,8 +234,6 @@ class JournalStore:
         db.execute("DELETE FROM gaps WHERE ended < ?", (oldest,))
         kept = "SELECT rowid FROM gaps ORDER BY rowid DESC LIMIT 1 OFFSET ?"
         db.execute(f"DELETE FROM gaps WHERE rowid <= ({kept})", (MAX_KEPT_GAPS,))  # noqa: S608 - a constant
-
-    # Questions
 
     def _answer(self, host: str, asked: HistoryAsk, now: float) -> History:
         db = self._opened()
@@ -265,7 +260,7 @@ class JournalStore:
             pattern = is_pattern(asked.rc)
             where.append("any_rc(?, rcs)" if pattern else "instr(char(10) || rcs || char(10), ?)")
             conditions.append(asked.rc if pattern else f"\n{asked.rc}\n")
-        # The conditions are met within an index: only what is found is read from the table.
+        # Conditions are met within an index: only results are read from the table.
         found = f"SELECT id FROM holds WHERE {' AND '.join(where)} ORDER BY began DESC, id DESC LIMIT ?"  # noqa: S608 - texts of this function
         sql = f"SELECT id, {_COLUMNS} FROM holds WHERE id IN ({found}) ORDER BY began DESC, id DESC"  # noqa: S608
         holds: list[PastHold] = []
@@ -385,8 +380,6 @@ def _any_rc(pattern: str, rcs: str) -> bool:
 
 
 class _transaction:  # noqa: N801 - reads as a statement
-    """All or nothing."""
-
     def __init__(self, db: sqlite3.Connection) -> None:
         self._db = db
 

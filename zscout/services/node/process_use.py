@@ -1,4 +1,4 @@
-"""What process trees use, read from /proc in one pass: each component of a node, or the whole node."""
+"""Resource use of process trees, read from /proc in one pass: each component of a node, or the whole node."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from zscout.types import SECOND
 TICK: Final = 1 / os.sysconf("SC_CLK_TCK")
 PAGE: Final = os.sysconf("SC_PAGE_SIZE")
 MAX_THREADS: Final = 4_096
-"""Of one tree whose waiting for a processor is looked at."""
+"""Threads of one tree whose waiting time is read."""
 PROC: Final = Path("/proc")
 
 
@@ -28,8 +28,8 @@ def since_boot() -> float:
 
 
 class RunningComponent(NamedTuple):
-    """A component that runs on this host. `pid` is its root process: a child that was not waited for yet, so
-    that the number can't have passed to another."""
+    """A component on this host. `pid` is its root process, a child not waited for yet, so that its number is not
+    reused."""
 
     component: str
     kind: str
@@ -38,21 +38,21 @@ class RunningComponent(NamedTuple):
 
 
 Running: TypeAlias = Callable[[], Iterable[RunningComponent]]
-"""The components of a node; may be called from any thread."""
+"""The components of a node; callable from any thread."""
 
 
 class _Process(NamedTuple):
     parent: int
     state: bytes
     cpu: float
-    """Seconds, with those of the children that it waited for."""
+    """Seconds, including children it waited for."""
     started: float
     """Seconds since the host's start."""
     memory: int
 
 
 _Demand: TypeAlias = tuple[int, int]
-"""Nanoseconds that a thread ran, and that it waited for a processor."""
+"""Nanoseconds that a thread ran, and waited for a processor."""
 
 
 class _Tree(NamedTuple):
@@ -60,21 +60,21 @@ class _Tree(NamedTuple):
 
     at: float
     started: float = 0.0
-    """When its root did, on the same clock."""
+    """Start of its root, on the same clock."""
     cpu: float = 0.0
-    """Seconds of processor time so far."""
+    """Processor seconds so far."""
     memory: int = 0
     pids: Sequence[int] = ()
     threads: Mapping[int, _Demand] = {}
 
     def cores(self, before: _Tree) -> float:
-        """What it had on average since. What leaves the tree for another parent takes its time with it."""
+        """Average since `before`. Processes that leave the tree take their time with them."""
         elapsed = self.at - before.at
         return max(0.0, self.cpu - before.cpu) / elapsed if elapsed > 0 else 0.0
 
 
 def _trees(proc: Path, at: float, roots: Iterable[int], *, ended: bool = False) -> dict[int, _Tree]:
-    """The trees of those roots that live; with `ended` also of processes that were not waited for yet."""
+    """The trees of living roots; with `ended` also of processes not waited for."""
     table: dict[int, _Process] = {}
     children: dict[int, list[int]] = {}
     for name in _names(str(proc)):
@@ -86,7 +86,7 @@ def _trees(proc: Path, at: float, roots: Iterable[int], *, ended: bool = False) 
     found = {}
     for root in roots:
         if root in table:
-            # Processes come and go while the table is read: it may hold a circle of parents.
+            # The table is read while processes change: it may hold a circle of parents.
             pids = {root: table[root]}
             queue = [root]
             for pid in queue:
@@ -100,15 +100,14 @@ def _trees(proc: Path, at: float, roots: Iterable[int], *, ended: bool = False) 
 
 
 class UseMeter:
-    """Measures what components use; a figure over time is that since the last call, or since the start of
-    the component. `proc` and `now` are the system's own."""
+    """Measures the use of components, averaged since the last call or their start."""
 
     def __init__(self, running: Running, *, proc: Path = PROC, now: Callable[[], float] = since_boot) -> None:
         self._running, self._proc, self._now = running, proc, now
         self._last: dict[RunningComponent, _Tree] = {}
 
     def measure(self) -> tuple[ComponentUse, ...]:
-        """One entry for each component whose root process lives, MAX_COMPONENTS at most."""
+        """One entry per component with a living root, at most MAX_COMPONENTS."""
         running = list(self._running())[:MAX_COMPONENTS]
         trees = _trees(self._proc, self._now(), {one.pid for one in running}) if running else {}
         last, self._last = self._last, {one: trees[one.pid] for one in running if one.pid in trees}
@@ -129,23 +128,23 @@ def _use(one: RunningComponent, before: _Tree, tree: _Tree) -> ComponentUse:
 
 
 class TreeUse(NamedTuple):
-    """What one process tree used since it was last looked at."""
+    """Use of one process tree since the last call."""
 
     elapsed: float
     """Seconds since then."""
     cores: float
-    """That it had on average."""
+    """Average used."""
     wanted: float
-    """Cores that it wanted: those that it had, and those that its threads waited for."""
+    """Used, plus those its threads waited for."""
     memory: int
-    """Bytes resident; what processes share counts for each."""
+    """Bytes resident; shared memory counts for each."""
 
 
 class TreeMeter:
-    """Measures the process `root` (this one, if not given) and all its descendants again and again.
+    """Measures the process `root` (default: this one) and its descendants repeatedly.
 
-    Where the system does not tell how long threads waited, `wanted` is how many could run at this moment. Use
-    it from one thread at a time. Raises OSError where there is no /proc."""
+    Without waiting times from the system, `wanted` is the number of runnable threads. For one thread at a time. Raises
+    OSError without /proc."""
 
     def __init__(self, root: int | None = None, *, proc: Path = PROC, now: Callable[[], float] = since_boot) -> None:
         self._root = os.getpid() if root is None else root
@@ -157,7 +156,7 @@ class TreeMeter:
         tree, elapsed = self._last, self._last.at - before.at
         if elapsed <= 0:
             return TreeUse(0.0, 0.0, 0.0, tree.memory)
-        # What comes late from ended children is no use of now.
+        # Late time of ended children says nothing about now.
         cores = min(tree.cores(before), float(os.cpu_count() or 1))
         if tree.threads:
             wanted = min(sum(_demand(before.threads, tree.threads)) / SECOND / elapsed, len(tree.threads))
@@ -166,7 +165,7 @@ class TreeMeter:
         return TreeUse(elapsed, cores, max(cores, wanted), tree.memory)
 
     def _look(self) -> _Tree:
-        # A child that ended keeps its time until somebody waits for it, and then hands it on.
+        # An ended child keeps its time until its parent waits for it, then passes it on.
         trees = _trees(self._proc, self._now(), [self._root], ended=True)
         if self._root not in trees:
             raise OSError(f"{self._proc} does not tell of process {self._root}; mount it, or set load = true")
@@ -174,8 +173,7 @@ class TreeMeter:
 
 
 def faded(averages: tuple[float, ...], wanted: float, seconds: float) -> tuple[float, float, float]:
-    """Averages over 1, 5 and 15 minutes after `wanted` cores were wanted for so long; the past fades, as in
-    the kernel's."""
+    """Averages over 1, 5 and 15 minutes after `wanted` cores for so many seconds, fading like the kernel's."""
     one, five, fifteen = (
         wanted + (past - wanted) * math.exp(-seconds / (60 * minutes))
         for past, minutes in zip(averages, (1, 5, 15), strict=True)
@@ -184,7 +182,7 @@ def faded(averages: tuple[float, ...], wanted: float, seconds: float) -> tuple[f
 
 
 def _fields(stat: bytes) -> list[bytes]:
-    """What follows the name, which stands in brackets and may hold anything, brackets and spaces too."""
+    """The fields after the name, which is in brackets and may contain any character."""
     return stat[stat.rfind(b")") + 1 :].split()
 
 
@@ -204,7 +202,7 @@ def _parse(stat: bytes) -> _Process | None:
 
 
 def _tasks(proc: Path, pids: Iterable[int], file: str) -> Iterator[tuple[int, bytes]]:
-    """This file of each thread, of MAX_THREADS at most: in the process's own folder is its first one's."""
+    """This file of each thread, at most MAX_THREADS: a process's own folder has only the first one's."""
     tasks = ((f"{proc}/{pid}/task", name) for pid in pids for name in _names(f"{proc}/{pid}/task"))
     for folder, name in islice(tasks, MAX_THREADS):
         yield int(name), _read(f"{folder}/{name}/{file}")
@@ -222,7 +220,7 @@ def _threads(proc: Path, pids: Iterable[int]) -> dict[int, _Demand]:
 
 
 def _demand(before: Mapping[int, _Demand], now: Mapping[int, _Demand]) -> _Demand:
-    """What the threads that are there now ran and waited since."""
+    """Time ran and waited since, by the present threads."""
     ran = waited = 0
     for thread, (ran_now, waited_now) in now.items():
         ran_then, waited_then = before.get(thread, (0, 0))
@@ -234,20 +232,20 @@ def _demand(before: Mapping[int, _Demand], now: Mapping[int, _Demand]) -> _Deman
 
 
 def _runnable(proc: Path, pids: Iterable[int]) -> int:
-    """Threads that run or wait for a processor at this moment, but for the one that asks."""
+    """Threads that run or wait for a processor now, except this one."""
     mine = threading.get_native_id()
     return sum(thread != mine and _fields(stat)[:1] == [b"R"] for thread, stat in _tasks(proc, pids, "stat"))
 
 
 def _names(folder: str) -> list[str]:
-    """What is in a folder; nothing if it has gone."""
+    """Names in a folder; none if it is gone."""
     with suppress(OSError), os.scandir(folder) as entries:
         return [entry.name for entry in entries]
     return []
 
 
 def _read(path: str) -> bytes:
-    """A small file of /proc; nothing if it has gone."""
+    """A small file of /proc; empty if it is gone."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         try:

@@ -58,8 +58,7 @@ REPORTS: Final = 2.0
 """Seconds of spoiled pictures before a report."""
 
 
-class BadCheckpoint(ValueError):
-    ...
+class BadCheckpoint(ValueError): ...
 
 
 class Hider:

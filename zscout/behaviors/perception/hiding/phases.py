@@ -171,7 +171,6 @@ def most_open(robot: HidingState) -> Opening:
     return best
 
 
-
 def stuck(robot: HidingState, _: View) -> Step:
     robot.note, robot.at_edge = "bumped", False
     return "back"
@@ -221,7 +220,6 @@ def leave(robot: HidingState, _: View) -> Step:
     if robot.cruised(0.6):
         return "scan"
     return robot.cruise(robot.pace, 0.0, f"{robot.note}: leaves")
-
 
 
 def approach(robot: HidingState, view: View) -> Step:
