@@ -16,10 +16,8 @@ from zscout.mesh.transport import TransportPublisher, TransportQuery, Undeclare
 from zscout.messages import Malformed, Problem, version_words
 from zscout.types import VERSION, Ns, Term
 
-QUEUE_DEPTH = 1_024
-"""Items of one declaration that may wait for the event loop."""
-MAX_CODES: Final = 32
-"""Refusal codes a tally counts separately: drivers and other hosts choose some of them."""
+QUEUE_DEPTH = 1_024  # items of one declaration that may wait for the event loop
+MAX_CODES: Final = 32  # refusal codes a tally counts separately: drivers and other hosts choose some of them
 OTHER: Final = "other"
 CODE: Final = re.compile("[a-z_]{1,32}")
 NOT_UNDERSTOOD: Final = frozenset({"malformed", "bad_name", "bad_request"})
@@ -117,8 +115,7 @@ class IncomingQuery(Generic[R]):
     key: str
     _reply_key: str
     message: R
-    arrived: Ns
-    """When it left the network, by `Mesh.now`."""
+    arrived: Ns  # when it left the network, by `Mesh.now`
     outcome: Answered | None = None
     tally: Tally | None = None
 

@@ -21,8 +21,7 @@ from zscout.types import Ns
 
 log = logging.getLogger(__name__)
 
-MAX_HEAD = 2_048
-"""Bytes attached to a frame."""
+MAX_HEAD = 2_048  # bytes attached to a frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +29,7 @@ class Frame:
     key: str
     head: FrameHead
     jpeg: bytes
-    arrived: Ns
-    """On this host's clock."""
+    arrived: Ns  # on this host's clock
 
 
 class FramePublisher:
@@ -40,8 +38,7 @@ class FramePublisher:
     def __init__(self, publisher: TransportPublisher, deliver: Callable[..., None]) -> None:
         self._publisher, self._deliver = publisher, deliver
         self.close = publisher.undeclare
-        self.watched = False
-        """True if there are subscribers, as far as is known since `follow`."""
+        self.watched = False  # True if there are subscribers, as far as is known since `follow`
 
     def follow(self, changed: Callable[[bool], None]) -> None:
         """Call `changed(watched)` in the event loop at each change."""
@@ -69,8 +66,7 @@ class FrameWatch:
         self._lock = threading.Lock()
         self._newest: tuple[str, bytes, bytes | None, Ns] | None = None
         self._arrived = asyncio.Event()
-        self.missed = 0
-        """Frames replaced before they were taken."""
+        self.missed = 0  # frames replaced before they were taken
         self.malformed = 0
         self.close = transport.subscriber(key, self._on_sample)
 

@@ -32,18 +32,15 @@ from zscout.mesh.relinking import MEETING
 from zscout.mesh.zenoh_mesh import in_thread, zenoh_config
 from zscout.types import clean
 
-SCOUT: Final = 1.5
-"""Seconds for all processes to answer."""
+SCOUT: Final = 1.5  # seconds for all processes to answer
 POLL: Final = 0.02
 CONNECT: Final = 1.5
 HANDSHAKE: Final = 2.0
 OBJECTION: Final = 0.3
 """Seconds for the other side to refuse our certificate: it checks after we have seen its own."""
 LINK: Final = 0.8
-LIST: Final = 1.0
-"""Seconds for links to a plain mesh, and for its tokens."""
-MAX_HEARD: Final = 64
-"""Processes called."""
+LIST: Final = 1.0  # seconds for links to a plain mesh, and for its tokens
+MAX_HEARD: Final = 64  # processes called
 MAX_TOKENS: Final = 10_000
 _ALERT: Final = re.compile(r"alert ([a-z ]*[a-z])")
 _ADDRESS: Final = re.compile(r"(tcp|tls)/([^#?]+):(\d+)(?:[?#].*)?")
@@ -128,8 +125,7 @@ class Called:
     issuer: str = ""
     trusted: bool = False
     objection: str = ""
-    here: bool = False
-    """Without an answer: True for an address of this host."""
+    here: bool = False  # without an answer: True for an address of this host
 
 
 async def call(
@@ -188,8 +184,7 @@ async def _reached(found: Iterable[tuple[str, int]]) -> tuple[str, int]:
 
 
 class _Shaken(NamedTuple):
-    told: Mapping[str, Any]
-    """The other side's certificate, if verified."""
+    told: Mapping[str, Any]  # the other side's certificate, if verified
     encoded: bytes
     objection: str
 

@@ -28,18 +28,15 @@ PAUSES: Final = (0.02, 0.1, 0.1, 0.2, 0.2, 0.5, *(1.0,) * 30)
 """Seconds before each look for a peer; after the last, Zenoh alone looks."""
 TOGETHER: Final = 0.25
 """Two losses within these seconds mean that this process was away: it looks for peers that make the link, too."""
-LOOKS_FOR_GREATER: Final = 4
-"""Looks for peers with a greater id; few, as many processes may look at one time."""
+LOOKS_FOR_GREATER: Final = 4  # looks for peers with a greater id; few, as many processes may look at one time
 PROBE_TIMEOUT: Final = 0.25
-PROBES_TIMEOUT: Final = 1.0
-"""Seconds for all probes of one look."""
+PROBES_TIMEOUT: Final = 1.0  # seconds for all probes of one look
 SCOUT_TIMEOUT: Final = 0.5
 GREET_TIMEOUT: Final = 0.1
 MEET_TIMEOUT: Final = 0.25
 """Seconds; gossip is immediate. An end that has not yet noticed the loss accepts no second link."""
 POLL: Final = 0.002
-MEETING: Final = "6d656574"
-"""Prefix of the ids of temporary sessions, whose end nobody notices."""
+MEETING: Final = "6d656574"  # prefix of the ids of temporary sessions, whose end nobody notices
 _ADDRESS: Final = re.compile(r"^(?:tcp|tls)/(.+):(\d+)(?:[?#].*)?$")
 
 
@@ -51,8 +48,7 @@ class _Lost:
     looks: int = 0
     listens: bool | None = None
     """True is not probed again: each unused connection keeps others off a TLS listener for 0.1 s (docs/zenoh.md)."""
-    together: bool = False
-    """True if this peer is looked for though it makes the link."""
+    together: bool = False  # True if this peer is looked for though it makes the link
 
 
 class Relinking:

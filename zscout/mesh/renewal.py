@@ -20,16 +20,12 @@ from zscout.types import SECOND, Ns
 
 log = logging.getLogger(__name__)
 
-PATIENCE: Final = 2.0
-"""Seconds for which a contradiction must last."""
+PATIENCE: Final = 2.0  # seconds for which a contradiction must last
 UNHEARD: Final = 0.5
 """Seconds, beyond half a hold lease, for which an RCM is alive yet silent: renewal must come before holds lapse."""
-LASTS: Final = 60.0
-"""Seconds after which a contradiction that is not repeated is forgotten."""
-OVERLAP: Final = 0.5
-"""Seconds with both sessions open, for others to learn what the new one declares."""
-LINKED: Final = 2.0
-"""Seconds that the new session may take to link to the peers of the old one."""
+LASTS: Final = 60.0  # seconds after which a contradiction that is not repeated is forgotten
+OVERLAP: Final = 0.5  # seconds with both sessions open, for others to learn what the new one declares
+LINKED: Final = 2.0  # seconds that the new session may take to link to the peers of the old one
 LOOK_EVERY: Final = 0.02
 SHORTEST, LONGEST = 10.0, 320.0
 """Seconds between renewals. Doubled while a renewal does not help; reset after ten times as long without one."""
@@ -43,12 +39,10 @@ class Suspicions:
 
     def __init__(self, now: Callable[[], Ns], renew: Callable[[], object]) -> None:
         self._now, self._renew = now, renew
-        self._since: dict[str, tuple[Ns, Ns]] = {}
-        """First and last time of each."""
+        self._since: dict[str, tuple[Ns, Ns]] = {}  # first and last time of each
         self._last: Ns | None = None
         self._pause = SHORTEST
-        self._acted: dict[str, Ns] = {}
-        """Time of the last renewal for each contradiction that is not resolved."""
+        self._acted: dict[str, Ns] = {}  # time of the last renewal for each contradiction that is not resolved
 
     @property
     def any(self) -> bool:
@@ -320,8 +314,7 @@ class _TokenView:
         self._session = 0
         # A token that dies during the iteration may be reported on the same thread.
         self._lock = threading.RLock()
-        self._alive: dict[str, int] = {}
-        """The last session that showed each token."""
+        self._alive: dict[str, int] = {}  # the last session that showed each token
 
     def declare(self, transport: Transport) -> Undeclare:
         self._session += 1

@@ -40,17 +40,12 @@ from zscout.types import Ns
 
 log = logging.getLogger(__name__)
 
-INBOX_DEPTH = 20_000
-"""Items of all kinds that may wait for the event loop."""
-BURST = 256
-"""Items handled in a row at most."""
+INBOX_DEPTH = 20_000  # items of all kinds that may wait for the event loop
+BURST = 256  # items handled in a row at most
 RING_DEPTH = 32
-LINK_PERIOD = 1.0
-"""Seconds between two checks that each linked session shows its declarations."""
-MAX_SESSIONS = 4_096
-"""Sessions remembered."""
-FINAL_SLACK = 0.5
-"""Seconds after its timeout at which a query ends without the transport's report."""
+LINK_PERIOD = 1.0  # seconds between two checks that each linked session shows its declarations
+MAX_SESSIONS = 4_096  # sessions remembered
+FINAL_SLACK = 0.5  # seconds after its timeout at which a query ends without the transport's report
 
 _Subscription: TypeAlias = tuple[Backlog, list[Callable[[str, Any], None]], Undeclare]
 """Publications decoded once for all handlers of this process."""
@@ -69,8 +64,7 @@ class Inbox:
     items: deque[tuple[Backlog | None, Callable[..., None], tuple[Any, ...]]] = field(default_factory=deque)
     scheduled: bool = False
     closed: bool = False
-    after: list[Callable[[], None]] | None = None
-    """Called after the present burst; None: outside a burst."""
+    after: list[Callable[[], None]] | None = None  # called after the present burst; None: outside a burst
 
     def offer(self, state: Backlog, call: Callable[..., None], *args: Any) -> bool:
         """Call `call(*args)` in the event loop; return False if too much waits."""
@@ -139,8 +133,7 @@ class Mesh:
 
     Declare once per purpose, never per request: Zenoh keeps memory for every key that was ever declared."""
 
-    validity: Validity | None = None
-    """Of this process's present certificate; None on a plain mesh."""
+    validity: Validity | None = None  # of this process's present certificate; None on a plain mesh
 
     def __init__(self, transport: RenewableTransport, keys: Keys, me: Sender, now: Callable[[], Ns]) -> None:
         self.keys, self.me, self.now = keys, me, now
@@ -150,8 +143,7 @@ class Mesh:
         self._strange = SparseLog(log, now)
         self._inbox = Inbox(asyncio.get_running_loop())
         self._shared: dict[tuple[Any, ...], _Subscription] = {}
-        self._kept: list[object] = []
-        """Objects that live as long as this mesh."""
+        self._kept: list[object] = []  # objects that live as long as this mesh
 
     async def __aenter__(self) -> Self:
         return self

@@ -9,8 +9,7 @@ from typing import Final
 from zscout.types import SECOND, Ns
 
 PERIOD: Final[Ns] = 10 * SECOND
-MAX_KEYS: Final = 64
-"""Keys with a period of their own; all further ones share one."""
+MAX_KEYS: Final = 64  # keys with a period of their own; all further ones share one
 OTHERS: Final = ("", "")
 
 

@@ -17,14 +17,10 @@ from zscout.types import SECOND, Ns
 
 log = logging.getLogger(__name__)
 
-CLOSE_TIMEOUT = 5.0
-"""Seconds that `close` waits for cancelled tasks."""
-STALL_PERIOD = 0.2
-"""Seconds between two readings of the clock."""
-STALL_THRESHOLD = SECOND // 5
-"""A reading this late (ns) means a stall."""
-AFTERMATH = SECOND // 4
-"""Arrivals this soon after a stall (ns) may have waited through it."""
+CLOSE_TIMEOUT = 5.0  # seconds that `close` waits for cancelled tasks
+STALL_PERIOD = 0.2  # seconds between two readings of the clock
+STALL_THRESHOLD = SECOND // 5  # a reading this late (ns) means a stall
+AFTERMATH = SECOND // 4  # arrivals this soon after a stall (ns) may have waited through it
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -41,8 +37,7 @@ class Supervisor:
         self.name = name
         self.error: Exception | None = None
         self._on_failure = on_failure
-        self.active = True
-        """False once it failed or was cancelled."""
+        self.active = True  # false once it failed or was cancelled
         self._tasks: dict[asyncio.Task[Any], None] = {}
         self._timers: WeakSet[asyncio.TimerHandle] = WeakSet()
 

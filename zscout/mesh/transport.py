@@ -6,18 +6,14 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Protocol, TypeAlias
 
-OnSample: TypeAlias = Callable[[str, bytes, bytes | None], None]
-"""Called with key, payload and attachment."""
+OnSample: TypeAlias = Callable[[str, bytes, bytes | None], None]  # called with key, payload and attachment
 Undeclare: TypeAlias = Callable[[], None]
 
 
 class Quality(Enum):
-    CONTROL = "control"
-    """Blocks while a peer does not read."""
-    DATA = "data"
-    """Dropped rather than wait; yields to control."""
-    FRAME = "frame"
-    """JPEG frames, dropped alike."""
+    CONTROL = "control"  # blocks while a peer does not read
+    DATA = "data"  # dropped rather than wait; yields to control
+    FRAME = "frame"  # JPEG frames, dropped alike
 
 
 class Collector(Protocol):

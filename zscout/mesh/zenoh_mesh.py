@@ -38,8 +38,7 @@ CONTROL_BATCHES = 8
 """Control messages in flight per peer: with fewer, an answer waits for the message before it."""
 SCOUTING_DELAY_MS = 200
 GREATER_CONNECTS = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
-CLOSE_TIMEOUT = 3.0
-"""Seconds that closing a session may take."""
+CLOSE_TIMEOUT = 3.0  # seconds that closing a session may take
 BLOCK, DROP = zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
 CONTROL: Any = {"congestion_control": BLOCK, "priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True}
 QUALITIES: dict[Quality, dict[str, Any]] = {
@@ -48,12 +47,9 @@ QUALITIES: dict[Quality, dict[str, Any]] = {
     Quality.FRAME: {"congestion_control": DROP, "priority": zenoh.Priority.DATA, "express": True},
 }
 QUERY: Any = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE, **CONTROL}
-MAX_QUERIERS = 256
-"""Per session: Zenoh never frees a key's declaration."""
-MAX_MESSAGE = 17_000_000
-"""Bytes: a little more than zscout's largest message."""
-LOOK_AT_CERTIFICATES = 2.0
-"""Seconds between two checks for renewed certificates."""
+MAX_QUERIERS = 256  # per session: Zenoh never frees a key's declaration
+MAX_MESSAGE = 17_000_000  # bytes: a little more than zscout's largest message
+LOOK_AT_CERTIFICATES = 2.0  # seconds between two checks for renewed certificates
 ANY_TLS = "tls/0.0.0.0:0"
 T = TypeVar("T")
 _PORT = re.compile(r":\d+$")
@@ -265,8 +261,7 @@ class ZenohTransport(Transport):
 
     def __init__(self, session: zenoh.Session, relinking: Relinking | None = None) -> None:
         self._session, self._relinking = session, relinking
-        self._queriers: dict[tuple[str, float], zenoh.Querier] = {}
-        """By key and timeout."""
+        self._queriers: dict[tuple[str, float], zenoh.Querier] = {}  # by key and timeout
         self._asked_once: dict[tuple[str, float], None] = {}
 
     def id(self) -> str:

@@ -16,21 +16,14 @@ from zscout.behaviors.perception.lens import COLUMNS, EYE, FOCAL, RISE, ROWS, Pi
 
 LEVELS: Final = (0.04, 0.08, 0.15, 0.25)
 """Shares of the lit floor's brightness that count as dark, from a gap's depth to shade."""
-LOWEST: Final = 0.055
-"""Metres: a lower gap is closed to the robot, or a mark on the floor."""
-HIGHEST: Final = 0.27
-"""Metres: a higher dark area is a face or a shadow."""
-NARROWEST: Final = 0.16
-"""Metres: narrower gaps do not admit a robot of 0.12 m."""
+LOWEST: Final = 0.055  # metres: a lower gap is closed to the robot, or a mark on the floor
+HIGHEST: Final = 0.27  # metres: a higher dark area is a face or a shadow
+NARROWEST: Final = 0.16  # metres: narrower gaps do not admit a robot of 0.12 m
 MOST_CONTRAST: Final = 120.0
-_BELOW: Final = ROWS // 2
-"""First row below the horizon."""
-_ROOF: Final = 14
-"""Rows at the top of the picture."""
-_THINNEST: Final = 3
-"""Columns, less one, of the narrowest entrance, 6 m off."""
-_CLOSE: Final = 0.3
-"""Metres; nearer, a gap's upper edge may be out of the picture."""
+_BELOW: Final = ROWS // 2  # first row below the horizon
+_ROOF: Final = 14  # rows at the top of the picture
+_THINNEST: Final = 3  # columns, less one, of the narrowest entrance, 6 m off
+_CLOSE: Final = 0.3  # metres; nearer, a gap's upper edge may be out of the picture
 
 
 class DarkPlace(NamedTuple):
@@ -39,35 +32,25 @@ class DarkPlace(NamedTuple):
     bearing: float
     distance: float
     width: float
-    height: float
-    """Of its upper edge above the floor; a lower bound if the edge is out of the picture."""
-    darkness: float
-    """Its brightness as a share of the lit floor's."""
+    height: float  # of its upper edge above the floor; a lower bound if the edge is out of the picture
+    darkness: float  # its brightness as a share of the lit floor's
     left: int
-    right: int
-    """First and last column."""
+    right: int  # first and last column
 
 
 class View(NamedTuple):
     """Brightness in one picture, linear, 0 to 1."""
 
     lit: float
-    near: float
-    """The floor 8 to 10 cm ahead."""
-    middling: float
-    """The median of the whole picture."""
-    ahead: float
-    """Straight ahead at the horizon, and up to a hand's width above."""
-    sides: tuple[float, float]
-    """Left and right half of the band around the horizon."""
-    places: tuple[DarkPlace, ...]
-    """Nearest first."""
+    near: float  # the floor 8 to 10 cm ahead
+    middling: float  # the median of the whole picture
+    ahead: float  # straight ahead at the horizon, and up to a hand's width above
+    sides: tuple[float, float]  # left and right half of the band around the horizon
+    places: tuple[DarkPlace, ...]  # nearest first
     contrast: NDArray[np.float32]
     """Per column: brightest distant floor over near floor, at most `MOST_CONTRAST`."""
-    outside: float
-    """The floor in the brighter half of the columns."""
-    above: float
-    """Top of the picture: above a dark floor a roof is dark, a wall is not."""
+    outside: float  # the floor in the brighter half of the columns
+    above: float  # top of the picture: above a dark floor a roof is dark, a wall is not
 
 
 def analyse(picture: Picture) -> View:

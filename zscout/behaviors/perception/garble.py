@@ -17,23 +17,16 @@ from numpy.typing import NDArray
 
 from zscout.behaviors.perception.lens import COLUMNS, Picture
 
-SNOW: Final = 48.0
-"""Grey levels of noise of a channel without a transmitter."""
-JAMMED: Final = 31.0
-"""Noise of two transmitters, or a very weak one."""
-FLAT: Final = 0.3
-"""Grey levels by which an empty line varies: every camera has more."""
-CUT: Final = 0.25
-"""Share of such lines that make half a picture."""
+SNOW: Final = 48.0  # grey levels of noise of a channel without a transmitter
+JAMMED: Final = 31.0  # noise of two transmitters, or a very weak one
+FLAT: Final = 0.3  # grey levels by which an empty line varies: every camera has more
+CUT: Final = 0.25  # share of such lines that make half a picture
 ALIKE: Final = 0.52
 """Correlation of neighbouring lines at the best offset, enough to judge: noise alone has up to 0.48."""
-ASIDE: Final = 0.4
-"""Loss of correlation in place, in a picture that is all torn."""
-_NORMAL: Final = 0.674 * 6**0.5
-"""Median second difference of normal noise of standard deviation 1."""
+ASIDE: Final = 0.4  # loss of correlation in place, in a picture that is all torn
+_NORMAL: Final = 0.674 * 6**0.5  # median second difference of normal noise of standard deviation 1
 _LONGEST: Final = 3
-_KINDS: Final = 12
-"""Kinds of waves, from _LONGEST per line on."""
+_KINDS: Final = 12  # kinds of waves, from _LONGEST per line on
 
 
 def _waves() -> NDArray[np.float32]:

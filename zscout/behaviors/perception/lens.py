@@ -16,21 +16,15 @@ from zscout.drivers.image_size import jpeg_size
 
 ROWS: Final = 120
 COLUMNS: Final = 160
-FIELD: Final = math.radians(65.0)
-"""Horizontal field of view."""
-FOCAL: Final = COLUMNS / 2 / math.tan(FIELD / 2)
-"""Pixels."""
+FIELD: Final = math.radians(65.0)  # horizontal field of view
+FOCAL: Final = COLUMNS / 2 / math.tan(FIELD / 2)  # pixels
 MIDDLE: Final = COLUMNS / 2 - 0.5
-EYE: Final = 0.04
-"""Metres of the camera above the floor."""
-RISE: Final = FOCAL * EYE
-"""Rows below the horizon, times metres."""
+EYE: Final = 0.04  # metres of the camera above the floor
+RISE: Final = FOCAL * EYE  # rows below the horizon, times metres
 GAMMA: Final = 2.2
-MAX_PIXELS: Final = 4_000_000
-"""Larger JPEG pictures are not decoded."""
+MAX_PIXELS: Final = 4_000_000  # larger JPEG pictures are not decoded
 
-Picture = NDArray[np.uint8]
-"""Grey, shape (120, 160), row 0 at the top, gamma 2.2."""
+Picture = NDArray[np.uint8]  # grey, shape (120, 160), row 0 at the top, gamma 2.2
 
 _LINEAR: Final = ((np.arange(256) / 255.0) ** GAMMA).astype(np.float32)
 

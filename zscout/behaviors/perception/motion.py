@@ -26,19 +26,14 @@ from numpy.typing import NDArray
 from zscout.behaviors.perception.outline import Mask, Outlines
 from zscout.behaviors.perception.presence import Presence
 
-WIDTH: Final = 160
-"""Columns of the analysed picture; larger ones are reduced to it."""
+WIDTH: Final = 160  # columns of the analysed picture; larger ones are reduced to it
 MAX_SIDE: Final = 8_192
-BLOCKS: Final = 20
-"""Blocks across for comparing brightness."""
-WHITE: Final = 240.0
-"""Grey levels from which noise may be clipped, so that a pixel follows the light less."""
-LEARN: Final = 6.0
-"""Seconds in which the background follows pixels without motion."""
+BLOCKS: Final = 20  # blocks across for comparing brightness
+WHITE: Final = 240.0  # grey levels from which noise may be clipped, so that a pixel follows the light less
+LEARN: Final = 6.0  # seconds in which the background follows pixels without motion
 ABSORB: Final = 30.0
 """Seconds in which it follows motion. The variance grows by the square, and follows much sooner."""
-WARM: Final = 1.0
-"""Seconds of the first look: all is background, and nothing is reported."""
+WARM: Final = 1.0  # seconds of the first look: all is background, and nothing is reported
 WARM_PICTURES: Final = 4
 CLEARER: Final = 0.7
 """The first look restarts at a picture with less than this share of its noise: the camera was warming up, and learned
@@ -47,54 +42,39 @@ OTHER: Final = 4.0
 OTHER_NOISE: Final = 2.0
 """It also restarts if half of the picture is off by these grey levels and multiples of its noise: a channel may still
 show the robot that had it before."""
-ALIKE: Final = 1.2
-"""After a pause, the largest factor of a known picture's noise, up or down ..."""
-CHANGED: Final = 0.2
-"""... and the largest share of it that changed."""
+ALIKE: Final = 1.2  # after a pause, the largest factor of a known picture's noise, up or down ...
+CHANGED: Final = 0.2  # ... and the largest share of it that changed.
 AGREE: Final = (0.15, 1.0)
 """Seconds, least and most, between two such pictures that continue the background: another robot's last picture comes
 alone."""
-APART: Final = 3
-"""So many in a row suffice if they come farther apart."""
-STANDS: Final = 0.25
-"""Largest share of differing pixels in a changed region that counts as still."""
+APART: Final = 3  # so many in a row suffice if they come farther apart
+STANDS: Final = 0.25  # largest share of differing pixels in a changed region that counts as still
 RETURN: Final = 2.0
 STRANGE: Final = 8
 """Seconds after a pause, or number of slower pictures, to wait for known ones; then all is learned again."""
-STRONG: Final = 6.5
-"""Standard deviations that begin a region."""
-WEAK: Final = 3.2
-"""Standard deviations that continue a region."""
-FLOOR: Final = 1.3
-"""Least noise of a smoothed picture in grey levels: quantisation and compression."""
-SMALLEST: Final = 0.0012
-"""Least share of the picture in a region."""
+STRONG: Final = 6.5  # standard deviations that begin a region
+WEAK: Final = 3.2  # standard deviations that continue a region
+FLOOR: Final = 1.3  # least noise of a smoothed picture in grey levels: quantisation and compression
+SMALLEST: Final = 0.0012  # least share of the picture in a region
 BAND: Final = 5.0
 THIN: Final = 0.07
 """Torn lines are regions BAND times as wide as high, and no higher than this share of the picture."""
-ASIDE: Final = 32
-"""Largest displacement of torn lines in columns."""
-UPHEAVAL: Final = 0.55
-"""Share of changed pixels that no motion explains."""
-ALL_OFF: Final = 4.0
-"""Standard deviations of the median pixel in a picture of another scene."""
+ASIDE: Final = 32  # largest displacement of torn lines in columns
+UPHEAVAL: Final = 0.55  # share of changed pixels that no motion explains
+ALL_OFF: Final = 4.0  # standard deviations of the median pixel in a picture of another scene
 UPRIGHT: Final = 0.15
 CERTAIN: Final = 0.005
 """Least share of the picture's height, and of its area, in a region reported at first sight. It is also no wider than
 high, and half of it above STRONG: transmission faults lie along the lines, and noise is never like it."""
-SURE: Final = 2
-"""Pictures of the last RECENT that must show anything else in one place."""
+SURE: Final = 2  # pictures of the last RECENT that must show anything else in one place
 RECENT: Final = 3
-MEMORY: Final = 1.2
-"""Seconds after which an earlier sighting confirms nothing."""
+MEMORY: Final = 1.2  # seconds after which an earlier sighting confirms nothing
 MAX_BOXES: Final = 16
-GAP: Final = 1.0
-"""Seconds without motion that end an event."""
+GAP: Final = 1.0  # seconds without motion that end an event
 
 Picture = NDArray[np.uint8]
 _Plane = NDArray[np.float32]
-_Regions = NDArray[np.int32]
-"""Left, top, width, height and area of each."""
+_Regions = NDArray[np.int32]  # left, top, width, height and area of each
 
 
 class Box(NamedTuple):
@@ -108,32 +88,22 @@ class Box(NamedTuple):
 
 class Seen(NamedTuple):
     moving: bool
-    boxes: tuple[Box, ...] = ()
-    """Largest first, including sightings not confirmed yet."""
-    learning: bool = False
-    """The background is new: nothing is known."""
-    present: bool = False
-    """Nothing moves, but the last mover is still there."""
-    mask: Mask | None = None
-    """Moving pixels, if requested and known."""
+    boxes: tuple[Box, ...] = ()  # largest first, including sightings not confirmed yet
+    learning: bool = False  # the background is new: nothing is known
+    present: bool = False  # nothing moves, but the last mover is still there
+    mask: Mask | None = None  # moving pixels, if requested and known
 
 
 class Event(NamedTuple):
     """A stretch of motion. Times are seconds of the pictures' clock."""
 
     start: float
-    end: float
-    """Last picture with motion."""
-    peak: float
-    """Picture with the largest moving area."""
-    boxes: tuple[Box, ...]
-    """Motion at the peak, largest first, in pixels of the source."""
-    area: Box
-    """Around all motion of the event."""
-    frames: int
-    """Pictures with motion."""
-    going_on: bool = False
-    """It was not over when the watch was."""
+    end: float  # last picture with motion
+    peak: float  # picture with the largest moving area
+    boxes: tuple[Box, ...]  # motion at the peak, largest first, in pixels of the source
+    area: Box  # around all motion of the event
+    frames: int  # pictures with motion
+    going_on: bool = False  # it was not over when the watch was
 
 
 class _Meanwhile:
@@ -170,16 +140,12 @@ class MotionDetector:
         self._variance = self._mean
         self._begun = self._last = 0.0
         self._pictures = 0
-        self._noise = 0.0
-        """In grey levels: the most of the first look, or the last before a pause."""
+        self._noise = 0.0  # in grey levels: the most of the first look, or the last before a pause
         self._latest = self._mean
         self._paused = False
-        self._back: float | None = None
-        """Time of the first picture after a pause, with no gap since."""
-        self._strange = 0
-        """Pictures since then that did not fit."""
-        self._meanwhile: _Meanwhile | None = None
-        """Summary of fitting pictures since then."""
+        self._back: float | None = None  # time of the first picture after a pause, with no gap since
+        self._strange = 0  # pictures since then that did not fit
+        self._meanwhile: _Meanwhile | None = None  # summary of fitting pictures since then
         self._presence = Presence()
         self._sightings: deque[tuple[float, NDArray[np.uint8]]] = deque(maxlen=RECENT - 1)
 
@@ -422,11 +388,9 @@ class EventTracker:
     """Turns a MotionDetector's results into events, each returned once, at its end."""
 
     def __init__(self) -> None:
-        self.current: Event | None = None
-        """The present event, so far."""
+        self.current: Event | None = None  # the present event, so far
         self._most = 0
-        self._first: tuple[float, tuple[Box, ...]] | None = None
-        """A sighting that the next picture may confirm."""
+        self._first: tuple[float, tuple[Box, ...]] | None = None  # a sighting that the next picture may confirm
 
     def see(self, time: float, seen: Seen) -> Event | None:
         """Take the result at `time`, which never goes back; return the event that had ended before, if any."""

@@ -13,19 +13,13 @@ from numpy.typing import NDArray
 
 from zscout.behaviors.perception.garble import noise_of
 
-AROUND: Final = 9
-"""Pixels of the reduced picture by which regions grow: smoothing has removed their rim."""
-DIFFERS: Final = 16.0
-"""Least grey levels of any colour by which a moving pixel differs ..."""
-NOISE: Final = 4.0
-"""... and multiple of the picture's noise."""
-SPARSE: Final = 4
-"""Every so many columns serve to estimate the noise."""
-HOLE: Final = 5
-"""Pixels across of the largest holes closed and specks removed."""
+AROUND: Final = 9  # pixels of the reduced picture by which regions grow: smoothing has removed their rim
+DIFFERS: Final = 16.0  # least grey levels of any colour by which a moving pixel differs ...
+NOISE: Final = 4.0  # ... and multiple of the picture's noise.
+SPARSE: Final = 4  # every so many columns serve to estimate the noise
+HOLE: Final = 5  # pixels across of the largest holes closed and specks removed
 
-Mask = NDArray[np.uint8]
-"""255 where something moves, else 0."""
+Mask = NDArray[np.uint8]  # 255 where something moves, else 0
 
 
 class Outlines:

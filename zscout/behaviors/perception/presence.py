@@ -11,17 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-LONGEST: Final = 60.0
-"""Most seconds of presence after the last motion."""
-ANOTHER: Final = 3.0
-"""Multiple of a picture's noise, smoothed, and ..."""
-LEAST: Final = 6.0
-"""... grey levels by which a pixel counts as changed."""
-SHARE: Final = 0.35
-"""Least share of changed pixels where it last moved: rims and shadows come and go."""
+LONGEST: Final = 60.0  # most seconds of presence after the last motion
+ANOTHER: Final = 3.0  # multiple of a picture's noise, smoothed, and ...
+LEAST: Final = 6.0  # ... grey levels by which a pixel counts as changed.
+SHARE: Final = 0.35  # least share of changed pixels where it last moved: rims and shadows come and go
 
-GONE: Final = 2.0
-"""Seconds of absence after which the background counts as known again."""
+GONE: Final = 2.0  # seconds of absence after which the background counts as known again
 
 Plane = NDArray[np.float32]
 Regions = NDArray[np.uint8]
@@ -29,12 +24,10 @@ Regions = NDArray[np.uint8]
 
 class Presence:
     def __init__(self) -> None:
-        self._before: Plane | None = None
-        """Background before the motion; None if there was none lately."""
+        self._before: Plane | None = None  # background before the motion; None if there was none lately
         self._moved_at = self._there_at = 0.0
         """Times of the last motion, and of the last presence without motion."""
-        self._where: Regions = np.empty((0, 0), np.uint8)
-        """Region of the last motion."""
+        self._where: Regions = np.empty((0, 0), np.uint8)  # region of the last motion
 
     def expects(self, moving: bool) -> bool:
         """Return True if the next picture's noise is needed."""

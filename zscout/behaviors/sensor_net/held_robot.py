@@ -22,8 +22,7 @@ class RobotNeeds:
     radio: str = "radio/*"
     video: str = "video/*"
     framegrabber: str = "framegrabber/*"
-    command_rate: float = 5.0
-    """Most commands per second."""
+    command_rate: float = 5.0  # most commands per second
 
     def needs(self, *, video: str | None = None) -> dict[str, dict[str, Any]]:
         """For an ARC; `video` names another channel than usual."""
@@ -45,10 +44,8 @@ class HeldRobot:
         self.framegrabber = held.rc(needs.framegrabber)
         self._period: Ns = round(SECOND / needs.command_rate)
         self._next: Ns = 0
-        self._still = False
-        """The last command was a stop."""
-        self._transmits: bool | None = None
-        """As last commanded; None if unknown."""
+        self._still = False  # the last command was a stop
+        self._transmits: bool | None = None  # as last commanded; None if unknown
         self.sent = self.refused = 0
 
     async def camera(self, on: bool, *, remind: bool = False) -> bool:

@@ -10,18 +10,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal, TypeAlias
 
-ABSENCE_TIMEOUT: Final = 10.0
-"""Seconds of absence after which a robot counts as lost."""
+ABSENCE_TIMEOUT: Final = 10.0  # seconds of absence after which a robot counts as lost
 GONE: Final = "it is not on the mesh"
-RETRY: Final = 60.0
-"""Seconds before a failed robot is retried, if no other is free."""
+RETRY: Final = 60.0  # seconds before a failed robot is retried, if no other is free
 
 WATCHING: Final = frozenset({"watch", "alert", "present"})
 """Status of a robot that watches; `present`: a mover is still there."""
-HIDDEN: Final = WATCHING | {"hidden", "blind"}
-"""Status of a robot in its place."""
-PAUSED: Final = frozenset({"wait", "lost", ""})
-"""Status that does not show whether it is hidden."""
+HIDDEN: Final = WATCHING | {"hidden", "blind"}  # status of a robot in its place
+PAUSED: Final = frozenset({"wait", "lost", ""})  # status that does not show whether it is hidden
 
 MemberStatus: TypeAlias = Literal["free", "active", "lost"]
 

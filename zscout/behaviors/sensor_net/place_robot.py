@@ -29,22 +29,15 @@ from zscout.mesh import FrameWatch
 from zscout.mesh.supervision import Supervisor, done_within, supervised
 from zscout.types import SECOND
 
-LOOK: Final = 0.5
-"""Seconds to wait for a picture."""
-RETRY_AFTER: Final = 1.0
-"""Seconds before a retry after a refusal."""
+LOOK: Final = 0.5  # seconds to wait for a picture
+RETRY_AFTER: Final = 1.0  # seconds before a retry after a refusal
 GIVEN_UP: Final = 60.0
 """Seconds before a robot that was given up is tried again: its battery may have been changed."""
-WARM_AHEAD: Final = 4.0
-"""Seconds of warm-up before the expected turn: it takes two, and turns may begin early."""
-WARM_SLACK: Final = 4.0
-"""Further seconds until the turn at which the camera is switched off again."""
-SOONER: Final = 0.9
-"""Share of its slot requested by a robot that recently saw motion."""
-BRIEF: Final = 0.1
-"""Seconds of minimum runtime of the warm-up: others may take the channel."""
-IDLE: Final = 0.1
-"""Seconds between safe points while waiting."""
+WARM_AHEAD: Final = 4.0  # seconds of warm-up before the expected turn: it takes two, and turns may begin early
+WARM_SLACK: Final = 4.0  # further seconds until the turn at which the camera is switched off again
+SOONER: Final = 0.9  # share of its slot requested by a robot that recently saw motion
+BRIEF: Final = 0.1  # seconds of minimum runtime of the warm-up: others may take the channel
+IDLE: Final = 0.1  # seconds between safe points while waiting
 
 
 class CameraBlind(Exception):
@@ -84,10 +77,8 @@ class PlaceRobot(Behavior):
         for task in self._tasks.values():
             self.add(task)
         self._clock = CarriedClock()
-        self.holding = ""
-        """Id of the ARC that holds its robot, or empty."""
-        self.video: str | None = None
-        """The channel that its present ARC requests by name."""
+        self.holding = ""  # id of the ARC that holds its robot, or empty
+        self.video: str | None = None  # the channel that its present ARC requests by name
         self.came: tuple[str, str | None] | None = None
         """`holding` and `video` from before a move, until that ARC is requested."""
 

@@ -19,10 +19,8 @@ from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor, done_within, supervised
 from zscout.messages import MAX_COMPONENT_NAME, BehaviorSaid, ComponentSpec, Placement, Placements
 
-PERIOD: Final = 0.5
-"""Seconds between two checks."""
-STOPPING: Final = 3.0
-"""Seconds for stopping its components at the end."""
+PERIOD: Final = 0.5  # seconds between two checks
+STOPPING: Final = 3.0  # seconds for stopping its components at the end
 
 
 class PlaceSensorNet(Behavior):
@@ -35,12 +33,9 @@ class PlaceSensorNet(Behavior):
         self._spec_for = spec_for
         self._components: dict[str, str] = {}
         """Robots by component name, which is unique as it contains the net's."""
-        self._placed: set[str] = set()
-        """Components that this net had placed: it stops no others."""
-        self._there: set[str] = set()
-        """Those that the placer has confirmed to this process."""
-        self._busy: set[str] = set()
-        """Components with a placer request under way."""
+        self._placed: set[str] = set()  # components that this net had placed: it stops no others
+        self._there: set[str] = set()  # those that the placer has confirmed to this process
+        self._busy: set[str] = set()  # components with a placer request under way
         self._clock = CarriedClock()
         self._supervisor: Supervisor
         self._mesh: Mesh

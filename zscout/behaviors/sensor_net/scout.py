@@ -20,19 +20,15 @@ from zscout.behaviors.perception.motion import Box, MotionDetector
 NO_PICTURE_TIMEOUT: Final = 10.0
 """Seconds from a hold's start, or the last picture, until the robot counts as unseen."""
 
-QUIET: Final = 2.0
-"""Seconds without motion that separate two events."""
-SUSPECTS: Final = 2
-"""Holds in a row without a picture that prove a robot dead."""
-BAD_FOR: Final = 60.0
-"""Seconds for which an empty channel is avoided."""
+QUIET: Final = 2.0  # seconds without motion that separate two events
+SUSPECTS: Final = 2  # holds in a row without a picture that prove a robot dead
+BAD_FOR: Final = 60.0  # seconds for which an empty channel is avoided
 NO_SIGNAL_TIMEOUT: Final = 4.0
 """Seconds without any picture at a hold's end that prove a receiver dead: framegrabbers give up after five."""
 REMIND: Final = 4.0
 """Seconds without a good picture, above any warm-up, after which the command to transmit is repeated."""
 
-LATELY: Final = 2
-"""Turns to watch that count as recent."""
+LATELY: Final = 2  # turns to watch that count as recent
 
 Task: TypeAlias = Literal["hide", "watch"]
 
@@ -41,22 +37,15 @@ Task: TypeAlias = Literal["hide", "watch"]
 class Step:
     left: float
     right: float
-    lasts: float
-    """Wheels: -1 to 1 of top speed, for so many seconds without a newer command."""
+    lasts: float  # wheels: -1 to 1 of top speed, for so many seconds without a newer command
     doing: str
     detail: str
-    boxes: tuple[Box, ...] = ()
-    """Around motion, in pixels of the picture."""
-    alert: bool = False
-    """Motion began."""
-    quiet: bool = False
-    """Motion ended: earlier boxes are old."""
-    over: bool = False
-    """The task is done: give the hold back, and request the other."""
-    blind: bool = False
-    """No picture for too long: give the hold back."""
-    learning: bool = False
-    """Watching, but still learning the background."""
+    boxes: tuple[Box, ...] = ()  # around motion, in pixels of the picture
+    alert: bool = False  # motion began
+    quiet: bool = False  # motion ended: earlier boxes are old
+    over: bool = False  # the task is done: give the hold back, and request the other
+    blind: bool = False  # no picture for too long: give the hold back
+    learning: bool = False  # watching, but still learning the background
 
 
 class Alerts:
@@ -64,8 +53,7 @@ class Alerts:
 
     def __init__(self) -> None:
         self.count = 0
-        self._last: float | None = None
-        """Last motion of the present event."""
+        self._last: float | None = None  # last motion of the present event
 
     @property
     def moving(self) -> bool:
@@ -96,11 +84,9 @@ class Blindness:
     working receiver: its framegrabber gives up, the hold ends before `timeout`, and the robot is not to blame."""
 
     def __init__(self, timeout: float) -> None:
-        self.timeout = timeout
-        """Seconds without a picture, warm-up included."""
+        self.timeout = timeout  # seconds without a picture, warm-up included
         self._dark_since: float | None = None
-        self._bad: dict[str, float] = {}
-        """Channels without this robot's picture, and the time."""
+        self._bad: dict[str, float] = {}  # channels without this robot's picture, and the time
         self._in_row = 0
         self._reminded = 0.0
         self._channel = ""
@@ -173,14 +159,10 @@ class Scout:
         self.alerts = Alerts()
         self.blindness = Blindness(NO_PICTURE_TIMEOUT)
         self._detector = MotionDetector()
-        self._task: Task = "hide"
-        """Of the present hold."""
-        self._alerts = 0
-        """Count before the present turn."""
-        self._turns: deque[bool] = deque(maxlen=LATELY)
-        """For each recent turn to watch: True if it saw motion."""
-        self._held = self.no_signal = False
-        """The last hold ended without even snow: leave its channel."""
+        self._task: Task = "hide"  # of the present hold
+        self._alerts = 0  # count before the present turn
+        self._turns: deque[bool] = deque(maxlen=LATELY)  # for each recent turn to watch: True if it saw motion
+        self._held = self.no_signal = False  # the last hold ended without even snow: leave its channel
 
     @property
     def task(self) -> Task:

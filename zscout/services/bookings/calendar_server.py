@@ -16,12 +16,9 @@ from zscout.messages import BookingsAsk, BookingsTold
 from zscout.services.bookings.calendar_text import CONTENT_TYPE, CalendarSelection, calendar_text
 from zscout.services.plain_http import Page, PlainHttpServer
 
-FRESH: Final = 5.0
-"""Seconds for which the leader's answer is reused."""
-ASK: Final = 2.0
-"""Seconds for its answer."""
-MAX_TEXTS: Final = 64
-"""Calendars kept as text."""
+FRESH: Final = 5.0  # seconds for which the leader's answer is reused
+ASK: Final = 2.0  # seconds for its answer
+MAX_TEXTS: Final = 64  # calendars kept as text
 _PATH: Final = re.compile(rf"/(?:fleet|rc/(?P<rc>{NAME.pattern}/{NAME.pattern})|owner/(?P<owner>{NAME.pattern}))\.ics")
 NOT_NOW: Final = Page(
     b"no leader tells the bookings now\n", status="503 Service Unavailable", headers="Retry-After: 60\r\n"

@@ -20,8 +20,7 @@ from zscout.services.bookings.dates import zone_of
 from zscout.types import clean
 
 CONTENT_TYPE: Final = "text/calendar; charset=utf-8"
-REFRESH: Final = "PT15M"
-"""Suggested reload interval; programs may ignore it."""
+REFRESH: Final = "PT15M"  # suggested reload interval; programs may ignore it
 NEEDS, PRIORITY, PATIENCE = "X-ZSCOUT-NEEDS", "X-ZSCOUT-PRIORITY", "X-ZSCOUT-PATIENCE"
 
 

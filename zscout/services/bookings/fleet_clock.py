@@ -11,12 +11,9 @@ from typing import Final
 
 from zscout.types import SECOND, Ns
 
-SLEW: Final = 100
-"""Slew by one part in so many."""
-DIFFERS: Final = 2.0
-"""Seconds of a host clock's error before a warning."""
-SAME: Final = 1.0
-"""Seconds: fleet times that began this close together are equally old."""
+SLEW: Final = 100  # slew by one part in so many
+DIFFERS: Final = 2.0  # seconds of a host clock's error before a warning
+SAME: Final = 1.0  # seconds: fleet times that began this close together are equally old
 
 
 def wall_ns(seconds: float) -> Ns:

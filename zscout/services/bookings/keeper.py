@@ -39,12 +39,10 @@ log = logging.getLogger(__name__)
 
 FILE: Final = "bookings.json"
 ASIDE: Final = "bookings.damaged.json"
-MAX_SAVING: Final = 16
-"""Answers awaiting the disk at one time."""
+MAX_SAVING: Final = 16  # answers awaiting the disk at one time
 UNASKED: Final[Ns] = 40 * SECOND
 """A keeper with a leader but no query for so long is not seen: each is asked every 30 s."""
-LEFT: Final[Ns] = 5 * SECOND
-"""Silence after which a leader counts as new."""
+LEFT: Final[Ns] = 5 * SECOND  # silence after which a leader counts as new
 
 
 class _BookingFile(msgspec.Struct):
@@ -109,23 +107,17 @@ class BookingKeeper:
     ) -> None:
         self.mesh, self.wall, self._disk, self._candidate = mesh, wall, disk, candidate
         self.records = Records()
-        self._offset: Ns | None = None
-        """Fleet time minus the own clock, at the last publication."""
-        self.heard: tuple[Term, Ns] = NO_TERM, 0
-        """Term and time of that publication."""
-        self.since: Ns = 0
-        """Start of its uninterrupted run, on the own clock."""
+        self._offset: Ns | None = None  # fleet time minus the own clock, at the last publication
+        self.heard: tuple[Term, Ns] = NO_TERM, 0  # term and time of that publication
+        self.since: Ns = 0  # start of its uninterrupted run, on the own clock
         self._leader: tuple[Term, Ns, Ns] = NO_TERM, 0, 0
         """Present leader's term, with its first and last publication."""
-        self._asked: Ns = 0
-        """Last query of a leader."""
-        self._saved = self.records.digest()
-        """Digest of the records on disk."""
+        self._asked: Ns = 0  # last query of a leader
+        self._saved = self.records.digest()  # digest of the records on disk
         self._saving = asyncio.Lock()
         self._waiting = 0
         self._declared: list[Declaration] = []
-        self.on_shared: Callable[[], None] = lambda: None
-        """Called when another leader shared new records."""
+        self.on_shared: Callable[[], None] = lambda: None  # called when another leader shared new records
         if disk is not None:
             self.records.take(disk.read())
             self._saved = self.records.digest()

@@ -14,10 +14,8 @@ from msgspec.structs import replace
 from zscout.messages import MAX_MERGED, BookingRecord, encode
 from zscout.services.bookings.dates import DAY, last_end
 
-MAX_BYTES: Final = 12_000_000
-"""Of all records: the limit of one answer, and of a file."""
-KEEP: Final = DAY
-"""Seconds a record is kept after its last end: clocks may differ."""
+MAX_BYTES: Final = 12_000_000  # of all records: the limit of one answer, and of a file
+KEEP: Final = DAY  # seconds a record is kept after its last end: clocks may differ
 
 
 def merged(one: BookingRecord, other: BookingRecord) -> BookingRecord:
@@ -42,8 +40,7 @@ class Records:
 
     def __init__(self) -> None:
         self._records: dict[str, BookingRecord] = {}
-        self.size = 0
-        """Encoded bytes."""
+        self.size = 0  # encoded bytes
         self._digest: str | None = None
 
     def __iter__(self) -> Iterator[BookingRecord]:

@@ -9,8 +9,7 @@ from typing import Final
 from zscout.messages import PastHold
 from zscout.services.journal.merging import Span
 
-THROWN_AWAY: Final = frozenset({"preempted", "lost"})
-"""Outcomes of holds ended against the holder's will."""
+THROWN_AWAY: Final = frozenset({"preempted", "lost"})  # outcomes of holds ended against the holder's will
 
 
 @dataclass(slots=True)
@@ -18,25 +17,20 @@ class Account:
     """Of one user, group or RC."""
 
     key: str
-    holds: int = 0
-    """Holds with some time in the window."""
-    held: float = 0.0
-    """Seconds held; simultaneous holds count twice."""
+    holds: int = 0  # holds with some time in the window
+    held: float = 0.0  # seconds held; simultaneous holds count twice
     rc_seconds: float = 0.0
     """Seconds times RCs: three RCs for 10 s are 30. Equals `held` in an RC's own account."""
     waited: float = 0.0
     """Known seconds in the queue, in full, of holds that began in the window. Waits without a hold are unknown."""
-    preempted: int = 0
-    """Holds preempted in the window before their minimum runtime."""
-    preempted_seconds: float = 0.0
-    """Seconds held by those."""
+    preempted: int = 0  # holds preempted in the window before their minimum runtime
+    preempted_seconds: float = 0.0  # seconds held by those
     thrown_away: float = 0.0
     """Seconds of holds that ended in the window, before their minimum runtime, by preemption or a lost RC. The
     programs' work counts as lost, though some keep it."""
     used: float | None = None
     """Reported seconds of use within `rc_seconds`, prorated for holds partly in the window; None without any report."""
-    used_unknown: int = 0
-    """Holds with some RC's use unreported; the other RCs' use counts."""
+    used_unknown: int = 0  # holds with some RC's use unreported; the other RCs' use counts
 
 
 def accounts(

@@ -18,12 +18,9 @@ from zscout.messages import MAX_PAGE, History, HistoryAsk, PastHold
 from zscout.services.journal.merging import Span, enough, merged, unknown_to, unknown_to_all
 from zscout.types import HostName
 
-ASK: Final = 5.0
-"""Seconds that a candidate has for a page."""
-QUIET: Final = 0.3
-"""Seconds without another candidate that end the search."""
-AT_ONCE: Final = 16
-"""Candidates queried at one time."""
+ASK: Final = 5.0  # seconds that a candidate has for a page
+QUIET: Final = 0.3  # seconds without another candidate that end the search
+AT_ONCE: Final = 16  # candidates queried at one time
 CAUSES: Final[Mapping[str, str]] = {
     "off": "did not run",
     "silent": "heard no RCM",
@@ -45,12 +42,9 @@ class Told:
     """Merged answer for a window."""
 
     window: Span
-    holds: Sequence[PastHold]
-    """By start; the latest, if there are too many."""
-    more: bool
-    """True if there are earlier ones."""
-    journals: Mapping[HostName, History]
-    """The first page of each candidate that answered."""
+    holds: Sequence[PastHold]  # by start; the latest, if there are too many
+    more: bool  # True if there are earlier ones
+    journals: Mapping[HostName, History]  # the first page of each candidate that answered
     without: Sequence[HostName]
     """Candidates without an answer: without a journal, of an old version, or too slow."""
 

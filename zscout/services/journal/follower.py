@@ -28,24 +28,18 @@ from zscout.types import NO_TERM, Grant, RcName, clean
 
 N = TypeVar("N", int, Decimal)
 
-MAX_OPEN: Final = 20_000
-"""Holds followed at one time. Further ones are kept, but may be written repeatedly."""
-MAX_EARLY: Final = 2_000
-"""Reports of use kept for holds not known yet."""
-MAX_TEXT: Final = 200
-"""Characters kept of a name or a reason."""
-MAX_RCS: Final = 1_000
-"""RCs kept per hold: no fleet allows more."""
-MAX_NUMBER: Final = 10**9
-"""Limit of a priority or a duration."""
+MAX_OPEN: Final = 20_000  # holds followed at one time. Further ones are kept, but may be written repeatedly.
+MAX_EARLY: Final = 2_000  # reports of use kept for holds not known yet
+MAX_TEXT: Final = 200  # characters kept of a name or a reason
+MAX_RCS: Final = 1_000  # RCs kept per hold: no fleet allows more
+MAX_NUMBER: Final = 10**9  # limit of a priority or a duration
 MAX_SEQ: Final = 2**63 - 1
 
 
 class PublicationHeard(NamedTuple):
     """A publication, `silence` seconds after the previous one or heartbeat."""
 
-    at: float
-    """Seconds since 1970, UTC."""
+    at: float  # seconds since 1970, UTC
     silence: float
     grants: Grants
 
@@ -108,14 +102,11 @@ class Follower:
         self._silent = silent
         self._open: dict[Grant, None] = dict.fromkeys(open_holds)
         self._term, self._seq = NO_TERM, 0
-        self._left = heard
-        """Time of that close, until the next publication."""
-        self._doubt: float | None = None
-        """Since then ends may have been missed."""
+        self._left = heard  # time of that close, until the next publication
+        self._doubt: float | None = None  # since then ends may have been missed
         self._early: OrderedDict[tuple[Grant, RcName], float] = OrderedDict()
         """Use under unfollowed grants, ended or not known yet; the last MAX_EARLY."""
-        self.must_read = False
-        """True while the RCM's state must be read, and passed as a `StateRead`."""
+        self.must_read = False  # true while the RCM's state must be read, and passed as a `StateRead`
 
     def take(self, event: Heard) -> Iterator[Change]:
         """The resulting changes; none for an earlier term."""

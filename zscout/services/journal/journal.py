@@ -25,22 +25,15 @@ from zscout.types import NO_TERM, SECOND, Grant, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
 
-COMMIT_EVERY: Final = 1.0
-"""Seconds between two commits."""
-HEARD_EVERY: Final = 30.0
-"""Seconds after which a quiet RCM is noted as alive."""
-READ_EVERY: Final = 2.0
-"""Seconds between two queries for the RCM's state, while it is needed."""
-AGAIN_AFTER: Final = 30.0
-"""Seconds until a failed disk is retried."""
-MAX_GATHERED: Final = 100_000
-"""Holders and ends awaiting a commit; more are dropped as a gap."""
+COMMIT_EVERY: Final = 1.0  # seconds between two commits
+HEARD_EVERY: Final = 30.0  # seconds after which a quiet RCM is noted as alive
+READ_EVERY: Final = 2.0  # seconds between two queries for the RCM's state, while it is needed
+AGAIN_AFTER: Final = 30.0  # seconds until a failed disk is retried
+MAX_GATHERED: Final = 100_000  # holders and ends awaiting a commit; more are dropped as a gap
 MAX_USES: Final = 10_000
 """Reports of use awaiting a commit, and remembered against duplicates; more are repeated later, or written twice."""
-MAX_TOLD: Final = 5_000
-"""Holds passed to `on_opened`."""
-MAX_ASKING: Final = 16
-"""Queries answered at one time."""
+MAX_TOLD: Final = 5_000  # holds passed to `on_opened`
+MAX_ASKING: Final = 16  # queries answered at one time
 ENDS_WITHIN: Final = 5.0
 MEGABYTE: Final = 1_000_000
 
@@ -56,25 +49,19 @@ class Journal:
         self._store = JournalStore(folder, config.max_age / SECOND, config.max_size * MEGABYTE)
         self._supervisor = Supervisor("the journal", lambda _: log.error("no journal is kept until this node restarts"))
         self._gathered: list[Heard] = []
-        self._weight = 0
-        """Of the gathered events."""
+        self._weight = 0  # of the gathered events
         self._uses: dict[tuple[RcName, Grant], float] = {}
         """Seconds of use since the last commit: the maximum for each RC and grant."""
         self._said: OrderedDict[RcName, dict[Grant, tuple[float, bool]]] = OrderedDict()
         """Last report of each RC, and whether that hold had ended: RCs repeat it."""
         self._said_count = 0
         self._number: tuple[Term, int] = NO_TERM, 0
-        self._at: Ns | None = None
-        """Last publication, by the mesh's clock."""
-        self._first = self._heard = 0.0
-        """First and last publication known to this journal."""
-        self._committed = 0.0
-        """Publications up to here are noted as received."""
+        self._at: Ns | None = None  # last publication, by the mesh's clock
+        self._first = self._heard = 0.0  # first and last publication known to this journal
+        self._committed = 0.0  # publications up to here are noted as received
         self._dropped, self._dropped_since = 0, 0.0
-        self._follower: Follower | None = None
-        """None: the file is not open."""
-        self._pending: list[Change] = []
-        """Derived, but not written."""
+        self._follower: Follower | None = None  # none: the file is not open
+        self._pending: list[Change] = []  # derived, but not written
         self.on_opened: Callable[[list[PastHold]], object] = lambda _: None
         """Called once, in the event loop, with the latest holds of the reopened journal, oldest first."""
         self._told = False
@@ -82,8 +69,7 @@ class Journal:
         self._not_before: Ns = 0
         self._read_at: Ns = 0
         self._asking = 0
-        self._used_last = False
-        """True with an RC's last report on an ended hold."""
+        self._used_last = False  # true with an RC's last report on an ended hold
         self._ending = asyncio.Event()
         self._declared: list[Declaration] = []
 

@@ -35,17 +35,12 @@ from zscout.types import Grant, RcName, Term
 log = logging.getLogger(__name__)
 
 FILE: Final = "journal.sqlite"
-ASIDE: Final = "journal.damaged.sqlite"
-"""Unreadable files; the last one only, to bound the disk."""
-FORMAT: Final = 1
-"""`user_version` of the file."""
-PRUNED_AT_ONCE: Final = 5_000
-"""Holds that one commit removes, so that the next does not wait long."""
-ROOM: Final = 0.95
-"""Share of the allowed size after a removal."""
+ASIDE: Final = "journal.damaged.sqlite"  # unreadable files; the last one only, to bound the disk
+FORMAT: Final = 1  # `user_version` of the file
+PRUNED_AT_ONCE: Final = 5_000  # holds that one commit removes, so that the next does not wait long
+ROOM: Final = 0.95  # share of the allowed size after a removal
 MAX_KEPT_GAPS: Final = 10_000
-WAL: Final = 4_000_000
-"""Bytes of the write-ahead log between commits."""
+WAL: Final = 4_000_000  # bytes of the write-ahead log between commits
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 _SCHEMA: Final = """

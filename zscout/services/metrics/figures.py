@@ -16,8 +16,7 @@ from zscout.scheduling.model import Outcome
 from zscout.services.rcm.digest import Began, Over
 from zscout.types import SECOND, ArcId, Ns, RcName
 
-MAX_WAITERS: Final = 100
-"""Pairs of a priority and a group."""
+MAX_WAITERS: Final = 100  # pairs of a priority and a group
 MAX_RCS: Final = 1_000
 MAX_WAIT: Final[Ns] = 90 * 86_400 * SECOND
 """Longer waits count as this: a client alone reports a wait under an earlier RCM."""
@@ -62,14 +61,12 @@ FAMILIES: Final[Mapping[str, MetricFamily]] = {
 
 class Distribution(NamedTuple):
     bounds: tuple[float, ...]
-    counts: tuple[int, ...]
-    """Up to each bound, and in all."""
+    counts: tuple[int, ...]  # up to each bound, and in all
     sum: float
 
 
 Value: TypeAlias = float | Distribution
-Samples: TypeAlias = dict[str, dict[tuple[str, ...], Value]]
-"""By metric and values of its labels."""
+Samples: TypeAlias = dict[str, dict[tuple[str, ...], Value]]  # by metric and values of its labels
 
 
 class Histogram:
@@ -109,8 +106,7 @@ class HoldFigures:
         self._waits: dict[tuple[str, ...], Histogram] = {}
         self._errors = Histogram(ERRORS)
         self._preemptions: dict[tuple[str, ...], int] = {}
-        self._held: dict[tuple[str, ...], Ns] = {}
-        """Of ended holds."""
+        self._held: dict[tuple[str, ...], Ns] = {}  # of ended holds
         self._holds: dict[ArcId, Began] = {}
 
     def take(self, access: AccessPolicy) -> None:

@@ -13,8 +13,7 @@ from zscout.services.metrics.exposition import CONTENT_TYPE, Exposition
 from zscout.services.metrics.figures import Samples
 from zscout.services.plain_http import Page, PlainHttpServer
 
-FRESH: Final = 1.0
-"""Seconds for which a text is reused."""
+FRESH: Final = 1.0  # seconds for which a text is reused
 
 
 class MetricsServer(PlainHttpServer):

@@ -24,14 +24,10 @@ from zscout.services.node.process_use import RunningComponent
 
 log = logging.getLogger("zscout.components")
 
-MAX_ENDED: Final = 64
-"""Ended components still listed."""
-MAX_UNDERWAY: Final = 512
-"""Operations at one time."""
-MAKE_WAY: Final = 5.0
-"""Seconds for a leaving incarnation before its successor is refused."""
-GRACE: Final = 2.0
-"""Seconds for components to end with their node."""
+MAX_ENDED: Final = 64  # ended components still listed
+MAX_UNDERWAY: Final = 512  # operations at one time
+MAKE_WAY: Final = 5.0  # seconds for a leaving incarnation before its successor is refused
+GRACE: Final = 2.0  # seconds for components to end with their node
 
 
 class ComponentHost:

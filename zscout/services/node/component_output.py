@@ -9,13 +9,10 @@ from typing import Final
 
 from zscout.messages import MAX_OUTPUT, MAX_TAIL
 
-RATE: Final = 1_000_000
-"""Bytes read per second, on average; faster writers wait."""
-BURST: Final = 262_144
-"""Bytes read before that limit applies."""
+RATE: Final = 1_000_000  # bytes read per second, on average; faster writers wait
+BURST: Final = 262_144  # bytes read before that limit applies
 CHUNK: Final = 65_536
-LAST_READS: Final = 32
-"""Chunks read after a component has ended."""
+LAST_READS: Final = 32  # chunks read after a component has ended
 
 
 class OutputRing:
@@ -24,10 +21,8 @@ class OutputRing:
     def __init__(self, size: int = MAX_OUTPUT) -> None:
         self._size = size
         self._bytes = bytearray()
-        self.end = 0
-        """Bytes ever written."""
-        self.over = False
-        """The stream has ended."""
+        self.end = 0  # bytes ever written
+        self.over = False  # the stream has ended
 
     @property
     def start(self) -> int:

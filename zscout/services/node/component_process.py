@@ -32,10 +32,8 @@ from zscout.types import SECOND, Ns
 
 log = logging.getLogger("zscout.components")
 
-LINGER: Final = 2.0
-"""Seconds from a process's last message to its end."""
-SLACK: Final = 5.0
-"""Seconds for an answer, beyond those for carrying out the order."""
+LINGER: Final = 2.0  # seconds from a process's last message to its end
+SLACK: Final = 5.0  # seconds for an answer, beyond those for carrying out the order
 
 
 class ComponentProcess:
@@ -61,23 +59,18 @@ class ComponentProcess:
         self.movable = False
         self.moved: Moved | None = None
         self.output = OutputRing()
-        self.settled = asyncio.Event()
-        """Set on standby, running, or ended."""
-        self.running = asyncio.Event()
-        """Set when running, or ended."""
+        self.settled = asyncio.Event()  # set on standby, running, or ended
+        self.running = asyncio.Event()  # set when running, or ended
         self.over = asyncio.Event()
         self._began = now()
         self._lasted: Ns | None = None
         self._tag = f"{start.component}.{start.incarnation}-{new_instance()}"
         self._child: subprocess.Popen[bytes] | None = None
-        self._orders: asyncio.Queue[bytes] | None = None
-        """Messages to its process, while connected."""
+        self._orders: asyncio.Queue[bytes] | None = None  # messages to its process, while connected
         self._group = ComponentGroup(0, 0)
-        self._verdict: EndReport | None = None
-        """The outcome if this node ends it."""
+        self._verdict: EndReport | None = None  # the outcome if this node ends it
         self._end_report: EndReport | None = None
-        self._gone = False
-        """Its process ended, cleanup continues."""
+        self._gone = False  # its process ended, cleanup continues
         self._waiting: dict[int, asyncio.Future[OrderAnswer]] = {}
         self._numbers = itertools.count(1)
         self._moving: tuple[MoveComponent, asyncio.Task[Moved]] | None = None

@@ -17,19 +17,13 @@ import psutil
 
 from zscout.types import SECOND
 
-WORK: Final = 12_000
-"""Rounds of the speed benchmark: about a millisecond on a plain machine of 2024."""
-TRIES: Final = 15
-"""The best try counts: caches and clocks warm up in the others."""
-PAUSE: Final = 0.001
-"""Seconds between two tries, for other threads."""
+WORK: Final = 12_000  # rounds of the speed benchmark: about a millisecond on a plain machine of 2024
+TRIES: Final = 15  # the best try counts: caches and clocks warm up in the others
+PAUSE: Final = 0.001  # seconds between two tries, for other threads
 
-NO_LIMIT: Final = 1 << 60
-"""Bytes; cgroup v1 writes about this much for no limit."""
-MAX_DEPTH: Final = 64
-"""Nested groups examined."""
-MAX_BYTES: Final = 65_536
-"""Of one file read."""
+NO_LIMIT: Final = 1 << 60  # bytes; cgroup v1 writes about this much for no limit
+MAX_DEPTH: Final = 64  # nested groups examined
+MAX_BYTES: Final = 65_536  # of one file read
 
 T = TypeVar("T")
 

@@ -20,15 +20,13 @@ from zscout.services.node.host_figures import group_folders, own_groups, read_fi
 log = logging.getLogger("zscout.components")
 
 PERIOD_US: Final = 100_000
-LEAST_US: Final = 1_000
-"""Of each period: the kernel's minimum."""
+LEAST_US: Final = 1_000  # of each period: the kernel's minimum
 START_CORES: Final = 1.0
 PREFIX: Final = "zscout."
 LEAF: Final = "zscout-node"
 """The group (v2) for the node itself: a group with processes can't limit groups within it."""
 CLOSE_TRIES: Final = 50
-CLOSE_PAUSE: Final = 0.02
-"""Seconds. The kernel must finish a group's last process before its removal."""
+CLOSE_PAUSE: Final = 0.02  # seconds. The kernel must finish a group's last process before its removal.
 
 
 class ComponentGroup:
@@ -36,13 +34,10 @@ class ComponentGroup:
 
     def __init__(self, memory: int, cpu: float) -> None:
         self.folders: list[Path] = []
-        self.memory = memory
-        """Bytes; 0: no limit."""
-        self.cpu = cpu
-        """Cores; 0: no limit."""
+        self.memory = memory  # bytes; 0: no limit
+        self.cpu = cpu  # cores; 0: no limit
         self.memory_set = self.cpu_set = False
-        self.throttle: tuple[Path, str] | None = None
-        """The file, and its content once the component is ready."""
+        self.throttle: tuple[Path, str] | None = None  # the file, and its content once the component is ready
 
     @property
     def each(self) -> int:

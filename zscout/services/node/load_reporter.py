@@ -20,20 +20,14 @@ from zscout.types import VERSION
 
 log = logging.getLogger("zscout.load")
 
-PERIOD: Final = 1.0
-"""Seconds between two reports."""
-RESTARTS: Final = (1.0, 60.0)
-"""Seconds before a failed reporter restarts: the first time, and at most."""
+PERIOD: Final = 1.0  # seconds between two reports
+RESTARTS: Final = (1.0, 60.0)  # seconds before a failed reporter restarts: the first time, and at most
 SPEED_EVERY: Final = 60.0
-SPEED_TRIES: Final = 5
-"""Of every measurement but the first."""
-SENSORS_EVERY: Final = 10.0
-"""Seconds; a sensor may take milliseconds, and one file per core."""
+SPEED_TRIES: Final = 5  # of every measurement but the first
+SENSORS_EVERY: Final = 10.0  # seconds; a sensor may take milliseconds, and one file per core
 SENSORS_SHARE: Final = 0.0002
-USES_SHARE: Final = 0.002
-"""Of one core, spent on measuring components: many are measured less often."""
-TREE_SHARE: Final = 0.004
-"""Likewise, for this process and its descendants."""
+USES_SHARE: Final = 0.002  # of one core, spent on measuring components: many are measured less often
+TREE_SHARE: Final = 0.004  # likewise, for this process and its descendants
 
 
 LoadFigures: TypeAlias = tuple[tuple[float, float, float], float, int]

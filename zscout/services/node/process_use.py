@@ -17,8 +17,7 @@ from zscout.types import SECOND
 
 TICK: Final = 1 / os.sysconf("SC_CLK_TCK")
 PAGE: Final = os.sysconf("SC_PAGE_SIZE")
-MAX_THREADS: Final = 4_096
-"""Threads of one tree whose waiting time is read."""
+MAX_THREADS: Final = 4_096  # threads of one tree whose waiting time is read
 PROC: Final = Path("/proc")
 
 
@@ -44,25 +43,20 @@ Running: TypeAlias = Callable[[], Iterable[RunningComponent]]
 class _Process(NamedTuple):
     parent: int
     state: bytes
-    cpu: float
-    """Seconds, including children it waited for."""
-    started: float
-    """Seconds since the host's start."""
+    cpu: float  # seconds, including children it waited for
+    started: float  # seconds since the host's start
     memory: int
 
 
-_Demand: TypeAlias = tuple[int, int]
-"""Nanoseconds that a thread ran, and waited for a processor."""
+_Demand: TypeAlias = tuple[int, int]  # nanoseconds that a thread ran, and waited for a processor
 
 
 class _Tree(NamedTuple):
     """A process and all its descendants at one moment, `at` in seconds since the host's start."""
 
     at: float
-    started: float = 0.0
-    """Start of its root, on the same clock."""
-    cpu: float = 0.0
-    """Processor seconds so far."""
+    started: float = 0.0  # start of its root, on the same clock
+    cpu: float = 0.0  # processor seconds so far
     memory: int = 0
     pids: Sequence[int] = ()
     threads: Mapping[int, _Demand] = {}
@@ -130,14 +124,10 @@ def _use(one: RunningComponent, before: _Tree, tree: _Tree) -> ComponentUse:
 class TreeUse(NamedTuple):
     """Use of one process tree since the last call."""
 
-    elapsed: float
-    """Seconds since then."""
-    cores: float
-    """Average used."""
-    wanted: float
-    """Used, plus those its threads waited for."""
-    memory: int
-    """Bytes resident; shared memory counts for each."""
+    elapsed: float  # seconds since then
+    cores: float  # average used
+    wanted: float  # used, plus those its threads waited for
+    memory: int  # bytes resident; shared memory counts for each
 
 
 class TreeMeter:

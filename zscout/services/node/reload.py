@@ -22,8 +22,7 @@ from zscout.services.node.service_manager import ServiceManager
 
 log = logging.getLogger("zscout.node")
 
-MAX_NAMED: Final = 12
-"""Keys named in one line."""
+MAX_NAMED: Final = 12  # keys named in one line
 
 
 class Reload:

@@ -14,10 +14,8 @@ from typing import Final, Self
 
 log = logging.getLogger(__name__)
 
-BEATS: Final = 3
-"""Messages per watchdog interval."""
-LONGEST: Final = 0.1
-"""Seconds that the event loop waits for a service manager that does not read."""
+BEATS: Final = 3  # messages per watchdog interval
+LONGEST: Final = 0.1  # seconds that the event loop waits for a service manager that does not read
 
 
 class ServiceManager:

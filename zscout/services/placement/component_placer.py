@@ -29,10 +29,8 @@ log = logging.getLogger("zscout.placer")
 BEGIN: Final = 2.0
 """Most seconds until a new placer begins, even if some hosts have not listed their components."""
 LIST_TRIES: Final = 5
-LIST_AGAIN: Final = 0.5
-"""Seconds until an unanswered list is asked for again."""
-PUBLISH_AT_ONCE: Final = 200
-"""Components in one publication."""
+LIST_AGAIN: Final = 0.5  # seconds until an unanswered list is asked for again
+PUBLISH_AT_ONCE: Final = 200  # components in one publication
 
 
 class ComponentPlacer:
@@ -57,12 +55,9 @@ class ComponentPlacer:
         )
         self._nodes = NodeClient(mesh, fleet.placement.start_timeout)
         self._inherited = inherited
-        self._instances: dict[HostName, set[str]] = {}
-        """Living instances of each host's node."""
-        self._unlisted: set[HostName] = set()
-        """Hosts that have not listed their components."""
-        self._cordoned: frozenset[HostName] = frozenset()
-        """As published last."""
+        self._instances: dict[HostName, set[str]] = {}  # living instances of each host's node
+        self._unlisted: set[HostName] = set()  # hosts that have not listed their components
+        self._cordoned: frozenset[HostName] = frozenset()  # as published last
         self._declarations = ExitStack()
         self._wake: TimerHandle | None = None
 

@@ -28,8 +28,7 @@ class PlacementLedger:
         self.mesh = mesh
         self.term: Term = NO_TERM
         self._placements: dict[ComponentId, Placement] = {}
-        self._current: set[ComponentId] = set()
-        """Published or listed since `start`."""
+        self._current: set[ComponentId] = set()  # published or listed since `start`
         self._cordoned: frozenset[HostName] = frozenset()
         self._declarations = ExitStack()
 

@@ -18,12 +18,9 @@ from zscout.types import SECOND, HostName
 
 log = logging.getLogger(__name__)
 
-READ_EVERY: Final = 0.1
-"""Seconds; a thousand hosts' reports would otherwise wake this loop as often."""
-AT_ONCE: Final = 32
-"""Reports read before the loop does other work."""
-DEPTH: Final = 4_096
-"""Reports kept unread; the oldest are lost, and later ones replace them."""
+READ_EVERY: Final = 0.1  # seconds; a thousand hosts' reports would otherwise wake this loop as often
+AT_ONCE: Final = 32  # reports read before the loop does other work
+DEPTH: Final = 4_096  # reports kept unread; the oldest are lost, and later ones replace them
 
 
 class LoadBalancer:

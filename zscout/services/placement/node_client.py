@@ -17,8 +17,7 @@ from zscout.types import SECOND, HostName, Ns
 R = TypeVar("R")
 
 LIST_TIMEOUT: Final = 1.0
-ANSWER_SLACK: Final = 2.0
-"""Seconds beyond a node's time for a start, stop or move."""
+ANSWER_SLACK: Final = 2.0  # seconds beyond a node's time for a start, stop or move
 HOPELESS: Final = frozenset({"unknown_kind", "not_allowed", "bad_request"})
 """Refusals that a retry on the same node would not change."""
 

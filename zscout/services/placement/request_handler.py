@@ -21,8 +21,7 @@ from zscout.services.authority import Authority
 from zscout.types import HostName, Term
 
 MAX_WAIT: Final = 60.0
-MAX_WAITING: Final = 1_000
-"""Requests awaiting their answer at one time."""
+MAX_WAITING: Final = 1_000  # requests awaiting their answer at one time
 
 Operation: TypeAlias = messages.PlacementOperation | messages.DrainHost | messages.UncordonHost
 PlacerQuery: TypeAlias = IncomingQuery[messages.PlacerOperation]

@@ -15,19 +15,14 @@ from numpy.typing import NDArray
 
 from zscout.behaviors.perception.lens import COLUMNS, FIELD, FOCAL, GAMMA, MIDDLE, Picture
 
-STEP: Final = FIELD / COLUMNS
-"""Radians between two columns of a strip."""
+STEP: Final = FIELD / COLUMNS  # radians between two columns of a strip
 BANDS: Final = 20
 _TOP, _BOTTOM = 4, 84
 """Rows used: on the floor below them, a turn about the wheels differs from one about the camera."""
-_NEAR: Final = 80
-"""First row of the near floor: 25 cm ahead."""
-_OVERLAP: Final = 36
-"""Least columns shared by two strips: turns of up to 50 degrees are measured."""
-_SLOW: Final = 31
-"""Columns of the mean that is subtracted."""
-_GREY: Final = 1.5
-"""Grey levels of a band's noise: less is no texture."""
+_NEAR: Final = 80  # first row of the near floor: 25 cm ahead
+_OVERLAP: Final = 36  # least columns shared by two strips: turns of up to 50 degrees are measured
+_SLOW: Final = 31  # columns of the mean that is subtracted
+_GREY: Final = 1.5  # grey levels of a band's noise: less is no texture
 
 _SOURCE: Final = np.clip(MIDDLE - FOCAL * np.tan((MIDDLE - np.arange(COLUMNS)) * STEP), 0, COLUMNS - 1)
 """The column of the picture, between two pixels, for each column of a strip."""
@@ -37,15 +32,12 @@ _SHARE: Final = (_SOURCE - _LEFT).astype(np.float32)
 Strip = NDArray[np.int8]
 """Shape (20, 160): bands of rows, columns by angle; grey levels off the slow mean, times `SCALE`."""
 SCALE: Final = 3.0
-Tones = NDArray[np.uint8]
-"""Grey levels, laid out as a strip."""
+Tones = NDArray[np.uint8]  # grey levels, laid out as a strip
 
 
 class Turn(NamedTuple):
-    angle: float
-    """Radians to the left."""
-    likeness: float
-    """Correlation at that shift: near 1 is sure, below about 0.4 a guess."""
+    angle: float  # radians to the left
+    likeness: float  # correlation at that shift: near 1 is sure, below about 0.4 a guess
 
 
 def strip_and_tones(picture: Picture) -> tuple[Strip, Tones]:

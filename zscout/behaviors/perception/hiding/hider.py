@@ -24,14 +24,10 @@ from zscout.behaviors.perception.lens import COLUMNS, ROWS, Picture
 class PhaseCode(NamedTuple):
     """The functions of one phase; all memory is in the state."""
 
-    step: Callable[[HidingState, View], Step]
-    """The action for this picture, after any hop has been measured."""
-    begin: Callable[[HidingState], None] = lambda _: None
-    """Begins the phase, without a command."""
-    cruises: bool = False
-    """Drives without waiting for a still picture."""
-    stuck: Callable[[HidingState, View], Step] = phases.stuck
-    """Called when it drove and nothing moved."""
+    step: Callable[[HidingState, View], Step]  # the action for this picture, after any hop has been measured
+    begin: Callable[[HidingState], None] = lambda _: None  # begins the phase, without a command
+    cruises: bool = False  # drives without waiting for a still picture
+    stuck: Callable[[HidingState, View], Step] = phases.stuck  # called when it drove and nothing moved
 
 
 PHASES: Final[dict[Phase, PhaseCode]] = {
@@ -52,10 +48,8 @@ RESUMES: Final[dict[Phase, Phase]] = {"hidden": "check", "check": "check", "face
 """Phases after an interruption in the dark; all others search again."""
 LONGEST_GAP: Final = 5.0
 """Most seconds counted between two pictures: longer gaps, and clocks that go back, come from another host."""
-BLIND: Final = 0.8
-"""Seconds without a good picture after which the robot stops."""
-REPORTS: Final = 2.0
-"""Seconds of spoiled pictures before a report."""
+BLIND: Final = 0.8  # seconds without a good picture after which the robot stops
+REPORTS: Final = 2.0  # seconds of spoiled pictures before a report
 
 
 class BadCheckpoint(ValueError): ...

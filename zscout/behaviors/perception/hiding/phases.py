@@ -14,56 +14,37 @@ from zscout.behaviors.perception.hiding.state import HidingState, Opening, Sight
 from zscout.behaviors.perception.lens import COLUMNS
 
 HOP: Final = math.radians(36)
-FULL_TURN: Final = math.tau - math.radians(20)
-"""Radians of hops that show all sides."""
-MOST_HOPS: Final = 24
-"""Of a scan: turns not visible in the picture must end too."""
+FULL_TURN: Final = math.tau - math.radians(20)  # radians of hops that show all sides
+MOST_HOPS: Final = 24  # of a scan: turns not visible in the picture must end too
 AIMED: Final = math.radians(7)
-LEG: Final = 1.4
-"""Most metres to drive before the next scan."""
-FORGETS: Final = 6
-"""Scans after which bad spots are forgotten, as dead reckoning has lost them."""
+LEG: Final = 1.4  # most metres to drive before the next scan
+FORGETS: Final = 6  # scans after which bad spots are forgotten, as dead reckoning has lost them
 MAX_VISITED: Final = 24
-BAD_NEAR: Final = 0.45
-"""Metres around a spot where hiding failed."""
-MOST_BLOCKED: Final = 4
-"""Sides tried after one scan."""
-AT_EDGE: Final = 0.17
-"""Metres to the dark from which the robot drives in blind."""
-DEEP: Final = 0.30
-"""Metres to drive beyond the edge of the dark."""
-OUTSIDE: Final = 3.0
-"""Brightness of the floor ahead, over the picture's median, outside."""
-DARK_AHEAD: Final = 0.3
-"""Share of the lit floor's light below which a lost place must lie ahead."""
+BAD_NEAR: Final = 0.45  # metres around a spot where hiding failed
+MOST_BLOCKED: Final = 4  # sides tried after one scan
+AT_EDGE: Final = 0.17  # metres to the dark from which the robot drives in blind
+DEEP: Final = 0.30  # metres to drive beyond the edge of the dark
+OUTSIDE: Final = 3.0  # brightness of the floor ahead, over the picture's median, outside
+DARK_AHEAD: Final = 0.3  # share of the lit floor's light below which a lost place must lie ahead
 TO_MIDDLE: Final = 0.15
-LOST: Final = 1.6
-"""Seconds without sight of the place."""
-LONGEST: Final = 25
-"""Seconds of an approach."""
+LOST: Final = 1.6  # seconds without sight of the place
+LONGEST: Final = 25  # seconds of an approach
 FACE_HOPS: Final = 22
 DARK: Final = 0.12
 """Most light of the floor here over the lit floor. The promise is a quarter of the room's median, and the visible floor
 may be twice as bright."""
-DARK_ENOUGH: Final = 0.19
-"""The same if it gets no darker further in."""
-DARKISH: Final = 0.4
-"""The same if it may be darker further in."""
+DARK_ENOUGH: Final = 0.19  # the same if it gets no darker further in
+DARKISH: Final = 0.4  # the same if it may be darker further in
 ROOFED: Final = 0.28
 """Share below which the top counts as dark: 0.03 to 0.2 beneath furniture, 0.45 and more on a dark rug."""
-DEEPER: Final = 0.18
-"""Metres of one step further in."""
+DEEPER: Final = 0.18  # metres of one step further in
 NEARER: Final = 0.1
-MOST_FACES: Final = 3
-"""Full turns in one place, each further in."""
-AS_LIGHT: Final = 0.6
-"""Share of the lightest side's light that counts as the same side."""
-CHECKED: Final = 5
-"""Pictures of a check."""
+MOST_FACES: Final = 3  # full turns in one place, each further in
+AS_LIGHT: Final = 0.6  # share of the lightest side's light that counts as the same side
+CHECKED: Final = 5  # pictures of a check
 STILL_DARK: Final = 0.3
 STILL_SEES: Final = 0.15
-SEES_OUT: Final = 0.45
-"""Share of columns that must show lit floor."""
+SEES_OUT: Final = 0.45  # share of columns that must show lit floor
 
 
 def begin_scan(robot: HidingState) -> None:

@@ -19,35 +19,22 @@ from zscout.behaviors.perception.darkness import View
 from zscout.behaviors.perception.hiding.compass import BANDS, SCALE, Strip, Tones, brighter, floor_strip, turned
 from zscout.behaviors.perception.lens import COLUMNS, Picture
 
-MAX_CHECKPOINT: Final = 64_000
-"""Bytes; a hider's own is below 20,000."""
+MAX_CHECKPOINT: Final = 64_000  # bytes; a hider's own is below 20,000
 MAX_BAD: Final = 24
 MAX_SIGHTINGS: Final = 120
-FORM: Final = 1
-"""Version of the checkpoint; others are refused."""
-WHEEL_BASE: Final = 0.11
-"""Metres between a Scout's two wheels."""
-TOP_SPEED: Final = 0.30
-"""Metres per second, of each wheel."""
-TOP_SPIN: Final = 2 * TOP_SPEED / WHEEL_BASE
-"""Radians per second with opposed wheels at full speed."""
-STRAIGHT: Final = 0.7
-"""Share of top speed of a straight step."""
+FORM: Final = 1  # version of the checkpoint; others are refused
+WHEEL_BASE: Final = 0.11  # metres between a Scout's two wheels
+TOP_SPEED: Final = 0.30  # metres per second, of each wheel
+TOP_SPIN: Final = 2 * TOP_SPEED / WHEEL_BASE  # radians per second with opposed wheels at full speed
+STRAIGHT: Final = 0.7  # share of top speed of a straight step
 LONGEST_HOP: Final = math.radians(44)
-SETTLES: Final = 0.15
-"""Seconds after a hop before its picture may count: the motors' lag."""
-LAGS: Final = 0.33
-"""Seconds after a hop when a turn as expected counts as finished."""
-SETTLED: Final = 1.0
-"""Seconds after a hop when its picture counts even if it seems to move."""
-SURE: Final = 0.35
-"""Least likeness of a credible turn."""
-WATCHED: Final = 0.5
-"""Seconds of driving that change the near floor."""
-SAME_FLOOR: Final = 0.5
-"""Likeness of unchanged floor: 0.6 to 0.95 when stuck, below 0.35 otherwise."""
-BRIGHTER: Final = 4.0
-"""Brightness, against the floor here, of the floor in a column that sees out."""
+SETTLES: Final = 0.15  # seconds after a hop before its picture may count: the motors' lag
+LAGS: Final = 0.33  # seconds after a hop when a turn as expected counts as finished
+SETTLED: Final = 1.0  # seconds after a hop when its picture counts even if it seems to move
+SURE: Final = 0.35  # least likeness of a credible turn
+WATCHED: Final = 0.5  # seconds of driving that change the near floor
+SAME_FLOOR: Final = 0.5  # likeness of unchanged floor: 0.6 to 0.95 when stuck, below 0.35 otherwise
+BRIGHTER: Final = 4.0  # brightness, against the floor here, of the floor in a column that sees out
 
 Phase = Literal[
     "scan", "aim", "roam", "approach", "enter", "face", "settle", "back", "dodge", "leave", "hidden", "check"
@@ -67,14 +54,10 @@ WORDS: Final = {phase: word for word, phases in PHASES_OF.items() for phase in p
 @dataclass(frozen=True, slots=True)
 class WheelCommand:
     left: float
-    right: float
-    """Shares of top speed, -1 to 1."""
-    lasts: float
-    """Seconds until the wheels stop without a newer command; 0 for still wheels."""
-    doing: str
-    """The state: search, approach, unstick, enter, turn or hidden."""
-    why: str
-    """A few words for an operator."""
+    right: float  # shares of top speed, -1 to 1
+    lasts: float  # seconds until the wheels stop without a newer command; 0 for still wheels
+    doing: str  # the state: search, approach, unstick, enter, turn or hidden
+    why: str  # a few words for an operator
     hidden: bool = False
 
     @property
@@ -82,8 +65,7 @@ class WheelCommand:
         return self.left != 0 or self.right != 0
 
 
-Step: TypeAlias = WheelCommand | Phase
-"""A command, or the phase that continues with the same picture."""
+Step: TypeAlias = WheelCommand | Phase  # a command, or the phase that continues with the same picture
 
 
 class Sighting(msgspec.Struct, frozen=True):
@@ -102,18 +84,12 @@ class Opening(msgspec.Struct, frozen=True):
     """One direction of a scan. Brightness is linear, in units of the scan's first picture."""
 
     heading: float
-    open_for: float
-    """Metres, roughly, to drive there."""
-    bright: float
-    """Mean over the columns of lit floor over near floor."""
-    near: float
-    """The floor just ahead."""
-    outside: float
-    """The lit floor."""
-    above: float
-    """Top of the picture: bright for a lit wall or ceiling, dark for the underside of a sofa."""
-    sees_out: float
-    """Share of columns that show lit floor."""
+    open_for: float  # metres, roughly, to drive there
+    bright: float  # mean over the columns of lit floor over near floor
+    near: float  # the floor just ahead
+    outside: float  # the lit floor
+    above: float  # top of the picture: bright for a lit wall or ceiling, dark for the underside of a sofa
+    sees_out: float  # share of columns that show lit floor
 
 
 class Spot(msgspec.Struct, frozen=True):
@@ -138,11 +114,9 @@ class HidingState(msgspec.Struct):
     began: float = 0.0
     clock: float = 0.0
     last_now: float | None = None
-    interval: float = 0.2
-    """Seconds between good pictures, smoothed."""
+    interval: float = 0.2  # seconds between good pictures, smoothed
     dice: int = 0
-    stopped: bool = False
-    """The hold is lost; wait until it is back."""
+    stopped: bool = False  # the hold is lost; wait until it is back
 
     heading: float = 0.0
     x: float = 0.0
@@ -150,69 +124,46 @@ class HidingState(msgspec.Struct):
 
     left: float = 0.0
     right: float = 0.0
-    ends: float = 0.0
-    """End of the wheels' last command."""
-    hopping: bool = False
-    """True until a turn or step is finished and measured."""
-    expected: float = 0.0
-    """Radians intended."""
-    hop_length: float = 0.0
-    """Metres intended."""
-    anchor: bytes = b""
-    """Strip before the hop."""
-    previous: bytes = b""
-    """Strip of the last picture."""
-    tones: bytes = b""
-    """Tones of the last picture."""
-    anchor_tones: bytes = b""
-    """Tones before the hop."""
-    opened: float = 1.0
-    """Factor by which the camera opened since the scan began."""
+    ends: float = 0.0  # end of the wheels' last command
+    hopping: bool = False  # true until a turn or step is finished and measured
+    expected: float = 0.0  # radians intended
+    hop_length: float = 0.0  # metres intended
+    anchor: bytes = b""  # strip before the hop
+    previous: bytes = b""  # strip of the last picture
+    tones: bytes = b""  # tones of the last picture
+    anchor_tones: bytes = b""  # tones before the hop
+    opened: float = 1.0  # factor by which the camera opened since the scan began
     thumbs: list[Thumb] = msgspec.field(default_factory=list)
-    noise: float = 1.0
-    """Grey levels by which thumbs differ while nothing moves."""
+    noise: float = 1.0  # grey levels by which thumbs differ while nothing moves
     floors: list[Thumb] = msgspec.field(default_factory=list)
     """Strips of the near floor over the last second of driving."""
-    halted: int = 0
-    """Pictures in a row that showed the same floor in spite of driving."""
-    print: int = 0
-    """CRC of the last picture: a repetition is a frozen picture."""
+    halted: int = 0  # pictures in a row that showed the same floor in spite of driving
+    print: int = 0  # CRC of the last picture: a repetition is a frozen picture
     spoiled_since: float | None = None
     spoiled_how: str = ""
     last_good: float = 0.0
 
-    turned: float = 0.0
-    """Radians turned since the scan, or the facing, began."""
+    turned: float = 0.0  # radians turned since the scan, or the facing, began
     hops: int = 0
     sightings: list[Sighting] = msgspec.field(default_factory=list)
     openings: list[Opening] = msgspec.field(default_factory=list)
     target: Sighting | None = None
-    seen_target: float = 0.0
-    """Last sight of the target in this phase."""
-    goal: float = 0.0
-    """Heading or distance, depending on the phase."""
+    seen_target: float = 0.0  # last sight of the target in this phase
+    goal: float = 0.0  # heading or distance, depending on the phase
     left_to_go: float = 0.0
     next_phase: Phase = "scan"
     bad: list[Spot] = msgspec.field(default_factory=list)
     """Places where hiding failed, or that could not be reached."""
     scans: int = 0
     bumps: int = 0
-    blocked: list[float] = msgspec.field(default_factory=list)
-    """Headings of bumps since the last scan."""
-    at_edge: bool = False
-    """The last bump was at the edge of a dark place."""
-    visited: list[Spot] = msgspec.field(default_factory=list)
-    """Places of former scans."""
-    tries: int = 0
-    """Bumps on the way to this target."""
-    faces: int = 0
-    """Full turns in this dark place."""
-    shifted: bool = False
-    """Moved since it turned to the light."""
-    note: str = ""
-    """Reason of this phase."""
-    why: str = ""
-    """As last reported."""
+    blocked: list[float] = msgspec.field(default_factory=list)  # headings of bumps since the last scan
+    at_edge: bool = False  # the last bump was at the edge of a dark place
+    visited: list[Spot] = msgspec.field(default_factory=list)  # places of former scans
+    tries: int = 0  # bumps on the way to this target
+    faces: int = 0  # full turns in this dark place
+    shifted: bool = False  # moved since it turned to the light
+    note: str = ""  # reason of this phase
+    why: str = ""  # as last reported
 
     def go(self, phase: Phase) -> None:
         self.phase, self.began = phase, self.clock
