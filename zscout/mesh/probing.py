@@ -53,7 +53,7 @@ def multicast_problems(config: MeshConfig) -> dict[str, str]:
     assert group is not None  # noqa: S101 - the fleet file was checked
     found = psutil.net_if_stats()
     if config.interface == "auto":
-        names = [name for name, one in found.items() if one.isup and "multicast" in one.flags.split(",")]
+        names = [name for name, stats in found.items() if stats.isup and "multicast" in stats.flags.split(",")]
     else:
         names = config.interface.split(",")
     return {name: _multicast_problem(name, group, int(port)) for name in names}
@@ -99,8 +99,8 @@ async def heard(config: MeshConfig) -> list[Heard]:
                 if (hello := scout.try_recv()) is None:
                     await asyncio.sleep(POLL)
                 elif not (zid := str(hello.zid)).startswith(MEETING):
-                    addresses = tuple(one for one in hello.locators if "[fe80:" not in one)
-                    hosts = {match[2].strip("[]") for one in addresses if (match := _ADDRESS.match(one))}
+                    addresses = tuple(address for address in hello.locators if "[fe80:" not in address)
+                    hosts = {match[2].strip("[]") for at in addresses if (match := _ADDRESS.match(at))}
                     found[zid] = Heard(zid, addresses, bool(hosts & own), str(hello.whatami) == "router")
     except zenoh.ZError:  # no interface for it
         pass
@@ -108,7 +108,7 @@ async def heard(config: MeshConfig) -> list[Heard]:
 
 
 def _own_addresses() -> set[str]:
-    return {one.address.partition("%")[0] for several in psutil.net_if_addrs().values() for one in several}
+    return {known.address.partition("%")[0] for several in psutil.net_if_addrs().values() for known in several}
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +134,7 @@ async def call(
     """Call all TCP and TLS addresses at a time, within six seconds, with these CAs (PEM) and this certificate.
     Addresses `heard` state themselves whether they speak TLS; for those `named` in a file it is tried."""
     tried = dict.fromkeys(heard, False) | dict.fromkeys(named, True)
-    matches = [(match, doubted) for one, doubted in tried.items() if (match := _ADDRESS.fullmatch(one))]
+    matches = [(match, doubted) for at, doubted in tried.items() if (match := _ADDRESS.fullmatch(at))]
     return list(await asyncio.gather(*(_call(match, doubted, cas, own) for match, doubted in matches)))
 
 
@@ -166,7 +166,7 @@ async def _looked_up(host: str, port: int) -> list[tuple[str, int]]:
     """A host's addresses. Raises OSError."""
     # In a thread that is not awaited at exit: it takes long without a name server.
     look_up = functools.partial(socket.getaddrinfo, host, port, type=socket.SOCK_STREAM)
-    return [(str(one[0]), port) for *_, one in await asyncio.wrap_future(in_thread("looks up a name", look_up))]
+    return [(str(at[0]), port) for *_, at in await asyncio.wrap_future(in_thread("looks up a name", look_up))]
 
 
 async def _reached(found: Iterable[tuple[str, int]]) -> tuple[str, int]:

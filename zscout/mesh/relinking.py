@@ -104,10 +104,10 @@ class Relinking:
                 self._routers.remove(peer)
                 return
             self._lost.setdefault(peer, _Lost(now)).addresses.append(event.link.dst)
-            lately = [one for one in self._lost.values() if now - one.at < TOGETHER]
-            for one in lately:
-                if len(lately) > 1 and not one.together:
-                    one.together, one.looks = True, 0
+            recent = [lost for lost in self._lost.values() if now - lost.at < TOGETHER]
+            for lost in recent:
+                if len(recent) > 1 and not lost.together:
+                    lost.together, lost.looks = True, 0
             if self._thread is None:
                 self._begin(greet=False)
 
@@ -141,10 +141,10 @@ class Relinking:
     def _next(self) -> float | None:
         """Seconds until the next look; None: no link is lost."""
         with self._lock:
-            still = {peer: one for peer, one in self._lost.items() if one.looks < len(PAUSES)}
+            still = {peer: lost for peer, lost in self._lost.items() if lost.looks < len(PAUSES)}
             self._lost = {} if self._closed.is_set() else still
             if self._lost:
-                return min(PAUSES[one.looks] for one in self._lost.values())
+                return min(PAUSES[lost.looks] for lost in self._lost.values())
             self._thread = None
             return None
 
@@ -153,20 +153,20 @@ class Relinking:
         with self._lock:
             # A peer just lost may still be listed as linked.
             self._lost = {
-                peer: one for peer, one in self._lost.items() if peer not in linked or now - one.at < TOGETHER
+                peer: link for peer, link in self._lost.items() if peer not in linked or now - link.at < TOGETHER
             }
-            lost = {peer: one for peer, one in self._lost.items() if peer not in linked}
+            lost = {peer: link for peer, link in self._lost.items() if peer not in linked}
         wanted, until = set(), time.monotonic() + PROBES_TIMEOUT
-        for peer, one in sorted(lost.items(), key=lambda known: known[1].looks):
+        for peer, link in sorted(lost.items(), key=lambda known: known[1].looks):
             if time.monotonic() > until or self._closed.is_set():
                 break
-            one.looks += 1
-            one.listens = one.listens or _listens(one.addresses)
-            if one.listens or (one.together and one.looks <= LOOKS_FOR_GREATER):
+            link.looks += 1
+            link.listens = link.listens or _listens(link.addresses)
+            if link.listens or (link.together and link.looks <= LOOKS_FOR_GREATER):
                 wanted.add(peer)
-            elif one.listens is False and time.monotonic() - one.at >= TOGETHER:
+            elif link.listens is False and time.monotonic() - link.at >= TOGETHER:
                 # Its process ended, or it makes the link itself. Earlier, another loss may still come.
-                one.looks = len(PAUSES)
+                link.looks = len(PAUSES)
         if wanted and not self._closed.is_set():
             there = self._scout(SCOUT_TIMEOUT, wanted)
             if self._own in there and len(there) > 1:
@@ -186,7 +186,7 @@ class Relinking:
                         break
                 elif not wanted or str(hello.zid) in {*wanted, self._own}:
                     # A link-local address is useless without its interface.
-                    found[str(hello.zid)] = [one for one in hello.locators if "[fe80:" not in one]
+                    found[str(hello.zid)] = [at for at in hello.locators if "[fe80:" not in at]
         return found
 
     def _introduce(self, there: dict[str, list[str]]) -> None:

@@ -56,12 +56,12 @@ class Suspicions:
             self._acted.pop(what, None)
             return
         now = self._now()
-        self._since = {one: (first, last) for one, (first, last) in self._since.items() if now - last < LASTS * SECOND}
+        self._since = {key: seen for key, seen in self._since.items() if now - seen[1] < LASTS * SECOND}
         first, _ = self._since.get(what, (now, now))
         self._since[what] = first, now
         if now - first < patience * SECOND:
             return
-        self._acted = {one: at for one, at in self._acted.items() if now - at < 10 * LONGEST * SECOND}
+        self._acted = {key: at for key, at in self._acted.items() if now - at < 10 * LONGEST * SECOND}
         if self._last is not None:
             helped = what not in self._acted
             if now - self._last < (SHORTEST if helped else self._pause) * SECOND:
@@ -109,13 +109,13 @@ class RenewableTransport(Transport):
                     raise
                 try:
                     # Declare first, so that no token of this process disappears in between.
-                    for one in self._all():
-                        one.declare(fresh)
+                    for declared in self._all():
+                        declared.declare(fresh)
                     await asyncio.sleep(OVERLAP)
                 finally:
                     await old.close()
-                    for one in self._all():
-                        one.forget_old()
+                    for declared in self._all():
+                        declared.forget_old()
         except MeshError as error:
             log.warning("%s", error)
         except Exception:
@@ -131,26 +131,26 @@ class RenewableTransport(Transport):
             await asyncio.sleep(LOOK_EVERY)
 
     def _all(self) -> list[_Declared]:
-        return [one for _, one in sorted([*self._declared.items(), *self._tokens.items()])]
+        return [declared for _, declared in sorted([*self._declared.items(), *self._tokens.items()])]
 
     def _keep(self, declare: Callable[[Transport], Undeclare]) -> Undeclare:
-        number, one = next(self._numbers), _Other(declare)
-        self._declared[number] = one
-        one.declare(self.current)
+        number, declared = next(self._numbers), _Other(declare)
+        self._declared[number] = declared
+        declared.declare(self.current)
 
         def undeclare() -> None:
             self._declared.pop(number, None)
-            one.close()
+            declared.close()
 
         return undeclare
 
     def _keep_token(self, key_of: Callable[[str], str]) -> Undeclare:
-        one = self._tokens[next(self._numbers)] = _Token(key_of)
-        one.declare(self.current)
-        return one.close
+        token = self._tokens[next(self._numbers)] = _Token(key_of)
+        token.declare(self.current)
+        return token.close
 
     def _owns(self, key: str) -> bool:
-        return any(one.key == key for one in list(self._tokens.values()))
+        return any(token.key == key for token in list(self._tokens.values()))
 
     def id(self) -> str:
         return self.current.id()
@@ -248,9 +248,8 @@ class _Declared:
 
     def close(self) -> None:
         self._closed = True
-        undeclare, self._undeclare = self._undeclare, []
-        for one in undeclare:
-            one()
+        while self._undeclare:
+            self._undeclare.pop(0)()
 
     def _on(self, transport: Transport) -> Undeclare:
         raise NotImplementedError

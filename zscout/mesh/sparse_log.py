@@ -25,7 +25,7 @@ class SparseLog:
         """`key` is the subject, possibly chosen by others; `text` and `args` are as in `logging`."""
         now, what = self._now(), (text, key[:200])
         if what not in self._said and len(self._said) >= MAX_KEYS:
-            self._said = {one: said for one, said in self._said.items() if now - said[0] < PERIOD}
+            self._said = {key: said for key, said in self._said.items() if now - said[0] < PERIOD}
             what = OTHERS if len(self._said) >= MAX_KEYS else what
         at, left_out = self._said.get(what, (now - PERIOD, 0))
         if now - at < PERIOD:

@@ -147,8 +147,8 @@ class ZenohMesh(Mesh):
         if config.listen:
             # Its ports are free again once the old session is closed. Until then a session on other ports learns the
             # peers from it.
-            own = tuple(one.replace("0.0.0.0", "127.0.0.1").replace("[::]", "[::1]") for one in config.listen)  # noqa: S104
-            ports = tuple(_PORT.sub(":0", one) for one in config.listen)
+            own = tuple(at.replace("0.0.0.0", "127.0.0.1").replace("[::]", "[::1]") for at in config.listen)  # noqa: S104
+            ports = tuple(_PORT.sub(":0", at) for at in config.listen)
             beside = replace(config, listen=ports, connect=(*config.connect, *own))
             openings.insert(0, lambda: _open(beside, door.security))
         mesh = cls(RenewableTransport(await _open(config, security), openings), keys, me, clock.now)
@@ -269,7 +269,7 @@ class ZenohTransport(Transport):
 
     def peers(self) -> list[str]:
         linked = (*self._session.info.peers_zid(), *self._session.info.routers_zid())
-        return [one for peer in linked if not (one := str(peer)).startswith(MEETING)]
+        return [zid for zid in map(str, linked) if not zid.startswith(MEETING)]
 
     def links(self) -> int:
         return sum(not str(link.zid).startswith(MEETING) for link in self._session.info.links())
@@ -355,7 +355,7 @@ class ZenohTransport(Transport):
         return _undeclare(self._session.liveliness().declare_token(key))
 
     def token_subscriber(self, key: str, on_token: Callable[[str, bool], None]) -> Undeclare:
-        callback = _direct(lambda one: on_token(str(one.key_expr), one.kind == zenoh.SampleKind.PUT))
+        callback = _direct(lambda sample: on_token(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
         return _undeclare(self._session.liveliness().declare_subscriber(key, callback, history=True))
 
     def tokens(self, key: str, timeout: float, to: Collector) -> None:

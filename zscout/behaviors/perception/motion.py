@@ -184,7 +184,7 @@ class MotionDetector:
         if middle > ALL_OFF or np.count_nonzero(mask) / mask.size > UPHEAVAL:
             return self._begin(time, grey), None
         self._learn(away, mask, passed / LEARN, passed / ABSORB)
-        largest = sorted(regions.tolist(), key=lambda one: -one[cv2.CC_STAT_AREA])[:MAX_BOXES]
+        largest = sorted(regions.tolist(), key=lambda region: -region[cv2.CC_STAT_AREA])[:MAX_BOXES]
         height, width = picture.shape[:2]
         boxes = tuple(
             Box(

@@ -60,8 +60,8 @@ class PlaceSensorNet(Behavior):
                     await context.safe_point()
                     await asyncio.sleep(PERIOD)
         finally:
-            for one in declared:
-                one.close()
+            for declaration in declared:
+                declaration.close()
             await done_within(STOPPING, asyncio.gather(*map(self._stop, [*self._placed])))
 
     def _report_progress(self) -> None:

@@ -42,9 +42,10 @@ class CalendarSelection(NamedTuple):
 
     def of(self, bookings: Iterable[BookingView]) -> list[BookingView]:
         return [
-            one
-            for one in bookings
-            if self.owner in (None, one.owner) and (self.rc is None or self.rc in one.needs or _may_have(one, self.rc))
+            view
+            for view in bookings
+            if self.owner in (None, view.owner)
+            and (self.rc is None or self.rc in view.needs or _may_have(view, self.rc))
         ]
 
 
@@ -61,10 +62,12 @@ def calendar_text(fleet: str, bookings: Iterable[BookingView], selection: Calend
     calendar.add("X-PUBLISHED-TTL", REFRESH)
     zones: dict[str, list[int]] = {}
     events: list[Event] = []
-    for view in sorted(selection.of(bookings), key=lambda one: (one.start, one.id)):
+    for view in sorted(selection.of(bookings), key=lambda booking: (booking.start, booking.id)):
         zone = _zone(view)
         if zone is None:
-            events += [_event(fleet, view, one.start, one) for one in view.dates] or [_event(fleet, view, view.start)]
+            events += [_event(fleet, view, date.start, date) for date in view.dates] or [
+                _event(fleet, view, view.start)
+            ]
             continue
         zones.setdefault(view.zone, []).extend((view.start, _until(view)))
         events += _repeated(fleet, view, zone)
@@ -78,7 +81,7 @@ def calendar_text(fleet: str, bookings: Iterable[BookingView], selection: Calend
 
 def _may_have(view: BookingView, rc: str) -> bool:
     """Return True if it has `rc` for a pattern, or may get it."""
-    bound = {name for one in view.dates for name in one.bound.values()}
+    bound = {name for date in view.dates for name in date.bound.values()}
     return rc in bound if bound else any(is_pattern(need) and matcher(need)(rc) for need in view.needs)
 
 
@@ -165,16 +168,16 @@ def _repeated(fleet: str, view: BookingView, zone: ZoneInfo) -> list[Event]:
     weeks, days = divmod(view.every, 7)
     rule: dict[str, object] = {"FREQ": "DAILY" if days else "WEEKLY", "INTERVAL": view.every if days else weeks}
     event.add("RRULE", vRecur({**rule, "UNTIL": datetime.fromtimestamp(_until(view), UTC)}))
-    given_up = {*view.dropped, *(one.start for one in view.dates if one.state == "unbooked")}
+    given_up = {*view.dropped, *(date.start for date in view.dates if date.state == "unbooked")}
     for at in sorted(given_up):
         event.add("EXDATE", nominal(at))
     found = [event]
-    told = {one.start: one for one in view.dates if one.state == "conflict"}
+    told = {date.start: date for date in view.dates if date.state == "conflict"}
     if nominal(view.start).timestamp() != view.start:
         told.setdefault(view.start, BookedDate(view.start, view.start, "open"))
-    for at, one in sorted(told.items()):
+    for at, date in sorted(told.items()):
         if at not in given_up:
-            other = _event(fleet, view, at if at == view.start else nominal(at), one)
+            other = _event(fleet, view, at if at == view.start else nominal(at), date)
             other.add("RECURRENCE-ID", nominal(at))
             found.append(other)
     return found

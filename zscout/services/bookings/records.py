@@ -18,15 +18,15 @@ MAX_BYTES: Final = 12_000_000  # of all records: the limit of one answer, and of
 KEEP: Final = DAY  # seconds a record is kept after its last end: clocks may differ
 
 
-def merged(one: BookingRecord, other: BookingRecord) -> BookingRecord:
+def merged(record: BookingRecord, other: BookingRecord) -> BookingRecord:
     """Merge two records of one booking: the newer, with the final facts of both."""
-    newer = max(one, other, key=lambda record: (record.changed, _changing(record)))
+    newer = max(record, other, key=lambda known: (known.changed, _changing(known)))
     return replace(
         newer,
-        made=min(one.made, other.made),
-        unbooked=one.unbooked or other.unbooked,
-        dropped=sorted({*one.dropped, *other.dropped}),
-        over=sorted({*one.over, *other.over}),
+        made=min(record.made, other.made),
+        unbooked=record.unbooked or other.unbooked,
+        dropped=sorted({*record.dropped, *other.dropped}),
+        over=sorted({*record.over, *other.over}),
     )
 
 

@@ -47,20 +47,20 @@ def accounts(
         ends_here = hold.ended is not None and hold.ended <= window.ended
         short = hold.min_runtime is None or ended - hold.began < hold.min_runtime
         for key in dict.fromkeys(keys(hold)):
-            one = found.setdefault(key, Account(key))
-            one.holds += 1
-            one.held += held
-            one.rc_seconds += held if by_rc else held * len(hold.rcs)
+            account = found.setdefault(key, Account(key))
+            account.holds += 1
+            account.held += held
+            account.rc_seconds += held if by_rc else held * len(hold.rcs)
             if hold.waited is not None and hold.began >= window.began:
-                one.waited += hold.waited
+                account.waited += hold.waited
             rcs = [key] if by_rc else hold.rcs
             if told := [hold.used[rc] for rc in rcs if rc in hold.used]:
                 part = held / stood if (stood := ended - hold.began) > 0 else 1.0
-                one.used = (one.used or 0.0) + sum(min(seconds * part, held) for seconds in told)
-            one.used_unknown += len(told) < len(rcs)
+                account.used = (account.used or 0.0) + sum(min(seconds * part, held) for seconds in told)
+            account.used_unknown += len(told) < len(rcs)
             if ends_here and hold.outcome == "preempted":
-                one.preempted += 1
-                one.preempted_seconds += held
+                account.preempted += 1
+                account.preempted_seconds += held
             if ends_here and short and hold.outcome in THROWN_AWAY:
-                one.thrown_away += held
-    return sorted(found.values(), key=lambda one: (-one.held, one.key))
+                account.thrown_away += held
+    return sorted(found.values(), key=lambda account: (-account.held, account.key))

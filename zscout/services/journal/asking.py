@@ -62,7 +62,7 @@ class Told:
                 for gap in journal.gaps
                 if gap.began < unknown.ended and (gap.ended is None or gap.ended > unknown.began)
             ]
-            if not found and any(one.ended > unknown.began for one in unknown_to(journal, unknown)):
+            if not found and any(span.ended > unknown.began for span in unknown_to(journal, unknown)):
                 found = ["has nothing of then"]
             words += [f"{host} {', '.join(dict.fromkeys(found))}"] if found else []
         return "; ".join(words)
@@ -109,7 +109,7 @@ async def ask_journals(
         count = "1 candidate" if len(hosts) == 1 else f"{len(hosts)} candidates"
         raise NoJournal(f"{why}: none of its {count} answers; see [journal] of a node file")
     now = wall()
-    begins = [one.since for one in journals.values() if one.since is not None]
+    begins = [journal.since for journal in journals.values() if journal.since is not None]
     began = now - asked.since if asked.since is not None else min(begins, default=now)
     window = Span(began, now - asked.until)
     found = await asyncio.gather(*map(pages, enough(journals, window)))

@@ -31,7 +31,7 @@ def merged(journals: Iterable[Iterable[PastHold]]) -> list[PastHold]:
             best[hold.grant] = hold
             continue
         more = hold if _knowledge(hold) > _knowledge(known) else known
-        used = {rc: max(one.used.get(rc, 0.0) for one in (known, hold)) for rc in {**known.used, **hold.used}}
+        used = {rc: max(record.used.get(rc, 0.0) for record in (known, hold)) for rc in {**known.used, **hold.used}}
         best[hold.grant] = more if more.used == used else structs.replace(more, used=used)
     return sorted(best.values(), key=lambda hold: (hold.began, hold.grant))
 
@@ -47,18 +47,18 @@ def unknown_to(journal: History, window: Span) -> list[Span]:
     since = window.ended if journal.since is None else journal.since
     spans = [Span(window.began, since)]
     spans += [Span(gap.began, window.ended if gap.ended is None else gap.ended) for gap in journal.gaps]
-    return apart(Span(max(one.began, window.began), min(one.ended, window.ended)) for one in spans)
+    return apart(Span(max(span.began, window.began), min(span.ended, window.ended)) for span in spans)
 
 
 def unknown_to_all(journals: Sequence[History], window: Span) -> list[Span]:
     """Times of a window that no journal covers."""
-    return reduce(both, (unknown_to(one, window) for one in journals), [window])
+    return reduce(both, (unknown_to(journal, window) for journal in journals), [window])
 
 
 def enough(journals: Mapping[HostName, History], window: Span) -> list[HostName]:
     """Hosts whose journals together cover as much as all: the most complete first. Without candidates in the fleet file
     every node keeps a journal, each with up to 180,000 holds."""
-    unknown = {host: unknown_to(one, window) for host, one in journals.items()}
+    unknown = {host: unknown_to(journal, window) for host, journal in journals.items()}
     chosen: list[HostName] = []
     left = [window]
     for host in sorted(unknown, key=lambda host: (_length(unknown[host]), host)):
@@ -83,13 +83,13 @@ def apart(spans: Iterable[Span]) -> list[Span]:
 def both(some: Sequence[Span], others: Sequence[Span]) -> list[Span]:
     """The intersection; both sorted and disjoint."""
     found, at = [], 0
-    for one in some:
-        while at < len(others) and others[at].ended <= one.began:
+    for span in some:
+        while at < len(others) and others[at].ended <= span.began:
             at += 1
         for other in others[at:]:
-            if other.began >= one.ended:
+            if other.began >= span.ended:
                 break
-            found.append(Span(max(one.began, other.began), min(one.ended, other.ended)))
+            found.append(Span(max(span.began, other.began), min(span.ended, other.ended)))
     return found
 
 

@@ -223,7 +223,7 @@ class JournalStore:
             many = round(count * (1 - ROOM * self._max_size / used)) + 1
             gone = db.execute(f"{over} ORDER BY ended LIMIT ?", (min(many, PRUNED_AT_ONCE),)).fetchall()
         if gone:
-            db.executemany("DELETE FROM holds WHERE id = ?", [(one,) for one, _ in gone])
+            db.executemany("DELETE FROM holds WHERE id = ?", [(number,) for number, _ in gone])
             oldest = max(oldest, gone[-1][1])
         db.execute("UPDATE facts SET at = ? WHERE name = 'since' AND at < ?", (oldest, oldest))
         db.execute("DELETE FROM gaps WHERE ended < ?", (oldest,))

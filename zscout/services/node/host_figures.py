@@ -81,7 +81,7 @@ class Cgroup:
                 found.append(HostMemory(max(0, min(total, free)), total))
         if not found:
             return None
-        return HostMemory(min(one.available for one in found), min(one.total for one in found))
+        return HostMemory(min(limit.available for limit in found), min(limit.total for limit in found))
 
     def _tightest(self) -> tuple[float, Path] | None:
         found = []
@@ -214,7 +214,7 @@ def temperature() -> float | None:
     """The hottest sensor in degrees Celsius; None without one."""
     with suppress(AttributeError, OSError, RuntimeError, ValueError):  # not every system has this function
         found = psutil.sensors_temperatures()
-        return max((one.current for group in found.values() for one in group if one.current), default=None)
+        return max((sensor.current for group in found.values() for sensor in group if sensor.current), default=None)
     return None
 
 

@@ -88,7 +88,10 @@ def _trees(proc: Path, at: float, roots: Iterable[int], *, ended: bool = False) 
                     if child not in pids:
                         pids[child] = table[child]
                         queue.append(child)
-            cpu, memory = sum(one.cpu for one in pids.values()), sum(one.memory for one in pids.values())
+            cpu, memory = (
+                sum(process.cpu for process in pids.values()),
+                sum(process.memory for process in pids.values()),
+            )
             found[root] = _Tree(at, table[root].started, cpu, memory, queue, _threads(proc, queue))
     return found
 
@@ -104,16 +107,16 @@ class UseMeter:
         """One entry per component with a living root, at most MAX_COMPONENTS."""
         running = list(self._running())[:MAX_COMPONENTS]
         trees = _trees(self._proc, self._now(), {one.pid for one in running}) if running else {}
-        last, self._last = self._last, {one: trees[one.pid] for one in running if one.pid in trees}
-        return tuple(_use(one, last.get(one) or _Tree(tree.started), tree) for one, tree in self._last.items())
+        last, self._last = self._last, {known: trees[known.pid] for known in running if known.pid in trees}
+        return tuple(_use(known, last.get(known) or _Tree(tree.started), tree) for known, tree in self._last.items())
 
 
-def _use(one: RunningComponent, before: _Tree, tree: _Tree) -> ComponentUse:
+def _use(running: RunningComponent, before: _Tree, tree: _Tree) -> ComponentUse:
     ran, waited = _demand(before.threads, tree.threads)
     return ComponentUse(
-        component=one.component,
-        kind=one.kind,
-        incarnation=one.incarnation,
+        component=running.component,
+        kind=running.kind,
+        incarnation=running.incarnation,
         cpu=round(tree.cores(before), 4),
         memory=tree.memory,
         processes=len(tree.pids),
@@ -164,11 +167,11 @@ class TreeMeter:
 
 def faded(averages: tuple[float, ...], wanted: float, seconds: float) -> tuple[float, float, float]:
     """Averages over 1, 5 and 15 minutes after `wanted` cores for so many seconds, fading like the kernel's."""
-    one, five, fifteen = (
+    first, second, third = (
         wanted + (past - wanted) * math.exp(-seconds / (60 * minutes))
         for past, minutes in zip(averages, (1, 5, 15), strict=True)
     )
-    return one, five, fifteen
+    return first, second, third
 
 
 def _fields(stat: bytes) -> list[bytes]:

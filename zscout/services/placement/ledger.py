@@ -75,7 +75,7 @@ class PlacementLedger:
             if reply is not None and reply.message is not None:
                 # Meanwhile publications are newer or equal.
                 listed = reply.message
-                fresh = [one for one in listed.components if one.component not in self._current]
+                fresh = [known for known in listed.components if known.component not in self._current]
                 try:
                     self._on_placements("", Placements(listed.term, fresh, listed.cordoned))
                 except BadName as error:

@@ -81,7 +81,7 @@ class LoadBalancer:
         left_out = dict(itertools.islice(ranking.left_out.items(), ask.at_most))
         reports = None
         if ask.reports:
-            named = [*(one.host for one in ranking.hosts), *left_out]
+            named = [*(ranked.host for ranked in ranking.hosts), *left_out]
             known = (self.core.reports[host] for host in named if host in self.core.reports)
             reports = [KnownLoad((now - at) / SECOND, report) for at, report in known]
         query.answer(HostRanking(list(ranking.hosts), ranking.metric, ranking.why, left_out, ranking.more, reports))

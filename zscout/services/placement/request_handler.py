@@ -135,7 +135,7 @@ class PlacerRequestHandler:
     def placements(self, component: str | None = None, *, host: str | None = None) -> messages.Placements:
         """All components, or those of a name or a host."""
         components = sorted(self._placer.components.items())
-        found = [one for name, one in components if component in (None, name) and host in (None, one.host)]
+        found = [status for name, status in components if component in (None, name) and host in (None, status.host)]
         return messages.Placements(self.term, found, sorted(self._placer.cordoned))
 
     def _timed_out(self, query: PlacerQuery) -> None:

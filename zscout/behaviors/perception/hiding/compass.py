@@ -82,7 +82,7 @@ def turned(old: Strip, new: Strip, expected: float = 0.0, spread: float = math.r
 
     The search prefers `expected` (radians): `spread` away, a turn must correlate better by 0.15."""
     after, before = new.astype(np.float32), old.astype(np.float32)
-    fast, slow = (np.fft.rfft(one, 2 * COLUMNS, axis=1) for one in (after, before))
+    fast, slow = (np.fft.rfft(strip, 2 * COLUMNS, axis=1) for strip in (after, before))
     common = np.fft.irfft((fast * np.conj(slow)).sum(axis=0), 2 * COLUMNS)
     shifts = np.arange(_OVERLAP - COLUMNS, COLUMNS - _OVERLAP + 1)
     noise = (_GREY * SCALE) ** 2 * BANDS * (COLUMNS - np.abs(shifts))

@@ -138,17 +138,17 @@ def roam_stuck(robot: HidingState, _: View) -> Step:
 def most_open(robot: HidingState) -> Opening:
     """The most open side of the scan, away from blocked ones, with a little chance."""
     best, most = Opening(robot.heading + math.pi, 0.5, 0, 0, 0, 0, 0), -99.0
-    for one in robot.openings:
-        value = min(one.open_for, 2.5) + 0.6 * robot.roll()
-        near = [abs(wrapped(one.heading - other)) < math.radians(50) for other in robot.blocked]
+    for side in robot.openings:
+        value = min(side.open_for, 2.5) + 0.6 * robot.roll()
+        near = [abs(wrapped(side.heading - other)) < math.radians(50) for other in robot.blocked]
         for spot in robot.bad:
             to = math.atan2(spot.y - robot.y, spot.x - robot.x)
-            if abs(wrapped(to - one.heading)) < 0.6:
+            if abs(wrapped(to - side.heading)) < 0.6:
                 value -= 0.5
-        ahead = Spot(*robot.point(one.heading, 0.9))
+        ahead = Spot(*robot.point(side.heading, 0.9))
         value -= 0.7 * sum(distance(ahead, spot) < 0.7 for spot in robot.visited[:-1])
         if value > most and not any(near):
-            best, most = one, value
+            best, most = side, value
     return best
 
 
@@ -304,17 +304,17 @@ def to_light(robot: HidingState) -> Step:
 
 def shelter(openings: list[Opening]) -> tuple[float, bool]:
     """From a full turn: near floor over lit floor, and whether the top is dark on most sides, as beneath a sofa."""
-    lit = max(one.outside for one in openings)
-    near, above = np.percentile([(one.near, one.above) for one in openings], 75, axis=0).tolist()
+    lit = max(side.outside for side in openings)
+    near, above = np.percentile([(side.near, side.above) for side in openings], 75, axis=0).tolist()
     return near / max(lit, 1e-4), above <= ROOFED * lit
 
 
 def lightest(openings: list[Opening]) -> Opening:
     """The direction with most lit floor, neighbours included, each side once."""
 
-    def value(one: Opening) -> float:
-        beside = [max(0.0, 1 - abs(wrapped(other.heading - one.heading)) / 0.9) for other in openings]
-        return one.bright + sum(w * o.bright for w, o in zip(beside, openings, strict=True)) / sum(beside)
+    def value(side: Opening) -> float:
+        beside = [max(0.0, 1 - abs(wrapped(other.heading - side.heading)) / 0.9) for other in openings]
+        return side.bright + sum(w * o.bright for w, o in zip(beside, openings, strict=True)) / sum(beside)
 
     return max(openings, key=value)
 
@@ -358,8 +358,8 @@ def check(robot: HidingState, view: View) -> Step:
     robot.openings = [*robot.openings, robot.opening(view)]
     if len(robot.openings) < CHECKED:
         return robot.stand("back: is it still hidden?")
-    ratio = np.median([one.near / max(one.outside, 1e-4) for one in robot.openings])
-    if ratio <= STILL_DARK and np.median([one.sees_out for one in robot.openings]) >= STILL_SEES:
+    ratio = np.median([side.near / max(side.outside, 1e-4) for side in robot.openings])
+    if ratio <= STILL_DARK and np.median([side.sees_out for side in robot.openings]) >= STILL_SEES:
         return "hidden"
     robot.note = "no longer hidden"
     return "scan"

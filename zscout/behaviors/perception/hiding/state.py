@@ -288,8 +288,8 @@ class HidingState(msgspec.Struct):
         """Return True if the floor stayed the same while driving: the robot pushes against something."""
         floor = floor_strip(picture)
         since = self.clock - max(WATCHED, 1.5 * self.interval)
-        old = [one for one in self.floors if one.at <= since]
-        kept = [*old[-1:], *(one for one in self.floors if one.at > since)]
+        old = [thumb for thumb in self.floors if thumb.at <= since]
+        kept = [*old[-1:], *(thumb for thumb in self.floors if thumb.at > since)]
         self.floors = [*kept[-11:], Thumb(self.clock, floor.tobytes())]
         same = bool(old) and turned(unpack(old[-1].data), floor, 0.0, 0.3).likeness >= SAME_FLOOR
         self.halted = self.halted + 1 if same else 0
@@ -325,9 +325,9 @@ class HidingState(msgspec.Struct):
         self.bad = [*self.bad, Spot(x, y)][-MAX_BAD:]
 
 
-def distance(one: Spot | Sighting | HidingState, other: Spot | Sighting | HidingState) -> float:
+def distance(place: Spot | Sighting | HidingState, other: Spot | Sighting | HidingState) -> float:
     """Metres between two places."""
-    return math.hypot(one.x - other.x, one.y - other.y)
+    return math.hypot(place.x - other.x, place.y - other.y)
 
 
 def wrapped(angle: float) -> float:
