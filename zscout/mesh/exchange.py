@@ -89,8 +89,6 @@ class Tally:
 
 @dataclass(slots=True, eq=False)
 class Answered:
-    """The answer to a question, kept for repeats of the question."""
-
     said: msgspec.Struct | None = None
     waiting: list[IncomingQuery[Any]] = field(default_factory=list)
 
@@ -153,12 +151,9 @@ class Publisher:
 
 @dataclass(slots=True)
 class Backlog:
-    """Items of one declaration that wait, and that were dropped at `depth`."""
-
     pending: int = 0
     missed: int = 0
-    closed: bool = False
-    """Items that still wait are dropped. Subscriptions that share a backlog do not check this."""
+    closed: bool = False  # items that still wait are dropped. Subscriptions that share a backlog do not check this.
     depth: int = QUEUE_DEPTH
 
 

@@ -36,8 +36,7 @@ SCOUT: Final = 1.5  # seconds for all processes to answer
 POLL: Final = 0.02
 CONNECT: Final = 1.5
 HANDSHAKE: Final = 2.0
-OBJECTION: Final = 0.3
-"""Seconds for the other side to refuse our certificate: it checks after we have seen its own."""
+OBJECTION: Final = 0.3  # seconds for the other side to refuse our certificate: it checks after we have seen its own
 LINK: Final = 0.8
 LIST: Final = 1.0  # seconds for links to a plain mesh, and for its tokens
 MAX_HEARD: Final = 64  # processes called

@@ -79,8 +79,7 @@ class Relinking:
                 self._begin(greet=True)
 
     def close(self) -> None:
-        """Close before the session. Takes a second or two, until the thread has ended: a process that ends while its
-        thread is inside Zenoh crashes."""
+        """Close before the session. Waits up to 2 s for the thread: ending the process inside Zenoh would crash it."""
         self._closed.set()
         for listener in self._listeners:
             with suppress(zenoh.ZError):
@@ -116,8 +115,7 @@ class Relinking:
         self._thread.start()
 
     def _greet(self) -> None:
-        """Look for all peers: none that links from here was found, and those that make the link may not know this
-        process."""
+        """Look for all peers: none needs a link from here, and those that make the link may not know this process."""
         found = self._scout(GREET_TIMEOUT)
         with self._lock:
             for peer in found.keys() - {self._own}:

@@ -319,8 +319,7 @@ class Mesh:
         return Declaration(self._transport.queryable(key, on_query), state)
 
     def publisher(self, key: str, kind: type, *, data: bool = False) -> Publisher:
-        """A publisher for control messages, which block rather than get lost; `data` is dropped rather than wait, and
-        yields to control."""
+        """A publisher for control messages, which block rather than get lost; `data` is dropped, and yields."""
         return Publisher(self._transport.publisher(key, kind, Quality.DATA if data else Quality.CONTROL))
 
     def put(self, key: str, message: Struct) -> None:

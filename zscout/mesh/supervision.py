@@ -101,8 +101,7 @@ class Supervisor:
                 task.cancel()
 
     async def close(self) -> None:
-        """Cancel all, and wait for all tasks but the calling one; after CLOSE_TIMEOUT those that still run are
-        logged."""
+        """Cancel all, and wait for all tasks but the calling one; log those that run after CLOSE_TIMEOUT."""
         self.cancel()
         tasks = self._tasks.keys() - {asyncio.current_task()}
         if tasks:
@@ -163,8 +162,7 @@ clock: Final = HostClock()
 
 
 class StallWatch:
-    """Length and end of the last stall of this process (stopped, suspended or starved) on the clock `now`. One per
-    process."""
+    """Last stall of this process (stopped, suspended or starved) by the clock `now`. One watch per process."""
 
     def __init__(self, now: Callable[[], Ns]) -> None:
         self.length: Ns = 0

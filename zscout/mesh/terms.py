@@ -13,8 +13,7 @@ from zscout.types import NO_TERM, Term
 
 
 class LastTerms:
-    """Queries others, once at a time, when one of the last terms appears; passes the highest they report to
-    `believe`."""
+    """Queries others, once at a time, when one of the last terms appears; `believe` gets the highest reported."""
 
     def __init__(
         self, mesh: Mesh, supervisor: Supervisor, believe: Callable[[Term], object], *, timeout: float
@@ -23,8 +22,7 @@ class LastTerms:
         self._asking: asyncio.Task[None] | None = None
 
     def shown(self, term: Term, known: Term) -> bool:
-        """Return True if `term` is one of the last, not credible after `known` without a second source: query
-        others."""
+        """Return True if `term` is one of the last, incredible after `known` without a second source: query others."""
         if not of_the_last(term, known):
             return False
         if self._asking is None or self._asking.done():

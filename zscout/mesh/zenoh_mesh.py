@@ -34,8 +34,7 @@ from zscout.mesh.transport import Collector, OnSample, Quality, Transport, Trans
 
 log = logging.getLogger(__name__)
 
-CONTROL_BATCHES = 8
-"""Control messages in flight per peer: with fewer, an answer waits for the message before it."""
+CONTROL_BATCHES = 8  # control messages in flight per peer: with fewer, an answer waits for the message before it
 SCOUTING_DELAY_MS = 200
 GREATER_CONNECTS = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
 CLOSE_TIMEOUT = 3.0  # seconds that closing a session may take
@@ -56,8 +55,6 @@ _PORT = re.compile(r":\d+$")
 
 
 class Security(NamedTuple):
-    """The certificates, keys and members of a closed fleet."""
-
     certificates: Certificates
     keys: Keys
     members: tuple[FleetMember, ...]
@@ -128,8 +125,6 @@ def _closed(security: Security) -> dict[str, Any]:
 
 @dataclass(slots=True)
 class _Door:
-    """The security for the next session of a process."""
-
     security: Security | None
 
 
@@ -164,8 +159,7 @@ class ZenohMesh(Mesh):
         await super().close()
 
     async def _watch_certificates(self, known: Certificates) -> NoReturn:
-        """Renew the session with the certificates: a session keeps those it was opened with, and peers would refuse it
-        after their end. Warn before they end."""
+        """Warn before certificates end, and reopen the session once renewed: it keeps those it was opened with."""
         told: str | None = None
         warned = ""
         while True:

@@ -47,8 +47,7 @@ class View(NamedTuple):
     ahead: float  # straight ahead at the horizon, and up to a hand's width above
     sides: tuple[float, float]  # left and right half of the band around the horizon
     places: tuple[DarkPlace, ...]  # nearest first
-    contrast: NDArray[np.float32]
-    """Per column: brightest distant floor over near floor, at most `MOST_CONTRAST`."""
+    contrast: NDArray[np.float32]  # per column: brightest distant floor over near floor, at most `MOST_CONTRAST`
     outside: float  # the floor in the brighter half of the columns
     above: float  # top of the picture: above a dark floor a roof is dark, a wall is not
 

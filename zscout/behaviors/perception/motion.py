@@ -31,22 +31,18 @@ MAX_SIDE: Final = 8_192
 BLOCKS: Final = 20  # blocks across for comparing brightness
 WHITE: Final = 240.0  # grey levels from which noise may be clipped, so that a pixel follows the light less
 LEARN: Final = 6.0  # seconds in which the background follows pixels without motion
-ABSORB: Final = 30.0
-"""Seconds in which it follows motion. The variance grows by the square, and follows much sooner."""
+ABSORB: Final = 30.0  # seconds in which it follows motion. The variance grows by the square, and follows much sooner.
 WARM: Final = 1.0  # seconds of the first look: all is background, and nothing is reported
 WARM_PICTURES: Final = 4
 CLEARER: Final = 0.7
-"""The first look restarts at a picture with less than this share of its noise: the camera was warming up, and learned
-noise would hide motion for long."""
+"""The first look restarts below this share of its noise: a camera's warm-up would hide motion for long."""
 OTHER: Final = 4.0
 OTHER_NOISE: Final = 2.0
-"""It also restarts if half of the picture is off by these grey levels and multiples of its noise: a channel may still
-show the robot that had it before."""
+"""It also restarts if half of a picture is off by these grey levels and multiples of its noise: another scene."""
 ALIKE: Final = 1.2  # after a pause, the largest factor of a known picture's noise, up or down ...
 CHANGED: Final = 0.2  # ... and the largest share of it that changed.
 AGREE: Final = (0.15, 1.0)
-"""Seconds, least and most, between two such pictures that continue the background: another robot's last picture comes
-alone."""
+"""Seconds, least and most, between two such pictures: another robot's last picture comes alone."""
 APART: Final = 3  # so many in a row suffice if they come farther apart
 STANDS: Final = 0.25  # largest share of differing pixels in a changed region that counts as still
 RETURN: Final = 2.0
@@ -57,8 +53,7 @@ WEAK: Final = 3.2  # standard deviations that continue a region
 FLOOR: Final = 1.3  # least noise of a smoothed picture in grey levels: quantisation and compression
 SMALLEST: Final = 0.0012  # least share of the picture in a region
 BAND: Final = 5.0
-THIN: Final = 0.07
-"""Torn lines are regions BAND times as wide as high, and no higher than this share of the picture."""
+THIN: Final = 0.07  # torn lines are regions BAND times as wide as high, and no higher than this share of the picture
 ASIDE: Final = 32  # largest displacement of torn lines in columns
 UPHEAVAL: Final = 0.55  # share of changed pixels that no motion explains
 ALL_OFF: Final = 4.0  # standard deviations of the median pixel in a picture of another scene
@@ -107,8 +102,6 @@ class Event(NamedTuple):
 
 
 class _Meanwhile:
-    """Changes found in the pictures after a pause."""
-
     def __init__(self, since: float, level: _Plane, mask: NDArray[np.uint8], row: int) -> None:
         self.since, self.pictures, self.row = since, 1, row
         self.level, self._mask = level.copy(), mask
@@ -207,8 +200,7 @@ class MotionDetector:
         return noise < CLEARER * before or _off(away) > max(OTHER, OTHER_NOISE * noise)
 
     def pause(self) -> None:
-        """Pictures pause. The background is kept, and continues with the first fitting picture; until then nothing is
-        reported."""
+        """Pictures pause. The first fitting one continues the background; until then nothing is reported."""
         self._sightings.clear()
         self._presence.clear()
         if self._pictures < WARM_PICTURES:
@@ -273,8 +265,7 @@ class MotionDetector:
         self._variance += rate * (away * away - self._variance)
 
     def _regions(self, score: _Plane, level: _Plane) -> tuple[NDArray[np.uint8], _Regions, _Regions]:
-        """Connected pixels above WEAK with some above STRONG: a mask (255 or 0), the regions' stats, and those of
-        regions certain at first sight."""
+        """Connected pixels above WEAK with some above STRONG: mask (255 or 0), stats, and stats of certain regions."""
         weak = (score > WEAK).astype(np.uint8)
         # Torn lines and hot pixels are thinner than anything that moves.
         thick = cv2.morphologyEx(weak, cv2.MORPH_OPEN, np.ones((3, 2), np.uint8))
@@ -320,8 +311,7 @@ def _fitted(box: Box, mask: Mask) -> Box:
 
 
 def reduced(picture: Picture) -> tuple[_Plane, float, float]:
-    """The picture in grey, at most WIDTH columns wide, and the factors to the source's columns and rows. Raises
-    ValueError."""
+    """The picture in grey, at most WIDTH columns wide, and the factors to the source's size. Raises ValueError."""
     planes = picture.ndim in (2, 3) and picture.shape[2:] in ((), (3,))
     sides = all(8 <= side <= MAX_SIDE for side in picture.shape[:2])
     if picture.dtype != np.uint8 or not planes or not sides:
@@ -336,8 +326,7 @@ def reduced(picture: Picture) -> tuple[_Plane, float, float]:
 
 
 def _noise(grey: _Plane) -> float:
-    """Standard deviation of noise and fine texture in grey levels, from the differences between lines and their
-    neighbours' mean."""
+    """Standard deviation of noise and fine texture, in grey levels, from second differences between lines."""
     return float(np.mean(np.abs(np.diff(grey, 2, axis=0)))) / 1.954
 
 

@@ -25,8 +25,7 @@ Regions = NDArray[np.uint8]
 class Presence:
     def __init__(self) -> None:
         self._before: Plane | None = None  # background before the motion; None if there was none lately
-        self._moved_at = self._there_at = 0.0
-        """Times of the last motion, and of the last presence without motion."""
+        self._moved_at = self._there_at = 0.0  # times of the last motion, and of the last presence without motion
         self._where: Regions = np.empty((0, 0), np.uint8)  # region of the last motion
 
     def expects(self, moving: bool) -> bool:
@@ -37,8 +36,8 @@ class Presence:
         self._before = None
 
     def see(self, time: float, level: Plane, mean: Plane, moving: Regions | None, noise: float) -> bool:
-        """Return True if something is present that does not move. `level`: brightness; `mean`: background; `moving`:
-        moving regions or None."""
+        """Return True if something present does not move. `level`: brightness; `mean`: background; `moving`:
+        regions."""
         if moving is not None:
             if self._before is None:
                 self._before = mean.copy()

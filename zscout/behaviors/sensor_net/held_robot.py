@@ -49,8 +49,7 @@ class HeldRobot:
         self.sent = self.refused = 0
 
     async def camera(self, on: bool, *, remind: bool = False) -> bool:
-        """Switch its transmitter on, to the held channel, or off. Sent once, unless `remind`: repeat until it returns
-        True."""
+        """Switch its transmitter on (to the held channel) or off, once unless `remind`; repeat until True."""
         if on != self._transmits or remind:
             self._transmits = on if await self._command({"name": "camera", "on": on}) else None
         return on == self._transmits

@@ -31,8 +31,7 @@ from zscout.types import SECOND
 
 LOOK: Final = 0.5  # seconds to wait for a picture
 RETRY_AFTER: Final = 1.0  # seconds before a retry after a refusal
-GIVEN_UP: Final = 60.0
-"""Seconds before a robot that was given up is tried again: its battery may have been changed."""
+GIVEN_UP: Final = 60.0  # seconds before a robot that was given up is tried again: its battery may have been changed
 WARM_AHEAD: Final = 4.0  # seconds of warm-up before the expected turn: it takes two, and turns may begin early
 WARM_SLACK: Final = 4.0  # further seconds until the turn at which the camera is switched off again
 SOONER: Final = 0.9  # share of its slot requested by a robot that recently saw motion
@@ -40,8 +39,7 @@ BRIEF: Final = 0.1  # seconds of minimum runtime of the warm-up: others may take
 IDLE: Final = 0.1  # seconds between safe points while waiting
 
 
-class CameraBlind(Exception):
-    """No pictures of the held robot."""
+class CameraBlind(Exception): ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +65,6 @@ class Slots:
 
 
 class PlaceRobot(Behavior):
-    """Hides one robot and has it watch, until stopped."""
-
     def __init__(self, name: str, needs: RobotNeeds, slots: Slots | None = None) -> None:
         super().__init__(name)
         self.needs, self.slots = needs, slots or Slots()
@@ -121,15 +117,13 @@ class PlaceRobot(Behavior):
 
 
 class RobotTask(Behavior):
-    """The work under one kind of ARC."""
-
     def __init__(self, task: Task, place: PlaceRobot) -> None:
         super().__init__(task)
         self.task, self.place = task, place
 
     async def run(self, context: BehaviorContext) -> None:
-        """Request all needs and work under the hold, again after a revocation, until the task or its slot ends. Raises
-        CameraBlind, and the errors of a request."""
+        """Request all needs and work under the hold, again after a revocation. Raises CameraBlind, and errors of
+        requests."""
         place, scout = self.place, self.place.scout
         priority, slot = place.slots.of(self.task, sooner=scout.saw_somebody)
         came, place.came = place.came, None

@@ -24,15 +24,12 @@ STOPPING: Final = 3.0  # seconds for stopping its components at the end
 
 
 class PlaceSensorNet(Behavior):
-    """The net over `net`'s robots; `spec_for` gives the component that places one of them."""
-
     def __init__(self, name: str, net: SensorNet, spec_for: Callable[[str, str], ComponentSpec]) -> None:
         """`spec_for(robot, path)`; raises the errors of `Behavior`."""
         super().__init__(name)
         self.net = net
         self._spec_for = spec_for
-        self._components: dict[str, str] = {}
-        """Robots by component name, which is unique as it contains the net's."""
+        self._components: dict[str, str] = {}  # robots by component name, which is unique as it contains the net's
         self._placed: set[str] = set()  # components that this net had placed: it stops no others
         self._there: set[str] = set()  # those that the placer has confirmed to this process
         self._busy: set[str] = set()  # components with a placer request under way
@@ -91,8 +88,7 @@ class PlaceSensorNet(Behavior):
                 self.report(self.doing, f"{effect.robot} is lost: {effect.why}")
 
     def _see_to_components(self) -> None:
-        """Place the components of active robots, again after a move, as the answer may be lost; stop all others until
-        the placer confirms."""
+        """Place components of active robots, again after a move; stop all others until the placer confirms."""
         for component, robot in self._components.items():
             active = self.net.members[robot].standing == "active"
             done = component in self._there if active else component not in self._placed

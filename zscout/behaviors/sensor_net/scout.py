@@ -17,8 +17,7 @@ from zscout.behaviors.perception.hiding.hider import Hider
 from zscout.behaviors.perception.lens import Picture
 from zscout.behaviors.perception.motion import Box, MotionDetector
 
-NO_PICTURE_TIMEOUT: Final = 10.0
-"""Seconds from a hold's start, or the last picture, until the robot counts as unseen."""
+NO_PICTURE_TIMEOUT: Final = 10.0  # seconds from a hold's start, or the last picture, until the robot counts as unseen
 
 QUIET: Final = 2.0  # seconds without motion that separate two events
 SUSPECTS: Final = 2  # holds in a row without a picture that prove a robot dead
@@ -49,8 +48,6 @@ class Step:
 
 
 class Alerts:
-    """One alert per event."""
-
     def __init__(self) -> None:
         self.count = 0
         self._last: float | None = None  # last motion of the present event
@@ -98,8 +95,7 @@ class Blindness:
         self._channel, self._no_signal_since = "", now
 
     def see(self, now: float, good: bool, channel: str, *, came: bool | None = None) -> bool:
-        """Record one look; `came`: any picture, if not a good one. Return True without a good picture for too long on
-        this channel."""
+        """Record a look; `came`: any picture, even a bad one. Return True without a good picture for too long."""
         self._channel = channel
         if good or came:
             self._no_signal_since = now

@@ -25,8 +25,6 @@ NEEDS, PRIORITY, PATIENCE = "X-ZSCOUT-NEEDS", "X-ZSCOUT-PRIORITY", "X-ZSCOUT-PAT
 
 
 class CalendarSelection(NamedTuple):
-    """The bookings of one `owner`, with one `rc`, or all."""
-
     owner: str | None = None
     rc: str | None = None
 

@@ -28,8 +28,7 @@ def zone_of(name: str) -> ZoneInfo:
 
 
 def dates(booking: BookingRecord, after: float, before: float) -> list[Instant]:
-    """The starts of a booking from `after` and before `before`, including dates given up. Raises ValueError for a zone
-    unknown here."""
+    """Starts from `after`, before `before`, including dates given up. Raises ValueError for an unknown zone."""
     if not booking.every:
         return [booking.start] if after <= booking.start < before else []
     return [*takewhile(lambda at: at < before, dropwhile(lambda at: at < after, _repeated(booking, after)))]

@@ -51,16 +51,13 @@ class _BookingFile(msgspec.Struct):
 
 
 class Disk(Protocol):
-    """Storage of records beyond their process."""
-
     def read(self) -> list[BookingRecord]: ...
     async def write(self, records: list[BookingRecord]) -> None:
         """Return once they are on disk. Raises OSError."""
 
 
 class BookingFile:
-    """A file of one fleet's bookings. Unreadable records are skipped and logged, and the file is copied, as the next
-    write would lose them."""
+    """A file of one fleet's bookings. Unreadable records are skipped and logged, and the file copied aside."""
 
     def __init__(self, folder: Path, fleet: str) -> None:
         self._path, self._fleet = folder / FILE, fleet

@@ -14,13 +14,10 @@ THROWN_AWAY: Final = frozenset({"preempted", "lost"})  # outcomes of holds ended
 
 @dataclass(slots=True)
 class Account:
-    """Of one user, group or RC."""
-
     key: str
     holds: int = 0  # holds with some time in the window
     held: float = 0.0  # seconds held; simultaneous holds count twice
-    rc_seconds: float = 0.0
-    """Seconds times RCs: three RCs for 10 s are 30. Equals `held` in an RC's own account."""
+    rc_seconds: float = 0.0  # seconds times RCs: three RCs for 10 s are 30. Equals `held` in an RC's own account.
     waited: float = 0.0
     """Known seconds in the queue, in full, of holds that began in the window. Waits without a hold are unknown."""
     preempted: int = 0  # holds preempted in the window before their minimum runtime

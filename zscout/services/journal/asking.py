@@ -33,20 +33,16 @@ class NoJournal(Exception):
     """No journal, or not all of it, is available; one line with the reason."""
 
 
-class NoCandidate(NoJournal):
-    """No candidate is visible."""
+class NoCandidate(NoJournal): ...
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """Merged answer for a window."""
-
     window: Span
     holds: Sequence[PastHold]  # by start; the latest, if there are too many
     more: bool  # True if there are earlier ones
     journals: Mapping[HostName, History]  # the first page of each candidate that answered
-    without: Sequence[HostName]
-    """Candidates without an answer: without a journal, of an old version, or too slow."""
+    without: Sequence[HostName]  # candidates without an answer: without a journal, of an old version, or too slow
 
     @property
     def unknown(self) -> list[Span]:

@@ -45,8 +45,6 @@ class PublicationHeard(NamedTuple):
 
 
 class StateRead(NamedTuple):
-    """The RCM's state, read after missed publications."""
-
     at: float
     state: RcmState
 
@@ -58,8 +56,6 @@ class UseHeard(NamedTuple):
 
 
 class HoldSeen(NamedTuple):
-    """A present hold, possibly known already."""
-
     hold: PastHold
 
 
@@ -77,8 +73,6 @@ class EndUnheard(NamedTuple):
 
 
 class GapSeen(NamedTuple):
-    """A time with incomplete records."""
-
     gap: JournalGap
 
 

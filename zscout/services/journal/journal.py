@@ -91,8 +91,7 @@ class Journal:
         await self._supervisor.close()
 
     def hear(self, grants: Grants) -> None:
-        """Take each publication of the leader, heartbeats included. Raises nothing: a candidate leads without a journal
-        as well."""
+        """Take each publication of the leader, heartbeats too. Raises nothing: candidates lead without a journal."""
         try:
             if self._supervisor.active:
                 self._hear(grants)

@@ -88,8 +88,7 @@ class Unwritable(Exception):
     """The journal can't be kept at present; the message gives the reason. A commit may be retried."""
 
 
-class Damaged(Unwritable):
-    """The file was unreadable, and set aside with its contents."""
+class Damaged(Unwritable): ...
 
 
 class JournalStore:
@@ -102,8 +101,7 @@ class JournalStore:
         self._one = threading.Lock()
 
     def open(self) -> tuple[list[Grant], float | None]:
-        """Open holds, and the time of the last publication, when it was closed. Sets an unreadable file aside, and
-        begins a new one. Raises Unwritable."""
+        """Open holds and last publication of the closed journal; sets an unreadable file aside. Raises Unwritable."""
         with self._one:
             try:
                 db = self._opened()

@@ -83,8 +83,6 @@ class Histogram:
 
 
 class Labels:
-    """Distinct values, up to a limit."""
-
     def __init__(self, most: int) -> None:
         self._most = most
         self._known: set[tuple[str, ...]] = set()

@@ -17,8 +17,6 @@ FRESH: Final = 1.0  # seconds for which a text is reused
 
 
 class MetricsServer(PlainHttpServer):
-    """`read` returns the present figures, in the event loop."""
-
     where = "figures are at /metrics"
 
     def __init__(self, read: Callable[[], Samples], bind: str, port: int) -> None:

@@ -31,8 +31,6 @@ GRACE: Final = 2.0  # seconds for components to end with their node
 
 
 class ComponentHost:
-    """Starts, watches and ends the components of this host."""
-
     def __init__(
         self,
         mesh: Mesh,
@@ -51,8 +49,7 @@ class ComponentHost:
         self._limits = limits or ControlGroups()
         self._living: dict[str, ComponentProcess] = {}
         self._ended: OrderedDict[str, ComponentProcess] = OrderedDict()
-        self._known: OrderedDict[str, int] = OrderedDict()
-        """The highest incarnation of each component started here."""
+        self._known: OrderedDict[str, int] = OrderedDict()  # the highest incarnation of each component started here
         self.supervisor = Supervisor("the component host", on_failure)
         self._underway = 0
         self._stopping = False

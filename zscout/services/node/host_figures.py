@@ -152,8 +152,6 @@ def read_field(file: Path, name: str) -> int | None:
 
 
 class CpuMeter:
-    """Use of the processors since the last call."""
-
     def __init__(self, cgroup: Cgroup) -> None:
         self._cgroup = cgroup
         self._host = _host_times()
@@ -172,8 +170,7 @@ class CpuMeter:
 
 
 class Paced(Generic[T]):
-    """A figure measured at most every `least` seconds, and seldom enough to cost at most `share` of one core; cached in
-    between."""
+    """A figure measured every `least` seconds at most, at a cost of `share` of one core at most; else cached."""
 
     def __init__(self, measure: Callable[[], T], *, least: float, share: float) -> None:
         self._measure, self._least, self._share = measure, least, share
@@ -219,8 +216,7 @@ def temperature() -> float | None:
 
 
 def speed(tries: int = TRIES) -> float:
-    """Speed of one core at Python: 1.0 takes a processor millisecond for the benchmark. About 2 ms a try; call it in a
-    thread."""
+    """Speed of one core at Python: 1.0 takes a processor millisecond for the benchmark. Takes 2 ms a try."""
     best = math.inf
     for _ in range(tries):
         # Thread time: other load does not slow the result.

@@ -23,8 +23,7 @@ PERIOD_US: Final = 100_000
 LEAST_US: Final = 1_000  # of each period: the kernel's minimum
 START_CORES: Final = 1.0
 PREFIX: Final = "zscout."
-LEAF: Final = "zscout-node"
-"""The group (v2) for the node itself: a group with processes can't limit groups within it."""
+LEAF: Final = "zscout-node"  # the group (v2) for the node itself: a group with processes can't limit groups within it
 CLOSE_TRIES: Final = 50
 CLOSE_PAUSE: Final = 0.02  # seconds. The kernel must finish a group's last process before its removal.
 
@@ -60,8 +59,7 @@ class ComponentGroup:
             _write(folder / "cgroup.procs", str(pid))
 
     def settle(self) -> None:
-        """The component is ready: set its limit of processor time. Until then START_CORES hold, so that a small limit
-        does not delay it."""
+        """The component is ready: replace START_CORES, which speed its start, by its limit."""
         if self.throttle is not None:
             with suppress(OSError):  # it has ended meanwhile
                 _write(*self.throttle)
@@ -99,8 +97,7 @@ class ControlGroups:
         self._of = own_groups(of)
 
     def group(self, name: str, memory: int, cpu: float) -> ComponentGroup:
-        """A group for one component: `memory` in bytes, `cpu` in cores, 0 for no limit. It lists the limits that can't
-        be set. Not for the event loop."""
+        """A group for one component: `memory` in bytes, `cpu` in cores, 0 for no limit. Not for the event loop."""
         group = ComponentGroup(memory, cpu)
         name = f"{PREFIX}{os.getpid()}.{name}"
         group.memory_set = memory > 0 and self._limit(group, "memory", name)

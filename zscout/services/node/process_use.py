@@ -27,8 +27,7 @@ def since_boot() -> float:
 
 
 class RunningComponent(NamedTuple):
-    """A component on this host. `pid` is its root process, a child not waited for yet, so that its number is not
-    reused."""
+    """`pid` is the component's root process, a child not waited for yet, so that its number is not reused."""
 
     component: str
     kind: str
@@ -36,8 +35,7 @@ class RunningComponent(NamedTuple):
     pid: int
 
 
-Running: TypeAlias = Callable[[], Iterable[RunningComponent]]
-"""The components of a node; callable from any thread."""
+Running: TypeAlias = Callable[[], Iterable[RunningComponent]]  # the components of a node; callable from any thread
 
 
 class _Process(NamedTuple):
@@ -106,7 +104,7 @@ class UseMeter:
     def measure(self) -> tuple[ComponentUse, ...]:
         """One entry per component with a living root, at most MAX_COMPONENTS."""
         running = list(self._running())[:MAX_COMPONENTS]
-        trees = _trees(self._proc, self._now(), {one.pid for one in running}) if running else {}
+        trees = _trees(self._proc, self._now(), {component.pid for component in running}) if running else {}
         last, self._last = self._last, {known: trees[known.pid] for known in running if known.pid in trees}
         return tuple(_use(known, last.get(known) or _Tree(tree.started), tree) for known, tree in self._last.items())
 
@@ -125,8 +123,6 @@ def _use(running: RunningComponent, before: _Tree, tree: _Tree) -> ComponentUse:
 
 
 class TreeUse(NamedTuple):
-    """Use of one process tree since the last call."""
-
     elapsed: float  # seconds since then
     cores: float  # average used
     wanted: float  # used, plus those its threads waited for

@@ -35,13 +35,11 @@ class Reload:
         self._asked = asyncio.Event()
 
     def takes(self, table: str, take: Callable[[Node], object]) -> None:
-        """Call `take` in the event loop with the new settings when a key of this table changes; if it raises, that is
-        logged, and the old ones stay."""
+        """Call `take` in the event loop with settings changed in this table; its errors are logged, old ones stay."""
         self._takers[table] = take
 
     def on_hangup(self) -> None:
-        """Reload at SIGHUP instead of ending. Call it in the main thread; a handler of the loop would be removed at its
-        close, before the process ends."""
+        """Reload at SIGHUP. For the main thread; asyncio would remove its own handler before the process ends."""
         loop = asyncio.get_running_loop()
 
         def ask(*_: object) -> None:

@@ -26,16 +26,14 @@ from zscout.types import SECOND, HostName, Ns, Term
 
 log = logging.getLogger("zscout.placer")
 
-BEGIN: Final = 2.0
-"""Most seconds until a new placer begins, even if some hosts have not listed their components."""
+BEGIN: Final = 2.0  # most seconds until a new placer begins, even if some hosts have not listed their components
 LIST_TRIES: Final = 5
 LIST_AGAIN: Final = 0.5  # seconds until an unanswered list is asked for again
 PUBLISH_AT_ONCE: Final = 200  # components in one publication
 
 
 class ComponentPlacer:
-    """The placer of one term. `inherited` comes from its predecessor; after `on_failure` it places nothing, and must be
-    stopped."""
+    """The placer of one term. `inherited` comes from its predecessor; stop it after `on_failure`."""
 
     def __init__(
         self,

@@ -22,8 +22,6 @@ TRIES: Final = 3
 
 
 class PlacementLedger:
-    """Follows publications during a candidacy, and keeps them for the next."""
-
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
         self.term: Term = NO_TERM

@@ -24,8 +24,7 @@ DEPTH: Final = 4_096  # reports kept unread; the oldest are lost, and later ones
 
 
 class LoadBalancer:
-    """Ranks hosts, until stopped or failed. All its knowledge comes from reports, so a new leader's balancer has it
-    within a second."""
+    """Ranks hosts until stopped or failed; knows load reports alone, so a new leader's knows all within 1 s."""
 
     def __init__(self, mesh: Mesh, on_failure: Callable[[Exception], object]) -> None:
         self.mesh = mesh

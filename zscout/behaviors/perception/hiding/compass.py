@@ -17,8 +17,7 @@ from zscout.behaviors.perception.lens import COLUMNS, FIELD, FOCAL, GAMMA, MIDDL
 
 STEP: Final = FIELD / COLUMNS  # radians between two columns of a strip
 BANDS: Final = 20
-_TOP, _BOTTOM = 4, 84
-"""Rows used: on the floor below them, a turn about the wheels differs from one about the camera."""
+_TOP, _BOTTOM = 4, 84  # rows used: on the floor below them, a turn about the wheels differs from one about the camera
 _NEAR: Final = 80  # first row of the near floor: 25 cm ahead
 _OVERLAP: Final = 36  # least columns shared by two strips: turns of up to 50 degrees are measured
 _SLOW: Final = 31  # columns of the mean that is subtracted
@@ -47,8 +46,7 @@ def strip_and_tones(picture: Picture) -> tuple[Strip, Tones]:
 
 
 def brighter(old: Tones, new: Tones, angle: float) -> float:
-    """Factor by which the camera opened from `old` to `new` over a turn by `angle`: the median over shared usable
-    pixels, 1 for too few."""
+    """The camera's gain from `old` to `new` over a turn by `angle`: a median, 1 for too few shared pixels."""
     shift = round(angle / STEP)
     if abs(shift) > COLUMNS - 16:
         return 1.0
@@ -62,8 +60,7 @@ def brighter(old: Tones, new: Tones, angle: float) -> float:
 
 
 def floor_strip(picture: Picture) -> Strip:
-    """The near floor's grain, laid out alike. It stays during turns on the spot and vain pushes, and changes within a
-    few centimetres."""
+    """The near floor's grain, laid out alike: unchanged by turns on the spot and vain pushes only."""
     return _off_the_mean(cv2.blur(_by_angle(picture[_NEAR:]), (3, 1)), (25, 7))
 
 

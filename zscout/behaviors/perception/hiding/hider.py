@@ -22,8 +22,6 @@ from zscout.behaviors.perception.lens import COLUMNS, ROWS, Picture
 
 
 class PhaseCode(NamedTuple):
-    """The functions of one phase; all memory is in the state."""
-
     step: Callable[[HidingState, View], Step]  # the action for this picture, after any hop has been measured
     begin: Callable[[HidingState], None] = lambda _: None  # begins the phase, without a command
     cruises: bool = False  # drives without waiting for a still picture

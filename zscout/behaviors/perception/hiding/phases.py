@@ -31,8 +31,7 @@ LOST: Final = 1.6  # seconds without sight of the place
 LONGEST: Final = 25  # seconds of an approach
 FACE_HOPS: Final = 22
 DARK: Final = 0.12
-"""Most light of the floor here over the lit floor. The promise is a quarter of the room's median, and the visible floor
-may be twice as bright."""
+"""Most light here over the lit floor: a quarter of the room's median, as that floor may be twice as bright."""
 DARK_ENOUGH: Final = 0.19  # the same if it gets no darker further in
 DARKISH: Final = 0.4  # the same if it may be darker further in
 ROOFED: Final = 0.28

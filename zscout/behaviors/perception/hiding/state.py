@@ -100,8 +100,6 @@ class Spot(msgspec.Struct, frozen=True):
 
 
 class Thumb(msgspec.Struct, frozen=True):
-    """A part of an earlier picture, to detect motion."""
-
     at: float
     data: bytes
 
@@ -152,8 +150,7 @@ class HidingState(msgspec.Struct):
     goal: float = 0.0  # heading or distance, depending on the phase
     left_to_go: float = 0.0
     next_phase: Phase = "scan"
-    bad: list[Spot] = msgspec.field(default_factory=list)
-    """Places where hiding failed, or that could not be reached."""
+    bad: list[Spot] = msgspec.field(default_factory=list)  # places where hiding failed, or that could not be reached
     scans: int = 0
     bumps: int = 0
     blocked: list[float] = msgspec.field(default_factory=list)  # headings of bumps since the last scan
