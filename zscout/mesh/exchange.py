@@ -158,7 +158,7 @@ class Backlog:
 
 
 class HostShares:
-    """Waiting queries per host, so that one host can't take all the room. Counted on any thread."""
+    """Waiting queries per host, so that no host takes all the room. Counted on any thread."""
 
     def __init__(self, share: int) -> None:
         self._share, self._lock, self._waiting = share, threading.Lock(), dict[str, int]()

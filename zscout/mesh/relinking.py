@@ -36,7 +36,7 @@ GREET_TIMEOUT: Final = 0.1
 MEET_TIMEOUT: Final = 0.25
 """Seconds; gossip is immediate. An end that has not yet noticed the loss accepts no second link."""
 POLL: Final = 0.002
-MEETING: Final = "6d656574"  # prefix of the ids of temporary sessions, whose end nobody notices
+MEETING: Final = "6d656574"  # prefix of the ids of temporary sessions, whose end is ignored
 _ADDRESS: Final = re.compile(r"^(?:tcp|tls)/(.+):(\d+)(?:[?#].*)?$")
 
 
@@ -54,7 +54,7 @@ class _Lost:
 class Relinking:
     """Restores the links of one session, in a thread that lives while a link is lost.
 
-    `scouting` holds the settings for finding peers; `meeting` returns those of a temporary session that links to the
+    `scouting` holds the settings for finding peers; `meeting` returns settings of a temporary session that links to the
     given addresses alone."""
 
     def __init__(
@@ -98,7 +98,7 @@ class Relinking:
         now, peer = time.monotonic(), str(event.link.zid)
         with self._lock:
             if event.kind == zenoh.SampleKind.PUT or self._closed.is_set() or peer.startswith(MEETING):
-                return  # of a link that is there a look tells: one may come and go without another event
+                return  # new links are found by a look: they may vanish without another event
             if peer in self._routers:
                 self._routers.remove(peer)
                 return
@@ -115,7 +115,7 @@ class Relinking:
         self._thread.start()
 
     def _greet(self) -> None:
-        """Look for all peers: none needs a link from here, and those that make the link may not know this process."""
+        """Look for all peers: none needs a link from here, and others may not know this process."""
         found = self._scout(GREET_TIMEOUT)
         with self._lock:
             for peer in found.keys() - {self._own}:
@@ -174,7 +174,7 @@ class Relinking:
         return {str(peer) for peer in self._session.info.peers_zid()}
 
     def _scout(self, seconds: float, wanted: Collection[str] = ()) -> dict[str, list[str]]:
-        """Addresses by peer: of all peers, or of `wanted` and this one, as soon as they are found."""
+        """Addresses by peer: of all peers, or of `wanted` and this process, as soon as they are found."""
         found: dict[str, list[str]] = {}
         until = time.monotonic() + seconds
         with zenoh.scout(what="peer", config=self._scouting) as scout:

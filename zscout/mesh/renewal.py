@@ -119,7 +119,7 @@ class RenewableTransport(Transport):
         except MeshError as error:
             log.warning("%s", error)
         except Exception:
-            log.exception("this process could not join the mesh anew as a whole")
+            log.exception("the mesh session could not be reopened")
         finally:
             self._renewing = None
 
@@ -321,7 +321,7 @@ class _TokenView:
 
         def on_token(token: str, alive: bool) -> None:
             with self._lock:
-                if session != self._session:  # of the old one, which is to be closed
+                if session != self._session:  # of the old session, which closes soon
                     return
                 # Zenoh reports a session's own token gone while the same token lives on another session.
                 if not alive and self._owns(token):

@@ -101,7 +101,7 @@ class Supervisor:
                 task.cancel()
 
     async def close(self) -> None:
-        """Cancel all, and wait for all tasks but the calling one; log those that run after CLOSE_TIMEOUT."""
+        """Cancel all, and wait for all tasks but the calling one; log the rest after CLOSE_TIMEOUT."""
         self.cancel()
         tasks = self._tasks.keys() - {asyncio.current_task()}
         if tasks:

@@ -1,4 +1,4 @@
-"""What a mesh needs of the network below it: bytes by key. Callbacks may come on any thread, and must not block."""
+"""The network below a mesh: bytes by key. Callbacks may come on any thread, and must not block."""
 
 from __future__ import annotations
 

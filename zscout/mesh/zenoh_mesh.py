@@ -199,7 +199,7 @@ def _security(fleet: Fleet, keys: Keys, me: Sender) -> Security:
 
 
 def increasing_id() -> str:
-    """A session id greater than those of earlier sessions, so that the newcomer makes the links. Zenoh compares ids
+    """A session id greater than all earlier ones, so that the newcomer makes the links. Zenoh compares ids
     from the last byte on, and prints them as a number."""
     return f"1{secrets.token_hex(9)}0{time.time_ns().to_bytes(8, 'little').hex()[4:]}"
 
@@ -419,7 +419,7 @@ def _encoding(kind: type | None) -> zenoh.Encoding:
 
 
 def _is_publication(sample: zenoh.Sample) -> bool:
-    """Return True for puts on concrete keys: one on a wildcard would pass for everybody's."""
+    """Return True for puts on concrete keys: one on a wildcard would pass for every sender's."""
     return sample.kind == zenoh.SampleKind.PUT and "*" not in str(sample.key_expr)
 
 

@@ -290,7 +290,7 @@ class MotionDetector:
         return _torn(level[top : top + high], self._mean[top : top + high])
 
     def _sure(self, time: float, mask: NDArray[np.uint8]) -> bool:
-        """Return True if recent sightings nearby confirm this one."""
+        """Return True if recent sightings nearby confirm this sighting."""
         near = np.asarray(cv2.dilate(mask, np.ones((15, 25), np.uint8)), np.uint8)
         agree = sum(time - at <= MEMORY and bool(np.any(earlier & near)) for at, earlier in self._sightings)
         self._sightings.append((time, mask))

@@ -24,7 +24,7 @@ Regions = NDArray[np.uint8]
 
 class Presence:
     def __init__(self) -> None:
-        self._before: Plane | None = None  # background before the motion; None if there was none lately
+        self._before: Plane | None = None  # background before the motion; None without recent motion
         self._moved_at = self._there_at = 0.0  # times of the last motion, and of the last presence without motion
         self._where: Regions = np.empty((0, 0), np.uint8)  # region of the last motion
 

@@ -76,7 +76,7 @@ class SensorNet:
         return [member for member in self.members.values() if member.standing == "active"]
 
     def report(self, now: float, robot: str, doing: str, *, alert: bool = False) -> list[Effect]:
-        """Take a status; that of an inactive robot is old, and ignored."""
+        """Take a status; inactive robots' are old, and ignored."""
         member = self.members.get(robot)
         if member is None or member.standing != "active":
             return []

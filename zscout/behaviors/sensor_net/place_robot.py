@@ -165,7 +165,7 @@ class RobotTask(Behavior):
                 raise CameraBlind(f"{channel} shows nothing at all")
 
     async def _channel(self, context: BehaviorContext) -> str | None:
-        """A channel to request by name, if others are to be avoided."""
+        """A channel to request by name, to avoid others."""
         place, state = self.place, await context.client.state()
         may = matcher(place.needs.video)
         channels = [rc.rc for rc in state.rcs if rc.present and may(rc.rc)] if state is not None else []

@@ -31,7 +31,7 @@ class PlaceSensorNet(Behavior):
         self._spec_for = spec_for
         self._components: dict[str, str] = {}  # robots by component name, which is unique as it contains the net's
         self._placed: set[str] = set()  # components that this net had placed: it stops no others
-        self._there: set[str] = set()  # those that the placer has confirmed to this process
+        self._there: set[str] = set()  # components confirmed by the placer to this process
         self._busy: set[str] = set()  # components with a placer request under way
         self._clock = CarriedClock()
         self._supervisor: Supervisor

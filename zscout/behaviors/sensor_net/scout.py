@@ -122,7 +122,7 @@ class Blindness:
         return True
 
     def end(self, now: float) -> bool:
-        """The hold ended; return True if its channel showed nothing at all, and is to be left."""
+        """The hold ended; return True if its channel showed nothing at all."""
         since, self._no_signal_since = self._no_signal_since, None
         if since is None or not self._channel or now - since < NO_SIGNAL_TIMEOUT:
             return False

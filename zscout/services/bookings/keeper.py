@@ -15,22 +15,11 @@ from typing import Annotated, Final, Protocol
 
 import msgspec
 
+from zscout import messages
 from zscout.config.state_folder import write_durably
 from zscout.config.strict import BadInput, read_bytes
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import (
-    MAX_MERGED,
-    MAX_STATE,
-    BookingRecord,
-    BookingsKept,
-    Grants,
-    Malformed,
-    ShareBookings,
-    decode,
-    decode_told,
-    encode,
-)
 from zscout.services.bookings.fleet_clock import DIFFERS, SAME, SLEW
 from zscout.services.bookings.records import Records
 from zscout.types import NO_TERM, SECOND, VERSION, Ns, Term
@@ -47,12 +36,12 @@ LEFT: Final[Ns] = 5 * SECOND  # silence after which a leader counts as new
 
 class _BookingFile(msgspec.Struct):
     fleet: str
-    records: Annotated[list[msgspec.Raw], msgspec.Meta(max_length=MAX_MERGED)] = []
+    records: Annotated[list[msgspec.Raw], msgspec.Meta(max_length=messages.MAX_MERGED)] = []
 
 
 class Disk(Protocol):
-    def read(self) -> list[BookingRecord]: ...
-    async def write(self, records: list[BookingRecord]) -> None:
+    def read(self) -> list[messages.BookingRecord]: ...
+    async def write(self, records: list[messages.BookingRecord]) -> None:
         """Return once they are on disk. Raises OSError."""
 
 
@@ -62,22 +51,24 @@ class BookingFile:
     def __init__(self, folder: Path, fleet: str) -> None:
         self._path, self._fleet = folder / FILE, fleet
 
-    def read(self) -> list[BookingRecord]:
+    def read(self) -> list[messages.BookingRecord]:
         if not self._path.exists():
             return []
         try:
-            kept: _BookingFile = decode(read_bytes(self._path, max_bytes=MAX_STATE), _BookingFile, MAX_STATE)
-        except (BadInput, Malformed) as error:
+            kept: _BookingFile = messages.decode(
+                read_bytes(self._path, max_bytes=messages.MAX_STATE), _BookingFile, messages.MAX_STATE
+            )
+        except (BadInput, messages.Malformed) as error:
             log.warning("%s can't be read, and is not used%s: %s", self._path, self._set_aside(), error)
             return []
         if kept.fleet != self._fleet:
             log.warning("%s is of fleet %s, and is not used%s", self._path, kept.fleet, self._set_aside())
             return []
-        found: list[BookingRecord] = []
+        found: list[messages.BookingRecord] = []
         for raw in kept.records:
             try:
-                found.append(decode_told(bytes(raw), BookingRecord))
-            except Malformed as error:
+                found.append(messages.decode_told(bytes(raw), messages.BookingRecord))
+            except messages.Malformed as error:
                 log.warning("a booking in %s can't be read, and is left out: %s", self._path, error)
         if len(found) < len(kept.records):
             log.warning("%s is not used whole%s", self._path, self._set_aside())
@@ -91,8 +82,10 @@ class BookingFile:
             return f" (and can't be set aside: {error.strerror})"
         return f" (a copy stays as {ASIDE})"
 
-    async def write(self, records: list[BookingRecord]) -> None:
-        content = encode(_BookingFile(self._fleet, [msgspec.Raw(encode(record)) for record in records]))
+    async def write(self, records: list[messages.BookingRecord]) -> None:
+        content = messages.encode(
+            _BookingFile(self._fleet, [msgspec.Raw(messages.encode(record)) for record in records])
+        )
         await asyncio.to_thread(write_durably, self._path, content, 0o600)
 
 
@@ -123,20 +116,22 @@ class BookingKeeper:
         """Answer the leader from now on."""
         self._supervisor, keys, guard = supervisor, self.mesh.keys, supervisor.guard
         key = keys.bookings(self.mesh.me.host)
-        self._declared = [self.mesh.serve(key, ShareBookings, guard(self._on_shared), limit=MAX_STATE)]
+        self._declared = [
+            self.mesh.serve(key, messages.ShareBookings, guard(self._on_shared), limit=messages.MAX_STATE)
+        ]
         if not self._candidate:
             # Candidates pass publications on by themselves. Others need no fleet time, but watch the leader.
             watch = guard(lambda _key, grants: self._look_whether_asked(grants))
-            self._declared.append(self.mesh.subscribe(keys.grants, Grants, watch))
+            self._declared.append(self.mesh.subscribe(keys.grants, messages.Grants, watch))
 
     def stop(self) -> None:
         for declared in self._declared:
             declared.close()
 
-    def hear(self, grants: Grants) -> None:
+    def hear(self, grants: messages.Grants) -> None:
         """Take a publication of the leader. Implausibly early times are delayed publications, even from an earlier
         leader: they may have waited while this process stalled. A leader that began without fleet time has a younger
-        one, until it learns this one."""
+        one, until it learns ours."""
         if grants.time is None:
             return
         self._look_whether_asked(grants)
@@ -152,7 +147,7 @@ class BookingKeeper:
             since = min(since, self.since)
         self._offset, self.heard, self.since = offset, (grants.term, now), since
 
-    def _look_whether_asked(self, grants: Grants) -> None:
+    def _look_whether_asked(self, grants: messages.Grants) -> None:
         """A leader that knows bookings asks each keeper that it sees."""
         if grants.time is None:
             return
@@ -182,10 +177,10 @@ class BookingKeeper:
             self._saved = digest
         return True
 
-    def told(self, digest: str, *, durable: bool) -> BookingsKept:
+    def told(self, digest: str, *, durable: bool) -> messages.BookingsKept:
         """The answer to a leader with this `digest`, with records if they differ."""
         own, heard = self.records.digest(), self.time
-        return BookingsKept(
+        return messages.BookingsKept(
             self.mesh.me.host,
             self._candidate,
             self.wall(),
@@ -197,7 +192,7 @@ class BookingKeeper:
             version=VERSION,
         )
 
-    def _on_shared(self, query: IncomingQuery[ShareBookings]) -> None:
+    def _on_shared(self, query: IncomingQuery[messages.ShareBookings]) -> None:
         self._asked = self.mesh.now()
         if self._waiting >= MAX_SAVING:
             raise Refused("busy", "this host is still writing bookings to its disk; ask again")
@@ -211,7 +206,7 @@ class BookingKeeper:
         self._waiting += 1
         self._supervisor.spawn(self._answer_saved(query))
 
-    async def _answer_saved(self, query: IncomingQuery[ShareBookings]) -> None:
+    async def _answer_saved(self, query: IncomingQuery[messages.ShareBookings]) -> None:
         try:
             durable = await self.save()
         finally:

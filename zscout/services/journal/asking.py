@@ -92,7 +92,7 @@ async def ask_journals(
         while question is not None and len(found) < most:
             answer = await page(host, question)
             if answer is None:
-                raise NoJournal(f"{host} did not go on to tell its journal; try again")
+                raise NoJournal(f"{host} stopped sending its journal; try again")
             found += answer.holds
             # A page without progress would repeat for ever.
             ahead = answer.next is not None and answer.next != question.before

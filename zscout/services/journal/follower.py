@@ -11,19 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from decimal import Decimal
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
-from zscout.messages import (
-    MAX_COUNTER,
-    MAX_WHO,
-    Grants,
-    Holder,
-    HoldView,
-    JournalGap,
-    PastHold,
-    RcmState,
-    ReasonParty,
-    Revocation,
-    Who,
-)
+from zscout import messages
 from zscout.types import NO_TERM, Grant, RcName, clean
 
 N = TypeVar("N", int, Decimal)
@@ -41,12 +29,12 @@ class PublicationHeard(NamedTuple):
 
     at: float  # seconds since 1970, UTC
     silence: float
-    grants: Grants
+    grants: messages.Grants
 
 
 class StateRead(NamedTuple):
     at: float
-    state: RcmState
+    state: messages.RcmState
 
 
 class UseHeard(NamedTuple):
@@ -56,13 +44,13 @@ class UseHeard(NamedTuple):
 
 
 class HoldSeen(NamedTuple):
-    hold: PastHold
+    hold: messages.PastHold
 
 
 class HoldOver(NamedTuple):
     """A hold ended; `hold` holds the whole record in case it is unknown."""
 
-    hold: PastHold
+    hold: messages.PastHold
 
 
 class EndUnheard(NamedTuple):
@@ -73,7 +61,7 @@ class EndUnheard(NamedTuple):
 
 
 class GapSeen(NamedTuple):
-    gap: JournalGap
+    gap: messages.JournalGap
 
 
 class HoldUsed(NamedTuple):
@@ -92,7 +80,7 @@ class Follower:
     """Follows one fleet. `silent`: seconds without a heartbeat that mean a lost RCM."""
 
     def __init__(self, silent: float, open_holds: Iterable[Grant] = (), heard: float | None = None) -> None:
-        """`open_holds`, `heard`: holds and time of the last publication when the journal was closed."""
+        """Holds, and time of the last publication, when the journal was closed."""
         self._silent = silent
         self._open: dict[Grant, None] = dict.fromkeys(open_holds)
         self._term, self._seq = NO_TERM, 0
@@ -135,17 +123,17 @@ class Follower:
                 yield HoldOver(hold := _over(revoked, at))
                 yield from self._used_early(hold)
 
-    def _gap_before(self, event: PublicationHeard) -> JournalGap | None:
+    def _gap_before(self, event: PublicationHeard) -> messages.JournalGap | None:
         at, grants = event.at, event.grants
         if self._left is not None:
-            return JournalGap(min(self._left, at), at, "off")
+            return messages.JournalGap(min(self._left, at), at, "off")
         if self._term == NO_TERM:
             return None
         before = self._seq if grants.term == self._term else 0
         if event.silence > self._silent:
-            return JournalGap(at - event.silence, at, "silent")
+            return messages.JournalGap(at - event.silence, at, "silent")
         if grants.prev > before:
-            return JournalGap(at - event.silence, at, "missed", _number(grants.prev - before))
+            return messages.JournalGap(at - event.silence, at, "missed", _number(grants.prev - before))
         return None
 
     def _read(self, event: StateRead) -> Iterator[Change]:
@@ -163,12 +151,12 @@ class Follower:
             if hold.grant not in self._open and _is_sane(hold.grant):
                 yield from self._stands(_viewed(hold, at))
 
-    def lost(self, gap: JournalGap) -> Iterator[Change]:
+    def lost(self, gap: messages.JournalGap) -> Iterator[Change]:
         """Changes could not be kept, possibly ends."""
         self._doubt, self.must_read = gap.began if self._doubt is None else min(self._doubt, gap.began), True
         yield GapSeen(gap)
 
-    def _stands(self, hold: PastHold) -> Iterator[Change]:
+    def _stands(self, hold: messages.PastHold) -> Iterator[Change]:
         if len(self._open) < MAX_OPEN:
             self._open[hold.grant] = None
         yield HoldSeen(hold)
@@ -183,7 +171,7 @@ class Follower:
                     if len(self._early) > MAX_EARLY:
                         self._early.popitem(last=False)
 
-    def _used_early(self, hold: PastHold) -> Iterator[Change]:
+    def _used_early(self, hold: messages.PastHold) -> Iterator[Change]:
         if self._early:
             for rc in hold.rcs:
                 if (seconds := self._early.pop((hold.grant, rc), None)) is not None:
@@ -193,12 +181,12 @@ class Follower:
 def _is_sane(grant: Grant) -> bool:
     """Return True if a grant fits the file: numbers on the mesh have any size."""
     (counter, rcm), seq = grant
-    return 0 <= seq <= MAX_SEQ and 0 <= counter <= MAX_COUNTER and _text(rcm) == rcm
+    return 0 <= seq <= MAX_SEQ and 0 <= counter <= messages.MAX_COUNTER and _text(rcm) == rcm
 
 
-def _held(holder: Holder, at: float, waited: float | None, grants: Grants) -> PastHold:
+def _held(holder: messages.Holder, at: float, waited: float | None, grants: messages.Grants) -> messages.PastHold:
     known = waited is not None or (holder.grant.term == grants.term and grants.prev < holder.grant.seq <= grants.seq)
-    return PastHold(
+    return messages.PastHold(
         **_names(holder.id, holder.arc, holder.client, holder.grant, holder.rcs),
         began=at,
         late=not known,
@@ -209,8 +197,8 @@ def _held(holder: Holder, at: float, waited: float | None, grants: Grants) -> Pa
     )
 
 
-def _viewed(hold: HoldView, at: float) -> PastHold:
-    return PastHold(
+def _viewed(hold: messages.HoldView, at: float) -> messages.PastHold:
+    return messages.PastHold(
         **_names(hold.id, hold.arc, hold.client, hold.grant, sorted(hold.needs)),
         began=max(0.0, at - max(0.0, hold.held)),
         priority=_number(hold.priority),
@@ -219,11 +207,11 @@ def _viewed(hold: HoldView, at: float) -> PastHold:
     )
 
 
-def _over(revoked: Revocation, at: float) -> PastHold:
+def _over(revoked: messages.Revocation, at: float) -> messages.PastHold:
     by = revoked.why.by[0] if revoked.by is not None and revoked.why is not None and revoked.why.by else None
     if by is not None:
-        by = ReasonParty(_text(by.id), _text(by.arc), _text(by.client), _number(by.priority), _user(by.who))
-    return PastHold(
+        by = messages.ReasonParty(_text(by.id), _text(by.arc), _text(by.client), _number(by.priority), _user(by.who))
+    return messages.PastHold(
         **_names(revoked.id, revoked.arc, revoked.client, revoked.grant, revoked.rcs),
         began=at,
         late=True,
@@ -239,11 +227,13 @@ def _names(number: str, arc: str, client: str, grant: Grant, rcs: list[str]) -> 
     return {"grant": grant, "id": _text(number), "arc": _text(arc), "client": _text(client), "rcs": kept}
 
 
-def _user(who: Who | None) -> Who | None:
+def _user(who: messages.Who | None) -> messages.Who | None:
     """Without the comment."""
     if who is None or not (who.user or who.host or who.command):
         return None
-    return Who(clean(who.user)[:MAX_WHO], clean(who.host)[:MAX_WHO], clean(who.command)[:MAX_WHO])
+    return messages.Who(
+        clean(who.user)[: messages.MAX_WHO], clean(who.host)[: messages.MAX_WHO], clean(who.command)[: messages.MAX_WHO]
+    )
 
 
 def _text(text: str) -> str:

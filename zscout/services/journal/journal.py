@@ -123,7 +123,7 @@ class Journal:
             if (use.seconds, ended) > before.get(use.grant, (-1.0, False)):
                 word = state.rc, use.grant
                 if word not in self._uses and len(self._uses) >= MAX_USES:
-                    continue  # it is said again
+                    continue  # it is repeated
                 self._uses[word] = max(use.seconds, self._uses.get(word, 0.0))
                 self._used_last |= ended
             said[use.grant] = use.seconds, ended

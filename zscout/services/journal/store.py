@@ -8,27 +8,16 @@ from __future__ import annotations
 import logging
 import sqlite3
 import threading
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
+from zscout import messages
 from zscout.keyexpr import check_need, is_pattern, matcher
-from zscout.messages import (
-    MAX_GAPS,
-    MAX_TOLD_BYTES,
-    UNHEARD,
-    Cursor,
-    History,
-    HistoryAsk,
-    JournalGap,
-    PastHold,
-    ReasonParty,
-    Who,
-)
 from zscout.services.journal.follower import Change, EndUnheard, GapSeen, HoldOver, HoldSeen, HoldUsed
 from zscout.types import Grant, RcName, Term
 
@@ -37,7 +26,7 @@ log = logging.getLogger(__name__)
 FILE: Final = "journal.sqlite"
 ASIDE: Final = "journal.damaged.sqlite"  # unreadable files; the last one only, to bound the disk
 FORMAT: Final = 1  # `user_version` of the file
-PRUNED_AT_ONCE: Final = 5_000  # holds that one commit removes, so that the next does not wait long
+PRUNED_AT_ONCE: Final = 5_000  # holds removed by a commit, so that the next does not wait long
 ROOM: Final = 0.95  # share of the allowed size after a removal
 MAX_KEPT_GAPS: Final = 10_000
 WAL: Final = 4_000_000  # bytes of the write-ahead log between commits
@@ -72,16 +61,16 @@ _BEGAN: Final = f"""{_INSERT}
     arc = excluded.arc, began = min(began, excluded.began), late = min(late, excluded.late),
     priority = excluded.priority, min_runtime = excluded.min_runtime, waited = coalesce(excluded.waited, waited),
     user = excluded.user, host = excluded.host, command = excluded.command,
-    ended = CASE outcome WHEN '{UNHEARD}' THEN NULL ELSE ended END,
-    outcome = CASE outcome WHEN '{UNHEARD}' THEN '' ELSE outcome END"""
+    ended = CASE outcome WHEN '{messages.UNHEARD}' THEN NULL ELSE ended END,
+    outcome = CASE outcome WHEN '{messages.UNHEARD}' THEN '' ELSE outcome END"""
 _ENDED: Final = f"""{_INSERT}
     ended = max(holds.began, excluded.ended), outcome = excluded.outcome, reason = excluded.reason,
     taken_for = excluded.taken_for
-    WHERE holds.ended IS NULL OR holds.outcome = '{UNHEARD}'"""
+    WHERE holds.ended IS NULL OR holds.outcome = '{messages.UNHEARD}'"""
 _UNHEARD: Final = f"""
-    UPDATE holds SET ended = max(began, ?), outcome = '{UNHEARD}'
+    UPDATE holds SET ended = max(began, ?), outcome = '{messages.UNHEARD}'
     WHERE term = ? AND rcm = ? AND seq = ? AND ended IS NULL"""  # noqa: S608 - a constant
-_PARTY: Final = msgspec.json.Decoder(ReasonParty)
+_PARTY: Final = msgspec.json.Decoder(messages.ReasonParty)
 
 
 class Unwritable(Exception):
@@ -126,7 +115,7 @@ class JournalStore:
             except sqlite3.Error as error:
                 raise self._failed(error) from None
 
-    def answer(self, host: str, asked: HistoryAsk, now: float) -> History:
+    def answer(self, host: str, asked: messages.HistoryAsk, now: float) -> messages.History:
         """A page. Raises Unwritable, BadName for an invalid pattern."""
         with self._one:
             try:
@@ -134,9 +123,9 @@ class JournalStore:
             except sqlite3.Error as error:
                 raise self._failed(error) from None
 
-    def latest(self, limit: int) -> list[PastHold]:
+    def latest(self, limit: int) -> list[messages.PastHold]:
         """The last holds with known start and end, oldest first. Raises Unwritable."""
-        heard = f"ended IS NOT NULL AND late = 0 AND outcome <> '{UNHEARD}'"
+        heard = f"ended IS NOT NULL AND late = 0 AND outcome <> '{messages.UNHEARD}'"
         sql = f"SELECT {_COLUMNS} FROM holds WHERE {heard} ORDER BY ended DESC LIMIT ?"  # noqa: S608 - constants
         with self._one:
             try:
@@ -228,7 +217,7 @@ class JournalStore:
         kept = "SELECT rowid FROM gaps ORDER BY rowid DESC LIMIT 1 OFFSET ?"
         db.execute(f"DELETE FROM gaps WHERE rowid <= ({kept})", (MAX_KEPT_GAPS,))  # noqa: S608 - a constant
 
-    def _answer(self, host: str, asked: HistoryAsk, now: float) -> History:
+    def _answer(self, host: str, asked: messages.HistoryAsk, now: float) -> messages.History:
         db = self._opened()
         low = 0.0 if asked.since is None else now - asked.since
         high, since = now - asked.until, self._fact("since")
@@ -256,12 +245,12 @@ class JournalStore:
         # Conditions are met within an index: only results are read from the table.
         found = f"SELECT id FROM holds WHERE {' AND '.join(where)} ORDER BY began DESC, id DESC LIMIT ?"  # noqa: S608 - texts of this function
         sql = f"SELECT id, {_COLUMNS} FROM holds WHERE id IN ({found}) ORDER BY began DESC, id DESC"  # noqa: S608
-        holds: list[PastHold] = []
-        last: Cursor = (0.0, 0)
-        more: Cursor | None = None
+        holds: list[messages.PastHold] = []
+        last: messages.Cursor = (0.0, 0)
+        more: messages.Cursor | None = None
         size = 0
         for row in db.execute(sql, (*conditions, asked.limit + 1)):
-            if len(holds) == asked.limit or size > MAX_TOLD_BYTES:
+            if len(holds) == asked.limit or size > messages.MAX_TOLD_BYTES:
                 more = last
                 break
             hold = _hold(row[1:])
@@ -269,13 +258,13 @@ class JournalStore:
             last = (hold.began, row[0])
             size += 400 + len(row[8]) + len(row[13]) + len(row[14] or "")
             size += 2 * len(row[8]) if row[21] else 0
-        return History(host, now, since, holds, more, [] if asked.before is not None else _gaps(db, low, high))
+        return messages.History(host, now, since, holds, more, [] if asked.before is not None else _gaps(db, low, high))
 
 
-def _gaps(db: sqlite3.Connection, low: float, high: float) -> list[JournalGap]:
+def _gaps(db: sqlite3.Connection, low: float, high: float) -> list[messages.JournalGap]:
     sql = "SELECT began, ended, cause, count FROM gaps WHERE ended >= ? AND began <= ? ORDER BY rowid DESC LIMIT ?"
-    rows = db.execute(sql, (low, high, MAX_GAPS)).fetchall()
-    return [JournalGap(*row) for row in reversed(rows)]
+    rows = db.execute(sql, (low, high, messages.MAX_GAPS)).fetchall()
+    return [messages.JournalGap(*row) for row in reversed(rows)]
 
 
 def _used(db: sqlite3.Connection) -> int:
@@ -316,54 +305,25 @@ def _used_by_rc(rcs: list[str], text: str | None) -> dict[RcName, float]:
     return {rc: float(seconds) for rc, seconds in zip(rcs, (text or "").split("\n"), strict=False) if seconds}
 
 
-def _row(hold: PastHold) -> tuple[object, ...]:
-    who = hold.who or Who()
-    return (
-        hold.grant.term.counter,
-        hold.grant.term.rcm,
-        hold.grant.seq,
-        hold.id,
-        hold.arc,
-        hold.client,
-        hold.client.partition("/")[0],
-        "\n".join(hold.rcs),
-        hold.began,
-        hold.late,
-        hold.ended,
-        hold.outcome,
-        hold.reason,
-        None if hold.by is None else msgspec.json.encode(hold.by).decode(),
-        hold.priority,
-        hold.min_runtime,
-        hold.waited,
-        who.user or None,
-        who.host or None,
-        who.command or None,
-        _used_text(hold.rcs, hold.used),
-    )
+def _row(hold: messages.PastHold) -> tuple[object, ...]:
+    (counter, rcm), seq = hold.grant
+    who, owner = hold.who or messages.Who(), hold.client.partition("/")[0]
+    by = None if hold.by is None else msgspec.json.encode(hold.by).decode()
+    names = counter, rcm, seq, hold.id, hold.arc, hold.client, owner, "\n".join(hold.rcs)
+    times = hold.began, hold.late, hold.ended, hold.outcome, hold.reason, by
+    asked = hold.priority, hold.min_runtime, hold.waited, who.user or None, who.host or None, who.command or None
+    return *names, *times, *asked, _used_text(hold.rcs, hold.used)
 
 
-def _hold(row: tuple[Any, ...]) -> PastHold:
+def _hold(row: tuple[Any, ...]) -> messages.PastHold:
     (term, rcm, seq, number, arc, client, _, rcs, began, late, ended, outcome, reason, by, priority, runtime) = row[:16]
     waited, user, host, command, used = row[16:]
-    held = rcs.split("\n") if rcs else []
-    return PastHold(
-        Grant(Term(term, rcm), seq),
-        number,
-        arc,
-        client,
-        held,
-        began,
-        bool(late),
-        ended,
-        outcome,
-        reason,
-        None if by is None else _PARTY.decode(by),
-        priority,
-        runtime,
-        waited,
-        Who(user or "", host or "", command or "") if user or host or command else None,
-        _used_by_rc(held, used),
+    grant, held = Grant(Term(term, rcm), seq), rcs.split("\n") if rcs else []
+    by = None if by is None else _PARTY.decode(by)
+    who = messages.Who(user or "", host or "", command or "") if user or host or command else None
+    times = began, bool(late), ended, outcome, reason
+    return messages.PastHold(
+        grant, number, arc, client, held, *times, by, priority, runtime, waited, who, _used_by_rc(held, used)
     )
 
 
@@ -372,19 +332,16 @@ def _any_rc(pattern: str, rcs: str) -> bool:
     return any(map(matcher(pattern), rcs.split("\n")))
 
 
-class _transaction:  # noqa: N801 - reads as a statement
-    def __init__(self, db: sqlite3.Connection) -> None:
-        self._db = db
-
-    def __enter__(self) -> None:
-        self._db.execute("BEGIN IMMEDIATE")
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            self._db.execute("COMMIT")
-        else:
-            with suppress(sqlite3.Error):
-                self._db.execute("ROLLBACK")
+@contextmanager
+def _transaction(db: sqlite3.Connection) -> Iterator[None]:
+    db.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+    except BaseException:
+        with suppress(sqlite3.Error):
+            db.execute("ROLLBACK")
+        raise
+    db.execute("COMMIT")
 
 
 def _damaged(why: str) -> sqlite3.DatabaseError:

@@ -1,4 +1,4 @@
-"""A node's figures in Prometheus' text format, with those of its process: `process_cpu_seconds_total` and the like."""
+"""A node's figures in Prometheus' text format, including its process's: `process_cpu_seconds_total` and the like."""
 
 from __future__ import annotations
 

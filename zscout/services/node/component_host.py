@@ -85,7 +85,7 @@ class ComponentHost:
         if self._underway >= MAX_UNDERWAY:
             raise Refused("busy", "too many operations are under way here; ask again")
         if self.mesh.keys.closed and not isinstance(request.message, messages.ListComponents | messages.ReadOutput):
-            self._authority.check_machine(self.mesh.keys.sender_of(request.key), "tell a node to do this")
+            self._authority.check_machine(self.mesh.keys.sender_of(request.key), "order a node to do this")
         self._underway += 1
         self.supervisor.spawn(self._answer(request))
 

@@ -147,7 +147,7 @@ class ComponentProcess:
 
     async def restore(self, order: RestoreComponent) -> ComponentView:
         if self.phase != "standby":
-            raise Refused("move_failed", f"it is {self.phase} here; only one that stands by is restored")
+            raise Refused("move_failed", f"it is {self.phase} here; only a component on standby is restored")
         await self._ask(order, SLACK)
         return self.view()
 

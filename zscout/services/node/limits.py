@@ -192,7 +192,7 @@ def _may_delegate(base: Path, controller: str) -> bool:
 
 
 def _is_ours(pid: int) -> bool:
-    """Return True if a process is this one or a descendant."""
+    """Return True if a process is our own or a descendant."""
     try:
         return os.getpid() in (pid, *(parent.pid for parent in psutil.Process(pid).parents()))
     except psutil.Error:

@@ -27,7 +27,7 @@ SPEED_TRIES: Final = 5  # of every measurement but the first
 SENSORS_EVERY: Final = 10.0  # seconds; a sensor may take milliseconds, and one file per core
 SENSORS_SHARE: Final = 0.0002
 USES_SHARE: Final = 0.002  # of one core, spent on measuring components: many are measured less often
-TREE_SHARE: Final = 0.004  # likewise, for this process and its descendants
+TREE_SHARE: Final = 0.004  # the same for this process and its descendants
 
 
 LoadFigures: TypeAlias = tuple[tuple[float, float, float], float, int]
@@ -102,7 +102,7 @@ class LoadReporter:
 
 
 class TreeLoad:
-    """The load of the process `root` (default: this one) and its descendants alone."""
+    """The load of the process `root` (default: our own) and its descendants alone."""
 
     def __init__(self, root: int | None = None) -> None:
         self._meter = TreeMeter(root)

@@ -130,7 +130,7 @@ class TreeUse(NamedTuple):
 
 
 class TreeMeter:
-    """Measures the process `root` (default: this one) and its descendants repeatedly.
+    """Measures the process `root` (default: our own) and its descendants repeatedly.
 
     Without waiting times from the system, `wanted` is the number of runnable threads. For one thread at a time. Raises
     OSError without /proc."""
@@ -145,7 +145,7 @@ class TreeMeter:
         tree, elapsed = self._last, self._last.at - before.at
         if elapsed <= 0:
             return TreeUse(0.0, 0.0, 0.0, tree.memory)
-        # Late time of ended children says nothing about now.
+        # Time of ended children arrives late, and is no present use.
         cores = min(tree.cores(before), float(os.cpu_count() or 1))
         if tree.threads:
             wanted = min(sum(_demand(before.threads, tree.threads)) / SECOND / elapsed, len(tree.threads))
@@ -202,7 +202,7 @@ def _threads(proc: Path, pids: Iterable[int]) -> dict[int, _Demand]:
     for thread, figures in _tasks(proc, pids, "schedstat"):
         try:
             ran, waited, *_ = map(int, figures.split())
-        except ValueError:  # it ended just now, or the system does not tell
+        except ValueError:  # it ended just now, or the system lacks the figure
             continue
         found[thread] = ran, waited
     return found
@@ -221,7 +221,7 @@ def _demand(before: Mapping[int, _Demand], now: Mapping[int, _Demand]) -> _Deman
 
 
 def _runnable(proc: Path, pids: Iterable[int]) -> int:
-    """Threads that run or wait for a processor now, except this one."""
+    """Threads that run or wait for a processor now, except the caller."""
     mine = threading.get_native_id()
     return sum(thread != mine and _fields(stat)[:1] == [b"R"] for thread, stat in _tasks(proc, pids, "stat"))
 

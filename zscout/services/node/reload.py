@@ -87,7 +87,7 @@ class Reload:
     def _read_again(self) -> Node:
         node = self._read()
         for rc in node.rcs:
-            driver_for(rc)  # what would be wrong with it at the next start
+            driver_for(rc)  # raises the errors of the next start
         return node
 
     def _is_taken(self, table: str, take: Callable[[Node], object], node: Node) -> bool:
@@ -111,7 +111,7 @@ def settings(node: Node) -> dict[str, object]:
                     # Some keys are under [limits].
                     enter("fleet", {key: getattr(value, key) for key in value.__slots__ if key not in _LIMITS})
                 case AccessPolicy():
-                    enter("fleet", structs.asdict(value))  # its tables stand by themselves in the file
+                    enter("fleet", structs.asdict(value))  # its tables are top-level ones in the file
                 case Struct():
                     enter(below, structs.asdict(value))
                 case Mapping():

@@ -133,7 +133,7 @@ class PlacerRequestHandler:
                 query.answer(status)
 
     def placements(self, component: str | None = None, *, host: str | None = None) -> messages.Placements:
-        """All components, or those of a name or a host."""
+        """All components, or the ones of a name or a host."""
         components = sorted(self._placer.components.items())
         found = [status for name, status in components if component in (None, name) and host in (None, status.host)]
         return messages.Placements(self.term, found, sorted(self._placer.cordoned))

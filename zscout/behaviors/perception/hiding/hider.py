@@ -165,9 +165,9 @@ class Hider:
         except (msgspec.MsgspecError, UnicodeDecodeError) as problem:
             raise BadCheckpoint(f"is no checkpoint of a hider: {problem}") from problem
         if robot.form != FORM:
-            raise BadCheckpoint(f"a checkpoint of form {robot.form}, not {FORM}: start anew")
+            raise BadCheckpoint(f"a checkpoint of form {robot.form}, not {FORM}: start again")
         if {len(robot.tones), len(robot.anchor_tones)} - {0, BANDS * COLUMNS}:
-            raise BadCheckpoint("a checkpoint whose pictures have another size: start anew")
+            raise BadCheckpoint("a checkpoint whose pictures have another size: start again")
         hider = cls()
         hider._robot = robot
         return hider
