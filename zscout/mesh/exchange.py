@@ -21,7 +21,7 @@ MAX_CODES: Final = 32  # refusal codes a tally counts separately: drivers and ot
 OTHER: Final = "other"
 CODE: Final = re.compile("[a-z_]{1,32}")
 NOT_UNDERSTOOD: Final = frozenset({"malformed", "bad_name", "bad_request"})
-"""Refusal codes for operations or values that only another version may know."""
+"""Codes that a version difference may explain."""
 
 R = TypeVar("R")
 S = TypeVar("S")

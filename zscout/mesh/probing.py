@@ -1,7 +1,7 @@
 """Find out about a mesh without joining it: by multicast, and by TLS handshakes.
 
-An intruder gets no link, and so does a host with wrong files or certificate. But processes answer multicast from
-anybody, and a TLS handshake shows why a certificate is refused."""
+A host with wrong files or certificate gets no link, but processes answer all multicast, and a handshake shows why a
+certificate is refused."""
 
 from __future__ import annotations
 
@@ -114,8 +114,7 @@ def _own_addresses() -> set[str]:
 class Called:
     """Result of calling an address. `speaks` is empty without an answer; `problem` gives the reason.
 
-    For TLS: the certificate shown, its CA, whether a trusted CA issued it, and the objection to ours, empty if it was
-    accepted or not shown."""
+    For TLS: the certificate shown, its CA, whether that is trusted, and the objection to ours, or empty."""
 
     address: str
     speaks: Literal["tls", "plain", ""]

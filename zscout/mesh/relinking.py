@@ -24,17 +24,14 @@ from zenoh.handlers import Callback
 
 log = logging.getLogger(__name__)
 
-PAUSES: Final = (0.02, 0.1, 0.1, 0.2, 0.2, 0.5, *(1.0,) * 30)
-"""Seconds before each look for a peer; after the last, Zenoh alone looks."""
-TOGETHER: Final = 0.25
-"""Two losses within these seconds mean that this process was away: it looks for peers that make the link, too."""
+PAUSES: Final = (0.02, 0.1, 0.1, 0.2, 0.2, 0.5, *(1.0,) * 30)  # seconds before each look; then Zenoh alone looks
+TOGETHER: Final = 0.25  # seconds between two losses that mean this process was away: it looks for all peers
 LOOKS_FOR_GREATER: Final = 4  # looks for peers with a greater id; few, as many processes may look at one time
 PROBE_TIMEOUT: Final = 0.25
 PROBES_TIMEOUT: Final = 1.0  # seconds for all probes of one look
 SCOUT_TIMEOUT: Final = 0.5
 GREET_TIMEOUT: Final = 0.1
-MEET_TIMEOUT: Final = 0.25
-"""Seconds; gossip is immediate. An end that has not yet noticed the loss accepts no second link."""
+MEET_TIMEOUT: Final = 0.25  # seconds; an end that has not noticed the loss accepts no second link
 POLL: Final = 0.002
 MEETING: Final = "6d656574"  # prefix of the ids of temporary sessions, whose end is ignored
 _ADDRESS: Final = re.compile(r"^(?:tcp|tls)/(.+):(\d+)(?:[?#].*)?$")
@@ -43,19 +40,16 @@ _ADDRESS: Final = re.compile(r"^(?:tcp|tls)/(.+):(\d+)(?:[?#].*)?$")
 @dataclass(slots=True)
 class _Lost:
     at: float
-    addresses: list[str] = field(default_factory=list)
-    """Listening addresses of the other ends, for links made from here."""
+    addresses: list[str] = field(default_factory=list)  # where the other ends listen
     looks: int = 0
-    listens: bool | None = None
-    """True is not probed again: each unused connection keeps others off a TLS listener for 0.1 s (docs/zenoh.md)."""
+    listens: bool | None = None  # not probed again: an unused connection keeps others off a TLS listener for 0.1 s
     together: bool = False  # True if this peer is looked for though it makes the link
 
 
 class Relinking:
     """Restores the links of one session, in a thread that lives while a link is lost.
 
-    `scouting` holds the settings for finding peers; `meeting` returns settings of a temporary session that links to the
-    given addresses alone."""
+    `scouting`: settings for finding peers; `meeting`: those of a temporary session with the given addresses alone."""
 
     def __init__(
         self, session: zenoh.Session, scouting: zenoh.Config, meeting: Callable[[Sequence[str]], zenoh.Config]

@@ -1,8 +1,7 @@
 """A session that can be reopened, and the contradictions that demand it.
 
-Zenoh's links can come back without all that was declared on the other side (docs/protocol.md). A process that sees such
-a contradiction last opens another session, declares everything on it, and closes the first. Its callers see only that
-missed tokens appear."""
+Zenoh's links can come back without all declarations of the other side (docs/protocol.md). A process that sees such a
+contradiction last opens another session with all its declarations, and closes the first: no caller notices."""
 
 from __future__ import annotations
 
@@ -21,14 +20,12 @@ from zscout.types import SECOND, Ns
 log = logging.getLogger(__name__)
 
 PATIENCE: Final = 2.0  # seconds for which a contradiction must last
-UNHEARD: Final = 0.5
-"""Seconds, beyond half a hold lease, for which an RCM is alive yet silent: renewal must come before holds lapse."""
+UNHEARD: Final = 0.5  # seconds beyond half a hold lease of an RCM alive yet silent: holds must not lapse
 LASTS: Final = 60.0  # seconds after which a contradiction that is not repeated is forgotten
 OVERLAP: Final = 0.5  # seconds with both sessions open, for others to learn what the new one declares
 LINKED: Final = 2.0  # seconds that the new session may take to link to the peers of the old one
 LOOK_EVERY: Final = 0.02
-SHORTEST, LONGEST = 10.0, 320.0
-"""Seconds between renewals. Doubled while a renewal does not help; reset after ten times as long without one."""
+SHORTEST, LONGEST = 10.0, 320.0  # seconds between renewals, doubled while they do not help
 
 OnToken: TypeAlias = Callable[[str, bool], None]
 Opening: TypeAlias = Callable[[], Awaitable[Transport]]
@@ -86,8 +83,7 @@ class RenewableTransport(Transport):
     def __init__(self, transport: Transport, openings: Sequence[Opening]) -> None:
         self.current, self._openings = transport, openings
         self._declared: dict[int, _Declared] = {}
-        self._tokens: WeakValueDictionary[int, _Token] = WeakValueDictionary()
-        """Tokens die with their undeclare function."""
+        self._tokens: WeakValueDictionary[int, _Token] = WeakValueDictionary()  # die with their undeclare function
         self._numbers = itertools.count()
         self._renewing: asyncio.Task[None] | None = None
         self._closed = False

@@ -48,9 +48,9 @@ MAX_SESSIONS = 4_096  # sessions remembered
 FINAL_SLACK = 0.5  # seconds after its timeout at which a query ends without the transport's report
 
 _Subscription: TypeAlias = tuple[Backlog, list[Callable[[str, Any], None]], Undeclare]
-"""Publications decoded once for all handlers of this process."""
+"""Decoded once for all handlers."""
 OnReply: TypeAlias = Callable[[str, bytes, bool], bool]
-"""Called with key, payload, and whether it is a message; returns True if that is enough."""
+"""Takes key, payload, is message; returns True if that is enough."""
 
 S = TypeVar("S")
 R = TypeVar("R")
@@ -136,8 +136,7 @@ class Mesh:
     validity: Validity | None = None  # of this process's present certificate; None on a plain mesh
 
     def __init__(self, transport: RenewableTransport, keys: Keys, me: Sender, now: Callable[[], Ns]) -> None:
-        self.keys, self.me, self.now = keys, me, now
-        """`now()` is in nanoseconds on this host's monotonic clock. Not comparable between hosts."""
+        self.keys, self.me, self.now = keys, me, now  # `now()`: ns on this host's monotonic clock
         self.suspicions = Suspicions(now, transport.renew)
         self._transport = transport
         self._strange = SparseLog(log, now)
@@ -186,8 +185,7 @@ class Mesh:
     ) -> list[Reply[R]]:
         """Query all servers of `key`; return the replies that came within `timeout` seconds, or until one is `enough`.
 
-        Without a reply the outcome is unknown: the query may have been carried out. Raises MeshError if it can't be
-        sent."""
+        Without a reply the query may have been carried out, or not. Raises MeshError if it can't be sent."""
         replies: list[Reply[R]] = []
 
         def on_reply(of: str, payload: bytes, ok: bool) -> bool:
@@ -263,9 +261,8 @@ class Mesh:
     ) -> Declaration:
         """Call `handler` for queries on `key` with a message of `kind`; `tally` counts how they end.
 
-        Refused before the handler sees them: malformed payloads (`malformed`), wildcard keys (answered on `key` if that
-        is concrete), and queries beyond `depth` waiting, or beyond half of it from one host if the key names its sender
-        (`busy`, undecoded)."""
+        Refused undecoded: wildcard keys (answered on `key` if that is concrete), and, as `busy`, queries beyond `depth`
+        waiting, or half of it from one host if the key names its sender. Bad payloads are `malformed`."""
         state = Backlog(depth=depth)
         wild, names_sender = "*" in key, key.endswith("/*/*")
         shares = HostShares(depth // 2)

@@ -30,8 +30,7 @@ class Supervisor:
     """Owns the tasks, timers and guarded handlers of one service.
 
     The first that raises is logged with its traceback, `on_failure(error)` is called once, and all others are
-    cancelled. Later failures are logged only. A failed or cancelled supervisor runs nothing: a service that restarts
-    takes a new one."""
+    cancelled. Later failures are logged only. A failed or cancelled supervisor is not reused."""
 
     def __init__(self, name: str, on_failure: Callable[[Exception], object]) -> None:
         self.name = name

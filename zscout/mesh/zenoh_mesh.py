@@ -73,8 +73,7 @@ def zenoh_config(config: MeshConfig, security: Security | None = None) -> zenoh.
         "scouting/multicast/autoconnect_strategy": GREATER_CONNECTS,
         "scouting/gossip/autoconnect_strategy": GREATER_CONNECTS,
         "transport/link/tx/lease": round(config.lease * 1000),
-        # Peers get as long to read as to be silent: on a stalled or busy host Zenoh's sending threads stop too, and any
-        # burst would cost a sound link.
+        # As for silence: on a busy host Zenoh's sending threads stall too, and any burst would cost a sound link.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(config.lease * 1_000_000),
         "transport/link/tx/queue/size": {"interactive_high": CONTROL_BATCHES},
         # Larger messages are cut off: a sender could fill this process's memory.
@@ -140,8 +139,7 @@ class ZenohMesh(Mesh):
         door = _Door(security)
         openings = [lambda: _open(config, door.security)]
         if config.listen:
-            # Its ports are free again once the old session is closed. Until then a session on other ports learns the
-            # peers from it.
+            # Until the old session frees its ports, one on other ports learns the peers from it.
             own = tuple(at.replace("0.0.0.0", "127.0.0.1").replace("[::]", "[::1]") for at in config.listen)  # noqa: S104
             ports = tuple(_PORT.sub(":0", at) for at in config.listen)
             beside = replace(config, listen=ports, connect=(*config.connect, *own))

@@ -1,9 +1,9 @@
 """Dark places in a picture: low gaps along the floor, where they are and how dark. Pure.
 
 The camera sets its own exposure, so brightness is compared within one picture. It stands lower than a gap's upper edge,
-so a gap beneath something low spans the horizon. Its rows below the horizon give the distance; the ratio of rows above
-to below gives its height at any distance, which separates a sofa's gap (0.12 m) from a carton's dark side (0.4 m). Several
-levels of darkness find a gap within the shade of a dark sofa."""
+so a gap spans the horizon. Its rows below the horizon give the distance; the ratio of rows above to below gives its
+height, which separates a sofa's gap (0.12 m) from a carton's dark side (0.4 m). Several levels of darkness find a gap
+within the shade of a dark sofa."""
 
 from __future__ import annotations
 

@@ -229,8 +229,7 @@ class MotionDetector:
         if time - self._meanwhile.since < AGREE[0] and self._meanwhile.row < APART:
             return Seen(False, learning=True)
         self._paused = False
-        # Changes during the pause count as still. Their noise is unknown but for the picture's own, and so few pictures
-        # leave their mean unsure.
+        # Changes in the pause count as still. So few pictures leave their noise and mean unsure.
         another = self._meanwhile.another()
         noise = max(FLOOR, _noise(level)) ** 2 * (1 + 1 / self._meanwhile.pictures)
         self._mean = np.where(another, self._meanwhile.level, self._mean)

@@ -36,8 +36,7 @@ class Presence:
         self._before = None
 
     def see(self, time: float, level: Plane, mean: Plane, moving: Regions | None, noise: float) -> bool:
-        """Return True if something present does not move. `level`: brightness; `mean`: background; `moving`:
-        regions."""
+        """Return True if something present does not move. `level`: brightness; `mean`: background."""
         if moving is not None:
             if self._before is None:
                 self._before = mean.copy()

@@ -1,8 +1,7 @@
 """Active robots of a sensor net, and replacements of lost ones. Pure; time is passed in.
 
 `wanted` robots start in the order of their names. A lost one (its camera shows nothing, it is gone from the mesh for
-ABSENCE_TIMEOUT, or its behavior can't be had) is replaced by the next free one. A robot that returns is free again; its
-replacement stays."""
+ABSENCE_TIMEOUT, or its behavior can't be had) is replaced by the next free one, for good; if it returns, it is free."""
 
 from __future__ import annotations
 

@@ -75,8 +75,7 @@ class PlaceRobot(Behavior):
         self._clock = CarriedClock()
         self.holding = ""  # id of the ARC that holds its robot, or empty
         self.video: str | None = None  # the channel that its present ARC requests by name
-        self.came: tuple[str, str | None] | None = None
-        """`holding` and `video` from before a move, until that ARC is requested."""
+        self.came: tuple[str, str | None] | None = None  # both from before a move, until requested
 
     async def run(self, context: BehaviorContext) -> None:
         self.now(context)
@@ -122,8 +121,8 @@ class RobotTask(Behavior):
         self.task, self.place = task, place
 
     async def run(self, context: BehaviorContext) -> None:
-        """Request all needs and work under the hold, again after a revocation. Raises CameraBlind, and errors of
-        requests."""
+        """Request all needs and work under the hold, again after a revocation. Raises CameraBlind, and request
+        errors."""
         place, scout = self.place, self.place.scout
         priority, slot = place.slots.of(self.task, sooner=scout.saw_somebody)
         came, place.came = place.came, None

@@ -1,7 +1,6 @@
 """Decisions of one robot of a sensor net. Pure: times and pictures in, wheels and words out.
 
-A scout has two tasks, each only while it is held: it *hides* until it stays in the dark and faces the light, and then
-*watches* for motion."""
+While held, it first *hides* until it stays in the dark and faces the light, and then *watches* for motion."""
 
 from __future__ import annotations
 
@@ -22,10 +21,8 @@ NO_PICTURE_TIMEOUT: Final = 10.0  # seconds from a hold's start, or the last pic
 QUIET: Final = 2.0  # seconds without motion that separate two events
 SUSPECTS: Final = 2  # holds in a row without a picture that prove a robot dead
 BAD_FOR: Final = 60.0  # seconds for which an empty channel is avoided
-NO_SIGNAL_TIMEOUT: Final = 4.0
-"""Seconds without any picture at a hold's end that prove a receiver dead: framegrabbers give up after five."""
-REMIND: Final = 4.0
-"""Seconds without a good picture, above any warm-up, after which the command to transmit is repeated."""
+NO_SIGNAL_TIMEOUT: Final = 4.0  # seconds that prove a receiver dead: framegrabbers give up after five
+REMIND: Final = 4.0  # seconds without a good picture, above any warm-up, before the command to transmit is repeated
 
 LATELY: Final = 2  # turns to watch that count as recent
 

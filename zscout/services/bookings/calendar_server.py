@@ -1,7 +1,6 @@
 """Serves bookings as calendars over HTTP, for subscribing programs: of the fleet, an RC, an owner.
 
-Nothing is stored: requests query the leader, at most once in `FRESH` seconds. Without a leader programs get 503, and
-keep their copy."""
+Requests query the leader, at most once in `FRESH` seconds. Without a leader programs get 503, and keep their copy."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """The dates of a repeated booking: the same hour in its owner's zone, across changes of summer time.
 
-An hour that occurs twice is its first, a missing one uses the offset before the gap: RFC 5545, section 3.3.5, and
-Python's `fold=0`."""
+Repeated hours are the first, missing ones use the offset before the gap: RFC 5545, section 3.3.5, and `fold=0`."""
 
 from __future__ import annotations
 

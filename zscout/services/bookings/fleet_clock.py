@@ -1,7 +1,6 @@
 """Fleet time: the leader's publications give all hosts the same dates. Pure.
 
-Within a reign it never jumps once published: it is slewed by at most 1 % towards the median of the hosts' clocks, as in
-`adjtime`."""
+Within a reign it never jumps: it is slewed by at most 1 % towards the median of the hosts' clocks, as in `adjtime`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Records of bookings, merged to the same result in any order. Pure.
 
-Changes only accumulate: a record, or dates of it, are given up or over. So an old copy on a host that was away brings
-nothing back."""
+Changes only accumulate: a record, or dates of it, are given up or over. So an old copy brings nothing back."""
 
 from __future__ import annotations
 

@@ -18,15 +18,13 @@ class Account:
     holds: int = 0  # holds with some time in the window
     held: float = 0.0  # seconds held; simultaneous holds count twice
     rc_seconds: float = 0.0  # seconds times RCs: three RCs for 10 s are 30. Equals `held` in an RC's own account.
-    waited: float = 0.0
-    """Known seconds in the queue, in full, of holds that began in the window. Waits without a hold are unknown."""
+    waited: float = 0.0  # known seconds in the queue, in full, of holds that began in the window
     preempted: int = 0  # holds preempted in the window before their minimum runtime
     preempted_seconds: float = 0.0  # seconds held by those
     thrown_away: float = 0.0
     """Seconds of holds that ended in the window, before their minimum runtime, by preemption or a lost RC. The
     programs' work counts as lost, though some keep it."""
-    used: float | None = None
-    """Reported seconds of use within `rc_seconds`, prorated for holds partly in the window; None without any report."""
+    used: float | None = None  # seconds of reported use, prorated at the window's ends; None: no report
     used_unknown: int = 0  # holds with some RC's use unreported; the other RCs' use counts
 
 

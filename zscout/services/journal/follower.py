@@ -1,8 +1,7 @@
 """Turns messages that a candidate receives into changes of its journal. Pure; times are passed in.
 
 Publications report starts and ends of holds. After a gap the RCM's state is read: unknown holds in it began unnoticed,
-known ones not in it ended unnoticed. RCs report the use of a hold, possibly before its start is known, or after its
-end."""
+known ones not in it ended unnoticed. RCs report the use of a hold, possibly out of order."""
 
 from __future__ import annotations
 

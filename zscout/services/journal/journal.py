@@ -30,8 +30,7 @@ HEARD_EVERY: Final = 30.0  # seconds after which a quiet RCM is noted as alive
 READ_EVERY: Final = 2.0  # seconds between two queries for the RCM's state, while it is needed
 AGAIN_AFTER: Final = 30.0  # seconds until a failed disk is retried
 MAX_GATHERED: Final = 100_000  # holders and ends awaiting a commit; more are dropped as a gap
-MAX_USES: Final = 10_000
-"""Reports of use awaiting a commit, and remembered against duplicates; more are repeated later, or written twice."""
+MAX_USES: Final = 10_000  # reports of use awaiting a commit, or remembered against duplicates
 MAX_TOLD: Final = 5_000  # holds passed to `on_opened`
 MAX_ASKING: Final = 16  # queries answered at one time
 ENDS_WITHIN: Final = 5.0
@@ -50,10 +49,8 @@ class Journal:
         self._supervisor = Supervisor("the journal", lambda _: log.error("no journal is kept until this node restarts"))
         self._gathered: list[Heard] = []
         self._weight = 0  # of the gathered events
-        self._uses: dict[tuple[RcName, Grant], float] = {}
-        """Seconds of use since the last commit: the maximum for each RC and grant."""
-        self._said: OrderedDict[RcName, dict[Grant, tuple[float, bool]]] = OrderedDict()
-        """Last report of each RC, and whether that hold had ended: RCs repeat it."""
+        self._uses: dict[tuple[RcName, Grant], float] = {}  # most seconds of use since the last commit
+        self._said: OrderedDict[RcName, dict[Grant, tuple[float, bool]]] = OrderedDict()  # last reports, and if over
         self._said_count = 0
         self._number: tuple[Term, int] = NO_TERM, 0
         self._at: Ns | None = None  # last publication, by the mesh's clock

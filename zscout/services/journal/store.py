@@ -1,7 +1,6 @@
 """A candidate's journal on disk: one SQLite file, bounded in size and age.
 
-All calls block, and come from threads, one at a time. WAL mode with a sync at each commit: commits survive the process
-and the host."""
+Calls block, and come from threads. WAL mode with a sync per commit: commits survive the process and the host."""
 
 from __future__ import annotations
 
@@ -100,8 +99,7 @@ class JournalStore:
             return [Grant(Term(term, rcm), seq) for term, rcm, seq in rows], self._fact("heard")
 
     def commit(self, changes: Iterable[Change], first: float, heard: float, now: float) -> None:
-        """Keep all changes or none, and the time `heard` of the last publication; remove what is too old or too much. A
-        new journal begins at `first`. Raises Unwritable."""
+        """Keep all changes or none, and the time `heard` of the last publication; prune. Raises Unwritable."""
         with self._one:
             try:
                 db = self._opened()

@@ -228,8 +228,7 @@ class ComponentProcess:
     async def _serve_connection(self, connection: socket.socket, child: subprocess.Popen[bytes]) -> None:
         """Give a child its job, and return at its end."""
         loop = asyncio.get_running_loop()
-        # Orders use a socket of their own: if one fails, asyncio would close the connection with unread messages, such
-        # as the last report.
+        # A socket for orders alone: if one fails, asyncio would close the connection with unread messages.
         sending = connection.dup()
         stream, writer = await asyncio.open_unix_connection(sock=connection, limit=channel.MAX_FRAME)
         self._orders = asyncio.Queue()

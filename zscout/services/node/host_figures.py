@@ -1,7 +1,6 @@
-"""Figures of a host: processors, their speed and use, memory, temperature. Read from the system.
+"""Figures of a host, read from the system: processors, their speed and use, memory, temperature.
 
-Limits of a container's control groups (cgroup v2, v1, or both) count where they are smaller than the host. A missing or
-invalid file is no limit."""
+Limits of control groups (cgroup v2, v1, or both) count if smaller than the host; unreadable files are no limit."""
 
 from __future__ import annotations
 

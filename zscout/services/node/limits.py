@@ -1,7 +1,6 @@
 """Limits of memory and processor time for components, by control groups (v1, or v2 if permitted).
 
-A component with a limit gets its own group below the node's. Otherwise memory is limited per process (RLIMIT_DATA), and
-processor time is not."""
+A component with a limit gets a group below the node's, else only a memory limit per process (RLIMIT_DATA)."""
 
 from __future__ import annotations
 

@@ -35,11 +35,9 @@ LoadFigures: TypeAlias = tuple[tuple[float, float, float], float, int]
 
 
 class LoadReporter:
-    """Publishes this host's load until stopped. `labels` are the host's; `running` its components. With `tree`, only
-    the load of this process and its descendants.
+    """Publishes this host's load until stopped. With `tree`, only the load of this process and its descendants.
 
-    A failure is logged, withdraws the liveliness token, and restarts after RESTARTS seconds: a node with devices must
-    not end for it."""
+    A failure is logged, withdraws the liveliness token, and restarts after RESTARTS seconds: the node continues."""
 
     def __init__(self, mesh: Mesh, labels: Iterable[str] = (), running: Running = tuple, *, tree: bool = False) -> None:
         self.mesh = mesh

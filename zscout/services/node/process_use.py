@@ -130,10 +130,10 @@ class TreeUse(NamedTuple):
 
 
 class TreeMeter:
-    """Measures the process `root` (default: our own) and its descendants repeatedly.
+    """Measures the process `root` (default: our own) and its descendants, from one thread. Raises OSError without
+    /proc.
 
-    Without waiting times from the system, `wanted` is the number of runnable threads. For one thread at a time. Raises
-    OSError without /proc."""
+    Without waiting times from the system, `wanted` is the number of runnable threads."""
 
     def __init__(self, root: int | None = None, *, proc: Path = PROC, now: Callable[[], float] = since_boot) -> None:
         self._root = os.getpid() if root is None else root

@@ -1,5 +1,5 @@
-"""A candidate's copy of the placer's publications, for its own term. Nodes list running components; only this copy
-knows those of a host that died together with the leader."""
+"""A candidate's copy of the placer's publications. It alone knows the components of a host that died with the
+leader."""
 
 from __future__ import annotations
 

@@ -30,8 +30,7 @@ class LoadBalancer:
         self.mesh = mesh
         self.core = Balancer(RANDOM.get())
         self._supervisor = Supervisor("the load balancer", on_failure)
-        self._lost: set[HostName] = set()
-        """Hosts that are gone: their unread reports must not bring them back. Cleared once those are read."""
+        self._lost: set[HostName] = set()  # gone, with unread reports that must not bring them back
         self._declarations = ExitStack()
 
     def start(self) -> None:

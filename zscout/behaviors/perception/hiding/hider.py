@@ -44,8 +44,7 @@ PHASES: Final[dict[Phase, PhaseCode]] = {
 }
 RESUMES: Final[dict[Phase, Phase]] = {"hidden": "check", "check": "check", "face": "face", "settle": "face"}
 """Phases after an interruption in the dark; all others search again."""
-LONGEST_GAP: Final = 5.0
-"""Most seconds counted between two pictures: longer gaps, and clocks that go back, come from another host."""
+LONGEST_GAP: Final = 5.0  # most seconds counted between two pictures; clocks that jump are another host's
 BLIND: Final = 0.8  # seconds without a good picture after which the robot stops
 REPORTS: Final = 2.0  # seconds of spoiled pictures before a report
 

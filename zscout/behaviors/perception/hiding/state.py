@@ -304,8 +304,8 @@ class HidingState(msgspec.Struct):
     def opening(self, view: View) -> Opening:
         """The direction of this picture.
 
-        Farther views have more structure around the horizon: in the simulated building 2 grey levels up to 0.7 m, 5 at
-        1 m, 8 beyond 1.5 m."""
+        Farther views have more structure around the horizon: 2 grey levels up to 0.7 m, 5 at 1 m, 8 beyond 1.5 m
+        (simulated)."""
         middle = unpack(self.previous)[9:15, COLUMNS // 4 : -COLUMNS // 4].astype(np.float32)
         return Opening(
             heading=self.heading,
