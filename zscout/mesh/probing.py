@@ -130,7 +130,7 @@ async def call(
     named: Iterable[str], heard: Iterable[str] = (), cas: str = "", own: Certificates | None = None
 ) -> list[Called]:
     """Call all TCP and TLS addresses at a time, within six seconds, with these CAs (PEM) and this certificate.
-    For addresses `named` in a file TLS is tried; `heard` ones state their protocol."""
+    Addresses `named` in a file are tried by TLS; the others state their protocol."""
     tried = dict.fromkeys(heard, False) | dict.fromkeys(named, True)
     matches = [(match, doubted) for at, doubted in tried.items() if (match := _ADDRESS.fullmatch(at))]
     return list(await asyncio.gather(*(_call(match, doubted, cas, own) for match, doubted in matches)))

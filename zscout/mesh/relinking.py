@@ -49,7 +49,7 @@ class _Lost:
 class Relinking:
     """Restores the links of one session, in a thread that lives while a link is lost.
 
-    `scouting`: settings for finding peers; `meeting`: those of a temporary session with the given addresses alone."""
+    `scouting`: settings for finding peers; `meeting`: for a temporary session with the given addresses alone."""
 
     def __init__(
         self, session: zenoh.Session, scouting: zenoh.Config, meeting: Callable[[Sequence[str]], zenoh.Config]

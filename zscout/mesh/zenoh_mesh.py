@@ -173,7 +173,7 @@ class ZenohMesh(Mesh):
                 continue
             told = None
             if fresh.ends != known.ends:
-                log.info("%s was renewed: this process joins the mesh anew", fresh.cert)
+                log.info("%s was renewed: reopening the mesh session", fresh.cert)
                 known = self.validity = fresh
                 self._transport.renew()
             if (soon := fresh.expires_soon(datetime.now(UTC))) and soon != warned:

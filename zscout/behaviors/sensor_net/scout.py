@@ -155,7 +155,7 @@ class Scout:
         self._task: Task = "hide"  # of the present hold
         self._alerts = 0  # count before the present turn
         self._turns: deque[bool] = deque(maxlen=LATELY)  # for each recent turn to watch: True if it saw motion
-        self._held = self.no_signal = False  # the last hold ended without even snow: leave its channel
+        self._held = self.no_signal = False  # no_signal: the last hold ended without even snow
 
     @property
     def task(self) -> Task:
@@ -213,7 +213,7 @@ class Scout:
         if self.alerts.moving:
             return Step(0, 0, 0, "alert", f"motion {count}", tuple(seen.boxes), alert=edge == "start")
         if seen.present:
-            return Step(0, 0, 0, "present", f"who moved stands still, motion {count}", quiet=edge == "end")
+            return Step(0, 0, 0, "present", f"the mover is still there, motion {count}", quiet=edge == "end")
         words = f"{count} alerts so far"
         return Step(0, 0, 0, "watch", words, quiet=edge == "end", learning=seen.learning)
 

@@ -182,7 +182,7 @@ def _repeated(fleet: str, view: BookingView, zone: ZoneInfo) -> list[Event]:
 
 
 def _event(fleet: str, view: BookingView, start: Instant | datetime, told: BookedDate | None = None) -> Event:
-    """One date, or the first of many, with its details `told`."""
+    """One date, or the first of many, with its details."""
     event = Event()
     whole = view.every and not isinstance(start, datetime) and _zone(view) is None
     event.add("UID", f"{view.id}{f'-{start}' if whole else ''}@{fleet}")

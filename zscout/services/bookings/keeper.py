@@ -154,7 +154,7 @@ class BookingKeeper:
         now, (leader, since, last) = self.mesh.now(), self._leader
         self._leader = grants.term, since if leader == grants.term and now - last < LEFT else now, now
         unasked = now - max(self._asked, self._leader[1]) > UNASKED
-        self.mesh.suspicions.suspect("a leader is heard that asks nothing about bookings", so=unasked)
+        self.mesh.suspicions.suspect("a known leader asks nothing about bookings", so=unasked)
 
     @property
     def time(self) -> Ns | None:

@@ -15,7 +15,7 @@ from zscout.types import NO_TERM, Grant, RcName, clean
 
 N = TypeVar("N", int, Decimal)
 
-MAX_OPEN: Final = 20_000  # holds followed at one time. Further ones are kept, but may be written repeatedly.
+MAX_OPEN: Final = 20_000  # holds followed at one time; further ones may be written repeatedly
 MAX_EARLY: Final = 2_000  # reports of use kept for holds not known yet
 MAX_TEXT: Final = 200  # characters kept of a name or a reason
 MAX_RCS: Final = 1_000  # RCs kept per hold: no fleet allows more

@@ -99,7 +99,7 @@ class JournalStore:
             return [Grant(Term(term, rcm), seq) for term, rcm, seq in rows], self._fact("heard")
 
     def commit(self, changes: Iterable[Change], first: float, heard: float, now: float) -> None:
-        """Keep all changes or none, and the time `heard` of the last publication; prune. Raises Unwritable."""
+        """Keep all changes or none, with the last publication's time; prune. Raises Unwritable."""
         with self._one:
             try:
                 db = self._opened()
