@@ -1,12 +1,10 @@
-"""The mesh as asyncio sees it: typed queries, queryables, publications, liveliness.
-
-A query that finds its queue full is answered "busy"; a publication that does is counted as missed."""
+"""The mesh for asyncio: typed queries, queryables, publications and liveliness."""
 
 from __future__ import annotations
 
 import os
 
-# Zenoh reads this once, when it is loaded. With few receiving threads one cut-off host stalls every link.
+# Zenoh reads this once, when it is loaded. With few receiving threads one unreachable host stalls every link.
 os.environ.setdefault(
     "ZENOH_RUNTIME",
     "(rx:(worker_threads:16),net:(worker_threads:4),acc:(worker_threads:4),tx:(worker_threads:4),"

@@ -1,4 +1,4 @@
-"""What services send and receive: queries with their replies, and what a process has declared on the mesh."""
+"""Queries with their replies, publishers, and declarations of a process on the mesh."""
 
 from __future__ import annotations
 
@@ -16,14 +16,12 @@ from zscout.mesh.transport import TransportPublisher, TransportQuery, Undeclare
 from zscout.messages import Malformed, Problem, version_words
 from zscout.types import VERSION, Ns, Term
 
-QUEUE_DEPTH = 1_024
-"""Items of one declaration that may wait for the event loop."""
-MAX_CODES: Final = 32
-"""Codes of refusals that a tally tells apart: some are of a driver's choice, or another host's."""
+QUEUE_DEPTH = 1_024  # items of one declaration that may wait for the event loop
+MAX_CODES: Final = 32  # refusal codes a tally counts separately: drivers and other hosts choose some of them
 OTHER: Final = "other"
 CODE: Final = re.compile("[a-z_]{1,32}")
 NOT_UNDERSTOOD: Final = frozenset({"malformed", "bad_name", "bad_request"})
-"""How an operation, a form of a name or a value is refused that only another version knows."""
+"""Codes that a version difference may explain."""
 
 R = TypeVar("R")
 S = TypeVar("S")
@@ -49,8 +47,6 @@ class Refused(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Reply(Generic[R]):
-    """One reply to a query: a message, or a problem."""
-
     key: str
     message: R | None
     problem: Problem | None = None
@@ -58,7 +54,7 @@ class Reply(Generic[R]):
 
 
 def naming_versions(reply: Reply[R] | None, who: str) -> Reply[R] | None:
-    """The same reply. Where `who` is of another version, and may not have understood what it was asked, it says so."""
+    """The same reply; a refusal that a version difference may explain names both versions."""
     problem = reply.problem if reply is not None else None
     if reply is None or problem is None or problem.code not in NOT_UNDERSTOOD or problem.version == VERSION:
         return reply
@@ -74,14 +70,13 @@ def refuse(query: TransportQuery, problem: Problem) -> None:
 
 @dataclass(slots=True, eq=False)
 class Tally:
-    """How queries of one purpose were ended. Answers are counted in the event loop, refusals on any thread."""
+    """How queries of one purpose ended. Answers are counted in the event loop, refusals on any thread."""
 
     answered: int = 0
     _refused: dict[str, int] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def refused(self) -> dict[str, int]:
-        """By code."""
         with self._lock:
             return dict(self._refused)
 
@@ -94,13 +89,11 @@ class Tally:
 
 @dataclass(slots=True, eq=False)
 class Answered:
-    """How a question was answered, for arrivals of it that come later."""
-
     said: msgspec.Struct | None = None
     waiting: list[IncomingQuery[Any]] = field(default_factory=list)
 
     def join(self, query: IncomingQuery[Any]) -> None:
-        """`query` gets the same answer, now or when there is one."""
+        """Answer `query` alike, now or once there is an answer."""
         if self.said is None:
             self.waiting.append(query)
         else:
@@ -114,18 +107,15 @@ class Answered:
 
 @dataclass(slots=True, eq=False)
 class IncomingQuery(Generic[R]):
-    """A query that arrived: answer it once, now or later. No answer at all reads as "unknown"."""
+    """A query that arrived: answer it once, now or later. Its sender takes no answer as "unknown"."""
 
     _query: TransportQuery | None
     key: str
     _reply_key: str
     message: R
-    arrived: Ns
-    """When it came out of the network, by `Mesh.now`."""
+    arrived: Ns  # when it left the network, by `Mesh.now`
     outcome: Answered | None = None
-    """Where to keep the answer, if it is to be kept."""
     tally: Tally | None = None
-    """Where to count how it ended, if that is counted."""
 
     def answer(self, message: msgspec.Struct) -> None:
         self.end(message)
@@ -134,7 +124,6 @@ class IncomingQuery(Generic[R]):
         self.end(problem)
 
     def end(self, said: msgspec.Struct) -> None:
-        """Answers or refuses, as `said` is a message or a Problem."""
         query, self._query = self._query, None
         if query is None:
             return
@@ -152,8 +141,6 @@ class IncomingQuery(Generic[R]):
 
 
 class Publisher:
-    """Publishes messages of one kind on one key."""
-
     def __init__(self, publisher: TransportPublisher) -> None:
         self._publisher = publisher
         self.close = publisher.undeclare
@@ -164,17 +151,14 @@ class Publisher:
 
 @dataclass(slots=True)
 class Backlog:
-    """Of one declaration: how many of its items wait, and how many were dropped because `depth` did."""
-
     pending: int = 0
     missed: int = 0
-    closed: bool = False
-    """Nothing that still waits is handled any more. Subscriptions that share a backlog do not ask."""
+    closed: bool = False  # items that still wait are dropped. Subscriptions that share a backlog do not check this.
     depth: int = QUEUE_DEPTH
 
 
 class HostShares:
-    """How many queries of each host wait, so that one host can't take all the room. Counted on any thread."""
+    """Waiting queries per host, so that no host takes all the room. Counted on any thread."""
 
     def __init__(self, share: int) -> None:
         self._share, self._lock, self._waiting = share, threading.Lock(), dict[str, int]()
@@ -201,7 +185,7 @@ class Declaration:
 
     @property
     def missed(self) -> int:
-        """Publications that were dropped because the queue was full."""
+        """Publications dropped because the queue was full."""
         return self._state.missed
 
     def close(self) -> None:
@@ -221,9 +205,8 @@ class PolledSubscription(Declaration, Generic[S]):
         self._take, self._kind, self._depth = take, kind, depth
 
     def each(self) -> Iterator[tuple[str, S]]:
-        """What was published since the last call, oldest first, each with its key; malformed messages are dropped
-        silently, what is not consumed is kept for the next call. Ends after as many as there is room for: more may
-        arrive meanwhile."""
+        """Yield the publications since the last call as (key, message), oldest first. Malformed ones are skipped,
+        unread ones are kept. Ends after `depth` items, as more may arrive meanwhile."""
         for _ in range(self._depth):
             sample = self._take()
             if sample is None:

@@ -1,7 +1,7 @@
-"""Frames on the mesh: large, many, and only the newest is of use.
+"""Frames on the mesh: large, many, and only the newest matters.
 
-They are apart from the messages: a publisher knows whether there are subscribers, a frame that can't be sent at once is
-dropped, and a subscriber slower than the frames misses those in between, never the newest."""
+Unlike with messages, a publisher knows whether there are subscribers, a frame that can't be sent at once is dropped,
+and a slow subscriber misses frames but never the newest."""
 
 from __future__ import annotations
 
@@ -21,32 +21,27 @@ from zscout.types import Ns
 
 log = logging.getLogger(__name__)
 
-MAX_HEAD = 2_048
-"""Bytes of what is attached to a frame."""
+MAX_HEAD = 2_048  # bytes attached to a frame
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One picture as it came."""
-
     key: str
     head: FrameHead
     jpeg: bytes
-    arrived: Ns
-    """On this host's clock."""
+    arrived: Ns  # on this host's clock
 
 
 class FramePublisher:
-    """Publishes frames on one key. `put` may be called from any one thread at a time."""
+    """Publishes frames on one key. One thread at a time may call `put`."""
 
     def __init__(self, publisher: TransportPublisher, deliver: Callable[..., None]) -> None:
         self._publisher, self._deliver = publisher, deliver
         self.close = publisher.undeclare
-        self.watched = False
-        """Whether there are subscribers, as far as is known since `follow`."""
+        self.watched = False  # True if there are subscribers, as far as is known since `follow`
 
     def follow(self, changed: Callable[[bool], None]) -> None:
-        """Calls `changed(watched)` in the event loop whenever that changes from now on."""
+        """Call `changed(watched)` in the event loop at each change."""
 
         def update(watched: bool) -> None:
             if watched != self.watched:
@@ -56,15 +51,14 @@ class FramePublisher:
         update(self._publisher.match(functools.partial(self._deliver, update)))
 
     def put(self, head: FrameHead, jpeg: bytes) -> None:
-        """Publishes a frame, or drops it where that would have to wait. Raises ValueError for more than
-        MAX_FRAME bytes."""
+        """Publish a frame, or drop it if it had to wait. Raises ValueError for more than MAX_FRAME bytes."""
         if len(jpeg) > MAX_FRAME:
             raise ValueError(f"a frame of {len(jpeg)} bytes is too large; at most {MAX_FRAME} are sent")
         self._publisher.put(jpeg, messages.encode(head))
 
 
 class FrameWatch:
-    """The newest frame on a key (or of each publication on a key expression, whichever came last)."""
+    """The newest frame on a key or key expression."""
 
     def __init__(self, transport: Transport, key: str, deliver: Callable[..., None], now: Callable[[], Ns]) -> None:
         self._deliver, self._now = deliver, now
@@ -72,8 +66,7 @@ class FrameWatch:
         self._lock = threading.Lock()
         self._newest: tuple[str, bytes, bytes | None, Ns] | None = None
         self._arrived = asyncio.Event()
-        self.missed = 0
-        """Frames that were replaced by a newer one before they were taken."""
+        self.missed = 0  # frames replaced before they were taken
         self.malformed = 0
         self.close = transport.subscriber(key, self._on_sample)
 
@@ -87,7 +80,7 @@ class FrameWatch:
             self._deliver(self._arrived.set)
 
     def take(self) -> Frame | None:
-        """The newest frame, if there is one that was not taken yet."""
+        """The newest frame, unless it was taken already."""
         with self._lock:
             newest, self._newest = self._newest, None
         self._arrived.clear()
@@ -107,7 +100,7 @@ class FrameWatch:
         return Frame(key, head, jpeg, arrived)
 
     async def next(self, timeout: float) -> Frame | None:
-        """The newest frame, once there is one; None if none came within `timeout` seconds."""
+        """The newest frame; None if none came within `timeout` seconds."""
         with suppress(TimeoutError):
             async with asyncio.timeout(timeout):
                 while (frame := self.take()) is None:

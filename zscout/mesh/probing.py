@@ -1,7 +1,7 @@
-"""What can be told of a network without being let in: who is heard, and what those say who are called.
+"""Find out about a mesh without joining it: by multicast, and by TLS handshakes.
 
-An intruder gets no link and no word, and so does a host whose files or certificate are wrong. But who is there says so
-by multicast to all, and a TLS handshake tells both sides' mind, down to why a certificate is refused."""
+A host with wrong files or certificate gets no link, but processes answer all multicast, and a handshake shows why a
+certificate is refused."""
 
 from __future__ import annotations
 
@@ -32,34 +32,27 @@ from zscout.mesh.relinking import MEETING
 from zscout.mesh.zenoh_mesh import in_thread, zenoh_config
 from zscout.types import clean
 
-SCOUT: Final = 1.5
-"""Seconds in which all who are there have answered."""
+SCOUT: Final = 1.5  # seconds for all processes to answer
 POLL: Final = 0.02
 CONNECT: Final = 1.5
 HANDSHAKE: Final = 2.0
-OBJECTION: Final = 0.3
-"""Seconds within which the other side says that it refuses our certificate: it looks after we have seen its own."""
+OBJECTION: Final = 0.3  # seconds for the other side to refuse our certificate: it checks after we have seen its own
 LINK: Final = 0.8
-LIST: Final = 1.0
-"""Seconds for links to a plain mesh, and for its tokens."""
-MAX_HEARD: Final = 64
-"""Processes that are called."""
+LIST: Final = 1.0  # seconds for links to a plain mesh, and for its tokens
+MAX_HEARD: Final = 64  # processes called
 MAX_TOKENS: Final = 10_000
 _ALERT: Final = re.compile(r"alert ([a-z ]*[a-z])")
 _ADDRESS: Final = re.compile(r"(tcp|tls)/([^#?]+):(\d+)(?:[?#].*)?")
 
 
-# Multicast
-
-
 def multicast_problems(config: MeshConfig) -> dict[str, str]:
-    """The interfaces that multicast would use, with why it can't; empty where it can. Really tried, on each."""
+    """The interfaces for multicast, each with its problem, empty if a test packet could be sent."""
     host, _, port = config.multicast_address.rpartition(":")
     group = ip_of(host.strip("[]"))
     assert group is not None  # noqa: S101 - the fleet file was checked
     found = psutil.net_if_stats()
     if config.interface == "auto":
-        names = [name for name, one in found.items() if one.isup and "multicast" in one.flags.split(",")]
+        names = [name for name, stats in found.items() if stats.isup and "multicast" in stats.flags.split(",")]
     else:
         names = config.interface.split(",")
     return {name: _multicast_problem(name, group, int(port)) for name in names}
@@ -86,7 +79,7 @@ def _multicast_problem(name: str, group: ipaddress.IPv4Address | ipaddress.IPv6A
 
 @dataclass(frozen=True, slots=True)
 class Heard:
-    """A process that answered by multicast, and where it listens; `here`: on this host."""
+    """A process that answered by multicast, with its listening addresses; `here`: on this host."""
 
     zid: str
     addresses: tuple[str, ...]
@@ -95,7 +88,7 @@ class Heard:
 
 
 async def heard(config: MeshConfig) -> list[Heard]:
-    """Who answers by multicast, of whatever fleet. Takes SCOUT seconds."""
+    """All processes that answer by multicast, of any fleet. Takes SCOUT seconds."""
     found: dict[str, Heard] = {}
     own = _own_addresses()
     until = time.monotonic() + SCOUT
@@ -105,8 +98,8 @@ async def heard(config: MeshConfig) -> list[Heard]:
                 if (hello := scout.try_recv()) is None:
                     await asyncio.sleep(POLL)
                 elif not (zid := str(hello.zid)).startswith(MEETING):
-                    addresses = tuple(one for one in hello.locators if "[fe80:" not in one)
-                    hosts = {match[2].strip("[]") for one in addresses if (match := _ADDRESS.match(one))}
+                    addresses = tuple(address for address in hello.locators if "[fe80:" not in address)
+                    hosts = {match[2].strip("[]") for at in addresses if (match := _ADDRESS.match(at))}
                     found[zid] = Heard(zid, addresses, bool(hosts & own), str(hello.whatami) == "router")
     except zenoh.ZError:  # no interface for it
         pass
@@ -114,18 +107,14 @@ async def heard(config: MeshConfig) -> list[Heard]:
 
 
 def _own_addresses() -> set[str]:
-    return {one.address.partition("%")[0] for several in psutil.net_if_addrs().values() for one in several}
-
-
-# Who is called
+    return {known.address.partition("%")[0] for several in psutil.net_if_addrs().values() for known in several}
 
 
 @dataclass(frozen=True, slots=True)
 class Called:
-    """What came of calling an address. `speaks` is empty where nobody answered, and `problem` says why.
+    """Result of calling an address. `speaks` is empty without an answer; `problem` gives the reason.
 
-    Of TLS: the certificate that was shown, by which CA, whether one that we trust has issued it, and what the other
-    side says against ours: empty where it took it, or we have shown none."""
+    For TLS: the certificate shown, its CA, whether that is trusted, and the objection to ours, or empty."""
 
     address: str
     speaks: Literal["tls", "plain", ""]
@@ -134,17 +123,16 @@ class Called:
     issuer: str = ""
     trusted: bool = False
     objection: str = ""
-    here: bool = False
-    """Of who does not answer: whether it is an address of this host's."""
+    here: bool = False  # without an answer: True for an address of this host
 
 
 async def call(
     named: Iterable[str], heard: Iterable[str] = (), cas: str = "", own: Certificates | None = None
 ) -> list[Called]:
-    """Calls all addresses of TCP and TLS at a time, within six seconds, as who trusts these CAs (PEM) and has this
-    certificate. Who was `heard` has said itself whether it speaks TLS; of those that a file has `named` it is tried."""
+    """Call all TCP and TLS addresses at a time, within six seconds, with these CAs (PEM) and this certificate.
+    Addresses `named` in a file are tried by TLS; the others state their protocol."""
     tried = dict.fromkeys(heard, False) | dict.fromkeys(named, True)
-    matches = [(match, doubted) for one, doubted in tried.items() if (match := _ADDRESS.fullmatch(one))]
+    matches = [(match, doubted) for at, doubted in tried.items() if (match := _ADDRESS.fullmatch(at))]
     return list(await asyncio.gather(*(_call(match, doubted, cas, own) for match, doubted in matches)))
 
 
@@ -164,7 +152,7 @@ async def _call(match: re.Match[str], doubted: bool, cas: str, own: Certificates
     if cas:
         with suppress(ssl.SSLCertVerificationError):
             return _answer(address, await _handshake(at, _trusting(cas, own)), trusted=True)
-    # Whoever issued it, a certificate that is taken for an authority itself can be read.
+    # Taken as its own authority, any certificate can be read.
     if (shaken := await _handshake(at, _trusting(None))) is not None and shaken.encoded:
         itself = ssl.DER_cert_to_PEM_cert(shaken.encoded)
         with suppress(ssl.SSLCertVerificationError):
@@ -174,13 +162,13 @@ async def _call(match: re.Match[str], doubted: bool, cas: str, own: Certificates
 
 async def _looked_up(host: str, port: int) -> list[tuple[str, int]]:
     """A host's addresses. Raises OSError."""
-    # In a thread that nobody waits for: where no name server answers it takes its time.
+    # In a thread that is not awaited at exit: it takes long without a name server.
     look_up = functools.partial(socket.getaddrinfo, host, port, type=socket.SOCK_STREAM)
-    return [(str(one[0]), port) for *_, one in await asyncio.wrap_future(in_thread("looks up a name", look_up))]
+    return [(str(at[0]), port) for *_, at in await asyncio.wrap_future(in_thread("looks up a name", look_up))]
 
 
 async def _reached(found: Iterable[tuple[str, int]]) -> tuple[str, int]:
-    """Which of these takes a connection. Raises OSError."""
+    """The first of these that accepts a connection. Raises OSError."""
     error: OSError | None = None
     for at in found:
         try:
@@ -194,14 +182,13 @@ async def _reached(found: Iterable[tuple[str, int]]) -> tuple[str, int]:
 
 
 class _Shaken(NamedTuple):
-    told: Mapping[str, Any]
-    """Of the other side's certificate, if that was verified."""
+    told: Mapping[str, Any]  # the other side's certificate, if verified
     encoded: bytes
     objection: str
 
 
 async def _handshake(at: tuple[str, int], context: ssl.SSLContext) -> _Shaken | None:
-    """None: no TLS is spoken there. Raises SSLCertVerificationError."""
+    """None if it speaks no TLS. Raises SSLCertVerificationError."""
     try:
         async with asyncio.timeout(HANDSHAKE):
             reader, writer = await asyncio.open_connection(*at, ssl=context)
@@ -225,7 +212,7 @@ async def _handshake(at: tuple[str, int], context: ssl.SSLContext) -> _Shaken | 
 
 
 def _trusting(cas: str | None, own: Certificates | None = None) -> ssl.SSLContext:
-    """Trusts what stands in a PEM text, or everybody; for how long something is valid is looked at later."""
+    """A context that trusts the CAs of a PEM text, or everything; dates are checked later."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname = False
     if cas is None:
@@ -251,16 +238,12 @@ def _answer(address: str, shaken: _Shaken | None, *, trusted: bool) -> Called:
 
 
 def _reason(error: OSError) -> str:
-    """What stands behind it, without the address: several addresses of a name have failed alike."""
+    """The cause without the address: all addresses of a name failed alike."""
     return os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror or "can't be called"
 
 
-# A plain mesh
-
-
 def plain_fleets(addresses: Sequence[str]) -> dict[str, set[str]]:
-    """The fleets of who listens at these addresses without TLS: the hosts of each that have a node. Blocks for two
-    seconds at most."""
+    """Fleets on these addresses without TLS: the hosts of each that have a node. Blocks for two seconds at most."""
     settings: dict[str, object] = {
         "mode": "peer",
         "id": f"{MEETING}{secrets.token_hex(10)}",

@@ -1,11 +1,10 @@
-"""Links that were lost, or could not be made, are made at once.
+"""Restore links that were lost or could not be made, at once.
 
-Of two peers the one with the greater id makes their link: that is who joins, as ids increase, but for clocks that
-differ. Zenoh looks for peers by multicast, once it has run for a while every 8 s: for so long two processes that live
-may be without a link after a fault of a moment. But peers that are linked to a third are told of one another by it
-(gossip), and link. So who had made a link sees whether the other listens still, asks by multicast for both addresses,
-and opens a session that links to these two until they have found each other (docs/zenoh.md). A relay is a router, which
-answers nobody who looks for peers: `connect` names it."""
+Of two peers the one with the greater id makes the link: usually the newer one, as ids increase. After its start Zenoh
+scouts every 8 s only, so a short fault may leave two live processes unlinked that long. Peers linked to a third learn
+of each other from it (gossip), and link. So the process that had made a link probes the other's listener, scouts for
+both addresses, and opens a session linked to both until they have met (docs/zenoh.md). Relays are routers, which
+scouting does not find: `connect` names them."""
 
 from __future__ import annotations
 
@@ -25,43 +24,32 @@ from zenoh.handlers import Callback
 
 log = logging.getLogger(__name__)
 
-PAUSES: Final = (0.02, 0.1, 0.1, 0.2, 0.2, 0.5, *(1.0,) * 30)
-"""Seconds before each look for a peer. After the last one it is left to Zenoh."""
-TOGETHER: Final = 0.25
-"""Seconds within which two losses mean that this process was away: it looks for those, too, that make the link."""
-LOOKS_FOR_GREATER: Final = 4
-"""So often: many may do so at one time."""
+PAUSES: Final = (0.02, 0.1, 0.1, 0.2, 0.2, 0.5, *(1.0,) * 30)  # seconds before each look; then Zenoh alone looks
+TOGETHER: Final = 0.25  # seconds between two losses that mean this process was away: it looks for all peers
+LOOKS_FOR_GREATER: Final = 4  # looks for peers with a greater id; few, as many processes may look at one time
 PROBE_TIMEOUT: Final = 0.25
-PROBES_TIMEOUT: Final = 1.0
-"""For all of one look: where many are lost, each has its turn."""
+PROBES_TIMEOUT: Final = 1.0  # seconds for all probes of one look
 SCOUT_TIMEOUT: Final = 0.5
 GREET_TIMEOUT: Final = 0.1
-MEET_TIMEOUT: Final = 0.25
-"""They are told of one another at once. An end that has not lost the link yet makes or takes no other."""
+MEET_TIMEOUT: Final = 0.25  # seconds; an end that has not noticed the loss accepts no second link
 POLL: Final = 0.002
-MEETING: Final = "6d656574"
-"""So begins the id of a session that is opened for a moment: nobody misses it."""
+MEETING: Final = "6d656574"  # prefix of the ids of temporary sessions, whose end is ignored
 _ADDRESS: Final = re.compile(r"^(?:tcp|tls)/(.+):(\d+)(?:[?#].*)?$")
 
 
 @dataclass(slots=True)
 class _Lost:
     at: float
-    addresses: list[str] = field(default_factory=list)
-    """Of the other ends of its links: where it listens, if they were made from here."""
+    addresses: list[str] = field(default_factory=list)  # where the other ends listen
     looks: int = 0
-    listens: bool | None = None
-    """Once it is known to, it is not asked again: each connection that a TLS listener sees closed unused keeps others
-    out for 0.1 s (docs/zenoh.md), and one that was frozen sees them all when it goes on."""
-    together: bool = False
-    """Whether it is looked for though it is it that makes the link."""
+    listens: bool | None = None  # not probed again: an unused connection keeps others off a TLS listener for 0.1 s
+    together: bool = False  # True if this peer is looked for though it makes the link
 
 
 class Relinking:
-    """Of one session, in a thread that lives while something is lost.
+    """Restores the links of one session, in a thread that lives while a link is lost.
 
-    `scouting` says how peers are asked who is there; `meeting` gives the settings of a session that links to the
-    addresses it is given, and to nobody else. It is one of a moment: its id, by which others know that, is set here."""
+    `scouting`: settings for finding peers; `meeting`: for a temporary session with the given addresses alone."""
 
     def __init__(
         self, session: zenoh.Session, scouting: zenoh.Config, meeting: Callable[[Sequence[str]], zenoh.Config]
@@ -85,8 +73,7 @@ class Relinking:
                 self._begin(greet=True)
 
     def close(self) -> None:
-        """Before the session is closed. Returns when the thread has ended, in a second or two: one that is inside Zenoh
-        when its process ends makes that a crash."""
+        """Close before the session. Waits up to 2 s for the thread: ending the process inside Zenoh would crash it."""
         self._closed.set()
         for listener in self._listeners:
             with suppress(zenoh.ZError):
@@ -105,15 +92,15 @@ class Relinking:
         now, peer = time.monotonic(), str(event.link.zid)
         with self._lock:
             if event.kind == zenoh.SampleKind.PUT or self._closed.is_set() or peer.startswith(MEETING):
-                return  # of a link that is there a look tells: one may come and go without another event
+                return  # new links are found by a look: they may vanish without another event
             if peer in self._routers:
                 self._routers.remove(peer)
                 return
             self._lost.setdefault(peer, _Lost(now)).addresses.append(event.link.dst)
-            lately = [one for one in self._lost.values() if now - one.at < TOGETHER]
-            for one in lately:
-                if len(lately) > 1 and not one.together:
-                    one.together, one.looks = True, 0
+            recent = [lost for lost in self._lost.values() if now - lost.at < TOGETHER]
+            for lost in recent:
+                if len(recent) > 1 and not lost.together:
+                    lost.together, lost.looks = True, 0
             if self._thread is None:
                 self._begin(greet=False)
 
@@ -122,7 +109,7 @@ class Relinking:
         self._thread.start()
 
     def _greet(self) -> None:
-        """Nobody was there who is to wait for a link from here; those who make it may not know of this process."""
+        """Look for all peers: none needs a link from here, and others may not know this process."""
         found = self._scout(GREET_TIMEOUT)
         with self._lock:
             for peer in found.keys() - {self._own}:
@@ -144,34 +131,34 @@ class Relinking:
                 self._lost, self._thread = {}, None
 
     def _next(self) -> float | None:
-        """Seconds until the next look; None: there is nobody to look for."""
+        """Seconds until the next look; None: no link is lost."""
         with self._lock:
-            still = {peer: one for peer, one in self._lost.items() if one.looks < len(PAUSES)}
+            still = {peer: lost for peer, lost in self._lost.items() if lost.looks < len(PAUSES)}
             self._lost = {} if self._closed.is_set() else still
             if self._lost:
-                return min(PAUSES[one.looks] for one in self._lost.values())
+                return min(PAUSES[lost.looks] for lost in self._lost.values())
             self._thread = None
             return None
 
     def _look(self) -> None:
         linked, now = self._linked(), time.monotonic()
         with self._lock:
-            # One that has just been lost may be on the list still.
+            # A peer just lost may still be listed as linked.
             self._lost = {
-                peer: one for peer, one in self._lost.items() if peer not in linked or now - one.at < TOGETHER
+                peer: link for peer, link in self._lost.items() if peer not in linked or now - link.at < TOGETHER
             }
-            lost = {peer: one for peer, one in self._lost.items() if peer not in linked}
+            lost = {peer: link for peer, link in self._lost.items() if peer not in linked}
         wanted, until = set(), time.monotonic() + PROBES_TIMEOUT
-        for peer, one in sorted(lost.items(), key=lambda known: known[1].looks):
+        for peer, link in sorted(lost.items(), key=lambda known: known[1].looks):
             if time.monotonic() > until or self._closed.is_set():
                 break
-            one.looks += 1
-            one.listens = one.listens or _listens(one.addresses)
-            if one.listens or (one.together and one.looks <= LOOKS_FOR_GREATER):
+            link.looks += 1
+            link.listens = link.listens or _listens(link.addresses)
+            if link.listens or (link.together and link.looks <= LOOKS_FOR_GREATER):
                 wanted.add(peer)
-            elif one.listens is False and time.monotonic() - one.at >= TOGETHER:
-                # Its process has gone, or it is it that makes the link. Until then another may be lost.
-                one.looks = len(PAUSES)
+            elif link.listens is False and time.monotonic() - link.at >= TOGETHER:
+                # Its process ended, or it makes the link itself. Earlier, another loss may still come.
+                link.looks = len(PAUSES)
         if wanted and not self._closed.is_set():
             there = self._scout(SCOUT_TIMEOUT, wanted)
             if self._own in there and len(there) > 1:
@@ -181,7 +168,7 @@ class Relinking:
         return {str(peer) for peer in self._session.info.peers_zid()}
 
     def _scout(self, seconds: float, wanted: Collection[str] = ()) -> dict[str, list[str]]:
-        """The addresses of all who are there; of those who are wanted, and of this one, as soon as they are known."""
+        """Addresses by peer: of all peers, or of `wanted` and this process, as soon as they are found."""
         found: dict[str, list[str]] = {}
         until = time.monotonic() + seconds
         with zenoh.scout(what="peer", config=self._scouting) as scout:
@@ -190,8 +177,8 @@ class Relinking:
                     if self._closed.wait(POLL):
                         break
                 elif not wanted or str(hello.zid) in {*wanted, self._own}:
-                    # An address that holds on one link of a network only is none without the name of that link.
-                    found[str(hello.zid)] = [one for one in hello.locators if "[fe80:" not in one]
+                    # A link-local address is useless without its interface.
+                    found[str(hello.zid)] = [at for at in hello.locators if "[fe80:" not in at]
         return found
 
     def _introduce(self, there: dict[str, list[str]]) -> None:
@@ -207,7 +194,7 @@ class Relinking:
 
 
 def _listens(addresses: Sequence[str]) -> bool | None:
-    """Whether anybody does at one of these; None: it can't be told now."""
+    """Return True if one of these addresses accepts connections; None: unknown now."""
     listens: bool | None = False
     for address in addresses:
         if (found := _ADDRESS.match(address)) is None:

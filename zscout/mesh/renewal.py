@@ -1,8 +1,7 @@
-"""A session that can be opened anew, and what tells that it has to be.
+"""A session that can be reopened, and the contradictions that demand it.
 
-Zenoh's links can come back without all that was declared on the other side (docs/protocol.md). A process that sees for
-some time that the mesh contradicts itself opens another session, declares everything on it, and closes the first: its
-callers notice nothing but that tokens which it had missed appear."""
+Zenoh's links can come back without all declarations of the other side (docs/protocol.md). A process that sees such a
+contradiction last opens another session with all its declarations, and closes the first: no caller notices."""
 
 from __future__ import annotations
 
@@ -20,56 +19,46 @@ from zscout.types import SECOND, Ns
 
 log = logging.getLogger(__name__)
 
-PATIENCE: Final = 2.0
-"""Seconds for which a contradiction must last."""
-UNHEARD: Final = 0.5
-"""Seconds for which an RCM must be seen and not heard, beyond half a hold lease: what is held is not to end for it."""
-LASTS: Final = 60.0
-"""Seconds after which one that is not said again is forgotten."""
-OVERLAP: Final = 0.5
-"""Seconds for which both sessions live: by then others know what is declared on the new one."""
-LINKED: Final = 2.0
-"""Seconds within which the new session is linked to whom the old one is linked to, or they are gone."""
+PATIENCE: Final = 2.0  # seconds for which a contradiction must last
+UNHEARD: Final = 0.5  # seconds beyond half a hold lease of an RCM alive yet silent: holds must not lapse
+LASTS: Final = 60.0  # seconds after which a contradiction that is not repeated is forgotten
+OVERLAP: Final = 0.5  # seconds with both sessions open, for others to learn what the new one declares
+LINKED: Final = 2.0  # seconds that the new session may take to link to the peers of the old one
 LOOK_EVERY: Final = 0.02
-SHORTEST, LONGEST = 10.0, 320.0
-"""Seconds from one renewal to the next. Doubled where what it was for has not been set right by it; the shortest again
-after ten times as long without one."""
+SHORTEST, LONGEST = 10.0, 320.0  # seconds between renewals, doubled while they do not help
 
 OnToken: TypeAlias = Callable[[str, bool], None]
 Opening: TypeAlias = Callable[[], Awaitable[Transport]]
 
 
 class Suspicions:
-    """Contradictions that this process sees, by what they are about. One that lasts calls `renew`."""
+    """Contradictions seen by this process, by subject. One that lasts calls `renew`."""
 
     def __init__(self, now: Callable[[], Ns], renew: Callable[[], object]) -> None:
         self._now, self._renew = now, renew
-        self._since: dict[str, tuple[Ns, Ns]] = {}
-        """When each was suspected first and last."""
+        self._since: dict[str, tuple[Ns, Ns]] = {}  # first and last time of each
         self._last: Ns | None = None
         self._pause = SHORTEST
-        self._acted: dict[str, Ns] = {}
-        """What this process has joined anew for, and when; until it is right."""
+        self._acted: dict[str, Ns] = {}  # time of the last renewal for each contradiction that is not resolved
 
     @property
     def any(self) -> bool:
-        """Whether anything is suspected, or was until it is said to be right."""
+        """Return True if a contradiction is suspected, or not resolved yet."""
         return bool(self._since or self._acted)
 
     def suspect(self, what: str, *, so: bool = True, patience: float = PATIENCE) -> None:
-        """What is seen contradicts itself, or no longer does (`so`); to be said again while it lasts. `patience` is in
-        seconds."""
+        """Report a contradiction (`so`), repeatedly while it lasts, or its end. `patience` is in seconds."""
         if not so:
             self._since.pop(what, None)
             self._acted.pop(what, None)
             return
         now = self._now()
-        self._since = {one: (first, last) for one, (first, last) in self._since.items() if now - last < LASTS * SECOND}
+        self._since = {key: seen for key, seen in self._since.items() if now - seen[1] < LASTS * SECOND}
         first, _ = self._since.get(what, (now, now))
         self._since[what] = first, now
         if now - first < patience * SECOND:
             return
-        self._acted = {one: at for one, at in self._acted.items() if now - at < 10 * LONGEST * SECOND}
+        self._acted = {key: at for key, at in self._acted.items() if now - at < 10 * LONGEST * SECOND}
         if self._last is not None:
             helped = what not in self._acted
             if now - self._last < (SHORTEST if helped else self._pause) * SECOND:
@@ -82,26 +71,25 @@ class Suspicions:
         self._renew()
 
     def keep(self, those: Collection[str], prefix: str) -> None:
-        """Of all that begins with `prefix` only `those` still last."""
+        """Drop all contradictions that begin with `prefix`, except `those`."""
         for known in (self._since, self._acted):
             for what in [what for what in known if what.startswith(prefix) and what not in those]:
                 del known[what]
 
 
 class RenewableTransport(Transport):
-    """`openings` open other sessions, one after the other; the last one is that which stays."""
+    """`openings` open replacement sessions one after the other; the last one stays."""
 
     def __init__(self, transport: Transport, openings: Sequence[Opening]) -> None:
         self.current, self._openings = transport, openings
         self._declared: dict[int, _Declared] = {}
-        self._tokens: WeakValueDictionary[int, _Token] = WeakValueDictionary()
-        """These die with what undeclares them."""
+        self._tokens: WeakValueDictionary[int, _Token] = WeakValueDictionary()  # die with their undeclare function
         self._numbers = itertools.count()
         self._renewing: asyncio.Task[None] | None = None
         self._closed = False
 
     def renew(self) -> None:
-        """Once at a time. What fails is logged, and leaves the session that there is."""
+        """Renew, unless a renewal runs. A failure is logged, and keeps the present session."""
         if self._renewing is None and not self._closed:
             self._renewing = asyncio.create_task(self._renew())
 
@@ -116,51 +104,49 @@ class RenewableTransport(Transport):
                     await fresh.close()
                     raise
                 try:
-                    # First all is declared anew: no token of this process goes in between.
-                    for one in self._all():
-                        one.declare(fresh)
+                    # Declare first, so that no token of this process disappears in between.
+                    for declared in self._all():
+                        declared.declare(fresh)
                     await asyncio.sleep(OVERLAP)
                 finally:
                     await old.close()
-                    for one in self._all():
-                        one.forget_old()
+                    for declared in self._all():
+                        declared.forget_old()
         except MeshError as error:
             log.warning("%s", error)
         except Exception:
-            log.exception("this process could not join the mesh anew as a whole")
+            log.exception("the mesh session could not be reopened")
         finally:
             self._renewing = None
 
     async def _linked(self, fresh: Transport) -> None:
-        # Zenoh tells of no links, but can be asked at no cost.
+        # Zenoh reports no links, but listing them costs nothing.
         tries = round(LINKED / LOOK_EVERY)
         while tries and not set(self.current.peers()) <= {*fresh.peers(), fresh.id()}:
             tries -= 1
             await asyncio.sleep(LOOK_EVERY)
 
     def _all(self) -> list[_Declared]:
-        return [one for _, one in sorted([*self._declared.items(), *self._tokens.items()])]
+        return [declared for _, declared in sorted([*self._declared.items(), *self._tokens.items()])]
 
     def _keep(self, declare: Callable[[Transport], Undeclare]) -> Undeclare:
-        number, one = next(self._numbers), _Other(declare)
-        self._declared[number] = one
-        one.declare(self.current)
+        number, declared = next(self._numbers), _Other(declare)
+        self._declared[number] = declared
+        declared.declare(self.current)
 
         def undeclare() -> None:
             self._declared.pop(number, None)
-            one.close()
+            declared.close()
 
         return undeclare
 
     def _keep_token(self, key_of: Callable[[str], str]) -> Undeclare:
-        one = self._tokens[next(self._numbers)] = _Token(key_of)
-        one.declare(self.current)
-        return one.close
+        token = self._tokens[next(self._numbers)] = _Token(key_of)
+        token.declare(self.current)
+        return token.close
 
     def _owns(self, key: str) -> bool:
-        return any(one.key == key for one in list(self._tokens.values()))
-
-    # The session of now
+        return any(token.key == key for token in list(self._tokens.values()))
 
     def id(self) -> str:
         return self.current.id()
@@ -190,12 +176,10 @@ class RenewableTransport(Transport):
     def tokens(self, key: str, timeout: float, to: Collector) -> None:
         self.current.tokens(key, timeout, to)
 
-    # What is declared, on each session
-
     def queryable(self, key: str, on_query: Callable[[TransportQuery], None]) -> Undeclare:
         def declare(transport: Transport) -> Undeclare:
             def once(query: TransportQuery) -> None:
-                # While there are two sessions a query may come by both.
+                # While there are two sessions a query may arrive on both.
                 if transport is self.current:
                     on_query(query)
                 else:
@@ -212,7 +196,7 @@ class RenewableTransport(Transport):
         return self._keep_token(lambda _session: key)
 
     def own_token(self, key_of: Callable[[str], str]) -> Undeclare:
-        """A token whose key names the session that it is declared on."""
+        """A token whose key names the session that declares it."""
         return self._keep_token(key_of)
 
     def ring(self, key: str, depth: int) -> tuple[Callable[[], tuple[str, bytes] | None], Undeclare]:
@@ -226,7 +210,7 @@ class RenewableTransport(Transport):
         undeclare = self._keep(declare)
 
         def take() -> tuple[str, bytes] | None:
-            # What the old session still had comes first.
+            # First drain the old session.
             while len(taking) > 1:
                 if (found := taking[0]()) is not None:
                     return found
@@ -245,7 +229,7 @@ class RenewableTransport(Transport):
 
 
 class _Declared:
-    """One declaration: on the session of now, and on the one before until that is closed."""
+    """One declaration: on the present session, and on the former until that is closed."""
 
     def __init__(self) -> None:
         self._undeclare: list[Undeclare] = []
@@ -260,9 +244,8 @@ class _Declared:
 
     def close(self) -> None:
         self._closed = True
-        undeclare, self._undeclare = self._undeclare, []
-        for one in undeclare:
-            one()
+        while self._undeclare:
+            self._undeclare.pop(0)()
 
     def _on(self, transport: Transport) -> Undeclare:
         raise NotImplementedError
@@ -278,7 +261,7 @@ class _Other(_Declared):
 
 
 class _Token(_Declared):
-    """`key_of` gives its key on a session of that id."""
+    """`key_of` returns the key for a session id."""
 
     def __init__(self, key_of: Callable[[str], str]) -> None:
         super().__init__()
@@ -319,15 +302,14 @@ class _RenewablePublisher(TransportPublisher):
 
 
 class _TokenView:
-    """The tokens on a key as their watcher knows them: of a new session only differences are told."""
+    """The tokens on a key as their watcher knows them: a new session reports differences only."""
 
     def __init__(self, key: str, on_token: OnToken, owns: Callable[[str], bool]) -> None:
         self._key, self._on_token, self._owns = key, on_token, owns
         self._session = 0
-        # A token that dies as it is looked through may be told of in the same thread.
+        # A token that dies during the iteration may be reported on the same thread.
         self._lock = threading.RLock()
-        self._alive: dict[str, int] = {}
-        """By token: the last session that showed it."""
+        self._alive: dict[str, int] = {}  # the last session that showed each token
 
     def declare(self, transport: Transport) -> Undeclare:
         self._session += 1
@@ -335,9 +317,9 @@ class _TokenView:
 
         def on_token(token: str, alive: bool) -> None:
             with self._lock:
-                if session != self._session:  # of the old one, which is to be closed
+                if session != self._session:  # of the old session, which closes soon
                     return
-                # Zenoh tells a session that its own token is gone, where the same one on another session is.
+                # Zenoh reports a session's own token gone while the same token lives on another session.
                 if not alive and self._owns(token):
                     return
                 known = token in self._alive
@@ -354,7 +336,7 @@ class _TokenView:
         return undeclare
 
     def _forget(self, session: int) -> None:
-        """What the new session has not shown by now is gone."""
+        """Report tokens that the new session has not shown as gone."""
         with self._lock:
             for token in [token for token, shown in self._alive.items() if shown < session]:
                 del self._alive[token]

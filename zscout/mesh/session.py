@@ -1,7 +1,7 @@
 """A process's place on the mesh: JSON messages over a transport, and one event loop for all handlers.
 
-What arrives on Zenoh's threads goes through one bounded inbox into the event loop, in the order in which it came, with
-one wake-up for a burst. Handlers are plain functions that run there and must not block."""
+Items from Zenoh's threads pass one bounded inbox into the event loop, in order, with one wake-up per burst. Handlers
+are plain functions that run there and must not block."""
 
 from __future__ import annotations
 
@@ -40,23 +40,17 @@ from zscout.types import Ns
 
 log = logging.getLogger(__name__)
 
-INBOX_DEPTH = 20_000
-"""Items of all kinds that may wait for the event loop."""
-BURST = 256
-"""Items that are handled in one go at most, those included that arrive meanwhile."""
+INBOX_DEPTH = 20_000  # items of all kinds that may wait for the event loop
+BURST = 256  # items handled in a row at most
 RING_DEPTH = 32
-"""Publications that `poll_latest` keeps."""
-LINK_PERIOD = 1.0
-"""Seconds between two looks at whether each linked session shows what it has declared."""
-MAX_SESSIONS = 4_096
-"""Sessions that are remembered."""
-FINAL_SLACK = 0.5
-"""Seconds after its timeout at which a query is over though the transport has not reported that."""
+LINK_PERIOD = 1.0  # seconds between two checks that each linked session shows its declarations
+MAX_SESSIONS = 4_096  # sessions remembered
+FINAL_SLACK = 0.5  # seconds after its timeout at which a query ends without the transport's report
 
 _Subscription: TypeAlias = tuple[Backlog, list[Callable[[str, Any], None]], Undeclare]
-"""One whose publications are decoded once for all handlers of this process."""
+"""Decoded once for all handlers."""
 OnReply: TypeAlias = Callable[[str, bytes, bool], bool]
-"""Called with a reply's key, payload, and whether it is a message; returns whether that is enough."""
+"""Takes key, payload, is message; returns True if that is enough."""
 
 S = TypeVar("S")
 R = TypeVar("R")
@@ -64,30 +58,28 @@ R = TypeVar("R")
 
 @dataclass(slots=True)
 class Inbox:
-    """From Zenoh's threads into the event loop, waking it once for whatever has gathered."""
+    """Carries calls from Zenoh's threads into the event loop, with one wake-up per burst."""
 
     loop: asyncio.AbstractEventLoop
     items: deque[tuple[Backlog | None, Callable[..., None], tuple[Any, ...]]] = field(default_factory=deque)
     scheduled: bool = False
     closed: bool = False
-    after: list[Callable[[], None]] | None = None
-    """What is called once the present burst has been handled; None: there is none at present."""
+    after: list[Callable[[], None]] | None = None  # called after the present burst; None: outside a burst
 
     def offer(self, state: Backlog, call: Callable[..., None], *args: Any) -> bool:
-        """Calls `call(*args)` in the event loop, unless too much waits there: whether it will."""
+        """Call `call(*args)` in the event loop; return False if too much waits."""
         if self.closed or len(self.items) >= INBOX_DEPTH or state.pending >= state.depth:
             return False
         state.pending += 1
         return self._put(state, call, args)
 
     def deliver(self, call: Callable[..., None], *args: Any) -> None:
-        """The same of what must not be lost, such as deaths and ends of queries. Of these there are as many
-        as there are processes and own queries."""
+        """Like `offer`, for what must not be lost, such as deaths and ends of queries; their number is bounded."""
         if not self.closed:
             self._put(None, call, args)
 
     def close(self) -> None:
-        """Nothing is called any more, what waits included."""
+        """Drop all calls, waiting ones included."""
         self.closed = True
         self.items.clear()
 
@@ -117,7 +109,7 @@ class Inbox:
                 guarded(then)
         finally:
             self.after = None
-            # In this order: a thread that offers something now either sees that nobody is coming, or is seen.
+            # In this order, another thread sees the flag cleared, or its item is seen here.
             self.scheduled = False
             if self.items and not self.closed:
                 self.scheduled = True
@@ -125,7 +117,7 @@ class Inbox:
 
 
 def guarded(call: Callable[..., None], *args: Any) -> None:
-    """Calls a handler; what it raises is logged, if it was not yet."""
+    """Call a handler; log what it raises."""
     try:
         call(*args)
     except Refused:  # by a supervised handler: it is logged there
@@ -141,19 +133,16 @@ class Mesh:
 
     Declare once per purpose, never per request: Zenoh keeps memory for every key that was ever declared."""
 
-    validity: Validity | None = None
-    """Of this process's certificate as it is now; None on a plain mesh."""
+    validity: Validity | None = None  # of this process's present certificate; None on a plain mesh
 
     def __init__(self, transport: RenewableTransport, keys: Keys, me: Sender, now: Callable[[], Ns]) -> None:
-        self.keys, self.me, self.now = keys, me, now
-        """`now()` is in nanoseconds on this host's monotonic clock. Not comparable between hosts."""
+        self.keys, self.me, self.now = keys, me, now  # `now()`: ns on this host's monotonic clock
         self.suspicions = Suspicions(now, transport.renew)
         self._transport = transport
         self._strange = SparseLog(log, now)
         self._inbox = Inbox(asyncio.get_running_loop())
         self._shared: dict[tuple[Any, ...], _Subscription] = {}
-        self._kept: list[object] = []
-        """What lives as long as this place."""
+        self._kept: list[object] = []  # objects that live as long as this mesh
 
     async def __aenter__(self) -> Self:
         return self
@@ -162,29 +151,27 @@ class Mesh:
         await self.close()
 
     def links(self) -> int:
-        """How many peers this process is linked to."""
+        """Links to peers."""
         return self._transport.links()
 
     def relays(self) -> int:
-        """How many of those are relays."""
+        """Links to relays."""
         return self._transport.relays()
 
     async def close(self) -> None:
-        """Leaves the mesh: tokens die, and no handler is called any more. Bounded in time."""
+        """Leave the mesh: tokens die, and no handler is called afterwards. Bounded in time."""
         self._inbox.close()
         await self._transport.close()
 
     def admit(self, members: Iterable[FleetMember]) -> None:
-        """From now on these are let in, with their rights, and nobody else. A mesh without certificates lets in all."""
+        """Replace the members that are admitted, with their rights. A mesh without certificates admits all."""
 
     def after_burst(self, then: Callable[[], None]) -> None:
-        """Calls `then` once all that has arrived together is handled: at once, where nothing arrives."""
+        """Call `then` after the present burst; at once outside a burst."""
         if self._inbox.after is None:
             then()
         else:
             self._inbox.after.append(then)
-
-    # Queries
 
     async def ask(
         self,
@@ -196,10 +183,9 @@ class Mesh:
         enough: Callable[[Reply[R]], bool] | None = None,
         limit: int = messages.MAX_STATE,
     ) -> list[Reply[R]]:
-        """Queries all who serve `key`, and returns the replies that came within `timeout` seconds.
+        """Query all servers of `key`; return the replies that came within `timeout` seconds, or until one is `enough`.
 
-        Returns as soon as a reply is `enough`. No reply at all means that the outcome is unknown: the query
-        may have been carried out or not. Raises MeshError where the query can't be sent."""
+        Without a reply the query may have been carried out, or not. Raises MeshError if it can't be sent."""
         replies: list[Reply[R]] = []
 
         def on_reply(of: str, payload: bytes, ok: bool) -> bool:
@@ -220,7 +206,7 @@ class Mesh:
     def ask_then(
         self, key: str, message: Struct, kind: type[R], then: Callable[[Reply[R] | None], None], *, timeout: float
     ) -> None:
-        """Queries, and calls `then` once with the first reply or None: cheaper than a task that waits."""
+        """Query, and call `then` once with the first reply or None: cheaper than a task that waits."""
         first: Reply[R] | None = None
 
         def on_reply(of: str, payload: bytes, ok: bool) -> bool:
@@ -231,7 +217,7 @@ class Mesh:
         self._get(key, message, timeout, _Collector(self._inbox, on_reply, lambda: then(first)))
 
     def _read_reply(self, key: str, payload: bytes, ok: bool, kind: type[R], limit: int) -> Reply[R] | None:
-        """`key` is the answer's, or the question's where a problem has none."""
+        """`key` is the answer's, or the question's for a problem without a key."""
         now = self.now()
         try:
             if ok:
@@ -248,7 +234,7 @@ class Mesh:
         self._transport.get(key, payload, None if message is None else type(message), timeout, to)
 
     async def _all(self, query: Callable[[Collector], None], on_reply: OnReply, timeout: float) -> None:
-        """Makes a query, and returns when it is over, or when `on_reply` says that it is enough."""
+        """Query, and return when the query ends or `on_reply` returns True."""
         loop = self._inbox.loop
         done: asyncio.Future[None] = loop.create_future()  # not an Event: this is the way of every request
 
@@ -273,12 +259,10 @@ class Mesh:
         limit: int = messages.MAX_PAYLOAD,
         tally: Tally | None = None,
     ) -> Declaration:
-        """Calls `handler` for queries on `key` whose message is of `kind`. `tally` counts how they end.
+        """Call `handler` for queries on `key` with a message of `kind`; `tally` counts how they end.
 
-        A payload that is not one is refused before the handler sees it, with code `malformed`; a query whose
-        own key holds a wildcard is answered on `key` itself where that is concrete, and refused otherwise;
-        with `depth` queries waiting for the event loop, or half as many of one host where the key names its sender,
-        further ones are refused as `busy`, undecoded."""
+        Refused undecoded: wildcard keys (answered on `key` if that is concrete), and, as `busy`, queries beyond `depth`
+        waiting, or half of it from one host if the key names its sender. Bad payloads are `malformed`."""
         state = Backlog(depth=depth)
         wild, names_sender = "*" in key, key.endswith("/*/*")
         shares = HostShares(depth // 2)
@@ -304,7 +288,7 @@ class Mesh:
             if host:
                 shares.leave(host)
             if state.closed:
-                # Unless it is dropped here and now, its sender waits for the whole of its timeout.
+                # Unless it is dropped now, its sender waits for the whole timeout.
                 query.drop()
                 return
             if wild and "*" in asked:
@@ -331,15 +315,12 @@ class Mesh:
 
         return Declaration(self._transport.queryable(key, on_query), state)
 
-    # Publications
-
     def publisher(self, key: str, kind: type, *, data: bool = False) -> Publisher:
-        """A publisher for control messages, which block rather than get lost; with `data` they are dropped
-        rather than wait, and yield to control."""
+        """A publisher for control messages, which block rather than get lost; `data` is dropped, and yields."""
         return Publisher(self._transport.publisher(key, kind, Quality.DATA if data else Quality.CONTROL))
 
     def put(self, key: str, message: Struct) -> None:
-        """Publishes one control message without a declaration: for keys of which there are many."""
+        """Publish one control message without a declaration: for keys of which there are many."""
         self._transport.put(key, messages.encode(message), type(message))
 
     def subscribe(
@@ -351,10 +332,8 @@ class Mesh:
         depth: int = QUEUE_DEPTH,
         limit: int = messages.MAX_STATE,
     ) -> Declaration:
-        """Calls `handler(key, message)` for every publication on `key`; malformed ones are logged, those that
-        find `depth` waiting are dropped, and counted as missed.
-
-        All subscriptions that are alike share one declaration and one decoding of each message."""
+        """Call `handler(key, message)` for every publication on `key`. Malformed ones are logged; those beyond `depth`
+        are dropped and counted as missed. Equal subscriptions share one declaration and decoding."""
         alike = (key, kind, depth, limit)
         if alike not in self._shared:
             self._shared[alike] = self._subscribe(key, kind, depth, limit)
@@ -396,7 +375,7 @@ class Mesh:
             self._strange.warning(name, "ignored what came under a bad name: %s", error)
 
     def poll_latest(self, key: str, kind: type[S], *, depth: int = RING_DEPTH) -> PolledSubscription[S]:
-        """Keeps the latest `depth` publications on `key`, without waking the event loop, until they are taken."""
+        """Keep the latest `depth` publications on `key` until they are taken, without waking the event loop."""
         return PolledSubscription(*self._transport.ring(key, depth), kind, depth)
 
     def frame_publisher(self, key: str) -> FramePublisher:
@@ -404,18 +383,15 @@ class Mesh:
         return FramePublisher(self._transport.publisher(key, None, Quality.FRAME), self._inbox.deliver)
 
     def frames(self, key: str) -> FrameWatch:
-        """The newest frame on `key`, to be taken as often as the caller can. Close it."""
+        """The newest frame on `key`, taken as often as the caller can. Close it."""
         return FrameWatch(self._transport, key, self._inbox.deliver, self.now)
 
-    # Liveliness
-
     def alive(self, token: Token) -> Declaration:
-        """Declares the liveliness token: it lives until the declaration is closed or this process is gone."""
+        """Declare the liveliness token until the declaration is closed or this process ends."""
         return Declaration(self._transport.token(self.keys.alive(token)))
 
     def watch(self, key: str, handler: Callable[[Token, bool], None]) -> Declaration:
-        """Subscribes to liveliness: calls `handler(token, alive)` for each token on `key` that comes or
-        goes, and for those that live already."""
+        """Call `handler(token, alive)` for each token on `key` that lives, appears or disappears."""
         state = Backlog()
 
         def handle(text: str, alive: bool) -> None:
@@ -426,7 +402,7 @@ class Mesh:
         return Declaration(self._transport.token_subscriber(key, deliver), state)
 
     async def living(self, key: str, *, timeout: float) -> list[Token]:
-        """Queries liveliness once: the tokens on `key` that live now, sorted."""
+        """The tokens on `key` that live now, sorted."""
         found: set[str] = set()
 
         def on_reply(text: str, *_: object) -> bool:
@@ -437,9 +413,8 @@ class Mesh:
         return sorted(token for token in map(self._token_of, found) if token is not None)
 
     def watch_links(self) -> None:
-        """Shows this session by a token that names it, until the mesh is left, and suspects links over which the token
-        of the other's session, seen before, has not come back; unless its program shows another session: it has left
-        that one, which Zenoh may not close. For programs that stay."""
+        """Show this session by a token, until the mesh is left, and suspect links whose session's token disappeared,
+        unless its program shows another session (Zenoh may not close the old one). For programs that stay."""
         name = functools.partial(Token, self.me.host, Role.SESSION, self.me.client)
         own = self._transport.own_token(lambda session: self.keys.alive(name(session)))
         shown: dict[str, tuple[Sender, bool]] = {}
@@ -474,7 +449,7 @@ class Mesh:
 
 
 class _Collector(Collector):
-    """Passes replies to `each` in the event loop, until that returns true. Calls `over` then, or at the end, once."""
+    """Pass replies to `each` in the event loop until it returns True; then, or at the end, call `over` once."""
 
     def __init__(self, inbox: Inbox, each: OnReply, over: Callable[[], None]) -> None:
         self._inbox, self._each, self._over = inbox, each, over

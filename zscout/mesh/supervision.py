@@ -1,5 +1,4 @@
-"""How the work of a process goes: tasks, timers and handlers of a service live and fail together; the host's
-clock; and whether the process stood still."""
+"""Tasks, timers and handlers of a service that live and fail together; the host's clock; stalls of the process."""
 
 from __future__ import annotations
 
@@ -18,14 +17,10 @@ from zscout.types import SECOND, Ns
 
 log = logging.getLogger(__name__)
 
-CLOSE_TIMEOUT = 5.0
-"""Seconds that `close` waits for cancelled tasks."""
-STALL_PERIOD = 0.2
-"""Seconds between two readings of the clock."""
-STALL_THRESHOLD = SECOND // 5
-"""A reading that comes this much too late means a stall."""
-AFTERMATH = SECOND // 4
-"""What comes out of the network this soon after a stall may have waited through it."""
+CLOSE_TIMEOUT = 5.0  # seconds that `close` waits for cancelled tasks
+STALL_PERIOD = 0.2  # seconds between two readings of the clock
+STALL_THRESHOLD = SECOND // 5  # a reading this late (ns) means a stall
+AFTERMATH = SECOND // 4  # arrivals this soon after a stall (ns) may have waited through it
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -34,22 +29,19 @@ T = TypeVar("T")
 class Supervisor:
     """Owns the tasks, timers and guarded handlers of one service.
 
-    The first of them that raises is logged with its traceback, `on_failure(error)` is called, once, and all others are
-    cancelled. Failures after that, of tasks that are being cancelled, are logged only. A supervisor that failed or was
-    cancelled runs nothing any more: a service that starts again takes a new one."""
+    The first that raises is logged with its traceback, `on_failure(error)` is called once, and all others are
+    cancelled. Later failures are logged only. A failed or cancelled supervisor is not reused."""
 
     def __init__(self, name: str, on_failure: Callable[[Exception], object]) -> None:
         self.name = name
         self.error: Exception | None = None
-        """What it failed with."""
         self._on_failure = on_failure
-        self.active = True
-        """Whether it neither failed nor was cancelled."""
+        self.active = True  # false once it failed or was cancelled
         self._tasks: dict[asyncio.Task[Any], None] = {}
         self._timers: WeakSet[asyncio.TimerHandle] = WeakSet()
 
     def spawn(self, coro: Coroutine[Any, Any, T], name: str | None = None) -> asyncio.Task[T]:
-        """Runs `coro` as a task, cancelled before it starts if the supervisor is no longer active."""
+        """Run `coro` as a task, cancelled at once if the supervisor is not active."""
         task = asyncio.create_task(coro, name=f"{self.name}: {name or getattr(coro, '__name__', 'task')}")
         self._tasks[task] = None
         task.add_done_callback(self._done)
@@ -58,7 +50,6 @@ class Supervisor:
         return task
 
     def call_later(self, delay: float, f: Callable[..., object], *args: Any) -> asyncio.TimerHandle:
-        """Calls `f(*args)` in `delay` seconds."""
         handle = asyncio.get_running_loop().call_later(delay, self._call, f, *args)
         if not self.active:
             handle.cancel()
@@ -66,10 +57,8 @@ class Supervisor:
         return handle
 
     def guard(self, f: Callable[P, object]) -> Callable[P, None]:
-        """`f` as a handler for the mesh: it is not called once the supervisor is no longer active, and what
-        it raises is a failure of the service, except for Refused and BadName, which are answers.
-
-        The handler then raises Refused: where it handled a query, that is answered with code `internal`."""
+        """`f` as a handler for the mesh, not called once the supervisor is inactive. Its exceptions fail the service,
+        and raise Refused (code `internal`) to answer a query; Refused and BadName pass through."""
 
         @functools.wraps(f)
         def guarded(*args: P.args, **kwargs: P.kwargs) -> None:
@@ -86,7 +75,7 @@ class Supervisor:
         return guarded
 
     def fail(self, error: Exception) -> None:
-        """Takes `error` for a failure of the service, as though one of its tasks had raised it."""
+        """Fail the service with `error`, as if one of its tasks had raised it."""
         if error is self.error:  # raised on by a task that awaited the one that failed
             return
         log.error("%s failed", self.name, exc_info=error)
@@ -101,18 +90,17 @@ class Supervisor:
             self.cancel()
 
     def cancel(self) -> None:
-        """Cancels all tasks and timers, without waiting for them."""
+        """Cancel all tasks and timers, without waiting for them."""
         self.active = False
         for handle in tuple(self._timers):
             handle.cancel()
         for task in tuple(self._tasks):
-            # Asked by its loop, which may have stopped.
+            # Its loop may have stopped.
             if task is not asyncio.current_task(task.get_loop()):
                 task.cancel()
 
     async def close(self) -> None:
-        """Cancels all, and returns when all tasks have ended, but for the one that calls; after CLOSE_TIMEOUT
-        those that still run are logged."""
+        """Cancel all, and wait for all tasks but the calling one; log the rest after CLOSE_TIMEOUT."""
         self.cancel()
         tasks = self._tasks.keys() - {asyncio.current_task()}
         if tasks:
@@ -134,15 +122,14 @@ class Supervisor:
 
 @asynccontextmanager
 async def supervised(name: str) -> AsyncIterator[Supervisor]:
-    """A supervisor for the body of an `async with`, closed at its end: when something that it runs fails, the
-    body is cancelled, and that error raised."""
+    """A supervisor for the body of an `async with`: a failure cancels the body, and is raised at its end."""
     body = asyncio.current_task()
     assert body is not None  # noqa: S101 - nothing but a task runs here
     supervisor = Supervisor(name, lambda _error: body.cancel())
     try:
         yield supervisor
     except asyncio.CancelledError:
-        # As asyncio.timeout does it: a cancellation from outside that came as well is not swallowed.
+        # As in asyncio.timeout: a simultaneous cancellation from outside is not swallowed.
         if supervisor.error is not None and body.uncancel() == 0:
             raise supervisor.error from None
         raise
@@ -151,7 +138,7 @@ async def supervised(name: str) -> AsyncIterator[Supervisor]:
 
 
 async def done_within(seconds: float | None, work: Awaitable[object]) -> bool:
-    """Waits for `work`, at most so long, and cancels it then; whether it was done."""
+    """Await `work`, and cancel it after `seconds`; return True if it finished."""
     try:
         async with asyncio.timeout(seconds) as limit:
             await work
@@ -163,7 +150,7 @@ async def done_within(seconds: float | None, work: Awaitable[object]) -> bool:
 
 
 class HostClock:
-    """Monotonic, and it goes on while the machine is suspended. Not comparable between hosts."""
+    """Monotonic, also while the machine is suspended. Not comparable between hosts."""
 
     def now(self) -> Ns:
         """Nanoseconds since boot."""
@@ -174,8 +161,7 @@ clock: Final = HostClock()
 
 
 class StallWatch:
-    """The last stall of this process, stopped, suspended or starved, on the clock `now`: how long it was, and
-    when it ended. One watch per process."""
+    """Last stall of this process (stopped, suspended or starved) by the clock `now`. One watch per process."""
 
     def __init__(self, now: Callable[[], Ns]) -> None:
         self.length: Ns = 0
@@ -194,7 +180,7 @@ class StallWatch:
             self._timer.cancel()
 
     def check(self) -> None:
-        """Records a stall that has just ended."""
+        """Record a stall that has just ended."""
         now = self._now()
         gap = now - self._last - round(STALL_PERIOD * SECOND)
         if gap > STALL_THRESHOLD:
@@ -203,12 +189,12 @@ class StallWatch:
         self._last = now
 
     def waited_through(self, arrived: Ns) -> Ns:
-        """How long something may have waited in the network that came out of it at `arrived`."""
+        """How long an item that left the network at `arrived` may have waited there."""
         self.check()
         return self.length if self.length and arrived <= self.ended + AFTERMATH else 0
 
     def fresh(self) -> bool:
-        """Whether a stall ended so lately that what came meanwhile may not have been handled yet."""
+        """Return True if a stall ended so recently that arrivals during it may not have been handled."""
         self.check()
         return bool(self.length) and self._now() - self.ended <= AFTERMATH
 

@@ -1,4 +1,4 @@
-"""Which terms others have promised, for who knows too little to believe one of the last (`messages.LAST_TERMS`)."""
+"""Terms promised elsewhere, for processes that know too little to believe one of the last (`messages.LAST_TERMS`)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from zscout.types import NO_TERM, Term
 
 
 class LastTerms:
-    """Asks others, once at a time, when one of the last terms is shown; tells `believe` the highest that they say."""
+    """Queries others, once at a time, when one of the last terms appears; `believe` gets the highest reported."""
 
     def __init__(
         self, mesh: Mesh, supervisor: Supervisor, believe: Callable[[Term], object], *, timeout: float
@@ -22,7 +22,7 @@ class LastTerms:
         self._asking: asyncio.Task[None] | None = None
 
     def shown(self, term: Term, known: Term) -> bool:
-        """Whether `term` is one of the last, which nobody who knows `known` believes of one alone: others are asked."""
+        """Return True if `term` is one of the last, incredible after `known` without a second source: query others."""
         if not of_the_last(term, known):
             return False
         if self._asking is None or self._asking.done():
@@ -34,8 +34,8 @@ class LastTerms:
 
 
 async def promised_elsewhere(mesh: Mesh, *, timeout: float) -> Term:
-    """The highest term that RCs and clients have promised, or an RCM leads in, of those whose tokens are seen. Where
-    one seems to say two things the lower counts: whoever speaks in its name can only make less of its word."""
+    """The highest term promised by RCs and clients, or led in by an RCM, whose tokens are alive. Of contradicting
+    replies of one witness the lower counts, so an impostor can only lower it."""
     keys = mesh.keys
     tokens, rcs, clients, leaders = await asyncio.gather(
         mesh.living(keys.alive_any(), timeout=timeout),
@@ -44,7 +44,7 @@ async def promised_elsewhere(mesh: Mesh, *, timeout: float) -> Term:
         mesh.ask(keys.rcm_state, StateAsk(holds_only=True), RcmState, timeout=timeout),
     )
     seen = {key for token in tokens if (key := _key_of(mesh, token)) is not None}
-    # A leader's instance is of one term: it is witness to itself.
+    # A leader's instance has one term: it vouches for itself.
     seen |= {token.instance for token in tokens if token.role == Role.RCM}
     said = [(reply.key, reply.message.term) for reply in rcs if reply.message is not None]
     said += [(reply.key, reply.message.term) for reply in clients if reply.message is not None]
@@ -57,7 +57,7 @@ async def promised_elsewhere(mesh: Mesh, *, timeout: float) -> Term:
 
 
 def _key_of(mesh: Mesh, token: Token) -> str | None:
-    """Where who has this token answers for itself."""
+    """The key on which the owner of `token` answers."""
     try:
         if token.role == Role.RC:
             return mesh.keys.rc_state(token.name)

@@ -1,6 +1,4 @@
-"""What a mesh needs of the network below it: bytes by key.
-
-Callbacks may come on any thread, and must not block."""
+"""The network below a mesh: bytes by key. Callbacks may come on any thread, and must not block."""
 
 from __future__ import annotations
 
@@ -8,18 +6,14 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Protocol, TypeAlias
 
-OnSample: TypeAlias = Callable[[str, bytes, bytes | None], None]
-"""Called with key, payload and attachment."""
+OnSample: TypeAlias = Callable[[str, bytes, bytes | None], None]  # called with key, payload and attachment
 Undeclare: TypeAlias = Callable[[], None]
 
 
 class Quality(Enum):
-    CONTROL = "control"
-    """Waits for a peer that does not read."""
-    DATA = "data"
-    """Is dropped rather than wait, and yields to control."""
-    FRAME = "frame"
-    """JPEG frames, likewise."""
+    CONTROL = "control"  # blocks while a peer does not read
+    DATA = "data"  # dropped rather than wait; yields to control
+    FRAME = "frame"  # JPEG frames, dropped alike
 
 
 class Collector(Protocol):
@@ -32,7 +26,7 @@ class Collector(Protocol):
 
 
 class TransportQuery(Protocol):
-    """A query that arrived. Each of the methods ends it: one that is kept makes its sender wait."""
+    """A query that arrived. Each method ends it; an unended query keeps its sender waiting."""
 
     @property
     def key(self) -> str: ...
@@ -47,38 +41,38 @@ class TransportPublisher(Protocol):
     def put(self, payload: bytes, attachment: bytes | None = None) -> None: ...
 
     def match(self, on_matching: Callable[[bool], None]) -> bool:
-        """Calls back whenever subscribers appear or are gone; returns whether there are any now."""
+        """Call back whenever subscribers appear or disappear; return True if there are any now."""
 
     def undeclare(self) -> None: ...
 
 
 class Transport(Protocol):
-    """A session on the network. What can't be sent is logged, but for queries, which raise MeshError."""
+    """A session on the network. Failures to send are logged; queries raise MeshError."""
 
     def id(self) -> str:
-        """Of this session, as the network tells it to others."""
+        """The session id that the network shows to others."""
 
     def peers(self) -> list[str]:
-        """The ids of the sessions that this one is linked to."""
+        """Ids of the linked sessions."""
 
     def links(self) -> int: ...
     def relays(self) -> int: ...
     async def close(self) -> None: ...
 
     def get(self, key: str, payload: bytes | None, kind: type | None, timeout: float, to: Collector) -> None:
-        """Queries all that serve `key`; it is over after `timeout` seconds at the latest."""
+        """Query all servers of `key`; ends after `timeout` seconds at the latest."""
 
     def queryable(self, key: str, on_query: Callable[[TransportQuery], None]) -> Undeclare: ...
     def publisher(self, key: str, kind: type | None, quality: Quality) -> TransportPublisher: ...
     def put(self, key: str, payload: bytes, kind: type) -> None: ...
     def subscriber(self, key: str, on_sample: OnSample) -> Undeclare:
-        """Of deletes, and of publications on keys with a wildcard, nothing is heard, here and by `ring`."""
+        """Skips deletes, and publications on keys with a wildcard; so does `ring`."""
 
     def ring(self, key: str, depth: int) -> tuple[Callable[[], tuple[str, bytes] | None], Undeclare]:
-        """Keeps the latest `depth` publications; returns what takes the oldest of them."""
+        """Keep the latest `depth` publications; the first function returned takes the oldest."""
 
     def token(self, key: str) -> Undeclare: ...
     def token_subscriber(self, key: str, on_token: Callable[[str, bool], None]) -> Undeclare: ...
 
     def tokens(self, key: str, timeout: float, to: Collector) -> None:
-        """The tokens that live, as keys of replies."""
+        """Living tokens, as keys of replies."""

@@ -1,4 +1,4 @@
-"""The mesh over Zenoh: its settings, with every trap taken into account, and a session as a transport."""
+"""The mesh over Zenoh: its settings, and a session as a transport."""
 
 from __future__ import annotations
 
@@ -34,12 +34,10 @@ from zscout.mesh.transport import Collector, OnSample, Quality, Transport, Trans
 
 log = logging.getLogger(__name__)
 
-CONTROL_BATCHES = 8
-"""Control messages under way to one peer: with fewer, an answer waits until the message before it is out."""
+CONTROL_BATCHES = 8  # control messages in flight per peer: with fewer, an answer waits for the message before it
 SCOUTING_DELAY_MS = 200
 GREATER_CONNECTS = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
-CLOSE_TIMEOUT = 3.0
-"""Seconds that closing a session may take."""
+CLOSE_TIMEOUT = 3.0  # seconds that closing a session may take
 BLOCK, DROP = zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
 CONTROL: Any = {"congestion_control": BLOCK, "priority": zenoh.Priority.INTERACTIVE_HIGH, "express": True}
 QUALITIES: dict[Quality, dict[str, Any]] = {
@@ -48,27 +46,22 @@ QUALITIES: dict[Quality, dict[str, Any]] = {
     Quality.FRAME: {"congestion_control": DROP, "priority": zenoh.Priority.DATA, "express": True},
 }
 QUERY: Any = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE, **CONTROL}
-MAX_QUERIERS = 256
-"""Of one session: what is declared for a key is never given back."""
-MAX_MESSAGE = 17_000_000
-"""Bytes: a little more than any message of zscout's has."""
-LOOK_AT_CERTIFICATES = 2.0
-"""Seconds from one look at whether they were renewed to the next."""
+MAX_QUERIERS = 256  # per session: Zenoh never frees a key's declaration
+MAX_MESSAGE = 17_000_000  # bytes: a little more than zscout's largest message
+LOOK_AT_CERTIFICATES = 2.0  # seconds between two checks for renewed certificates
 ANY_TLS = "tls/0.0.0.0:0"
 T = TypeVar("T")
 _PORT = re.compile(r":\d+$")
 
 
 class Security(NamedTuple):
-    """What makes a session one of a closed fleet."""
-
     certificates: Certificates
     keys: Keys
     members: tuple[FleetMember, ...]
 
 
 def zenoh_config(config: MeshConfig, security: Security | None = None) -> zenoh.Config:
-    """The Zenoh settings behind a `[mesh]` table, for one session."""
+    """The Zenoh settings for a `[mesh]` table, for one session."""
     settings: dict[str, Any] = {
         "mode": "router" if config.relay else "peer",
         "id": increasing_id(),
@@ -76,15 +69,14 @@ def zenoh_config(config: MeshConfig, security: Security | None = None) -> zenoh.
         "scouting/multicast/address": config.multicast_address,
         "scouting/multicast/interface": config.interface,
         "scouting/delay": SCOUTING_DELAY_MS,
-        # Of two peers always the same one makes their link, and there is one, not two (docs/zenoh.md).
+        # Of two peers always the same one makes the only link (docs/zenoh.md).
         "scouting/multicast/autoconnect_strategy": GREATER_CONNECTS,
         "scouting/gossip/autoconnect_strategy": GREATER_CONNECTS,
         "transport/link/tx/lease": round(config.lease * 1000),
-        # A peer is given up no sooner for not reading than for being silent: on a host that stalls, or is short of
-        # processor time, Zenoh's own sending threads stand still as well, and any burst would cost a sound link.
+        # As for silence: on a busy host Zenoh's sending threads stall too, and any burst would cost a sound link.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(config.lease * 1_000_000),
         "transport/link/tx/queue/size": {"interactive_high": CONTROL_BATCHES},
-        # What is greater is not read to its end: whoever sends it would fill this process's memory.
+        # Larger messages are cut off: a sender could fill this process's memory.
         "transport/link/rx/max_message_size": MAX_MESSAGE,
         "transport/shared_memory/enabled": False,
         "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 1.5},
@@ -109,10 +101,10 @@ def zenoh_config(config: MeshConfig, security: Security | None = None) -> zenoh.
 
 
 def _closed(security: Security) -> dict[str, Any]:
-    """That only members of the fleet are let in, and what each may send. Each of these is needed."""
+    """Settings that admit members of the fleet alone, and limit what each may send. Each is needed."""
     own = security.certificates
     return {
-        # Else a peer dials whoever is announced at an address without TLS, and talks to it.
+        # Otherwise a peer links to announced addresses without TLS.
         "transport/link/protocols": ["tls"],
         "transport/link/tls": {
             "root_ca_certificate": str(own.ca),
@@ -121,9 +113,9 @@ def _closed(security: Security) -> dict[str, Any]:
             "connect_private_key": str(own.key),
             "connect_certificate": str(own.cert),
             "enable_mtls": True,
-            # A name stands for a machine or a person, not for an address: the rules below go by it.
+            # A name means a machine or a person, not an address; the rules below use it.
             "verify_name_on_connect": False,
-            # A link that was good when it was made stays: certificates are renewed in place.
+            # Links outlive the certificate they began with: certificates are renewed in place.
             "close_link_on_expiration": False,
         },
         "access_control": access_control(security.keys, security.members),
@@ -132,30 +124,24 @@ def _closed(security: Security) -> dict[str, Any]:
 
 @dataclass(slots=True)
 class _Door:
-    """By what the next session of a process is opened."""
-
     security: Security | None
 
 
 class ZenohMesh(Mesh):
-    """The mesh over a Zenoh session of this process."""
-
     _door: _Door
     _watching: asyncio.Task[NoReturn] | None = None
 
     @classmethod
     async def open(cls, fleet: Fleet, me: Sender) -> Self:
-        """Joins the mesh of `fleet`. Raises MeshError where an address can't be had, BadInput for certificates that are
-        none or another's."""
+        """Join the mesh of `fleet`. Raises MeshError if an address can't be had, BadInput for bad certificates."""
         config, keys = fleet.mesh, Keys(fleet.name, closed=fleet.security is not None)
         security = None if fleet.security is None else _security(fleet, keys, me)
         door = _Door(security)
         openings = [lambda: _open(config, door.security)]
         if config.listen:
-            # Its addresses are to be had again once the session that listens there is closed. Until then one on other
-            # ports hears from that session who else is there.
-            own = tuple(one.replace("0.0.0.0", "127.0.0.1").replace("[::]", "[::1]") for one in config.listen)  # noqa: S104
-            ports = tuple(_PORT.sub(":0", one) for one in config.listen)
+            # Until the old session frees its ports, one on other ports learns the peers from it.
+            own = tuple(at.replace("0.0.0.0", "127.0.0.1").replace("[::]", "[::1]") for at in config.listen)  # noqa: S104
+            ports = tuple(_PORT.sub(":0", at) for at in config.listen)
             beside = replace(config, listen=ports, connect=(*config.connect, *own))
             openings.insert(0, lambda: _open(beside, door.security))
         mesh = cls(RenewableTransport(await _open(config, security), openings), keys, me, clock.now)
@@ -171,8 +157,7 @@ class ZenohMesh(Mesh):
         await super().close()
 
     async def _watch_certificates(self, known: Certificates) -> NoReturn:
-        """Joins anew when they were renewed: a session that listens goes on showing what it was opened with, and who
-        comes when that has ended would not link to it. Says when an end is near."""
+        """Warn before certificates end, and reopen the session once renewed: it keeps those it was opened with."""
         told: str | None = None
         warned = ""
         while True:
@@ -188,7 +173,7 @@ class ZenohMesh(Mesh):
                 continue
             told = None
             if fresh.ends != known.ends:
-                log.info("%s was renewed: this process joins the mesh anew", fresh.cert)
+                log.info("%s was renewed: reopening the mesh session", fresh.cert)
                 known = self.validity = fresh
                 self._transport.renew()
             if (soon := fresh.expires_soon(datetime.now(UTC))) and soon != warned:
@@ -212,9 +197,8 @@ def _security(fleet: Fleet, keys: Keys, me: Sender) -> Security:
 
 
 def increasing_id() -> str:
-    """The id of a session, greater than those of sessions that began before, so that whoever joins makes the links.
-
-    Zenoh compares ids from the last byte on, and prints them as a number."""
+    """A session id greater than all earlier ones, so that the newcomer makes the links. Zenoh compares ids
+    from the last byte on, and prints them as a number."""
     return f"1{secrets.token_hex(9)}0{time.time_ns().to_bytes(8, 'little').hex()[4:]}"
 
 
@@ -223,7 +207,7 @@ async def _open(config: MeshConfig, security: Security | None) -> Transport:
     try:
         session = await asyncio.wrap_future(opening)
     except asyncio.CancelledError:
-        # In a thread of its own: this may be the event loop's.
+        # In a thread: this may be the event loop's.
         opening.add_done_callback(
             lambda opened: opened.exception() or in_thread("closes the mesh", opened.result().close)
         )
@@ -231,7 +215,7 @@ async def _open(config: MeshConfig, security: Security | None) -> Transport:
     except zenoh.ZError as error:
         raise MeshError(f"the mesh can't be joined: {error}; check listen and connect under [mesh]") from None
     try:
-        # A relay leaves it to its sites, which know where it is.
+        # A relay leaves relinking to its sites, which know its address.
         relinks = config.multicast and not config.relay
         return ZenohTransport(session, _relinking(session, config, security) if relinks else None)
     except BaseException:
@@ -250,7 +234,7 @@ def _relinking(session: zenoh.Session, config: MeshConfig, security: Security | 
 
 
 def in_thread(name: str, call: Callable[[], T]) -> Future[T]:
-    """Calls in a daemon thread: one of asyncio's own would be joined when the loop ends, however long it takes."""
+    """Call in a daemon thread: asyncio would join its own at the end of the loop, however long that takes."""
     future: Future[T] = Future()
     future.set_running_or_notify_cancel()
 
@@ -265,13 +249,11 @@ def in_thread(name: str, call: Callable[[], T]) -> Future[T]:
 
 
 class ZenohTransport(Transport):
-    # Every callback is direct: it runs on a thread of Zenoh's, where a plain function would get a thread of
-    # its own per declaration and per query.
+    # Callbacks are direct, on Zenoh's threads: a plain function would get its own thread per declaration and query.
 
     def __init__(self, session: zenoh.Session, relinking: Relinking | None = None) -> None:
         self._session, self._relinking = session, relinking
-        self._queriers: dict[tuple[str, float], zenoh.Querier] = {}
-        """By key and timeout."""
+        self._queriers: dict[tuple[str, float], zenoh.Querier] = {}  # by key and timeout
         self._asked_once: dict[tuple[str, float], None] = {}
 
     def id(self) -> str:
@@ -279,7 +261,7 @@ class ZenohTransport(Transport):
 
     def peers(self) -> list[str]:
         linked = (*self._session.info.peers_zid(), *self._session.info.routers_zid())
-        return [one for peer in linked if not (one := str(peer)).startswith(MEETING)]
+        return [zid for zid in map(str, linked) if not zid.startswith(MEETING)]
 
     def links(self) -> int:
         return sum(not str(link.zid).startswith(MEETING) for link in self._session.info.links())
@@ -313,7 +295,7 @@ class ZenohTransport(Transport):
             raise MeshError(f"{key} can't be asked: {error}") from None
 
     def _querier(self, key: str, timeout: float) -> zenoh.Querier | None:
-        """Declared for what is asked a second time, which is quicker from then on; None for others."""
+        """The querier for a key asked before, faster than a get; None for others."""
         asked = key, timeout
         if (known := self._queriers.get(asked)) is not None or "*" in key or len(self._queriers) >= MAX_QUERIERS:
             return known
@@ -365,7 +347,7 @@ class ZenohTransport(Transport):
         return _undeclare(self._session.liveliness().declare_token(key))
 
     def token_subscriber(self, key: str, on_token: Callable[[str, bool], None]) -> Undeclare:
-        callback = _direct(lambda one: on_token(str(one.key_expr), one.kind == zenoh.SampleKind.PUT))
+        callback = _direct(lambda sample: on_token(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT))
         return _undeclare(self._session.liveliness().declare_subscriber(key, callback, history=True))
 
     def tokens(self, key: str, timeout: float, to: Collector) -> None:
@@ -422,7 +404,7 @@ class ZenohPublisher(TransportPublisher):
     def match(self, on_matching: Callable[[bool], None]) -> bool:
         callback = _direct(lambda status: on_matching(bool(status.matching)))
         self._listener = self._publisher.declare_matching_listener(callback)
-        # The package's own types call it a bool; the object it gives is true in either case.
+        # Typed as a bool, but the object it gives is true in either case.
         status: Any = self._publisher.matching_status
         return bool(status.matching)
 
@@ -435,7 +417,7 @@ def _encoding(kind: type | None) -> zenoh.Encoding:
 
 
 def _is_publication(sample: zenoh.Sample) -> bool:
-    """Not a delete, nor of a key with a wildcard, by which one message would pass for everybody's."""
+    """Return True for puts on concrete keys: one on a wildcard would pass for every sender's."""
     return sample.kind == zenoh.SampleKind.PUT and "*" not in str(sample.key_expr)
 
 

@@ -1,1 +1,1 @@
-"""What is in a picture. Pure: pictures in, findings out."""
+"""Perception: pictures in, findings out. Pure."""

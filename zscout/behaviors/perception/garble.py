@@ -1,14 +1,11 @@
-"""Whether a picture may be believed. Pure.
+"""Defects that make a picture unusable. Pure.
 
-Noise is estimated from the second differences along columns: lines of a true picture are alike, and what is
-not smooth in it are a few edges, so the median of their size is the noise (as in Immerkaer, "Fast noise
-variance estimation", 1996). A cheap camera in the dark has up to 27 grey levels of it, a jammed picture 34
-and more, snow some 60: measured in the simulated building at up to three times the usual noise.
+Noise is the median size of second differences along columns, as true pictures have few edges (Immerkaer, "Fast noise
+variance estimation", 1996). A cheap camera in the dark has up to 27 grey levels of it, a jammed picture 34 and more,
+snow about 60: measured in the simulated building at up to three times the usual noise.
 
-Where a receiver has lost its sync, lines stand aside. A line is like the one before where it is; torn from it, it is so
-somewhere else. That is looked for in waves of 11 to 53 columns: shorter ones are mostly noise, and longer ones
-are much alike wherever they stand.
-"""
+Without sync, lines are displaced: each matches the one before at an offset. Offsets are sought in waves of 11 to 53
+columns: shorter ones are mostly noise, longer ones match at any offset."""
 
 from __future__ import annotations
 
@@ -20,24 +17,16 @@ from numpy.typing import NDArray
 
 from zscout.behaviors.perception.lens import COLUMNS, Picture
 
-SNOW: Final = 48.0
-"""Grey levels of noise of a channel without a transmitter."""
-JAMMED: Final = 31.0
-"""Above this nothing can be seen, two transmitters or a very weak one."""
-FLAT: Final = 0.3
-"""Grey levels by which a line varies that holds no picture: no camera is as quiet."""
-CUT: Final = 0.25
-"""Share of such lines that make half a picture."""
+SNOW: Final = 48.0  # grey levels of noise of a channel without a transmitter
+JAMMED: Final = 31.0  # noise of two transmitters, or a very weak one
+FLAT: Final = 0.3  # grey levels by which an empty line varies: every camera has more
+CUT: Final = 0.25  # share of such lines that make half a picture
 ALIKE: Final = 0.52
-"""Correlation of neighbouring lines, wherever they fit best, from which there is enough in a picture to tell by: noise
-alone has up to 0.48."""
-ASIDE: Final = 0.4
-"""By how much less they correlate as they stand, in a picture that is all torn."""
-_NORMAL: Final = 0.674 * 6**0.5
-"""Median size of a second difference of normal noise of standard deviation 1."""
+"""Correlation of neighbouring lines at the best offset, enough to judge: noise alone has up to 0.48."""
+ASIDE: Final = 0.4  # loss of correlation in place, in a picture that is all torn
+_NORMAL: Final = 0.674 * 6**0.5  # median second difference of normal noise of standard deviation 1
 _LONGEST: Final = 3
-_KINDS: Final = 12
-"""Of waves in a line, from this many in it on."""
+_KINDS: Final = 12  # kinds of waves, from _LONGEST per line on
 
 
 def _waves() -> NDArray[np.float32]:
@@ -49,13 +38,13 @@ _WAVES: Final = _waves()
 
 
 def garbled(picture: Picture) -> str | None:
-    """What is wrong with it in one word, or None if it may be believed."""
+    """The defect in one word, or None."""
     noise = noise_of(picture)
     if noise > JAMMED:
         return "snow" if noise > SNOW else "jammed"
     lines = picture
     if noise <= FLAT:
-        # A picture drawn without noise is a picture still; one without anything in it is none.
+        # A picture drawn without noise is valid unless it is empty.
         if np.ptp(picture) < 3:
             return "blank"
         lines = picture[picture.shape[0] // 2 :]
@@ -66,9 +55,9 @@ def garbled(picture: Picture) -> str | None:
 
 
 def noise_of(picture: Picture) -> float:
-    """Standard deviation of the noise in grey levels, by the differences between three lines in a row."""
+    """Standard deviation of the noise in grey levels, from three lines in a row."""
     second = np.abs(np.diff(picture.astype(np.int16), 2, axis=0))
-    # The middle of a histogram: a partition of so many numbers takes four times as long.
+    # The middle of a histogram: partitioning so many numbers takes four times as long.
     counts = cv2.calcHist([second.astype(np.uint16)], [0], None, [1021], [0, 1021]).ravel().cumsum()
     half = float(counts[-1]) / 2
     place = int(np.searchsorted(counts, half))
@@ -78,9 +67,9 @@ def noise_of(picture: Picture) -> float:
 
 
 def _all_torn(picture: Picture) -> bool:
-    """Whether nearly all lines are torn from their neighbours. Few are in any picture of an analog receiver."""
+    """Return True if nearly all lines are torn from their neighbours; any analog receiver tears a few."""
     both = picture.astype(np.float32) @ _WAVES
-    # What is in a line counts by its square root: neither a few bright lines alone nor those of mere noise.
+    # Weighted by square root: neither a few bright lines nor many noisy ones dominate.
     size = np.einsum("ij,ij->i", both, both) ** 0.25
     both /= size[:, None] + 1e-3
     whole = float(size[:-1] @ size[1:]) + 1e-3
@@ -89,7 +78,7 @@ def _all_torn(picture: Picture) -> bool:
     in_place = float(pairs.real.sum()) / whole
     if in_place > 1 - ASIDE:
         return False
-    # Their correlation at every second column aside.
+    # Correlation at every second column of offset.
     spectrum = np.zeros((len(pairs), COLUMNS // 4 + 1), np.complex64)
     spectrum[:, _LONGEST : _LONGEST + _KINDS] = pairs
     anywhere = float(np.fft.irfft(spectrum, axis=1).max(axis=1).sum()) * (COLUMNS / 4) / whole

@@ -1,23 +1,18 @@
-"""Whether something moves in a camera's picture, where, and from when to when. Pure: time and pictures in.
+"""Motion in a camera's pictures: where, and from when to when. Pure: times and pictures in.
 
-    detector, tracker = MotionDetector(), EventTracker()
-    seen = detector.see(time, picture)      # seen.moving, seen.boxes
-    event = tracker.see(time, seen)         # one that is over, or None
-
-A background of running means and variances per pixel (Wren et al., "Pfinder", 1997; the two thresholds are
-Canny's hysteresis), with what a real camera needs beside it:
-
-- Rates are by time, not by picture, so that 2 and 30 pictures a second learn alike.
-- Each picture is first brought to the background's brightness: gain and offset by least squares over blocks,
-  from which those that do not fit are left out. So flicker, exposure and slow light changes move nothing.
-- A pixel counts by how many standard deviations of its own noise it is off, never by grey levels: no tuning.
-- Lines that fit the background when moved aside are torn by the transmission.
+A `MotionDetector` returns a `Seen` per picture, an `EventTracker` turns these into events. A background of running
+means and variances per pixel (Wren et al., "Pfinder", 1997; the two thresholds are Canny's hysteresis), with what a
+real camera needs:
+- Rates are by time, so that 2 and 30 pictures a second learn alike.
+- Each picture is brought to the background's brightness: gain and offset by robust least squares over blocks. So
+flicker, exposure and slow light changes are no motion.
+- A pixel counts by standard deviations of its own noise, never by grey levels: no tuning.
+- Lines that fit the background when displaced are torn by the transmission.
 - A change of most of the picture at once is a switched light or a moved camera: it is learned at once.
-- Something moves once it was seen in two of three pictures, in about the same place; or in one, upright and clear.
+- Motion needs two of three pictures at about the same place, or one that is upright and clear.
 
-What stays is learned as that pixel's noise: whoever stops is no motion any more after a second or two, and
-leaves no ghost behind on leaving. The background itself follows within half a minute.
-"""
+Whatever stays is learned as that pixel's noise: a person who stops is no motion after a second or two, and leaves no
+ghost behind. The background itself follows within half a minute."""
 
 from __future__ import annotations
 
@@ -31,80 +26,54 @@ from numpy.typing import NDArray
 from zscout.behaviors.perception.outline import Mask, Outlines
 from zscout.behaviors.perception.presence import Presence
 
-WIDTH: Final = 160
-"""Columns of the picture that is looked at; larger ones are reduced to it."""
+WIDTH: Final = 160  # columns of the analysed picture; larger ones are reduced to it
 MAX_SIDE: Final = 8_192
-BLOCKS: Final = 20
-"""Blocks across, by which brightness is compared."""
-WHITE: Final = 240.0
-"""Grey levels from which noise may be cut off at the top, and so a pixel does not follow the light as others do."""
-LEARN: Final = 6.0
-"""Seconds in which the background follows what is no motion."""
-ABSORB: Final = 30.0
-"""Seconds in which it follows what is. The variance is fed by the square of it, and so follows much sooner."""
-WARM: Final = 1.0
-"""Seconds of the first look: all is background, and nothing is reported."""
+BLOCKS: Final = 20  # blocks across for comparing brightness
+WHITE: Final = 240.0  # grey levels from which noise may be clipped, so that a pixel follows the light less
+LEARN: Final = 6.0  # seconds in which the background follows pixels without motion
+ABSORB: Final = 30.0  # seconds in which it follows motion. The variance grows by the square, and follows much sooner.
+WARM: Final = 1.0  # seconds of the first look: all is background, and nothing is reported
 WARM_PICTURES: Final = 4
 CLEARER: Final = 0.7
-"""A picture of the first look whose noise is less than this part of the first one's begins it anew: the camera was
-still warming up, and what its noise taught would hide what moves for a long time."""
+"""The first look restarts below this share of its noise: a camera's warm-up would hide motion for long."""
 OTHER: Final = 4.0
 OTHER_NOISE: Final = 2.0
-"""So does one of which half is off by more than so many grey levels, and so many times its noise: the first was of
-something else. A channel may still show the robot that had it before."""
-ALIKE: Final = 1.2
-"""A picture after a pause has at most so many times the noise of the last before it, and at least as much less,"""
-CHANGED: Final = 0.2
-"""and is another in at most this share: else it is not of the background that is known."""
+"""It also restarts if half of a picture is off by these grey levels and multiples of its noise: another scene."""
+ALIKE: Final = 1.2  # after a pause, the largest factor of a known picture's noise, up or down ...
+CHANGED: Final = 0.2  # ... and the largest share of it that changed.
 AGREE: Final = (0.15, 1.0)
-"""Seconds, at least and at most, between two such pictures that go on with it: the last of another robot is alone."""
-APART: Final = 3
-"""So many in a row do that come farther apart."""
-STANDS: Final = 0.25
-"""Less than this share of what has become another since differs between them where it does not move."""
+"""Seconds, least and most, between two such pictures: another robot's last picture comes alone."""
+APART: Final = 3  # so many in a row suffice if they come farther apart
+STANDS: Final = 0.25  # largest share of differing pixels in a changed region that counts as still
 RETURN: Final = 2.0
 STRANGE: Final = 8
-"""Seconds after a pause in which pictures are waited for that fit what was known before, or so many of them where they
-come farther apart; then all is learned anew."""
-STRONG: Final = 6.5
-"""Standard deviations that begin a region."""
-WEAK: Final = 3.2
-"""That go on with one."""
-FLOOR: Final = 1.3
-"""Grey levels that the noise of a smoothed picture has at least: quantisation and compression."""
-SMALLEST: Final = 0.0012
-"""Share of the picture that a region has at least."""
+"""Seconds after a pause, or number of slower pictures, to wait for known ones; then all is learned again."""
+STRONG: Final = 6.5  # standard deviations that begin a region
+WEAK: Final = 3.2  # standard deviations that continue a region
+FLOOR: Final = 1.3  # least noise of a smoothed picture in grey levels: quantisation and compression
+SMALLEST: Final = 0.0012  # least share of the picture in a region
 BAND: Final = 5.0
-THIN: Final = 0.07
-"""A region BAND times as wide as it is high, and no higher than this share of the picture, is torn lines."""
-ASIDE: Final = 32
-"""Columns by which torn lines are sought aside."""
-UPHEAVAL: Final = 0.55
-"""Share of the picture that changes where it is not something in it that moves."""
-ALL_OFF: Final = 4.0
-"""Standard deviations by which the median pixel is off in a picture of something else."""
+THIN: Final = 0.07  # torn lines are regions BAND times as wide as high, and no higher than this share of the picture
+ASIDE: Final = 32  # largest displacement of torn lines in columns
+UPHEAVAL: Final = 0.55  # share of changed pixels that no motion explains
+ALL_OFF: Final = 4.0  # standard deviations of the median pixel in a picture of another scene
 UPRIGHT: Final = 0.15
 CERTAIN: Final = 0.005
-"""Shares of the picture, in height and in all, that a region has at least which is told at first sight. It is no wider
-than high as well, and half of it is above STRONG: what is spoiled on the way lies along the lines, and noise is nowhere
-like it."""
-SURE: Final = 2
-"""Pictures of the last RECENT in which anything else is seen in one place."""
+"""Least share of the picture's height, and of its area, in a region reported at first sight. It is also no wider than
+high, and half of it above STRONG: transmission faults lie along the lines, and noise is never like it."""
+SURE: Final = 2  # pictures of the last RECENT that must show anything else in one place
 RECENT: Final = 3
-MEMORY: Final = 1.2
-"""Seconds after which an earlier sighting confirms nothing."""
+MEMORY: Final = 1.2  # seconds after which an earlier sighting confirms nothing
 MAX_BOXES: Final = 16
-GAP: Final = 1.0
-"""Seconds without motion that end an event; what moves again sooner goes on with it."""
+GAP: Final = 1.0  # seconds without motion that end an event
 
 Picture = NDArray[np.uint8]
 _Plane = NDArray[np.float32]
-_Regions = NDArray[np.int32]
-"""Left, top, width, height and area of each."""
+_Regions = NDArray[np.int32]  # left, top, width, height and area of each
 
 
 class Box(NamedTuple):
-    """Left, top, width and height in pixels of the source."""
+    """In pixels of the source."""
 
     x: int
     y: int
@@ -114,54 +83,40 @@ class Box(NamedTuple):
 
 class Seen(NamedTuple):
     moving: bool
-    boxes: tuple[Box, ...] = ()
-    """Where, largest first; of a sighting that is not sure yet as well."""
-    learning: bool = False
-    """Nothing is known yet, or not any more: the background is new."""
-    present: bool = False
-    """Nothing moves, but what moved last is still there."""
-    mask: Mask | None = None
-    """Which pixels of the picture move, if that was asked for, and all is known."""
+    boxes: tuple[Box, ...] = ()  # largest first, including sightings not confirmed yet
+    learning: bool = False  # the background is new: nothing is known
+    present: bool = False  # nothing moves, but the last mover is still there
+    mask: Mask | None = None  # moving pixels, if requested and known
 
 
 class Event(NamedTuple):
-    """A stretch of motion. Times are seconds of the clock by which the pictures came."""
+    """A stretch of motion. Times are seconds of the pictures' clock."""
 
     start: float
-    """Of the first picture in which what moves was seen."""
-    end: float
-    """Of the last one."""
-    peak: float
-    """Of the picture in which it covered most."""
-    boxes: tuple[Box, ...]
-    """All that moved at the peak, largest first, in pixels of the source."""
-    area: Box
-    """Around all that moved from start to end."""
-    frames: int
-    """Pictures with motion."""
-    going_on: bool = False
-    """It was not over when the watch was."""
+    end: float  # last picture with motion
+    peak: float  # picture with the largest moving area
+    boxes: tuple[Box, ...]  # motion at the peak, largest first, in pixels of the source
+    area: Box  # around all motion of the event
+    frames: int  # pictures with motion
+    going_on: bool = False  # it was not over when the watch was
 
 
 class _Meanwhile:
-    """What pictures after a pause show of what has become another while nobody looked."""
-
     def __init__(self, since: float, level: _Plane, mask: NDArray[np.uint8], row: int) -> None:
         self.since, self.pictures, self.row = since, 1, row
         self.level, self._mask = level.copy(), mask
         self._differ = np.zeros(level.shape, np.bool_)
-        """Where they differ."""
 
     def add(self, level: _Plane, mask: NDArray[np.uint8]) -> None:
         off = level - self.level
-        # Of two that are smoothed 0.6 of their noise is left.
+        # Smoothing leaves 0.6 of the noise of two pictures.
         self._differ |= np.abs(cv2.GaussianBlur(off, (3, 3), 0)) > 0.6 * WEAK * max(FLOOR, _noise(level))
         self._mask = self._mask | mask
         self.pictures += 1
         self.level += off / self.pictures
 
     def another(self) -> NDArray[np.bool_]:
-        """Where what is another stands: the rest moves, or was spoiled on the way."""
+        """Changed regions that are still; the rest moves, or was spoiled in transmission."""
         count, labels = cv2.connectedComponents(_with_rim(self._mask))
         area = np.bincount(labels.ravel(), minlength=count)
         differ = np.bincount(labels.ravel(), weights=self._differ.ravel(), minlength=count)
@@ -172,28 +127,24 @@ class _Meanwhile:
 
 class MotionDetector:
     def __init__(self, *, outlines: bool = False) -> None:
-        """With `outlines` it tells the very pixels that move, and boxes close around them."""
+        """With `outlines`, report moving pixels too, and fit boxes to them."""
         self._outlines = Outlines() if outlines else None
         self._mean: _Plane = np.empty((0, 0), np.float32)
         self._variance = self._mean
         self._begun = self._last = 0.0
         self._pictures = 0
-        self._noise = 0.0
-        """The most of the pictures of the first look, or that of the last before a pause; in grey levels."""
+        self._noise = 0.0  # in grey levels: the most of the first look, or the last before a pause
         self._latest = self._mean
         self._paused = False
-        self._back: float | None = None
-        """When the first picture after a pause came, with no gap since."""
-        self._strange = 0
-        """How many pictures after it did not fit."""
-        self._meanwhile: _Meanwhile | None = None
-        """What those show that have all fitted."""
+        self._back: float | None = None  # time of the first picture after a pause, with no gap since
+        self._strange = 0  # pictures since then that did not fit
+        self._meanwhile: _Meanwhile | None = None  # summary of fitting pictures since then
         self._presence = Presence()
         self._sightings: deque[tuple[float, NDArray[np.uint8]]] = deque(maxlen=RECENT - 1)
 
     def see(self, time: float, picture: Picture) -> Seen:
-        """Takes a picture of shape (height, width), or (height, width, 3) in BGR, made at `time` in seconds
-        of any clock. Raises ValueError for what is no picture."""
+        """Analyse a picture of shape (height, width), or (height, width, 3) in BGR, made at `time` (seconds of any
+        clock). Raises ValueError for other arrays."""
         passed = min(1.0, max(0.0, time - self._last))
         seen, regions = self._look(time, picture, passed)
         if self._outlines is None:
@@ -206,7 +157,7 @@ class MotionDetector:
         return seen._replace(boxes=tuple(_fitted(box, mask) for box in seen.boxes), mask=mask)
 
     def _look(self, time: float, picture: Picture, passed: float) -> tuple[Seen, Mask | None]:
-        """And where something moves in the reduced picture, if that is known."""
+        """Also return the moving regions of the reduced picture, if known."""
         grey, across, down = reduced(picture)
         if self._mean.shape != grey.shape:
             return self._begin(time, grey), None
@@ -226,7 +177,7 @@ class MotionDetector:
         if middle > ALL_OFF or np.count_nonzero(mask) / mask.size > UPHEAVAL:
             return self._begin(time, grey), None
         self._learn(away, mask, passed / LEARN, passed / ABSORB)
-        largest = sorted(regions.tolist(), key=lambda one: -one[cv2.CC_STAT_AREA])[:MAX_BOXES]
+        largest = sorted(regions.tolist(), key=lambda region: -region[cv2.CC_STAT_AREA])[:MAX_BOXES]
         height, width = picture.shape[:2]
         boxes = tuple(
             Box(
@@ -243,14 +194,13 @@ class MotionDetector:
         return Seen(moving, boxes, present=present), mask
 
     def _is_no_first_look(self, grey: _Plane, away: _Plane) -> bool:
-        """Whether the background so far is of something else, or of a camera that was still warming up."""
+        """Return True if the background shows another scene, or a camera that was warming up."""
         noise, before = _noise(grey), self._noise
         self._noise = max(before, noise)
         return noise < CLEARER * before or _off(away) > max(OTHER, OTHER_NOISE * noise)
 
     def pause(self) -> None:
-        """No pictures come for a while. What is known of the background is kept: the first picture afterwards that
-        fits it goes on with it. Until then nothing is reported."""
+        """Pictures pause. The first fitting one continues the background; until then nothing is reported."""
         self._sightings.clear()
         self._presence.clear()
         if self._pictures < WARM_PICTURES:
@@ -268,7 +218,7 @@ class MotionDetector:
         changed = np.count_nonzero(mask) / mask.size
         alike = 1 / ALIKE <= _noise(grey) / max(self._noise, 1e-3) <= ALIKE
         if not alike or middle > ALL_OFF or changed > CHANGED:
-            # The camera is warming up, or this is not its picture; or it is not where it was.
+            # The camera is warming up, was moved, or this is another's picture.
             self._meanwhile, self._strange = None, self._strange + 1
             anew = time - self._back > RETURN or self._strange >= STRANGE
             return self._begin(time, grey) if anew else Seen(False, learning=True)
@@ -279,8 +229,7 @@ class MotionDetector:
         if time - self._meanwhile.since < AGREE[0] and self._meanwhile.row < APART:
             return Seen(False, learning=True)
         self._paused = False
-        # What is another now has become so while nobody looked, and moves no more than the rest. Nothing is known of
-        # its noise but the picture's own, and its mean is as sure as so few pictures make it.
+        # Changes in the pause count as still. So few pictures leave their noise and mean unsure.
         another = self._meanwhile.another()
         noise = max(FLOOR, _noise(level)) ** 2 * (1 + 1 / self._meanwhile.pictures)
         self._mean = np.where(another, self._meanwhile.level, self._mean)
@@ -297,18 +246,17 @@ class MotionDetector:
         return Seen(False, learning=True)
 
     def _score(self, away: _Plane) -> tuple[_Plane, float]:
-        """By how many standard deviations of its noise each pixel is off, smoothed, in terms of what this
-        picture's pixels are off in general. And that median."""
-        # Neighbours are alike noisy: their mean is a floor under what few pictures tell of one pixel.
+        """Standard deviations by which each pixel is off, smoothed, relative to the median, which is returned too."""
+        # Neighbours have similar noise: their mean bounds one pixel's few samples from below.
         spread = np.sqrt(np.maximum(np.maximum(self._variance, cv2.blur(self._variance, (5, 5))), FLOOR**2))
         score = np.abs(cv2.GaussianBlur(away, (3, 3), 0)) / spread
-        # Smoothing leaves about 0.4 of independent noise; what is left of it is judged by its own measure.
+        # Smoothing leaves about 0.4 of independent noise; judge the rest by its own median.
         middle = float(np.median(score))
         score /= middle / 0.674 if middle > 0.3 else 0.45
         return np.asarray(score, np.float32), middle
 
     def _learn(self, away: _Plane, mask: NDArray[np.uint8] | None, still: float, moved: float) -> None:
-        """Follows the picture, by `still` and where something moves by `moved` (shares, 0 to 1)."""
+        """Follow the picture by `still`, and in motion by `moved` (shares, 0 to 1)."""
         rate: _Plane | float = min(1.0, still)
         if mask is not None:
             rate = np.where(_with_rim(mask) > 0, np.float32(min(1.0, moved)), np.float32(min(1.0, still)))
@@ -316,10 +264,9 @@ class MotionDetector:
         self._variance += rate * (away * away - self._variance)
 
     def _regions(self, score: _Plane, level: _Plane) -> tuple[NDArray[np.uint8], _Regions, _Regions]:
-        """Where the score is above WEAK, connected, and somewhere in it above STRONG: 255, elsewhere 0. Left, top,
-        width, height and area of each region. And the same of those that are certain at first sight."""
+        """Connected pixels above WEAK with some above STRONG: mask (255 or 0), stats, and stats of certain regions."""
         weak = (score > WEAK).astype(np.uint8)
-        # A line that is torn, or a single hot pixel, is thinner than anything that moves.
+        # Torn lines and hot pixels are thinner than anything that moves.
         thick = cv2.morphologyEx(weak, cv2.MORPH_OPEN, np.ones((3, 2), np.uint8))
         weak = np.asarray(cv2.morphologyEx(thick, cv2.MORPH_CLOSE, np.ones((7, 5), np.uint8)), np.uint8)
         count, labels, found, _ = cv2.connectedComponentsWithStats(weak, connectivity=8)
@@ -327,7 +274,7 @@ class MotionDetector:
         strong = np.bincount(labels.ravel(), weights=(score > STRONG).ravel(), minlength=count)
         area = stats[:, cv2.CC_STAT_AREA]
         keep = (area >= SMALLEST * score.size) & (strong >= 0.15 * area)
-        # A thin band along the lines is a fault of the transmission.
+        # A thin band along the lines is a transmission fault.
         for region in np.flatnonzero(keep & (stats[:, cv2.CC_STAT_HEIGHT] <= THIN * score.shape[0])):
             wide = stats[region, cv2.CC_STAT_WIDTH] > BAND * stats[region, cv2.CC_STAT_HEIGHT]
             keep[region] = not (wide or self._stands_aside(level, stats[region]))
@@ -337,12 +284,12 @@ class MotionDetector:
         return np.where(keep[labels], np.uint8(255), np.uint8(0)), stats[keep], stats[clear]
 
     def _stands_aside(self, level: _Plane, region: _Regions | list[int]) -> bool:
-        """Whether lines of a region are torn."""
+        """Return True if a region's lines are torn."""
         top, high = region[cv2.CC_STAT_TOP], region[cv2.CC_STAT_HEIGHT]
         return _torn(level[top : top + high], self._mean[top : top + high])
 
     def _sure(self, time: float, mask: NDArray[np.uint8]) -> bool:
-        """Whether what is seen was seen lately, near there."""
+        """Return True if recent sightings nearby confirm this sighting."""
         near = np.asarray(cv2.dilate(mask, np.ones((15, 25), np.uint8)), np.uint8)
         agree = sum(time - at <= MEMORY and bool(np.any(earlier & near)) for at, earlier in self._sightings)
         self._sightings.append((time, mask))
@@ -350,12 +297,12 @@ class MotionDetector:
 
 
 def _with_rim(mask: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Around what moves its shadow and its blur are, too."""
+    """Include the shadow and blur around motion."""
     return np.asarray(cv2.dilate(mask, np.ones((5, 5), np.uint8)), np.uint8)
 
 
 def _fitted(box: Box, mask: Mask) -> Box:
-    """A box drawn close around what moves in it, or within a rim around it; as it was, if nothing does."""
+    """Fit a box to the motion in it and in a rim around it; unchanged without motion."""
     rim_x, rim_y = box.width // 4 + 1, box.height // 4 + 1
     left, top = max(0, box.x - rim_x), max(0, box.y - rim_y)
     x, y, width, height = cv2.boundingRect(mask[top : box.y + box.height + rim_y, left : box.x + box.width + rim_x])
@@ -363,8 +310,7 @@ def _fitted(box: Box, mask: Mask) -> Box:
 
 
 def reduced(picture: Picture) -> tuple[_Plane, float, float]:
-    """The picture grey and WIDTH columns wide at most, and by what its columns and rows are multiplied for
-    those of the source. Raises ValueError."""
+    """The picture in grey, at most WIDTH columns wide, and the factors to the source's size. Raises ValueError."""
     planes = picture.ndim in (2, 3) and picture.shape[2:] in ((), (3,))
     sides = all(8 <= side <= MAX_SIDE for side in picture.shape[:2])
     if picture.dtype != np.uint8 or not planes or not sides:
@@ -379,18 +325,17 @@ def reduced(picture: Picture) -> tuple[_Plane, float, float]:
 
 
 def _noise(grey: _Plane) -> float:
-    """Standard deviation of a picture's noise and fine texture, in grey levels: by what lines differ from the mean of
-    their neighbours."""
+    """Standard deviation of noise and fine texture, in grey levels, from second differences between lines."""
     return float(np.mean(np.abs(np.diff(grey, 2, axis=0)))) / 1.954
 
 
 def _off(away: _Plane) -> float:
-    """By how many grey levels half of a smoothed picture is off."""
+    """Median deviation of a smoothed picture in grey levels."""
     return float(np.median(np.abs(cv2.GaussianBlur(away, (3, 3), 0))))
 
 
 def _levelled(grey: _Plane, mean: _Plane) -> _Plane:
-    """The picture with the gain and offset taken out by which it differs from the background."""
+    """The picture without its gain and offset against the background."""
     rows = max(2, round(BLOCKS * grey.shape[0] / grey.shape[1]))
     now = cv2.resize(grey, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
     was = cv2.resize(mean, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
@@ -411,7 +356,7 @@ def _levelled(grey: _Plane, mean: _Plane) -> _Plane:
     expected = np.float32(gain) * mean + np.float32(offset)
     white = np.maximum(mean, expected) > WHITE
     if np.any(white):
-        # White may be brighter than it can be told: it stays as it was, or becomes what it should be.
+        # White is clipped: any value between the background and the expectation fits.
         was, should = mean[white], expected[white]
         off = grey[white] - np.clip(grey[white], np.minimum(was, should), np.maximum(was, should))
         level[white] = was + off / np.float32(gain)
@@ -419,7 +364,7 @@ def _levelled(grey: _Plane, mean: _Plane) -> _Plane:
 
 
 def _torn(lines: _Plane, mean: _Plane) -> bool:
-    """Whether some lines of a picture look like the background's, but stand aside."""
+    """Return True if some lines match the background only when displaced."""
     aside = [((lines - mean) ** 2).mean(axis=1)]
     for by in range(2, min(ASIDE, lines.shape[1] // 2)):
         aside.append(((lines[:, by:] - mean[:, :-by]) ** 2).mean(axis=1))
@@ -428,17 +373,15 @@ def _torn(lines: _Plane, mean: _Plane) -> bool:
 
 
 class EventTracker:
-    """Takes what a MotionDetector sees. Each event comes back once, when it is over."""
+    """Turns a MotionDetector's results into events, each returned once, at its end."""
 
     def __init__(self) -> None:
-        self.current: Event | None = None
-        """The event that is not over yet, as far as it goes."""
+        self.current: Event | None = None  # the present event, so far
         self._most = 0
-        self._first: tuple[float, tuple[Box, ...]] | None = None
-        """A sighting that the next picture may confirm."""
+        self._first: tuple[float, tuple[Box, ...]] | None = None  # a sighting that the next picture may confirm
 
     def see(self, time: float, seen: Seen) -> Event | None:
-        """Takes what was seen at `time`, which never goes back. The event that had ended before, if any."""
+        """Take the result at `time`, which never goes back; return the event that had ended before, if any."""
         ended = self.quiet(time)
         recent = self._first is not None and time - self._first[0] <= MEMORY
         if not seen.moving:
@@ -447,7 +390,7 @@ class EventTracker:
             return ended
         event = self.current
         if event is None:
-            # What is certain only now began with the sighting that it confirms.
+            # A confirmed event began with its first sighting.
             start, boxes = self._first if self._first is not None and recent else (time, ())
             event = Event(start, time, time, seen.boxes, around((*boxes, *seen.boxes)), 1 if boxes else 0)
             self._most, self._first = -1, None
@@ -460,7 +403,7 @@ class EventTracker:
         return ended
 
     def quiet(self, time: float) -> Event | None:
-        """No picture came until `time`. The event that is over by that, if any."""
+        """No picture came until `time`: return the event that this ends, if any."""
         event = self.current
         if event is None or time - event.end <= GAP:
             return None
@@ -468,13 +411,13 @@ class EventTracker:
         return event
 
     def close(self) -> Event | None:
-        """The watch is over. The event that was going on, if any."""
+        """The watch is over: return the unfinished event, if any."""
         event, self.current = self.current, None
         return event._replace(going_on=True) if event is not None else None
 
 
 def around(boxes: tuple[Box, ...]) -> Box:
-    """The box around all of these; an empty one around none."""
+    """The box around all; an empty one for none."""
     if not boxes:
         return Box(0, 0, 0, 0)
     left, top = min(box.x for box in boxes), min(box.y for box in boxes)

@@ -1,8 +1,7 @@
-"""Which pixels of a picture move, at its own resolution and in its colours. Pure.
+"""The moving pixels of a picture, at its own resolution and in its colours. Pure.
 
-The detector finds where something moves in a picture of 160 columns, by each pixel's own noise (`motion.py`). Within
-that, and a little around it, a pixel moves that differs from a background of full resolution by more than the
-picture's noise. Nothing is looked for elsewhere, so this costs little more than to keep that background."""
+The detector finds moving regions in a picture of 160 columns, by each pixel's own noise (`motion.py`). In and just
+around them a pixel moves if it differs from a full-resolution background by more than the picture's noise."""
 
 from __future__ import annotations
 
@@ -14,19 +13,13 @@ from numpy.typing import NDArray
 
 from zscout.behaviors.perception.garble import noise_of
 
-AROUND: Final = 9
-"""Pixels of the reduced picture by which a region is widened: its rim is smoothed away there."""
-DIFFERS: Final = 16.0
-"""Grey levels of any colour by which a pixel differs at least ..."""
-NOISE: Final = 4.0
-"""... and so many times the picture's noise."""
-SPARSE: Final = 4
-"""Every so many columns are looked at for it."""
-HOLE: Final = 5
-"""Pixels across up to which holes are closed, and specks left out."""
+AROUND: Final = 9  # pixels of the reduced picture by which regions grow: smoothing has removed their rim
+DIFFERS: Final = 16.0  # least grey levels of any colour by which a moving pixel differs ...
+NOISE: Final = 4.0  # ... and multiple of the picture's noise.
+SPARSE: Final = 4  # every so many columns serve to estimate the noise
+HOLE: Final = 5  # pixels across of the largest holes closed and specks removed
 
-Mask = NDArray[np.uint8]
-"""255 where something moves, elsewhere 0."""
+Mask = NDArray[np.uint8]  # 255 where something moves, else 0
 
 
 class Outlines:
@@ -34,15 +27,14 @@ class Outlines:
         self._mean: NDArray[np.float32] = np.empty((0, 0), np.float32)
 
     def learn(self, picture: NDArray[np.uint8], share: float) -> None:
-        """Follows the whole picture by this share, 0 to 1."""
+        """Follow the whole picture by this share, 0 to 1."""
         if self._mean.shape != picture.shape:
             self._mean = picture.astype(np.float32)
         else:
             cv2.accumulateWeighted(picture, self._mean, share)
 
     def trace(self, picture: NDArray[np.uint8], regions: Mask, share: float) -> Mask:
-        """Which pixels of the picture move, where `regions` of a reduced one do; the background follows the others by
-        this share."""
+        """The moving pixels within `regions` of the reduced picture; the background follows the others by `share`."""
         height, width = picture.shape[:2]
         if self._mean.shape != picture.shape or not regions.any():
             self.learn(picture, share)

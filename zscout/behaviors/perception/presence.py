@@ -1,8 +1,7 @@
-"""Whether who moved and stopped is still there. Pure.
+"""Presence of someone who moved and stopped. Pure.
 
-Who stands still is soon learned as noise (`motion.py`), and is no motion any more. But where he moved last, the picture
-is not as it was before he came: as long as that is so, and no longer than LONGEST, something is *present*. Whoever
-walks out of the picture leaves it as it was."""
+A standing person soon counts as noise (`motion.py`). But while the picture where they last moved differs from the one
+before they came, at most LONGEST, something is *present*."""
 
 from __future__ import annotations
 
@@ -12,17 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-LONGEST: Final = 60.0
-"""Seconds after the last motion for which something is present at most."""
-ANOTHER: Final = 3.0
-"""Times a picture's noise, smoothed, and ..."""
-LEAST: Final = 6.0
-"""... grey levels, by which a pixel is another than before he came."""
-SHARE: Final = 0.35
-"""Share of the pixels that moved last which are so while he is there: his rim and his shadow come and go."""
+LONGEST: Final = 60.0  # most seconds of presence after the last motion
+ANOTHER: Final = 3.0  # multiple of a picture's noise, smoothed, and ...
+LEAST: Final = 6.0  # ... grey levels by which a pixel counts as changed.
+SHARE: Final = 0.35  # least share of changed pixels where it last moved: rims and shadows come and go
 
-GONE: Final = 2.0
-"""Seconds without him after which what is behind him counts as known again."""
+GONE: Final = 2.0  # seconds of absence after which the background counts as known again
 
 Plane = NDArray[np.float32]
 Regions = NDArray[np.uint8]
@@ -30,23 +24,19 @@ Regions = NDArray[np.uint8]
 
 class Presence:
     def __init__(self) -> None:
-        self._before: Plane | None = None
-        """The background as it was before something moved; None: nothing does, or did lately."""
-        self._moved_at = self._there_at = 0.0
-        """When something moved, and was there without moving, last."""
-        self._where: Regions = np.empty((0, 0), np.uint8)
-        """Where it moved last."""
+        self._before: Plane | None = None  # background before the motion; None without recent motion
+        self._moved_at = self._there_at = 0.0  # times of the last motion, and of the last presence without motion
+        self._where: Regions = np.empty((0, 0), np.uint8)  # region of the last motion
 
     def expects(self, moving: bool) -> bool:
-        """Whether the noise of the next picture is needed."""
+        """Return True if the next picture's noise is needed."""
         return not moving and self._before is not None
 
     def clear(self) -> None:
         self._before = None
 
     def see(self, time: float, level: Plane, mean: Plane, moving: Regions | None, noise: float) -> bool:
-        """Takes a picture `level` in brightness with the background `mean`; `moving`: where something moves, None:
-        nothing does. Whether something is present that does not move."""
+        """Return True if something present does not move. `level`: brightness; `mean`: background."""
         if moving is not None:
             if self._before is None:
                 self._before = mean.copy()

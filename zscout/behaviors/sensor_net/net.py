@@ -1,9 +1,7 @@
-"""Which robots of a sensor net are active, and which replaces one that is lost. Pure; time is passed in.
+"""Active robots of a sensor net, and replacements of lost ones. Pure; time is passed in.
 
-`wanted` robots are to be placed. They are started in the order in which they were named; one that is lost
-(its camera shows nothing, it is gone from the mesh for ABSENCE_TIMEOUT, or its behavior can't be had) is
-replaced by the next that is free. One that comes back is free again; whoever has replaced it stays.
-"""
+`wanted` robots start in the order of their names. A lost one (its camera shows nothing, it is gone from the mesh for
+ABSENCE_TIMEOUT, or its behavior can't be had) is replaced by the next free one, for good; if it returns, it is free."""
 
 from __future__ import annotations
 
@@ -11,18 +9,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal, TypeAlias
 
-ABSENCE_TIMEOUT: Final = 10.0
-"""Seconds that a robot may be away from the mesh before it counts as lost."""
+ABSENCE_TIMEOUT: Final = 10.0  # seconds of absence after which a robot counts as lost
 GONE: Final = "it is not on the mesh"
-RETRY: Final = 60.0
-"""Seconds after which one that failed may be tried again, where there is nobody else."""
+RETRY: Final = 60.0  # seconds before a failed robot is retried, if no other is free
 
 WATCHING: Final = frozenset({"watch", "alert", "present"})
-"""Status of a robot that watches; `present`: who moved stands still."""
-HIDDEN: Final = WATCHING | {"hidden", "blind"}
-"""Status of one that has found its place."""
-PAUSED: Final = frozenset({"wait", "lost", ""})
-"""Status that does not show whether it is hidden."""
+"""Status of a robot that watches; `present`: a mover is still there."""
+HIDDEN: Final = WATCHING | {"hidden", "blind"}  # status of a robot in its place
+PAUSED: Final = frozenset({"wait", "lost", ""})  # status that does not show whether it is hidden
 
 MemberStatus: TypeAlias = Literal["free", "active", "lost"]
 
@@ -56,7 +50,7 @@ class Member:
 
 class SensorNet:
     def __init__(self, robots: Sequence[str], wanted: int | None = None) -> None:
-        """Raises ValueError for no robots, one named twice, or more wanted than named."""
+        """Raises ValueError for no robots, duplicates, or more wanted than named."""
         if not robots or len(set(robots)) != len(robots):
             raise ValueError("robots must be named, each once")
         self.wanted = len(robots) if wanted is None else wanted
@@ -81,7 +75,7 @@ class SensorNet:
         return [member for member in self.members.values() if member.standing == "active"]
 
     def report(self, now: float, robot: str, doing: str, *, alert: bool = False) -> list[Effect]:
-        """The status of a robot's behavior; of a robot that is not active it is old, and ignored."""
+        """Take a status; inactive robots' are old, and ignored."""
         member = self.members.get(robot)
         if member is None or member.standing != "active":
             return []
@@ -97,7 +91,7 @@ class SensorNet:
         return self._lose(now, member, why) if member.standing == "active" else []
 
     def there(self, now: float, robots: Iterable[str]) -> list[Effect]:
-        """Exactly these robots are on the mesh now. Call it now and then: it also sees to what is due."""
+        """Exactly these robots are on the mesh now. Call it regularly: it also starts replacements."""
         present = set(robots)
         for member in self.members.values():
             member.there = member.robot in present
@@ -107,7 +101,7 @@ class SensorNet:
                     member.standing, member.why = "free", ""
             elif member.away_since is None:
                 member.away_since = now
-        # Not before it is known of all: whoever stands in for one may have gone with it.
+        # Only once all are updated: a replacement may be gone too.
         effects: list[Effect] = []
         for member in self._active:
             if member.away_since is not None and now - member.away_since >= ABSENCE_TIMEOUT:
@@ -127,13 +121,11 @@ class SensorNet:
         return effects
 
     def _next(self, now: float) -> Member | None:
-        """Who begins next: of those on the mesh the first that is free, else the one lost for longest."""
+        """The first free robot on the mesh, else the longest lost."""
         here = [member for member in self.members.values() if member.there]
         free = [member for member in here if member.standing == "free"]
         lost = [member for member in here if member.standing == "lost" and now - member.lost_at >= RETRY]
         return free[0] if free else min(lost, key=lambda member: member.lost_at, default=None)
-
-    # What outlives a move
 
     def memory(self) -> dict[str, Any]:
         return {"members": [asdict(member) for member in self.members.values()]}

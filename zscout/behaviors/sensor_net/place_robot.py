@@ -1,10 +1,9 @@
 """One robot of a sensor net: it hides in the dark, turns to the light and watches for motion.
 
-Sensing and acting go through ARCs only. To hide, and to watch, it holds robot, radio, video channel and
-framegrabber for a slot, and keeps them while nobody of its rank waits: with more robots than framegrabbers
-they take turns. Hiding ranks above watching. Just before its turn to watch a robot's camera warms up, if a channel is
-free: a third ARC, below all others, without a framegrabber. `Scout` decides what to do with what is seen.
-"""
+Sensing and acting use ARCs only. To hide, and to watch, it holds robot, radio, video channel and framegrabber for a
+slot, and keeps them until another request of its rank waits: with more robots than framegrabbers they take turns.
+Hiding ranks above watching. Just before its turn to watch, a robot's camera warms up if a channel is free: a third ARC,
+below all others, without a framegrabber. `Scout` decides what to do with the pictures."""
 
 from __future__ import annotations
 
@@ -30,32 +29,22 @@ from zscout.mesh import FrameWatch
 from zscout.mesh.supervision import Supervisor, done_within, supervised
 from zscout.types import SECOND
 
-LOOK: Final = 0.5
-"""Seconds that a picture is waited for."""
-RETRY_AFTER: Final = 1.0
-"""Seconds before it asks again after a refusal."""
-GIVEN_UP: Final = 60.0
-"""Seconds before a robot that was given up is tried again: its battery may have been changed."""
-WARM_AHEAD: Final = 4.0
-"""Seconds before a turn to watch, as it is foretold, in which the camera warms up: it takes two, and turns may begin
-earlier than foretold."""
-WARM_SLACK: Final = 4.0
-"""Seconds by which a turn is farther away than that, and the camera is switched off again."""
-SOONER: Final = 0.9
-"""Share of its slot that a robot asks for which has seen somebody in one of its last turns."""
-BRIEF: Final = 0.1
-"""Seconds of the minimum runtime of that: whoever wants the channel may have it."""
-IDLE: Final = 0.1
-"""Seconds from one safe point to the next while it waits."""
+LOOK: Final = 0.5  # seconds to wait for a picture
+RETRY_AFTER: Final = 1.0  # seconds before a retry after a refusal
+GIVEN_UP: Final = 60.0  # seconds before a robot that was given up is tried again: its battery may have been changed
+WARM_AHEAD: Final = 4.0  # seconds of warm-up before the expected turn: it takes two, and turns may begin early
+WARM_SLACK: Final = 4.0  # further seconds until the turn at which the camera is switched off again
+SOONER: Final = 0.9  # share of its slot requested by a robot that recently saw motion
+BRIEF: Final = 0.1  # seconds of minimum runtime of the warm-up: others may take the channel
+IDLE: Final = 0.1  # seconds between safe points while waiting
 
 
-class CameraBlind(Exception):
-    """The robot that is held is not seen."""
+class CameraBlind(Exception): ...
 
 
 @dataclass(frozen=True, slots=True)
 class Slots:
-    """How its ARCs are asked for: priorities, and seconds of the minimum runtimes."""
+    """Priorities, and minimum runtimes in seconds, of its ARCs."""
 
     hide_priority: int = 2
     watch_priority: int = 1
@@ -63,21 +52,19 @@ class Slots:
     watch: float = 30.0
 
     def of(self, task: Task, *, sooner: bool = False) -> tuple[int, float]:
-        """Priority and minimum runtime in seconds of a task's ARC. A turn to watch that is to come `sooner` asks for a
-        little less than the others: the shorter goes first, until somebody has waited for his patience."""
+        """Priority and minimum runtime in seconds of a task's ARC. With `sooner` a turn is a little shorter: shorter
+        ones go first, until another request has exhausted its patience."""
         if task == "hide":
             return self.hide_priority, self.hide
         return self.watch_priority, self.watch * (SOONER if sooner else 1)
 
     @property
     def warm_priority(self) -> int:
-        """Below whatever its own robots do."""
+        """Below all other ARCs of its own robots."""
         return min(self.watch_priority, self.hide_priority) - 1
 
 
 class PlaceRobot(Behavior):
-    """Hides one robot and has it watch, for as long as it is let."""
-
     def __init__(self, name: str, needs: RobotNeeds, slots: Slots | None = None) -> None:
         super().__init__(name)
         self.needs, self.slots = needs, slots or Slots()
@@ -86,12 +73,9 @@ class PlaceRobot(Behavior):
         for task in self._tasks.values():
             self.add(task)
         self._clock = CarriedClock()
-        self.holding = ""
-        """The id of the ARC under which it holds its robot; empty while it does not."""
-        self.video: str | None = None
-        """The channel that its present ARC asks for by name."""
-        self.came: tuple[str, str | None] | None = None
-        """`holding` and `video` of before a move, until it has asked for that ARC."""
+        self.holding = ""  # id of the ARC that holds its robot, or empty
+        self.video: str | None = None  # the channel that its present ARC requests by name
+        self.came: tuple[str, str | None] | None = None  # both from before a move, until requested
 
     async def run(self, context: BehaviorContext) -> None:
         self.now(context)
@@ -111,7 +95,7 @@ class PlaceRobot(Behavior):
                     self.video = None
 
     async def _offer_safe_points(self, context: BehaviorContext) -> None:
-        """While the robot is not held nothing changes here, however long that takes: a time to be moved."""
+        """Without a hold nothing changes here for long: a time to be moved."""
         while True:
             if not self.holding:
                 await context.safe_point()
@@ -132,19 +116,17 @@ class PlaceRobot(Behavior):
 
 
 class RobotTask(Behavior):
-    """What is done with a robot under one kind of ARC."""
-
     def __init__(self, task: Task, place: PlaceRobot) -> None:
         super().__init__(task)
         self.task, self.place = task, place
 
     async def run(self, context: BehaviorContext) -> None:
-        """Requests all that the task needs and does it under the hold, anew when that was taken away, until
-        it is over or has had its slot. Raises CameraBlind, and what a request raises."""
+        """Request all needs and work under the hold, again after a revocation. Raises CameraBlind, and request
+        errors."""
         place, scout = self.place, self.place.scout
         priority, slot = place.slots.of(self.task, sooner=scout.saw_somebody)
         came, place.came = place.came, None
-        # What was handed over is found by its needs.
+        # A hold that was handed over is found by its needs.
         video = place.video = (came and came[1]) or await self._channel(context)
         self.report("wait", "for its turn", robot=place.needs.robot)
         needs = place.needs.needs(video=video)
@@ -163,26 +145,26 @@ class RobotTask(Behavior):
             turn = await attempt.asked()
             goes_on, came = came is not None and turn.id == came[0] and turn.grant is not None, None
             async with self._warming(context, warm, turn) as warming, attempt as held:
-                # What has not begun by now would begin when this is over.
+                # A warm-up now would start after the hold.
                 warming.cancel()
                 channel = held.rc(video or place.needs.video)
-                # It may be about to be moved: nothing changes before that is over.
+                # If a move is due, it must come before any change.
                 await context.safe_point()
                 await self._use(context, held, video, goes_on=goes_on)
             if held.completed:
                 break
             if scout.task != self.task:
-                # It was taken away in the very step that was its last.
+                # Revoked in the very step that was its last.
                 await context.client.end(turn)
                 break
             if scout.no_signal and attempt.arc is not None and attempt.arc.open:
-                # It was taken away because the receiver is dead: the same needs would be given the same one.
+                # Revoked because the receiver is dead: the same needs would bring it back.
                 await context.client.end(attempt.arc)
                 scout.no_signal = False
                 raise CameraBlind(f"{channel} shows nothing at all")
 
     async def _channel(self, context: BehaviorContext) -> str | None:
-        """One to ask for by name, of those that it may have, because others are to be avoided."""
+        """A channel to request by name, to avoid others."""
         place, state = self.place, await context.client.state()
         may = matcher(place.needs.video)
         channels = [rc.rc for rc in state.rcs if rc.present and may(rc.rc)] if state is not None else []
@@ -190,8 +172,7 @@ class RobotTask(Behavior):
 
     @asynccontextmanager
     async def _warming(self, context: BehaviorContext, name: str, turn: OpenArc) -> AsyncIterator[Supervisor]:
-        """While `turn` is waited for, its camera is warmed up under an ARC of this `name`, if it has one; until that is
-        cancelled."""
+        """While `turn` waits, warm its camera up under an ARC of this `name`, if any, until cancelled."""
         async with supervised(self.path) as supervisor:
             if name:
                 supervisor.spawn(self._warm_up(context, name, turn))
@@ -211,9 +192,9 @@ class RobotTask(Behavior):
                 async with hold(client, name, needs, priority=priority, min_runtime=BRIEF) as held:
                     await held.command(place.needs.robot, {"name": "camera", "on": True})
                     if await _begins(client, turn, ahead + slack, slack):
-                        # It goes on with this one, which is over by that.
+                        # The turn continues this hold, which ends by that.
                         await held.over()
-                    # What is handed over may come back: then it is given back.
+                    # A hold handed over may come back: then give it back.
                     await held.resumed()
             await asyncio.sleep(RETRY_AFTER)
 
@@ -235,7 +216,7 @@ class RobotTask(Behavior):
             self.report("wait", "the hold is over", robot=place.needs.robot)
 
     async def _look(self, context: BehaviorContext, robot: HeldRobot, watch: FrameWatch) -> bool:
-        """Waits for a picture, and does what it asks for, or none; whether the task goes on."""
+        """Wait for a picture, if any, and act on it; return True if the task continues."""
         frame = await watch.next(LOOK / context.speed)
         # A frame taken under another grant shows another robot.
         picture = grey_picture(frame.jpeg) if frame and frame.head.grant == robot.held.grant else None
@@ -254,13 +235,13 @@ class RobotTask(Behavior):
 
 
 def _arc_name(robot: str, task: str) -> str:
-    """Names of robots may be as long as those of ARCs, which need not be told apart by them."""
+    """Robot names may be as long as ARC names; cut ones need not differ."""
     return f"{robot[: MAX_NAME - 1 - len(task)]}-{task}"
 
 
 def _left(client: Client, turn: OpenArc, slack: float) -> float:
-    """Seconds until a turn begins, as it was foretold last; infinite where nothing is, or where it is overdue by more
-    than `slack`: nobody is told that a forecast does not hold any more, only another one."""
+    """Seconds until the last estimated start of a turn; infinite without one, or if it is overdue by more than `slack`,
+    as an estimate is replaced but never withdrawn."""
     if turn.start is None:
         return math.inf
     left = (turn.start - client.mesh.now()) / SECOND
@@ -268,7 +249,7 @@ def _left(client: Client, turn: OpenArc, slack: float) -> float:
 
 
 async def _begins(client: Client, turn: OpenArc, within: float, slack: float) -> bool:
-    """Waits for as long as a turn is foretold to begin within so many seconds, and whether it does."""
+    """Wait while the turn is expected within `within` seconds; return True if it begins."""
     while turn.open and turn.grant is None:
         left = _left(client, turn, slack)
         if left > within:

@@ -1,8 +1,7 @@
-"""Place Sensor Net: has robots hide and watch, each by a component of its own, wherever there is room.
+"""Place Sensor Net: robots hide and watch, each by a component of its own, wherever there is room.
 
-The root of the tree. It asks the component placer for one `place_robot` per robot, follows their status, and
-lets `SensorNet` decide who begins and who stands in for one that is lost.
-"""
+The root of the tree. It requests one `place_robot` per robot from the component placer, follows their status, and lets
+`SensorNet` decide which start and which replace a lost one."""
 
 from __future__ import annotations
 
@@ -20,28 +19,20 @@ from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor, done_within, supervised
 from zscout.messages import MAX_COMPONENT_NAME, BehaviorSaid, ComponentSpec, Placement, Placements
 
-PERIOD: Final = 0.5
-"""Seconds between two checks of what is due."""
-STOPPING: Final = 3.0
-"""Seconds within which its components are stopped when it ends."""
+PERIOD: Final = 0.5  # seconds between two checks
+STOPPING: Final = 3.0  # seconds for stopping its components at the end
 
 
 class PlaceSensorNet(Behavior):
-    """The net over `net`'s robots; `spec_for` gives the component that places one of them."""
-
     def __init__(self, name: str, net: SensorNet, spec_for: Callable[[str, str], ComponentSpec]) -> None:
-        """`spec_for(robot, path)`; raises what `Behavior` raises."""
+        """`spec_for(robot, path)`; raises the errors of `Behavior`."""
         super().__init__(name)
         self.net = net
         self._spec_for = spec_for
-        self._components: dict[str, str] = {}
-        """Robots by the names of their components, which are unique: they contain the net's own."""
-        self._placed: set[str] = set()
-        """Of these components, the ones that this net has asked to have placed: it stops no others."""
-        self._there: set[str] = set()
-        """Of these, the ones of which the placer has said so to this process."""
-        self._busy: set[str] = set()
-        """Components of which the placer is being asked something."""
+        self._components: dict[str, str] = {}  # robots by component name, which is unique as it contains the net's
+        self._placed: set[str] = set()  # components that this net had placed: it stops no others
+        self._there: set[str] = set()  # components confirmed by the placer to this process
+        self._busy: set[str] = set()  # components with a placer request under way
         self._clock = CarriedClock()
         self._supervisor: Supervisor
         self._mesh: Mesh
@@ -66,8 +57,8 @@ class PlaceSensorNet(Behavior):
                     await context.safe_point()
                     await asyncio.sleep(PERIOD)
         finally:
-            for one in declared:
-                one.close()
+            for declaration in declared:
+                declaration.close()
             await done_within(STOPPING, asyncio.gather(*map(self._stop, [*self._placed])))
 
     def _report_progress(self) -> None:
@@ -77,12 +68,10 @@ class PlaceSensorNet(Behavior):
             words += f", lost: {', '.join(lost)}"
         self.report("place" if net.hidden < net.wanted else "guard", words)
 
-    # Events
-
     def _on_status(self, key: str, status: BehaviorSaid) -> None:
         sender = self._mesh.keys.sender_of(key)
         robot = self._components.get(sender.client.rpartition(".")[0])
-        # Only the component that was placed for a robot reports of it.
+        # Only a robot's own component reports its status.
         if robot is not None and status.robot == robot:
             self._apply(self.net.report(self._now(), robot, status.doing, alert=status.alert))
 
@@ -93,16 +82,13 @@ class PlaceSensorNet(Behavior):
             if robot is not None and ended:
                 self._apply(self.net.failed(self._now(), robot, placement.reason or "it was stopped"))
 
-    # Effects
-
     def _apply(self, effects: Iterable[Effect]) -> None:
         for effect in effects:
             if isinstance(effect, StopRobot):
                 self.report(self.doing, f"{effect.robot} is lost: {effect.why}")
 
     def _see_to_components(self) -> None:
-        """Has those of active robots placed, also after a move, as the answer may not have come any more; and stops all
-        others, until the placer has said that they are."""
+        """Place components of active robots, again after a move; stop all others until the placer confirms."""
         for component, robot in self._components.items():
             active = self.net.members[robot].standing == "active"
             done = component in self._there if active else component not in self._placed
@@ -140,8 +126,6 @@ class PlaceSensorNet(Behavior):
     def _now(self) -> float:
         return self._clock.read(self._mesh.now())
 
-    # What outlives a move
-
     def memory(self) -> dict[str, Any]:
         return {"net": self.net.memory(), "clock": self._clock.seconds, "placed": sorted(self._placed)}
 
@@ -152,10 +136,10 @@ class PlaceSensorNet(Behavior):
 
 
 def component_of(net: str, robot: str) -> str:
-    """The name of the component that places one robot of the net that runs as component `net`."""
+    """The component that places one robot of the net with component name `net`."""
     name = f"{net}-{robot.partition('/')[2]}"
     if len(name) <= MAX_COMPONENT_NAME:
         return name
-    # Cut names could be alike.
+    # Cut names could collide.
     mark = hashlib.sha256(name.encode()).hexdigest()[:8]
     return f"{name[: MAX_COMPONENT_NAME - len(mark) - 1]}-{mark}"

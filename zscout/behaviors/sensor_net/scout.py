@@ -1,8 +1,6 @@
-"""What one robot of a sensor net does with what it sees. Pure: time and pictures in, wheels and words out.
+"""Decisions of one robot of a sensor net. Pure: times and pictures in, wheels and words out.
 
-A scout has two tasks, each only while it is held: it *hides* until it stands in the dark and faces the light,
-and then *watches* for motion.
-"""
+While held, it first *hides* until it stays in the dark and faces the light, and then *watches* for motion."""
 
 from __future__ import annotations
 
@@ -18,23 +16,15 @@ from zscout.behaviors.perception.hiding.hider import Hider
 from zscout.behaviors.perception.lens import Picture
 from zscout.behaviors.perception.motion import Box, MotionDetector
 
-NO_PICTURE_TIMEOUT: Final = 10.0
-"""Seconds from the beginning of a hold, or from the last picture, until the robot counts as not seen."""
+NO_PICTURE_TIMEOUT: Final = 10.0  # seconds from a hold's start, or the last picture, until the robot counts as unseen
 
-QUIET: Final = 2.0
-"""Seconds without motion after which the next one is another event."""
-SUSPECTS: Final = 2
-"""Holds in a row without a picture that prove a robot dead."""
-BAD_FOR: Final = 60.0
-"""Seconds for which a channel that showed nothing is avoided."""
-NO_SIGNAL_TIMEOUT: Final = 4.0
-"""Seconds without any picture at the end of a hold that prove a receiver dead: framegrabbers give up after five."""
-REMIND: Final = 4.0
-"""Seconds without a good picture, above any warm-up, after which a robot may not have received the command to
-transmit."""
+QUIET: Final = 2.0  # seconds without motion that separate two events
+SUSPECTS: Final = 2  # holds in a row without a picture that prove a robot dead
+BAD_FOR: Final = 60.0  # seconds for which an empty channel is avoided
+NO_SIGNAL_TIMEOUT: Final = 4.0  # seconds that prove a receiver dead: framegrabbers give up after five
+REMIND: Final = 4.0  # seconds without a good picture, above any warm-up, before the command to transmit is repeated
 
-LATELY: Final = 2
-"""Turns to watch back to which what was seen counts."""
+LATELY: Final = 2  # turns to watch that count as recent
 
 Task: TypeAlias = Literal["hide", "watch"]
 
@@ -43,38 +33,28 @@ Task: TypeAlias = Literal["hide", "watch"]
 class Step:
     left: float
     right: float
-    lasts: float
-    """Wheels: -1 to 1 of top speed, for so many seconds without a newer command."""
+    lasts: float  # wheels: -1 to 1 of top speed, for so many seconds without a newer command
     doing: str
     detail: str
-    boxes: tuple[Box, ...] = ()
-    """Of what moves, in pixels of the picture."""
-    alert: bool = False
-    """Something has begun to move."""
-    quiet: bool = False
-    """It has stopped moving: boxes shown before are old."""
-    over: bool = False
-    """The task of this hold is done: give it back, and ask for the other."""
-    blind: bool = False
-    """No picture for too long: give the hold back."""
-    learning: bool = False
-    """It watches, and can't tell yet what moves."""
+    boxes: tuple[Box, ...] = ()  # around motion, in pixels of the picture
+    alert: bool = False  # motion began
+    quiet: bool = False  # motion ended: earlier boxes are old
+    over: bool = False  # the task is done: give the hold back, and request the other
+    blind: bool = False  # no picture for too long: give the hold back
+    learning: bool = False  # watching, but still learning the background
 
 
 class Alerts:
-    """One alert for each time that something moves."""
-
     def __init__(self) -> None:
         self.count = 0
-        self._last: float | None = None
-        """When motion was seen last, within one event."""
+        self._last: float | None = None  # last motion of the present event
 
     @property
     def moving(self) -> bool:
         return self._last is not None
 
     def see(self, now: float, moving: bool) -> str:
-        """`start` where an event begins, `end` where it is over, else an empty word."""
+        """`start` or `end` of an event, else empty."""
         if moving:
             began, self._last = self._last is None, now
             self.count += began
@@ -85,26 +65,22 @@ class Alerts:
         return ""
 
     def rest(self) -> None:
-        """Nobody watches any more: whatever comes next is another event."""
+        """The watch ended: later motion is another event."""
         self._last = None
 
 
 class Blindness:
-    """Why there is no picture of a robot, over its holds: because of the channel, or of the robot.
+    """Why a robot shows no picture, over its holds: the channel's fault, or its own.
 
-    A robot whose transmitter is on shows a picture within seconds. If none comes for `timeout`, the channel
-    may be jammed, its receiver dead, or the robot. So another channel is tried where there is one: a robot
-    that is not seen on SUSPECTS in a row is dead; one that is seen had a bad channel, which is avoided for a
-    while. A channel without any picture, not even snow, has no receiver that works: its framegrabber gives
-    up, the hold ends before `timeout` is over, and the robot is not to blame.
-    """
+    A robot that transmits shows a picture within seconds. If none comes for `timeout`, the channel may be jammed, its
+    receiver dead, or the robot. So another channel is tried if there is one: a robot unseen on SUSPECTS in a row is
+    dead; once it is seen, the earlier channel was bad, and is avoided for a while. A channel without even snow has no
+    working receiver: its framegrabber gives up, the hold ends before `timeout`, and the robot is not to blame."""
 
     def __init__(self, timeout: float) -> None:
-        self.timeout = timeout
-        """Seconds without a picture, warm-up included."""
+        self.timeout = timeout  # seconds without a picture, warm-up included
         self._dark_since: float | None = None
-        self._bad: dict[str, float] = {}
-        """Channels on which this robot was not seen, and when."""
+        self._bad: dict[str, float] = {}  # channels without this robot's picture, and the time
         self._in_row = 0
         self._reminded = 0.0
         self._channel = ""
@@ -116,8 +92,7 @@ class Blindness:
         self._channel, self._no_signal_since = "", now
 
     def see(self, now: float, good: bool, channel: str, *, came: bool | None = None) -> bool:
-        """Takes what a look showed; `came`: any picture, if not a good one. True: no good picture for too
-        long on this channel."""
+        """Record a look; `came`: any picture, even a bad one. Return True without a good picture for too long."""
         self._channel = channel
         if good or came:
             self._no_signal_since = now
@@ -136,7 +111,7 @@ class Blindness:
         return True
 
     def remind(self, now: float) -> bool:
-        """Whether the robot is to be commanded once more to transmit: its radio goes one way."""
+        """Return True to repeat the command to transmit: the radio goes one way."""
         since = self._dark_since
         if since is None or now - max(since, min(self._reminded, now)) < REMIND:
             return False
@@ -144,7 +119,7 @@ class Blindness:
         return True
 
     def end(self, now: float) -> bool:
-        """The hold is over. True: its channel gave nothing at all, and is to be left."""
+        """The hold ended; return True if its channel showed nothing at all."""
         since, self._no_signal_since = self._no_signal_since, None
         if since is None or not self._channel or now - since < NO_SIGNAL_TIMEOUT:
             return False
@@ -153,12 +128,11 @@ class Blindness:
 
     @property
     def dead(self) -> bool:
-        """Whether that is enough to give the robot up; of a single channel, two tries on it are."""
+        """Return True to give the robot up; on a single channel two tries count."""
         return self._in_row >= SUSPECTS
 
     def choose(self, now: float, channels: Iterable[str]) -> str | None:
-        """A channel to ask for by name, because another one is to be avoided; None: any will do. Where all are, the
-        one that showed nothing the longest ago."""
+        """A channel to request by name because another is bad; None: any. If all are bad, the oldest."""
         self._bad = {channel: at for channel, at in self._bad.items() if now - at < BAD_FOR}
         if self._bad.keys().isdisjoint(channels := set(channels)):
             return None
@@ -178,31 +152,27 @@ class Scout:
         self.alerts = Alerts()
         self.blindness = Blindness(NO_PICTURE_TIMEOUT)
         self._detector = MotionDetector()
-        self._task: Task = "hide"
-        """Of the present hold."""
-        self._alerts = 0
-        """Before the present turn."""
-        self._turns: deque[bool] = deque(maxlen=LATELY)
-        """Of its last turns to watch: whether it saw somebody."""
-        self._held = self.no_signal = False
-        """The last hold ended without any picture, not even snow, so its channel is to be left."""
+        self._task: Task = "hide"  # of the present hold
+        self._alerts = 0  # count before the present turn
+        self._turns: deque[bool] = deque(maxlen=LATELY)  # for each recent turn to watch: True if it saw motion
+        self._held = self.no_signal = False  # no_signal: the last hold ended without even snow
 
     @property
     def task(self) -> Task:
-        """What it would be held for now."""
+        """The task for a hold that begins now."""
         return "watch" if self.hider.state == "hidden" else "hide"
 
     @property
     def saw_somebody(self) -> bool:
-        """Whether it has lately."""
+        """Return True if a recent turn saw motion."""
         return any(self._turns)
 
     def held(self, now: float, *, goes_on: bool = False) -> None:
-        """A hold begins, or `goes_on` elsewhere after a move. `now` in seconds, by the clock of all calls."""
+        """A hold begins, or with `goes_on` continues after a move. `now` in seconds, on the same clock in all calls."""
         if self._held:
             if goes_on:
                 return
-            # It was lost on the way, and others may have moved the robot.
+            # It was lost meanwhile, and others may have moved the robot.
             self.released(now)
         self._held = True
         self._task = self.task
@@ -211,13 +181,13 @@ class Scout:
             self._turns.clear()
             self._detector = MotionDetector()
         else:
-            # It is where it was, if nobody has moved it: what it knows of its background it need not learn again.
+            # The robot is probably where it was: keep its background.
             self._detector.pause()
         self.hider.resumed(now)
         self.blindness.begin(now)
 
     def released(self, now: float) -> None:
-        """The hold is over, for whatever reason: the wheels are stopped, and others may move the robot."""
+        """The hold ended for any reason: the wheels are stopped, and others may move the robot."""
         if self._held and self._task == "watch":
             self._turns.append(self.alerts.count > self._alerts)
         self._held = False
@@ -226,7 +196,7 @@ class Scout:
         self.alerts.rest()
 
     def see(self, now: float, picture: Picture | None, channel: str) -> Step:
-        """Takes the newest picture, or None if none came, from the robot on this video channel."""
+        """Take the newest picture, or None, from the robot on this video channel."""
         defect = garbled(picture) if picture is not None else None
         good = picture is not None and defect is None
         blind = self.blindness.see(now, good, channel, came=picture is not None)
@@ -235,7 +205,7 @@ class Scout:
         if self._task == "hide" or step.over or step.blind:
             return step
         if picture is None or not good:
-            # Nobody sees whether it goes on: what moves later is another event.
+            # Blind: later motion is another event.
             edge = self.alerts.see(now, False)
             return Step(0, 0, 0, "blind", "no good picture", quiet=edge == "end")
         seen = self._detector.see(now, picture)
@@ -243,14 +213,12 @@ class Scout:
         if self.alerts.moving:
             return Step(0, 0, 0, "alert", f"motion {count}", tuple(seen.boxes), alert=edge == "start")
         if seen.present:
-            return Step(0, 0, 0, "present", f"who moved stands still, motion {count}", quiet=edge == "end")
+            return Step(0, 0, 0, "present", f"the mover is still there, motion {count}", quiet=edge == "end")
         words = f"{count} alerts so far"
         return Step(0, 0, 0, "watch", words, quiet=edge == "end", learning=seen.learning)
 
-    # What outlives a move
-
     def memory(self) -> dict[str, Any]:
-        """All but what the detector has learned: that begins anew."""
+        """All but the detector's background."""
         return {
             "hider": base64.b64encode(self.hider.checkpoint()).decode(),
             "alerts": {"count": self.alerts.count, "before": self._alerts, "turns": list(self._turns)},
@@ -260,7 +228,7 @@ class Scout:
         }
 
     def recall(self, memory: dict[str, Any]) -> None:
-        """Raises ValueError for what is no such memory."""
+        """Raises ValueError for an invalid memory."""
         self.hider = Hider.restore(base64.b64decode(memory["hider"]))
         alerts = memory["alerts"]
         self.alerts.count = int(alerts["count"])

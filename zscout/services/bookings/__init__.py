@@ -1,1 +1,1 @@
-"""Bookings, as all candidates keep them: records that are merged one by one, their dates, and fleet time."""
+"""Bookings of all candidates: merged records, their dates, and fleet time."""

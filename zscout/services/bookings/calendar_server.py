@@ -1,7 +1,6 @@
-"""Serves bookings as calendars over HTTP, for programs that subscribe to one: of the fleet, an RC, an owner.
+"""Serves bookings as calendars over HTTP, for subscribing programs: of the fleet, an RC, an owner.
 
-Nothing is kept here: the leader is asked when somebody asks, at most once in `FRESH` seconds. Where none answers
-programs are told so (503), and go on to show what they have."""
+Requests query the leader, at most once in `FRESH` seconds. Without a leader programs get 503, and keep their copy."""
 
 from __future__ import annotations
 
@@ -16,12 +15,9 @@ from zscout.messages import BookingsAsk, BookingsTold
 from zscout.services.bookings.calendar_text import CONTENT_TYPE, CalendarSelection, calendar_text
 from zscout.services.plain_http import Page, PlainHttpServer
 
-FRESH: Final = 5.0
-"""Seconds for which what the leader told is told again."""
-ASK: Final = 2.0
-"""Seconds that it has to answer."""
-MAX_TEXTS: Final = 64
-"""Calendars that are kept as text."""
+FRESH: Final = 5.0  # seconds for which the leader's answer is reused
+ASK: Final = 2.0  # seconds for its answer
+MAX_TEXTS: Final = 64  # calendars kept as text
 _PATH: Final = re.compile(rf"/(?:fleet|rc/(?P<rc>{NAME.pattern}/{NAME.pattern})|owner/(?P<owner>{NAME.pattern}))\.ics")
 NOT_NOW: Final = Page(
     b"no leader tells the bookings now\n", status="503 Service Unavailable", headers="Retry-After: 60\r\n"

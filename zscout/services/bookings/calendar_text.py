@@ -1,7 +1,7 @@
-"""Bookings as iCalendar (RFC 5545), for calendar programs. Pure; the same bookings give the same text.
+"""Bookings as iCalendar (RFC 5545). Pure; equal bookings give equal texts.
 
-One that is repeated is one event in its zone; all others are in UTC, and have no hour that comes twice. A duration is
-written in hours: days would be longer or shorter where clocks change."""
+A repeated booking is one event in its zone; all others are in UTC, without ambiguous hours. Durations are in hours:
+days vary where clocks change."""
 
 from __future__ import annotations
 
@@ -20,14 +20,11 @@ from zscout.services.bookings.dates import zone_of
 from zscout.types import clean
 
 CONTENT_TYPE: Final = "text/calendar; charset=utf-8"
-REFRESH: Final = "PT15M"
-"""How often programs are asked to read it again; they do as they like."""
+REFRESH: Final = "PT15M"  # suggested reload interval; programs may ignore it
 NEEDS, PRIORITY, PATIENCE = "X-ZSCOUT-NEEDS", "X-ZSCOUT-PRIORITY", "X-ZSCOUT-PATIENCE"
 
 
 class CalendarSelection(NamedTuple):
-    """Which bookings a calendar has: of one `owner`, of those that have one `rc`, or all."""
-
     owner: str | None = None
     rc: str | None = None
 
@@ -36,16 +33,17 @@ class CalendarSelection(NamedTuple):
 
     @property
     def path(self) -> str:
-        """Where its calendar stands: `fleet.ics`, `rc/robot/arm1.ics`, `owner/anvil.ics`."""
+        """Its path: `fleet.ics`, `rc/robot/arm1.ics`, `owner/anvil.ics`."""
         if self.rc is not None:
             return f"rc/{self.rc}.ics"
         return f"owner/{self.owner}.ics" if self.owner is not None else "fleet.ics"
 
     def of(self, bookings: Iterable[BookingView]) -> list[BookingView]:
         return [
-            one
-            for one in bookings
-            if self.owner in (None, one.owner) and (self.rc is None or self.rc in one.needs or _may_have(one, self.rc))
+            view
+            for view in bookings
+            if self.owner in (None, view.owner)
+            and (self.rc is None or self.rc in view.needs or _may_have(view, self.rc))
         ]
 
 
@@ -53,7 +51,7 @@ EVERYTHING: Final = CalendarSelection()
 
 
 def calendar_text(fleet: str, bookings: Iterable[BookingView], selection: CalendarSelection = EVERYTHING) -> bytes:
-    """The calendar of those that are selected. Lines end as the format wants it, in CR LF."""
+    """The calendar of the selected bookings. Lines end in CR LF, as the format requires."""
     calendar = Calendar()
     calendar.add("VERSION", "2.0")
     calendar.add("PRODID", "-//zscout//zscout//EN")
@@ -62,10 +60,12 @@ def calendar_text(fleet: str, bookings: Iterable[BookingView], selection: Calend
     calendar.add("X-PUBLISHED-TTL", REFRESH)
     zones: dict[str, list[int]] = {}
     events: list[Event] = []
-    for view in sorted(selection.of(bookings), key=lambda one: (one.start, one.id)):
+    for view in sorted(selection.of(bookings), key=lambda booking: (booking.start, booking.id)):
         zone = _zone(view)
         if zone is None:
-            events += [_event(fleet, view, one.start, one) for one in view.dates] or [_event(fleet, view, view.start)]
+            events += [_event(fleet, view, date.start, date) for date in view.dates] or [
+                _event(fleet, view, view.start)
+            ]
             continue
         zones.setdefault(view.zone, []).extend((view.start, _until(view)))
         events += _repeated(fleet, view, zone)
@@ -78,13 +78,13 @@ def calendar_text(fleet: str, bookings: Iterable[BookingView], selection: Calend
 
 
 def _may_have(view: BookingView, rc: str) -> bool:
-    """Whether it is kept `rc` for a pattern, or may be where none is kept yet."""
-    bound = {name for one in view.dates for name in one.bound.values()}
+    """Return True if it has `rc` for a pattern, or may get it."""
+    bound = {name for date in view.dates for name in date.bound.values()}
     return rc in bound if bound else any(is_pattern(need) and matcher(need)(rc) for need in view.needs)
 
 
 def _zone(view: BookingView) -> ZoneInfo | None:
-    """None: it is not repeated, or in a zone that this host does not know; it is written as the dates that are told."""
+    """None if not repeated, or of a zone unknown here; then its dates are written one by one."""
     try:
         return zone_of(view.zone) if view.every else None
     except ValueError:
@@ -97,8 +97,8 @@ def _until(view: BookingView) -> Instant:
 
 @lru_cache(1_024)  # it takes milliseconds, and there are 600 zones
 def _timezone(name: str, first: int, last: int) -> Timezone:
-    """As it is in these years, by rules where its clocks are changed on the same Sunday of each: some programs know no
-    others, and of dates the first alone. icalendar's own misses times of few weeks, as Morocco's in Ramadan."""
+    """The zone in these years, by yearly rules where possible: some programs ignore all but the first date. icalendar's
+    own misses short periods, such as Morocco's Ramadan."""
     zone, timezone = zone_of(name), Timezone()
     timezone.add("TZID", name)
     begins, ends = (datetime(year, 1, 1, tzinfo=UTC) for year in (first - 1, last + 2))
@@ -129,7 +129,7 @@ def _offset(at: datetime, zone: ZoneInfo) -> timedelta:
 
 
 def _changes(zone: ZoneInfo, begins: datetime, ends: datetime) -> Iterator[datetime]:
-    """The instants at which its offset is another than in the second before."""
+    """The instants at which the zone's offset changes."""
     day = timedelta(days=1)
     while begins < ends:
         low, high = begins, begins + day
@@ -142,7 +142,7 @@ def _changes(zone: ZoneInfo, begins: datetime, ends: datetime) -> Iterator[datet
 
 
 def _rule(times: Sequence[datetime]) -> vRecur | None:
-    """That of these local times, one a year; None: there is none."""
+    """The yearly rule of these local times; None: there is none."""
     if len({(at.month, at.weekday(), at.time()) for at in times}) > 1:
         return None
     weeks = {(at.day - 1) // 7 + 1 for at in times}
@@ -159,30 +159,30 @@ def _repeated(fleet: str, view: BookingView, zone: ZoneInfo) -> list[Event]:
     hour = first.time().replace(fold=0)
 
     def nominal(at: Instant) -> datetime:
-        """A date as its rule has it: on a day without that hour it is not what clocks show."""
+        """A date by its rule: clocks differ on a day without that hour."""
         return datetime.combine(datetime.fromtimestamp(at, zone).date(), hour, zone)
 
     event = _event(fleet, view, first)
     weeks, days = divmod(view.every, 7)
     rule: dict[str, object] = {"FREQ": "DAILY" if days else "WEEKLY", "INTERVAL": view.every if days else weeks}
     event.add("RRULE", vRecur({**rule, "UNTIL": datetime.fromtimestamp(_until(view), UTC)}))
-    given_up = {*view.dropped, *(one.start for one in view.dates if one.state == "unbooked")}
+    given_up = {*view.dropped, *(date.start for date in view.dates if date.state == "unbooked")}
     for at in sorted(given_up):
         event.add("EXDATE", nominal(at))
     found = [event]
-    told = {one.start: one for one in view.dates if one.state == "conflict"}
+    told = {date.start: date for date in view.dates if date.state == "conflict"}
     if nominal(view.start).timestamp() != view.start:
         told.setdefault(view.start, BookedDate(view.start, view.start, "open"))
-    for at, one in sorted(told.items()):
+    for at, date in sorted(told.items()):
         if at not in given_up:
-            other = _event(fleet, view, at if at == view.start else nominal(at), one)
+            other = _event(fleet, view, at if at == view.start else nominal(at), date)
             other.add("RECURRENCE-ID", nominal(at))
             found.append(other)
     return found
 
 
 def _event(fleet: str, view: BookingView, start: Instant | datetime, told: BookedDate | None = None) -> Event:
-    """One date, or the first of many. `told` is what is told of it."""
+    """One date, or the first of many, with its details."""
     event = Event()
     whole = view.every and not isinstance(start, datetime) and _zone(view) is None
     event.add("UID", f"{view.id}{f'-{start}' if whole else ''}@{fleet}")
@@ -218,7 +218,7 @@ def _duration(seconds: int) -> str:
     minutes, seconds = divmod(seconds, 60)
     hours, minutes = divmod(minutes, 60)
     parts = ((hours, "H"), (minutes, "M"), (seconds, "S"))
-    # RFC 5545 has no hours and seconds without minutes between.
+    # RFC 5545 requires minutes between hours and seconds.
     if hours and seconds:
         return f"PT{hours}H{minutes}M{seconds}S"
     return "PT" + "".join(f"{number}{unit}" for number, unit in parts if number)

@@ -1,7 +1,6 @@
-"""The dates of a booking that is repeated: the same hour of the day in its owner's zone, over changes of summer time.
+"""The dates of a repeated booking: the same hour in its owner's zone, across changes of summer time.
 
-An hour that a day has twice is its first, and one that it has not is taken by the offset before the gap: RFC 5545,
-section 3.3.5, which is what Python's `fold=0` means."""
+Repeated hours are the first, missing ones use the offset before the gap: RFC 5545, section 3.3.5, and `fold=0`."""
 
 from __future__ import annotations
 
@@ -21,7 +20,7 @@ DAY: Final = 86_400
 
 @lru_cache(256)
 def zone_of(name: str) -> ZoneInfo:
-    """A time zone by its name in the IANA database. Raises ValueError where there is none."""
+    """A time zone by its IANA name. Raises ValueError for unknown ones."""
     try:
         return ZoneInfo(name)
     except (ValueError, KeyError, OSError):
@@ -29,15 +28,14 @@ def zone_of(name: str) -> ZoneInfo:
 
 
 def dates(booking: BookingRecord, after: float, before: float) -> list[Instant]:
-    """The instants from `after` on and before `before` at which a booking begins, those included that were given up.
-    Raises ValueError for a zone that this host does not know."""
+    """Starts from `after`, before `before`, including dates given up. Raises ValueError for an unknown zone."""
     if not booking.every:
         return [booking.start] if after <= booking.start < before else []
     return [*takewhile(lambda at: at < before, dropwhile(lambda at: at < after, _repeated(booking, after)))]
 
 
 def last_end(booking: BookingRecord) -> float:
-    """When the last of its dates is over, or later."""
+    """The end of its last date, or later."""
     last = booking.start
     if booking.every:
         last = booking.until if booking.until is not None else booking.start + MAX_AHEAD
@@ -45,11 +43,11 @@ def last_end(booking: BookingRecord) -> float:
 
 
 def _repeated(booking: BookingRecord, after: float) -> Iterator[Instant]:
-    """From the last date before `after` on, to the last of all."""
+    """From the last date before `after` to the last of all."""
     zone = zone_of(booking.zone)
     first = datetime.fromtimestamp(booking.start, zone).replace(tzinfo=None)
     last = booking.until if booking.until is not None else booking.start + MAX_AHEAD
-    # Days are 23 to 25 hours long: one is begun too early rather than missed.
+    # Days are 23 to 25 hours long: rather begin too early.
     count = max(0, int((after - booking.start) // (booking.every * DAY)) - 1)
     while True:
         local = first + timedelta(days=count * booking.every)
@@ -61,7 +59,7 @@ def _repeated(booking: BookingRecord, after: float) -> Iterator[Instant]:
 
 
 def told(time: float, zone: str) -> str:
-    """An instant, for people who live in that zone."""
+    """An instant, for people in that zone."""
     with suppress(ValueError, OverflowError):
         return datetime.fromtimestamp(time, zone_of(zone)).strftime("%Y-%m-%d %H:%M:%S %Z")
     return f"{time:.0f} s after 1970"

@@ -1,7 +1,6 @@
-"""Fleet time: what the leader's publications tell, so that all mean the same by a date. Pure.
+"""Fleet time: the leader's publications give all hosts the same dates. Pure.
 
-In a reign it never jumps once it is told: it is slewed by at most 1 % towards the median of the hosts' clocks, as
-`adjtime` does."""
+Within a reign it never jumps: it is slewed by at most 1 % towards the median of the hosts' clocks, as in `adjtime`."""
 
 from __future__ import annotations
 
@@ -11,12 +10,9 @@ from typing import Final
 
 from zscout.types import SECOND, Ns
 
-SLEW: Final = 100
-"""One part in so many."""
-DIFFERS: Final = 2.0
-"""Seconds by which a host's clock may differ before people are told."""
-SAME: Final = 1.0
-"""Seconds: fleet times that have gone on for as long, but for this, are as old."""
+SLEW: Final = 100  # slew by one part in so many
+DIFFERS: Final = 2.0  # seconds of a host clock's error before a warning
+SAME: Final = 1.0  # seconds: fleet times that began this close together are equally old
 
 
 def wall_ns(seconds: float) -> Ns:
@@ -24,18 +20,18 @@ def wall_ns(seconds: float) -> Ns:
 
 
 def agreed(times: Iterable[Ns], goes_on: Ns | None = None) -> Ns:
-    """The time of several clocks at one instant: their median. Of two in the middle it is the one that is nearer to
-    the time that `goes_on`, which more may have agreed upon; else the lower. Raises ValueError for none."""
+    """The median of several clocks at one instant. Of two middle ones the nearer to `goes_on`, the present time, which
+    more may share; else the lower. Raises ValueError for none."""
     all_times = sorted(times)
     low, high = median_low(all_times), median_high(all_times)
     return high if goes_on is not None and abs(high - goes_on) < abs(low - goes_on) else low
 
 
 class FleetClock:
-    """Fleet time on one host's own clock, on which `now` always is."""
+    """Fleet time on one host's own clock, which `now` always uses."""
 
     def __init__(self, time: Ns, now: Ns, since: Ns) -> None:
-        """`time`: ns since 1970 (UTC) that it is at `now`; it has gone on since `since` on the own clock."""
+        """`time`: ns since 1970 (UTC) at `now`; unbroken since `since` on the own clock."""
         self.since = since
         self.step(time, now)
 
@@ -44,12 +40,12 @@ class FleetClock:
         return now + self._slewed(now)
 
     def step(self, time: Ns, now: Ns) -> None:
-        """It is `time` at `now`: before anybody goes by it, or where one that is older goes on elsewhere."""
+        """Set it to `time` at `now`: before its first use, or to adopt an older one."""
         self._offset = self._aim = time - now
         self._set = now
 
     def aim(self, time: Ns, now: Ns) -> None:
-        """It should be `time` at `now`: goes there slowly."""
+        """Slew towards `time` at `now`."""
         self._offset, self._set = self._slewed(now), now
         self._aim = time - now
 

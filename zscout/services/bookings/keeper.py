@@ -1,7 +1,7 @@
-"""What one host keeps of the fleet's bookings: in memory, and on its disk if it has a state folder.
+"""One host's copy of the fleet's bookings: in memory, and on disk with a state folder.
 
-Each host that may lead or has RCs is one. It learns of bookings from the leader alone, which asks all at once to keep
-what it has, and hears in the same answer what others have and it has not."""
+Each host that may lead or has RCs keeps one. The leader alone shares bookings: it asks all hosts at once to keep its
+records, and the answers bring back those it lacks."""
 
 from __future__ import annotations
 
@@ -15,22 +15,11 @@ from typing import Annotated, Final, Protocol
 
 import msgspec
 
+from zscout import messages
 from zscout.config.state_folder import write_durably
 from zscout.config.strict import BadInput, read_bytes
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import (
-    MAX_MERGED,
-    MAX_STATE,
-    BookingRecord,
-    BookingsKept,
-    Grants,
-    Malformed,
-    ShareBookings,
-    decode,
-    decode_told,
-    encode,
-)
 from zscout.services.bookings.fleet_clock import DIFFERS, SAME, SLEW
 from zscout.services.bookings.records import Records
 from zscout.types import NO_TERM, SECOND, VERSION, Ns, Term
@@ -39,67 +28,64 @@ log = logging.getLogger(__name__)
 
 FILE: Final = "bookings.json"
 ASIDE: Final = "bookings.damaged.json"
-MAX_SAVING: Final = 16
-"""Answers that wait for the disk at one time."""
+MAX_SAVING: Final = 16  # answers awaiting the disk at one time
 UNASKED: Final[Ns] = 40 * SECOND
-"""After which a keeper that hears a leader, and is not asked by it, is not seen: each is asked every 30 s."""
-LEFT: Final[Ns] = 5 * SECOND
-"""Silence after which a leader counts as heard anew."""
+"""A keeper with a leader but no query for so long is not seen: each is asked every 30 s."""
+LEFT: Final[Ns] = 5 * SECOND  # silence after which a leader counts as new
 
 
 class _BookingFile(msgspec.Struct):
-    """What is kept on disk."""
-
     fleet: str
-    records: Annotated[list[msgspec.Raw], msgspec.Meta(max_length=MAX_MERGED)] = []
+    records: Annotated[list[msgspec.Raw], msgspec.Meta(max_length=messages.MAX_MERGED)] = []
 
 
 class Disk(Protocol):
-    """Where records outlive their process."""
-
-    def read(self) -> list[BookingRecord]: ...
-    async def write(self, records: list[BookingRecord]) -> None:
-        """They are on disk on return. Raises OSError."""
+    def read(self) -> list[messages.BookingRecord]: ...
+    async def write(self, records: list[messages.BookingRecord]) -> None:
+        """Return once they are on disk. Raises OSError."""
 
 
 class BookingFile:
-    """A file of one fleet's bookings. A record that can't be read is left out, and told in the log; as the next write
-    would be its end, a copy of such a file is kept."""
+    """A file of one fleet's bookings. Unreadable records are skipped and logged, and the file copied aside."""
 
     def __init__(self, folder: Path, fleet: str) -> None:
         self._path, self._fleet = folder / FILE, fleet
 
-    def read(self) -> list[BookingRecord]:
+    def read(self) -> list[messages.BookingRecord]:
         if not self._path.exists():
             return []
         try:
-            kept: _BookingFile = decode(read_bytes(self._path, max_bytes=MAX_STATE), _BookingFile, MAX_STATE)
-        except (BadInput, Malformed) as error:
+            kept: _BookingFile = messages.decode(
+                read_bytes(self._path, max_bytes=messages.MAX_STATE), _BookingFile, messages.MAX_STATE
+            )
+        except (BadInput, messages.Malformed) as error:
             log.warning("%s can't be read, and is not used%s: %s", self._path, self._set_aside(), error)
             return []
         if kept.fleet != self._fleet:
             log.warning("%s is of fleet %s, and is not used%s", self._path, kept.fleet, self._set_aside())
             return []
-        found: list[BookingRecord] = []
+        found: list[messages.BookingRecord] = []
         for raw in kept.records:
             try:
-                found.append(decode_told(bytes(raw), BookingRecord))
-            except Malformed as error:
+                found.append(messages.decode_told(bytes(raw), messages.BookingRecord))
+            except messages.Malformed as error:
                 log.warning("a booking in %s can't be read, and is left out: %s", self._path, error)
         if len(found) < len(kept.records):
             log.warning("%s is not used whole%s", self._path, self._set_aside())
         return found
 
     def _set_aside(self) -> str:
-        """Keeps a copy; the last one stays. What is to be said of it."""
+        """Keep a copy, replacing the last; return a remark for the log."""
         try:
             shutil.copy(self._path, self._path.with_name(ASIDE))
         except OSError as error:
             return f" (and can't be set aside: {error.strerror})"
         return f" (a copy stays as {ASIDE})"
 
-    async def write(self, records: list[BookingRecord]) -> None:
-        content = encode(_BookingFile(self._fleet, [msgspec.Raw(encode(record)) for record in records]))
+    async def write(self, records: list[messages.BookingRecord]) -> None:
+        content = messages.encode(
+            _BookingFile(self._fleet, [msgspec.Raw(messages.encode(record)) for record in records])
+        )
         await asyncio.to_thread(write_durably, self._path, content, 0o600)
 
 
@@ -111,47 +97,41 @@ class BookingKeeper:
     ) -> None:
         self.mesh, self.wall, self._disk, self._candidate = mesh, wall, disk, candidate
         self.records = Records()
-        self._offset: Ns | None = None
-        """What fleet time is more than the own clock, as it was heard last."""
-        self.heard: tuple[Term, Ns] = NO_TERM, 0
-        """In which term, and when, that was."""
-        self.since: Ns = 0
-        """Since when it has gone on, on the own clock."""
+        self._offset: Ns | None = None  # fleet time minus the own clock, at the last publication
+        self.heard: tuple[Term, Ns] = NO_TERM, 0  # term and time of that publication
+        self.since: Ns = 0  # start of its uninterrupted run, on the own clock
         self._leader: tuple[Term, Ns, Ns] = NO_TERM, 0, 0
-        """Who is heard, since when, and when last."""
-        self._asked: Ns = 0
-        """When a leader asked last."""
-        self._saved = self.records.digest()
-        """What the disk has."""
+        """Present leader's term, with its first and last publication."""
+        self._asked: Ns = 0  # last query of a leader
+        self._saved = self.records.digest()  # digest of the records on disk
         self._saving = asyncio.Lock()
         self._waiting = 0
         self._declared: list[Declaration] = []
-        self.on_shared: Callable[[], None] = lambda: None
-        """Called when another leader told of what was not known here."""
+        self.on_shared: Callable[[], None] = lambda: None  # called when another leader shared new records
         if disk is not None:
             self.records.take(disk.read())
             self._saved = self.records.digest()
 
     def start(self, supervisor: Supervisor) -> None:
-        """From now on it answers the leader."""
+        """Answer the leader from now on."""
         self._supervisor, keys, guard = supervisor, self.mesh.keys, supervisor.guard
         key = keys.bookings(self.mesh.me.host)
-        self._declared = [self.mesh.serve(key, ShareBookings, guard(self._on_shared), limit=MAX_STATE)]
+        self._declared = [
+            self.mesh.serve(key, messages.ShareBookings, guard(self._on_shared), limit=messages.MAX_STATE)
+        ]
         if not self._candidate:
-            # A candidate passes on whom it believes. Here fleet time is of no use, and a leader is heard all the same.
+            # Candidates pass publications on by themselves. Others need no fleet time, but watch the leader.
             watch = guard(lambda _key, grants: self._look_whether_asked(grants))
-            self._declared.append(self.mesh.subscribe(keys.grants, Grants, watch))
+            self._declared.append(self.mesh.subscribe(keys.grants, messages.Grants, watch))
 
     def stop(self) -> None:
         for declared in self._declared:
             declared.close()
 
-    # Fleet time
-
-    def hear(self, grants: Grants) -> None:
-        """A publication of the leader. One that tells an earlier time than can be was late, be it of another leader
-        than the last: it may have waited here while this process stood still. And a leader that knew none as it began
-        tells a younger time than is known here, until it has heard of this one."""
+    def hear(self, grants: messages.Grants) -> None:
+        """Take a publication of the leader. Implausibly early times are delayed publications, even from an earlier
+        leader: they may have waited while this process stalled. A leader that began without fleet time has a younger
+        one, until it learns ours."""
         if grants.time is None:
             return
         self._look_whether_asked(grants)
@@ -160,31 +140,29 @@ class BookingKeeper:
         if self._offset is not None:
             near = abs(offset - self._offset) <= DIFFERS * SECOND
             if near or (grants.term == term and since >= self.since - SAME * SECOND):
-                # Slewed as far as it may be, on a clock that is as far off again.
+                # Slewed as far as possible, on a clock with as large an error.
                 offset = max(offset, self._offset - 2 * (now - at) // SLEW)
             elif since > self.since + SAME * SECOND:
                 return
             since = min(since, self.since)
         self._offset, self.heard, self.since = offset, (grants.term, now), since
 
-    def _look_whether_asked(self, grants: Grants) -> None:
-        """A leader that is heard, and that knows bookings, asks each keeper that it sees."""
+    def _look_whether_asked(self, grants: messages.Grants) -> None:
+        """A leader that knows bookings asks each keeper that it sees."""
         if grants.time is None:
             return
         now, (leader, since, last) = self.mesh.now(), self._leader
         self._leader = grants.term, since if leader == grants.term and now - last < LEFT else now, now
         unasked = now - max(self._asked, self._leader[1]) > UNASKED
-        self.mesh.suspicions.suspect("a leader is heard that asks nothing about bookings", so=unasked)
+        self.mesh.suspicions.suspect("a known leader asks nothing about bookings", so=unasked)
 
     @property
     def time(self) -> Ns | None:
-        """Fleet time, in ns since 1970 (UTC), as it goes on here; None: it was never heard."""
+        """Fleet time here, in ns since 1970 (UTC); None: unknown."""
         return None if self._offset is None else self.mesh.now() + self._offset
 
-    # Records
-
     async def save(self) -> bool:
-        """Whether what is known now is on disk on return; False where there is none, or it fails."""
+        """Return True once the present records are on disk; False without a disk, or if it fails."""
         if self._disk is None:
             return False
         async with self._saving:
@@ -199,10 +177,10 @@ class BookingKeeper:
             self._saved = digest
         return True
 
-    def told(self, digest: str, *, durable: bool) -> BookingsKept:
-        """What is kept here, for one who knows what `digest` tells: its records where it may know others."""
+    def told(self, digest: str, *, durable: bool) -> messages.BookingsKept:
+        """The answer to a leader with this `digest`, with records if they differ."""
         own, heard = self.records.digest(), self.time
-        return BookingsKept(
+        return messages.BookingsKept(
             self.mesh.me.host,
             self._candidate,
             self.wall(),
@@ -214,7 +192,7 @@ class BookingKeeper:
             version=VERSION,
         )
 
-    def _on_shared(self, query: IncomingQuery[ShareBookings]) -> None:
+    def _on_shared(self, query: IncomingQuery[messages.ShareBookings]) -> None:
         self._asked = self.mesh.now()
         if self._waiting >= MAX_SAVING:
             raise Refused("busy", "this host is still writing bookings to its disk; try again")
@@ -228,7 +206,7 @@ class BookingKeeper:
         self._waiting += 1
         self._supervisor.spawn(self._answer_saved(query))
 
-    async def _answer_saved(self, query: IncomingQuery[ShareBookings]) -> None:
+    async def _answer_saved(self, query: IncomingQuery[messages.ShareBookings]) -> None:
         try:
             durable = await self.save()
         finally:

@@ -1,7 +1,6 @@
-"""Records of bookings, merged one by one: whoever has heard of the same ones knows the same, in whatever order. Pure.
+"""Records of bookings, merged to the same result in any order. Pure.
 
-What changes of a record only grows: it is given up, or dates of it are, or are over. So nothing that was given up
-comes back from a host that was away, however old its copy is."""
+Changes only accumulate: a record, or dates of it, are given up or over. So an old copy brings nothing back."""
 
 from __future__ import annotations
 
@@ -14,26 +13,24 @@ from msgspec.structs import replace
 from zscout.messages import MAX_MERGED, BookingRecord, encode
 from zscout.services.bookings.dates import DAY, last_end
 
-MAX_BYTES: Final = 12_000_000
-"""Of all records: one answer, and a file, has room for them."""
-KEEP: Final = DAY
-"""Seconds for which a record is kept beyond its last end: clocks may differ."""
+MAX_BYTES: Final = 12_000_000  # of all records: the limit of one answer, and of a file
+KEEP: Final = DAY  # seconds a record is kept after its last end: clocks may differ
 
 
-def merged(one: BookingRecord, other: BookingRecord) -> BookingRecord:
-    """What both tell of one booking. The newer tells all but what is final."""
-    newer = max(one, other, key=lambda record: (record.changed, _changing(record)))
+def merged(record: BookingRecord, other: BookingRecord) -> BookingRecord:
+    """Merge two records of one booking: the newer, with the final facts of both."""
+    newer = max(record, other, key=lambda known: (known.changed, _changing(known)))
     return replace(
         newer,
-        made=min(one.made, other.made),
-        unbooked=one.unbooked or other.unbooked,
-        dropped=sorted({*one.dropped, *other.dropped}),
-        over=sorted({*one.over, *other.over}),
+        made=min(record.made, other.made),
+        unbooked=record.unbooked or other.unbooked,
+        dropped=sorted({*record.dropped, *other.dropped}),
+        over=sorted({*record.over, *other.over}),
     )
 
 
 def _changing(record: BookingRecord) -> bytes:
-    """What the newer tells."""
+    """The parts taken from the newer record."""
     return encode(replace(record, made=record.changed, unbooked=False, dropped=[], over=[]))
 
 
@@ -42,8 +39,7 @@ class Records:
 
     def __init__(self) -> None:
         self._records: dict[str, BookingRecord] = {}
-        self.size = 0
-        """In bytes, as they are sent."""
+        self.size = 0  # encoded bytes
         self._digest: str | None = None
 
     def __iter__(self) -> Iterator[BookingRecord]:
@@ -56,7 +52,7 @@ class Records:
         return self._records.get(booking)
 
     def take(self, records: Iterable[BookingRecord]) -> list[BookingRecord]:
-        """Merges these, as far as there is room; returns what is not as it was."""
+        """Merge records while there is room; return the changed ones."""
         changed = []
         for record in records:
             known = self._records.get(record.id)
@@ -73,20 +69,20 @@ class Records:
         return changed
 
     def remove(self, booking: str) -> None:
-        """As if it had never been made."""
+        """Remove it without a trace."""
         if (record := self._records.pop(booking, None)) is not None:
             self.size -= len(encode(record))
             self._digest = None
 
     def forget_old(self, time: float) -> bool:
-        """Forgets those that were over a day ago, by fleet time; whether there were any."""
+        """Forget records that ended a day ago, by fleet time; return True if there were any."""
         old = [record.id for record in self if last_end(record) + KEEP < time]
         for booking in old:
             self.remove(booking)
         return bool(old)
 
     def digest(self) -> str:
-        """The same for who knows the same."""
+        """Equal for equal records."""
         if self._digest is None:
             found = hashlib.sha256()
             for _, record in sorted(self._records.items()):

@@ -1,4 +1,4 @@
-"""The journals of all candidates, asked side by side, and what they tell as one."""
+"""Query the journals of all candidates in parallel, and merge the answers."""
 
 from __future__ import annotations
 
@@ -18,12 +18,9 @@ from zscout.messages import MAX_PAGE, History, HistoryAsk, PastHold
 from zscout.services.journal.merging import Span, enough, merged, unknown_to, unknown_to_all
 from zscout.types import HostName
 
-ASK: Final = 5.0
-"""Seconds that a candidate has for a page."""
-QUIET: Final = 0.3
-"""Seconds without another candidate after which all are seen."""
-AT_ONCE: Final = 16
-"""Candidates that are asked at one time."""
+ASK: Final = 5.0  # seconds that a candidate has for a page
+QUIET: Final = 0.3  # seconds without another candidate that end the search
+AT_ONCE: Final = 16  # candidates queried at one time
 CAUSES: Final[Mapping[str, str]] = {
     "off": "did not run",
     "silent": "heard no RCM",
@@ -33,34 +30,27 @@ CAUSES: Final[Mapping[str, str]] = {
 
 
 class NoJournal(Exception):
-    """Nobody tells, or not all of it: one line that says why."""
+    """No journal, or not all of it, is available; one line with the reason."""
 
 
-class NoCandidate(NoJournal):
-    """Nobody is there to be asked."""
+class NoCandidate(NoJournal): ...
 
 
 @dataclass(frozen=True, slots=True)
 class Told:
-    """What the journals tell of a window."""
-
     window: Span
-    holds: Sequence[PastHold]
-    """In the order in which they began: of more than were wanted the latest."""
-    more: bool
-    """Whether there are earlier ones."""
-    journals: Mapping[HostName, History]
-    """The first page of each candidate that answered."""
-    without: Sequence[HostName]
-    """Candidates that did not: they keep no journal, are older than journals, or too slow."""
+    holds: Sequence[PastHold]  # by start; the latest, if there are too many
+    more: bool  # True if there are earlier ones
+    journals: Mapping[HostName, History]  # the first page of each candidate that answered
+    without: Sequence[HostName]  # candidates without an answer: without a journal, of an old version, or too slow
 
     @property
     def unknown(self) -> list[Span]:
-        """Times of which no journal knows all."""
+        """Times that no journal covers."""
         return unknown_to_all([*self.journals.values()], self.window)
 
     def causes(self, unknown: Span) -> str:
-        """Why none knows of it, by candidate."""
+        """Why each candidate lacks it."""
         words = []
         for host, journal in sorted(self.journals.items()):
             found = [
@@ -68,7 +58,7 @@ class Told:
                 for gap in journal.gaps
                 if gap.began < unknown.ended and (gap.ended is None or gap.ended > unknown.began)
             ]
-            if not found and any(one.ended > unknown.began for one in unknown_to(journal, unknown)):
+            if not found and any(span.ended > unknown.began for span in unknown_to(journal, unknown)):
                 found = ["has nothing of then"]
             words += [f"{host} {', '.join(dict.fromkeys(found))}"] if found else []
         return "; ".join(words)
@@ -83,9 +73,8 @@ async def ask_journals(
     look: float = QUIET,
     wall: Callable[[], float] = time.time,
 ) -> Told:
-    """The latest holds, `most` at most, from as few journals as know all that any knows. `look`: seconds in which some
-    candidate comes into sight; `wall`: seconds since 1970, UTC. Raises NoJournal where none answers, or one does not
-    go on."""
+    """The latest holds, at most `most`, from as few journals as cover all. `look`: seconds for a first candidate to
+    appear; `wall`: seconds since 1970, UTC. Raises NoJournal if none answers, or one stops midway."""
     hosts = await _candidates(mesh, fleet, look)
     why = f"no journal of fleet {fleet.name} can be read"
     if not hosts:
@@ -105,7 +94,7 @@ async def ask_journals(
             if answer is None:
                 raise NoJournal(f"{host} stopped answering halfway; try again")
             found += answer.holds
-            # What does not go on would never end.
+            # A page without progress would repeat for ever.
             ahead = answer.next is not None and answer.next != question.before
             question = structs.replace(question, before=answer.next) if ahead else None
         return found, question is not None
@@ -116,7 +105,7 @@ async def ask_journals(
         count = "1 candidate" if len(hosts) == 1 else f"{len(hosts)} candidates"
         raise NoJournal(f"{why}: none of {count} answered; see [journal] of a node file")
     now = wall()
-    begins = [one.since for one in journals.values() if one.since is not None]
+    begins = [journal.since for journal in journals.values() if journal.since is not None]
     began = now - asked.since if asked.since is not None else min(begins, default=now)
     window = Span(began, now - asked.until)
     found = await asyncio.gather(*map(pages, enough(journals, window)))
@@ -126,7 +115,7 @@ async def ask_journals(
 
 
 async def _candidates(mesh: Mesh, fleet: Fleet, look: float) -> list[HostName]:
-    """Those that are there: links are made one after another, so until no more come into sight."""
+    """Candidates on the mesh: links come one by one, so wait until no more appear."""
     hosts: set[HostName] = set()
     changed = asyncio.Event()
 

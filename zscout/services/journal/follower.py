@@ -1,8 +1,7 @@
-"""What a candidate hears, as changes of its journal: pure; times are passed in.
+"""Turns messages that a candidate receives into changes of its journal. Pure; times are passed in.
 
-A publication tells that holds begin and end. Where some were missed, the RCM's state is read: what stands there and is
-not known began unheard, what is known and does not stand there has ended unheard. RCs tell for how long they were used
-under a hold, which may be before it is heard of, or after its end."""
+Publications report starts and ends of holds. After a gap the RCM's state is read: unknown holds in it began unnoticed,
+known ones not in it ended unnoticed. RCs report the use of a hold, possibly out of order."""
 
 from __future__ import annotations
 
@@ -11,85 +10,61 @@ from collections.abc import Iterable, Iterator, Sequence
 from decimal import Decimal
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
-from zscout.messages import (
-    MAX_COUNTER,
-    MAX_WHO,
-    Grants,
-    Holder,
-    HoldView,
-    JournalGap,
-    PastHold,
-    RcmState,
-    ReasonParty,
-    Revocation,
-    Who,
-)
+from zscout import messages
 from zscout.types import NO_TERM, Grant, RcName, clean
 
 N = TypeVar("N", int, Decimal)
 
-MAX_OPEN: Final = 20_000
-"""Holds that are followed at one time. More are kept, but may be written again and again."""
-MAX_EARLY: Final = 2_000
-"""Words of RCs that are kept for holds which are still to be heard of."""
-MAX_TEXT: Final = 200
-"""Characters that are kept of a name or a reason."""
-MAX_RCS: Final = 1_000
-"""RCs that are kept of one hold: no fleet allows more."""
-MAX_NUMBER: Final = 10**9
-"""Of a priority or a duration."""
+MAX_OPEN: Final = 20_000  # holds followed at one time; further ones may be written repeatedly
+MAX_EARLY: Final = 2_000  # reports of use kept for holds not known yet
+MAX_TEXT: Final = 200  # characters kept of a name or a reason
+MAX_RCS: Final = 1_000  # RCs kept per hold: no fleet allows more
+MAX_NUMBER: Final = 10**9  # limit of a priority or a duration
 MAX_SEQ: Final = 2**63 - 1
 
 
 class PublicationHeard(NamedTuple):
-    """A publication, `silence` seconds after the one before (heartbeats included)."""
+    """A publication, `silence` seconds after the previous one or heartbeat."""
 
-    at: float
-    """Seconds since 1970, UTC."""
+    at: float  # seconds since 1970, UTC
     silence: float
-    grants: Grants
+    grants: messages.Grants
 
 
 class StateRead(NamedTuple):
-    """The RCM's state, read when publications had been missed."""
-
     at: float
-    state: RcmState
+    state: messages.RcmState
 
 
 class UseHeard(NamedTuple):
-    """RCs told for how long they were used: (RC, grant, seconds), each as the key told which RC it is."""
+    """Use reported by RCs: (RC, grant, seconds), with the RC of the report's key."""
 
     words: Sequence[tuple[RcName, Grant, float]]
 
 
 class HoldSeen(NamedTuple):
-    """A hold stands; it may be known already."""
-
-    hold: PastHold
+    hold: messages.PastHold
 
 
 class HoldOver(NamedTuple):
-    """A hold is over; `hold` has all that is to be kept of it if it is not known yet."""
+    """A hold ended; `hold` holds the whole record in case it is unknown."""
 
-    hold: PastHold
+    hold: messages.PastHold
 
 
 class EndUnheard(NamedTuple):
-    """A hold is over, since `at` or later."""
+    """A hold ended at `at` or later."""
 
     grant: Grant
     at: float
 
 
 class GapSeen(NamedTuple):
-    """Time of which not all is known."""
-
-    gap: JournalGap
+    gap: messages.JournalGap
 
 
 class HoldUsed(NamedTuple):
-    """An RC was used under a hold for `seconds` or longer, if that hold is known and the RC is one of it."""
+    """An RC was used under a hold for at least `seconds`, if both are known."""
 
     grant: Grant
     rc: RcName
@@ -101,24 +76,21 @@ Change: TypeAlias = HoldSeen | HoldOver | EndUnheard | HoldUsed | GapSeen
 
 
 class Follower:
-    """Follows one fleet. `silent`: seconds without a heartbeat after which no RCM was heard."""
+    """Follows one fleet. `silent`: seconds without a heartbeat that mean a lost RCM."""
 
     def __init__(self, silent: float, open_holds: Iterable[Grant] = (), heard: float | None = None) -> None:
-        """`open_holds` and `heard`: what stood, and when the last publication came, as the journal was left."""
+        """Holds, and time of the last publication, when the journal was closed."""
         self._silent = silent
         self._open: dict[Grant, None] = dict.fromkeys(open_holds)
         self._term, self._seq = NO_TERM, 0
-        self._left = heard
-        """When the journal was left, until something is heard again."""
-        self._doubt: float | None = None
-        """Since when ends may have been missed."""
+        self._left = heard  # time of that close, until the next publication
+        self._doubt: float | None = None  # since then ends may have been missed
         self._early: OrderedDict[tuple[Grant, RcName], float] = OrderedDict()
-        """Uses under grants that are not followed: over by now, or not heard of yet. The last MAX_EARLY."""
-        self.must_read = False
-        """Whether the RCM's state is to be read, and told with a `StateRead`."""
+        """Use under unfollowed grants, ended or not known yet; the last MAX_EARLY."""
+        self.must_read = False  # true while the RCM's state must be read, and passed as a `StateRead`
 
     def take(self, event: Heard) -> Iterator[Change]:
-        """What is to be kept of it; nothing of what an RCM of an earlier term says."""
+        """The resulting changes; none for an earlier term."""
         match event:
             case PublicationHeard():
                 return self._heard(event)
@@ -134,7 +106,7 @@ class Follower:
         if (gap := self._gap_before(event)) is not None:
             self._doubt = gap.began if self._doubt is None else min(self._doubt, gap.began)
             yield GapSeen(gap)
-        # A new term may begin with ends that nobody publishes.
+        # A new term may begin with unpublished ends.
         self.must_read |= gap is not None or grants.term != self._term
         self._seq = max(self._seq, grants.seq) if grants.term == self._term else grants.seq
         self._term, self._left = grants.term, None
@@ -150,22 +122,22 @@ class Follower:
                 yield HoldOver(hold := _over(revoked, at))
                 yield from self._used_early(hold)
 
-    def _gap_before(self, event: PublicationHeard) -> JournalGap | None:
+    def _gap_before(self, event: PublicationHeard) -> messages.JournalGap | None:
         at, grants = event.at, event.grants
         if self._left is not None:
-            return JournalGap(min(self._left, at), at, "off")
+            return messages.JournalGap(min(self._left, at), at, "off")
         if self._term == NO_TERM:
             return None
         before = self._seq if grants.term == self._term else 0
         if event.silence > self._silent:
-            return JournalGap(at - event.silence, at, "silent")
+            return messages.JournalGap(at - event.silence, at, "silent")
         if grants.prev > before:
-            return JournalGap(at - event.silence, at, "missed", _number(grants.prev - before))
+            return messages.JournalGap(at - event.silence, at, "missed", _number(grants.prev - before))
         return None
 
     def _read(self, event: StateRead) -> Iterator[Change]:
         at, state = event.at, event.state
-        # Only what an RCM publishes is believed of its term; what is older is read again.
+        # Only a publication introduces a term; older states are read again.
         if state.term != self._term or not self._seq <= state.seq <= MAX_SEQ:
             return
         self._seq = state.seq
@@ -178,12 +150,12 @@ class Follower:
             if hold.grant not in self._open and _is_sane(hold.grant):
                 yield from self._stands(_viewed(hold, at))
 
-    def lost(self, gap: JournalGap) -> Iterator[Change]:
-        """Changes could not be kept: ends may be among them."""
+    def lost(self, gap: messages.JournalGap) -> Iterator[Change]:
+        """Changes could not be kept, possibly ends."""
         self._doubt, self.must_read = gap.began if self._doubt is None else min(self._doubt, gap.began), True
         yield GapSeen(gap)
 
-    def _stands(self, hold: PastHold) -> Iterator[Change]:
+    def _stands(self, hold: messages.PastHold) -> Iterator[Change]:
         if len(self._open) < MAX_OPEN:
             self._open[hold.grant] = None
         yield HoldSeen(hold)
@@ -198,7 +170,7 @@ class Follower:
                     if len(self._early) > MAX_EARLY:
                         self._early.popitem(last=False)
 
-    def _used_early(self, hold: PastHold) -> Iterator[Change]:
+    def _used_early(self, hold: messages.PastHold) -> Iterator[Change]:
         if self._early:
             for rc in hold.rcs:
                 if (seconds := self._early.pop((hold.grant, rc), None)) is not None:
@@ -206,14 +178,14 @@ class Follower:
 
 
 def _is_sane(grant: Grant) -> bool:
-    """Whether a grant can be kept: numbers of the mesh have any size."""
+    """Return True if a grant fits the file: numbers on the mesh have any size."""
     (counter, rcm), seq = grant
-    return 0 <= seq <= MAX_SEQ and 0 <= counter <= MAX_COUNTER and _text(rcm) == rcm
+    return 0 <= seq <= MAX_SEQ and 0 <= counter <= messages.MAX_COUNTER and _text(rcm) == rcm
 
 
-def _held(holder: Holder, at: float, waited: float | None, grants: Grants) -> PastHold:
+def _held(holder: messages.Holder, at: float, waited: float | None, grants: messages.Grants) -> messages.PastHold:
     known = waited is not None or (holder.grant.term == grants.term and grants.prev < holder.grant.seq <= grants.seq)
-    return PastHold(
+    return messages.PastHold(
         **_names(holder.id, holder.arc, holder.client, holder.grant, holder.rcs),
         began=at,
         late=not known,
@@ -224,8 +196,8 @@ def _held(holder: Holder, at: float, waited: float | None, grants: Grants) -> Pa
     )
 
 
-def _viewed(hold: HoldView, at: float) -> PastHold:
-    return PastHold(
+def _viewed(hold: messages.HoldView, at: float) -> messages.PastHold:
+    return messages.PastHold(
         **_names(hold.id, hold.arc, hold.client, hold.grant, sorted(hold.needs)),
         began=max(0.0, at - max(0.0, hold.held)),
         priority=_number(hold.priority),
@@ -234,11 +206,11 @@ def _viewed(hold: HoldView, at: float) -> PastHold:
     )
 
 
-def _over(revoked: Revocation, at: float) -> PastHold:
+def _over(revoked: messages.Revocation, at: float) -> messages.PastHold:
     by = revoked.why.by[0] if revoked.by is not None and revoked.why is not None and revoked.why.by else None
     if by is not None:
-        by = ReasonParty(_text(by.id), _text(by.arc), _text(by.client), _number(by.priority), _user(by.who))
-    return PastHold(
+        by = messages.ReasonParty(_text(by.id), _text(by.arc), _text(by.client), _number(by.priority), _user(by.who))
+    return messages.PastHold(
         **_names(revoked.id, revoked.arc, revoked.client, revoked.grant, revoked.rcs),
         began=at,
         late=True,
@@ -254,11 +226,13 @@ def _names(number: str, arc: str, client: str, grant: Grant, rcs: list[str]) -> 
     return {"grant": grant, "id": _text(number), "arc": _text(arc), "client": _text(client), "rcs": kept}
 
 
-def _user(who: Who | None) -> Who | None:
-    """Without the comment, which is of no use later."""
+def _user(who: messages.Who | None) -> messages.Who | None:
+    """Without the comment."""
     if who is None or not (who.user or who.host or who.command):
         return None
-    return Who(clean(who.user)[:MAX_WHO], clean(who.host)[:MAX_WHO], clean(who.command)[:MAX_WHO])
+    return messages.Who(
+        clean(who.user)[: messages.MAX_WHO], clean(who.host)[: messages.MAX_WHO], clean(who.command)[: messages.MAX_WHO]
+    )
 
 
 def _text(text: str) -> str:
@@ -266,5 +240,5 @@ def _text(text: str) -> str:
 
 
 def _number(number: N) -> N:
-    """One that others can read in an answer."""
+    """A number that readers of an answer accept."""
     return max(min(number, type(number)(MAX_NUMBER)), type(number)(-MAX_NUMBER))

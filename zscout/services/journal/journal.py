@@ -1,6 +1,6 @@
-"""A candidate's journal: gathers what its leader and the RCs publish, commits it in a thread, answers questions.
+"""A candidate's journal: gathers publications of its leader and the RCs, commits them in a thread, answers queries.
 
-The event loop only appends. Once a second, at most, a thread works out what has changed and commits it as one."""
+The event loop only appends. At most once a second a thread derives the changes and commits them together."""
 
 from __future__ import annotations
 
@@ -25,29 +25,20 @@ from zscout.types import NO_TERM, SECOND, Grant, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
 
-COMMIT_EVERY: Final = 1.0
-"""Seconds that what is heard is gathered before it is on disk."""
-HEARD_EVERY: Final = 30.0
-"""Seconds after which it is noted that an RCM was heard, though it told nothing new."""
-READ_EVERY: Final = 2.0
-"""Seconds from one question for the RCM's state to the next, while it is needed."""
-AGAIN_AFTER: Final = 30.0
-"""Seconds until a disk that failed is tried again."""
-MAX_GATHERED: Final = 100_000
-"""Holders and ends that wait to be committed: more are dropped, and the journal has a gap."""
-MAX_USES: Final = 10_000
-"""Words of RCs on their use that wait to be committed, and that are remembered so that none is written twice: more are
-said again, or written again."""
-MAX_TOLD: Final = 5_000
-"""Holds that a journal tells of when it is opened."""
-MAX_ASKING: Final = 16
-"""Questions that are answered at one time."""
+COMMIT_EVERY: Final = 1.0  # seconds between two commits
+HEARD_EVERY: Final = 30.0  # seconds after which a quiet RCM is noted as alive
+READ_EVERY: Final = 2.0  # seconds between two queries for the RCM's state, while it is needed
+AGAIN_AFTER: Final = 30.0  # seconds until a failed disk is retried
+MAX_GATHERED: Final = 100_000  # holders and ends awaiting a commit; more are dropped as a gap
+MAX_USES: Final = 10_000  # reports of use awaiting a commit, or remembered against duplicates
+MAX_TOLD: Final = 5_000  # holds passed to `on_opened`
+MAX_ASKING: Final = 16  # queries answered at one time
 ENDS_WITHIN: Final = 5.0
 MEGABYTE: Final = 1_000_000
 
 
 class Journal:
-    """The journal of one node. `silent`: seconds after which a leader that publishes nothing is not heard any more."""
+    """The journal of one node. `silent`: seconds without publications that mean a lost leader."""
 
     def __init__(
         self, mesh: Mesh, folder: Path, config: JournalConfig, silent: float, wall: Callable[[], float] = time.time
@@ -57,34 +48,25 @@ class Journal:
         self._store = JournalStore(folder, config.max_age / SECOND, config.max_size * MEGABYTE)
         self._supervisor = Supervisor("the journal", lambda _: log.error("no journal is kept until this node restarts"))
         self._gathered: list[Heard] = []
-        self._weight = 0
-        """Of what is gathered."""
-        self._uses: dict[tuple[RcName, Grant], float] = {}
-        """Seconds of use, as they were heard since the last commit: of each RC and grant the most."""
-        self._said: OrderedDict[RcName, dict[Grant, tuple[float, bool]]] = OrderedDict()
-        """What each RC said last, and whether that hold was over: it says it again and again."""
+        self._weight = 0  # of the gathered events
+        self._uses: dict[tuple[RcName, Grant], float] = {}  # most seconds of use since the last commit
+        self._said: OrderedDict[RcName, dict[Grant, tuple[float, bool]]] = OrderedDict()  # last reports, and if over
         self._said_count = 0
         self._number: tuple[Term, int] = NO_TERM, 0
-        self._at: Ns | None = None
-        """When the last publication was heard, by the mesh's clock."""
-        self._first = self._heard = 0.0
-        """When the first one was that this journal may know of, and the last."""
-        self._committed = 0.0
-        """Up to when it is noted that it heard."""
+        self._at: Ns | None = None  # last publication, by the mesh's clock
+        self._first = self._heard = 0.0  # first and last publication known to this journal
+        self._committed = 0.0  # publications up to here are noted as received
         self._dropped, self._dropped_since = 0, 0.0
-        self._follower: Follower | None = None
-        """None: the file is not open."""
-        self._pending: list[Change] = []
-        """Worked out, and not written yet."""
+        self._follower: Follower | None = None  # none: the file is not open
+        self._pending: list[Change] = []  # derived, but not written
         self.on_opened: Callable[[list[PastHold]], object] = lambda _: None
-        """Called once, in the event loop, with the latest holds of the journal as it was left, the oldest first."""
+        """Called once, in the event loop, with the latest holds of the reopened journal, oldest first."""
         self._told = False
         self._troubled: str | None = None
         self._not_before: Ns = 0
         self._read_at: Ns = 0
         self._asking = 0
-        self._used_last = False
-        """Whether there is a last word of an RC among them, of a hold that is over."""
+        self._used_last = False  # true with an RC's last report on an ended hold
         self._ending = asyncio.Event()
         self._declared: list[Declaration] = []
 
@@ -92,24 +74,21 @@ class Journal:
         mesh, guard = self._mesh, self._supervisor.guard
         self._declared = [
             mesh.serve(mesh.keys.history_any(mesh.me.host), HistoryAsk, guard(self._on_asked)),
-            # Its candidate has the same subscription: a state is decoded once.
+            # The candidate subscribes alike: a state is decoded once.
             mesh.subscribe(mesh.keys.rc_state_any, RcState, guard(self._on_rc_state)),
         ]
         self._keeping = self._supervisor.spawn(self._keep())
 
     async def stop(self) -> None:
-        """What was heard until now is on disk on return."""
+        """Return once all events are on disk."""
         for declared in self._declared:
             declared.close()
         self._ending.set()
         await asyncio.wait([self._keeping], timeout=ENDS_WITHIN)
         await self._supervisor.close()
 
-    # In
-
     def hear(self, grants: Grants) -> None:
-        """What the leader publishes: called for each publication, heartbeats included. Raises nothing: a candidate
-        leads without a journal as well."""
+        """Take each publication of the leader, heartbeats too. Raises nothing: candidates lead without a journal."""
         try:
             if self._supervisor.active:
                 self._hear(grants)
@@ -141,7 +120,7 @@ class Journal:
             if (use.seconds, ended) > before.get(use.grant, (-1.0, False)):
                 word = state.rc, use.grant
                 if word not in self._uses and len(self._uses) >= MAX_USES:
-                    continue  # it is said again
+                    continue  # it is repeated
                 self._uses[word] = max(use.seconds, self._uses.get(word, 0.0))
                 self._used_last |= ended
             said[use.grant] = use.seconds, ended
@@ -151,17 +130,15 @@ class Journal:
         while self._said_count > MAX_USES:
             self._said_count -= len(self._said.popitem(last=False)[1])
 
-    # To disk
-
     async def _keep(self) -> None:
         while not self._ending.is_set():
             await done_within(COMMIT_EVERY, self._ending.wait())
             now = self._mesh.now()
             news = self._gathered or self._pending or self._dropped or self._heard - self._committed > HEARD_EVERY
-            # What is said of holds that stand grows all the time, and is written with what else there is.
+            # Use under open holds grows all the time: it is written with other changes.
             news = news or self._used_last
             last = self._ending.is_set() and self._heard > self._committed
-            # It is opened before anything is heard: what is asked is answered.
+            # Opened before any publication, to answer queries.
             if last or (now >= self._not_before and (news or self._follower is None)):
                 await self._commit()
             if self._follower is not None and self._follower.must_read and now - self._read_at > READ_EVERY * SECOND:
@@ -187,10 +164,10 @@ class Journal:
                 self._troubled = None
 
     async def _write(self, follower: Follower) -> None:
-        """All that is gathered and pending. Raises Unwritable."""
+        """Write all gathered and pending events. Raises Unwritable."""
         events, self._gathered, self._weight, heard = self._gathered, [], 0, self._heard
         if self._uses and heard:
-            # Behind the beginnings and ends that were heard before.
+            # After the starts and ends received before.
             events.append(UseHeard([(*word, seconds) for word, seconds in self._uses.items()]))
             self._uses, self._used_last = {}, False
         dropped, self._dropped = self._dropped, 0
@@ -208,9 +185,9 @@ class Journal:
         self._pending, self._committed = [], heard
 
     def _trouble(self, error: Unwritable) -> None:
-        """What is pending is tried again later, with what is gathered until then."""
+        """Retry pending changes later, with newer ones."""
         if isinstance(error, Damaged):
-            # The new file knows nothing of what stood, nor of what was pending.
+            # The new file lacks the open holds, and the pending changes.
             self._follower, self._pending, self._first = None, [], self._wall()
             self._said.clear()
             self._said_count = 0
@@ -229,8 +206,6 @@ class Journal:
             return
         for state in (reply.message for reply in replies if reply.message is not None):
             self._gather(StateRead(self._wall(), state))
-
-    # Questions
 
     def _on_asked(self, query: IncomingQuery[HistoryAsk]) -> None:
         if query.message.rc is not None:
@@ -256,7 +231,7 @@ class Journal:
 
 
 def _weight(event: PublicationHeard | StateRead) -> int:
-    """About how much there is to be kept of it."""
+    """Rough size of an event's records."""
     if isinstance(event, StateRead):
         return 1 + len(event.state.holds)
     return 1 + sum(map(len, event.grants.rcs.values())) + len(event.grants.revoked)

@@ -1,8 +1,7 @@
-"""What several journals tell of one fleet, as one: pure.
+"""Merge the journals of one fleet. Pure.
 
-Each candidate writes by its own clock, and has its own gaps. A hold is one by its grant; of what several know of it the
-one who knows most is believed, whole, so that its times are of one clock. Only how long RCs were used, by their own
-clocks, is the most that any heard."""
+Each candidate has its own clock and gaps. Records of a hold share its grant; the most complete is taken whole, so that
+its times are of one clock. Only the use of RCs, by their own clocks, is the maximum of all records."""
 
 from __future__ import annotations
 
@@ -17,14 +16,14 @@ from zscout.types import HostName
 
 
 class Span(NamedTuple):
-    """A time: seconds since 1970, UTC."""
+    """Seconds since 1970, UTC."""
 
     began: float
     ended: float
 
 
 def merged(journals: Iterable[Iterable[PastHold]]) -> list[PastHold]:
-    """Each hold once, in the order in which they began."""
+    """Each hold once, by start."""
     best: dict[object, PastHold] = {}
     for hold in (hold for journal in journals for hold in journal):
         known = best.get(hold.grant)
@@ -32,34 +31,34 @@ def merged(journals: Iterable[Iterable[PastHold]]) -> list[PastHold]:
             best[hold.grant] = hold
             continue
         more = hold if _knowledge(hold) > _knowledge(known) else known
-        used = {rc: max(one.used.get(rc, 0.0) for one in (known, hold)) for rc in {**known.used, **hold.used}}
+        used = {rc: max(record.used.get(rc, 0.0) for record in (known, hold)) for rc in {**known.used, **hold.used}}
         best[hold.grant] = more if more.used == used else structs.replace(more, used=used)
     return sorted(best.values(), key=lambda hold: (hold.began, hold.grant))
 
 
 def _knowledge(hold: PastHold) -> tuple[int, bool, bool]:
-    """How it ended, or that it stands; when it began; how long it was waited for."""
+    """Rank of a record: end or present state known; start known; wait known."""
     ending = 1 if hold.outcome == UNHEARD else 0 if hold.ended is not None and not hold.outcome else 2
     return ending + (hold.ended is not None and ending == 2), not hold.late, hold.waited is not None
 
 
 def unknown_to(journal: History, window: Span) -> list[Span]:
-    """The times of a window of which a journal does not know all, in order and apart."""
+    """Incomplete times of a journal within a window, sorted and disjoint."""
     since = window.ended if journal.since is None else journal.since
     spans = [Span(window.began, since)]
     spans += [Span(gap.began, window.ended if gap.ended is None else gap.ended) for gap in journal.gaps]
-    return apart(Span(max(one.began, window.began), min(one.ended, window.ended)) for one in spans)
+    return apart(Span(max(span.began, window.began), min(span.ended, window.ended)) for span in spans)
 
 
 def unknown_to_all(journals: Sequence[History], window: Span) -> list[Span]:
-    """The times of a window of which no journal knows all."""
-    return reduce(both, (unknown_to(one, window) for one in journals), [window])
+    """Times of a window that no journal covers."""
+    return reduce(both, (unknown_to(journal, window) for journal in journals), [window])
 
 
 def enough(journals: Mapping[HostName, History], window: Span) -> list[HostName]:
-    """Hosts whose journals together know what all know of a window: the least known first left out. Where the fleet
-    file names no candidates every node keeps one, and each may have 180,000 holds to tell."""
-    unknown = {host: unknown_to(one, window) for host, one in journals.items()}
+    """Hosts whose journals together cover as much as all: the most complete first. Without candidates in the fleet file
+    every node keeps a journal, each with up to 180,000 holds."""
+    unknown = {host: unknown_to(journal, window) for host, journal in journals.items()}
     chosen: list[HostName] = []
     left = [window]
     for host in sorted(unknown, key=lambda host: (_length(unknown[host]), host)):
@@ -71,7 +70,7 @@ def enough(journals: Mapping[HostName, History], window: Span) -> list[HostName]
 
 
 def apart(spans: Iterable[Span]) -> list[Span]:
-    """All of them, in order; what touches is one."""
+    """The union, sorted and disjoint."""
     found: list[Span] = []
     for span in sorted(span for span in spans if span.ended > span.began):
         if found and span.began <= found[-1].ended:
@@ -82,15 +81,15 @@ def apart(spans: Iterable[Span]) -> list[Span]:
 
 
 def both(some: Sequence[Span], others: Sequence[Span]) -> list[Span]:
-    """What is in both; each in order and apart."""
+    """The intersection; both sorted and disjoint."""
     found, at = [], 0
-    for one in some:
-        while at < len(others) and others[at].ended <= one.began:
+    for span in some:
+        while at < len(others) and others[at].ended <= span.began:
             at += 1
         for other in others[at:]:
-            if other.began >= one.ended:
+            if other.began >= span.ended:
                 break
-            found.append(Span(max(one.began, other.began), min(one.ended, other.ended)))
+            found.append(Span(max(span.began, other.began), min(span.ended, other.ended)))
     return found
 
 

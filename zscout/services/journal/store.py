@@ -1,51 +1,34 @@
 """A candidate's journal on disk: one SQLite file, bounded in size and age.
 
-All of it blocks, and is called from threads, one call at a time. The file is in WAL mode with a sync at each commit:
-what is committed outlives the process and the host."""
+Calls block, and come from threads. WAL mode with a sync per commit: commits survive the process and the host."""
 
 from __future__ import annotations
 
 import logging
 import sqlite3
 import threading
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
+from zscout import messages
 from zscout.keyexpr import check_need, is_pattern, matcher
-from zscout.messages import (
-    MAX_GAPS,
-    MAX_TOLD_BYTES,
-    UNHEARD,
-    Cursor,
-    History,
-    HistoryAsk,
-    JournalGap,
-    PastHold,
-    ReasonParty,
-    Who,
-)
 from zscout.services.journal.follower import Change, EndUnheard, GapSeen, HoldOver, HoldSeen, HoldUsed
 from zscout.types import Grant, RcName, Term
 
 log = logging.getLogger(__name__)
 
 FILE: Final = "journal.sqlite"
-ASIDE: Final = "journal.damaged.sqlite"
-"""What could not be read: of several the last, so that they do not fill the disk."""
-FORMAT: Final = 1
-"""`user_version` of the file."""
-PRUNED_AT_ONCE: Final = 5_000
-"""Holds that one commit removes: more would keep the next waiting."""
-ROOM: Final = 0.95
-"""Of the size that is allowed: what is left after a commit that removed holds."""
+ASIDE: Final = "journal.damaged.sqlite"  # unreadable files; the last one only, to bound the disk
+FORMAT: Final = 1  # `user_version` of the file
+PRUNED_AT_ONCE: Final = 5_000  # holds removed by a commit, so that the next does not wait long
+ROOM: Final = 0.95  # share of the allowed size after a removal
 MAX_KEPT_GAPS: Final = 10_000
-WAL: Final = 4_000_000
-"""Bytes that the log beside the file has at most between commits."""
+WAL: Final = 4_000_000  # bytes of the write-ahead log between commits
 _DAMAGED: Final = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 
 _SCHEMA: Final = """
@@ -64,8 +47,7 @@ CREATE TABLE gaps (began REAL NOT NULL, ended REAL NOT NULL, cause TEXT NOT NULL
 CREATE TABLE facts (name TEXT PRIMARY KEY, at REAL NOT NULL);
 """
 _USED: Final = "ALTER TABLE holds ADD COLUMN used TEXT"
-"""Seconds, in a line for each RC of `rcs`; an empty one: not known. A journal without that column gets it when it is
-opened; versions that do not know it read on."""
+"""Seconds, one line per RC of `rcs`, empty if unknown. Added to older files when opened; older versions ignore it."""
 _COLUMNS: Final = (
     "term, rcm, seq, request, arc, client, owner, rcs, began, late, ended, outcome, reason, taken_for, priority, "
     "min_runtime, waited, user, host, command, used"
@@ -73,29 +55,28 @@ _COLUMNS: Final = (
 _INSERT: Final = (
     f"INSERT INTO holds ({_COLUMNS}) VALUES ({', '.join('?' * 21)}) ON CONFLICT (term, rcm, seq) DO UPDATE SET "  # noqa: S608 - constants
 )
-# What was taken for over, or known by its end alone, is told in full now.
+# Complete a hold assumed ended, or known by its end alone.
 _BEGAN: Final = f"""{_INSERT}
     arc = excluded.arc, began = min(began, excluded.began), late = min(late, excluded.late),
     priority = excluded.priority, min_runtime = excluded.min_runtime, waited = coalesce(excluded.waited, waited),
     user = excluded.user, host = excluded.host, command = excluded.command,
-    ended = CASE outcome WHEN '{UNHEARD}' THEN NULL ELSE ended END,
-    outcome = CASE outcome WHEN '{UNHEARD}' THEN '' ELSE outcome END"""
+    ended = CASE outcome WHEN '{messages.UNHEARD}' THEN NULL ELSE ended END,
+    outcome = CASE outcome WHEN '{messages.UNHEARD}' THEN '' ELSE outcome END"""
 _ENDED: Final = f"""{_INSERT}
     ended = max(holds.began, excluded.ended), outcome = excluded.outcome, reason = excluded.reason,
     taken_for = excluded.taken_for
-    WHERE holds.ended IS NULL OR holds.outcome = '{UNHEARD}'"""
+    WHERE holds.ended IS NULL OR holds.outcome = '{messages.UNHEARD}'"""
 _UNHEARD: Final = f"""
-    UPDATE holds SET ended = max(began, ?), outcome = '{UNHEARD}'
+    UPDATE holds SET ended = max(began, ?), outcome = '{messages.UNHEARD}'
     WHERE term = ? AND rcm = ? AND seq = ? AND ended IS NULL"""  # noqa: S608 - a constant
-_PARTY: Final = msgspec.json.Decoder(ReasonParty)
+_PARTY: Final = msgspec.json.Decoder(messages.ReasonParty)
 
 
 class Unwritable(Exception):
-    """The journal can't be kept at present; the message says why. What was to be committed may be tried again."""
+    """The journal can't be kept at present; the message gives the reason. A commit may be retried."""
 
 
-class Damaged(Unwritable):
-    """Nor read: the file has been set aside, and what it told is gone."""
+class Damaged(Unwritable): ...
 
 
 class JournalStore:
@@ -108,8 +89,7 @@ class JournalStore:
         self._one = threading.Lock()
 
     def open(self) -> tuple[list[Grant], float | None]:
-        """What stood when it was left, and when something was heard last. A file that can't be read is set aside, and a
-        new one begun. Raises Unwritable."""
+        """Open holds and last publication of the closed journal; sets an unreadable file aside. Raises Unwritable."""
         with self._one:
             try:
                 db = self._opened()
@@ -119,8 +99,7 @@ class JournalStore:
             return [Grant(Term(term, rcm), seq) for term, rcm, seq in rows], self._fact("heard")
 
     def commit(self, changes: Iterable[Change], first: float, heard: float, now: float) -> None:
-        """Keeps these changes, all or none, and that something was heard last at `heard`; removes what is too old or
-        too much. A new journal begins at `first`. Raises Unwritable."""
+        """Keep all changes or none, with the last publication's time; prune. Raises Unwritable."""
         with self._one:
             try:
                 db = self._opened()
@@ -134,17 +113,17 @@ class JournalStore:
             except sqlite3.Error as error:
                 raise self._failed(error) from None
 
-    def answer(self, host: str, asked: HistoryAsk, now: float) -> History:
-        """A page. Raises Unwritable, BadName for a pattern that is none."""
+    def answer(self, host: str, asked: messages.HistoryAsk, now: float) -> messages.History:
+        """A page. Raises Unwritable, BadName for an invalid pattern."""
         with self._one:
             try:
                 return self._answer(host, asked, now)
             except sqlite3.Error as error:
                 raise self._failed(error) from None
 
-    def latest(self, limit: int) -> list[PastHold]:
-        """The last holds whose beginning and end were heard, the oldest first. Raises Unwritable."""
-        heard = f"ended IS NOT NULL AND late = 0 AND outcome <> '{UNHEARD}'"
+    def latest(self, limit: int) -> list[messages.PastHold]:
+        """The last holds with known start and end, oldest first. Raises Unwritable."""
+        heard = f"ended IS NOT NULL AND late = 0 AND outcome <> '{messages.UNHEARD}'"
         sql = f"SELECT {_COLUMNS} FROM holds WHERE {heard} ORDER BY ended DESC LIMIT ?"  # noqa: S608 - constants
         with self._one:
             try:
@@ -153,15 +132,13 @@ class JournalStore:
                 raise self._failed(error) from None
 
     def size(self) -> int:
-        """Bytes of the file that are in use."""
+        """Bytes of the file in use."""
         with self._one:
             return _used(self._opened())
 
     def close(self) -> None:
         with self._one:
             self._forget()
-
-    # The file
 
     def _opened(self) -> sqlite3.Connection:
         if self._db is None:
@@ -197,7 +174,7 @@ class JournalStore:
         return db
 
     def _failed(self, error: sqlite3.Error) -> Unwritable:
-        """What to raise; a file that is damaged has been set aside then."""
+        """The error to raise; sets a damaged file aside."""
         if getattr(error, "sqlite_errorcode", 0) & 0xFF in _DAMAGED:
             self._forget()
             aside = self.path.with_name(ASIDE)
@@ -222,7 +199,7 @@ class JournalStore:
         return None if row is None else float(row[0])
 
     def _prune(self, db: sqlite3.Connection, now: float) -> None:
-        """Removes what ended longest ago; what stands is kept. The journal knows nothing before that any more."""
+        """Remove the holds that ended first; the journal knows nothing before them. Open holds stay."""
         oldest = now - self._max_age
         over = "SELECT id, ended FROM holds WHERE ended IS NOT NULL"
         gone = db.execute(f"{over} AND ended < ? ORDER BY ended LIMIT ?", (oldest, PRUNED_AT_ONCE)).fetchall()
@@ -231,16 +208,14 @@ class JournalStore:
             many = round(count * (1 - ROOM * self._max_size / used)) + 1
             gone = db.execute(f"{over} ORDER BY ended LIMIT ?", (min(many, PRUNED_AT_ONCE),)).fetchall()
         if gone:
-            db.executemany("DELETE FROM holds WHERE id = ?", [(one,) for one, _ in gone])
+            db.executemany("DELETE FROM holds WHERE id = ?", [(number,) for number, _ in gone])
             oldest = max(oldest, gone[-1][1])
         db.execute("UPDATE facts SET at = ? WHERE name = 'since' AND at < ?", (oldest, oldest))
         db.execute("DELETE FROM gaps WHERE ended < ?", (oldest,))
         kept = "SELECT rowid FROM gaps ORDER BY rowid DESC LIMIT 1 OFFSET ?"
         db.execute(f"DELETE FROM gaps WHERE rowid <= ({kept})", (MAX_KEPT_GAPS,))  # noqa: S608 - a constant
 
-    # Questions
-
-    def _answer(self, host: str, asked: HistoryAsk, now: float) -> History:
+    def _answer(self, host: str, asked: messages.HistoryAsk, now: float) -> messages.History:
         db = self._opened()
         low = 0.0 if asked.since is None else now - asked.since
         high, since = now - asked.until, self._fact("since")
@@ -265,15 +240,15 @@ class JournalStore:
             pattern = is_pattern(asked.rc)
             where.append("any_rc(?, rcs)" if pattern else "instr(char(10) || rcs || char(10), ?)")
             conditions.append(asked.rc if pattern else f"\n{asked.rc}\n")
-        # The conditions are met within an index: only what is found is read from the table.
+        # Conditions are met within an index: only results are read from the table.
         found = f"SELECT id FROM holds WHERE {' AND '.join(where)} ORDER BY began DESC, id DESC LIMIT ?"  # noqa: S608 - texts of this function
         sql = f"SELECT id, {_COLUMNS} FROM holds WHERE id IN ({found}) ORDER BY began DESC, id DESC"  # noqa: S608
-        holds: list[PastHold] = []
-        last: Cursor = (0.0, 0)
-        more: Cursor | None = None
+        holds: list[messages.PastHold] = []
+        last: messages.Cursor = (0.0, 0)
+        more: messages.Cursor | None = None
         size = 0
         for row in db.execute(sql, (*conditions, asked.limit + 1)):
-            if len(holds) == asked.limit or size > MAX_TOLD_BYTES:
+            if len(holds) == asked.limit or size > messages.MAX_TOLD_BYTES:
                 more = last
                 break
             hold = _hold(row[1:])
@@ -281,13 +256,13 @@ class JournalStore:
             last = (hold.began, row[0])
             size += 400 + len(row[8]) + len(row[13]) + len(row[14] or "")
             size += 2 * len(row[8]) if row[21] else 0
-        return History(host, now, since, holds, more, [] if asked.before is not None else _gaps(db, low, high))
+        return messages.History(host, now, since, holds, more, [] if asked.before is not None else _gaps(db, low, high))
 
 
-def _gaps(db: sqlite3.Connection, low: float, high: float) -> list[JournalGap]:
+def _gaps(db: sqlite3.Connection, low: float, high: float) -> list[messages.JournalGap]:
     sql = "SELECT began, ended, cause, count FROM gaps WHERE ended >= ? AND began <= ? ORDER BY rowid DESC LIMIT ?"
-    rows = db.execute(sql, (low, high, MAX_GAPS)).fetchall()
-    return [JournalGap(*row) for row in reversed(rows)]
+    rows = db.execute(sql, (low, high, messages.MAX_GAPS)).fetchall()
+    return [messages.JournalGap(*row) for row in reversed(rows)]
 
 
 def _used(db: sqlite3.Connection) -> int:
@@ -328,54 +303,25 @@ def _used_by_rc(rcs: list[str], text: str | None) -> dict[RcName, float]:
     return {rc: float(seconds) for rc, seconds in zip(rcs, (text or "").split("\n"), strict=False) if seconds}
 
 
-def _row(hold: PastHold) -> tuple[object, ...]:
-    who = hold.who or Who()
-    return (
-        hold.grant.term.counter,
-        hold.grant.term.rcm,
-        hold.grant.seq,
-        hold.id,
-        hold.arc,
-        hold.client,
-        hold.client.partition("/")[0],
-        "\n".join(hold.rcs),
-        hold.began,
-        hold.late,
-        hold.ended,
-        hold.outcome,
-        hold.reason,
-        None if hold.by is None else msgspec.json.encode(hold.by).decode(),
-        hold.priority,
-        hold.min_runtime,
-        hold.waited,
-        who.user or None,
-        who.host or None,
-        who.command or None,
-        _used_text(hold.rcs, hold.used),
-    )
+def _row(hold: messages.PastHold) -> tuple[object, ...]:
+    (counter, rcm), seq = hold.grant
+    who, owner = hold.who or messages.Who(), hold.client.partition("/")[0]
+    by = None if hold.by is None else msgspec.json.encode(hold.by).decode()
+    names = counter, rcm, seq, hold.id, hold.arc, hold.client, owner, "\n".join(hold.rcs)
+    times = hold.began, hold.late, hold.ended, hold.outcome, hold.reason, by
+    asked = hold.priority, hold.min_runtime, hold.waited, who.user or None, who.host or None, who.command or None
+    return *names, *times, *asked, _used_text(hold.rcs, hold.used)
 
 
-def _hold(row: tuple[Any, ...]) -> PastHold:
+def _hold(row: tuple[Any, ...]) -> messages.PastHold:
     (term, rcm, seq, number, arc, client, _, rcs, began, late, ended, outcome, reason, by, priority, runtime) = row[:16]
     waited, user, host, command, used = row[16:]
-    held = rcs.split("\n") if rcs else []
-    return PastHold(
-        Grant(Term(term, rcm), seq),
-        number,
-        arc,
-        client,
-        held,
-        began,
-        bool(late),
-        ended,
-        outcome,
-        reason,
-        None if by is None else _PARTY.decode(by),
-        priority,
-        runtime,
-        waited,
-        Who(user or "", host or "", command or "") if user or host or command else None,
-        _used_by_rc(held, used),
+    grant, held = Grant(Term(term, rcm), seq), rcs.split("\n") if rcs else []
+    by = None if by is None else _PARTY.decode(by)
+    who = messages.Who(user or "", host or "", command or "") if user or host or command else None
+    times = began, bool(late), ended, outcome, reason
+    return messages.PastHold(
+        grant, number, arc, client, held, *times, by, priority, runtime, waited, who, _used_by_rc(held, used)
     )
 
 
@@ -384,21 +330,16 @@ def _any_rc(pattern: str, rcs: str) -> bool:
     return any(map(matcher(pattern), rcs.split("\n")))
 
 
-class _transaction:  # noqa: N801 - reads as a statement
-    """All or nothing."""
-
-    def __init__(self, db: sqlite3.Connection) -> None:
-        self._db = db
-
-    def __enter__(self) -> None:
-        self._db.execute("BEGIN IMMEDIATE")
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is None:
-            self._db.execute("COMMIT")
-        else:
-            with suppress(sqlite3.Error):
-                self._db.execute("ROLLBACK")
+@contextmanager
+def _transaction(db: sqlite3.Connection) -> Iterator[None]:
+    db.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+    except BaseException:
+        with suppress(sqlite3.Error):
+            db.execute("ROLLBACK")
+        raise
+    db.execute("COMMIT")
 
 
 def _damaged(why: str) -> sqlite3.DatabaseError:

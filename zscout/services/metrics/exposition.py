@@ -1,4 +1,4 @@
-"""A node's figures in Prometheus' text format. With those of its process: `process_cpu_seconds_total` and the like."""
+"""A node's figures in Prometheus' text format, including its process's: `process_cpu_seconds_total` and the like."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4
 
 
 class Exposition:
-    """Writes what it is given; on any thread, one at a time."""
+    """For any thread, one at a time."""
 
     def __init__(self) -> None:
         self._samples: Samples = {}

@@ -1,7 +1,7 @@
-"""The figures of one node, and what each means: plain numbers, counted as things happen and read when somebody asks.
+"""The figures of one node, and their meaning: plain numbers, counted at events and read on request.
 
-`exposition.py` writes them in Prometheus' format. docs/reference/metrics.md has the same table; a test compares them.
-Labels have a bounded number of values: what is beyond is counted under `other`."""
+`exposition.py` writes them in Prometheus' format; a test compares docs/reference/metrics.md. Labels have a bounded
+number of values: further ones count as `other`."""
 
 from __future__ import annotations
 
@@ -16,18 +16,17 @@ from zscout.scheduling.model import Outcome
 from zscout.services.rcm.digest import Began, Over
 from zscout.types import SECOND, ArcId, Ns, RcName
 
-MAX_WAITERS: Final = 100
-"""Pairs of a priority and a group."""
+MAX_WAITERS: Final = 100  # pairs of a priority and a group
 MAX_RCS: Final = 1_000
 MAX_WAIT: Final[Ns] = 90 * 86_400 * SECOND
-"""A longer wait counts as one of this: what was waited under another RCM is a client's word."""
+"""Longer waits count as this: a client alone reports a wait under an earlier RCM."""
 WAITS: Final = (0.01, 0.1, 1.0, 5.0, 15.0, 60.0, 300.0, 900.0, 3_600.0, 14_400.0, 86_400.0)
 """Seconds: bounds of the buckets."""
 ERRORS: Final = (-3_600.0, -900.0, -300.0, -60.0, -15.0, -1.0, 0.0, 1.0, 15.0, 60.0, 300.0, 900.0, 3_600.0)
 
 
 class MetricFamily(NamedTuple):
-    """One metric. A node without what it is about does not show it."""
+    """A node shows only the metrics that apply to it."""
 
     kind: Literal["gauge", "counter", "histogram"]
     labels: tuple[str, ...]
@@ -61,17 +60,13 @@ FAMILIES: Final[Mapping[str, MetricFamily]] = {
 
 
 class Distribution(NamedTuple):
-    """What a histogram has counted."""
-
     bounds: tuple[float, ...]
-    counts: tuple[int, ...]
-    """Up to each bound, and in all."""
+    counts: tuple[int, ...]  # up to each bound, and in all
     sum: float
 
 
 Value: TypeAlias = float | Distribution
-Samples: TypeAlias = dict[str, dict[tuple[str, ...], Value]]
-"""By metric and values of its labels."""
+Samples: TypeAlias = dict[str, dict[tuple[str, ...], Value]]  # by metric and values of its labels
 
 
 class Histogram:
@@ -88,8 +83,6 @@ class Histogram:
 
 
 class Labels:
-    """Values that are told apart, up to so many."""
-
     def __init__(self, most: int) -> None:
         self._most = most
         self._known: set[tuple[str, ...]] = set()
@@ -103,7 +96,7 @@ class Labels:
 
 
 class HoldFigures:
-    """What this node's RCMs have counted of waits and holds. A HoldListener."""
+    """Waits and holds counted by this node's RCMs. A HoldListener."""
 
     def __init__(self, access: AccessPolicy) -> None:
         self.take(access)
@@ -111,12 +104,11 @@ class HoldFigures:
         self._waits: dict[tuple[str, ...], Histogram] = {}
         self._errors = Histogram(ERRORS)
         self._preemptions: dict[tuple[str, ...], int] = {}
-        self._held: dict[tuple[str, ...], Ns] = {}
-        """Of what is over."""
+        self._held: dict[tuple[str, ...], Ns] = {}  # of ended holds
         self._holds: dict[ArcId, Began] = {}
 
     def take(self, access: AccessPolicy) -> None:
-        """The groups may be others from now on. Of several that a name is in, the first counts."""
+        """Replace the groups. Of several groups of a name, the first counts."""
         self._groups: dict[str, str] = {}
         for group, members in access.groups.items():
             for member in members:

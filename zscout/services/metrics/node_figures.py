@@ -1,4 +1,4 @@
-"""What a node knows at one moment, of itself and as a leader."""
+"""A node's figures at one moment, of itself and as a leader."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from zscout.types import VERSION
 
 
 class NodeFigures:
-    """Read in the event loop, so that all of it is of one moment."""
+    """Read in the event loop, so that all figures are of one moment."""
 
     def __init__(self, node: Node, mesh: Mesh, rcs: Sequence[ResourceController]) -> None:
         self._node, self._mesh, self._rcs = node, mesh, rcs

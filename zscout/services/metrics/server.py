@@ -1,7 +1,6 @@
-"""Serves a node's figures over HTTP: `GET /metrics`, and nothing else.
+"""Serves a node's figures over HTTP, `GET /metrics` alone.
 
-A scrape is read and answered in the event loop, and written as text in a thread, one at a time, at most once in
-`FRESH` seconds however many ask."""
+Figures are read in the event loop, and formatted in a thread, one at a time, at most once in `FRESH` seconds."""
 
 from __future__ import annotations
 
@@ -14,13 +13,10 @@ from zscout.services.metrics.exposition import CONTENT_TYPE, Exposition
 from zscout.services.metrics.figures import Samples
 from zscout.services.plain_http import Page, PlainHttpServer
 
-FRESH: Final = 1.0
-"""Seconds for which a text is given again."""
+FRESH: Final = 1.0  # seconds for which a text is reused
 
 
 class MetricsServer(PlainHttpServer):
-    """`read` gives the figures of now, in the event loop."""
-
     where = "figures are at /metrics"
 
     def __init__(self, read: Callable[[], Samples], bind: str, port: int) -> None:

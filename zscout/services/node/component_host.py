@@ -1,4 +1,4 @@
-"""The components of one host: what is asked of its node about them (`host/<host>/component`)."""
+"""The components of one host, and their operations (`host/<host>/component`)."""
 
 from __future__ import annotations
 
@@ -25,19 +25,13 @@ from zscout.services.node.process_use import RunningComponent
 
 log = logging.getLogger("zscout.components")
 
-MAX_ENDED: Final = 64
-"""Ended components that are still listed."""
-MAX_UNDERWAY: Final = 512
-"""Operations at one time."""
-MAKE_WAY: Final = 5.0
-"""Seconds that an incarnation on its way out has until the next one is refused."""
-GRACE: Final = 2.0
-"""Seconds that components have to end when their node does."""
+MAX_ENDED: Final = 64  # ended components still listed
+MAX_UNDERWAY: Final = 512  # operations at one time
+MAKE_WAY: Final = 5.0  # seconds for a leaving incarnation before its successor is refused
+GRACE: Final = 2.0  # seconds for components to end with their node
 
 
 class ComponentHost:
-    """Starts, watches and ends the components of this host."""
-
     def __init__(
         self,
         mesh: Mesh,
@@ -56,8 +50,7 @@ class ComponentHost:
         self._limits = limits or ControlGroups()
         self._living: dict[str, ComponentProcess] = {}
         self._ended: OrderedDict[str, ComponentProcess] = OrderedDict()
-        self._known: OrderedDict[str, int] = OrderedDict()
-        """The highest incarnation of each component that was started here."""
+        self._known: OrderedDict[str, int] = OrderedDict()  # the highest incarnation of each component started here
         self.supervisor = Supervisor("the component host", on_failure)
         self._underway = 0
         self._stopping = False
@@ -70,7 +63,7 @@ class ComponentHost:
         ]
 
     async def stop(self) -> None:
-        """Ends all components, side by side, each within GRACE seconds."""
+        """End all components in parallel, each within GRACE seconds."""
         self._stopping = True
         await asyncio.gather(*(process.stop(GRACE) for process in list(self._living.values())))
         for served in self._served:
@@ -78,24 +71,22 @@ class ComponentHost:
         await self.supervisor.close()
 
     def take(self, rules: ComponentsConfig) -> None:
-        """What may be started from now on; what runs goes on."""
+        """Rules for later starts; running components continue."""
         self._rules = rules
 
     def running(self) -> list[RunningComponent]:
-        """For the load report; may be called from any thread."""
+        """For the load report; callable from any thread."""
         return [
             RunningComponent(process.start.component, process.start.spec.kind, process.start.incarnation, pid)
             for process in list(self._living.values())
             if (pid := process.pid) is not None
         ]
 
-    # What is asked
-
     def _on_request(self, request: IncomingQuery[messages.ComponentOperation]) -> None:
         if self._underway >= MAX_UNDERWAY:
             raise Refused("busy", "too many operations are running here; try again")
         if self.mesh.keys.closed and not isinstance(request.message, messages.ListComponents | messages.ReadOutput):
-            self._authority.check_machine(self.mesh.keys.sender_of(request.key), "tell a node to do this")
+            self._authority.check_machine(self.mesh.keys.sender_of(request.key), "order a node to do this")
         self._underway += 1
         self.supervisor.spawn(self._answer(request))
 
@@ -141,7 +132,7 @@ class ComponentHost:
     async def _start(self, start: messages.StartComponent) -> msgspec.Struct:
         before = self._living.get(start.component)
         if before is not None and before.leaving and start.incarnation > before.start.incarnation:
-            # It moved away, failed or is being stopped: what comes next may be here before it is quite gone.
+            # It moved away, failed or stops: its successor may come before the end.
             await done_within(MAKE_WAY, before.over.wait())
         process = self._same(start) or await self._launch(start)
         await process.settled.wait()
@@ -150,7 +141,7 @@ class ComponentHost:
     async def _launch(self, start: messages.StartComponent) -> ComponentProcess:
         self._check(start)
         kinds = await asyncio.to_thread(self._kinds)
-        # Another one may have asked meanwhile.
+        # A start may have come meanwhile.
         if process := self._same(start):
             return process
         where = kinds.get(start.spec.kind)
@@ -177,7 +168,7 @@ class ComponentHost:
         return process
 
     def _same(self, start: messages.StartComponent) -> ComponentProcess | None:
-        """The process that this start has led to already. Raises Refused where another one is in its way."""
+        """The process of an equal earlier start. Raises Refused if another is in the way."""
         name = start.component
         process = self._living.get(name) or self._ended.get(name)
         if process is not None and process.start.incarnation == start.incarnation:
@@ -215,7 +206,7 @@ class ComponentHost:
         return sorted(kind for kind in kinds if allowed is None or kind in allowed)
 
     def _find(self, name: str, incarnation: int | None = None, *, old: str = "old_incarnation") -> ComponentProcess:
-        """`old` is the code where a higher incarnation was started here: the one that is meant has ended."""
+        """`old` is the code if a higher incarnation was started here: the one meant has ended."""
         process = self._living.get(name) or self._ended.get(name)
         if process is None:
             raise Refused("unknown_component", f"there is no component {quoted(name[:80])} on this host")

@@ -1,4 +1,4 @@
-"""What a component writes: the last of it is kept, and a flood is held back."""
+"""Output of a component: the end is kept, and a flood is held back."""
 
 from __future__ import annotations
 
@@ -9,29 +9,24 @@ from typing import Final
 
 from zscout.messages import MAX_OUTPUT, MAX_TAIL
 
-RATE: Final = 1_000_000
-"""Bytes a second that are read at most, on average: who writes more has to wait."""
-BURST: Final = 262_144
-"""Bytes that are read at once before that holds."""
+RATE: Final = 1_000_000  # bytes read per second, on average; faster writers wait
+BURST: Final = 262_144  # bytes read before that limit applies
 CHUNK: Final = 65_536
-LAST_READS: Final = 32
-"""Chunks that are read of what is left when a component has ended."""
+LAST_READS: Final = 32  # chunks read after a component has ended
 
 
 class OutputRing:
-    """The last `size` bytes of a stream. Places are counted in bytes from its beginning."""
+    """The last `size` bytes of a stream. Positions are bytes from its beginning."""
 
     def __init__(self, size: int = MAX_OUTPUT) -> None:
         self._size = size
         self._bytes = bytearray()
-        self.end = 0
-        """Bytes that were ever written."""
-        self.over = False
-        """Nothing more will come."""
+        self.end = 0  # bytes ever written
+        self.over = False  # the stream has ended
 
     @property
     def start(self) -> int:
-        """The first byte that is still there."""
+        """The first byte still kept."""
         return self.end - len(self._bytes)
 
     def write(self, data: bytes) -> None:
@@ -41,8 +36,7 @@ class OutputRing:
             del self._bytes[: -self._size]
 
     def read(self, start: int) -> tuple[int, int, str]:
-        """What there is from byte `start` on: where it begins and ends, and the text, with U+FFFD for what is
-        no UTF-8. A character that is not whole yet is left for the next time."""
+        """Start, end and text from byte `start`, U+FFFD for invalid UTF-8, without an incomplete last character."""
         first = min(max(start, self.start), self.end)
         decoder = codecs.getincrementaldecoder("utf-8")("replace")
         text = decoder.decode(self._bytes[first - self.start :], final=self.over)
@@ -80,7 +74,7 @@ class OutputReader:
             self._again = self._loop.call_later(-self._credit / RATE, self._loop.add_reader, self._fd, self._readable)
 
     def _read(self) -> int | None:
-        """How many bytes were read; None: nothing is there now, 0: nobody holds the other end any more."""
+        """Bytes read; None: nothing now, 0: the other end is closed."""
         try:
             data = os.read(self._fd, CHUNK)
         except BlockingIOError:
@@ -89,7 +83,7 @@ class OutputReader:
         return len(data)
 
     def finish(self) -> None:
-        """Reads what is there still, and closes the pipe, whoever writes to it."""
+        """Read the rest, and close the pipe, even if it has writers."""
         if self._again is not None:
             self._again.cancel()
         self._loop.remove_reader(self._fd)

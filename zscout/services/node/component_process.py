@@ -1,4 +1,4 @@
-"""One component as its node sees it: a child process, its orders, its messages, and how it ended."""
+"""One component of a node: a child process, its orders, its messages, and its end."""
 
 from __future__ import annotations
 
@@ -32,15 +32,13 @@ from zscout.types import SECOND, Ns
 
 log = logging.getLogger("zscout.components")
 
-LINGER: Final = 2.0
-"""Seconds from a process's last word to its end."""
-SLACK: Final = 5.0
-"""Seconds for its answer to an order, beyond those that it has to carry it out."""
+LINGER: Final = 2.0  # seconds from a process's last message to its end
+SLACK: Final = 5.0  # seconds for an answer, beyond those for carrying out the order
 
 
 class ComponentProcess:
-    """One incarnation of a component. `where` is the kind's `module:class`; `fleet` how a child joins; `now` the clock
-    of its node; `on_over` is called once, when it has ended."""
+    """One incarnation of a component. `where` is the kind's `module:class`; `fleet` how a child joins; `now` the node's
+    clock; `on_over` is called once, at its end."""
 
     def __init__(
         self,
@@ -61,23 +59,18 @@ class ComponentProcess:
         self.movable = False
         self.moved: Moved | None = None
         self.output = OutputRing()
-        self.settled = asyncio.Event()
-        """It stands by, runs, or has ended."""
-        self.running = asyncio.Event()
-        """It runs, or has ended."""
+        self.settled = asyncio.Event()  # set on standby, running, or ended
+        self.running = asyncio.Event()  # set when running, or ended
         self.over = asyncio.Event()
         self._began = now()
         self._lasted: Ns | None = None
         self._tag = f"{start.component}.{start.incarnation}-{new_instance()}"
         self._child: subprocess.Popen[bytes] | None = None
-        self._orders: asyncio.Queue[bytes] | None = None
-        """What is to be sent to its process, while there is a connection."""
+        self._orders: asyncio.Queue[bytes] | None = None  # messages to its process, while connected
         self._group = ComponentGroup(0, 0)
-        self._verdict: EndReport | None = None
-        """How it ends if it is this node that ends it."""
+        self._verdict: EndReport | None = None  # the outcome if this node ends it
         self._end_report: EndReport | None = None
-        self._gone = False
-        """Its process is no more, but not everything of it is cleared up."""
+        self._gone = False  # its process ended, cleanup continues
         self._waiting: dict[int, asyncio.Future[OrderAnswer]] = {}
         self._numbers = itertools.count(1)
         self._moving: tuple[MoveComponent, asyncio.Task[Moved]] | None = None
@@ -89,11 +82,11 @@ class ComponentProcess:
 
     @property
     def leaving(self) -> bool:
-        """Whether it will have ended before long, of itself or because it was ordered to."""
+        """Return True if it will end soon, by itself or by order."""
         return self.phase == "stopping" or self.moved is not None or self._gone or self._end_report is not None
 
     def begin(self, supervisor: Supervisor) -> None:
-        """Starts it; `supervisor` is its host's. What fails at it ends this component alone, as `failed`."""
+        """Start it under its host's `supervisor`. A failure ends this component alone, as `failed`."""
         self._supervisor = supervisor
         supervisor.spawn(self._live())
 
@@ -117,7 +110,7 @@ class ComponentProcess:
     # Orders. Each raises Refused.
 
     async def stop(self, grace: float) -> ComponentView:
-        """Returns when it has ended: by itself within `grace` seconds, or killed."""
+        """Return at its end: by itself within `grace` seconds, or killed."""
         if self.phase != "ended":
             self.phase = "stopping"
             self._send(Order(0, messages.StopComponent(self.start.component)))
@@ -133,7 +126,7 @@ class ComponentProcess:
         return messages.Checkpoint(start.component, start.incarnation, answer.state)
 
     async def move(self, order: MoveComponent) -> Moved:
-        """Asked again for the same move it answers with the outcome of that one."""
+        """A repeated order returns the outcome of the same move."""
         if self.moved is not None and self.moved.incarnation == order.to_incarnation:
             return self.moved
         if self._moving is not None and not self._moving[1].done():
@@ -145,7 +138,7 @@ class ComponentProcess:
         return await asyncio.shield(self._moving[1])
 
     async def _move(self, order: MoveComponent) -> Moved:
-        # Without an end: once it is committed it may last until the other node is known to be gone.
+        # No timeout: a committed move may last until the other node is known to be gone.
         answer = await self._ask(order, None)
         if self.phase == "running":
             self.phase = "stopping"
@@ -154,12 +147,12 @@ class ComponentProcess:
 
     async def restore(self, order: RestoreComponent) -> ComponentView:
         if self.phase != "standby":
-            raise Refused("move_failed", f"it is {self.phase} here; only a component that is standing by is restored")
+            raise Refused("move_failed", f"it is {self.phase} here; only a component on standby is restored")
         await self._ask(order, SLACK)
         return self.view()
 
     async def activate(self, order: messages.ActivateComponent) -> ComponentView:
-        """Returns when it runs, or has ended."""
+        """Return when it runs, or has ended."""
         self._send(Order(0, order))
         await self.running.wait()
         return self.view()
@@ -187,8 +180,6 @@ class ComponentProcess:
     def _send(self, message: msgspec.Struct) -> None:
         if self._orders is not None:
             self._orders.put_nowait(channel.pack(message))
-
-    # Its life
 
     async def _live(self) -> None:
         timeout = self._fleet.placement.start_timeout / SECOND
@@ -222,12 +213,12 @@ class ComponentProcess:
         finally:
             os.close(writing)
         try:
-            # It waits for its job: what it uses from now on counts.
+            # It waits for its job: its use counts from here.
             await asyncio.to_thread(self._group.enter, child.pid)
             await self._serve_connection(ours, child)
         finally:
             ours.close()
-            # As long as nobody waited for it, nobody else has its number.
+            # Its number is not reused before the wait.
             with suppress(ProcessLookupError):
                 os.killpg(child.pid, signal.SIGKILL)
             await asyncio.to_thread(child.wait)
@@ -235,10 +226,9 @@ class ComponentProcess:
             output.finish()
 
     async def _serve_connection(self, connection: socket.socket, child: subprocess.Popen[bytes]) -> None:
-        """Gives a child its job, and returns when it has ended."""
+        """Give a child its job, and return at its end."""
         loop = asyncio.get_running_loop()
-        # Orders go by a socket of their own: where one can't be sent any more, asyncio would close the connection with
-        # all that has arrived and was not read, the last report of who has just left.
+        # A socket for orders alone: if one fails, asyncio would close the connection with unread messages.
         sending = connection.dup()
         stream, writer = await asyncio.open_unix_connection(sock=connection, limit=channel.MAX_FRAME)
         self._orders = asyncio.Queue()
@@ -312,7 +302,7 @@ class ComponentProcess:
             self._kill(EndReport("failed", f"it was killed: it did not get ready within {timeout:g} s"))
 
     def _kill(self, verdict: EndReport) -> None:
-        """Ends it by force, unless it has ended."""
+        """Kill it, unless it has ended."""
         if self.over.is_set():
             return
         self._verdict = self._verdict or verdict
@@ -320,7 +310,7 @@ class ComponentProcess:
 
     def _kill_child(self) -> None:
         if self.pid is not None:
-            # Its number is its own until it was waited for.
+            # Its number is not reused before the wait.
             with suppress(ProcessLookupError):
                 os.killpg(self.pid, signal.SIGKILL)
 
@@ -341,7 +331,7 @@ class ComponentProcess:
                 event.set()
 
     def _how(self) -> EndReport:
-        """How one ended that had no last word."""
+        """The outcome without a final report."""
         if self._verdict is not None:
             return self._verdict
         code = self._child.returncode if self._child is not None else None
@@ -355,7 +345,7 @@ class ComponentProcess:
 
 
 async def _speak(connection: socket.socket, frames: asyncio.Queue[bytes]) -> None:
-    """Sends what is put into `frames`, until the other side has closed."""
+    """Send the frames until the other side has closed."""
     loop = asyncio.get_running_loop()
     connection.setblocking(False)
     with suppress(OSError):

@@ -1,7 +1,6 @@
-"""What a host is and has: processors, their speed and use, memory, temperature. Read from the system.
+"""Figures of a host, read from the system: processors, their speed and use, memory, temperature.
 
-The limits of a container, by its control groups (cgroup v2, v1, or both at once), count where they are smaller than the
-host. A file that is missing or makes no sense is no limit."""
+Limits of control groups (cgroup v2, v1, or both) count if smaller than the host; unreadable files are no limit."""
 
 from __future__ import annotations
 
@@ -17,19 +16,13 @@ import psutil
 
 from zscout.types import SECOND
 
-WORK: Final = 12_000
-"""Rounds of the piece of work that speed is measured by: about a millisecond on a plain machine of 2024."""
-TRIES: Final = 15
-"""The best of so many counts: caches and clocks were not ready for the others."""
-PAUSE: Final = 0.001
-"""Seconds between two tries, in which other threads have the interpreter."""
+WORK: Final = 12_000  # rounds of the speed benchmark: about a millisecond on a plain machine of 2024
+TRIES: Final = 15  # the best try counts: caches and clocks warm up in the others
+PAUSE: Final = 0.001  # seconds between two tries, for other threads
 
-NO_LIMIT: Final = 1 << 60
-"""Bytes; cgroup v1 writes about so much where there is no limit."""
-MAX_DEPTH: Final = 64
-"""Groups within groups that are looked at."""
-MAX_BYTES: Final = 65_536
-"""Of one file that is read."""
+NO_LIMIT: Final = 1 << 60  # bytes; cgroup v1 writes about this much for no limit
+MAX_DEPTH: Final = 64  # nested groups examined
+MAX_BYTES: Final = 65_536  # of one file read
 
 T = TypeVar("T")
 
@@ -42,27 +35,26 @@ class HostMemory(NamedTuple):
 
 
 class Cgroup:
-    """The limits of the control groups that a process is in, and of those above them.
+    """The limits of a process's control groups and their parents.
 
-    `root` is where they are mounted, `of` the file that says which the process is in."""
+    `root`: their mount point; `of`: the file that lists the process's groups."""
 
     def __init__(self, root: Path = Path("/sys/fs/cgroup"), of: Path = Path("/proc/self/cgroup")) -> None:
         places = own_groups(of)
         unified = places.get("", ())
-        # Beside groups of v1 systemd mounts those of v2 one folder deeper.
+        # Beside groups of v1 systemd mounts v2 one folder deeper.
         self._v2 = [*group_folders(root, unified), *group_folders(root / "unified", unified)]
         self._cpu = group_folders(root / "cpu", places.get("cpu", ()))
         self._cpuacct = root / "cpuacct"
         self._memory = group_folders(root / "memory", places.get("memory", ()))
 
     def cores(self) -> float | None:
-        """Cores that may be used at most; None: no limit."""
+        """Most usable cores; None: no limit."""
         limit = self._tightest()
         return None if limit is None else limit[0]
 
     def used(self) -> float | None:
-        """Seconds of processor time that the group of the tightest limit has used so far; None: no limit, or
-        the system does not tell."""
+        """Processor seconds used by the group with the tightest limit; None without limit or figure."""
         limit = self._tightest()
         if limit is None:
             return None
@@ -77,8 +69,7 @@ class Cgroup:
         return None
 
     def memory(self) -> HostMemory | None:
-        """The total of the tightest limit and what is left of the most used one; None: no limit. Files that
-        the system can drop count as available."""
+        """The tightest total, and the least left of any; None: no limit. Droppable file caches count as available."""
         found = []
         names = [(folder, "memory.max", "memory.current", "inactive_file") for folder in self._v2]
         v1 = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
@@ -89,7 +80,7 @@ class Cgroup:
                 found.append(HostMemory(max(0, min(total, free)), total))
         if not found:
             return None
-        return HostMemory(min(one.available for one in found), min(one.total for one in found))
+        return HostMemory(min(limit.available for limit in found), min(limit.total for limit in found))
 
     def _tightest(self) -> tuple[float, Path] | None:
         found = []
@@ -104,12 +95,12 @@ class Cgroup:
 
 
 def _share(quota: int | None, period: int | None) -> float | None:
-    """Cores by a quota of time in each period; a quota of -1 is none."""
+    """Cores by a quota of time per period; -1 is none."""
     return quota / period if quota and period and quota > 0 and period > 0 else None
 
 
 def own_groups(of: Path) -> dict[str, tuple[str, ...]]:
-    """The way to the process's group by controller; that of cgroup v2 has no name."""
+    """The process's group path by controller; cgroup v2 has no name."""
     places = {}
     for line in read_text(of).splitlines():
         _, first, rest = line.partition(":")
@@ -122,8 +113,7 @@ def own_groups(of: Path) -> dict[str, tuple[str, ...]]:
 
 
 def group_folders(root: Path, parts: tuple[str, ...]) -> list[Path]:
-    """The folder of a group and those above it, from the root on. In a container the way to the group may be
-    the host's, of which only the root is there."""
+    """The folders from the root to a group. In a container the path may be the host's, with only the root present."""
     folders = [root]
     for part in parts:
         folders.append(folders[-1] / part)
@@ -139,7 +129,7 @@ def read_text(file: Path) -> str:
 
 
 def _whole(text: str) -> int | None:
-    """A whole number of no more than 20 digits."""
+    """A whole number of at most 20 digits."""
     text = text.strip()
     try:
         return int(text) if len(text) <= 20 else None
@@ -152,7 +142,7 @@ def _number(file: Path) -> int | None:
 
 
 def read_field(file: Path, name: str) -> int | None:
-    """One figure of a file that has a name and a figure in each line; None if it is not there."""
+    """The figure after `name` in a file of named figures; None if absent."""
     for line in read_text(file).splitlines():
         key, _, value = line.partition(" ")
         if key == name:
@@ -161,15 +151,13 @@ def read_field(file: Path, name: str) -> int | None:
 
 
 class CpuMeter:
-    """How much of the processors was in use since it was last asked."""
-
     def __init__(self, cgroup: Cgroup) -> None:
         self._cgroup = cgroup
         self._host = _host_times()
         self._group = (time.monotonic(), cgroup.used())
 
     def percent(self, cores: float) -> float:
-        """In percent of the host's processors or, if that is more, of the `cores` a container may use."""
+        """Percent of the host's processors or, if that is more, of a container's `cores`."""
         before, self._host = self._host, _host_times()
         busy, total = (now - then for now, then in zip(self._host, before, strict=True))
         percent = 100 * busy / total if total > 0 else 0.0
@@ -181,8 +169,7 @@ class CpuMeter:
 
 
 class Paced(Generic[T]):
-    """A figure that is measured no more often than every `least` seconds, and less often where measuring it
-    would take more than `share` of one core; between that the last one is given."""
+    """A figure measured every `least` seconds at most, at a cost of `share` of one core at most; else cached."""
 
     def __init__(self, measure: Callable[[], T], *, least: float, share: float) -> None:
         self._measure, self._least, self._share = measure, least, share
@@ -199,20 +186,20 @@ class Paced(Generic[T]):
 
 
 def cores(cgroup: Cgroup) -> float:
-    """Cores that this process can use: the fewest of what there are, what it is bound to, and its limits."""
+    """Usable cores: the fewest of present, bound, and limit."""
     bound = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return float(min(bound, cgroup.cores() or bound))
 
 
 def memory(cgroup: Cgroup) -> HostMemory:
-    """What the host has, or the container where that is less."""
+    """The host's memory, or the container's if less."""
     host = psutil.virtual_memory()
     limit = cgroup.memory() or host
     return HostMemory(min(limit.available, host.available), min(limit.total, host.total))
 
 
 def clock() -> tuple[float, float]:
-    """Processor clock in MHz, now and rated; 0 where the system does not tell."""
+    """Processor clock in MHz, now and rated; 0 if unknown."""
     with suppress(OSError, NotImplementedError, RuntimeError, ValueError):
         if (found := psutil.cpu_freq()) is not None:
             return float(found.current or 0), float(found.max or 0)
@@ -220,19 +207,18 @@ def clock() -> tuple[float, float]:
 
 
 def temperature() -> float | None:
-    """The hottest of the host's sensors in degrees Celsius; None where there is none."""
+    """The hottest sensor in degrees Celsius; None without one."""
     with suppress(AttributeError, OSError, RuntimeError, ValueError):  # not every system has this function
         found = psutil.sensors_temperatures()
-        return max((one.current for group in found.values() for one in group if one.current), default=None)
+        return max((sensor.current for group in found.values() for sensor in group if sensor.current), default=None)
     return None
 
 
 def speed(tries: int = TRIES) -> float:
-    """How fast one core is at Python's own work: 1.0 does the piece of work in a millisecond of processor
-    time. Takes a few of them, 2 ms a try; call it in a thread of its own."""
+    """Speed of one core at Python: 1.0 takes a processor millisecond for the benchmark. Takes 2 ms a try."""
     best = math.inf
     for _ in range(tries):
-        # Processor time of this thread: what others take from it says nothing about the machine.
+        # Thread time: other load does not slow the result.
         start = time.thread_time()
         total = 0
         for number in range(WORK):
@@ -243,7 +229,7 @@ def speed(tries: int = TRIES) -> float:
 
 
 def _host_times() -> tuple[float, float]:
-    """Seconds of all processors so far: busy, and in all."""
+    """Seconds of all processors so far: busy, and total."""
     times = psutil.cpu_times()._asdict()
     for within in ("guest", "guest_nice"):  # these are in `user` and `nice` already
         times.pop(within, None)

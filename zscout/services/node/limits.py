@@ -1,7 +1,6 @@
-"""Limits of memory and processor time for components, by control groups (v1, or v2 where the node may).
+"""Limits of memory and processor time for components, by control groups (v1, or v2 if permitted).
 
-A component that has a limit gets a group of its own below the node's. Where that can't be had, memory is limited for
-each of its processes by itself (RLIMIT_DATA), and processor time is not."""
+A component with a limit gets a group below the node's, else only a memory limit per process (RLIMIT_DATA)."""
 
 from __future__ import annotations
 
@@ -20,38 +19,32 @@ from zscout.services.node.host_figures import group_folders, own_groups, read_fi
 log = logging.getLogger("zscout.components")
 
 PERIOD_US: Final = 100_000
-LEAST_US: Final = 1_000
-"""Of each period: the kernel takes no less."""
+LEAST_US: Final = 1_000  # of each period: the kernel's minimum
 START_CORES: Final = 1.0
 PREFIX: Final = "zscout."
-LEAF: Final = "zscout-node"
-"""The group (v2) that the node moves itself into: one with processes can't limit groups within it."""
+LEAF: Final = "zscout-node"  # the group (v2) for the node itself: a group with processes can't limit groups within it
 CLOSE_TRIES: Final = 50
-CLOSE_PAUSE: Final = 0.02
-"""Seconds. A group can't be removed before the kernel is done with its last process."""
+CLOSE_PAUSE: Final = 0.02  # seconds. The kernel must finish a group's last process before its removal.
 
 
 class ComponentGroup:
-    """The limits of one component. Not for the event loop: its methods wait for files, `close` up to 1 s."""
+    """The limits of one component. Methods wait for files, `close` up to 1 s: not for the event loop."""
 
     def __init__(self, memory: int, cpu: float) -> None:
         self.folders: list[Path] = []
-        self.memory = memory
-        """Bytes; 0: no limit."""
-        self.cpu = cpu
-        """Cores; 0: no limit."""
+        self.memory = memory  # bytes; 0: no limit
+        self.cpu = cpu  # cores; 0: no limit
         self.memory_set = self.cpu_set = False
-        self.throttle: tuple[Path, str] | None = None
-        """The file, and what it is to say once the component is ready."""
+        self.throttle: tuple[Path, str] | None = None  # the file, and its content once the component is ready
 
     @property
     def each(self) -> int:
-        """Bytes that each process is to limit itself to, as there is no group to do it for all; 0: none."""
+        """Bytes that each process limits itself to, without a group; 0: none."""
         return 0 if self.memory_set else self.memory
 
     @property
     def missing(self) -> str:
-        """Which limits this host can't set, in words."""
+        """The limits this host can't set, in words."""
         parts = []
         if self.memory and not self.memory_set:
             parts.append("memory_limit holds for each of its processes, not for all together")
@@ -60,26 +53,25 @@ class ComponentGroup:
         return f"{' and '.join(parts)}: this host lets its node make no control groups" if parts else ""
 
     def enter(self, pid: int) -> None:
-        """Puts a process in, and all that it starts from now on. Raises OSError."""
+        """Add a process, with all its later children. Raises OSError."""
         for folder in self.folders:
             _write(folder / "cgroup.procs", str(pid))
 
     def settle(self) -> None:
-        """The component is ready: from now on its limit of processor time holds. Before, START_CORES do, so
-        that one that may use little later is ready in time."""
+        """The component is ready: replace START_CORES, which speed its start, by its limit."""
         if self.throttle is not None:
             with suppress(OSError):  # it has ended meanwhile
                 _write(*self.throttle)
 
     def overdrawn(self) -> bool:
-        """Whether the kernel killed something of it because it used more memory than its limit."""
+        """Return True if the kernel killed part of it for exceeding its memory limit."""
         names = ("memory.events", "memory.oom_control")
         return self.memory_set and any(
             (read_field(folder / name, "oom_kill") or 0) > 0 for folder in self.folders for name in names
         )
 
     def close(self) -> None:
-        """Kills what is still in it, and removes it."""
+        """Kill all processes left in it, and remove it."""
         for folder in self.folders:
             for last in range(CLOSE_TRIES):
                 for pid in _numbers(folder / "cgroup.procs"):
@@ -97,15 +89,14 @@ class ComponentGroup:
 
 
 class ControlGroups:
-    """Makes groups. `root` is where they are mounted, `of` the file that says which ones the node is in."""
+    """Makes groups. `root`: their mount point; `of`: the file that lists the node's groups."""
 
     def __init__(self, root: Path = Path("/sys/fs/cgroup"), of: Path = Path("/proc/self/cgroup")) -> None:
         self._root = root
         self._of = own_groups(of)
 
     def group(self, name: str, memory: int, cpu: float) -> ComponentGroup:
-        """A group for one component: `memory` in bytes, `cpu` in cores, 0 for no limit. What can't be set is
-        listed by the group. Not for the event loop."""
+        """A group for one component: `memory` in bytes, `cpu` in cores, 0 for no limit. Not for the event loop."""
         group = ComponentGroup(memory, cpu)
         name = f"{PREFIX}{os.getpid()}.{name}"
         group.memory_set = memory > 0 and self._limit(group, "memory", name)
@@ -113,7 +104,7 @@ class ControlGroups:
         return group
 
     def sweep(self) -> None:
-        """Removes the groups of nodes that were killed. Not for the event loop."""
+        """Remove the groups of killed nodes. Not for the event loop."""
         for parent in (self._own("memory"), self._own("cpu"), self._base()):
             for folder in parent.glob(f"{PREFIX}*"):
                 owner = folder.name.removeprefix(PREFIX).partition(".")[0]
@@ -122,18 +113,17 @@ class ControlGroups:
                         folder.rmdir()
 
     def _own(self, controller: str) -> Path:
-        """The node's own group of v1, or the deepest above it that can be seen: in a container the way to it
-        may be the host's."""
+        """The node's group of v1, or its deepest visible parent: in a container the path may be the host's."""
         return group_folders(self._root / controller, self._of.get(controller, ()))[-1]
 
     def _limit(self, group: ComponentGroup, controller: str, name: str) -> bool:
-        """Limits memory or processor time by a group of v1, or else of v2."""
+        """Limit memory or processor time by a group of v1, else of v2."""
         own, base, memory = self._own(controller), self._base(), str(group.memory)
         first, later = _quota(max(group.cpu, START_CORES)), _quota(group.cpu)
         also: dict[str, str] = {}
         if (own / "tasks").is_file():
             if controller == "memory":
-                # The second counts swap as well; not every kernel has it, and it can't be below the first.
+                # The second includes swap; it is optional, and must not be below the first.
                 wanted = {"memory.limit_in_bytes": memory}
                 also = {"memory.memsw.limit_in_bytes": memory}
             else:
@@ -176,8 +166,8 @@ def _make(group: ComponentGroup, folder: Path, wanted: dict[str, str], also: dic
 
 
 def _may_delegate(base: Path, controller: str) -> bool:
-    """Whether groups below `base` have a controller; gives it to them where this may be. A group that holds
-    processes can't (but for the root): if they are all the node's own, they are moved into one below."""
+    """Return True if groups below `base` have, or now get, a controller. A group that holds processes can't pass it on
+    (but for the root): if all are the node's own, move them into one below."""
     if controller not in read_text(base / "cgroup.controllers").split():
         return False
     switch = base / "cgroup.subtree_control"
@@ -201,7 +191,7 @@ def _may_delegate(base: Path, controller: str) -> bool:
 
 
 def _is_ours(pid: int) -> bool:
-    """Whether a process is this one or descends from it."""
+    """Return True if a process is our own or a descendant."""
     try:
         return os.getpid() in (pid, *(parent.pid for parent in psutil.Process(pid).parents()))
     except psutil.Error:
@@ -213,7 +203,7 @@ def _quota(cores: float) -> int:
 
 
 def _write(file: Path, text: str) -> None:
-    # Without O_CREAT: in a folder that is no control group nothing is to appear.
+    # Without O_CREAT: create no file in a folder that is no control group.
     with os.fdopen(os.open(file, os.O_WRONLY | os.O_TRUNC), "w") as opened:
         opened.write(text)
 

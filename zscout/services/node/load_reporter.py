@@ -1,4 +1,4 @@
-"""Publishes how loaded this host is: measured, once a second, dropped rather than queued."""
+"""Publishes the load of this host once a second, dropped rather than queued."""
 
 from __future__ import annotations
 
@@ -20,32 +20,24 @@ from zscout.types import VERSION
 
 log = logging.getLogger("zscout.load")
 
-PERIOD: Final = 1.0
-"""Seconds between two reports."""
-RESTARTS: Final = (1.0, 60.0)
-"""Seconds before a reporter that failed starts again: the first time, and at most."""
+PERIOD: Final = 1.0  # seconds between two reports
+RESTARTS: Final = (1.0, 60.0)  # seconds before a failed reporter restarts: the first time, and at most
 SPEED_EVERY: Final = 60.0
-SPEED_TRIES: Final = 5
-"""Of every measurement but the first."""
-SENSORS_EVERY: Final = 10.0
-"""Seconds; reading a sensor may take milliseconds, and one file for each core."""
+SPEED_TRIES: Final = 5  # of every measurement but the first
+SENSORS_EVERY: Final = 10.0  # seconds; a sensor may take milliseconds, and one file per core
 SENSORS_SHARE: Final = 0.0002
-USES_SHARE: Final = 0.002
-"""Of one core, that is spent on looking at what components use: many are looked at less often."""
-TREE_SHARE: Final = 0.004
-"""Likewise, at looking at this process and its descendants."""
+USES_SHARE: Final = 0.002  # of one core, spent on measuring components: many are measured less often
+TREE_SHARE: Final = 0.004  # the same for this process and its descendants
 
 
 LoadFigures: TypeAlias = tuple[tuple[float, float, float], float, int]
-"""Of a host, or of what is taken for one: load averages, percent of all cores, bytes of memory available."""
+"""Load averages, percent of all cores, bytes of memory available."""
 
 
 class LoadReporter:
-    """Publishes this host's load until stopped. `labels` are the host's; `running` its components. With
-    `tree` only the load of this process and its descendants, as if the host had no other programs.
+    """Publishes this host's load until stopped. With `tree`, only the load of this process and its descendants.
 
-    One that fails is logged, and withdraws its liveliness token: the host is seen to report no load. It
-    starts again after RESTARTS seconds: a node that runs devices does not end for want of figures."""
+    A failure is logged, withdraws the liveliness token, and restarts after RESTARTS seconds: the node continues."""
 
     def __init__(self, mesh: Mesh, labels: Iterable[str] = (), running: Running = tuple, *, tree: bool = False) -> None:
         self.mesh = mesh
@@ -87,13 +79,13 @@ class LoadReporter:
     async def _run(self) -> None:
         loop = asyncio.get_running_loop()
         due = loop.time() + PERIOD
-        # In a thread: it reads files, of which a sensor's may take its time.
+        # In a thread: reading files, such as a sensor's, may be slow.
         load = await asyncio.to_thread(TreeLoad) if self._tree else None
         gauge = await asyncio.to_thread(Gauge, self.mesh.me.host, self._labels, self._running, load=load)
         failed = False
         while True:
             await asyncio.sleep(due - loop.time())
-            # After a stall the reports that were missed are not made up for.
+            # Reports missed in a stall are skipped.
             due = max(due + PERIOD, loop.time())
             try:
                 report = await asyncio.to_thread(gauge.report)
@@ -108,7 +100,7 @@ class LoadReporter:
 
 
 class TreeLoad:
-    """The load of the process `root` (this one, if not given) and its descendants, as if there were no others."""
+    """The load of the process `root` (default: our own) and its descendants alone."""
 
     def __init__(self, root: int | None = None) -> None:
         self._meter = TreeMeter(root)
@@ -116,7 +108,7 @@ class TreeLoad:
         self._uses = host_figures.Paced(self._measure, least=PERIOD / 2, share=TREE_SHARE)
 
     def __call__(self, size: float, ram: host_figures.HostMemory) -> LoadFigures:
-        """Of so many cores, with this memory; CPU use since the tree was last looked at."""
+        """For so many cores, with this memory; CPU use since the last measurement."""
         use = self._uses()
         return self._averages, min(100.0, 100 * use.cores / size), max(0, ram.total - use.memory)
 
@@ -127,7 +119,7 @@ class TreeLoad:
 
 
 class Gauge:
-    """Measures one host again and again, the first time for 30 ms; use it from one thread at a time."""
+    """Measures one host repeatedly, the first time for 30 ms; for one thread at a time."""
 
     def __init__(
         self, host: str, labels: tuple[str, ...] = (), running: Running = tuple, *, load: TreeLoad | None = None
@@ -152,7 +144,7 @@ class Gauge:
         return LoadReport(
             host=self._host,
             number=self._number,
-            # Readers of the first version take whole numbers only.
+            # Readers of the first version accept whole numbers only.
             cores=int(size) if size.is_integer() else size,
             load_average=averages,
             cpu=percent,
@@ -168,11 +160,11 @@ class Gauge:
         )
 
     def _host_load(self, size: float, ram: host_figures.HostMemory) -> LoadFigures:
-        """Of the whole host, or of the container where that has limits; CPU use since the last call."""
+        """Of the host, or of a limited container; CPU use since the last call."""
         return os.getloadavg(), self._cpu.percent(size), ram.available
 
     def _measure_speed(self) -> float:
         found = host_figures.speed(SPEED_TRIES) if self._speed else host_figures.speed()
-        # A few tries may find a processor that was only asleep: believed at once if faster, else by halves.
+        # A slow result may come from a sleeping processor: faster ones are believed at once, slower ones by half.
         self._speed = found if found > self._speed else (self._speed + found) / 2
         return self._speed

@@ -1,4 +1,4 @@
-"""What process trees use, read from /proc in one pass: each component of a node, or the whole node."""
+"""Resource use of process trees, read from /proc in one pass: each component of a node, or the whole node."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ from zscout.types import SECOND
 
 TICK: Final = 1 / os.sysconf("SC_CLK_TCK")
 PAGE: Final = os.sysconf("SC_PAGE_SIZE")
-MAX_THREADS: Final = 4_096
-"""Of one tree whose waiting for a processor is looked at."""
+MAX_THREADS: Final = 4_096  # threads of one tree whose waiting time is read
 PROC: Final = Path("/proc")
 
 
@@ -28,8 +27,7 @@ def since_boot() -> float:
 
 
 class RunningComponent(NamedTuple):
-    """A component that runs on this host. `pid` is its root process: a child that was not waited for yet, so
-    that the number can't have passed to another."""
+    """`pid` is the component's root process, a child not waited for yet, so that its number is not reused."""
 
     component: str
     kind: str
@@ -37,44 +35,38 @@ class RunningComponent(NamedTuple):
     pid: int
 
 
-Running: TypeAlias = Callable[[], Iterable[RunningComponent]]
-"""The components of a node; may be called from any thread."""
+Running: TypeAlias = Callable[[], Iterable[RunningComponent]]  # the components of a node; callable from any thread
 
 
 class _Process(NamedTuple):
     parent: int
     state: bytes
-    cpu: float
-    """Seconds, with those of the children that it waited for."""
-    started: float
-    """Seconds since the host's start."""
+    cpu: float  # seconds, including children it waited for
+    started: float  # seconds since the host's start
     memory: int
 
 
-_Demand: TypeAlias = tuple[int, int]
-"""Nanoseconds that a thread ran, and that it waited for a processor."""
+_Demand: TypeAlias = tuple[int, int]  # nanoseconds that a thread ran, and waited for a processor
 
 
 class _Tree(NamedTuple):
     """A process and all its descendants at one moment, `at` in seconds since the host's start."""
 
     at: float
-    started: float = 0.0
-    """When its root did, on the same clock."""
-    cpu: float = 0.0
-    """Seconds of processor time so far."""
+    started: float = 0.0  # start of its root, on the same clock
+    cpu: float = 0.0  # processor seconds so far
     memory: int = 0
     pids: Sequence[int] = ()
     threads: Mapping[int, _Demand] = {}
 
     def cores(self, before: _Tree) -> float:
-        """What it had on average since. What leaves the tree for another parent takes its time with it."""
+        """Average since `before`. Processes that leave the tree take their time with them."""
         elapsed = self.at - before.at
         return max(0.0, self.cpu - before.cpu) / elapsed if elapsed > 0 else 0.0
 
 
 def _trees(proc: Path, at: float, roots: Iterable[int], *, ended: bool = False) -> dict[int, _Tree]:
-    """The trees of those roots that live; with `ended` also of processes that were not waited for yet."""
+    """The trees of living roots; with `ended` also of processes not waited for."""
     table: dict[int, _Process] = {}
     children: dict[int, list[int]] = {}
     for name in _names(str(proc)):
@@ -86,7 +78,7 @@ def _trees(proc: Path, at: float, roots: Iterable[int], *, ended: bool = False) 
     found = {}
     for root in roots:
         if root in table:
-            # Processes come and go while the table is read: it may hold a circle of parents.
+            # The table is read while processes change: it may hold a circle of parents.
             pids = {root: table[root]}
             queue = [root]
             for pid in queue:
@@ -94,33 +86,35 @@ def _trees(proc: Path, at: float, roots: Iterable[int], *, ended: bool = False) 
                     if child not in pids:
                         pids[child] = table[child]
                         queue.append(child)
-            cpu, memory = sum(one.cpu for one in pids.values()), sum(one.memory for one in pids.values())
+            cpu, memory = (
+                sum(process.cpu for process in pids.values()),
+                sum(process.memory for process in pids.values()),
+            )
             found[root] = _Tree(at, table[root].started, cpu, memory, queue, _threads(proc, queue))
     return found
 
 
 class UseMeter:
-    """Measures what components use; a figure over time is that since the last call, or since the start of
-    the component. `proc` and `now` are the system's own."""
+    """Measures the use of components, averaged since the last call or their start."""
 
     def __init__(self, running: Running, *, proc: Path = PROC, now: Callable[[], float] = since_boot) -> None:
         self._running, self._proc, self._now = running, proc, now
         self._last: dict[RunningComponent, _Tree] = {}
 
     def measure(self) -> tuple[ComponentUse, ...]:
-        """One entry for each component whose root process lives, MAX_COMPONENTS at most."""
+        """One entry per component with a living root, at most MAX_COMPONENTS."""
         running = list(self._running())[:MAX_COMPONENTS]
-        trees = _trees(self._proc, self._now(), {one.pid for one in running}) if running else {}
-        last, self._last = self._last, {one: trees[one.pid] for one in running if one.pid in trees}
-        return tuple(_use(one, last.get(one) or _Tree(tree.started), tree) for one, tree in self._last.items())
+        trees = _trees(self._proc, self._now(), {component.pid for component in running}) if running else {}
+        last, self._last = self._last, {known: trees[known.pid] for known in running if known.pid in trees}
+        return tuple(_use(known, last.get(known) or _Tree(tree.started), tree) for known, tree in self._last.items())
 
 
-def _use(one: RunningComponent, before: _Tree, tree: _Tree) -> ComponentUse:
+def _use(running: RunningComponent, before: _Tree, tree: _Tree) -> ComponentUse:
     ran, waited = _demand(before.threads, tree.threads)
     return ComponentUse(
-        component=one.component,
-        kind=one.kind,
-        incarnation=one.incarnation,
+        component=running.component,
+        kind=running.kind,
+        incarnation=running.incarnation,
         cpu=round(tree.cores(before), 4),
         memory=tree.memory,
         processes=len(tree.pids),
@@ -129,23 +123,17 @@ def _use(one: RunningComponent, before: _Tree, tree: _Tree) -> ComponentUse:
 
 
 class TreeUse(NamedTuple):
-    """What one process tree used since it was last looked at."""
-
-    elapsed: float
-    """Seconds since then."""
-    cores: float
-    """That it had on average."""
-    wanted: float
-    """Cores that it wanted: those that it had, and those that its threads waited for."""
-    memory: int
-    """Bytes resident; what processes share counts for each."""
+    elapsed: float  # seconds since then
+    cores: float  # average used
+    wanted: float  # used, plus those its threads waited for
+    memory: int  # bytes resident; shared memory counts for each
 
 
 class TreeMeter:
-    """Measures the process `root` (this one, if not given) and all its descendants again and again.
+    """Measures the process `root` (default: our own) and its descendants, from one thread. Raises OSError without
+    /proc.
 
-    Where the system does not tell how long threads waited, `wanted` is how many could run at this moment. Use
-    it from one thread at a time. Raises OSError where there is no /proc."""
+    Without waiting times from the system, `wanted` is the number of runnable threads."""
 
     def __init__(self, root: int | None = None, *, proc: Path = PROC, now: Callable[[], float] = since_boot) -> None:
         self._root = os.getpid() if root is None else root
@@ -157,7 +145,7 @@ class TreeMeter:
         tree, elapsed = self._last, self._last.at - before.at
         if elapsed <= 0:
             return TreeUse(0.0, 0.0, 0.0, tree.memory)
-        # What comes late from ended children is no use of now.
+        # Time of ended children arrives late, and is no present use.
         cores = min(tree.cores(before), float(os.cpu_count() or 1))
         if tree.threads:
             wanted = min(sum(_demand(before.threads, tree.threads)) / SECOND / elapsed, len(tree.threads))
@@ -166,7 +154,7 @@ class TreeMeter:
         return TreeUse(elapsed, cores, max(cores, wanted), tree.memory)
 
     def _look(self) -> _Tree:
-        # A child that ended keeps its time until somebody waits for it, and then hands it on.
+        # An ended child keeps its time until its parent waits for it, then passes it on.
         trees = _trees(self._proc, self._now(), [self._root], ended=True)
         if self._root not in trees:
             raise OSError(f"{self._proc} does not show process {self._root}; mount it, or set load = true")
@@ -174,17 +162,16 @@ class TreeMeter:
 
 
 def faded(averages: tuple[float, ...], wanted: float, seconds: float) -> tuple[float, float, float]:
-    """Averages over 1, 5 and 15 minutes after `wanted` cores were wanted for so long; the past fades, as in
-    the kernel's."""
-    one, five, fifteen = (
+    """Averages over 1, 5 and 15 minutes after `wanted` cores for so many seconds, fading like the kernel's."""
+    first, second, third = (
         wanted + (past - wanted) * math.exp(-seconds / (60 * minutes))
         for past, minutes in zip(averages, (1, 5, 15), strict=True)
     )
-    return one, five, fifteen
+    return first, second, third
 
 
 def _fields(stat: bytes) -> list[bytes]:
-    """What follows the name, which stands in brackets and may hold anything, brackets and spaces too."""
+    """The fields after the name, which is in brackets and may contain any character."""
     return stat[stat.rfind(b")") + 1 :].split()
 
 
@@ -204,7 +191,7 @@ def _parse(stat: bytes) -> _Process | None:
 
 
 def _tasks(proc: Path, pids: Iterable[int], file: str) -> Iterator[tuple[int, bytes]]:
-    """This file of each thread, of MAX_THREADS at most: in the process's own folder is its first one's."""
+    """This file of each thread, at most MAX_THREADS: a process's own folder has only the first one's."""
     tasks = ((f"{proc}/{pid}/task", name) for pid in pids for name in _names(f"{proc}/{pid}/task"))
     for folder, name in islice(tasks, MAX_THREADS):
         yield int(name), _read(f"{folder}/{name}/{file}")
@@ -215,14 +202,14 @@ def _threads(proc: Path, pids: Iterable[int]) -> dict[int, _Demand]:
     for thread, figures in _tasks(proc, pids, "schedstat"):
         try:
             ran, waited, *_ = map(int, figures.split())
-        except ValueError:  # it ended just now, or the system does not tell
+        except ValueError:  # it ended just now, or the system lacks the figure
             continue
         found[thread] = ran, waited
     return found
 
 
 def _demand(before: Mapping[int, _Demand], now: Mapping[int, _Demand]) -> _Demand:
-    """What the threads that are there now ran and waited since."""
+    """Time ran and waited since, by the present threads."""
     ran = waited = 0
     for thread, (ran_now, waited_now) in now.items():
         ran_then, waited_then = before.get(thread, (0, 0))
@@ -234,20 +221,20 @@ def _demand(before: Mapping[int, _Demand], now: Mapping[int, _Demand]) -> _Deman
 
 
 def _runnable(proc: Path, pids: Iterable[int]) -> int:
-    """Threads that run or wait for a processor at this moment, but for the one that asks."""
+    """Threads that run or wait for a processor now, except the caller."""
     mine = threading.get_native_id()
     return sum(thread != mine and _fields(stat)[:1] == [b"R"] for thread, stat in _tasks(proc, pids, "stat"))
 
 
 def _names(folder: str) -> list[str]:
-    """What is in a folder; nothing if it has gone."""
+    """Names in a folder; none if it is gone."""
     with suppress(OSError), os.scandir(folder) as entries:
         return [entry.name for entry in entries]
     return []
 
 
 def _read(path: str) -> bytes:
-    """A small file of /proc; nothing if it has gone."""
+    """A small file of /proc; empty if it is gone."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         try:

@@ -1,6 +1,6 @@
-"""SIGHUP: a node reads its files again, and takes what can be taken without a restart.
+"""SIGHUP: a node reads its files again, and applies changes that need no restart.
 
-Whoever can take something names the table and what to call (`Reload.takes`). A file that is bad changes nothing."""
+Services register a table and a function (`Reload.takes`). A bad file changes nothing."""
 
 from __future__ import annotations
 
@@ -22,12 +22,11 @@ from zscout.services.node.service_manager import ServiceManager
 
 log = logging.getLogger("zscout.node")
 
-MAX_NAMED: Final = 12
-"""Keys that one line names."""
+MAX_NAMED: Final = 12  # keys named in one line
 
 
 class Reload:
-    """What a node's files said when it took it, and who takes what they say now. `read` raises BadInput."""
+    """The settings in force, and the functions that apply new ones. `read` raises BadInput."""
 
     def __init__(self, node: Node, read: Callable[[], Node]) -> None:
         self._taken = settings(node)
@@ -36,13 +35,11 @@ class Reload:
         self._asked = asyncio.Event()
 
     def takes(self, table: str, take: Callable[[Node], object]) -> None:
-        """From now on `take` is given the new settings, in the event loop, when a key of this table has changed; what
-        it raises is logged, and the old ones stay."""
+        """Call `take` in the event loop with settings changed in this table; its errors are logged, old ones stay."""
         self._takers[table] = take
 
     def on_hangup(self) -> None:
-        """From now on SIGHUP asks for it, and does not end this process. (The loop would give a handler of its own back
-        as it closes, before the process has ended.) Call it in the main thread."""
+        """Reload at SIGHUP. For the main thread; asyncio would remove its own handler before the process ends."""
         loop = asyncio.get_running_loop()
 
         def ask(*_: object) -> None:
@@ -52,8 +49,7 @@ class Reload:
         signal.signal(signal.SIGHUP, ask)
 
     async def serve(self, manager: ServiceManager, status: str) -> None:
-        """Reads the files each time that it is asked to, for as long as the node runs; `manager` is told `status`, and
-        how it went."""
+        """Reload at each request while the node runs; report `status` and the result to `manager`."""
         while True:
             await self._asked.wait()
             self._asked.clear()
@@ -61,7 +57,7 @@ class Reload:
             manager.ready(f"{status}; {await self.now()}")
 
     async def now(self) -> str:
-        """Reads the files; returns the line that is logged."""
+        """Read the files; return the line that is logged."""
         try:
             # They may be on another host.
             node = await asyncio.to_thread(self._read_again)
@@ -91,7 +87,7 @@ class Reload:
     def _read_again(self) -> Node:
         node = self._read()
         for rc in node.rcs:
-            driver_for(rc)  # what would be wrong with it at the next start
+            driver_for(rc)  # raises the errors of the next start
         return node
 
     def _is_taken(self, table: str, take: Callable[[Node], object], node: Node) -> bool:
@@ -104,7 +100,7 @@ class Reload:
 
 
 def settings(node: Node) -> dict[str, object]:
-    """What the two files say, by key as it stands there; RCs by name."""
+    """The settings of both files, by key; RCs by name."""
     found: dict[str, object] = {}
 
     def enter(table: str, values: Mapping[str, Any]) -> None:
@@ -112,10 +108,10 @@ def settings(node: Node) -> dict[str, object]:
             below = name if table in ("node", "fleet") else f"{table}.{name}"
             match value:
                 case SchedulingPolicy():
-                    # Some of it stands under [limits].
+                    # Some keys are under [limits].
                     enter("fleet", {key: getattr(value, key) for key in value.__slots__ if key not in _LIMITS})
                 case AccessPolicy():
-                    enter("fleet", structs.asdict(value))  # its tables stand by themselves in the file
+                    enter("fleet", structs.asdict(value))  # its tables are top-level ones in the file
                 case Struct():
                     enter(below, structs.asdict(value))
                 case Mapping():

@@ -1,6 +1,6 @@
-"""What a node tells the service manager that started it: systemd's `sd_notify`, which is one datagram to a socket.
+"""Notifies the service manager: systemd's `sd_notify`, one datagram to a socket.
 
-The watchdog's word comes from the event loop, so that a node whose loop stands still is silent, and is started anew."""
+Watchdog messages come from the event loop, so that a node with a blocked loop is restarted."""
 
 from __future__ import annotations
 
@@ -14,14 +14,12 @@ from typing import Final, Self
 
 log = logging.getLogger(__name__)
 
-BEATS: Final = 3
-"""Words within the time after which a service that is silent is ended."""
-LONGEST: Final = 0.1
-"""Seconds that the event loop waits for a service manager that does not read."""
+BEATS: Final = 3  # messages per watchdog interval
+LONGEST: Final = 0.1  # seconds that the event loop waits for a service manager that does not read
 
 
 class ServiceManager:
-    """Without `address` nobody is told anything. `watchdog` is in seconds; 0: nobody waits for a word."""
+    """Without `address` nothing is sent. `watchdog` is in seconds; 0: none."""
 
     def __init__(self, address: str = "", watchdog: float = 0.0) -> None:
         self._address = "\0" + address[1:] if address.startswith("@") else address
@@ -31,14 +29,14 @@ class ServiceManager:
 
     @classmethod
     def from_env(cls, env: MutableMapping[str, str] = os.environ) -> Self:
-        """As systemd tells its services. Takes it out of `env`: what this process starts has nothing to say there."""
+        """From systemd's variables, removed from `env` for the sake of child processes."""
         address = env.pop("NOTIFY_SOCKET", "")
         within, pid = env.pop("WATCHDOG_USEC", ""), env.pop("WATCHDOG_PID", "")
         for_us = within.isdecimal() and pid in ("", str(os.getpid()))
         return cls(address, int(within) / 1e6 if for_us else 0.0)
 
     def ready(self, status: str) -> None:
-        """The service runs, or has done what `reloading` began. From the first time on the watchdog hears of it."""
+        """The service runs, or has finished reloading. The first call starts the watchdog messages."""
         self._tell("READY=1", status)
         if self._beat is None and self._every:
             self._beat = asyncio.get_running_loop().call_later(self._every, self._live)
@@ -49,7 +47,7 @@ class ServiceManager:
         self._tell(f"RELOADING=1\nMONOTONIC_USEC={now}", "reads its files again")
 
     def stopping(self, status: str) -> None:
-        """The service ends, which is not for the watchdog to hear."""
+        """The service ends, and the watchdog messages too."""
         if self._beat is not None:
             self._beat.cancel()
         self._tell("STOPPING=1", status)

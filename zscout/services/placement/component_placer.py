@@ -1,7 +1,7 @@
 """The component placer on the mesh, beside the leading RCM: a pure core, its requests and its commands.
 
-What is requested and observed becomes an event of the core; its effects become queries to nodes, whose answers are
-events again. Each change is published, for the candidates that may have to go on and for all who watch."""
+Requests and observations are events of the core; its effects are queries to nodes, whose answers are events again. Each
+change is published, for candidates that may take over and for watchers."""
 
 from __future__ import annotations
 
@@ -26,18 +26,14 @@ from zscout.types import SECOND, HostName, Ns, Term
 
 log = logging.getLogger("zscout.placer")
 
-BEGIN: Final = 2.0
-"""Seconds at most until a new placer begins, though not all hosts have listed what runs there."""
+BEGIN: Final = 2.0  # most seconds until a new placer begins, even if some hosts have not listed their components
 LIST_TRIES: Final = 5
-LIST_AGAIN: Final = 0.5
-"""Seconds until a host that did not answer is asked again."""
-PUBLISH_AT_ONCE: Final = 200
-"""Components in one publication."""
+LIST_AGAIN: Final = 0.5  # seconds until an unanswered list is asked for again
+PUBLISH_AT_ONCE: Final = 200  # components in one publication
 
 
 class ComponentPlacer:
-    """The placer of one term. `inherited` is what the one before it published; after `on_failure` it places
-    nothing more, and is to be stopped."""
+    """The placer of one term. `inherited` comes from its predecessor; stop it after `on_failure`."""
 
     def __init__(
         self,
@@ -57,12 +53,9 @@ class ComponentPlacer:
         )
         self._nodes = NodeClient(mesh, fleet.placement.start_timeout)
         self._inherited = inherited
-        self._instances: dict[HostName, set[str]] = {}
-        """Of each host's node, those that live."""
-        self._unlisted: set[HostName] = set()
-        """Hosts that have not listed yet what runs there."""
-        self._cordoned: frozenset[HostName] = frozenset()
-        """As published last."""
+        self._instances: dict[HostName, set[str]] = {}  # living instances of each host's node
+        self._unlisted: set[HostName] = set()  # hosts that have not listed their components
+        self._cordoned: frozenset[HostName] = frozenset()  # as published last
         self._declarations = ExitStack()
         self._wake: TimerHandle | None = None
 
@@ -80,18 +73,16 @@ class ComponentPlacer:
         self._supervisor.call_later(BEGIN, self._requests.open)
 
     def stop(self) -> None:
-        """Stops placing. Nothing is stopped: what runs, runs for the next placer."""
+        """Stop placing. Components run on for the next placer."""
         self._supervisor.cancel()
         self._requests.close()
         self._declarations.close()
-
-    # Observations
 
     def _on_node(self, token: Token, alive: bool) -> None:
         host = token.host
         instances = self._instances.setdefault(host, set())
         if alive:
-            # A node that started anew has lost its components, though its old token may live on for a while.
+            # A restarted node has lost its components, even if its old token still lives.
             if instances:
                 self._feed(events.HostLost(host))
             instances.add(token.instance)
@@ -106,7 +97,7 @@ class ComponentPlacer:
             self._listed(host)
 
     async def _list_components(self, node: Token) -> None:
-        """Asks a host what runs there until it answers."""
+        """Ask a host for its components until it answers."""
         for _ in range(LIST_TRIES):
             gone = node.instance not in self._instances.get(node.host, ())
             if gone or await self._command(events.HostCommand(node.host, ListComponents())):
@@ -123,10 +114,8 @@ class ComponentPlacer:
         event = events.TokenAppeared if alive else events.TokenVanished
         self._feed(event(token.name, incarnation_of(token.instance), token.host))
 
-    # Events into the core, effects out of it
-
     def _feed(self, *happened: events.PlacerEvent) -> list[events.PlacementRefused]:
-        """Carries out what follows from events, or from the time; returns what the core refused."""
+        """Carry out the effects of events, or of the time; return the refusals."""
         refusals: list[events.PlacementRefused] = []
         changed: dict[str, Placement | None] = {}
         for effect in self._core.handle(self.mesh.now(), *happened):
@@ -144,7 +133,7 @@ class ComponentPlacer:
         return refusals
 
     async def _command(self, command: events.HostCommand) -> bool:
-        """Whether anything came of it."""
+        """Return True if it led to an event."""
         event = await self._nodes.carry_out(command)
         if event is not None:
             self._feed(event)
@@ -158,7 +147,7 @@ class ComponentPlacer:
             self._wake = self._supervisor.call_later(delay, self._woken, at)
 
     def _woken(self, at: Ns) -> None:
-        # A timer may go off a little early, and the core gives each time of waking only once.
+        # A timer may fire early, and the core gives each wake-up time only once.
         if self.mesh.now() < at:
             self._wake_at(at)
         else:

@@ -1,5 +1,5 @@
-"""Each candidate's copy of what the placer publishes, for the time when it leads. Nodes list what runs; only this copy
-knows what ran on a host that died together with the leader."""
+"""A candidate's copy of the placer's publications. It alone knows the components of a host that died with the
+leader."""
 
 from __future__ import annotations
 
@@ -22,14 +22,11 @@ TRIES: Final = 3
 
 
 class PlacementLedger:
-    """Follows publications while its candidate stands, and keeps them from one candidacy to the next."""
-
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
         self.term: Term = NO_TERM
         self._placements: dict[ComponentId, Placement] = {}
-        self._current: set[ComponentId] = set()
-        """Those that were published or listed since `start`."""
+        self._current: set[ComponentId] = set()  # published or listed since `start`
         self._cordoned: frozenset[HostName] = frozenset()
         self._declarations = ExitStack()
 
@@ -47,7 +44,7 @@ class PlacementLedger:
         self._declarations.close()
 
     def inherited(self) -> Inherited:
-        """Everything that is known, for a placer that begins."""
+        """All placements known, for a new placer."""
         return Inherited(tuple(self._placements.values()), self._cordoned)
 
     def _on_placements(self, _key: str, published: Placements) -> None:
@@ -65,7 +62,7 @@ class PlacementLedger:
             self._current.discard(component)
 
     def _on_leader(self, token: Token, alive: bool) -> None:
-        """A candidate that comes late asks for what was published before."""
+        """A late candidate asks for earlier publications."""
         if alive and token.host != self.mesh.me.host:
             self._supervisor.spawn(self._catch_up())
 
@@ -74,9 +71,9 @@ class PlacementLedger:
             key = self.mesh.keys.placer(self.mesh.me)
             reply = await self.mesh.ask_one(key, ListPlacements(), Placements, timeout=ASK_TIMEOUT)
             if reply is not None and reply.message is not None:
-                # What was published meanwhile is newer than the answer or the same.
+                # Meanwhile publications are newer or equal.
                 listed = reply.message
-                fresh = [one for one in listed.components if one.component not in self._current]
+                fresh = [known for known in listed.components if known.component not in self._current]
                 try:
                     self._on_placements("", Placements(listed.term, fresh, listed.cordoned))
                 except BadName as error:

@@ -1,4 +1,4 @@
-"""The load balancer: load reports in, rankings out. It runs beside the leading RCM."""
+"""The load balancer beside the leading RCM: load reports in, rankings out."""
 
 from __future__ import annotations
 
@@ -18,25 +18,19 @@ from zscout.types import SECOND, HostName
 
 log = logging.getLogger(__name__)
 
-READ_EVERY: Final = 0.1
-"""Seconds; the reports of a thousand hosts would else wake this loop a thousand times in each."""
-AT_ONCE: Final = 32
-"""Reports that are read between two other things that the loop has to do."""
-DEPTH: Final = 4_096
-"""Reports kept until they are read; of more the oldest are lost, and the next ones make up for them."""
+READ_EVERY: Final = 0.1  # seconds; a thousand hosts' reports would otherwise wake this loop as often
+AT_ONCE: Final = 32  # reports read before the loop does other work
+DEPTH: Final = 4_096  # reports kept unread; the oldest are lost, and later ones replace them
 
 
 class LoadBalancer:
-    """Answers which hosts are best, until it is stopped or fails. What it knows of hosts comes from their
-    reports alone, so a new leader's balancer knows all that report within a second."""
+    """Ranks hosts until stopped or failed; knows load reports alone, so a new leader's knows all within 1 s."""
 
     def __init__(self, mesh: Mesh, on_failure: Callable[[Exception], object]) -> None:
         self.mesh = mesh
         self.core = Balancer(RANDOM.get())
         self._supervisor = Supervisor("the load balancer", on_failure)
-        self._lost: set[HostName] = set()
-        """Hosts that are gone: reports that they sent before, and that are not read yet, must not bring them
-        back. Cleared once all of those are read."""
+        self._lost: set[HostName] = set()  # gone, with unread reports that must not bring them back
         self._declarations = ExitStack()
 
     def start(self) -> None:
@@ -55,11 +49,11 @@ class LoadBalancer:
         self._declarations.close()
 
     def _read(self) -> None:
-        """Reads a few reports at most: whatever else waits for this loop is done in between."""
+        """Read a few reports, then let the loop do other work."""
         read = 0
         for key, report in itertools.islice(self._reports.each(), AT_ONCE):
             read += 1
-            # A report is believed of the host in whose key it stands.
+            # A report must come from the host in its key.
             try:
                 if key == self.mesh.keys.load(report.host) and report.host not in self._lost:
                     self.core.reported(self.mesh.now(), report)
@@ -85,7 +79,7 @@ class LoadBalancer:
         left_out = dict(itertools.islice(ranking.left_out.items(), ask.at_most))
         reports = None
         if ask.reports:
-            named = [*(one.host for one in ranking.hosts), *left_out]
+            named = [*(ranked.host for ranked in ranking.hosts), *left_out]
             known = (self.core.reports[host] for host in named if host in self.core.reports)
             reports = [KnownLoad((now - at) / SECOND, report) for at, report in known]
         query.answer(HostRanking(list(ranking.hosts), ranking.metric, ranking.why, left_out, ranking.more, reports))

@@ -1,4 +1,4 @@
-"""The placer's commands to nodes. What comes of each is an event of the core."""
+"""The placer's commands to nodes; the results are events of the core."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ from zscout.types import SECOND, HostName, Ns
 R = TypeVar("R")
 
 LIST_TIMEOUT: Final = 1.0
-ANSWER_SLACK: Final = 2.0
-"""Seconds beyond what a node may take for a start, a stop or a move."""
+ANSWER_SLACK: Final = 2.0  # seconds beyond a node's time for a start, stop or move
 HOPELESS: Final = frozenset({"unknown_kind", "not_allowed", "bad_request"})
-"""Refusals of a node that another try there would not change."""
+"""Refusals that a retry on the same node would not change."""
 
 
 class NodeClient:
@@ -28,7 +27,7 @@ class NodeClient:
         self.mesh, self._start_timeout = mesh, start_timeout / SECOND + ANSWER_SLACK
 
     async def carry_out(self, command: events.HostCommand) -> events.PlacerEvent | None:
-        """None: a list that was not answered."""
+        """None if a list was not answered."""
         match command.operation:
             case messages.StartComponent() as start:
                 return await self._start(command.host, start)
@@ -41,7 +40,7 @@ class NodeClient:
                 if reply is None or reply.message is None:
                     return None
                 told = reply.message.kinds
-                # Of a list that was cut short nobody knows what it lacks.
+                # A truncated list does not show which kinds are missing.
                 kinds = None if told is None or len(told) >= MAX_KINDS else frozenset(told)
                 return events.ComponentsListed(command.host, reply.message.components, listing.component, kinds)
 

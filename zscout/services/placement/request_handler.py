@@ -1,4 +1,4 @@
-"""Requests of operators and programs to the placer: what each is for the core, and when it is answered."""
+"""Requests of operators and programs to the placer: their events for the core, and their answers."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ from zscout.services.authority import Authority
 from zscout.types import HostName, Term
 
 MAX_WAIT: Final = 60.0
-MAX_WAITING: Final = 1_000
-"""Requests that wait for their answer at one time."""
+MAX_WAITING: Final = 1_000  # requests awaiting their answer at one time
 
 Operation: TypeAlias = messages.PlacementOperation | messages.DrainHost | messages.UncordonHost
 PlacerQuery: TypeAlias = IncomingQuery[messages.PlacerOperation]
@@ -32,7 +31,7 @@ SETTLED: Final = OVER | {"running", "waiting"}
 
 @dataclass(slots=True)
 class _Waiting:
-    """An operation that has not come to its end; `host` is where its component was when it was requested."""
+    """An unfinished operation; `host` is its component's host at the request."""
 
     operation: messages.PlacementOperation
     host: HostName | None
@@ -40,8 +39,8 @@ class _Waiting:
 
 
 class PlacerRequestHandler:
-    """Answers a request to place, end or move a component once it is in a state that ends that, or when its `wait` is
-    over. `feed` gives an event to the core, and returns what the core refused."""
+    """Answers a request to place, end or move a component once its state settles, or its `wait` is over. `feed` passes
+    an event to the core, and returns the refusals."""
 
     def __init__(
         self,
@@ -59,7 +58,7 @@ class PlacerRequestHandler:
         self._waiting: dict[PlacerQuery, _Waiting] = {}
 
     def receive(self, query: PlacerQuery) -> None:
-        """Answers it, carries it out or keeps it until `open`. Raises Refused and BadName."""
+        """Answer it, carry it out, or keep it until `open`. Raises Refused and BadName."""
         operation = query.message
         if isinstance(operation, messages.ListPlacements):
             query.answer(self.placements(operation.component))
@@ -75,7 +74,7 @@ class PlacerRequestHandler:
             self._early.append((query, event))
 
     def _allowed(self, event: Operation, sender: Sender) -> Operation:
-        """What of that its sender may do, in its name. Raises Refused."""
+        """The event as permitted to its sender. Raises Refused."""
         if isinstance(event, messages.DrainHost | messages.UncordonHost):
             self._authority.check_operator(sender, f"empty {event.host} or fill it again")
             return event
@@ -89,14 +88,14 @@ class PlacerRequestHandler:
         return event
 
     def open(self) -> None:
-        """From now on requests are carried out, first those that came before."""
+        """Carry out requests from now on, waiting ones first."""
         self._is_open = True
         early, self._early = self._early, []
         for query, event in early:
             self._carry_out(query, event)
 
     def close(self) -> None:
-        """Refuses what still waits: another placer has to be asked."""
+        """Refuse all waiting requests: another placer must be asked."""
         problem = Refused("not_leading", "this placer stopped leading; try again").problem
         for query in (*(query for query, _ in self._early), *self._waiting):
             query.refuse(problem)
@@ -115,7 +114,7 @@ class PlacerRequestHandler:
             query.answer(self.placements(host=operation.host))
 
     def changed(self, components: Collection[str]) -> None:
-        """Answers requests about these components that have come to their end."""
+        """Answer settled requests about these components."""
         for query, waiting in list(self._waiting.items()):
             operation, component = waiting.operation, waiting.operation.component
             if component not in components:
@@ -134,9 +133,9 @@ class PlacerRequestHandler:
                 query.answer(status)
 
     def placements(self, component: str | None = None, *, host: str | None = None) -> messages.Placements:
-        """All components, or that one, or those of a host."""
+        """All components, or the ones of a name or a host."""
         components = sorted(self._placer.components.items())
-        found = [one for name, one in components if component in (None, name) and host in (None, one.host)]
+        found = [status for name, status in components if component in (None, name) and host in (None, status.host)]
         return messages.Placements(self.term, found, sorted(self._placer.cordoned))
 
     def _timed_out(self, query: PlacerQuery) -> None:
@@ -153,7 +152,7 @@ class PlacerRequestHandler:
 
 
 def _event_of(operation: Operation) -> Operation:
-    """The operation, its spec in order. Raises BadName or Refused for what can't be."""
+    """The operation, its spec normalised. Raises BadName or Refused."""
     if isinstance(operation, messages.DrainHost | messages.UncordonHost):
         check_name(operation.host, "host")
         return operation
@@ -166,7 +165,7 @@ def _event_of(operation: Operation) -> Operation:
 
 
 def _checked(spec: messages.ComponentSpec) -> messages.ComponentSpec:
-    """In one order, so that equal specs compare so."""
+    """Sorted, so that equal specs compare equal."""
     check_name(spec.kind, "kind")
     for host in spec.hosts or ():
         check_name(host, "host")

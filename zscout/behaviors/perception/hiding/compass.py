@@ -1,10 +1,8 @@
-"""How far a robot turned between two pictures: the picture's own shift, whatever the wheels did. Pure.
+"""Turn of a robot between two pictures, from the pictures' shift alone. Pure.
 
-A turn on the spot moves everything by the same angle, near or far. So each picture is laid out by angle
-instead of by pixel, reduced to a few bands of rows without their slow changes (light, exposure), and the
-shift with the best normalised cross-correlation is the turn: J. P. Lewis, "Fast Normalized
-Cross-Correlation" (1995), here along one axis, by FFT.
-"""
+A turn on the spot moves everything by the same angle, near or far. So each picture is laid out by angle, reduced to a
+few bands of rows without slow changes (light, exposure); the shift with the best normalised cross-correlation is the
+turn (J. P. Lewis, "Fast Normalized Cross-Correlation", 1995; here along one axis, by FFT)."""
 
 from __future__ import annotations
 
@@ -17,49 +15,38 @@ from numpy.typing import NDArray
 
 from zscout.behaviors.perception.lens import COLUMNS, FIELD, FOCAL, GAMMA, MIDDLE, Picture
 
-STEP: Final = FIELD / COLUMNS
-"""Radians between two columns of a strip."""
+STEP: Final = FIELD / COLUMNS  # radians between two columns of a strip
 BANDS: Final = 20
-_TOP, _BOTTOM = 4, 84
-"""Rows used. Below them the floor is so near that a turn about the wheels is not one about the camera."""
-_NEAR: Final = 80
-"""First row of the near floor: 25 cm ahead."""
-_OVERLAP: Final = 36
-"""Columns that two strips must share at least: a turn of up to 50 degrees is measured."""
-_SLOW: Final = 31
-"""Columns over which the mean is taken away."""
-_GREY: Final = 1.5
-"""Grey levels of noise that a band carries anyway: less than this is no texture."""
+_TOP, _BOTTOM = 4, 84  # rows used: on the floor below them, a turn about the wheels differs from one about the camera
+_NEAR: Final = 80  # first row of the near floor: 25 cm ahead
+_OVERLAP: Final = 36  # least columns shared by two strips: turns of up to 50 degrees are measured
+_SLOW: Final = 31  # columns of the mean that is subtracted
+_GREY: Final = 1.5  # grey levels of a band's noise: less is no texture
 
 _SOURCE: Final = np.clip(MIDDLE - FOCAL * np.tan((MIDDLE - np.arange(COLUMNS)) * STEP), 0, COLUMNS - 1)
-"""The column of the picture, between two pixels, that each column of a strip shows."""
+"""The column of the picture, between two pixels, for each column of a strip."""
 _LEFT: Final = np.minimum(_SOURCE.astype(np.intp), COLUMNS - 2)
 _SHARE: Final = (_SOURCE - _LEFT).astype(np.float32)
 
 Strip = NDArray[np.int8]
 """Shape (20, 160): bands of rows, columns by angle; grey levels off the slow mean, times `SCALE`."""
 SCALE: Final = 3.0
-Tones = NDArray[np.uint8]
-"""Grey levels, laid out as a strip."""
+Tones = NDArray[np.uint8]  # grey levels, laid out as a strip
 
 
 class Turn(NamedTuple):
-    angle: float
-    """Radians to the left."""
-    likeness: float
-    """Correlation at that shift: near 1 is sure, below about 0.4 is a guess."""
+    angle: float  # radians to the left
+    likeness: float  # correlation at that shift: near 1 is sure, below about 0.4 a guess
 
 
 def strip_and_tones(picture: Picture) -> tuple[Strip, Tones]:
-    """What `turned` compares, in whole numbers, so that a checkpoint keeps it exactly; and the same part of
-    the picture as it is, to compare exposures."""
+    """The strip for `turned`, in whole numbers that a checkpoint keeps exactly, and the plain tones for `brighter`."""
     by_angle = _by_angle(picture[_TOP:_BOTTOM])
     return _off_the_mean(by_angle, (_SLOW, 1)), np.rint(by_angle).astype(np.uint8)
 
 
 def brighter(old: Tones, new: Tones, angle: float) -> float:
-    """By which factor the camera opened from `old` to `new`, between which the robot turned by `angle`: the
-    median over what both show, neither too dark nor white. 1 if they share too little."""
+    """The camera's gain from `old` to `new` over a turn by `angle`: a median, 1 for too few shared pixels."""
     shift = round(angle / STEP)
     if abs(shift) > COLUMNS - 16:
         return 1.0
@@ -73,8 +60,7 @@ def brighter(old: Tones, new: Tones, angle: float) -> float:
 
 
 def floor_strip(picture: Picture) -> Strip:
-    """The near floor's grain, laid out likewise. It stays as it is while the robot turns on the spot or
-    pushes in vain, and is another one after a few centimetres of way."""
+    """The near floor's grain, laid out alike: unchanged by turns on the spot and vain pushes only."""
     return _off_the_mean(cv2.blur(_by_angle(picture[_NEAR:]), (3, 1)), (25, 7))
 
 
@@ -89,25 +75,24 @@ def _off_the_mean(levels: NDArray[Any], around: tuple[int, int]) -> Strip:
 
 
 def turned(old: Strip, new: Strip, expected: float = 0.0, spread: float = math.radians(40)) -> Turn:
-    """The turn that best makes `old` into `new`.
+    """The turn that best makes `old` into `new`, in whole columns (0.4 degrees).
 
-    `expected` and `spread` (radians) say where to look first: a turn that is off by `spread` has to be more
-    alike by 0.15. The angle is a whole number of columns (0.4 degrees)."""
+    The search prefers `expected` (radians): `spread` away, a turn must correlate better by 0.15."""
     after, before = new.astype(np.float32), old.astype(np.float32)
-    fast, slow = (np.fft.rfft(one, 2 * COLUMNS, axis=1) for one in (after, before))
+    fast, slow = (np.fft.rfft(strip, 2 * COLUMNS, axis=1) for strip in (after, before))
     common = np.fft.irfft((fast * np.conj(slow)).sum(axis=0), 2 * COLUMNS)
     shifts = np.arange(_OVERLAP - COLUMNS, COLUMNS - _OVERLAP + 1)
     noise = (_GREY * SCALE) ** 2 * BANDS * (COLUMNS - np.abs(shifts))
     energy = (_ends(before, -shifts) + noise) * (_ends(after, shifts) + noise)
     likeness = common[shifts] / np.sqrt(energy)
-    # Content that moves to the right in the picture (a positive shift) is a turn to the left.
+    # A positive shift, to the right in the picture, is a turn to the left.
     off = (shifts * STEP - expected) / spread
     best = int(np.argmax(likeness - 0.15 * off**2))
     return Turn(float(shifts[best]) * STEP, float(likeness[best]))
 
 
 def _ends(strip: NDArray[np.float32], shifts: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Energy of the part of a strip that a shift leaves in the picture: from `shift` on, or up to its end."""
+    """Energy of the part of a strip that a shift leaves in the picture."""
     running = np.concatenate(([0.0], np.cumsum((strip**2).sum(axis=0), dtype=np.float64)))
     from_shift, to_end = running[-1] - running[np.maximum(shifts, 0)], running[COLUMNS + np.minimum(shifts, 0)]
     return np.asarray(np.where(shifts >= 0, from_shift, to_end), np.float64)

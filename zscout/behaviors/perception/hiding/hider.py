@@ -1,12 +1,8 @@
 """A Scout that finds a dark place by its camera alone, drives in, turns to the light and keeps still. Pure.
 
-    hider = Hider(seed=33)
-    command = hider.see(now, picture)      # at every picture, or None when there is no new one
-
-The paper's Place Sensor Net, per robot: locate the dark place, servo to it, handle collisions, turn to the light. There
-is no odometry and no answer from the robot: turns are measured in the pictures (`compass`), drives are dead-reckoned
-and corrected by what comes into view. The phases stand in `PHASES`; everything they remember is one `HidingState`.
-"""
+This is the paper's Place Sensor Net, per robot: locate the dark place, servo to it, handle collisions, turn to the
+light. Without odometry, turns are measured in the pictures (`compass`), drives dead-reckoned and corrected by sight.
+Call `see(now, picture)` at every picture, with None if there is no new one. All memory is in one `HidingState`."""
 
 from __future__ import annotations
 
@@ -26,16 +22,10 @@ from zscout.behaviors.perception.lens import COLUMNS, ROWS, Picture
 
 
 class PhaseCode(NamedTuple):
-    """The functions of one phase of hiding. They keep nothing of their own: all is in the state."""
-
-    step: Callable[[HidingState, View], Step]
-    """What to do on this picture. After a hop it is called when that is over and measured."""
-    begin: Callable[[HidingState], None] = lambda _: None
-    """The phase begins; nothing is commanded yet."""
-    cruises: bool = False
-    """It drives without waiting for a still picture."""
-    stuck: Callable[[HidingState, View], Step] = phases.stuck
-    """It drove, and nothing moved."""
+    step: Callable[[HidingState, View], Step]  # the action for this picture, after any hop has been measured
+    begin: Callable[[HidingState], None] = lambda _: None  # begins the phase, without a command
+    cruises: bool = False  # drives without waiting for a still picture
+    stuck: Callable[[HidingState, View], Step] = phases.stuck  # called when it drove and nothing moved
 
 
 PHASES: Final[dict[Phase, PhaseCode]] = {
@@ -53,17 +43,13 @@ PHASES: Final[dict[Phase, PhaseCode]] = {
     "check": PhaseCode(phases.check, phases.begin_check),
 }
 RESUMES: Final[dict[Phase, Phase]] = {"hidden": "check", "check": "check", "face": "face", "settle": "face"}
-"""Where a phase goes on that was in the dark when the hold was lost; all others search anew."""
-LONGEST_GAP: Final = 5.0
-"""Seconds that count between two pictures at most: longer ones, and clocks that go back, are another host's."""
-BLIND: Final = 0.8
-"""Seconds without a good picture after which the robot stands."""
-REPORTS: Final = 2.0
-"""Seconds of spoiled pictures after which it reports that."""
+"""Phases after an interruption in the dark; all others search again."""
+LONGEST_GAP: Final = 5.0  # most seconds counted between two pictures; clocks that jump are another host's
+BLIND: Final = 0.8  # seconds without a good picture after which the robot stops
+REPORTS: Final = 2.0  # seconds of spoiled pictures before a report
 
 
-class BadCheckpoint(ValueError):
-    """Bytes that are no checkpoint of a hider."""
+class BadCheckpoint(ValueError): ...
 
 
 class Hider:
@@ -76,9 +62,8 @@ class Hider:
         return self._robot.word
 
     def see(self, now: float, picture: Picture | None, defect: str | None = "") -> WheelCommand:
-        """What to do now. `now` in seconds of any clock that runs; `picture` of shape (120, 160), or None if
-        there is no newer one; `defect`: what `garbled` gave for it, if the caller knows. Raises ValueError
-        for an array of another form."""
+        """The next command. `now`: seconds of any running clock; `picture`: shape (120, 160), None if not new;
+        `defect`: result of `garbled`, if known. Raises ValueError for other shapes."""
         if picture is not None and (picture.shape != (ROWS, COLUMNS) or picture.dtype != np.uint8):
             raise ValueError(f"a picture is uint8 of shape (120, 160), not {picture.dtype} of {picture.shape}")
         robot = self._robot
@@ -133,8 +118,7 @@ class Hider:
         return passed
 
     def _blind(self, how: str) -> WheelCommand:
-        """Nothing to see, `how` the picture is spoiled if there is one: what was commanded may run out, then
-        the robot stands."""
+        """Without a usable picture (`how` it is spoiled, if any) the last command runs out, then the robot stops."""
         robot = self._robot
         if how:
             robot.spoiled_how = how
@@ -157,8 +141,7 @@ class Hider:
         self._robot.stopped = True
 
     def resumed(self, now: float) -> None:
-        """The hold is back. A robot that was hidden, or about to be, looks whether it still is; any other
-        searches anew."""
+        """The hold is back. A hidden or nearly hidden robot checks its place; any other searches again."""
         self._passed(now)
         robot = self._robot
         robot.stopped = False
@@ -168,7 +151,7 @@ class Hider:
         self._go(RESUMES.get(robot.phase, "scan"))
 
     def checkpoint(self) -> bytes:
-        """All that it remembers; `restore` gives one that does exactly the same from here on."""
+        """All memory; a hider from `restore` behaves exactly the same."""
         return msgspec.msgpack.encode(self._robot)
 
     @classmethod
@@ -181,9 +164,9 @@ class Hider:
         except (msgspec.MsgspecError, UnicodeDecodeError) as problem:
             raise BadCheckpoint(f"not a checkpoint of a hider: {problem}") from problem
         if robot.form != FORM:
-            raise BadCheckpoint(f"a checkpoint of form {robot.form}, not {FORM}: start anew")
+            raise BadCheckpoint(f"a checkpoint of form {robot.form}, not {FORM}: start again")
         if {len(robot.tones), len(robot.anchor_tones)} - {0, BANDS * COLUMNS}:
-            raise BadCheckpoint("a checkpoint whose pictures have another size: start anew")
+            raise BadCheckpoint("a checkpoint whose pictures have another size: start again")
         hider = cls()
         hider._robot = robot
         return hider

@@ -1,6 +1,5 @@
-"""What a robot does in each phase of hiding: it looks around for a dark place, drives elsewhere if there is
-none, and gets free again; it drives to the place under sight, and in; there it turns to the light, checks
-that this is a hiding place at all, and keeps still."""
+"""The phases of hiding: look around for a dark place, roam if there is none, get free when stuck; approach and enter
+the place; there turn to the light, check that it hides, and keep still."""
 
 from __future__ import annotations
 
@@ -15,56 +14,36 @@ from zscout.behaviors.perception.hiding.state import HidingState, Opening, Sight
 from zscout.behaviors.perception.lens import COLUMNS
 
 HOP: Final = math.radians(36)
-FULL_TURN: Final = math.tau - math.radians(20)
-"""Radians of hops that show all sides."""
-MOST_HOPS: Final = 24
-"""Of a scan: turns that the picture does not show do not count for ever."""
+FULL_TURN: Final = math.tau - math.radians(20)  # radians of hops that show all sides
+MOST_HOPS: Final = 24  # of a scan: turns not visible in the picture must end too
 AIMED: Final = math.radians(7)
-LEG: Final = 1.4
-"""Metres to drive at most before the next scan."""
-FORGETS: Final = 6
-"""Scans after which bad spots are forgotten: by then dead reckoning does not know where they are."""
+LEG: Final = 1.4  # most metres to drive before the next scan
+FORGETS: Final = 6  # scans after which bad spots are forgotten, as dead reckoning has lost them
 MAX_VISITED: Final = 24
-BAD_NEAR: Final = 0.45
-"""Metres around a spot where hiding failed."""
-MOST_BLOCKED: Final = 4
-"""Sides of a scan that may be tried."""
-AT_EDGE: Final = 0.17
-"""Metres to the dark, from where on the way in is driven blind."""
-DEEP: Final = 0.30
-"""Metres to go beyond the edge of the dark."""
-OUTSIDE: Final = 3.0
-"""How many times brighter than the median of the picture the floor ahead is, outside."""
-DARK_AHEAD: Final = 0.3
-"""Share of the lit floor's light, below which a place that was lost must lie ahead."""
+BAD_NEAR: Final = 0.45  # metres around a spot where hiding failed
+MOST_BLOCKED: Final = 4  # sides tried after one scan
+AT_EDGE: Final = 0.17  # metres to the dark from which the robot drives in blind
+DEEP: Final = 0.30  # metres to drive beyond the edge of the dark
+OUTSIDE: Final = 3.0  # brightness of the floor ahead, over the picture's median, outside
+DARK_AHEAD: Final = 0.3  # share of the lit floor's light below which a lost place must lie ahead
 TO_MIDDLE: Final = 0.15
-LOST: Final = 1.6
-"""Seconds without sight of the place."""
-LONGEST: Final = 25
-"""Seconds of an approach."""
+LOST: Final = 1.6  # seconds without sight of the place
+LONGEST: Final = 25  # seconds of an approach
 FACE_HOPS: Final = 22
 DARK: Final = 0.12
-"""Share of the lit floor's light that the floor here may have. The promise is a quarter of the room's
-median, and the floor that is seen may be twice as bright as that."""
-DARK_ENOUGH: Final = 0.19
-"""The same where it gets no darker further in."""
-DARKISH: Final = 0.4
-"""Share up to which it may be darker further in."""
+"""Most light here over the lit floor: a quarter of the room's median, as that floor may be twice as bright."""
+DARK_ENOUGH: Final = 0.19  # the same if it gets no darker further in
+DARKISH: Final = 0.4  # the same if it may be darker further in
 ROOFED: Final = 0.28
-"""Share up to which what is above counts as dark: 0.03 to 0.2 beneath furniture, 0.45 and more on a dark rug."""
-DEEPER: Final = 0.18
-"""Metres to back further in at once."""
+"""Share below which the top counts as dark: 0.03 to 0.2 beneath furniture, 0.45 and more on a dark rug."""
+DEEPER: Final = 0.18  # metres of one step further in
 NEARER: Final = 0.1
-MOST_FACES: Final = 3
-"""Full turns in one place, each further in."""
-AS_LIGHT: Final = 0.6
-"""Share of the lightest side's light that is taken for the same side."""
-CHECKED: Final = 5
-"""Pictures by which it is judged whether it is still hidden."""
+MOST_FACES: Final = 3  # full turns in one place, each further in
+AS_LIGHT: Final = 0.6  # share of the lightest side's light that counts as the same side
+CHECKED: Final = 5  # pictures of a check
 STILL_DARK: Final = 0.3
 STILL_SEES: Final = 0.15
-SEES_OUT: Final = 0.45
-"""Share of columns that must show lit floor."""
+SEES_OUT: Final = 0.45  # share of columns that must show lit floor
 
 
 def begin_scan(robot: HidingState) -> None:
@@ -78,14 +57,14 @@ def begin_scan(robot: HidingState) -> None:
 
 
 def scan(robot: HidingState, view: View) -> Step:
-    """A full turn in steps; at its end the best dark place is chosen."""
+    """A full turn in steps; then choose the best dark place."""
     robot.sight(view)
     if abs(robot.turned) < FULL_TURN and robot.hops < MOST_HOPS:
         degrees, seen = math.degrees(abs(robot.turned)), len(robot.sightings)
         return robot.hop(HOP, f"looks around, {degrees:.0f} degrees, {seen} dark seen")
     share, roof = shelter(robot.openings)
     if roof and share <= DARKISH:
-        # It is beneath something already, if maybe not deep enough in.
+        # Beneath something already, if maybe not deep enough.
         robot.faces = 1
         return to_light(robot)
     target = robot.target = best(robot)
@@ -99,7 +78,7 @@ def scan(robot: HidingState, view: View) -> Step:
 
 
 def worth(sighting: Sighting, memory: HidingState) -> float:
-    """How promising a dark place is; 0: not at all. Wide, low, dark and near is best."""
+    """How promising a dark place is, 0 for useless. Wide, low, dark and near is best."""
     if sighting.darkness > 0.5 or sighting.width < 0.2:
         return 0.0
     if any(distance(spot, sighting) < BAD_NEAR + 0.15 * sighting.distance for spot in memory.bad):
@@ -111,7 +90,7 @@ def worth(sighting: Sighting, memory: HidingState) -> float:
 
 
 def best(memory: HidingState) -> Sighting | None:
-    """The most promising sighting of the scan; one seen in several pictures counts more."""
+    """The most promising sighting of the scan; repeated sightings count more."""
 
     def value(sighting: Sighting) -> float:
         near = 0.3 + 0.15 * sighting.distance
@@ -123,7 +102,7 @@ def best(memory: HidingState) -> Sighting | None:
 
 
 def aim(robot: HidingState, _: View) -> Step:
-    """Turns to `goal` in measured hops, then goes on to `next_phase`."""
+    """Turn to `goal` in measured hops, then continue with `next_phase`."""
     off = wrapped(robot.goal - robot.heading)
     if abs(off) > AIMED and robot.hops < 10:
         return robot.hop(off, robot.note)
@@ -141,7 +120,7 @@ def begin_roam(robot: HidingState) -> None:
 
 
 def roam(robot: HidingState, _: View) -> Step:
-    """No dark place in view: drives to the most open side. Where that is blocked, to the next."""
+    """No dark place in view: drive to the most open side, or the next if that is blocked."""
     if robot.next_phase == "roam":
         return "aim"
     if robot.cruised(robot.left_to_go):
@@ -156,33 +135,29 @@ def roam_stuck(robot: HidingState, _: View) -> Step:
 
 
 def most_open(robot: HidingState) -> Opening:
-    """One of the scan's sides, none near one that was blocked, by a little luck."""
+    """The most open side of the scan, away from blocked ones, with a little chance."""
     best, most = Opening(robot.heading + math.pi, 0.5, 0, 0, 0, 0, 0), -99.0
-    for one in robot.openings:
-        value = min(one.open_for, 2.5) + 0.6 * robot.roll()
-        near = [abs(wrapped(one.heading - other)) < math.radians(50) for other in robot.blocked]
+    for side in robot.openings:
+        value = min(side.open_for, 2.5) + 0.6 * robot.roll()
+        near = [abs(wrapped(side.heading - other)) < math.radians(50) for other in robot.blocked]
         for spot in robot.bad:
             to = math.atan2(spot.y - robot.y, spot.x - robot.x)
-            if abs(wrapped(to - one.heading)) < 0.6:
+            if abs(wrapped(to - side.heading)) < 0.6:
                 value -= 0.5
-        ahead = Spot(*robot.point(one.heading, 0.9))
+        ahead = Spot(*robot.point(side.heading, 0.9))
         value -= 0.7 * sum(distance(ahead, spot) < 0.7 for spot in robot.visited[:-1])
         if value > most and not any(near):
-            best, most = one, value
+            best, most = side, value
     return best
 
 
-# Out of a bump, and out of a place that is no good
-
-
 def stuck(robot: HidingState, _: View) -> Step:
-    """It drove, and nothing moved."""
     robot.note, robot.at_edge = "bumped", False
     return "back"
 
 
 def back(robot: HidingState, _: View) -> Step:
-    """Backs off from what it pushed against, then turns aside."""
+    """Back off, then turn aside."""
     if robot.hops == 0:
         robot.bumps += 1
         return robot.step_straight(-0.14, f"{robot.note or 'bumped'}: backs off")
@@ -193,7 +168,7 @@ def back(robot: HidingState, _: View) -> Step:
 
 
 def dodge(robot: HidingState, view: View) -> Step:
-    """Turns aside and looks around anew."""
+    """Turn aside and look around again."""
     target = robot.target
     if robot.hops == 0:
         robot.goal = side_of(robot, view) * math.radians(40 + 20 * robot.roll())
@@ -213,7 +188,7 @@ def dodge(robot: HidingState, view: View) -> Step:
 
 
 def side_of(robot: HidingState, view: View) -> int:
-    """1 left, -1 right: at the edge of the dark where it goes on, else by turns."""
+    """1 left, -1 right: at an edge towards the darker side, else in turns."""
     left, right = view.sides
     if robot.at_edge and max(left, right) > 1.5 * min(left, right):
         return 1 if left < right else -1
@@ -221,17 +196,14 @@ def side_of(robot: HidingState, view: View) -> int:
 
 
 def leave(robot: HidingState, _: View) -> Step:
-    """Out of a place that is no hiding place, towards the light."""
+    """Out of a bad place, towards the light."""
     if robot.cruised(0.6):
         return "scan"
     return robot.cruise(robot.pace, 0.0, f"{robot.note}: leaves")
 
 
-# To the dark, in, and still
-
-
 def approach(robot: HidingState, view: View) -> Step:
-    """Keeps the place ahead and drives; re-centred at every picture."""
+    """Drive with the place ahead, re-centred at every picture."""
     target = robot.target
     if target is None:
         return "scan"
@@ -241,7 +213,7 @@ def approach(robot: HidingState, view: View) -> Step:
     if place is None:
         in_half_light = target.distance < 1 and view.ahead < DARK_AHEAD * view.lit
         if rough < 0.3 or target.distance < 0.45 or in_half_light:
-            # So near that the place fills the picture, or its edge is below it, or in its own half-light.
+            # The place fills the picture, has its edge below it, or surrounds the robot with half-light.
             return "enter"
         if robot.clock - robot.seen_target > LOST:
             robot.note = "lost sight of the dark place"
@@ -264,7 +236,7 @@ def approach(robot: HidingState, view: View) -> Step:
 
 
 def match(view: View, expected: float, distance: float) -> DarkPlace | None:
-    """The place of this picture that is most like the one expected there."""
+    """The place of this picture most like the expected one."""
     found, least = None, 1.0
     for place in view.places:
         # Radians from the bearing to the nearest part of the place.
@@ -276,15 +248,15 @@ def match(view: View, expected: float, distance: float) -> DarkPlace | None:
 
 
 def aim_at(place: DarkPlace, expected: float) -> float:
-    """The part of the place nearest to where it was headed for, well away from its ends: feet stand there."""
+    """The nearest part of the place to the present course, away from its ends, where feet stand."""
     margin = min(0.45 * place.width, 0.28)
-    # Where the picture cuts it off, it goes on.
+    # The place continues where the picture cuts it off.
     left = place.width / 2 - (margin if place.left > 1 else 0.05)
     right = place.width / 2 - (margin if place.right < COLUMNS - 2 else 0.05)
     most = place.bearing + math.atan2(left, place.distance)
     least = place.bearing - math.atan2(right, place.distance)
     kept = max(least, min(most, expected))
-    # A little towards the middle each time, or a wheel that slips more leads to the end in the end.
+    # A little towards the middle each time, to counter a slipping wheel.
     return kept + TO_MIDDLE * (place.bearing - kept)
 
 
@@ -294,7 +266,7 @@ def begin_enter(robot: HidingState) -> None:
 
 
 def enter(robot: HidingState, view: View) -> Step:
-    """Straight on into the dark: a few lengths of the body from where the floor ahead is dark."""
+    """Straight into the dark, by a few lengths of the body."""
     if robot.cruised(robot.left_to_go):
         return enter_stuck(robot, view)
     return robot.cruise(robot.pace, 0.0, "drives in")
@@ -302,7 +274,7 @@ def enter(robot: HidingState, view: View) -> Step:
 
 def enter_stuck(robot: HidingState, view: View) -> Step:
     if view.near > OUTSIDE * view.middling:
-        # The floor just ahead is lit and all the rest dark: it is in front of the dark, not in it.
+        # The floor just ahead is lit and the rest dark: it is in front of the dark.
         robot.note, robot.at_edge = "bumped at the edge of the dark", True
         return "back"
     return "face"
@@ -315,7 +287,7 @@ def begin_face(robot: HidingState) -> None:
 
 
 def face(robot: HidingState, view: View) -> Step:
-    """A full turn in the dark; then to the side that shows most lit floor."""
+    """A full turn in the dark; then to the side with most lit floor."""
     robot.sight(view)
     if abs(robot.turned) < FULL_TURN and robot.hops < FACE_HOPS:
         return robot.hop(HOP, "in the dark, looks for the light")
@@ -323,38 +295,37 @@ def face(robot: HidingState, view: View) -> Step:
 
 
 def to_light(robot: HidingState) -> Step:
-    """Turns to the lightest side of the full turn just made."""
+    """Turn to the lightest side of the full turn just made."""
     robot.goal, robot.next_phase = lightest(robot.openings).heading, "settle"
     robot.note = "turns to the light"
     return "aim"
 
 
 def shelter(openings: list[Opening]) -> tuple[float, bool]:
-    """By the full turn: the floor all around over the lit floor; and whether what is above is dark on most
-    sides, as beneath a sofa. Most sides count: at the edge some are lit."""
-    lit = max(one.outside for one in openings)
-    near, above = np.percentile([(one.near, one.above) for one in openings], 75, axis=0).tolist()
+    """From a full turn: near floor over lit floor, and whether the top is dark on most sides, as beneath a sofa."""
+    lit = max(side.outside for side in openings)
+    near, above = np.percentile([(side.near, side.above) for side in openings], 75, axis=0).tolist()
     return near / max(lit, 1e-4), above <= ROOFED * lit
 
 
 def lightest(openings: list[Opening]) -> Opening:
-    """The direction that shows most lit floor; what its neighbours show counts as well, each side once."""
+    """The direction with most lit floor, neighbours included, each side once."""
 
-    def value(one: Opening) -> float:
-        beside = [max(0.0, 1 - abs(wrapped(other.heading - one.heading)) / 0.9) for other in openings]
-        return one.bright + sum(w * o.bright for w, o in zip(beside, openings, strict=True)) / sum(beside)
+    def value(side: Opening) -> float:
+        beside = [max(0.0, 1 - abs(wrapped(other.heading - side.heading)) / 0.9) for other in openings]
+        return side.bright + sum(w * o.bright for w, o in zip(beside, openings, strict=True)) / sum(beside)
 
     return max(openings, key=value)
 
 
 def settle(robot: HidingState, view: View) -> Step:
-    """Turned to the light: is it dark here, and lit there?"""
+    """Facing the light, check that it is dark here and lit there."""
     if robot.shifted:
-        # It came nearer to the light, or went further in: how is it here?
+        # It moved: check again.
         return "face"
     here = robot.opening(view)
     if here.bright < AS_LIGHT * lightest(robot.openings).bright and robot.hops < FACE_HOPS:
-        # Commands were lost, or too little was seen to measure the turn.
+        # Commands were lost, or the turn could not be measured.
         return robot.hop(HOP, "turns on to the light")
     share, roof = shelter(robot.openings)
     dark = share <= DARK or (share <= DARK_ENOUGH and robot.faces > 1)
@@ -382,13 +353,12 @@ def begin_check(robot: HidingState) -> None:
 
 
 def check(robot: HidingState, view: View) -> Step:
-    """Back after a loss of the hold: is it still hidden? By what it sees as it stands, and not as strictly as
-    when it hid: nothing moves unless the place is another one."""
+    """After a lost hold, check less strictly than before, so that only a changed place makes it move."""
     robot.openings = [*robot.openings, robot.opening(view)]
     if len(robot.openings) < CHECKED:
         return robot.stand("back: is it still hidden?")
-    ratio = np.median([one.near / max(one.outside, 1e-4) for one in robot.openings])
-    if ratio <= STILL_DARK and np.median([one.sees_out for one in robot.openings]) >= STILL_SEES:
+    ratio = np.median([side.near / max(side.outside, 1e-4) for side in robot.openings])
+    if ratio <= STILL_DARK and np.median([side.sees_out for side in robot.openings]) >= STILL_SEES:
         return "hidden"
     robot.note = "no longer hidden"
     return "scan"

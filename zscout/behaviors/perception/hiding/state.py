@@ -1,13 +1,8 @@
-"""All that a hider remembers, in one structure: a checkpoint is this, as MessagePack. And the moves that all phases
-share: turns that are measured, drives that are watched, what was seen where. Pure.
+"""A hider's memory, one structure that its checkpoint holds as MessagePack, and the moves of all phases. Pure.
 
-Times are seconds of the hider's own clock, which begins at 0 and counts only what passed between pictures:
-after a move to another host, whose clock reads otherwise, it goes on. Places are dead-reckoned from where
-the hider began: metres, x along its first heading.
-
-A *hop* is a short turn on the spot, after which the robot waits until the picture stands still and measures how far it
-truly turned. A *cruise* is a drive with short commands, each with a time to live, one at every picture.
-"""
+Times are seconds of the hider's own clock, from 0, counted between pictures only, so that it survives a move to another
+host. Places are dead-reckoned metres from the start, x along the first heading. A *hop* is a short turn on the spot,
+measured once the picture is still. A *cruise* is a drive by short commands with a time to live, one per picture."""
 
 from __future__ import annotations
 
@@ -24,35 +19,22 @@ from zscout.behaviors.perception.darkness import View
 from zscout.behaviors.perception.hiding.compass import BANDS, SCALE, Strip, Tones, brighter, floor_strip, turned
 from zscout.behaviors.perception.lens import COLUMNS, Picture
 
-MAX_CHECKPOINT: Final = 64_000
-"""Bytes; a hider's own is below 20,000."""
+MAX_CHECKPOINT: Final = 64_000  # bytes; a hider's own is below 20,000
 MAX_BAD: Final = 24
 MAX_SIGHTINGS: Final = 120
-FORM: Final = 1
-"""Of the checkpoint; one of another form is refused."""
-WHEEL_BASE: Final = 0.11
-"""Metres between a Scout's two wheels."""
-TOP_SPEED: Final = 0.30
-"""Metres per second, of each wheel."""
-TOP_SPIN: Final = 2 * TOP_SPEED / WHEEL_BASE
-"""Radians per second with the wheels at full speed against each other."""
-STRAIGHT: Final = 0.7
-"""Share of top speed of a straight step."""
+FORM: Final = 1  # version of the checkpoint; others are refused
+WHEEL_BASE: Final = 0.11  # metres between a Scout's two wheels
+TOP_SPEED: Final = 0.30  # metres per second, of each wheel
+TOP_SPIN: Final = 2 * TOP_SPEED / WHEEL_BASE  # radians per second with opposed wheels at full speed
+STRAIGHT: Final = 0.7  # share of top speed of a straight step
 LONGEST_HOP: Final = math.radians(44)
-SETTLES: Final = 0.15
-"""Seconds after a hop before its picture may count: the motors' lag."""
-LAGS: Final = 0.33
-"""Seconds after a hop when a turn that shows as expected is taken to be over."""
-SETTLED: Final = 1.0
-"""Seconds after a hop when its picture counts even if it still seems to move."""
-SURE: Final = 0.35
-"""Likeness below which a measured turn is not believed."""
-WATCHED: Final = 0.5
-"""Seconds of driving after which the near floor is another one."""
-SAME_FLOOR: Final = 0.5
-"""Likeness of the floor now and then from which on it is the same: 0.6 to 0.95 when stuck, below 0.35 else."""
-BRIGHTER: Final = 4.0
-"""How many times brighter than here the floor of a column that sees out is."""
+SETTLES: Final = 0.15  # seconds after a hop before its picture may count: the motors' lag
+LAGS: Final = 0.33  # seconds after a hop when a turn as expected counts as finished
+SETTLED: Final = 1.0  # seconds after a hop when its picture counts even if it seems to move
+SURE: Final = 0.35  # least likeness of a credible turn
+WATCHED: Final = 0.5  # seconds of driving that change the near floor
+SAME_FLOOR: Final = 0.5  # likeness of unchanged floor: 0.6 to 0.95 when stuck, below 0.35 otherwise
+BRIGHTER: Final = 4.0  # brightness, against the floor here, of the floor in a column that sees out
 
 Phase = Literal[
     "scan", "aim", "roam", "approach", "enter", "face", "settle", "back", "dodge", "leave", "hidden", "check"
@@ -72,14 +54,10 @@ WORDS: Final = {phase: word for word, phases in PHASES_OF.items() for phase in p
 @dataclass(frozen=True, slots=True)
 class WheelCommand:
     left: float
-    right: float
-    """Shares of top speed, -1 to 1."""
-    lasts: float
-    """Seconds that the wheels may turn without a newer command; 0 with wheels that stand."""
-    doing: str
-    """One word, the hider's state: search, approach, unstick, enter, turn or hidden."""
-    why: str
-    """A few words for an operator."""
+    right: float  # shares of top speed, -1 to 1
+    lasts: float  # seconds until the wheels stop without a newer command; 0 for still wheels
+    doing: str  # the state: search, approach, unstick, enter, turn or hidden
+    why: str  # a few words for an operator
     hidden: bool = False
 
     @property
@@ -87,12 +65,11 @@ class WheelCommand:
         return self.left != 0 or self.right != 0
 
 
-Step: TypeAlias = WheelCommand | Phase
-"""What a phase does on a picture: a command, or the phase that goes on with the same picture."""
+Step: TypeAlias = WheelCommand | Phase  # a command, or the phase that continues with the same picture
 
 
 class Sighting(msgspec.Struct, frozen=True):
-    """A dark place as it was seen once: heading in radians, metres."""
+    """A dark place in one picture: heading in radians, metres."""
 
     heading: float
     distance: float
@@ -104,50 +81,40 @@ class Sighting(msgspec.Struct, frozen=True):
 
 
 class Opening(msgspec.Struct, frozen=True):
-    """How a scan found one direction. Brightness is linear, in units of the scan's first picture."""
+    """One direction of a scan. Brightness is linear, in units of the scan's first picture."""
 
     heading: float
-    open_for: float
-    """Metres, roughly, to drive there."""
-    bright: float
-    """Mean over the columns of lit floor over near floor."""
-    near: float
-    """The floor just ahead."""
-    outside: float
-    """The lit floor."""
-    above: float
-    """What is at the top of the picture: a wall or ceiling in the light is bright, the underside of a sofa dark."""
-    sees_out: float
-    """Share of columns that show lit floor."""
+    open_for: float  # metres, roughly, to drive there
+    bright: float  # mean over the columns of lit floor over near floor
+    near: float  # the floor just ahead
+    outside: float  # the lit floor
+    above: float  # top of the picture: bright for a lit wall or ceiling, dark for the underside of a sofa
+    sees_out: float  # share of columns that show lit floor
 
 
 class Spot(msgspec.Struct, frozen=True):
-    """A place to remember: metres."""
+    """A remembered place, in metres."""
 
     x: float
     y: float
 
 
 class Thumb(msgspec.Struct, frozen=True):
-    """A part of an earlier picture, to see whether anything moves."""
-
     at: float
     data: bytes
 
 
 class HidingState(msgspec.Struct):
-    """See the module's head. Arrays are kept as bytes."""
+    """See the module. Arrays are kept as bytes."""
 
     form: int = FORM
     phase: Phase = "scan"
     began: float = 0.0
     clock: float = 0.0
     last_now: float | None = None
-    interval: float = 0.2
-    """Seconds between good pictures, smoothed."""
+    interval: float = 0.2  # seconds between good pictures, smoothed
     dice: int = 0
-    stopped: bool = False
-    """The hold is lost; nothing is done until it is back."""
+    stopped: bool = False  # the hold is lost; wait until it is back
 
     heading: float = 0.0
     x: float = 0.0
@@ -155,69 +122,45 @@ class HidingState(msgspec.Struct):
 
     left: float = 0.0
     right: float = 0.0
-    ends: float = 0.0
-    """When the wheels' last command runs out."""
-    hopping: bool = False
-    """A measured turn (or step) is under way, or its picture not yet still."""
-    expected: float = 0.0
-    """Radians that the hop was to turn."""
-    hop_length: float = 0.0
-    """Metres that it was to go ahead."""
-    anchor: bytes = b""
-    """Strip before the hop."""
-    previous: bytes = b""
-    """Strip of the last picture."""
-    tones: bytes = b""
-    """Tones of the last picture."""
-    anchor_tones: bytes = b""
-    """And of that before the hop."""
-    opened: float = 1.0
-    """By how much the camera opened since the scan began."""
+    ends: float = 0.0  # end of the wheels' last command
+    hopping: bool = False  # true until a turn or step is finished and measured
+    expected: float = 0.0  # radians intended
+    hop_length: float = 0.0  # metres intended
+    anchor: bytes = b""  # strip before the hop
+    previous: bytes = b""  # strip of the last picture
+    tones: bytes = b""  # tones of the last picture
+    anchor_tones: bytes = b""  # tones before the hop
+    opened: float = 1.0  # factor by which the camera opened since the scan began
     thumbs: list[Thumb] = msgspec.field(default_factory=list)
-    noise: float = 1.0
-    """Grey levels by which thumbs differ while nothing moves."""
+    noise: float = 1.0  # grey levels by which thumbs differ while nothing moves
     floors: list[Thumb] = msgspec.field(default_factory=list)
     """Strips of the near floor over the last second of driving."""
-    halted: int = 0
-    """Pictures in a row that showed the same floor in spite of driving."""
-    print: int = 0
-    """CRC of the last picture: the same again is a frozen picture."""
+    halted: int = 0  # pictures in a row that showed the same floor in spite of driving
+    print: int = 0  # CRC of the last picture: a repetition is a frozen picture
     spoiled_since: float | None = None
     spoiled_how: str = ""
     last_good: float = 0.0
 
-    turned: float = 0.0
-    """Radians turned since the scan, or the facing, began."""
+    turned: float = 0.0  # radians turned since the scan, or the facing, began
     hops: int = 0
     sightings: list[Sighting] = msgspec.field(default_factory=list)
     openings: list[Opening] = msgspec.field(default_factory=list)
     target: Sighting | None = None
-    seen_target: float = 0.0
-    """When the target was last seen, in this phase."""
-    goal: float = 0.0
-    """Heading to turn to, or metres to go, as the phase has it."""
+    seen_target: float = 0.0  # last sight of the target in this phase
+    goal: float = 0.0  # heading or distance, depending on the phase
     left_to_go: float = 0.0
     next_phase: Phase = "scan"
-    bad: list[Spot] = msgspec.field(default_factory=list)
-    """Where hiding failed, or the robot could not get."""
+    bad: list[Spot] = msgspec.field(default_factory=list)  # places where hiding failed, or that could not be reached
     scans: int = 0
     bumps: int = 0
-    blocked: list[float] = msgspec.field(default_factory=list)
-    """Headings in which it bumped since the last scan."""
-    at_edge: bool = False
-    """The last bump was at the edge of a dark place."""
-    visited: list[Spot] = msgspec.field(default_factory=list)
-    """Where it has looked around."""
-    tries: int = 0
-    """Bumps on the way to this target."""
-    faces: int = 0
-    """Full turns in this dark place."""
-    shifted: bool = False
-    """It moved since it turned to the light."""
-    note: str = ""
-    """Why this phase."""
-    why: str = ""
-    """As last reported."""
+    blocked: list[float] = msgspec.field(default_factory=list)  # headings of bumps since the last scan
+    at_edge: bool = False  # the last bump was at the edge of a dark place
+    visited: list[Spot] = msgspec.field(default_factory=list)  # places of former scans
+    tries: int = 0  # bumps on the way to this target
+    faces: int = 0  # full turns in this dark place
+    shifted: bool = False  # moved since it turned to the light
+    note: str = ""  # reason of this phase
+    why: str = ""  # as last reported
 
     def go(self, phase: Phase) -> None:
         self.phase, self.began = phase, self.clock
@@ -233,8 +176,7 @@ class HidingState(msgspec.Struct):
 
     @property
     def word(self) -> str:
-        """What it is doing, for people."""
-        # To aim is part of what follows.
+        # Aiming belongs to the next phase.
         facing = self.phase == "aim" and self.next_phase == "settle"
         return WORDS["settle" if facing else self.phase]
 
@@ -242,7 +184,7 @@ class HidingState(msgspec.Struct):
         return self.act(0.0, 0.0, 0.0, why)
 
     def rest(self, why: str) -> WheelCommand:
-        """Nothing new: what was commanded runs out by itself."""
+        """Nothing new: the last command runs out by itself."""
         lasts = self.ends - self.clock
         if lasts > 0.01:
             return WheelCommand(self.left, self.right, lasts, self.word, why)
@@ -262,13 +204,11 @@ class HidingState(msgspec.Struct):
         return float((mixed ^ (mixed >> 31)) >> 11) / float(1 << 53)
 
     def point(self, heading: float, distance: float) -> tuple[float, float]:
-        """Where one is so far from here in this direction."""
+        """The place at this heading and distance."""
         return self.x + distance * math.cos(heading), self.y + distance * math.sin(heading)
 
-    # Hops
-
     def hop(self, angle: float, why: str) -> WheelCommand:
-        """Turns on the spot by `angle` (at most `LONGEST_HOP`, the rest is for the next hop)."""
+        """Turn on the spot by `angle`, at most `LONGEST_HOP`; the rest is for the next hop."""
         angle = max(-LONGEST_HOP, min(LONGEST_HOP, angle))
         speed = 0.5 if abs(angle) > 0.25 else 0.3
         wheel = math.copysign(speed, angle)
@@ -276,7 +216,7 @@ class HidingState(msgspec.Struct):
         return self.act(-wheel, wheel, abs(angle) / (TOP_SPIN * speed), why)
 
     def step_straight(self, distance: float, why: str) -> WheelCommand:
-        """Drives straight by `distance` metres (negative: back) and waits for a still picture."""
+        """Drive straight by `distance` metres (negative: back) and wait for a still picture."""
         wheel = math.copysign(STRAIGHT, distance)
         self._measure(0.0, distance)
         return self.act(wheel, wheel, abs(distance) / (TOP_SPEED * STRAIGHT), why)
@@ -286,7 +226,7 @@ class HidingState(msgspec.Struct):
         self.anchor, self.anchor_tones = self.previous, self.tones
 
     def settled(self, strip: Strip, tones: Tones, picture: Picture) -> bool:
-        """Whether the hop is over and measured. Until then the caller stands, or lets the wheels turn."""
+        """Return True if the hop is over and measured."""
         thumb = cv2.resize(picture, (40, 30), interpolation=cv2.INTER_AREA).astype(np.uint8)
         moved = difference(self.thumbs[-1].data, thumb) if self.thumbs else 255.0
         self.thumbs = [Thumb(self.clock, thumb.tobytes())]
@@ -295,12 +235,12 @@ class HidingState(msgspec.Struct):
             return False
         turn = turned(unpack(self.anchor), strip, self.expected)
         still = moved <= 1.6 * self.noise + 0.4
-        # A turn that has come as far as it was to go needs no second look.
+        # A complete turn needs no second look.
         done = over >= LAGS and self.expected and turn.likeness >= 0.5 and abs(turn.angle / self.expected - 1) < 0.2
         if not still and not done and over < SETTLED:
             return False
         if moved <= 3 * self.noise + 0.5:
-            # Nothing moves: what differs is noise.
+            # Nothing moves: differences are noise.
             self.noise = max(0.3, 0.7 * self.noise + 0.3 * moved)
         self.hopping = False
         angle = turn.angle if turn.likeness >= SURE or self.hop_length else self.expected
@@ -313,10 +253,8 @@ class HidingState(msgspec.Struct):
         self.hops += 1
         return True
 
-    # Cruises
-
     def cruise(self, speed: float, spin: float, why: str) -> WheelCommand:
-        """Drives on at `speed` (m/s, ahead positive) and `spin` (rad/s, left positive) until the next picture."""
+        """Drive at `speed` (m/s, ahead positive) and `spin` (rad/s, left positive) until the next picture."""
         half = spin * WHEEL_BASE / 2
         left, right = (speed - half) / TOP_SPEED, (speed + half) / TOP_SPEED
         most = max(1.0, abs(left), abs(right))
@@ -329,7 +267,7 @@ class HidingState(msgspec.Struct):
         return min(0.24, 0.07 / self.interval)
 
     def cruised(self, least: float) -> bool:
-        """Whether this phase has driven so many metres."""
+        """Return True if this phase has driven `least` metres."""
         return self.pace * self.here_for >= least
 
     def advanced(self, seconds: float, strip: Strip) -> None:
@@ -344,20 +282,18 @@ class HidingState(msgspec.Struct):
             self.heading += turn.angle if turn.likeness >= SURE else spin * ran
 
     def blocked_by(self, picture: Picture) -> bool:
-        """Whether the robot has driven for a while over the same floor: it pushes against something."""
+        """Return True if the floor stayed the same while driving: the robot pushes against something."""
         floor = floor_strip(picture)
         since = self.clock - max(WATCHED, 1.5 * self.interval)
-        old = [one for one in self.floors if one.at <= since]
-        kept = [*old[-1:], *(one for one in self.floors if one.at > since)]
+        old = [thumb for thumb in self.floors if thumb.at <= since]
+        kept = [*old[-1:], *(thumb for thumb in self.floors if thumb.at > since)]
         self.floors = [*kept[-11:], Thumb(self.clock, floor.tobytes())]
         same = bool(old) and turned(unpack(old[-1].data), floor, 0.0, 0.3).likeness >= SAME_FLOOR
         self.halted = self.halted + 1 if same else 0
         return self.halted >= 2
 
-    # What was seen where
-
     def sight(self, view: View) -> None:
-        """Adds what this picture shows to the scan's findings."""
+        """Add this picture to the scan's findings."""
         for place in view.places:
             heading = self.heading + place.bearing
             x, y = self.point(heading, place.distance)
@@ -366,10 +302,10 @@ class HidingState(msgspec.Struct):
         self.openings.append(self.opening(view))
 
     def opening(self, view: View) -> Opening:
-        """What this picture shows of its direction.
+        """The direction of this picture.
 
-        The farther one sees, the more there is around the horizon. In the simulated building 2 grey levels of
-        structure up to 0.7 m, 5 at 1 m, 8 beyond 1.5 m."""
+        Farther views have more structure around the horizon: 2 grey levels up to 0.7 m, 5 at 1 m, 8 beyond 1.5 m
+        (simulated)."""
         middle = unpack(self.previous)[9:15, COLUMNS // 4 : -COLUMNS // 4].astype(np.float32)
         return Opening(
             heading=self.heading,
@@ -382,13 +318,13 @@ class HidingState(msgspec.Struct):
         )
 
     def note_bad(self, x: float, y: float) -> None:
-        """This place is not tried again."""
+        """Avoid this place from now on."""
         self.bad = [*self.bad, Spot(x, y)][-MAX_BAD:]
 
 
-def distance(one: Spot | Sighting | HidingState, other: Spot | Sighting | HidingState) -> float:
-    """Metres from one to the other."""
-    return math.hypot(one.x - other.x, one.y - other.y)
+def distance(place: Spot | Sighting | HidingState, other: Spot | Sighting | HidingState) -> float:
+    """Metres between two places."""
+    return math.hypot(place.x - other.x, place.y - other.y)
 
 
 def wrapped(angle: float) -> float:
@@ -397,7 +333,7 @@ def wrapped(angle: float) -> float:
 
 
 def difference(grey: bytes, thumb: NDArray[np.uint8]) -> float:
-    """Mean difference in grey levels, whatever the exposure did in between."""
+    """Mean difference in grey levels, corrected for exposure."""
     old = np.frombuffer(grey, np.uint8).astype(np.float32)
     new = thumb.ravel().astype(np.float32)
     gain = (float(old @ new) + 1) / (float(old @ old) + 1)
