@@ -23,7 +23,7 @@ from zscout.services.journal.merging import Span
         ("history --since 1h --until 2h", "--since is not before --until"),
         ("history --rc robot", "write kind/name, as in robot/scout33"),
         ("history --user ''", "is not a name"),
-        ("history --group arms", '--group: the fleet file has no group "arms" with members; it has no groups'),
+        ("history --group arms", '--group: the fleet file has no group "arms" with members; there are none'),
         ("history --limit 0", "0 is out of range"),
         ("history --json --csv", "--json and --csv exclude each other; use only one of them"),
         ("usage --by weekday", '--by: "weekday" is unknown; write one of'),
@@ -43,7 +43,7 @@ def test_times_ago_are_durations_or_dates() -> None:
     assert journals.parse_past("7d", "--since") == 7 * 86_400
     assert journals.parse_past("2020-01-01T00:00:00+00:00", "--since") > 5 * 365 * 86_400
     assert journals.parse_past("2999-01-01", "--until") == 0
-    with pytest.raises(BadInput, match="too long ago"):
+    with pytest.raises(BadInput, match="too far back"):
         journals.parse_past("1900-01-01", "--since")
 
 

@@ -83,7 +83,7 @@ AT = ("--for", "1h", "--at", "tue 14:00")
     [
         (("book", "robot/a", "--for", "1h"), "--at is missing"),
         (("book", *AT), "DEVICE... is missing"),
-        (("book", "robot/a", "--for", "1h", "--at", "tue"), '--at: "tue" has no time of day; write "tue 14:00"'),
+        (("book", "robot/a", "--for", "1h", "--at", "tue"), '--at: "tue" has no time; write "tue 14:00"'),
         (("book", "robot/a", "--for", "soon", "--at", "9:00"), '--for: "soon" is not a duration'),
         (("book", "robot/a", "--for", "1h", "--at", "9999-12-31 23:59"), "is more than a year ahead; write an earlier"),
         (("book", "robot/a", "--for", "1h", "--at", "0001-01-01"), "is long past; write a later date"),
