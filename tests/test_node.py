@@ -176,7 +176,7 @@ def test_an_rc_that_another_process_of_its_host_offers_is_refused_and_free_when_
         finally:
             await mesh.close()
 
-    with pytest.raises(MeshError, match="robot/a: another process on anvil already serves it"):
+    with pytest.raises(MeshError, match="robot/a: another process on anvil serves it already"):
         run(begin())
     other.kill()
     other.communicate()

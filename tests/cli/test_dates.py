@@ -90,7 +90,7 @@ def test_a_whole_day_is_only_one_where_days_are_asked_for() -> None:
     written = parse_date("tue", "--date")
     assert written.whole_day(NOW, BERLIN) == date(2026, 12, 1)
     assert parse_date("tue 14:00", "--date").whole_day(NOW, BERLIN) is None
-    with pytest.raises(BadInput, match='has no time of day; write "tue 14:00"'):
+    with pytest.raises(BadInput, match='has no time; write "tue 14:00"'):
         written.found(NOW, BERLIN)
 
 

@@ -24,8 +24,8 @@ BAD_NODES = {
     '[node]\nhost = "a/b"': f'node.host: "a/b" is not a name; {NAME_RULE}',
     '[node]\nload = "yes"': 'node.load: is the text "yes"; write true, false or "tree"',
     "[notify]": "notify: sends nothing to anybody; name urls or users, or remove the table",
-    '[node]\ncandidate = false\n[notify]\nurls = ["json://a"]': "notify: this host never leads, "
-    "and only the leader sends notices; move it to a candidate",
+    '[node]\ncandidate = false\n[notify]\nurls = ["json://a"]': "notify: only the leader sends notices, "
+    "and this host never leads; move it to a candidate",
     # No secret is shown.
     '[notify]\nurls = "json://user:secret@a"': f"notify.urls: {UNSHOWN}; "
     'write texts in a list, as in ["mailtos://user:password@example.org"]',

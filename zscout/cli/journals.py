@@ -43,7 +43,9 @@ def parse_past(text: str, option: str) -> float:
     if option == "--until":
         ago = max(0.0, ago)  # up to now
     if not 0 <= ago <= MAX_AGO:
-        raise BadInput(f"{option}: {quoted(text)} is {'in future' if ago < 0 else 'too far back'}; write {PAST_FORMS}")
+        raise BadInput(
+            f"{option}: {quoted(text)} is {'in the future' if ago < 0 else 'too far back'}; write {PAST_FORMS}"
+        )
     return ago
 
 

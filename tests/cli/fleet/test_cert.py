@@ -69,7 +69,7 @@ def test_managers_share_the_key_that_seals_places(capsys: pytest.CaptureFixture[
     with pytest.raises(BadInput, match="may be read by others"):
         read_places_key(Path("anvil"))
     Path("bellows/places.key").write_text("short\n")
-    with pytest.raises(BadInput, match=r"places\.key: is not 32 bytes"):
+    with pytest.raises(BadInput, match=r"places\.key: is not 32 hex bytes"):
         read_places_key(Path("bellows"))
     Path("zscout-ca/places.key").unlink()
     capsys.readouterr()

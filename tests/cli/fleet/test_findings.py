@@ -94,7 +94,7 @@ def test_a_certificate_that_ends_soon_is_told_of_every_host_and_of_ones_own_once
     )
     ends = [
         "the certificate of anvil expires in 1 d; renew it (zscout cert renew)",
-        "the certificate of bellows has ended 1 min ago; renew it (zscout cert renew)",
+        "the certificate of bellows expired 1 min ago; renew it (zscout cert renew)",
     ]
     for own in (certificates("anvil", lasts=40 * DAY, begun=39 * DAY), certificates()):
         assert [words for _, words in mends(seen(CLOSED, certificates=own, seals=True, hosts=hosts))] == ends

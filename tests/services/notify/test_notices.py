@@ -98,7 +98,7 @@ def test_a_certificate_that_ends_soon_is_told_once_and_again_after_it_was_renewe
     )
     assert notices.look([soon]) == []
     assert notices.look([report("anvil", 9e6, renew=False)]) == []
-    assert notices.look([report("anvil", -5, renew=True)])[0].title.endswith("anvil has ended")
+    assert notices.look([report("anvil", -5, renew=True)])[0].title.endswith("anvil has expired")
 
 
 def test_a_url_is_sent_so_many_a_minute() -> None:
