@@ -25,8 +25,8 @@ CLOSED = '[security]\nfolder = "k"\n[roles]\nmanager = ["a"]\n'
 SYNTAX = "fix the TOML there or just before"
 
 BAD_FLEETS = """
-x =  | line 1, column 5, the end: Invalid value; mend the TOML there or just before
-x = 1 / x = 2 | line 2, column 6, the end: Cannot overwrite a value; mend the TOML there or just before
+x =  | line 1, column 5, the end: Invalid value; fix the TOML there or just before
+x = 1 / x = 2 | line 2, column 6, the end: Cannot overwrite a value; fix the TOML there or just before
 [flet] | flet: unknown key; did you mean fleet?
 [fleet] / candiates = [] | fleet.candiates: unknown key; did you mean candidates?
 [limits] / max_needed = 1 | limits.max_needed: unknown key; did you mean max_needs or max_queued?
@@ -36,7 +36,7 @@ fleet = "lab" | fleet: is the text "lab"; write a table, under [fleet]
 [fleet] / name = "a b" | fleet.name: "a b" is not a name; write 1 to 64 letters A to Z, digits, "_", "." or "-"
 [fleet] / candidates = "anvil" | fleet.candidates: is the text "anvil"; write a list
 [fleet] / candidates = ["a", 1] | fleet.candidates[1]: is 1; write a text in quotes
-[fleet] / candidates = ["a", "b", "a"] | fleet.candidates[2]: "a" stands at fleet.candidates[0] already;
+[fleet] / candidates = ["a", "b", "a"] | fleet.candidates[2]: "a" is already at fleet.candidates[0];
 [fleet] / strategy = "fifo" | fleet.strategy: is the text "fifo"; write "adaptive", "optimal" or "priority"
 [fleet] / patience = -1 | fleet.patience: is -1 s; write 0 to 31622400 seconds
 [fleet] / patience = nan | fleet.patience: is not a finite number; write a number
@@ -54,7 +54,7 @@ fleet = "lab" | fleet: is the text "lab"; write a table, under [fleet]
 [mesh] / connect = ["tcp/[::g]:7"] | mesh.connect[0]: "tcp/[::g]:7" is not an endpoint;
 [mesh] / connect = ["tcp/anvil:0"] | mesh.connect[0]: "tcp/anvil:0" has no valid port; write one from 1 to 65535
 [mesh] / listen = ["tcp/anvil:70000"] | mesh.listen[0]: "tcp/anvil:70000" has no valid port; write one from 0 to 65535
-[mesh] / connect = ["tcp/a:1", "tcp/a:1"] | mesh.connect[1]: "tcp/a:1" stands at mesh.connect[0] already;
+[mesh] / connect = ["tcp/a:1", "tcp/a:1"] | mesh.connect[1]: "tcp/a:1" is already at mesh.connect[0];
 [mesh] / multicast = 1 | mesh.multicast: is 1; write true or false
 [mesh] / multicast_address = "10.0.0.1:7446" | mesh.multicast_address: "10.0.0.1:7446" is not a multicast address;
 [limits] / max_needs = 0 | limits.max_needs: is 0; write a whole number from 1 to 1000
@@ -67,16 +67,16 @@ fleet = "lab" | fleet: is the text "lab"; write a table, under [fleet]
 [mesh] / lease = 2.9 | timing.hold_lease: is 3 s; write more than mesh.lease + timing.rebuild, which is 3.1 s
 [mesh] / relay = ["a", "b"] | mesh.relay: unknown key;
 [security] | security.folder: is missing; add it
-[security] / folder = "" | security.folder: "" is no folder; name one, as in folder = "/etc/zscout/keys"
-[security] / folder = "k" | roles: [security] is there, and no host may lead; write manager = ["anvil"] under [roles]
-[roles] / viewer = ["a"] / client = ["a"] | roles.client: "a" is viewer already;
-[roles] / operator = ["a"] / manager = ["a"] | roles.manager: "a" is operator already;
-[roles.node] / a = ["robot"] | roles.node.a[0]: "robot" names no RC;
-[groups] / arms = ["a"] | groups.arms[0]: "a" has no role; name it under [roles], or mend the name
-[roles] / client = ["a"] / [groups] / a = ["a"] | groups.a: "a" is a name with a role; call the group otherwise
-[access] / "robot/x" = ["arms"] | access."robot/x"[0]: "arms" has no role; name it under [roles], or mend the name
-[quotas] / a = { rcs = 1 } | quotas[0]: "a" has no role; name it under [roles], or mend the name
-[ceilings.viewer] / priority = 1 | ceilings.viewer: only ARCs of clients and operators have a ceiling; write "client"
+[security] / folder = "" | security.folder: "" is not a folder; name one, as in folder = "/etc/zscout/keys"
+[security] / folder = "k" | roles: [security] needs a host that may lead; write manager = ["anvil"] under [roles]
+[roles] / viewer = ["a"] / client = ["a"] | roles.client: "a" already has the role viewer;
+[roles] / operator = ["a"] / manager = ["a"] | roles.manager: "a" already has the role operator;
+[roles.node] / a = ["robot"] | roles.node.a[0]: "robot" does not name a device;
+[groups] / arms = ["a"] | groups.arms[0]: "a" has no role; name it under [roles], or correct the name
+[roles] / client = ["a"] / [groups] / a = ["a"] | groups.a: "a" is also a name with a role; rename the group
+[access] / "robot/x" = ["arms"] | access."robot/x"[0]: "arms" has no role; name it under [roles], or correct the name
+[quotas] / a = { rcs = 1 } | quotas.a: "a" has no role; name it under [roles], or correct the name
+[ceilings.viewer] / priority = 1 | ceilings.viewer: only clients and operators have a ceiling; write "client" or "operator"
 """
 """The file, and how the line begins."""
 BAD_FLEETS_BY_TEXT = {

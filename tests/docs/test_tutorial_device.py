@@ -41,7 +41,8 @@ def commands() -> list[str]:
 
 
 def test_it_takes_at_most_50_lines_of_python() -> None:
-    lines = [line for name, text in files().items() if name.endswith(".py") for line in text.splitlines() if line]
+    programs = [text for name, text in files().items() if name.endswith(".py") and name != "test_lamp.py"]
+    lines = [line for text in programs for line in text.splitlines() if line]
     assert len(lines) <= MOST_LINES
 
 

@@ -54,18 +54,19 @@ BAD = {
     'arm\nport = "x"\njoints = [1, 2.5]': "rc[0].joints[1] (arm/a): is 2.5; write a whole number",
     'arm\nport = "x"\nsped = 1': "rc[0].sped (arm/a): unknown key; did you mean speed?",
     'arm\nport = "x"\nbaud = 1': "rc[0].baud (arm/a): unknown key; known here: joints, port, speed",
-    'arm\nport = "x"\nspeed = 101': "rc[0] (arm/a): speed is above 100, which bends it; write less; mend it",
-    'arm\nport = "gone"': "rc[0].driver (arm/a): zscout_arm.Arm can't be made: KeyError: 'gone'; mend that package, or",
+    'arm\nport = "x"\nspeed = 101': "rc[0] (arm/a): speed is above 100, which bends it; write less; correct it",
+    'arm\nport = "gone"': "rc[0].driver (arm/a): zscout_arm.Arm can't be made: KeyError: 'gone'; fix that package, or",
     "bare\nport = 1": "rc[0].port (arm/a): unknown key; known here: none",
     'odd\nport = "x"': "rc[0].driver (arm/a): the options of zscout_arm.Odd can't be read: rc[0].port has a type that",
-    "nodriver": "rc[0].driver (arm/a): zscout_arm:NoDriver of package zscout_arm 1.0 is no driver; name a subclass of",
+    "nodriver": "rc[0].driver (arm/a): zscout_arm:NoDriver of package zscout_arm 1.0 is not a driver; "
+    "name a subclass of",
     "amr": 'rc[0].driver (arm/a): no driver "amr" is installed here; did you mean "arm"? Install the package',
     "sonar": 'rc[0].driver (arm/a): no driver "sonar" is installed here; install the package that brings it into this '
     'environment, or write one of "arm", "bare", "broken", "capacity", "command", "exclusive", "framegrabber", ',
     "broken": "rc[0].driver (arm/a): broken:Arm of package broken 1.0 can't be loaded: ModuleNotFoundError: No module "
-    "named 'no_such_vendor'; mend that package, or install what it needs; --log-level debug shows more",
+    "named 'no_such_vendor'; fix that package, or install its needs; --log-level debug shows more",
     "quits": "rc[0].driver (arm/a): quits:Arm of package quits 1.0 can't be loaded: SystemExit: no licence\\x1b[2J;",
-    "twice": 'rc[0].driver (arm/a): "twice" is brought by one:Arm of package one 1.0 and two:Arm of package two 1.0; '
+    "twice": 'rc[0].driver (arm/a): "twice" comes with one:Arm of package one 1.0 and two:Arm of package two 1.0; '
     "uninstall one of them",
 }
 """How the message about a driver begins."""

@@ -48,8 +48,8 @@ QUERIES: list[tuple[str, str, bytes | None, str, str]] = [
     ("no needs", SCHEDULE, bad(needs=...), "malformed", "`needs`"),
     ("needs as a list", SCHEDULE, bad(needs=["robot/a"]), "malformed", "at `$.needs`"),
     ("a need twice", SCHEDULE, bad(needs={"robot/a": {}, "robot/b": {"r": 1}}).replace(b"/b", b"/a"),
-     "malformed", "'robot/a' stands more than once"),
-    ("an id twice", SCHEDULE, b'{"op":"cancel","id":"x","id":"y"}', "malformed", "'id' stands more than"),
+     "malformed", '"robot/a" is given more than once; give it once'),
+    ("an id twice", SCHEDULE, b'{"op":"cancel","id":"x","id":"y"}', "malformed", '"id" is given more than'),
     ("text as priority", SCHEDULE, bad(priority="9"), "malformed", "at `$.priority`"),
     ("a fraction as priority", SCHEDULE, bad(priority=1.5), "malformed", "at `$.priority`"),
     ("a priority of 400 digits", SCHEDULE, bad(priority=10**400), "bad_request", "priority must lie between"),
@@ -79,40 +79,40 @@ QUERIES: list[tuple[str, str, bytes | None, str, str]] = [
     ("an amount of 40 digits", SCHEDULE, rate("0." + "1" * 40), "bad_request", "more than 25 digits"),
     ("an amount in words", SCHEDULE, rate('"much"'), "malformed", "decimal"),
     ("an RC without a kind", SCHEDULE, bad(needs={"scout33": {}}), "bad_request", "write kind/name"),
-    ("an RC with a space", SCHEDULE, bad(needs={"robot/a b": {}}), "bad_request", "'a b' is not valid"),
+    ("an RC with a space", SCHEDULE, bad(needs={"robot/a b": {}}), "bad_request", 'device name "a b" is not valid'),
     ("a pattern over chunks", SCHEDULE, bad(needs={"robot/**": {}}), "bad_request", "write kind/name with *"),
-    ("a pattern of 60000 signs", SCHEDULE, bad(needs={"r/" + "$*" * 30_000: {}}), "bad_request", "'r/$*$*"),
+    ("a pattern of 60000 signs", SCHEDULE, bad(needs={"r/" + "$*" * 30_000: {}}), "bad_request", 'pattern "r/$*$*'),
     ("many patterns", SCHEDULE, bad(needs={f"r/*#{n}": {} for n in range(1, 10)}), "bad_request", "9 ne"),
     ("patterns at odds", SCHEDULE, bad(needs={"radio/*": {"rate": 1}, "radio/*#2": {}}), "bad_request",
-     "different parameters; give all the same"),
+     "different parameters; give them all the same"),
     ("foresee a bad pattern", SCHEDULE, bad(op="foresee", needs={"robot/*#": {}}), "bad_request", "is not"),
     ("a pattern for a sender", "rcm/schedule/t/$*x", bad(), "bad_key", "no wildcards"),
-    ("an RC of three parts", SCHEDULE, bad(needs={"robot/a/b": {}}), "bad_request", "'a/b' is not valid"),
+    ("an RC of three parts", SCHEDULE, bad(needs={"robot/a/b": {}}), "bad_request", 'device name "a/b" is not valid'),
     ("a bad parameter name", SCHEDULE, bad(needs={"radio/a": {"a rate": 1}}), "bad_request", "parameter of"),
-    ("a bad ARC name", SCHEDULE, bad(arc="my arc"), "bad_request", "arc 'my arc' is not valid"),
-    ("an id with a slash", SCHEDULE, bad(id="t/other/x"), "bad_name", "id 't/other/x' is not valid"),
-    ("an empty id", SCHEDULE, bad(id=""), "bad_name", "id '' is not valid"),
+    ("a bad ARC name", SCHEDULE, bad(arc="my arc"), "bad_request", 'arc "my arc" is not valid'),
+    ("an id with a slash", SCHEDULE, bad(id="t/other/x"), "bad_name", 'id "t/other/x" is not valid'),
+    ("an empty id", SCHEDULE, bad(id=""), "bad_name", 'id "" is not valid'),
     ("a long id", SCHEDULE, bad(id="x" * 65), "bad_name", "use 1 to 64 of"),
-    ("an id with a line feed", SCHEDULE, bad(id="x\ny"), "bad_name", "'x\\ny' is not valid"),
+    ("an id with a line feed", SCHEDULE, bad(id="x\ny"), "bad_name", '"x\\ny" is not valid'),
     ("no metric of ours", RANK, b'{"metric": "luck"}', "malformed", "Invalid enum value 'luck'"),
     ("no policy of ours", RANK, b'{"policy": 7}', "malformed", "at `$.policy`"),
     ("no host to be named", RANK, b'{"at_most": 0}', "malformed", "at `$.at_most`"),
     ("hosts by pattern", RANK, b'{"hosts": ["*"]}', "bad_name", "host \"*\" is not valid"),
     ("a thousand hosts", RANK, json.dumps({"hosts": ["h"] * 1000}).encode(), "malformed", "at `$.hosts`"),
     ("less than no memory", RANK, b'{"memory": -1}', "malformed", "at `$.memory`"),
-    ("a place of a future term", SCHEDULE, bad(place=[[HIGH, "f"], 1]), "bad_request", "place is of a term"),
+    ("a place of a future term", SCHEDULE, bad(place=[[HIGH, "f"], 1]), "bad_request", "place has a future term"),
     ("a place of one part", SCHEDULE, bad(place=[[1, "x"]]), "malformed", "at `$.place`"),
     ("a place before the first", SCHEDULE, bad(place=[[0, ""], 0]), "bad_request", "place was never given"),
     ("keep in words", SCHEDULE, bad(keep="yes"), "malformed", "at `$.keep`"),
-    ("a cancel for nobody", SCHEDULE, b'{"op":"cancel","id":"x","client":"x"}', "bad_name", "client '' is"),
-    ("a cancel for all", SCHEDULE, b'{"op":"cancel","id":"x","client":"*/*"}', "bad_name", "host '*' is not"),
+    ("a cancel for nobody", SCHEDULE, b'{"op":"cancel","id":"x","client":"x"}', "bad_name", 'client "" is'),
+    ("a cancel for all", SCHEDULE, b'{"op":"cancel","id":"x","client":"*/*"}', "bad_name", 'host "*" is not'),
     ("a hand-over without a goal", SCHEDULE, b'{"op":"hand_over","id":"x"}', "malformed", "`to`"),
-    ("a hand-over to no name", SCHEDULE, b'{"op":"hand_over","id":"x","to":"x"}', "bad_name", "client ''"),
+    ("a hand-over to no name", SCHEDULE, b'{"op":"hand_over","id":"x","to":"x"}', "bad_name", 'client ""'),
     ("a hand-over of nothing", SCHEDULE, b'{"op":"hand_over","id":"x","to":"t/good"}', "not_running", "x "),
     ("a wildcard for a client", "rcm/schedule/t/*", bad(), "bad_key", "name yourself in the key"),
     ("wildcards for a sender", "rcm/schedule/*/*", bad(), "bad_key", "no wildcards"),
     ("a half wildcard", "rcm/schedule/t/go$*", bad(), "bad_key", "no wildcards"),
-    ("a sender with a space", "rcm/schedule/t/the boss", bad(), "bad_name", "client 'the boss' is not valid"),
+    ("a sender with a space", "rcm/schedule/t/the boss", bad(), "bad_name", 'client "the boss" is not valid'),
     ("a sender in Greek", "rcm/schedule/t/βοσσ", bad(), "bad_name", "is not valid"),
     ("a long sender", f"rcm/schedule/{'t' * 65}/x", bad(), "bad_name", "use 1 to 64"),
     ("state: not JSON", "rcm/state", b"\x00", "malformed", "not a valid StateAsk"),
@@ -128,7 +128,7 @@ QUERIES: list[tuple[str, str, bytes | None, str, str]] = [
     ("vote: a term of one part", VOTE, proposal(term=[1]), "malformed", "at `$.term`"),
     ("command: not JSON", COMMAND, b"{", "malformed", "not a valid Command"),
     ("command: no payload", COMMAND, None, "malformed", "`do`"),
-    ("command: no grant", COMMAND, command(grant=...), "no_grant", "without a grant"),
+    ("command: no grant", COMMAND, command(grant=...), "no_grant", "obeys only under a grant"),
     ("command: a grant in words", COMMAND, command(grant="mine"), "malformed", "at `$.grant`"),
     ("command: a list to do", COMMAND, command(do=[]), "malformed", "at `$.do`"),
     ("command: ttl 0", COMMAND, command(ttl=0), "bad_command", "ttl must lie between 0 and 60"),
@@ -137,9 +137,9 @@ QUERIES: list[tuple[str, str, bytes | None, str, str]] = [
     ("command: ttl in words", COMMAND, command(ttl="1"), "malformed", "at `$.ttl`"),
     ("command: ttl 1e999", COMMAND, command(ttl="@").replace(b'"@"', b"1e999"), "malformed", "out of range"),
     ("command: nothing held", COMMAND, command(), "free", "robot/a is held by nobody"),
-    ("command: an absurd grant", COMMAND, command(grant=[[HIGH, "f"], 1]), "free", "ask the RCM for it"),
+    ("command: an absurd grant", COMMAND, command(grant=[[HIGH, "f"], 1]), "free", "held by nobody; request it"),
     ("command: by all", "rc/robot/a/command/*/*", command(), "bad_key", "no wildcards"),
-    ("command: by a bad name", "rc/robot/a/command/t/a b", command(), "bad_name", "client 'a b'"),
+    ("command: by a bad name", "rc/robot/a/command/t/a b", command(), "bad_name", 'client "a b"'),
     ("RC state: not JSON", "rc/robot/a/state", b"}", "malformed", "not a valid RcAsk"),
     ("RC state: a promise in words", "rc/robot/a/state", b'{"promise":"me"}', "malformed", "at `$.promise`"),
     ("RC state: an old promise", "rc/robot/a/state", b'{"promise":[0,"x"]}', "old_term", "obeys term"),
@@ -191,14 +191,14 @@ def test_one_client_one_host_and_all_together_may_wait_with_so_many(stranger: St
             if client == "t/many0":
                 [(kind, answer)] = stranger.get("rcm/schedule/t/many0", bad(id="n6"))
                 assert (kind, answer["code"]) == ("err", "too_many")
-                assert "5 requests open" in answer["message"]
+                assert "t/many0 already has 5 open requests, the most" in answer["message"]
             if client == "t/many2":
                 [(kind, answer)] = stranger.get("rcm/schedule/t/more", bad())
                 assert (kind, answer["code"]) == ("err", "too_many")
-                assert "the clients of t have 15 requests open" in answer["message"]
+                assert "clients of t already have 15 open requests, the most" in answer["message"]
         [(kind, answer)] = stranger.get("rcm/schedule/other/more", bad())
         assert (kind, answer["code"]) == ("err", "queue_full")
-        assert "20 ARCs wait already" in answer["message"]
+        assert "20 requests already wait" in answer["message"]
         for client in clients:
             for number in range(5):
                 stranger.ask(f"rcm/schedule/{client}", {"op": "cancel", "id": f"n{number}"})

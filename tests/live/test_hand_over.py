@@ -328,7 +328,7 @@ async def test_what_comes_and_nobody_wants_or_does_not_come(lab: Lab, monkeypatc
     asked = await new.request("talk", NEEDS["talk"], min_runtime=600)
     assert (asked.id, asked.state) == ("ghost", "running")
     assert arcs["drive"].state == "moved"
-    with pytest.raises(ValueError, match="is open here already"):
+    with pytest.raises(ValueError, match="request ghost is already open here; no other client can hand it over"):
         new.internals.expect(new.internals.open_requests())
     with pytest.raises(RuntimeError, match="pause"):
         await new.internals.hand_over_all(me(old))

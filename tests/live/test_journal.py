@@ -194,6 +194,6 @@ async def test_a_fleet_without_a_journal_says_so(lab: Lab) -> None:
     for command in ("history", "usage"):
         done = await lab.zscout(command)
         assert done.returncode == 1
-        assert "has no journal that could be asked" in done.stderr
+        assert f"no journal of fleet {lab.fleet.name} can be read" in done.stderr
         assert done.stderr.count("\n") == 1
     assert not file_of(lab, "anvil").exists()

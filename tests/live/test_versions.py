@@ -239,7 +239,7 @@ async def test_what_the_other_side_does_not_know_is_refused_naming_both_versions
         for sent, code in ((operation, "malformed"), (ask, "bad_request")):
             problem = await refusal(functools.partial(link.query, sent))
             assert problem.code == code
-            assert f"the RCM {says}" in problem.message
+            assert f"the leader {says}" in problem.message
         with pytest.raises(RequestRefused, match=f"the component placer {re.escape(says)}"):
             await PlacerClient(client.mesh).request(operation, Placement)
         node = NodeClient(client.mesh, round(HANG * SECOND))

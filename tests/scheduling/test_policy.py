@@ -147,7 +147,7 @@ def test_a_host_has_its_quota(strategy: StrategyName) -> None:
     core.handle(0, *(Requested(request(f"mine{rc}", f"robot/{rc}", host="greedy")) for rc in "ab"))
     core.handle(0, Requested(request("theirs", "robot/c", host="modest")))
     assert running(core) == {"minea", "theirs"}
-    assert str(core._state.queued["mineb"].reason) == "host greedy has 1 requests running, its quota"
+    assert str(core._state.queued["mineb"].reason) == "host greedy has reached its quota of running requests: 1"
     core.handle(SECOND, Requested(request("operator", "robot/b", priority=10, host="greedy")))
     assert running(core) == {"minea", "theirs", "operator"}
     core.handle(2 * SECOND, Released("operator"))

@@ -39,7 +39,7 @@ runtime = 60
 """
 
 
-TOO_MANY_RCS = "arms may hold 3 RCs at one time, and this asks for more"
+TOO_MANY_RCS = "arms may hold 3 devices at one time, and this request needs more; name fewer"
 OTHERS_MAY = "; ada, anvil, bellows, bob and 1 more may"
 
 
@@ -78,14 +78,14 @@ def test_who_is_in_several_groups_counts_in_the_first(tmp_path: Path) -> None:
         ("bob", ask("robot/scout1", priority=9), ""),
         ("bob", ask("robot/scout1", priority=10), "bob (client) may not request priority 10; at most 9; ada may"),
         ("ada", ask("robot/scout1", priority=10, keep=True, min_runtime=600), ""),
-        ("anvil", ask("robot/scout1", priority=10), "anvil (manager) may not ask for priority 10; at most 9; ada may"),
-        ("wall", ask("robot/scout1"), "wall (viewer) may not ask for an ARC" + OTHERS_MAY),
-        ("mallory", ask("robot/scout1"), "mallory, who has no role here, may not ask for an ARC" + OTHERS_MAY),
+        ("anvil", ask("robot/scout1", priority=10), "anvil (manager) may not request priority 10; at most 9; ada may"),
+        ("wall", ask("robot/scout1"), "wall (viewer) may not request devices" + OTHERS_MAY),
+        ("mallory", ask("robot/scout1"), "mallory, which has no role here, may not request devices" + OTHERS_MAY),
         ("bob", ask("robot/arm1"), "bob (client) may not hold robot/arm1; ada, eve may"),
         ("eve", ask("robot/arm1"), ""),
         ("bob", ask("robot/*"), ""),
         ("bob", ask("robot/scout1", keep=True), "bob (client) may not keep a hold; ada may"),
-        ("bob", ask("robot/scout1", min_runtime=61), "bob (client) may not ask for 61 s; at most 60; ada may"),
+        ("bob", ask("robot/scout1", min_runtime=61), "bob (client) may not request 61 s; at most 60; ada may"),
         ("eve", ask("a/1", "a/2", "a/3", "a/4"), TOO_MANY_RCS),
     ],
 )
@@ -116,7 +116,7 @@ def given(*needs: str, priority: int = 1, keep: bool = False, runs: bool = False
         ("bob", [given("robot/arm1")], "bob (client) may not hold robot/arm1; ada, eve may"),
         ("bob", [given("robot/s1", priority=10)], "bob (client) may not request priority 10; at most 9; ada may"),
         ("bob", [given("robot/s1", keep=True)], "bob (client) may not keep a hold; ada may"),
-        ("wall", [given("robot/s1")], "wall (viewer) may not take over an ARC" + OTHERS_MAY),
+        ("wall", [given("robot/s1")], "wall (viewer) may not take over a request" + OTHERS_MAY),
         # Of one group: it has no more than before.
         ("eve", [given("a/1", "a/2", runs=True)], ""),
         ("eve", [given("a/1", "a/2", "a/3", "a/4", runs=True)], TOO_MANY_RCS),

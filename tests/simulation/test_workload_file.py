@@ -59,7 +59,7 @@ BAD = {
     arc(priority="1.5"): "arc[0].priority (arc0): is 1.5; write a whole number from 0 to 1000000000",
     arc(priority="-1"): "arc[0].priority (arc0): is -1; write a whole number from 0 to 1000000000",
     # Needs and capacities
-    arc(needs="{}"): "arc[0].needs (arc0): an ARC needs at least one RC; name one, with {} for no parameters",
+    arc(needs="{}"): "arc[0].needs (arc0): a request needs at least one device; name one, with {} for no parameters",
     arc(needs='{"robot/a" = 5}'): 'arc[0].needs."robot/a" (arc0): is 5; write a table',
     arc(needs='{"robot/a" = {rate = -1}}'): 'arc[0].needs."robot/a".rate (arc0): is -1; write 0 or more',
     arc() + arc("arc1", needs='{"robot/a" = {rate = "5"}}'): (

@@ -158,14 +158,17 @@ def check_access(policy: AccessPolicy, at: Where) -> None:
     _check_known(policy.quotas, known, at / "quotas")
     for rank in policy.ceilings:
         if rank not in ("client", "operator"):
-            raise (at / "ceilings" / rank).bad("only clients and operators have a ceiling", 'write "client"')
+            raise (at / "ceilings" / rank).bad(
+                "only clients and operators have a ceiling", 'write "client" or "operator"'
+            )
 
 
 def _check_known(names: Collection[str], known: Collection[str], at: Where) -> None:
     for number, name in enumerate(names):
-        check_name(name, at.item(number))
+        here = at / name if isinstance(names, Mapping) else at.item(number)
+        check_name(name, here)
         if name not in known:
-            raise at.item(number).bad(f"{quoted(name)} has no role", "name it under [roles], or correct the name")
+            raise here.bad(f"{quoted(name)} has no role", "name it under [roles], or correct the name")
 
 
 def _check_pattern(pattern: str, at: Where) -> None:

@@ -365,7 +365,7 @@ def check_security(fleet: Fleet, top: Where) -> None:
         return
     access = fleet.access
     if not access.roles.manager:
-        raise (top / "roles").bad("with [security], no host may lead", 'write manager = ["anvil"] under [roles]')
+        raise (top / "roles").bad("[security] needs a host that may lead", 'write manager = ["anvil"] under [roles]')
     for name in ("listen", "connect"):
         for number, endpoint in enumerate(getattr(fleet.mesh, name)):
             if not endpoint.startswith("tls/"):

@@ -227,7 +227,7 @@ async def test_what_was_given_up_while_its_hand_over_was_undecided_is_not_taken_
         begin_move(old, new)
         fleet.network.disturb({"notice": Disturbance(lost=1.0)})
         ending = asyncio.create_task(old.end(runs))
-        with pytest.raises(RequestRefused, match="no RCM told"):
+        with pytest.raises(RequestRefused, match="no leader reported within 10 s whether h/new took over; try again"):
             await old.internals.hand_over_all(new.mesh.me)
         fleet.network.kill(new.mesh)
         old.internals.take_back()

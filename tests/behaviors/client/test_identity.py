@@ -42,5 +42,5 @@ def test_a_user_without_a_name_is_a_number(monkeypatch: pytest.MonkeyPatch) -> N
 def test_what_is_sent_is_on_one_line_and_bounded() -> None:
     assert bounded("sh -c 'a\n\tb\x1b[2J'") == "sh -c 'a b [2J'"
     assert (len(bounded("x" * 1000)), checked_comment("  night\nrun ")) == (MAX_WHO, "night run")
-    with pytest.raises(ValueError, match=f"a comment of 201 characters; at most {MAX_COMMENT} are shown"):
+    with pytest.raises(ValueError, match=f"the comment has 201 characters; write at most {MAX_COMMENT}"):
         checked_comment("x" * 201)

@@ -58,7 +58,7 @@ BAD = {
         "furniture[1].leg (desk): is 0.301; write a number from 0.02 to 0.3"
     ),
     ("width = 1.0, ", "width = 0.05, "): ("furniture[1].leg (desk): is 0.05 m; write at most 0.025, half of the piece"),
-    ("x = 0.0, ", "x = 0.5, "): ("light[1] (window): is a window in no outer wall; put its x or y on an outer wall"),
+    ("x = 0.0, ", "x = 0.5, "): ("light[1] (window): is not in an outer wall; put its x or y on an outer wall"),
     ("z = 1.5", "z = 0.4"): (
         "light[1].z (window): is 0.4 m, so the window leaves its wall; "
         "give the height of its middle, half its depth or more from floor and ceiling"
@@ -75,16 +75,16 @@ BAD = {
     ("[3.0, 1.0]]", "[-0.45, 1.0]]"): ("person[0].path (ada): has no length; move one of its points by 0.1 m or more"),
     ("[3.0, 1.0]]", "[1, 2, 3]]"): ("person[0].path[1] (ada): has 3 entries; at most 2 are allowed"),
     ("id = 33", "id = 255"): ("robot[0].id (scout33): is 255; write a whole number from 0 to 254"),
-    ("id = 33", "id = 35"): ('robot[1].id (35): "35" stands at robot[0] already; rename or remove one of the two'),
+    ("id = 33", "id = 35"): ('robot[1].id (35): "35" is already at robot[0]; rename or remove one of the two'),
     ('name = "ada"', 'name = "ada", speed = 0'): ("person[0].speed (ada): is 0; write a number from 0.1 to 3"),
     ("x = 1.0, y = 1.0", "x = 2.6, y = 1.62"): (
-        "robot[0] (scout33): (2.6, 1.62) is in a wall or furniture, or touches it; leave 0.06 m around its middle"
+        "robot[0] (scout33): (2.6, 1.62) is in or touches a wall or furniture; leave 0.06 m around its middle"
     ),
     ("x = 1.0, y = 1.0", "x = 2.1, y = 1.0"): (
         "robot[1] (scout35): stands in scout33; leave 0.12 m between their middles"
     ),
     ("x = 1.0, y = 1.0", "x = 0.05, y = 1.0"): (
-        "robot[0] (scout33): (0.05, 1) is in a wall or furniture, or touches it; leave 0.06 m around its middle"
+        "robot[0] (scout33): (0.05, 1) is in or touches a wall or furniture; leave 0.06 m around its middle"
     ),
 }
 
@@ -147,4 +147,4 @@ def test_every_shipped_building_is_good() -> None:
 
 def test_a_building_without_light_is_refused(tmp_path: Path) -> None:
     dark = GOOD[: GOOD.index("light = [")] + GOOD[GOOD.index("person = [") :]
-    assert read(tmp_path, dark) == "light: there is none; add a [[light]]: cameras see nothing without"
+    assert read(tmp_path, dark) == "light: is missing; add a [[light]]: cameras see nothing without one"

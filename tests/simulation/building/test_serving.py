@@ -246,5 +246,5 @@ async def test_the_port_is_free_again_where_a_part_failed(tmp_path: Path) -> Non
         with pytest.raises(BadInput, match="in use"):
             await Served(PLAN, http=("127.0.0.1", port)).__aenter__()
     for _ in range(2):
-        with pytest.raises(BadInput, match="is there already"):
+        with pytest.raises(BadInput, match="already exists"):
             await Served(PLAN, http=("127.0.0.1", port), radio_link=taken).__aenter__()
