@@ -158,9 +158,13 @@ class CliFleet:
         """A command at a terminal of its own. Use as a context manager."""
         return tools.Terminal(*args, env=self.lab.env)
 
+    def end_started(self) -> None:
+        """End the commands that were started, and forget them."""
+        while self._started:
+            tools.end(self._started.pop())
+
     def close(self) -> None:
-        for process in self._started:
-            tools.end(process)
+        self.end_started()
         self._eye.close()
         asyncio.run(self.lab.__aexit__(None, None, None))
 

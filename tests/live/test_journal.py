@@ -119,7 +119,7 @@ async def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> 
         # In a pipe: a line for each hold, newest last.
         plain = (await lab.zscout("history", "--rc", "robot/*")).stdout.splitlines()
         assert plain[0].startswith("Holds since ")
-        assert plain[1].split() == ["BEGAN", "HELD", "ARC", "WHO", "PRIORITY", "WAITED", "END", "RCS"]
+        assert plain[1].split() == ["BEGAN", "HELD", "REQUEST", "WHO", "PRIORITY", "WAITED", "END", "DEVICES"]
         assert [line.split()[-1] for line in plain[2:5]] == ["robot/b"] * 3
         assert "preempted by take" in plain[2]
         assert "stands" in plain[4]
@@ -156,7 +156,7 @@ async def test_what_was_held_is_known_after_a_node_is_killed(tmp_path: Path) -> 
         await lab.living(client, Role.RCM, lambda hosts: hosts == ["anvil"])
         why = await lab.zscout("why", "take")
         assert why.returncode == 0
-        assert why.stdout.startswith("take is not open any more\nHolds, as the candidates' journals have them\n")
+        assert why.stdout.startswith("take is not open any more\nHolds, from the journals of the candidates\n")
         assert "priority 10, held robot/b\n" in why.stdout
         as_json = json.loads((await lab.zscout("why", survey.id, "--json")).stdout)
         (arc,) = as_json["arcs"]

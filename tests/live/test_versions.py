@@ -269,7 +269,7 @@ async def test_status_names_who_runs_which_version_where_they_differ(tmp_path: P
 @pytest.mark.slow
 @leaders
 async def test_a_command_is_told_that_nobody_waits_for_it(tmp_path: Path, former: Path, leads: str) -> None:
-    who = [f"the RCM at a (older than 0.2.0, this is {VERSION})"] * (leads == "old") + ["robot/old"]
+    who = [f"the leader at a (older than 0.2.0, this is {VERSION})"] * (leads == "old") + ["robot/old"]
     async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
         with lab.at(leads):
             lab.node("a")

@@ -357,7 +357,7 @@ def _print(rows: list[Row], left_out: Counter[str], zone: ZoneInfo, name: str) -
             )
             for row in rows
         ]
-        Table(f"Calendar {clean(name)}", ("EVENT", "DATE", "RCS", "RESULT"), cells).print()
+        Table(f"Calendar {clean(name)}", ("EVENT", "DATE", "DEVICES", "RESULT"), cells).print()
     else:
         terminal.print_line(f"calendar {clean(name)} has nothing to book")
     for why, number in sorted(left_out.items()):

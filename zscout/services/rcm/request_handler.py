@@ -500,7 +500,7 @@ def check_place(place: Place, core: Core) -> None:
     if absurd(place.term, core.term):
         raise Refused("bad_request", "place has a future term; omit it")
     if place.term > core.term:
-        raise Refused("old_term", "place has a higher term than this manager", core.term)
+        raise Refused("old_term", "place has a higher term than this leader; ask the leader of that term", core.term)
     if place.arrival < 1 or not core.could_have_issued(place):
         raise Refused("bad_request", "place was never given; omit it")
 
