@@ -13,7 +13,7 @@ from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
 from zscout.cli import common
 from zscout.cli.components.placing import (
     OVER,
-    check_host,
+    absent,
     component_argument,
     host_option,
     placer_of,
@@ -167,7 +167,8 @@ class Reader:
     async def _nothing(self) -> common.Failed:
         """What to raise where there is no output."""
         if self._only and self._host is not None:
-            await check_host(self._client.mesh, self._host, "--host: ")
+            for line in await absent(self._client.mesh, [self._host]):
+                return common.Failed(f"--host: {line}")
             return common.Failed(f"{self._host} has no output of {self._name}; leave --host out to read its last host")
         if self._record is not None:
             return common.Failed(f"no host has output of {self._name}: it {standing(self._record)}")

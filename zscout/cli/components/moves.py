@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 
 import click
@@ -12,6 +13,7 @@ from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common
 from zscout.cli.components import placing
 from zscout.cli.requests.options import timeout_option
+from zscout.config.strict import BadInput
 from zscout.messages import DrainHost, MigrateComponent, Placement, Placements, UncordonHost
 
 
@@ -62,7 +64,8 @@ async def _moved(placer: PlacerClient, shown: placing.Progress, before: Placemen
         raise
     except RequestRefused as refused:
         if to is not None and refused.code == "unknown_host":
-            await placing.check_host(placer.mesh, to, "--to: ")
+            for line in await placing.absent(placer.mesh, [to]):
+                raise BadInput(f"--to: {line}") from None
         now = placer.placements.get(name, before)
         why = str(refused)
         if refused.code == "not_running" and now.state != "running":
@@ -110,9 +113,8 @@ async def drain(host: str, timeout: float | None, as_json: bool) -> None:
             try:
                 drained = await placer.request(DrainHost(host), Placements)
             except RequestRefused as refused:
-                if refused.code == "unknown_host":
-                    await placing.check_host(placer.mesh, host)
-                raise
+                lines = await placing.absent(placer.mesh, [host]) if refused.code == "unknown_host" else ()
+                raise next(map(common.Failed, lines), refused) from None
             placer.take(*drained.components)
             # What is not running yet is moved when it does.
             while leaving := [one for one in _there(placer, host) if one.movable or one.state != "running"]:
@@ -144,7 +146,8 @@ async def uncordon(host: str, as_json: bool) -> None:
     """
     async with placing.connected("uncordon", as_json=as_json) as (_, placer):
         if host not in placer.cordoned:
-            await placing.check_host(placer.mesh, host)
+            for line in await placing.absent(placer.mesh, [host]):
+                terminal.print_line(f"zscout: {line}", sys.stderr)
         uncordoned = await placer.request(UncordonHost(host), Placements)
     if as_json:
         terminal.print_json({"host": host, "components": list(map(placing.placement_object, uncordoned.components))})

@@ -124,12 +124,6 @@ async def absent(mesh: Mesh, hosts: Collection[str]) -> list[str]:
     return [f"unknown host {quoted(host)}{hint}" for host, hint in hints.items()]
 
 
-async def check_host(mesh: Mesh, host: str, option: str = "") -> None:
-    """Raises BadInput where no node has this name."""
-    for line in await absent(mesh, [host]):
-        raise BadInput(f"{option}{line}")
-
-
 async def ask_nodes(mesh: Mesh, asked: ListComponents) -> list[ComponentList]:
     replies = await mesh.ask(mesh.keys.component_any(mesh.me), asked, ComponentList, timeout=LOOK_FOR_HOSTS)
     lists = (reply.message for reply in replies if reply.message is not None)

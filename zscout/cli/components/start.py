@@ -152,7 +152,7 @@ async def start(
         if before is None or before.state in placing.OVER:
             await placing.check_kind(placer.mesh, kind)
             for line in await placing.absent(placer.mesh, spec.hosts or ()):
-                terminal.print_line(line, sys.stderr)
+                terminal.print_line(f"zscout: {line}", sys.stderr)
         placement = await _place(placer, name, spec, before)
         if not no_wait:
             async with shown.within(timeout, late, stays):
