@@ -23,136 +23,161 @@ FILES: Final = {
     "node.toml": '[[rc]]\nname = "robot/a"\ndriver = "robot"\n',
     "not.rrd": "no recording",
 }
-NEEDS_ARGUMENTS: Final = (
-    "request", "take", "book robot/a", "book --at 9:00 --for 1h", "drive", "watch", "release", "cancel", "why", "start",
-    "stop", "logs", "migrate", "drain", "uncordon", "replay", "unbook", "slots robot/a", "maintain robot/a --for 1h",
-)  # fmt: skip
+NEEDS_ARGUMENTS: Final = {
+    "DEVICE...": ("request", "take", "book --at 9:00 --for 1h"),
+    "REQUEST": ("release", "cancel", "why"),
+    "ROBOT": ("drive",),
+    "HOST": ("drain", "uncordon"),
+    "KIND": ("component start", "start"),
+    "NAME...": ("component stop", "stop"),
+    "NAME": ("component logs", "logs", "component migrate", "migrate"),
+    "NAME|ID": ("booking show", "booking cancel", "unbook"),
+    "FILE": ("replay",),
+    "--at": ("book robot/a", "maintain robot/a --for 1h"),
+    "--for": ("slots robot/a",),
+    "--source": ("motion", "watch"),
+}
+"""What is missing, and where."""
 BAD: Final = """
-nonsense | there is no command 'nonsense'; known: request
-requst | there is no command 'requst'; did you mean request? (see zscout --help)
+nonsense | there is no command "nonsense" (see zscout --help)
+requst | there is no command "requst"; did you mean request?
 --fleet none.toml status | none.toml: there is no such file; check the path
 --fleet bad.toml status | bad.toml: fleet.nam: unknown key; did you mean name?
-request robot/a -- | no command follows the --
-request robot/a sleep 5 | a command goes after --
-request robot/a --priority high | 'high' is not a whole number
-request robot/a --priority 1.5 | '1.5' is not a whole number
-request robot/a --again | --again runs a command again
+request robot/a -- | no command follows the --; write one, or leave the -- out
+request robot/a sleep 5 | device "sleep" is not valid; write kind/name, as in robot/scout33; a command goes after --
+request robot/a --priority high | --priority: "high" is not a whole number
+request robot/a --priority 1.5 | --priority: "1.5" is not a whole number
+request robot/a --again | --again repeats a command; add one after --
 request robot/a --min-runtime never | --min-runtime: "never" is not a duration
-request robot/a --min-runtime 0 | --min-runtime must be positive
+request robot/a --min-runtime 0 | --min-runtime must be positive, and is 0
 request robot/a --timeout -1 | --timeout: "-1" is not a duration
-request robot/a --name a/b | --name 'a/b' is not valid
-request robot | need "robot": RC 'robot' is not valid: write kind/name
-request robot/a robot/a | robot/a is named twice
-request robot/a:rate | rate has no number; write parameter=number
-request robot/a:rate=x | rate is "x"; write parameter=number
-request robot/a:rate=1,rate=2 | rate is given twice
-request true -- true | need "true": RC 'true' is not valid
-request framegrabber/** | need "framegrabber/**": need 'framegrabber/**' is not valid: write
-request framegrabber/f* | write kind/name with * for a whole name or $* for a part of one
-request radio/*:rate=1 radio/*:rate=2 | have different parameters; give all the same
-request */x radio/*:rate=2 | can't stand beside parameters; name its kind
-request fg/*#2 fg/*#2 | fg/*#2 is named twice; leave the numbers out, and they are given
-request --booking x --min-runtime 5 | --min-runtime is not for --booking
-request --booking x --release-after 5 | --release-after is not for --booking
-request --booking x --dry-run | --dry-run is not for --booking
-take framegrabber/*#0 | #2, #3 and so on behind it for a second and third
-take robot/a:= | parameter '' is not valid
-take robot/a --min-runtime 0 | --min-runtime must be positive
-drive radio/rf0 | "radio/rf0" is no robot
-drive robot/a | zscout drive reads keys: run it at a terminal
-drive robot/a --speed 9 | 9.0 is not in the range
-watch --source none.avi | "none.avi" can't be read
-watch --source none.avi --limit 0 | --limit must be positive
-cancel '' | "" names no ARC; zscout status lists them
-cancel \\a | names no ARC
-why '' | names no ARC; zscout status lists them
-status --once | No such option '--once'
-book robot/a --for 1h --at tue | --at: "tue" has no time of day; write "tue 14:00"
+request robot/a --name a/b | --name "a/b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
+request robot | device "robot" is not valid; write kind/name, as in robot/scout33; a command goes after --
+request robot/a robot/a | robot/a is named twice; name each device once, with all its parameters after one colon
+request robot/a:rate | rate has no number; write parameter=number, as in robot/a:command_rate=5
+request robot/a:rate=x | rate is "x"; write parameter=number, as in robot/a:command_rate=5
+request robot/a:rate=1,rate=2 | rate is given twice; give it once
+request true -- true | device "true" is not valid; write kind/name, as in robot/scout33
+request framegrabber/** | pattern "framegrabber/**" is not valid; write kind/name with * for a whole name or $* for a
+request framegrabber/f* | pattern "framegrabber/f*" is not valid; write kind/name with * for a whole name or $* for a
+request radio/*:rate=1 radio/*:rate=2 | patterns of the kind radio have different parameters; give them all the same
+request */x radio/*:rate=2 | a pattern for devices of any kind can't be combined with parameters; name a kind
+request fg/*#2 fg/*#2 | fg/*#2 is named twice; leave the numbers out: zscout numbers them
+request --booking x --min-runtime 5 | --min-runtime can't be used with --booking; leave it out
+request --booking x --release-after 5 | --release-after can't be used with --booking; leave it out
+request --booking x --dry-run | --dry-run can't be used with --booking; leave it out
+take framegrabber/*#0 | pattern "framegrabber/*#0" is not valid; write kind/name with * for a whole name or $* for a
+take robot/a:= | parameter "" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -; write parameter=number, as in
+take robot/a --min-runtime 0 | --min-runtime must be positive, and is 0
+drive radio/rf0 | "radio/rf0" is not a robot; name one, as in robot/NAME
+drive robot/a | standard input is not a terminal, and zscout drive reads keys; run it at a terminal
+drive robot/a --speed 9 | --speed: 9.0 is out of range; write 0.1 to 1.0
+motion --source none.avi | "none.avi" can't be read (No such file or directory); name a video file, a URL or a device
+motion --source none.avi --limit 0 | --limit must be positive, and is 0
+cancel '' | "" can't be the name of a request; see zscout status
+cancel \\a | "\\x07" can't be the name of a request; see zscout status
+why '' | "" can't be the name of a request; see zscout status
+status --once | there is no option --once
+book robot/a --for 1h --at tue | --at: "tue" has no time; write "tue 14:00"
 book robot/a --for soon --at 9:00 | --for: "soon" is not a duration
-book robot/a --for 1h --at '9999-12-31 23:59' | is more than a year ahead; write an earlier
-book robot/a --for 1h --at 0001-01-01 | is long past; write a later one
-book robot --for 1h --at 9:00 | need "robot":
-book robot/a --for 1h --at 9:00 --until 2026-12-24 | --until is the end of what is repeated
-book robot/a --for 1h --at 9:00 --every month | --every: "month" is not from 1 to 366 days
-book robot/a --for 1h --at 9:00 --patience 2h | --patience: it is over after 1 h
-book robot/a --for 1h --at 9:00 --zone Berlin | did you mean Europe/Berlin?
-book robot/a robot/a --for 1h --at 9:00 | robot/a is named twice
-book robot/a --for 1h --at 9:00 --name 'a b' | --name
-maintain robot/* --for 1h --at 9:00 | robot/* may be any one RC; name those
-maintain robot/a robot/a --for 1h --at 9:00 | an RC is named twice
-slots robot/a --for 1h --within 500d | --within: 500 d is not from 1.0 s to 366 d; write
-slots robot/a --for 1h --limit 0 | --limit
-unbook x --date someday | --date:
-history --since soon | --since: "soon" is no time; write a number of seconds
-history --since 2999-01-01 | is in the future
-history --since 1h --until 2h | --since: it is not before --until
-history --rc robot | write kind/name, like robot/scout33
-history --user '' | is no name
-history --group arms | --group: "arms" is no group of the fleet file that has members; it has none
-history --limit 0 | 0 is not in the range
-history --json --csv | --json and --csv: write one of them
-usage --by weekday | 'weekday' is not one of
-usage --by group | the fleet file has no [groups]
-usage --until 30d | --since: it is not before --until
-start a/b | kind 'a/b' is not valid
-start counter --name 'a b' | --name 'a b' is not valid
-start counter --name '' | --name '' is not valid
-start counter --set x | --set "x" sets nothing; write KEY=VALUE
-start counter --host a* | --host 'a*' is not valid
-start counter --label a/b | --label 'a/b' is not valid
-start counter --memory much | --memory: "much" is no size
-start counter --memory-limit -5 | --memory-limit: "-5" is no size
-start counter --cpu-limit nan | --cpu-limit: "nan" is no number of cores
-start counter --cpu-limit 0 | --cpu-limit: "0" is no number of cores
-start counter --restart maybe | 'maybe' is not one of
-start counter --timeout soon | --timeout: "soon" is not a duration
-stop a/b | component 'a/b' is not valid
-logs * | zscout components lists them
-logs counter --lines -1 | -1 is not in the range
-migrate counter --to a/b | --to 'a/b' is not valid
-drain * | host '*' is not valid
-uncordon '' | host '' is not valid
-components --kinds --watch | leave NAME and --watch out
-components 'a b' | component 'a b' is not valid
-keys --all --json | No such option '--all'
-cert ca --days 0 | --days: "0" is no time up to 36,525 days
-cert issue anvil | zscout-ca/ca-key.pem: there is no such file; make a CA with `zscout cert ca`
-cert issue a/b | name 'a/b' is not valid
-cert show | name a folder; $ZSCOUT_KEYS names none
-view none.rrd | none.rrd: there is no such file
+book robot/a --for 1h --at '9999-12-31 23:59' | --at: "9999-12-31 23:59" is more than a year ahead; write an earlier
+book robot/a --for 1h --at 0001-01-01 | --at: "0001-01-01" is long past; write a later date
+book robot --for 1h --at 9:00 | device "robot" is not valid; write kind/name, as in robot/scout33
+book robot/a --for 1h --at 9:00 --until 2026-12-24 | --until ends a repeated booking; add --every, or leave --until
+book robot/a --for 1h --at 9:00 --every month | --every: "month" is not 1 to 366 days; write day, week, "2 weeks" or
+book robot/a --for 1h --at 9:00 --patience 2h | --patience is longer than the booking; write at most 1 h
+book robot/a --for 1h --at 9:00 --zone Berlin | --zone: "Berlin" is not a time zone of the IANA database; did you mean
+book robot/a robot/a --for 1h --at 9:00 | robot/a is named twice; name each device once, with all its parameters after
+book robot/a --for 1h --at 9:00 --name 'a b' | --name "a b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
+maintain robot/* --for 1h --at 9:00 | robot/* is a pattern; name each device for maintenance
+maintain robot/a robot/a --for 1h --at 9:00 | is named twice; name each
+slots robot/a --for 1h --within 500d | --within: 500 d is not within 1.0 s and 366 d
+slots robot/a --for 1h --limit 0 | --limit: 0 is out of range; write 1 to 50
+booking cancel x --date someday | --date: "someday" is not a date; write "tue 14:00", "tomorrow 9:00", "14:30"
+history --since soon | --since: "soon" is not a time
+history --since 2999-01-01 | --since: "2999-01-01" is in the future
+history --since 1h --until 2h | --since is not before --until; write an earlier --since
+history --rc robot | device "robot" is not valid; write kind/name, as in robot/scout33
+history --user '' | --user: "" is not a name; write 1 to 64 characters
+history --group arms | --group: the fleet file has no group "arms" with members; there are none
+history --limit 0 | --limit: 0 is out of range; write 1 to 100000
+history --json --csv | --json and --csv exclude each other; use only one of them
+usage --by weekday | --by: "weekday" is unknown; write one of "user", "group", "rc"
+usage --by group | --by group: the fleet file has no [groups]; name some there, or write --by user
+usage --until 30d | --since is not before --until; write an earlier --since
+component start a/b | kind "a/b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
+component start counter --name 'a b' | --name "a b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
+component start counter --name '' | --name "" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
+component start counter --set x | --set: "x" has no value; write KEY=VALUE
+component start counter --host a* | --host "a*" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
+component start counter --label a/b | --label "a/b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
+component start counter --memory much | --memory: "much" is not a size; write bytes, or with a unit: 500M, 1.5G
+component start counter --memory-limit -5 | --memory-limit: "-5" is not a size; write bytes, or with a unit: 500M
+component start counter --cpu-limit nan | --cpu-limit: "nan" is not a number of cores; write one, as in 0.5 or 2
+component start counter --cpu-limit 0 | --cpu-limit: "0" is not a number of cores; write one, as in 0.5 or 2
+component start counter --restart maybe | --restart: "maybe" is unknown; write one of "never", "on-failure", "always"
+component start counter --timeout soon | --timeout: "soon" is not a duration
+component stop a/b | component "a/b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -; see zscout component list
+component logs * | component "*" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -; see zscout component list
+component logs counter --lines -1 | --lines: -1 is out of range; write 0 to 100000
+component migrate counter --to a/b | --to "a/b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
+drain * | host "*" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
+uncordon '' | host "" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
+components --kinds --watch | --kinds lists what can be started; leave NAME and --watch out
+component list 'a b' | component "a b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -; see zscout component list
+doctor --keys --all --json | there is no option --all (see zscout doctor --help)
+cert ca --days 0 | --days: "0" is not a time up to 36,525 days; write it as in 90, 12h, 90s
+cert issue anvil | zscout-ca/ca-key.pem: there is no such file; make a CA with `zscout cert ca`, or name its folder by
+cert issue a/b | name "a/b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
+cert show | no folder is given; name one, or set $ZSCOUT_KEYS
+view none.rrd | none.rrd: there is no such file; recordings of nodes and of zscout view are in runs/
 view not.rrd | not.rrd: is not a Rerun recording; name a .rrd file
-view --bind somewhere | --bind: "somewhere" is not an IP address
-view --port 0 | 0 is not in the range
-replay none.toml | none.toml: there is no such file
+view --bind somewhere | --bind: "somewhere" is not an IP address; write one, as in 127.0.0.1
+view --port 0 | --port: 0 is out of range; write 1 to 65535
+replay none.toml | none.toml: there is no such file; check the path
 replay bad.toml | bad.toml: fleet: unknown key; known here: arc, rc
-replay none.toml --strategy best | 'best' is not one of 'priority'
-replay work.toml --rrd picture.png | end it in .rrd
-replay work.toml --rrd no/such/folder/x.rrd | can't write the recording
-replay torn.toml | torn.toml: line 1
-replay early.toml | early.toml: arc[0].at
-replay nan.toml | nan.toml: arc[0].at
-replay needless.toml | needless.toml: arc[0].needs (a): an ARC needs at least one RC
-simulate | which building? name one of living_room, office, random:SEED, or a file
-simulate castle | there is no building "castle"; name one of living_room, office
-simulate castle.toml | castle.toml
-simulate random:x | write random: and a number
-simulate living_room --http nowhere | write HOST:PORT, as in
-simulate living_room --http 127.0.0.1:99999 | write HOST:PORT, as in
-simulate living_room --radio /dev/null | /dev/null: is there already; give another name
-simulate living_room --node /no/such/folder/lab.toml | can't be written
-simulate office --speed 0 | 0.0 is not in the range
-demo nothing | No such command 'nothing'
-demo table1 --out picture.png | let it end in .rrd
-demo placement --policy best | 'best' is not one of 'least_loaded'
-demo robots --building nowhere | there is no building "nowhere"; name one of living_room
-completion tcsh | 'tcsh' is not one of 'bash', 'zsh', 'fish'
+replay none.toml --strategy best | --strategy: "best" is unknown; write one of "priority", "optimal", "adaptive"
+replay work.toml --rrd picture.png | --rrd picture.png: not the name of a recording; end it in .rrd
+replay work.toml --rrd no/such/folder/x.rrd | timeline: can't write the recording no/such/folder/x.rrd (No such file
+replay torn.toml | torn.toml: line 1, column 5, the end: Expected ']]' at the end of an array declaration; fix the
+replay early.toml | early.toml: arc[0].at (a): is -1 s; write 0 to 1000000000 seconds
+replay nan.toml | nan.toml: arc[0].at (a): is not a finite number; write a number
+replay needless.toml | needless.toml: arc[0].needs (a): a request needs at least one device; name one, with {} for no
+simulate | no building is given; name one of living_room, office, random:SEED, or a file
+simulate castle | unknown building "castle"; name one of living_room, office, random:SEED, or a file
+simulate castle.toml | castle.toml: there is no such file; check the path
+simulate random:x | "random:x": write random: and a number from 0 to 4294967295
+simulate living_room --http nowhere | --http: "nowhere" is not an address; write HOST:PORT, as in 127.0.0.1:8080
+simulate living_room --http 127.0.0.1:99999 | --http: "127.0.0.1:99999" is not an address; write HOST:PORT, as in
+simulate living_room --radio /dev/null | /dev/null: already exists; give another name for the radio's link
+simulate living_room --node /no/such/folder/lab.toml | /no/such/folder/lab.toml: can't be written (No such file or
+simulate office --speed 0 | --speed: 0.0 is out of range; write 0 to 100
+demo nothing | there is no command "nothing" (see zscout demo --help)
+demo table1 --out picture.png | --out picture.png: not the name of a recording; end it in .rrd
+demo placement --policy best | --policy: "best" is unknown; write one of "least_loaded", "randomized", "two_choices"
+demo robots --building nowhere | unknown building "nowhere"; name one of living_room, office, random:SEED, or a file
+completion tcsh | "tcsh" is unknown; write one of "bash", "zsh", "fish"
+bookings x | too many arguments: "x" (see zscout bookings --help)
+calendar export a b | too many arguments: "a b"
+calendar import none.ics | none.ics: there is no such file; check the path
+keys --json x | too many arguments: "x" (see zscout keys --help)
+components 'a b' | component "a b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -; see zscout component list
+component starp counter | there is no command "starp"; did you mean start?
+component ps | there is no command "ps"; use zscout component list
+component kinds x | too many arguments: "x" (see zscout component kinds --help)
+booking ls | there is no command "ls"; use zscout booking list
+booking import none.ics | none.ics: there is no such file; check the path
+node --nope | there is no option --nope (see zscout node --help)
+--fleet none.toml node lab.toml | --fleet is for other commands; write fleet = "FILE" under [node] in the node file
 """
 LONG: Final = {
-    f"start {'k' * 49}": "has more than 48 characters; give a shorter --name",
-    "start counter" + "".join(f" --label=l{number}" for number in range(33)): "33 labels; at most 32",
-    "start counter" + "".join(f" --host=h{number}" for number in range(257)): "257 hosts; name at most 256",
-    f"unbook {'x' * 65}": "names no booking",
-    f"why {'x' * 300}": "names no ARC",
+    f"component start {'k' * 49}": "has more than 48 characters; give a shorter --name",
+    "component start counter"
+    + "".join(f" --label=l{number}" for number in range(33)): "33 labels; at most 32 are allowed",
+    "component start counter"
+    + "".join(f" --host=h{number}" for number in range(257)): "257 hosts; name at most 256, or give them a label",
+    f"booking cancel {'x' * 65}": """x..." can't be the name of a booking; see zscout booking list""",
+    f"why {'x' * 300}": """x..." can't be the name of a request; see zscout status""",
 }
 
 
@@ -164,7 +189,11 @@ def test_what_a_command_can_not_use_is_one_line_and_code_2(tmp_path: Path, monke
     for name, text in FILES.items():
         Path(name).write_text(text)
     rows = dict(line.split(" | ") for line in BAD.strip().splitlines()) | LONG
-    rows |= dict.fromkeys(NEEDS_ARGUMENTS, "Missing ")
+    for missing, calls in NEEDS_ARGUMENTS.items():
+        rows |= {
+            call: f"zscout: {missing} is missing (see zscout {call.split(' --')[0].removesuffix(' robot/a')} --help)"
+            for call in calls
+        }
     wrong = []
     for words, said in rows.items():
         done = CliRunner().invoke(main, shlex.split(words.replace("\\a", "\a")))

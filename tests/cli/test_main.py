@@ -80,6 +80,15 @@ def test_an_old_spelling_has_the_meaning_and_options_of_the_new(old: str, new: s
 @pytest.mark.parametrize(
     ("call", "words"),
     [
+        ("bookings --mine", "zscout bookings is now called zscout booking list"),
+        ("unbook survey", "zscout unbook is now called zscout booking cancel"),
+        ("calendar import lab.ics", "zscout calendar is now called zscout booking import"),
+        *(
+            (f"{name} survey", f"zscout {name} is now called zscout component {name}")
+            for name in ("start", "stop", "logs", "migrate")
+        ),
+        ("keys --json", "zscout keys is now called zscout doctor --keys"),
+        ("watch --source none.avi", "zscout watch is now called zscout motion"),
         ("components --json", "zscout components is now called zscout component list"),
         ("components --kinds a", "zscout components is now called zscout component kinds"),
         ("calendar export --folder a --out b", "zscout calendar is now called zscout booking export"),

@@ -31,8 +31,8 @@ OWN_TERMINAL = (
     "import fcntl, os, sys, termios; os.setsid(); fcntl.ioctl(0, termios.TIOCSCTTY, 0); "
     "os.execvp(sys.argv[1], sys.argv[1:])"
 )
-CLOCK = r"\d\d:\d\d(:\d\d)?"
-"""A time of this day."""
+CLOCK = r"(?:[A-Z][a-z]{2} \d\d? |\d{4}-\d\d-\d\d )?\d\d:\d\d(:\d\d)?"
+"""A time of day, with its date where that is another: a test may run before midnight."""
 _ESCAPE = re.compile(r"\x1b(\[[0-9;?]*[A-Za-z]|[=>])")
 
 

@@ -75,10 +75,14 @@ async def test_who_is_heard_by_a_radio_and_what_a_gang_must_have(tmp_path: Path)
 
         # What a gang must have for a robot to do as it is told.
         for needs, do, word in (
-            ({"robot/r1": {}}, TURN, "your ARC holds no radio: nothing reaches the robot; ask also for radio/rf0"),
-            ({"robot/r1": {}, **RADIO}, {"name": "camera", "on": True}, "ask also for video/*"),
+            (
+                {"robot/r1": {}},
+                TURN,
+                "your request holds no radio, so nothing reaches the robot; request radio/rf0 as well",
+            ),
+            ({"robot/r1": {}, **RADIO}, {"name": "camera", "on": True}, "request video/* as well"),
             (GANG | {"video/ch2": {}}, {"name": "camera", "on": True}, "one transmitter"),
-            ({"robot/r1": {}, "video/ch3": {}, **RADIO}, {"name": "camera", "on": True}, "no channel of video/ch3"),
+            ({"robot/r1": {}, "video/ch3": {}, **RADIO}, {"name": "camera", "on": True}, "no channel for video/ch3"),
         ):
             arc, grant = await held(client, "poor", needs)
             with pytest.raises(CommandRefused, match=re.escape(word)):

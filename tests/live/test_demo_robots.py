@@ -117,7 +117,7 @@ def test_robots_hide_on_a_live_mesh_and_nothing_is_left(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        (None, 'there is no building "den"; name one of living_room, office, random:SEED, or a file'),
+        (None, 'unknown building "den"; name one of living_room, office, random:SEED, or a file'),
         ("width = 3.0\n", "den.toml: name: is missing; add it"),
         (EMPTY, "--building den.toml: there is no robot in it; add a [[robot]]"),
     ],

@@ -93,7 +93,7 @@ async def test_a_fleet_that_is_well_is_told_to_be(lab: Lab) -> None:
     told = await mends(lab, [])
     assert told.code == 0
     assert told.of("leader") == [("ok", "anvil leads, term 1")]
-    assert told.of("devices") == [("ok", "1 RC there and well")]
+    assert told.of("devices") == [("ok", "1 device there and well")]
     assert [state for state, _ in told.of("open")] == ["note"]
 
 
@@ -287,7 +287,7 @@ async def test_status_says_that_roles_are_advisory_where_nothing_proves_a_name(t
         lab.node("anvil")
         await lab.ready(await lab.client())
         done = await lab.zscout("status")
-        assert "roles  they are advisory: nobody proves a name where [security] is not set" in done.stdout
+        assert "roles  they are only advisory: set [security], so that names are proved" in done.stdout
         assert json.loads((await lab.zscout("status", "--json")).stdout)["advisory"] is True
 
 

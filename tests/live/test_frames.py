@@ -294,7 +294,7 @@ async def test_tuning_by_hand(tmp_path: Path) -> None:
         arc, grant = await running(at.client, "free", GRABBER, "robot/a")
         told = await at.ask(grant, "snapshot")
         assert told["source"] is None
-        assert told["health"] == "no video RC is in its gang; tune it to one of video/ch1, video/ch2"
+        assert told["health"] == "no video channel is in its hold; tune it to one of video/ch1, video/ch2"
         assert (at.one.accepted, at.two.accepted) == (1, 0)
 
         def tune(**how: Any) -> Any:

@@ -80,7 +80,7 @@ def test_booked_listed_found_taken_up_and_given_up(fleet: CliFleet) -> None:
     assert slots["slots"][0]["latest"] < listed["dates"][0]["start"]
     assert slots["slots"][1]["start"] == listed["dates"][0]["end"]
     line = said(fleet, "slots", "robot/a", "--for", "30h", "--within", "2h", code=1)
-    assert line == "zscout: within 2 h there is no time at which all are free together\n"
+    assert line == "zscout: the devices are not free together within 2 h; raise --within\n"
 
     # Taken up before its date it waits; given up, it goes on waiting as any other.
     waiting, said_first = fleet.begun("survey waits", "request", "--booking", "survey", "--", "sleep", "1")
@@ -106,7 +106,8 @@ def test_at_its_date_it_is_held_and_the_command_runs(fleet: CliFleet) -> None:
     assert (granted["arc"], granted["rcs"]) == ("soon", ["robot/b"])
     assert 0 < granted["remaining"] <= 60
     assert told(fleet, "bookings")["bookings"] == []
-    assert 'no booking "soon" is known' in said(fleet, "request", "--booking", "soon", "--", "true", code=1)
+    gone = said(fleet, "request", "--booking", "soon", "--", "true", code=1)
+    assert gone == 'zscout: unknown booking "soon", and there are none\n'
 
 
 def test_a_booking_has_its_own_needs_and_priority(fleet: CliFleet) -> None:
@@ -114,7 +115,7 @@ def test_a_booking_has_its_own_needs_and_priority(fleet: CliFleet) -> None:
     other = said(fleet, "request", "robot/c", "--booking", "fixed", "--", "true", code=2)
     assert other == "zscout: fixed is booked with other devices: robot/b; leave the devices out\n"
     higher = said(fleet, "request", "--booking", "fixed", "--priority", "3", "--", "true", code=2)
-    assert higher == "zscout: --priority: fixed is booked at 2; leave it out\n"
+    assert higher == "zscout: --priority: fixed is booked with priority 2; leave --priority out\n"
     same = said(fleet, "request", "robot/b", "--booking", "fixed", "--priority", "2", "--timeout", "0.5", code=1)
     assert "fixed was not granted within 0.5 s" in same
 
@@ -170,7 +171,7 @@ def test_who_would_run_into_maintenance_is_told_until_when(fleet: CliFleet) -> N
         end(waiting)
     assert fleet.zscout("request", "robot/c", "--min-runtime", "1m", "--", "true").returncode == 0, "it is over by then"
     nobody = said(fleet, "request", "--booking", "maintenance", "--", "true", code=1)
-    assert nobody.startswith("zscout: maintenance is maintenance, which nobody takes up")
+    assert nobody.startswith("zscout: maintenance is maintenance, not for requests; end it: zscout booking cancel ")
     assert "; 1 booking within 24 h" in said(fleet, "status").splitlines()[0]
     assert told(fleet, "status")["booked_soon"] == 1
 
@@ -190,7 +191,9 @@ def test_what_the_rcm_refuses_is_bad_input(fleet: CliFleet) -> None:
         fleet, "slots", "robot/a", "--for", "1h", "--from", "2100-01-01 9:00", code=2
     )
     args = ("--for", "24h", "--at", "9:00", "--every", "day")
-    assert "it would overlap its own next date" in said(fleet, "book", "robot/a", *args, code=2)
+    assert "each date would overlap the next; make it shorter, or less often" in said(
+        fleet, "book", "robot/a", *args, code=2
+    )
     assert "speed" in said(fleet, "book", "radio/rf0:speed=1", "--for", "1h", "--at", "9:00", code=2)
     assert "command_rate" in said(fleet, "slots", "radio/rf0:command_rate=11", "--for", "1h", code=2)
-    assert 'no booking "surveys" is known, and there are none' in said(fleet, "unbook", "surveys", code=1)
+    assert 'unknown booking "surveys", and there are none' in said(fleet, "unbook", "surveys", code=1)

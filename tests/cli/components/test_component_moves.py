@@ -115,13 +115,13 @@ def test_migrating_keeps_the_count_and_followed_output_goes_along(fleet: CliFlee
     went = migrate(fleet, "wanderer", "--to", there)
     assert (went.returncode, went.stderr) == (0, "")
     assert re.fullmatch(rf"wanderer went from {here} to {there}, out of work for \d+ ms", went.stdout.splitlines()[-1])
-    lines += read_until(follower, f"-- wanderer goes on on {there}")
+    lines += read_until(follower, f"-- wanderer continues on {there}")
     (begins, *_) = kept_by(fleet, there, "wanderer")
     first = kept_by(fleet, here, "wanderer", until=lambda counts: counts[-1:] == [begins - 1])
     back = told(migrate(fleet, "wanderer", "--json"))
     assert (back["from"], back["host"], back["moves"]) == (there, here, 2)
     assert 0 < back["dead"] < HANG
-    lines += read_until(follower, f"-- wanderer goes on on {here}")
+    lines += read_until(follower, f"-- wanderer continues on {here}")
 
     stop(fleet, "wanderer")
     assert follower.wait(HANG) == 0
@@ -170,7 +170,7 @@ def test_what_can_not_be_migrated_is_one_line(fleet: CliFleet) -> None:
     assert (near.returncode, near.stderr) == (2, 'zscout: --to: there is no host "bellow"; did you mean bellows?\n')
     nobody = fleet.zscout("migrate", "stayr")
     assert (nobody.returncode, nobody.stdout) == (1, "")
-    assert nobody.stderr == 'zscout: no component "stayr" is known; did you mean stayer?\n'
+    assert nobody.stderr == 'zscout: unknown component "stayr"; did you mean stayer?\n'
     stop(fleet, "stayer")
     ended = fleet.zscout("migrate", "stayer")
     assert ended.returncode == 1
@@ -240,7 +240,7 @@ def test_logs_of_what_runs_and_of_what_has_ended(fleet: CliFleet) -> None:
     assert elsewhere.stderr.startswith(f"zscout: {OTHER[here]} has no output of speaker; leave --host out")
     nobody = fleet.zscout("logs", "nobody")
     assert nobody.returncode == 1
-    assert nobody.stderr.startswith('zscout: no component "nobody" is known; ')
+    assert nobody.stderr.startswith('zscout: unknown component "nobody"; ')
 
 
 @pytest.mark.slow
@@ -274,7 +274,7 @@ def test_followed_output_goes_over_when_a_host_dies(fleet: CliFleet) -> None:
     follower = follow(fleet, "survivor")
     counted(follower, 20)
     clamp.kill()
-    lines = read_until(follower, "-- survivor goes on on bellows")
+    lines = read_until(follower, "-- survivor continues on bellows")
     # It was not handed over: it begins anew.
     assert numbers("\n".join(counted(follower, 3))) == [1, 2, 3]
     # What it still wrote there, if that was read before its host died.

@@ -88,7 +88,7 @@ def test_several_are_stopped_at_once_and_what_is_unknown_is_named(fleet: CliFlee
     assert stopped.returncode == 1
     states = {one["component"]: one["state"] for one in json.loads(stopped.stdout)["components"]}
     assert states == {"blue": "ended", "green": "ended"}
-    assert stopped.stderr.startswith('zscout: no component "red" is known; ')
+    assert stopped.stderr.startswith('zscout: unknown component "red"; known: ')
     assert stopped.stderr.count("\n") == 1
     gone = fleet.zscout("components", "gren")
     assert (gone.returncode, gone.stdout) == (1, "")
@@ -116,7 +116,7 @@ def test_what_fails_is_given_up_with_its_reason(fleet: CliFleet) -> None:
     assert 'period: is the text "fast"' in fleet.zscout("components").stdout
     unknown = fleet.zscout("start", "cuonter")
     assert unknown.returncode == 1
-    assert "no host has kind cuonter; did you mean counter?" in unknown.stderr
+    assert 'unknown kind "cuonter"; did you mean counter?' in unknown.stderr
     assert unknown.stderr.count("\n") == 1
 
 
@@ -149,13 +149,13 @@ def test_waiting_for_a_host_says_why_and_stays_placed(fleet: CliFleet) -> None:
     assert late.stdout.startswith("picky waits for a host: ")
     assert "gpu" in late.stdout
     assert late.stderr.startswith("zscout: picky does not run after 6.0 s: waits for a host: ")
-    assert late.stderr.endswith("; picky stays placed; to end it: zscout stop picky\n")
+    assert late.stderr.endswith("; picky stays placed; to end it: zscout component stop picky\n")
     assert listed(fleet, "picky")[0]["state"] == "waiting"
 
     waiting = fleet.start("start", "counter", "--name", "picky", "--label", "gpu")
     read_until(waiting, "picky waits for a host")
     waiting.send_signal(signal.SIGINT)
-    read_until(waiting, "picky stays placed; to end it: zscout stop picky")
+    read_until(waiting, "picky stays placed; to end it: zscout component stop picky")
     assert waiting.wait(HANG) == 130
     assert listed(fleet, "picky")[0]["state"] == "waiting"
     assert fleet.zscout("stop", "picky").returncode == 0
@@ -163,13 +163,13 @@ def test_waiting_for_a_host_says_why_and_stays_placed(fleet: CliFleet) -> None:
 
 @pytest.mark.slow
 def test_at_a_terminal_one_line_goes_along(fleet: CliFleet) -> None:
-    with fleet.terminal("start", "counter", "--name", "shown", "--label", "gpu") as terminal:
+    with fleet.terminal("component", "start", "counter", "--name", "shown", "--label", "gpu") as terminal:
         terminal.until("shown waits for a host: ")
         terminal.press("\x03")
         terminal.until("shown stays placed")
         assert terminal.code() == 130
     assert fleet.zscout("stop", "shown").returncode == 0
-    with fleet.terminal("components", "--watch") as terminal:
+    with fleet.terminal("component", "list", "--watch") as terminal:
         terminal.until("q or Ctrl-C ends")
         assert fleet.zscout("start", "counter", "--name", "fresh").returncode == 0
         terminal.until("fresh")

@@ -93,7 +93,7 @@ async def test_at_a_narrow_terminal_every_key_can_be_copied(lab: Lab) -> None:
     async with asyncio.timeout(HANG):
         # It lists what its session sees in a second or two.
         while "rc/robot/a-rather-long-name-for-a-robot/command/*/*" not in keys:
-            with Terminal("keys", env=lab.env, columns=80) as terminal:
+            with Terminal("doctor", "--keys", env=lab.env, columns=80) as terminal:
                 if await asyncio.to_thread(terminal.code):
                     continue
             lines = terminal.text.splitlines()[1:]

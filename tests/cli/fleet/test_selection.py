@@ -78,4 +78,4 @@ def test_a_name_that_nothing_has() -> None:
     assert Selection(["robot/a", "anvil"], STATE, HOMES, {"anvil": Host()}).missing() is None
     missing = Selection(["robot/a", "survy"], STATE, HOMES, {"anvil": Host()}).missing()
     assert missing is not None
-    assert 'no device, request or host "survy" is known; did you mean survey?' in str(missing)
+    assert str(missing) == 'unknown device, request or host "survy"; did you mean survey?'

@@ -254,7 +254,7 @@ def test_a_live_view_as_json(tmp_path: Path) -> None:
     assert [Path(said["file"])] == list((tmp_path / "out").glob("*.rrd"))
     # Nobody leads yet: the view may fill later.
     (line,) = (tmp_path / "view.log").read_text().splitlines()
-    assert line.startswith("zscout: no RCM is on the mesh")
+    assert line.startswith("zscout: no leader is on the mesh")
 
 
 def test_without_a_display_it_names_web(
@@ -290,8 +290,8 @@ def test_what_can_t_be_opened_or_served_is_one_line_and_code_2(
             ([tmp_path / "none.rrd"], "there is no such file"),
             ([tmp_path], "there is no such file"),
             ([text], "is not a Rerun recording"),
-            (["--past", "99d"], "at most 31d"),
-            (["--past", "soon"], "is no such duration"),
+            (["--past", "99d"], '--past: "99d" is not a duration up to 31d'),
+            (["--past", "soon"], '--past: "soon" is not a duration up to 31d'),
             ([recording, "--bind", "here"], "is not an IP address"),
             ([recording, "--bind", "192.0.2.1"], "can't serve on 192.0.2.1"),
             ([recording, "--port", port], f"port {port} (Address already in use); choose another"),

@@ -179,7 +179,7 @@ def test_ctrl_c_does_not_wait_for_a_camera_that_is_silent(camera: MjpegServer) -
 
 @pytest.mark.live
 def test_at_a_terminal_there_is_a_live_line(video: Path) -> None:
-    with Terminal("watch", "--source", video) as terminal:
+    with Terminal("motion", "--source", video) as terminal:
         terminal.until("motion for")
         terminal.until("9.9 s watched, 100 pictures; 1 event")
         assert terminal.code() == 0

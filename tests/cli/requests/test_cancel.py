@@ -39,7 +39,7 @@ def test_cancel_ends_a_wait_by_id(fleet: CliFleet) -> None:
     (view,) = fleet.state(lambda state: len(state.queue) == 1).queue
     refused = fleet.zscout("release", "survey")
     assert refused.returncode == 1
-    assert "holds nothing, it waits; to end that: zscout cancel survey" in refused.stderr
+    assert "holds nothing, it waits; to cancel it: zscout cancel survey" in refused.stderr
     done = fleet.zscout("cancel", view.id, "--json")
     assert done.returncode == 0, done.stderr
     (arc,) = json.loads(done.stdout)["arcs"]
@@ -71,4 +71,4 @@ def test_a_name_of_several_is_refused_with_the_list(fleet: CliFleet) -> None:
 def test_an_unknown_arc_is_one_line(fleet: CliFleet) -> None:
     done = fleet.zscout("cancel", "nobody")
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == 'zscout: no ARC "nobody" holds or waits; see zscout status\n'
+    assert done.stderr == 'zscout: no request "nobody" holds or waits; see zscout status\n'

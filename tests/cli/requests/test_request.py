@@ -301,9 +301,9 @@ def test_what_can_never_start_is_refused_at_once_with_code_2(fleet: CliFleet) ->
     for command in (("request",), ("request", "--dry-run"), ("take", "--yes")):
         much = fleet.zscout(*command, "radio/rf0:rate=50")
         assert (much.returncode, much.stdout) == (2, "")
-        assert much.stderr == "zscout: can never start: rate 50 of 10 at radio/rf0; ask for less\n"
+        assert much.stderr == "zscout: can never start: rate 50 of 10 at radio/rf0; request less\n"
     typo = fleet.zscout("request", "--dry-run", "radio/rf0:rat=5")
-    assert (typo.returncode, typo.stderr) == (2, "zscout: radio/rf0 knows no parameter rat; did you mean rate?\n")
+    assert (typo.returncode, typo.stderr) == (2, "zscout: radio/rf0 has no parameter rat; did you mean rate?\n")
     none = fleet.zscout("request", "robot/a:speed=1", "--", "true")
     assert none.returncode == 2
     assert none.stderr == "zscout: robot/a has no parameter speed; it has none\n"

@@ -82,7 +82,7 @@ async def test_the_story_of_an_arc(lab: Lab) -> None:
     assert "cancelled" in ended.stdout.splitlines()[-1]
     unknown = await zscout_soon("why", "mappin", env=lab.env)
     assert (unknown.returncode, unknown.stdout) == (1, "")
-    assert unknown.stderr == 'zscout: no request "mappin" is known; did you mean mapping?\n'
+    assert unknown.stderr == 'zscout: unknown request "mappin"; did you mean mapping?\n'
 
 
 @in_lab()

@@ -92,7 +92,7 @@ def test_table_1_gives_table_2_as_a_table(table1: Path, capsys: pytest.CaptureFi
     assert head == ["seconds", *map(str, range(18))]
     assert [(row[0], " ".join(row[1:])) for row in rows] == list(TABLE2.items())
     assert "arc2 at 11 s by arc4, after 3 of 4 s; ran again from 14 s" in shown
-    assert "0 ARCs unserved" in shown
+    assert "0 requests unserved" in shown
     assert "\x1b" not in shown
 
 

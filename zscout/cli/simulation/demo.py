@@ -77,11 +77,7 @@ def live_options(command: F) -> F:
     return click.option("--web", is_flag=True, help="Show it live in a browser: prints the address to open.")(command)
 
 
-async def _played(
-    web: bool, view: bool, play: Callable[[LiveView | None], Coroutine[Any, Any, int]], *, as_json: bool
-) -> int:
-    if not (web or view or as_json):
-        terminal.print_line(f"To see it live in a browser: {click.get_current_context().command_path} --web")
+async def _played(web: bool, view: bool, play: Callable[[LiveView | None], Coroutine[Any, Any, int]]) -> int:
     async with AsyncExitStack() as stack:
         return await play(_Live(stack, web=web) if web or view else None)
 
@@ -134,9 +130,7 @@ def robots(building: str, seed: int, speed: float, out: Path | None, web: bool, 
     # Zenoh is loaded here: the help needs none of it.
     from zscout.simulation.demo.robots_screen import play
 
-    return common.run(
-        _played(web, view, lambda live: play(building, seed, speed, out, as_json=as_json, live=live), as_json=as_json)
-    )
+    return common.run(_played(web, view, lambda live: play(building, seed, speed, out, as_json=as_json, live=live)))
 
 
 @demo.command()
@@ -159,7 +153,7 @@ def table1(out: Path | None, web: bool, view: bool, as_json: bool) -> int:
     _check_live(web, view)
     from zscout.simulation.demo.table1_screen import play
 
-    return common.run(_played(web, view, lambda live: play(out, as_json=as_json, live=live), as_json=as_json))
+    return common.run(_played(web, view, lambda live: play(out, as_json=as_json, live=live)))
 
 
 @demo.command()

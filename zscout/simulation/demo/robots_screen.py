@@ -41,8 +41,8 @@ async def play(
     if not ids:
         raise BadInput(f"--building {building}: there is no robot in it; add a [[robot]]")
     began = time.monotonic()
-    screen = DemoScreen(as_json=as_json, decimals=1, live=live)
-    screen.print_line(f"{_title(building, speed, len(ids))}; {HARDWARE}; starting")
+    screen = DemoScreen("robots", as_json=as_json, decimals=1, live=live)
+    screen.begin(f"{_title(building, speed, len(ids))}; {HARDWARE}; starting")
     demo, path = await screen.play(
         lambda folder: RobotsDemo(folder, building, ids, seed=seed, speed=speed, show=screen.show),
         lambda demo: _picture(demo, screen),

@@ -38,12 +38,17 @@ class LiveView(Protocol):
 class DemoScreen:
     """Events as lines in a pipe, as a picture with the latest at a terminal, or not at all with `--json`."""
 
-    def __init__(self, *, as_json: bool, decimals: int, live: LiveView | None = None) -> None:
-        self._live, self._where = live, ""
+    def __init__(self, name: str, *, as_json: bool, decimals: int, live: LiveView | None = None) -> None:
+        self._name, self._live, self._where = name, live, ""
         self._as_json, self._decimals = as_json, decimals
         self._plain = not as_json and not terminal.at_terminal()
         self._drawn = not as_json and not self._plain
         self._events: list[str] = []
+
+    def begin(self, title: str) -> None:
+        if self._live is None and not self._as_json:
+            terminal.print_line(f"To see it live in a browser: zscout demo {self._name} --web")
+        self.print_line(title)
 
     def print_line(self, text: str) -> None:
         if self._plain:

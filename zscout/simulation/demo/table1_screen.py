@@ -41,8 +41,8 @@ async def play(out: Path | None, *, as_json: bool, live: LiveView | None = None)
     expected = paper()
     rcs, seconds = list(expected.table), len(next(iter(expected.table.values())))
     began = clock.now()
-    screen = DemoScreen(as_json=as_json, decimals=2, live=live)
-    screen.print_line("Table 1 of the paper on three nodes of this machine; starting them")
+    screen = DemoScreen("table1", as_json=as_json, decimals=2, live=live)
+    screen.begin("Table 1 of the paper on three nodes of this machine; starting them")
     demo, path = await screen.play(
         lambda folder: Table1Demo(folder, expected.workload, screen.show),
         lambda demo: _picture(demo, expected, screen),
