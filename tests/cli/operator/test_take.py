@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import COMMAND, Terminal, by, course, end, events, held_by, named, out_of, read_until
+from tests.cli.tools import COMMAND, Terminal, by, course, end, events, held_by, out_of, read_until
 from tests.hang import HANG
 
 pytestmark = pytest.mark.live
