@@ -76,7 +76,7 @@ fleet = "lab" | fleet: is the text "lab"; write a table, under [fleet]
 [roles] / client = ["a"] / [groups] / a = ["a"] | groups.a: "a" is also a name with a role; rename the group
 [access] / "robot/x" = ["arms"] | access."robot/x"[0]: "arms" has no role; name it under [roles], or correct the name
 [quotas] / a = { rcs = 1 } | quotas.a: "a" has no role; name it under [roles], or correct the name
-[ceilings.viewer] / priority = 1 | ceilings.viewer: only clients and operators have a ceiling; write "client" or "operator"
+[ceilings.viewer] / priority = 1 | ceilings.viewer: only clients and operators have a ceiling; write "client" or
 """
 """The file, and how the line begins."""
 BAD_FLEETS_BY_TEXT = {
