@@ -201,6 +201,9 @@ def check_light(programs: Path, folder: Path) -> None:
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(text)
     run(programs / "python", "-m", "pip", "install", "--quiet", "./lamp", cwd=folder, timeout=INSTALL)
+    # The tutorial's own test, by what the wheel brings for authors.
+    test = "from pathlib import Path; from test_lamp import test_the_lamp_is_set_and_goes_out as test; test(Path())"
+    run(programs / "python", "-c", test, cwd=folder)
     (folder / "brightness").touch()
     for module in LEFT_OUT:
         found = run(programs / "python", "-c", f"import {module}", cwd=folder, check=False)
@@ -233,7 +236,7 @@ def check_light(programs: Path, folder: Path) -> None:
     # What is missing is named, with the command that brings it.
     line = fleet.refused('[[rc]]\nname = "framegrabber/f"\ndriver = "framegrabber"\nsource = "/dev/video0"\n')
     expect(len(line.splitlines()) == 1 and "pip install" in line, f"a framegrabber is refused with {line}")
-    for args, package in ((("watch", "--source", "x.avi"), "opencv-python-headless"), (("view", "--web"), "rerun-sdk")):
+    for args, package in ((("motion", "--source", "x.avi"), "opencv-python-headless"), (("view", "--web"), "rerun-sdk")):
         done = fleet.zscout(*args, check=False)
         last = (done.stderr.splitlines() or [""])[-1]
         expect(done.returncode != 0 and package in last and "pip install" in last, f"{args}: {done.stderr}")
