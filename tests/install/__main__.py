@@ -236,7 +236,10 @@ def check_light(programs: Path, folder: Path) -> None:
     # What is missing is named, with the command that brings it.
     line = fleet.refused('[[rc]]\nname = "framegrabber/f"\ndriver = "framegrabber"\nsource = "/dev/video0"\n')
     expect(len(line.splitlines()) == 1 and "pip install" in line, f"a framegrabber is refused with {line}")
-    for args, package in ((("motion", "--source", "x.avi"), "opencv-python-headless"), (("view", "--web"), "rerun-sdk")):
+    for args, package in (
+        (("motion", "--source", "a.avi"), "opencv-python-headless"),
+        (("view", "--web"), "rerun-sdk"),
+    ):
         done = fleet.zscout(*args, check=False)
         last = (done.stderr.splitlines() or [""])[-1]
         expect(done.returncode != 0 and package in last and "pip install" in last, f"{args}: {done.stderr}")
