@@ -65,14 +65,14 @@ model: $(READY)
 install-check: $(READY)
 	$(BIN)/python -m tests.install
 
-# More options: $(BIN)/python -m tests.chaos --help
+# More options: $(BIN)/python -m studies chaos --help
 MINUTES ?= 20
 chaos: $(READY)
-	$(BIN)/python -m tests.chaos --minutes $(MINUTES)
+	$(BIN)/python -m studies chaos --minutes $(MINUTES)
 
 HOURS ?= 8
 soak: $(READY)
-	$(BIN)/python -m tests.chaos.soak --hours $(HOURS)
+	$(BIN)/python -m studies soak --hours $(HOURS)
 
 # What the peers need stands apart from what zscout needs.
 $(PEERS_READY): benchmarks/peers/requirements.txt requirements/dev.txt pyproject.toml

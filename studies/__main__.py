@@ -32,6 +32,8 @@ STUDIES: Final[dict[str, Study]] = {
     "watching": Study("watching:main", "How many passers-by does the motion detector report?", "20 min"),
     "cdnet": Study("cdnet:main", "How does the motion detector compare with MOG2 and KNN on CDnet 2014?", "1 min"),
     "faults": Study("faults.commands:faults", "Are all promises kept under faults, in virtual time?", "3 min"),
+    "chaos": Study("chaos.__main__:main", "Are all promises kept in a real fleet under faults?", "20 min, root"),
+    "soak": Study("chaos.soak:main", "What does a fleet use after hours?", "8 h, root"),
     "overlap": Study("overlap:main", "Do two programs ever run at one exclusive device?", "10 min, root"),
     "sites": Study("sites:main", "Is nothing lost when the relay between two sites fails?", "15 min, root"),
     "guards": Study("suite:guards", "Which guards of the protocol does the quick tier of tests notice?", "30 min"),

@@ -28,8 +28,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any, Final, Literal, NamedTuple, Self
 
-from tests.chaos import net
-from tests.chaos.net import Net
+from studies.chaos import net
+from studies.chaos.net import Net
 from zscout.behaviors.client.direct import DEFAULT_SETTLE
 from zscout.config.fleet import default_fleet
 from zscout.mesh import clock

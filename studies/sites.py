@@ -26,7 +26,7 @@ from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias
 
 import msgspec
 
-from tests.chaos import net
+from studies.chaos import net
 from tests.hang import HANG
 from tests.live.closed import make_keys
 from tests.live.lab import HolderProcess, awaited

@@ -173,7 +173,7 @@ async def test_a_move_that_fails_before_the_commit_changes_nothing(tmp_path: Pat
             await counts_on(hosts, "a")
             return problem.message
 
-        assert "no component 'c'" in await fails("b", 2)
+        assert 'there is no component "c" on this host' in await fails("b", 2)
         await hosts.start("b", "c", "still", incarnation=2, standby=True)
         assert "no checkpoint() and restore()" in await fails("b", 2)
         await hosts.stop("b", "c")

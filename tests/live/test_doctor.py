@@ -244,7 +244,9 @@ async def test_a_name_that_is_not_the_certificates_is_told_before_joining(tmp_pa
     file.write_text('[node]\nhost = "bench"\nfleet = "fleet.toml"\n[security]\nfolder = "keys/anvil"')
     told = await doctor(lab, file)
     keys = tmp_path / "keys" / "anvil"
-    assert told.of("certificate") == [("mend", f'{keys}/cert.pem: is the certificate of "anvil", and this is "bench"')]
+    assert told.of("certificate") == [
+        ("mend", f'{keys}/cert.pem: is the certificate of "anvil", but this host is "bench"')
+    ]
     assert not told.of("links")
     lab.node("cart")
     await lab.logged("cart", "is on the mesh")
@@ -265,7 +267,7 @@ async def test_status_and_doctor_warn_of_every_certificate_that_ends_soon(tmp_pa
     done = await lab.zscout("status", env=env)
     _, warnings = done.stdout.split("\nWarnings\n")
     said = [line.split("  ") for line in warnings.split("\n\n")[0].splitlines()[1:]]
-    assert [(about, words.partition(" ends in ")[0]) for about, words in said] == [
+    assert [(about, words.partition(" expires in ")[0]) for about, words in said] == [
         ("certificate", "the certificate of anvil"),
         ("certificate", "the certificate of ada"),
     ]
@@ -276,7 +278,7 @@ async def test_status_and_doctor_warn_of_every_certificate_that_ends_soon(tmp_pa
     ending = ["the certificate of ada", "the certificate of anvil"]
     await told_that(
         lab,
-        lambda told: [says.partition(" ends in ")[0] for says in told.mends()] == ending,
+        lambda told: [says.partition(" expires in ")[0] for says in told.mends()] == ending,
         **{KEYS_VARIABLE: env[KEYS_VARIABLE]},
     )
     await lab.logged("anvil", "renew it (zscout cert renew)")

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from tests.chaos.net import Net, NoNamespaces, Processes, check
+from studies.chaos.net import Net, NoNamespaces, Processes, check
 from tests.cli.fleet.test_status import section
 from tests.hang import HANG
 from tests.live.bench import granted
@@ -52,9 +52,9 @@ async def test_the_one_that_is_not_named_obeys_nothing_and_says_so(tmp_path: Pat
 
         await lab.state(client, lambda state: [view.duplicates for view in state.rcs] == [["ws1"]])
         plain = await lab.zscout("status")
-        (row,) = section(plain.stdout, "RCs")
+        (row,) = section(plain.stdout, "Devices")
         assert row[:4] == [RC, "exclusive", "held", "ws2"]
-        assert [row[:2] for row in section(plain.stdout, "Devices")] == [[RC, "at ws1: duplicate of robot/arm at ws2"]]
+        assert [row[:2] for row in section(plain.stdout, "Health")] == [[RC, "at ws1: duplicate of robot/arm at ws2"]]
 
         # Who leads next has a link to both.
         await lab.candidates(client, "boss", "heir")

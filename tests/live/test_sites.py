@@ -15,8 +15,8 @@ from typing import Any, get_args
 import msgspec
 import pytest
 
+from studies.chaos.net import NoNamespaces, check, ip
 from studies.sites import ALL, GATE, SITES, Fault, Sites
-from tests.chaos.net import NoNamespaces, check, ip
 from tests.cli.tools import COMMAND
 from tests.hang import HANG
 from tests.live.lab import PATIENT

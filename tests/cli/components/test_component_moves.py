@@ -165,9 +165,9 @@ def test_what_can_not_be_migrated_is_one_line(fleet: CliFleet) -> None:
 
     nowhere = fleet.until(both_seen, "migrate", "stayer", "--to", "nowhere")
     assert (nowhere.returncode, nowhere.stdout) == (2, "")
-    assert nowhere.stderr.startswith('zscout: --to: there is no host "nowhere"; there are: anvil, bellows')
+    assert nowhere.stderr.startswith('zscout: --to: unknown host "nowhere"; there are: anvil, bellows')
     near = fleet.until(both_seen, "migrate", "stayer", "--to", "bellow")
-    assert (near.returncode, near.stderr) == (2, 'zscout: --to: there is no host "bellow"; did you mean bellows?\n')
+    assert (near.returncode, near.stderr) == (2, 'zscout: --to: unknown host "bellow"; did you mean bellows?\n')
     nobody = fleet.zscout("migrate", "stayr")
     assert (nobody.returncode, nobody.stdout) == (1, "")
     assert nobody.stderr == 'zscout: unknown component "stayr"; did you mean stayer?\n'

@@ -70,8 +70,10 @@ def test_start_list_and_stop(fleet: CliFleet) -> None:
 
     other = fleet.zscout("start", "counter", "--set", "period=0.2")
     assert (other.returncode, other.stdout) == (1, "")
-    assert other.stderr.startswith("zscout: counter exists already, as another kind or with other settings; give")
-    assert other.stderr.endswith("zscout stop counter\n")
+    assert other.stderr.startswith(
+        "zscout: counter already exists with another kind or other settings; give this one another --name, "
+    )
+    assert other.stderr.endswith("zscout component stop counter\n")
 
     stopped = fleet.zscout("stop", "counter")
     assert (stopped.returncode, stopped.stderr) == (0, "")
@@ -198,7 +200,7 @@ def test_status_names_components_and_cordoned_hosts(fleet: CliFleet) -> None:
     assert "zscout: anvil is not empty: seen stays (it can't be moved; anvil is drained); " in drained.stderr
     assert fleet.zscout("drain", "anvli").returncode == 1
     # Its process shows itself to a newcomer as soon as both are linked.
-    row = r"^anvil +leads, cordoned .* node, 1 RC, seen$"
+    row = r"^anvil +leads, cordoned .* node, 1 device, seen$"
     fleet.shown("status", until=lambda text: re.search(row, text, re.MULTILINE))
 
     def anvil(text: str) -> tuple[list[str], bool]:

@@ -50,7 +50,7 @@ async def behave(spec: ArcSpec, signal: asyncio.Event) -> None:
         sys.stdout.flush()
 
     async with await Client.connect(spec.arc, host=spec.host) as client:
-        client.who = Who(command=spec.arc)
+        client.who = msgspec.structs.replace(client.who or Who(), command=spec.arc)
         missing, complete = {Role.RCM, *spec.needs}, asyncio.Event()
 
         def seen(token: Token, alive: bool) -> None:

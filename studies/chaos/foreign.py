@@ -1,7 +1,7 @@
 """A client and resource controllers written from `docs/protocol.md` alone, with plain `zenoh` and `json`: nothing of
 the project. Section names in quotes are that page's.
 
-    python -m tests.chaos.foreign client|rcs FLEET HOST SEED"""
+    python -m studies.chaos.foreign client|rcs FLEET HOST SEED"""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ os.environ["ZENOH_RUNTIME"] = (
 
 import zenoh
 
-from tests.chaos.work import CAPACITY, CLIENT, JOBS, PULSE, Json, draw, now, rcs_of, say
+from studies.chaos.work import CAPACITY, CLIENT, JOBS, PULSE, Json, draw, now, rcs_of, say
 from tests.live.plain_client import GREATER_CONNECTS, TRY_AGAIN, answers, encoding
 
 SECOND = 1_000_000_000

@@ -7,8 +7,8 @@ import statistics
 from collections.abc import Sequence
 from typing import Any, Final, TypeAlias
 
-from tests.chaos.checker import Violation
-from tests.chaos.faults import KINDS, SECOND, Fault
+from studies.chaos.checker import Violation
+from studies.chaos.faults import KINDS, SECOND, Fault
 
 Figures: TypeAlias = dict[str, Any]
 MEASURES: Final = {

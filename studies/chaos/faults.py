@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from tests.chaos.work import CLIENTS, HOSTS, NODES, RC_HOSTS
+from studies.chaos.work import CLIENTS, HOSTS, NODES, RC_HOSTS
 
 SECOND: Final = 1_000_000_000
 LEASE: Final = 1.0

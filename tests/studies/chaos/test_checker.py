@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from tests.chaos.checker import Apart, Checker, Violation, check, events
-from tests.chaos.faults import SECOND, Fault, isolated
-from tests.chaos.report import figures, late, spread, table
-from tests.chaos.work import CAPACITY, CLIENT, HOSTS, Json, host_of, rcs_of
+from studies.chaos.checker import Apart, Checker, Violation, check, events
+from studies.chaos.faults import SECOND, Fault, isolated
+from studies.chaos.report import figures, late, spread, table
+from studies.chaos.work import CAPACITY, CLIENT, HOSTS, Json, host_of, rcs_of
 
 TERM = [3, "aa"]
 OLD, NEW = [TERM, 1], [TERM, 2]

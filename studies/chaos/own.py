@@ -1,6 +1,6 @@
 """A client of zscout's own, with the same jobs as the foreign one, and telling the same.
 
-python -m tests.chaos.own FLEET_FILE HOST SEED"""
+python -m studies.chaos.own FLEET_FILE HOST SEED"""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tests.chaos.work import CLIENT, JOBS, PULSE, Json, draw, now, say
+from studies.chaos.work import CLIENT, JOBS, PULSE, Json, draw, now, say
 from zscout.behaviors.client.client import Client, CommandRefused
 from zscout.behaviors.client.request import OpenArc
 from zscout.config.fleet import load_fleet

@@ -15,10 +15,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-from tests.chaos.checker import Apart, Violation, check
-from tests.chaos.faults import SECOND, Fault, Way, draw
-from tests.chaos.net import Links, Net, Processes
-from tests.chaos.work import (
+from studies.chaos.checker import Apart, Violation, check
+from studies.chaos.faults import SECOND, Fault, Way, draw
+from studies.chaos.net import Links, Net, Processes
+from studies.chaos.work import (
     CAPACITY,
     CLIENTS,
     FOREIGN_CLIENTS,
@@ -161,9 +161,9 @@ class Fleet:
                 self._node(host)
             for host in RC_HOSTS + FOREIGN_CLIENTS:
                 what = "rcs" if host in RC_HOSTS else "client"
-                self._start(host, "tests.chaos.foreign", what, name, host, f"{self.seed} {host}")
+                self._start(host, "studies.chaos.foreign", what, name, host, f"{self.seed} {host}")
             for host in OWN_CLIENTS:
-                self._start(host, "tests.chaos.own", str(file), host, f"{self.seed} {host}")
+                self._start(host, "studies.chaos.own", str(file), host, f"{self.seed} {host}")
             others = RC_HOSTS + CLIENTS
             self.until(lambda: all(self.watch.up[host] for host in others), BEGIN_WITHIN, "all programs are up")
             self.until(lambda: self.watch.entered.keys() == set(CLIENTS), BEGIN_WITHIN, "all clients are served")

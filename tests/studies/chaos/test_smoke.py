@@ -9,8 +9,8 @@ import sys
 
 import pytest
 
-from tests.chaos import net
-from tests.chaos.__main__ import main
+from studies.chaos import net
+from studies.chaos.__main__ import main
 from tests.hang import HANG
 
 try:
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.live
 @pytest.mark.slow
 @pytest.mark.skipif(bool(why_not), reason=why_not)
 def test_a_leader_is_killed_and_nothing_is_left() -> None:
-    command = [sys.executable, "-m", "tests.chaos", "--count", "1", "--only", "leader killed", "--json"]
+    command = [sys.executable, "-m", "studies", "chaos", "--count", "1", "--only", "leader killed", "--json"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     told, _ = process.communicate(timeout=5 * HANG)
     found = json.loads(told)

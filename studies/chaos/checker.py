@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
-from tests.chaos.faults import LEASE, Fault
-from tests.chaos.work import CAPACITY, CLIENT, HOSTS, NODES, Json, host_of
+from studies.chaos.faults import LEASE, Fault
+from studies.chaos.work import CAPACITY, CLIENT, HOSTS, NODES, Json, host_of
 
 SECOND: Final = 1_000_000_000
 HOLD_LEASE: Final = 3 * SECOND

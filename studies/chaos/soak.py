@@ -18,11 +18,11 @@ from typing import Any, Final, TypeAlias
 
 import psutil
 
+from studies.chaos import net
+from studies.chaos.run import Fleet, NotServed
+from studies.chaos.work import NODES, OWN_CLIENTS
 from studies.faults import simulation
 from studies.faults.simulation import Result, Simulation, Size, simulate
-from tests.chaos import net
-from tests.chaos.run import Fleet, NotServed
-from tests.chaos.work import NODES, OWN_CLIENTS
 from zscout.services.rcm.registry import MAX_LINES
 
 Figures: TypeAlias = dict[str, float]
@@ -148,7 +148,7 @@ def grown(found: dict[str, dict[str, list[float]]]) -> list[str]:
 
 
 def main() -> int:
-    options = argparse.ArgumentParser(prog="python -m tests.chaos.soak", description=__doc__)
+    options = argparse.ArgumentParser(prog="python -m studies soak", description=__doc__)
     options.add_argument("--hours", type=float, default=8.0, help="live, and in virtual time (8)")
     options.add_argument("--live", type=float, help="hours live, where that is another number")
     options.add_argument("--virtual", type=float, help="hours of virtual time, where that is another number")
@@ -190,7 +190,3 @@ def main() -> int:
                     print(f"{part:8} {host:16} {name:12}" + "".join(f"{value:>12g}" for value in values))
         print("\n".join(found["wrong"]) or "nothing grew")
     return 1 if found["wrong"] else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -12,15 +12,15 @@ import time
 from pathlib import Path
 from typing import Any
 
-from tests.chaos import net, report
-from tests.chaos.checker import events
-from tests.chaos.faults import KINDS, SECOND
-from tests.chaos.run import Fleet, NotServed, finish, random_faults
-from tests.chaos.work import HOSTS, now
+from studies.chaos import net, report
+from studies.chaos.checker import events
+from studies.chaos.faults import KINDS, SECOND
+from studies.chaos.run import Fleet, NotServed, finish, random_faults
+from studies.chaos.work import HOSTS, now
 
 
 def main(words: list[str] | None = None) -> int:
-    options = argparse.ArgumentParser(prog="python -m tests.chaos", description=__doc__)
+    options = argparse.ArgumentParser(prog="python -m studies chaos", description=__doc__)
     options.add_argument("--minutes", type=float, default=20.0, help="how long there are faults (20)")
     options.add_argument("--count", type=int, help="so many faults, however long that takes")
     options.add_argument("--seed", type=int, default=1, help="which faults, and what is asked for (1)")
@@ -101,7 +101,3 @@ def write_traces(folder: Path, file: Path) -> None:
     with file.open("w") as out:
         for event in sorted(traced, key=lambda one: one["at"]):
             out.write(json.dumps(event) + "\n")
-
-
-if __name__ == "__main__":
-    sys.exit(main())
