@@ -102,7 +102,8 @@ class Table:
 
     `styles` has Rich's style for each row. `spare` names the columns that a narrow terminal gives up, first things
     first: those that are also in `beneath` get lines of their own below each row, the others are left out. Texts in the
-    columns `cut` are shortened before others are broken."""
+    columns `cut` are shortened before others are broken. Long words in the columns `fold` are broken, not shortened, so
+    that they can be copied."""
 
     title: str
     columns: Sequence[str]
@@ -111,6 +112,7 @@ class Table:
     spare: Sequence[str] = ()
     cut: Collection[str] = ()
     beneath: Collection[str] = ()
+    fold: Collection[str] = ()
 
     def lines(self) -> list[str]:
         """Without colours, as wide as the texts are: two spaces between columns."""
@@ -130,7 +132,7 @@ class Table:
         styles = ["bold" if self.title else "bold cyan", *self.styles[: len(safe)]]
         for number, style in enumerate([*styles, *[""] * (1 + len(safe) - len(styles))]):
             cells = [
-                wrapped(texts[at][number], wide)
+                wrapped(texts[at][number], wide, fold=self.columns[at] in self.fold)
                 if self.columns[at] not in self.cut
                 else [shortened(clean(texts[at][number]), wide)]
                 for at, wide in zip(kept, widths, strict=True)
@@ -205,12 +207,15 @@ def shortened(text: str, width: int) -> str:
     return text if _wide(text) <= width else set_cell_size(text, width - 1).rstrip() + "…"
 
 
-def wrapped(text: str, width: int) -> list[str]:
+def wrapped(text: str, width: int, *, fold: bool = False) -> list[str]:
     """On lines of this width, broken at newlines if there are some, otherwise at spaces, within parentheses only where
-    nothing else will do. Words that are too long are shortened."""
+    nothing else will do. Words that are too long are broken with `fold`, else shortened."""
     lines = [""]
     for part in re.split(ITEMS if "\n" in text else WORDS, text):
-        for word in [part] if _wide(part) <= width else part.split(" "):
+        words = [part] if _wide(part) <= width else part.split(" ")
+        if fold:
+            words = [word[at : at + width] for word in words for at in range(0, max(1, len(word)), width)]
+        for word in words:
             joined = f"{lines[-1]} {word}" if lines[-1] else shortened(word, width)
             if _wide(joined) <= width:
                 lines[-1] = joined

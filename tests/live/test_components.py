@@ -169,7 +169,7 @@ async def test_how_one_ended_is_told_as_it_was(lab: ComponentLab) -> None:
     bad = await hosts.start("a", "bad", "spin", {"cpu": "much"})
     assert (bad.ended, quiet(bad.tail)) == ("failed", "")
     assert 'bad parameters: cpu: is the text "much"; write a number' in bad.reason
-    for kind, words in (("no-component", "no subclass of"), ("missing", "can't be imported")):
+    for kind, words in (("no-component", "not a subclass of"), ("missing", "can't be imported")):
         wrong = await hosts.start("a", kind, kind)
         assert (wrong.phase, wrong.ended) == ("ended", "failed")
         assert words in wrong.reason

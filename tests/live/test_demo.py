@@ -91,7 +91,8 @@ def test_table_1_live_gives_table_2(tmp_path: Path) -> None:
     used = {text: colour for lane in colours(path, "/devices/**").values() for text, colour in lane.items()}
     assert set(used) == {*(f"arc{number}{PERSON}" for number in range(4)), f"arc4{PERSON}{OPERATOR_MARK}"}
     assert len(set(used.values())) == 5
-    doing = [text.split(" · ")[0] for _, (text,) in lanes(path, "/requests/**")[f"/requests/{USER}/arc2"]]
+    words = (text.split(" · ")[0] for _, (text,) in lanes(path, "/requests/**")[f"/requests/{USER}/arc2"])
+    doing = [word for word, _ in groupby(words)]  # its reason to wait may change meanwhile
     assert doing[-4:] == ["running", "waiting again", "running", "done"]
     assert set(doing[:-4]) == {"waiting"}
     assert {entity for entity, _, _ in rows(path, "/load/**", "Scalars:scalars")} == {
