@@ -25,7 +25,7 @@ PROCESSOR_S: Final = 1.0
 ESSENTIAL_PROCESSOR_S: Final = 3.0
 WAITING_S: Final = 5.0
 LIVE_WAITING_S: Final = 3.0
-MAX_NAMED: Final = 20
+MAX_NAMED: Final = 100
 """Tests above a bound that are named in one line each."""
 STARTS_A_PROCESS: Final = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn"}
 """Audit events."""

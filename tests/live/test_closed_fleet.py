@@ -40,6 +40,7 @@ async def test_two_persons_and_a_node_on_one_machine(lab: ClosedLab) -> None:
         assert whose == [("ada", machine), ("bob", machine)]
 
 
+@pytest.mark.slow
 async def test_a_secured_fleet_and_an_open_one_never_mix(tmp_path: Path) -> None:
     """On one network, under one name: nobody of the one is seen in the other."""
     (tmp_path / "open").mkdir()

@@ -303,6 +303,7 @@ async def test_who_handed_over_takes_back_what_the_new_one_does_not_take_on(lab:
     assert sorted(set(grants)) == grants[1:]
 
 
+@pytest.mark.slow
 async def test_who_handed_over_does_nothing_until_it_is_known_that_the_new_one_runs(lab: ComponentLab) -> None:
     register(lab)
     lab.node("a", "robot/x")

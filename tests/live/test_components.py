@@ -41,6 +41,7 @@ pytestmark = pytest.mark.live
 COUNTER = ComponentSpec("counter", {"period": 0.02}, restart="never")
 
 
+@pytest.mark.slow
 async def test_a_component_is_started_once_listed_read_checkpointed_and_stopped(lab: ComponentLab) -> None:
     lab.node("a")
     client = await lab.client()

@@ -291,6 +291,7 @@ def test_plain_pictures_and_times_that_go_back_do_no_harm() -> None:
         assert not seen.moving
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not PASSERS_BY.exists(), reason=MISSING)
 def test_passers_by_of_a_real_recording_are_found_and_nobody_else() -> None:
     whole, lawn = MotionDetector(), MotionDetector()

@@ -72,6 +72,7 @@ def test_pictures_of_another_size_begin_anew() -> None:
     assert seen.mask.shape == grey.shape
 
 
+@pytest.mark.slow
 def test_the_table_of_a_sequence_of_cdnet(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A sequence in the form of that data set, whose truth is known to the pixel."""
     for name in ("input", "groundtruth"):

@@ -97,6 +97,7 @@ def test_booked_listed_found_taken_up_and_given_up(fleet: CliFleet) -> None:
     assert said(fleet, "bookings") == "nothing is booked\n"
 
 
+@pytest.mark.slow
 def test_at_its_date_it_is_held_and_the_command_runs(fleet: CliFleet) -> None:
     said(fleet, "book", "robot/b", "--for", "1m", "--at", "in 2s", "--name", "soon")
     done = fleet.zscout("request", "--booking", "soon", "--json", "--", "sh", "-c", "exit 7")

@@ -180,6 +180,7 @@ def test_at_a_terminal_one_line_goes_along(fleet: CliFleet) -> None:
     assert fleet.zscout("stop", "fresh").returncode == 0
 
 
+@pytest.mark.slow
 def test_kinds(fleet: CliFleet) -> None:
     shown = fleet.zscout("components", "--kinds")
     assert (shown.returncode, shown.stderr) == (0, "")

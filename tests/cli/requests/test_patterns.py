@@ -49,6 +49,7 @@ def test_a_command_is_told_which_device_meets_which_pattern(fleet: CliFleet) -> 
     assert plain.stdout == "robot/a|{}\n"
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_who_waits_hears_who_has_all_that_match_and_gets_the_first(fleet: CliFleet) -> None:
     first, second = (fleet.holder(name, rc, "--min-runtime", "10m") for name, rc in (("first", F1), ("second", ANY)))

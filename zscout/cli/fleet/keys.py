@@ -105,4 +105,6 @@ def _print(own: Keys, tokens: list[Token], links: int, sharable: set[str] | None
             who = token[:3] if number == 0 or not terminal.at_terminal() else ("", "", "")
             rows.append((*who, key["how"], key["key"].removeprefix(f"{own.base}/"), key["what"]))
     terminal.print_line("")
-    terminal.Table("", ("HOST", "ROLE", "NAME", "HOW", "KEY", "WHAT"), rows, spare=("WHAT",), fold=("NAME", "KEY")).print()
+    terminal.Table(
+        "", ("HOST", "ROLE", "NAME", "HOW", "KEY", "WHAT"), rows, spare=("WHAT",), fold=("NAME", "KEY")
+    ).print()
