@@ -43,6 +43,7 @@ test-all: $(READY)
 
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	@! grep -rnoE '<script[^>]* src="https?://[^"]*' site --include=*.html || { echo "a page loads a script from another host"; exit 1; }
 	@echo "site/index.html"
 
 pictures: $(READY)
