@@ -18,7 +18,7 @@ class Study(NamedTuple):
     """Module below `studies`, and its click command or function."""
     question: str
     takes: str
-    """Typical duration on two cores."""
+    """Estimated duration on two cores."""
 
 
 STUDIES: Final[dict[str, Study]] = {
