@@ -90,6 +90,7 @@ def test_a_forged_step_is_refused_in_any_piece(trace: list[str]) -> None:
     assert "does not lead to" in verdict.refused[3]
 
 
+@pytest.mark.slow
 def test_who_promises_once_more_goes_on_with_what_it_holds(monkeypatch: pytest.MonkeyPatch) -> None:
     """A leader that was away itself asks its RCs again, and names what they hold as before."""
     # Java's second compiler takes half a second, which only long runs get back.

@@ -183,6 +183,7 @@ def test_an_rc_that_another_process_of_its_host_offers_is_refused_and_free_when_
     run(begin())
 
 
+@pytest.mark.slow
 @pytest.mark.live
 def test_a_node_ends_though_a_thread_of_a_driver_hangs_in_its_device(tmp_path: Path) -> None:
     program = (

@@ -36,7 +36,7 @@ class Cost(NamedTuple):
 
     wall: float
     processor: float
-    """Of this process and of its children that ended meanwhile."""
+    """Of this process and of its children that ended meanwhile, without fixtures that several tests share."""
 
     @property
     def waiting(self) -> float:
@@ -71,6 +71,8 @@ class Tiers:
         self.named: list[str] = []
         self.costs: list[tuple[str, Cost]] = []
         self._started = False
+        self._shared = Cost(0.0, 0.0)
+        """Setting up and ending shared fixtures, since the present test began."""
         sys.addaudithook(self._on_audit)
 
     def _on_audit(self, event: str, _args: tuple[Any, ...]) -> None:
@@ -80,8 +82,32 @@ class Tiers:
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, Any, Any]:
         self._started = False
-        item.stash[BEGAN] = time.monotonic(), spent()
+        self._shared = Cost(0.0, 0.0)
+        item.stash[BEGAN] = Cost(time.monotonic(), spent())
         return (yield)
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef: pytest.FixtureDef[Any]) -> Generator[None, Any, Any]:
+        """Leave out of the test's cost what a fixture costs that others use too: a fleet counts when it ends."""
+        if fixturedef.scope == "function":
+            return (yield)
+        began = Cost(time.monotonic(), spent())
+        fixturedef.addfinalizer(lambda: self._share(began))  # finalizers run in reverse: this one last
+        try:
+            return (yield)
+        finally:
+            self._share(began)
+
+            def note() -> None:
+                nonlocal began
+                began = Cost(time.monotonic(), spent())
+
+            fixturedef.addfinalizer(note)
+
+    def _share(self, began: Cost) -> None:
+        self._shared = Cost(
+            self._shared.wall + time.monotonic() - began.wall, self._shared.processor + spent() - began.processor
+        )
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self, item: pytest.Item) -> Generator[None, Any, Any]:
@@ -96,8 +122,8 @@ class Tiers:
     ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
         report = yield
         if call.when == "teardown":
-            began, before = item.stash[BEGAN]
-            cost = Cost(time.monotonic() - began, spent() - before)
+            began, shared = item.stash[BEGAN], self._shared
+            cost = Cost(time.monotonic() - began.wall - shared.wall, spent() - began.processor - shared.processor)
             report.user_properties.append(("cost", [*cost]))
             why = above(cost, {mark.name for mark in item.iter_markers()})
             if why:
@@ -146,7 +172,7 @@ class Tiers:
             yield f"{self.left_out} slow tests were left out: make test-all"
 
 
-BEGAN: Final = pytest.StashKey[tuple[float, float]]()
+BEGAN: Final = pytest.StashKey[Cost]()
 
 
 def pytest_configure(config: pytest.Config) -> None:

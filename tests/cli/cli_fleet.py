@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import subprocess
 import time
-from collections.abc import Callable, Coroutine, Iterator, Mapping
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -50,8 +50,8 @@ def in_lab(**options: Any) -> Callable[[Callable[[Lab], Coroutine[Any, Any, None
 class CliFleet:
     """One node with RCs, and `zscout` processes that use it."""
 
-    def __init__(self, folder: Path, hold_lease: float | None = None) -> None:
-        self.lab = Lab(folder, lease=PATIENT, extra=patient_timing(hold_lease))
+    def __init__(self, folder: Path, hold_lease: float | None = None, candidates: Sequence[str] = ()) -> None:
+        self.lab = Lab(folder, lease=PATIENT, candidates=candidates, extra=patient_timing(hold_lease))
         self.folder = folder
         self._started: list[subprocess.Popen[str]] = []
         self._eye = connect("eye", fleet=self.lab.fleet, host="test")
@@ -175,7 +175,8 @@ def fleet_of(
 ) -> Iterator[CliFleet]:
     """A fleet of one node with these RCs, ready; `env` beside the environment of this process, `hold_lease` in
     seconds."""
-    fleet = CliFleet(folder, hold_lease)
+    # Named, so that it knows at once that no other host has bookings.
+    fleet = CliFleet(folder, hold_lease, candidates=("anvil",))
     fleet.lab.env |= env or {}
     try:
         fleet.lab.node("anvil", *rcs)

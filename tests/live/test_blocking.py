@@ -307,6 +307,7 @@ def test_a_lab_that_was_closed_says_so(fleet: CliFleet) -> None:
     assert told == ["this lab is closed; zscout.connect() gives a new one"] * 3
 
 
+@pytest.mark.slow
 def test_who_waits_in_another_thread_as_a_lab_is_closed_is_told(fleet: CliFleet) -> None:
     text = """
         import asyncio

@@ -62,6 +62,7 @@ async def test_a_secured_fleet_and_an_open_one_never_mix(tmp_path: Path) -> None
             assert {token.host for token in tokens} == hosts
 
 
+@pytest.mark.slow
 async def test_what_roles_say_is_enforced_and_taken_anew_at_sighup(lab: ClosedLab) -> None:
     lab.node("anvil", "robot/a", "robot/b")
     bob, ada = await lab.person("bob"), await lab.person("ada")

@@ -305,6 +305,7 @@ async def test_one_that_does_not_reach_a_device_takes_over_no_hold_of_it(lab: Co
     assert view.phase == "standby"
 
 
+@pytest.mark.slow
 async def test_one_that_stands_by_runs_when_it_is_activated(lab: ComponentLab) -> None:
     lab.node("a")
     client = await lab.client()

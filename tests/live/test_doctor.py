@@ -87,6 +87,7 @@ def plain_file(lab: Lab) -> Path:
     return file
 
 
+@pytest.mark.slow
 async def test_a_fleet_that_is_well_is_told_to_be(lab: Lab) -> None:
     lab.node("anvil", "robot/a")
     await lab.begun()
@@ -284,6 +285,7 @@ async def test_status_and_doctor_warn_of_every_certificate_that_ends_soon(tmp_pa
     await lab.logged("anvil", "renew it (zscout cert renew)")
 
 
+@pytest.mark.slow
 async def test_status_says_that_roles_are_advisory_where_nothing_proves_a_name(tmp_path: Path) -> None:
     async with Lab(tmp_path, extra='[roles]\nmanager = ["anvil"]\nclient = ["bob"]') as lab:
         lab.node("anvil")
@@ -327,6 +329,7 @@ def doctoring(lab: Lab) -> Iterator[subprocess.Popen[bytes]]:
         process.wait()
 
 
+@pytest.mark.slow
 async def test_interrupted_it_leaves_nothing(tmp_path: Path) -> None:
     async with Lab(tmp_path, candidates=("forge",)) as lab:
         lab.node("anvil")

@@ -103,6 +103,7 @@ def test_a_token_of_an_rc_that_never_answers_is_asked_now_and_then(stranger: Str
     stranger.serves()
 
 
+@pytest.mark.slow
 async def test_a_client_does_not_fall_for_forged_notices(lab: Lab) -> None:
     lab.node("n", "robot/a", "radio/a:rate=10")
     client = await lab.begun("victim")

@@ -173,6 +173,7 @@ async def scene(folder: Path, *, rate: float = 60) -> AsyncIterator[Scene]:
         yield Scene(lab, client, rc, driver, one, two)
 
 
+@pytest.mark.slow
 async def test_frames_are_published_while_somebody_holds_and_somebody_looks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -175,6 +175,7 @@ async def test_all_goes_over_in_one_step_and_nobody_gets_in_between(
     assert new.internals.open_requests()[0].arc == "talk"
 
 
+@pytest.mark.slow
 async def test_back_and_forth_without_end(lab: Lab, stand: Stand, monkeypatch: pytest.MonkeyPatch) -> None:
     patiently(monkeypatch)
     lab.node("a")
@@ -207,6 +208,7 @@ async def test_back_and_forth_without_end(lab: Lab, stand: Stand, monkeypatch: p
     assert rival.state == arcs["later"].state == "queued"
 
 
+@pytest.mark.slow
 async def test_bodies_go_on_after_a_hand_over_that_was_refused(lab: Lab) -> None:
     lab.node("a", "robot/x")
     client, other = await lab.client("old"), await lab.client("rival")
@@ -235,6 +237,7 @@ async def test_bodies_go_on_after_a_hand_over_that_was_refused(lab: Lab) -> None
     await other.end(taker)
 
 
+@pytest.mark.slow
 async def test_what_was_handed_to_one_who_died_is_taken_back(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
     patiently(monkeypatch)
     lab.node("a", "robot/x", "radio/f:rate=5")
@@ -272,6 +275,7 @@ async def test_what_was_handed_to_one_who_died_is_taken_back(lab: Lab, monkeypat
     await until(lambda: later.state == "running")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("done", [False, True])
 async def test_after_an_unknown_outcome_all_is_the_old_client_s_again(
     lab: Lab, monkeypatch: pytest.MonkeyPatch, done: bool
@@ -378,6 +382,7 @@ async def test_the_leader_dies_around_a_hand_over(tmp_path: Path) -> None:
         assert [arc.place for arc in back.values()] == [arc.place for arc in before.values()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.003, *(pytest.param(delay, marks=pytest.mark.slow) for delay in (0.0, 0.001))])
 async def test_the_leader_dies_in_a_hand_over(tmp_path: Path, delay: float) -> None:
     """Whenever that is: all is at one of both, once, and the other knows."""

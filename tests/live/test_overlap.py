@@ -48,6 +48,7 @@ class Chain:
         return begun[self._number].alone
 
 
+@pytest.mark.slow
 def test_a_preempted_program_that_ignores_sigterm_is_gone_before_the_next_one_begins(
     fleet: CliFleet, tmp_path: Path
 ) -> None:

@@ -70,6 +70,7 @@ async def commands(holder: HolderProcess, *rcs: str) -> None:
         assert event.get("result") == ECHO["value"], event
 
 
+@pytest.mark.slow
 @leaders
 async def test_a_gang_over_nodes_of_both_versions(tmp_path: Path, former: Path, leads: str) -> None:
     async with MixedLab(tmp_path, former, candidates=("a",)) as lab:
@@ -220,6 +221,7 @@ class Book(messages.Message, frozen=True, tag_field="op", tag="book"):
     id: str
 
 
+@pytest.mark.slow
 @leaders
 async def test_what_the_other_side_does_not_know_is_refused_naming_both_versions(
     tmp_path: Path, former: Path, leads: str, monkeypatch: pytest.MonkeyPatch

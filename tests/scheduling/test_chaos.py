@@ -200,7 +200,7 @@ class Chaos:
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
-@settings(max_examples=times(80))
+@settings(max_examples=times(60))
 @given(st.data(), st.lists(st.tuples(st.sampled_from(OPS), st.integers(0, 11)), max_size=60))
 def test_promises_hold_in_any_chaos_and_in_the_end_all_are_served(
     strategy: StrategyName, draw: st.DataObject, ops: list[tuple[str, int]]

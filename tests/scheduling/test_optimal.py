@@ -91,7 +91,7 @@ def test_one_question_settles_a_set_that_an_rc_accepts() -> None:
     assert [len(one.holders) for one in proposed(effects)] == [8]
 
 
-@settings(max_examples=times(35))
+@settings(max_examples=times(18))
 @given(workloads(keep=False))
 def test_free_rcs_are_shared_out_as_by_trying_all(workload: Workload) -> None:
     """All ask at once; the RCs' own sums, not their votes, say which sets are ruled out."""

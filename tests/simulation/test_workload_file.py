@@ -212,6 +212,7 @@ def toml(workload: Workload) -> str:
     return "\n".join(lines)
 
 
+@settings(max_examples=times(50))
 @given(workloads())
 def test_whatever_is_written_is_read_back_the_same(workload: Workload) -> None:
     assert parse_workload(toml(workload), "w") == workload

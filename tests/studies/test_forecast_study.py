@@ -33,6 +33,7 @@ def test_near_is_within_a_fifth_of_what_was_told() -> None:
     assert accuracy([]).near == 0.0
 
 
+@pytest.mark.slow
 def test_who_learns_foretells_better_and_nobody_better_than_who_knows() -> None:
     trial = run(ForecastJob("calm", 0, "adaptive"))
     assert trial == run(ForecastJob("calm", 0, "adaptive"))

@@ -40,11 +40,13 @@ def test_staggered_every_policy_uses_all_hosts(policy: Policy) -> None:
         assert sum(counts) == NETS * NET_SIZE
 
 
+@pytest.mark.slow
 def test_pending_brings_the_load_curves_together() -> None:
     apart = {policy: sum(figure("simultaneous", policy, seed).apart() for seed in range(4)) for policy in POLICIES}
     assert apart["pending"] < apart["two_choices"] < apart["randomized"] < apart["least_loaded"]
 
 
+@pytest.mark.slow
 def test_unlike_machines_finish_a_mixed_batch_a_quarter_sooner() -> None:
     """Both the last end and the mean completion, means over the seeds."""
     setups: tuple[tuple[Metric, Policy], ...] = (BASELINE, ("composite", "pending"), ("auto", "pending"))
@@ -55,6 +57,7 @@ def test_unlike_machines_finish_a_mixed_batch_a_quarter_sooner() -> None:
         assert took[2] <= 0.75 * took[0]
 
 
+@pytest.mark.slow
 def test_a_seed_is_the_same_every_time() -> None:
     for metric, policy in BATCHES:
         assert batch(metric, policy, 3) == batch(metric, policy, 3)
@@ -68,7 +71,7 @@ def test_a_seed_is_the_same_every_time() -> None:
     [
         ("processor_speed", {"processor_speed"}),
         # Where nothing misleads `composite`, it ranks hosts exactly as the load does.
-        ("load_average", {"load_average", "composite"}),
+        pytest.param("load_average", {"load_average", "composite"}, marks=pytest.mark.slow),
         pytest.param("available_memory", {"available_memory"}, marks=pytest.mark.slow),
     ],
 )

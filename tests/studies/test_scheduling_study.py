@@ -185,7 +185,9 @@ def test_the_best_is_that_of_exhaustive_search() -> None:
         assert (first.best, first.behind) == (best, first.used < best), seed
 
 
-@pytest.mark.parametrize("name", ["paper", pytest.param("larger", marks=pytest.mark.slow), "narrow"])
+@pytest.mark.parametrize(
+    "name", ["paper", *(pytest.param(name, marks=pytest.mark.slow) for name in ("larger", "narrow"))]
+)
 def test_where_nothing_within_reach_is_idle_nothing_is_lost(name: str) -> None:
     """With one priority and no sharable RC this is a proof; the study must not contradict it."""
     found = [one for seed in range(2) for one in run(SchedulingJob(name, seed, "priority"), steps()).situations]
@@ -200,7 +202,7 @@ def test_where_nothing_within_reach_is_idle_nothing_is_lost(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "strategy"),
     [
-        pytest.param(name, strategy, marks=[pytest.mark.slow] * (strategy != "adaptive" and name not in SOON_PLAYED))
+        pytest.param(name, strategy, marks=[pytest.mark.slow] * (name not in SOON_PLAYED))
         for name in FAMILIES
         for strategy in STRATEGIES
     ],

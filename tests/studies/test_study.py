@@ -66,6 +66,7 @@ def test_in_a_pipe_it_prints_plain_tables(capsys: pytest.CaptureFixture[str]) ->
     assert re.search(r"^unreached +\+0\.\d\d$", shown.out, re.MULTILINE)
 
 
+@pytest.mark.slow
 def test_forecasts_are_held_against_what_came(capsys: pytest.CaptureFixture[str]) -> None:
     some = ("forecasts", "--family", "calm", "--seeds", "1", "--jobs", "1")
     assert study_here(*some, "--json") == 0

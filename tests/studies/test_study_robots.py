@@ -17,6 +17,7 @@ from tests.studies.tools import study_here
 LITTLE = ("robots", "--seconds", "1", "--seeds", "3-3", "--building", "living_room", "--jobs", "1")
 
 
+@pytest.mark.slow
 def test_json_has_the_figures_and_every_run_and_the_plots_are_written(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -27,6 +27,7 @@ def test_what_comes_with_zscout_is_installed_and_can_be_loaded() -> None:
     assert not is_movable(Component({}))
 
 
+@pytest.mark.slow
 def test_kinds_of_other_packages_are_seen_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert "still" not in installed_kinds()
     register_odd_kinds(tmp_path / "site")

@@ -70,6 +70,7 @@ def test_a_dark_rug_does_not_hide_anybody() -> None:
     assert outcome.hidden_at is None
 
 
+@pytest.mark.slow
 def test_every_act_is_one_that_a_packet_carries(story: list[Frame]) -> None:
     for frame in story:
         act = frame.act
@@ -82,6 +83,7 @@ def test_every_act_is_one_that_a_packet_carries(story: list[Frame]) -> None:
     assert {"search", "approach", "enter", "turn"} <= {frame.act.doing for frame in story}
 
 
+@pytest.mark.slow
 @settings(max_examples=times(4))
 @given(cuts=st.sets(st.integers(1, 400), min_size=1, max_size=4))
 def test_a_checkpoint_changes_nothing(story: list[Frame], cuts: set[int]) -> None:
@@ -188,6 +190,7 @@ def test_back_from_an_interruption_it_keeps_still_if_it_is_hidden_yet() -> None:
     assert loop.body.pose == place
 
 
+@pytest.mark.slow
 def test_moved_into_the_light_it_hides_again() -> None:
     loop = Loop(room(sofa(4.0)), Pose(3.2, 1.8, 0.2), Hider())
     assert loop.until_hidden(60).hidden

@@ -134,6 +134,7 @@ def test_the_end_of_its_output_goes_along(fleet: CliFleet) -> None:
     assert shown.endswith("\nModuleNotFoundError: No module named 'tests.behaviors.components.nowhere'\n")
 
 
+@pytest.mark.slow
 def test_what_is_done_soon_is_no_failure(fleet: CliFleet) -> None:
     done = fleet.zscout("start", "brief", "--set", "how=return", "--json")
     assert (done.returncode, done.stderr) == (0, "")

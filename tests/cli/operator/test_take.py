@@ -106,6 +106,7 @@ def test_who_shares_may_stay_and_equals_are_waited_for(fleet: CliFleet) -> None:
     end(peer)
 
 
+@pytest.mark.slow
 def test_a_take_that_must_wait_says_so_and_then_holds(fleet: CliFleet) -> None:
     peer = fleet.holder("peer", "robot/b", "--priority", "10")
     taker, lines = fleet.begun(

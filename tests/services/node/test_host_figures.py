@@ -164,6 +164,7 @@ def test_a_host_that_computes_is_seen_to(tmp_path: Path) -> None:
     assert 5 / (os.cpu_count() or 1) < meter.percent(1) <= 100
 
 
+@pytest.mark.slow
 def test_what_is_dear_to_measure_is_measured_less_often() -> None:
     calls = 0
 

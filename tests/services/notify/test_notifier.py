@@ -55,6 +55,7 @@ async def test_it_arrives_as_text_at_the_urls_and_at_the_user_concerned() -> Non
     assert "apprise" not in sys.modules
 
 
+@pytest.mark.slow
 async def test_apprise_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     telling = notifier(NotifyTable(("json://localhost",)))
     monkeypatch.setattr(apprise_process, "TIMEOUT", 0.001)
@@ -69,6 +70,7 @@ async def test_apprise_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch, capl
         notifier(NotifyTable(("json://localhost",)))
 
 
+@pytest.mark.slow
 async def test_what_is_refused_is_tried_again() -> None:
     with Receiver(refuses=2) as lab:
         telling = started(notifier(NotifyTable((lab.url,))))

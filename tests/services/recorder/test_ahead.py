@@ -161,6 +161,7 @@ def tells(*bookings: BookingView, after: float = 0) -> BookingsTold:
     return BookingsTold(NOW + after, list(bookings))
 
 
+@pytest.mark.slow
 def test_what_changes_is_said_once_and_what_stood_before_is_not(path: Path) -> None:
     survey = booked("survey", "robot/a", "radio/rf0")
     danger = [{"state": "open", "danger": "robot/* is gone", "bound": {"robot/*": "robot/b"}}, {"state": "open"}]

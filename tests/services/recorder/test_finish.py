@@ -30,6 +30,7 @@ def chunks(path: Path) -> int:
     return len(RrdReader(path).stream().to_chunks())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("until", "fewer"), [(5, 2), pytest.param(60, 8, marks=pytest.mark.slow)])
 def test_a_recording_that_is_over_has_few_chunks_and_all_that_was_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, until: int, fewer: int

@@ -167,6 +167,7 @@ def test_windows_follow_the_day_and_lamps_do_not() -> None:
         assert (max(gains) > 2 * min(gains)) == changes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("looks", [range(53, 68), pytest.param(range(100), marks=pytest.mark.slow)])
 def test_a_camera_that_stands_sees_what_one_does_that_has_just_come(looks: range) -> None:
     world, both, rng = World(shipped("office"), seed=3), 0, np.random.default_rng(4)

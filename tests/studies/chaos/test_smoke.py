@@ -38,6 +38,7 @@ def test_a_leader_is_killed_and_nothing_is_left() -> None:
     assert f"{net.PREFIX}{process.pid}" not in net.ip("netns", "list") + net.ip("link")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(bool(why_not), reason=why_not)
 def test_a_net_that_was_closed_is_gone_at_once() -> None:
     for _ in range(5):

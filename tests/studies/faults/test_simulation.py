@@ -76,6 +76,7 @@ def test_a_seed_is_one_run_to_the_byte_whatever_the_order_of_sets() -> None:
     assert said[0] == said[1]
 
 
+@pytest.mark.slow
 def test_a_run_leaves_nothing_in_memory() -> None:
     def left() -> int:
         gc.collect()
