@@ -114,7 +114,7 @@ def test_table_1_is_served_as_by_priority() -> None:
     assert adaptive.unserved == first.unserved == ()
 
 
-@settings(max_examples=times(40))
+@settings(max_examples=times(28))
 @given(workloads())
 def test_promises_hold_in_replay(workload: Workload) -> None:
     strategy = Adaptive()
@@ -129,7 +129,7 @@ def test_promises_hold_in_replay(workload: Workload) -> None:
     assert not ledger.open
 
 
-@settings(max_examples=times(40))
+@settings(max_examples=times(28))
 @given(workloads())
 def test_no_instant_ends_with_less_than_priority_would_give(workload: Workload) -> None:
     core = Core(Adaptive())

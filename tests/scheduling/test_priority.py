@@ -89,7 +89,7 @@ def test_table_1_of_the_paper_gives_its_table_2() -> None:
     assert shown == TABLE2
 
 
-@settings(max_examples=times(80))
+@settings(max_examples=times(50))
 @given(workloads())
 def test_replay_is_the_oracle_exactly(workload: Workload) -> None:
     ledger = Ledger(workload.rcs, [arrival.request for arrival in workload.arrivals])
@@ -102,7 +102,7 @@ def test_replay_is_the_oracle_exactly(workload: Workload) -> None:
     assert not ledger.open
 
 
-@settings(max_examples=times(80))
+@settings(max_examples=times(50))
 @given(workloads(), st.randoms(use_true_random=False))
 def test_votes_one_by_one_in_any_order_give_the_oracles_outcome(workload: Workload, order: Random) -> None:
     assert SlowPlayer(workload, order, linger=False).play() == oracle.play(workload, one_by_one=True)

@@ -27,6 +27,7 @@ async def test_a_device_begins_obeys_and_is_safe_in_the_end() -> None:
         assert arm.calls[-4:] == ["echo 7", "measure", "end weigh", "safe"]
 
 
+@pytest.mark.essential
 @in_virtual_time
 async def test_minutes_pass_at_once_and_priority_preempts() -> None:
     async with MemoryFleet({"arm/left": FakeDevice()}) as fleet:

@@ -101,6 +101,7 @@ async def test_who_can_not_be_reached_is_logged_once_without_its_url_and_holds_u
     assert Receiver.SECRET not in caplog.text
 
 
+@pytest.mark.slow
 async def test_what_is_too_much_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
     with Receiver() as lab:
         # It has not begun to send.

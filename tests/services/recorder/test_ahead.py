@@ -192,6 +192,7 @@ def test_what_changes_is_said_once_and_what_stood_before_is_not(path: Path) -> N
     ]
 
 
+@pytest.mark.slow
 def test_conflicts_and_danger_are_said_though_they_stood_before(path: Path) -> None:
     with Timeline("lab", path=path) as timeline:
         stuck = booked("stuck", "robot/a", dates=[{"state": "conflict", "danger": "crew of ws2 stands"}])
