@@ -60,10 +60,10 @@ def test_an_rc_that_answers_under_anothers_name_takes_nobodys_place() -> None:
         await asyncio.sleep(0.1)
         thief.publish()
         await asyncio.sleep(0.1)
-        real = rcm.membership.reported("robot/a")
+        real = rcm.roster.reported("robot/a")
         assert real is not None
         assert real.instance == "i1"
-        assert rcm.membership.reported("robot/x") is None
+        assert rcm.roster.reported("robot/x") is None
 
     run(story())
 

@@ -194,7 +194,7 @@ async def test_a_client_has_a_lease_to_show_itself_and_longer_where_the_leader_s
     await ghost.ask("first", "robot/a")
     await until(lambda: robot.arcs == ["first"])
     await asyncio.sleep(0.7 * lease)
-    stall = rcm.membership._absence._stall
+    stall = rcm._stall
     stall.length, stall.ended = round(0.6 * lease * SECOND), rcm.mesh.now()
     await asyncio.sleep(lease)
     assert robot.arcs == ["first"]
@@ -256,7 +256,7 @@ async def test_a_hand_over_is_one_publication_and_can_be_repeated() -> None:
 async def test_a_hold_that_is_adopted_and_displaced_in_one_instant_is_told_as_it_ended() -> None:
     fleet = FakeFleet()
     rcm, one, two = fleet.rcm(counter=5), fleet.client("one"), fleet.client("two")
-    await until(lambda: rcm.membership.clients.keys() >= {one.name, two.name})
+    await until(lambda: rcm.roster.clients.keys() >= {one.name, two.name})
     assert (await two.ask("next", "robot/a")).state == "queued"
     before, at = Term(4, "before"), rcm.mesh.now()
     kept = ArcRequest(f"{one.name}/id", one.name, {"robot/a": {}}, 0, SECOND, keep=True, label="tally")

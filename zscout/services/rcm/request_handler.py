@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Iterable, Mapping
-from functools import partial
 from typing import TypeAlias
 
 from msgspec.structs import replace
@@ -37,6 +36,7 @@ from zscout.messages import (
     duration,
     exact_amounts,
 )
+from zscout.rcm.roster import Change, Roster
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import (
@@ -59,7 +59,6 @@ from zscout.services.authority import Authority
 from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.devices import ExpectedDevices
 from zscout.services.rcm.door import check_door
-from zscout.services.rcm.membership import Membership
 from zscout.services.rcm.places import Places, arc_id, request_id
 from zscout.services.rcm.registry import RequestRegistry, party_info, reason_info
 from zscout.types import SECOND, ArcId, ClientId, Place, RcName
@@ -84,21 +83,23 @@ class RequestHandler:
         fleet: Fleet,
         core: Core,
         registry: RequestRegistry,
-        membership: Membership,
+        roster: Roster,
         devices: ExpectedDevices,
         authority: Authority,
         places: Places,
         supervisor: Supervisor,
         emit: Callable[..., None],
+        follow: Callable[[Change], None],
     ) -> None:
         self.mesh, self.limits, self.core, self._devices = mesh, fleet.limits, core, devices
         self._authority, self._places = authority, places
         self._knows_all = mesh.now() + fleet.timing.hold_lease
         """From when on an RC that was not seen yet is none of this fleet."""
         self._first_answer_timeout = fleet.timing.vote_timeout / SECOND + REPLY_SLACK
-        self._registry, self._membership, self._supervisor = registry, membership, supervisor
+        self._registry, self._roster, self._supervisor = registry, roster, supervisor
         self._strange = SparseLog(log, mesh.now)
         self._flush_guarded = supervisor.guard(self.flush)
+        self._follow = follow
         self._emit = emit
         """Takes the events of one instant."""
         self.bookings: Bookings
@@ -116,15 +117,15 @@ class RequestHandler:
         self.believed: Mapping[ArcId, Collection[RcName]] = {}
         """Of what waited as the lead was taken: the RCs that its client believed to hold."""
         self._lease = fleet.mesh.lease
-        membership.on_settled = self._resume
         registry.may_be_held = self._may_be_held
-        self._moving: dict[Query, None] = {}
-        """Hand-overs that wait until it is known whether their new client is there."""
+        self._moving: dict[int, tuple[Query, HandOver, ClientId, ClientId]] = {}
+        """Hand-overs that wait until it is known whether their new client is there, by number."""
+        self._moved = 0
 
     def close(self) -> None:
         """Refuses what still waits: another RCM has to be asked."""
         for query in (
-            *self._moving,
+            *(moving[0] for moving in self._moving.values()),
             *self._deferred,
             *(query for queries in self.waiting.values() for query in queries),
         ):
@@ -135,7 +136,7 @@ class RequestHandler:
     def on_operation(self, query: Query) -> None:
         sender = self.mesh.keys.sender_of(query.key)
         client = str(sender)
-        self._membership.heard(client)
+        self._follow(self._roster.heard(self.mesh.now(), client))
         operation = query.message
         check_name(operation.id, "id")
         match operation:
@@ -152,13 +153,13 @@ class RequestHandler:
 
     def _ask(self, query: Query, ask: Ask, sender: Sender, client: ClientId) -> None:
         if ask.term is not None and ask.term > self.core.term:
-            seen = client if client in self._membership.clients else None
-            self._membership.see(ask.term, obeyed_by=seen)
+            seen = client if client in self._roster.clients else None
+            self._follow(Change(higher=[(ask.term, seen)]))
             raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
         arc = arc_id(client, ask.id)
         self._keep_order(arc)
         self._authority.check_ask(sender, ask, lambda names: self._open_of(names, arc))
-        undecided = self._may_hold(arc, ask) and self._membership.awaits(arc, ask.rcs)
+        undecided = self._may_hold(arc, ask) and self._roster.awaits(self.mesh.now(), arc, ask.rcs)
         undecided = undecided or bool(ask.booking and not self.bookings.settled)
         if undecided and len(self._deferred) < MAX_BATCH:
             self._defer(query)
@@ -211,7 +212,7 @@ class RequestHandler:
         if ask.place is None:
             return None
         check_place(ask.place, self.core)
-        seen = client in self._membership.clients
+        seen = client in self._roster.clients
         if self._places.may_claim(ask.place, client, ask.was or ask.id, ask.seal, seen=seen):
             if self._places.takes_the_word_for(ask.place):
                 told = "%s shows a place of term %d that is not known here: it has it"
@@ -223,12 +224,10 @@ class RequestHandler:
     def check_door(self, needs: Mapping[str, Amounts], *, waits: bool = False, may_wait: bool = True) -> None:
         """Raises Refused for what can never start."""
         waits = waits or self.mesh.now() < self._knows_all
-        check_door(
-            needs, self._devices.names, self._membership.is_known, self._parameters, waits=waits, may_wait=may_wait
-        )
+        check_door(needs, self._devices.names, self._roster.is_known, self._parameters, waits=waits, may_wait=may_wait)
 
     def _parameters(self, rc: RcName) -> Parameters | None:
-        state = self._membership.reported(rc)
+        state = self._roster.reported(rc)
         return state.parameters if state is not None else self._devices.parameters(rc)
 
     def _may_hold(self, arc: ArcId, ask: Ask) -> bool:
@@ -240,7 +239,11 @@ class RequestHandler:
 
     def _may_be_held(self, arc: ArcId) -> bool:
         known = self.core.arc(arc)
-        return known is not None and known.hold is None and self._membership.awaits(arc, self.believed.get(arc, ()))
+        return (
+            known is not None
+            and known.hold is None
+            and self._roster.awaits(self.mesh.now(), arc, self.believed.get(arc, ()))
+        )
 
     def _standing(self, arc: ArcId, ask: Ask) -> Notice:
         """How an open ARC stands, for a client that may not have heard how its last hold ended."""
@@ -250,9 +253,9 @@ class RequestHandler:
 
     def _defer(self, query: Query) -> None:
         self._deferred[query] = None
-        self._supervisor.call_later(self._lease, self._resume)
+        self._supervisor.call_later(self._lease, self.resume)
 
-    def _resume(self) -> None:
+    def resume(self) -> None:
         """Looks again at what was asked by clients that believe to hold."""
         deferred, self._deferred = self._deferred, {}
         for query in deferred:
@@ -419,17 +422,19 @@ class RequestHandler:
             return
         if len(self._moving) >= MAX_BATCH:
             raise Refused("busy", f"{MAX_BATCH} hand-overs already wait here; try again")
-        self._moving[query] = None
-        self._membership.find(to, partial(self._on_new_client, query, operation, sender, to))
+        self._moved += 1
+        self._moving[self._moved] = query, operation, sender, to
+        self._follow(self._roster.seek(self.mesh.now(), to, self._moved))
 
-    def _on_new_client(self, query: Query, operation: HandOver, sender: ClientId, to: ClientId, found: bool) -> None:
+    def on_new_client(self, number: int, *, found: bool) -> None:
+        """It is known whether the new client of a hand-over has a token."""
+        query, operation, sender, to = self._moving.pop(number)
         try:
             if not found:
                 raise Refused("unknown_client", f"{to} is not on the mesh")
             self._hand_over(query, operation, sender, to)
         except Refused as refused:
             query.refuse(refused.problem)
-        self._moving.pop(query, None)
 
     def _hand_over(self, query: Query, operation: HandOver, sender: ClientId, to: ClientId) -> None:
         """All in one batch of events, and so in one publication: nobody gets in between."""
