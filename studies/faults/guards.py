@@ -26,6 +26,8 @@ from zscout.drivers.resource_controller import ResourceController
 from zscout.mesh.renewal import Suspicions
 from zscout.messages import BookingRecord, Problem
 from zscout.rcm import roster
+from zscout.rcm.places import Places
+from zscout.rcm.request_log import RequestLog
 from zscout.rcm.roster import Roster
 from zscout.scheduling.claims import Claims
 from zscout.scheduling.model import ArcRequest
@@ -38,10 +40,7 @@ from zscout.services.rcm.booked_dates import BookedDates
 from zscout.services.rcm.booking_sharing import BookingSharing
 from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.election import Election
-from zscout.services.rcm.places import Places
 from zscout.services.rcm.rcm import Rcm
-from zscout.services.rcm.registry import RequestRegistry
-from zscout.services.rcm.request_handler import RequestHandler
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
 
 ABSENT: Final = object()
@@ -245,7 +244,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "deposed": Guard("who was deposed waits longer each time", {(Election, "deposed"): _nothing}),
         "step down": Guard("a leader that sees a higher term steps down", {(candidate.Candidate, "_see"): _yes}),
         "away": Guard("a leader that was away itself drops nobody for it", {(Roster, "_was_away"): _no}),
-        "reopen": Guard("who was dropped and lives goes on at its place", {(RequestRegistry, "reopens"): _no}),
+        "reopen": Guard("who was dropped and lives goes on at its place", {(RequestLog, "reopens"): _no}),
         "places": Guard("a client shows the place that it had", {(OpenArc, "_as_asked"): _without_place}),
         "claims": Guard("of the ARCs that claim one place one runs", {(SchedulerState, "_is_first"): _yes}),
         "unheard": Guard("what had its time unheard is asked for anew", {(RequestStore, "_ask_anew"): _nothing}),
@@ -259,11 +258,10 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
             "what was handed over stays the old client's until the new one has heard of it",
             {(MovableClient, "_awaited_by"): _none_async},
         ),
-        "ids": Guard("a request that has ended is not entered again", {(RequestRegistry, "ended"): _no}),
+        "ids": Guard("a request that has ended is not entered again", {(RequestLog, "ended"): _no}),
         "links": Guard("a session in contradiction is opened anew", {(Suspicions, "suspect"): _nothing}),
         "believed": Guard(
-            "who believes in a hold is not told to wait before its RCs could say so",
-            {(RequestHandler, "_may_be_held"): _no},
+            "who believes in a hold is not told to wait before its RCs could say so", {(RequestLog, "may_be_held"): _no}
         ),
         "beside": Guard("what its RCs do not confirm ends the body", {(Confirmations, "_give_back"): _nothing}),
         "settling": Guard("an RC settles before the next holder begins", {(HoldTable, "settles"): _nothing}),

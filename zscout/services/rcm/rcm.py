@@ -21,9 +21,11 @@ from msgspec.structs import replace
 
 from zscout import messages, trace
 from zscout.config.fleet import Fleet
-from zscout.keyexpr import Role, Token
+from zscout.keyexpr import Role, Token, client_of
 from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError, Reply, Tally
 from zscout.mesh.supervision import StallWatch, Supervisor
+from zscout.rcm.places import Places, arc_id, client_id, request_id
+from zscout.rcm.request_log import REMEMBERED, RequestLog, reason_info
 from zscout.rcm.roster import Ask, Change, Roster, discrepancies
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
@@ -59,9 +61,7 @@ from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.digest import HoldDigest, HoldListener
 from zscout.services.rcm.inventory import Inventory
-from zscout.services.rcm.places import Places, client_id, request_id
 from zscout.services.rcm.recovery import RecoveredState
-from zscout.services.rcm.registry import REMEMBER, RequestRegistry, reason_info
 from zscout.services.rcm.request_handler import RequestHandler
 from zscout.types import SECOND, VERSION, ArcId, ClientId, Ns, RcName, Term
 
@@ -116,17 +116,14 @@ class Rcm:
         self.on_disbelieved: Callable[[RcName, Term], object] = lambda *_: None
         """Called when no RC has joined, and one obeys an RCM of so low a term that this one is none to it."""
         self.places = places or Places(fleet.name, None, term)
-        self.registry = RequestRegistry(mesh, self.core, term, supervisor, self.places)
-        self._runtimes = self.registry.runtimes = runtimes
+        self._runtimes = runtimes
         self._own_inventory = inventory is None
         self.inventory = inventory or Inventory(mesh, fleet)
         devices = self.inventory.devices
         self.roster = Roster(mesh.keys, mesh.me.host, fleet, term, devices, mesh.now())
         self._stall = StallWatch(mesh.now)
-        self.registry.hosts_of = self.roster.hosts_of
+        self.registry = RequestLog(self.core, self.roster, self.places, runtimes)
         self._digest = HoldDigest(self.core, listeners) if listeners else None
-        if self._digest is not None:
-            self.registry.on_foretold = self._digest.foretell
         self._tally = tally
         self.requests = RequestHandler(
             mesh,
@@ -140,6 +137,7 @@ class Rcm:
             supervisor,
             receive,
             self._follow,
+            runtimes,
         )
         self.bookings = self.requests.bookings = Bookings(
             mesh,
@@ -186,14 +184,15 @@ class Rcm:
         now = self._look()
         joined = self.roster.start(now, recovered.rcs.values(), recovered.pending, patient=recovered.patient)
         for arc in recovered.given_up:
-            self.registry.give_up(arc, Outcome.RELEASED)
+            self.registry.give_up(now, arc, Outcome.RELEASED)
         requests = [*(hold.request for hold in recovered.holds), *(one.request for one in recovered.waiting)]
         for request in requests:
             self.registry.enter(request.arc, request.name)
             self.roster.expect(now, request.client)
             if request.client not in recovered.answered:
                 self._recover(request)
-        self.requests.believed = recovered.believed
+        for arc, rcs in recovered.believed.items():
+            self.registry.believe(arc, rcs)
         waiting = (replace(one, request=self.bookings.dates.dated(one.request)) for one in recovered.waiting)
         certain = 0 if self.bookings.settled else self.bookings.settles_at
         lead = LeadTaken(self.term, tuple(recovered.holds), tuple(waiting), recovered.charged, certain)
@@ -207,7 +206,7 @@ class Rcm:
         limit = self.fleet.limits.max_payload
         self._declared = [
             mesh.serve(
-                keys.schedule_any, messages.Operation, guard(self.requests.on_operation), limit=limit, tally=self._tally
+                keys.schedule_any, messages.Operation, guard(self._on_operation), limit=limit, tally=self._tally
             ),
             mesh.serve(keys.rcm_state, messages.StateAsk, guard(self._on_state_asked)),
             mesh.subscribe(keys.rc_state_any, messages.RcState, guard(self._on_rc_state)),
@@ -228,7 +227,7 @@ class Rcm:
         self.supervisor.cancel()
         if self._own_inventory:
             self.inventory.stop()
-        self.registry.close()
+        self._log(self.registry.close(self.mesh.now()))
         self.bookings.close()
         self.requests.close()
         self._grants.close()
@@ -246,6 +245,14 @@ class Rcm:
         stall, fresh = self._stall, self._stall.fresh()
         self.roster.stalled(stall.length, stall.ended, fresh=fresh)
         return self.mesh.now()
+
+    def _on_operation(self, query: IncomingQuery[messages.Operation]) -> None:
+        self.requests.on_operation(query)
+        self._send_notices()
+
+    def _send_notices(self) -> None:
+        notices, self.requests.notices = self.requests.notices, []
+        self._notify(notices)
 
     def _on_rc_state(self, key: str, state: messages.RcState) -> None:
         self._follow(self.roster.rc_state(self._look(), key, state))
@@ -274,8 +281,10 @@ class Rcm:
             self._on_requests(listed.client, {request.id for request in listed.requests})
         for number, found in change.found:
             self.requests.on_new_client(number, found=found)
+            self._send_notices()
         if change.settled:
             self.requests.resume()
+            self._send_notices()
         for asked in change.questions:
             self.supervisor.spawn(self._ask(asked))
         for sign, so in change.suspicions:
@@ -336,19 +345,22 @@ class Rcm:
         over = self.registry.ended
         events = [one for one in events if not (isinstance(one, Adopted) and over(one.held.request.arc))]
         effects = self.core.handle(self.mesh.now(), *events)
+        now = self.mesh.now()
         told = self.requests.answer_grants(effects)
         if not any(isinstance(event, CONTINUED) for event in events):
-            told |= self.registry.tell_grants(effects, told)
+            notices = self.registry.grants(now, effects, told)
+            told |= self._notify(notices)
         self._publish(effects, named)
         self._note(events)
-        self.registry.report(effects, told | self.requests.waiting.keys(), self.requests.given_up)
+        answered = told | self.requests.waiting.keys()
+        self._notify(self.registry.report(now, effects, answered, self.requests.given_up))
         self.requests.answer(effects)
         for effect in effects:
             match effect:
                 case Dropped(arc=arc, outcome=outcome) | HoldEnded(arc=arc, outcome=outcome) if not self.core.is_open(
                     arc
                 ):
-                    self.places.end(arc, self.mesh.now(), KEPT.get(outcome, REMEMBER))
+                    self.places.end(arc, now, KEPT.get(outcome, REMEMBERED))
                 case Propose():
                     self._propose(effect)
                 case WakeAt(at):
@@ -358,7 +370,26 @@ class Rcm:
             log.info("%s", line)
         if self._digest is not None:
             # All who wait for an answer have it by now.
-            self._digest.take(self.mesh.now(), events, effects)
+            self._digest.take(now, events, effects, self.registry.foretold)
+        self._trace()
+
+    def _notify(self, notices: Iterable[messages.Notice]) -> set[ArcId]:
+        """Send notices to their clients; return their ARCs."""
+        notified = set()
+        for notice in notices:
+            self.mesh.put(self.mesh.keys.notice(client_of(notice.client)), notice)
+            notified.add(arc_id(notice.client, notice.id))
+        return notified
+
+    def _trace(self) -> None:
+        if trace.enabled():
+            for did, arc in self.registry.traced:
+                trace.write(self.mesh.now(), did, term=self.term, arc=arc)
+        self.registry.traced.clear()
+
+    def _log(self, text: str) -> None:
+        if text:
+            log.info("%s", text)
 
     def _note(self, events: Iterable[Event]) -> None:
         """What is remembered of an instant."""
@@ -371,7 +402,7 @@ class Rcm:
                 case Requested(request):
                     self._bind(request.arc)
                     asked = f"asked for {', '.join(sorted(request.needs))} at priority {request.priority}"
-                    self.registry.record(request.arc, asked)
+                    self.registry.record(now, request.arc, asked)
                 case PlaceShown(arc) | HandedOver(renamed=arc):
                     self._bind(arc)
                 case Adopted(RecoveredHold(ArcRequest(client=client) as request)) if self.core.arc(request.arc):
@@ -391,7 +422,7 @@ class Rcm:
         """Sets when the core is woken. A timer that is set for earlier stays, and is set again when it goes off: most
         ends are put off before they come."""
         self._core_wake = at
-        at = min((time for time in (at, self.roster.next) if time is not None), default=None)
+        at = min((time for time in (at, self.roster.next, self.registry.next) if time is not None), default=None)
         if at is None or (self._wake is not None and self._armed <= at):
             return
         if self._wake is not None:
@@ -406,6 +437,9 @@ class Rcm:
             self._follow(self.roster.tick(now))
         if self._core_wake is not None and self._core_wake <= now:
             self._receive(Tick())
+        notices, text = self.registry.tick(now)
+        self._notify(notices)
+        self._log(text)
         self._set_wake(self._core_wake)
 
     # Out: grants
@@ -521,12 +555,12 @@ class Rcm:
         me = self.mesh.me.host
         state = messages.RcmState(self.term, self.seq, me, holds, instances=instances, version=VERSION)
         if not asked.holds_only:
-            starts = self.registry.starts() if asked.forecast else {}
+            starts = self.registry.starts(now) if asked.forecast else {}
             state = replace(
                 state,
                 queue=[_wait_view(arc, now, starts.get(arc.id)) for arc in status.queued],
                 rcs=self._devices(status, now),
-                story=self.registry.story(asked.arc) if asked.arc is not None else [],
+                story=self.registry.story(now, asked.arc) if asked.arc is not None else [],
                 more=status.waiting - len(status.queued),
                 charged=self.core.charged(),
             )

@@ -36,6 +36,8 @@ from zscout.messages import (
     duration,
     exact_amounts,
 )
+from zscout.rcm.places import Places, arc_id, request_id
+from zscout.rcm.request_log import RequestLog, party_info, reason_info
 from zscout.rcm.roster import Change, Roster
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
@@ -55,12 +57,11 @@ from zscout.scheduling.model import (
     Unconfirmed,
 )
 from zscout.scheduling.reason import ITS_CLIENT, Party, named
+from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.services.authority import Authority
 from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.devices import ExpectedDevices
 from zscout.services.rcm.door import check_door
-from zscout.services.rcm.places import Places, arc_id, request_id
-from zscout.services.rcm.registry import RequestRegistry, party_info, reason_info
 from zscout.types import SECOND, ArcId, ClientId, Place, RcName
 
 log = logging.getLogger(__name__)
@@ -82,7 +83,7 @@ class RequestHandler:
         mesh: Mesh,
         fleet: Fleet,
         core: Core,
-        registry: RequestRegistry,
+        registry: RequestLog,
         roster: Roster,
         devices: ExpectedDevices,
         authority: Authority,
@@ -90,6 +91,7 @@ class RequestHandler:
         supervisor: Supervisor,
         emit: Callable[..., None],
         follow: Callable[[Change], None],
+        runtimes: RuntimeEstimator | None,
     ) -> None:
         self.mesh, self.limits, self.core, self._devices = mesh, fleet.limits, core, devices
         self._authority, self._places = authority, places
@@ -99,7 +101,9 @@ class RequestHandler:
         self._registry, self._roster, self._supervisor = registry, roster, supervisor
         self._strange = SparseLog(log, mesh.now)
         self._flush_guarded = supervisor.guard(self.flush)
-        self._follow = follow
+        self._follow, self._runtimes = follow, runtimes
+        self.notices: list[Notice] = []
+        """To be sent, once the caller takes them."""
         self._emit = emit
         """Takes the events of one instant."""
         self.bookings: Bookings
@@ -114,10 +118,7 @@ class RequestHandler:
         """Operations of the present burst that are not decided yet."""
         self._deferred: dict[Query, None] = {}
         """Asked by clients that believe to hold, or handed over by them, while their RCs have not said so."""
-        self.believed: Mapping[ArcId, Collection[RcName]] = {}
-        """Of what waited as the lead was taken: the RCs that its client believed to hold."""
         self._lease = fleet.mesh.lease
-        registry.may_be_held = self._may_be_held
         self._moving: dict[int, tuple[Query, HandOver, ClientId, ClientId]] = {}
         """Hand-overs that wait until it is known whether their new client is there, by number."""
         self._moved = 0
@@ -175,7 +176,7 @@ class RequestHandler:
                 self._emit(Reachable(arc))
             query.answer(self._standing(arc, ask))
         elif self._registry.ended(arc) and not self._registry.reopens(arc, ask.grant if ask.unserved else None):
-            query.answer(self._registry.notice(arc))
+            query.answer(self._registry.notice(self.mesh.now(), arc))
         elif self._goes_on_elsewhere(ask):
             query.answer(self._registry.handed_over(arc, ask.arc))
         else:
@@ -237,19 +238,11 @@ class RequestHandler:
         known = self.core.arc(arc)
         return (known is None or known.hold is None) and not self._registry.ended(arc)
 
-    def _may_be_held(self, arc: ArcId) -> bool:
-        known = self.core.arc(arc)
-        return (
-            known is not None
-            and known.hold is None
-            and self._roster.awaits(self.mesh.now(), arc, self.believed.get(arc, ()))
-        )
-
     def _standing(self, arc: ArcId, ask: Ask) -> Notice:
         """How an open ARC stands, for a client that may not have heard how its last hold ended."""
         if ask.grant is not None and not ask.unconfirmed and not ask.unserved and self.core.is_queued(arc):
-            return self._registry.interrupted(arc, ask.grant)
-        return self._registry.notice(arc)
+            return self._registry.interrupted(self.mesh.now(), arc, ask.grant)
+        return self._registry.notice(self.mesh.now(), arc)
 
     def _defer(self, query: Query) -> None:
         self._deferred[query] = None
@@ -275,7 +268,9 @@ class RequestHandler:
             if operation.left:
                 self.left.add(arc)
             if not self.core.is_open(arc):
-                self._registry.give_up(arc, Outcome.CANCELLED if isinstance(operation, Cancel) else Outcome.RELEASED)
+                self._registry.give_up(
+                    self.mesh.now(), arc, Outcome.CANCELLED if isinstance(operation, Cancel) else Outcome.RELEASED
+                )
         event = Cancelled if isinstance(operation, Cancel) else Released
         who = self._authority.known_as(sender, operation.who)
         by = str(sender) if who is None else named(who, str(sender), operation.id)
@@ -322,7 +317,7 @@ class RequestHandler:
         request = admit(asked, str(sender), arc, self.core, self.limits)
         if asked.check:
             self.check_door(asked.needs, waits=asked.wait_for_device)
-        expected = forecast(self.core, now, request, self._registry.runtimes)
+        expected = forecast(self.core, now, request, self._runtimes)
         start = expected.starts.get(arc)
         victims = [known.request for known in map(self.core.arc, expected.preempts) if known is not None]
         query.answer(
@@ -397,7 +392,7 @@ class RequestHandler:
     def _answer(self, arcs: Iterable[ArcId]) -> None:
         for arc in arcs:
             if queries := self.waiting.pop(arc, None):
-                notice = self._registry.notice(arc)
+                notice = self._registry.notice(self.mesh.now(), arc)
                 for query in queries:
                     query.answer(notice)
 
@@ -408,7 +403,8 @@ class RequestHandler:
         for other in operation.others:
             check_name(other, "id")
         arcs = [arc_id(sender, one) for one in (operation.id, *operation.others)]
-        if any(self._may_be_held(arc) for arc in arcs) and len(self._deferred) < MAX_BATCH:
+        now = self.mesh.now()
+        if any(self._registry.may_be_held(now, arc) for arc in arcs) and len(self._deferred) < MAX_BATCH:
             self._defer(query)
             return
         self.flush()
@@ -455,14 +451,15 @@ class RequestHandler:
             lambda names: self._held_by(names, *replaced),
         )
         for move in moves:
-            self._registry.enter(move.renamed, self._registry.name(move.arc))
+            self._registry.rename(move.arc, move.renamed)
         places = {move.renamed: place for move in moves if (place := self.core.place_of(move.arc)) is not None}
         shown = [
             PlaceShown(arc, place) for arc, place in places.items() if self.core.place_of(arc) not in (None, place)
         ]
         self._emit(*shown, *moves)
-        self._registry.publish(move.renamed for move in moves if self.core.is_queued(move.renamed))
-        query.answer(self._registry.notice(moves[0].renamed))
+        queued = [move.renamed for move in moves if self.core.is_queued(move.renamed)]
+        self.notices += self._registry.present(self.mesh.now(), queued)
+        query.answer(self._registry.notice(self.mesh.now(), moves[0].renamed))
 
     def _check_room_for(self, moves: Collection[HandedOver], sender: ClientId, to: ClientId) -> None:
         added = sum(self.core.arc(move.renamed) is None for move in moves)
@@ -496,8 +493,9 @@ class RequestHandler:
         if self.core.arc(goal) is None and not over:
             raise Refused("not_running", f"{operation.id} is not open at {sender}")
         # The new client may have missed it, where the RCM changed just then.
-        self._registry.publish(arc_id(to, one) for one in (operation.id, *operation.others))
-        query.answer(self._registry.notice(goal))
+        arcs = [arc_id(to, one) for one in (operation.id, *operation.others)]
+        self.notices += self._registry.present(self.mesh.now(), arcs)
+        query.answer(self._registry.notice(self.mesh.now(), goal))
 
 
 def check_place(place: Place, core: Core) -> None:
