@@ -17,7 +17,7 @@ from zscout.config.devices import SETTLE
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Keys, Role, Token, client_of
 from zscout.messages import ClientRequests, Problem, RcAsk, RcState, disbelieved
-from zscout.rcm.timers import Timers
+from zscout.rcm.deadlines import Deadlines
 from zscout.scheduling.model import Adopted, ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
 from zscout.services.rcm.devices import ExpectedDevices
 from zscout.services.rcm.recovery import aged, gangs_of, recover
@@ -44,7 +44,7 @@ MAX_WITNESSES: Final = 3
 """Hosts that are asked whether this one is away."""
 
 
-class Ask(NamedTuple):
+class Question(NamedTuple):
     """A question to the mesh. The first answer, or none within `timeout` seconds, goes to `Roster.answered`; the tokens
     on `key`, where `kind` is None, to `Roster.seen`."""
 
@@ -100,7 +100,7 @@ class Change:
     """By number of `seek`: whether the client has a token."""
     settled: bool = False
     """RCs are no longer pending."""
-    questions: list[Ask] = field(default_factory=list)
+    questions: list[Question] = field(default_factory=list)
     suspicions: list[tuple[str, bool]] = field(default_factory=list)
     """Contradictions of the mesh, and those that are over."""
     duplicates: list[tuple[RcName, HostName]] = field(default_factory=list)
@@ -166,7 +166,7 @@ class Roster:
         self._gone_hosts: deque[tuple[Ns, HostName]] = deque()
         """Hosts whose last tokens disappeared recently, and when."""
         self._away_until: Ns = 0
-        self._deadlines: Timers[tuple[_Due, Any]] = Timers()
+        self._deadlines: Deadlines[tuple[_Due, Any]] = Deadlines()
         self._numbers = 0
         self._now = now
         self._change = Change()
@@ -260,14 +260,14 @@ class Roster:
         return self._taken()
 
     def ask_requests(self, now: Ns, client: ClientId) -> Change:
-        """Ask a client for its requests, until it answers or is gone."""
+        """Question a client for its requests, until it answers or is gone."""
         self._now = now
         if client not in self._asked:
             self._asked.add(client)
             self._ask_client(client)
         return self._taken()
 
-    def answered(self, now: Ns, asked: Ask, message: Any, problem: Problem | None) -> Change:
+    def answered(self, now: Ns, asked: Question, message: Any, problem: Problem | None) -> Change:
         """The first answer to a question. Without `message` and `problem` there was none."""
         self._now = now
         silent = message is None and problem is None
@@ -294,7 +294,7 @@ class Roster:
                 self._present()
         return self._taken()
 
-    def seen(self, now: Ns, asked: Ask, tokens: Sequence[Token]) -> Change:
+    def seen(self, now: Ns, asked: Question, tokens: Sequence[Token]) -> Change:
         """The tokens of a query of the mesh."""
         self._now = now
         if asked.why is Why.SOUGHT:
@@ -388,7 +388,7 @@ class Roster:
             key = self._keys.requests(client_of(client))
             self._ask(Why.OVERDUE, key, kind=ClientRequests, client=client, number=number)
 
-    def _shown_late(self, asked: Ask) -> None:
+    def _shown_late(self, asked: Question) -> None:
         """A client without a token answers, or its session is seen."""
         if self._unshown.get(asked.client) == asked.number:
             self._suspect(self._keys.requests(client_of(asked.client)))
@@ -405,7 +405,7 @@ class Roster:
             return
         absent = message is None and problem is None
         self._change.suspicions.append((silent, absent and client in self.clients))
-        self._set(self._timeout, _Due.AGAIN, Ask(Why.REQUESTS, "", 0, client=client))
+        self._set(self._timeout, _Due.AGAIN, Question(Why.REQUESTS, "", 0, client=client))
 
     def _lose_client(self, client: ClientId) -> None:
         self._unshown.pop(client, None)
@@ -461,7 +461,7 @@ class Roster:
             # Of several lost links one is the first.
             self._away_until = now + self._lease
             for key, kind in witnesses:
-                self._change.questions.append(Ask(Why.WITNESS, key, PRESENT_WITHIN, kind=kind))
+                self._change.questions.append(Question(Why.WITNESS, key, PRESENT_WITHIN, kind=kind))
         return now < self._away_until
 
     def _present(self) -> None:
@@ -507,10 +507,10 @@ class Roster:
         if not fresh or len(self._probed) < MAX_PROBED:
             self._probed[key] = MAX_PROBES
             if fresh:
-                asked = Ask(Why.PROBE, key, self._timeout / SECOND, kind=kind, client=client, token=token)
+                asked = Question(Why.PROBE, key, self._timeout / SECOND, kind=kind, client=client, token=token)
                 self._set(PROBE_PERIOD, _Due.AGAIN, asked)
 
-    def _is_seen(self, asked: Ask) -> bool:
+    def _is_seen(self, asked: Question) -> bool:
         """Return True if the client or RC that is probed shows a token again."""
         return asked.client in self.clients if asked.token is None else bool(self._rc(asked.token.name).tokens)
 
@@ -612,7 +612,7 @@ class Roster:
         promised = isinstance(state, RcState) and (state.rc, state.instance) == (token.name, token.instance)
         if not promised or state.term < self.term:  # a report from before the promise
             # An answer without a promise can come at once, again and again: a token may outlive its RC.
-            self._set(self._timeout, _Due.AGAIN, Ask(Why.PROMISE, "", 0, token=token))
+            self._set(self._timeout, _Due.AGAIN, Question(Why.PROMISE, "", 0, token=token))
         elif any(holder.grant.term != self.term for holder in state.holders):
             # A hold that all RCs of its gang report continues: they join together.
             self._hold_up(state, patient=True)
@@ -722,7 +722,7 @@ class Roster:
         self._change.suspicions.append((f"{key} answers, and its token is missing", so))
 
     def _ask(self, why: Why, key: str, **how: Any) -> None:
-        self._change.questions.append(Ask(why, key, self._timeout / SECOND, **how))
+        self._change.questions.append(Question(why, key, self._timeout / SECOND, **how))
 
     def _ask_rc(self, why: Why, token: Token) -> None:
         message = RcAsk(promise=self.term, instance=token.instance)
@@ -740,7 +740,7 @@ class Roster:
             self._asked.discard(client)
             self._change.suspicions.append((f"{client} is seen and does not answer", False))
 
-    def _ask_again(self, asked: Ask) -> None:
+    def _ask_again(self, asked: Question) -> None:
         if asked.why is Why.REQUESTS:
             self._ask_client(asked.client)
         elif asked.why is Why.PROMISE and asked.token is not None:

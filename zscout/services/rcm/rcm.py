@@ -26,7 +26,7 @@ from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError, Reply, Tall
 from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.rcm.places import Places, arc_id, client_id, request_id
 from zscout.rcm.request_log import REMEMBERED, RequestLog, reason_info
-from zscout.rcm.roster import Ask, Change, Roster, discrepancies
+from zscout.rcm.roster import Change, Question, Roster, discrepancies
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     Adopted,
@@ -293,7 +293,7 @@ class Rcm:
             log.warning("duplicate device %s at %s; another host's is used", rc, host)
         self._set_wake(self._core_wake)
 
-    async def _ask(self, asked: Ask) -> None:
+    async def _ask(self, asked: Question) -> None:
         if asked.kind is None:
             tokens = await self.mesh.living(asked.key, timeout=asked.timeout)
             self._follow(self.roster.seen(self._look(), asked, tokens))
@@ -350,6 +350,7 @@ class Rcm:
         if not any(isinstance(event, CONTINUED) for event in events):
             notices = self.registry.grants(now, effects, told)
             told |= self._notify(notices)
+        self._trace()
         self._publish(effects, named)
         self._note(events)
         answered = told | self.requests.waiting.keys()

@@ -11,7 +11,7 @@ from zscout.types import Ns
 T = TypeVar("T")
 
 
-class Timers(Generic[T]):
+class Deadlines(Generic[T]):
     """A value whose reason is gone is ignored when it is due: nothing is cancelled."""
 
     def __init__(self) -> None:
