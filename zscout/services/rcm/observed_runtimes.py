@@ -1,5 +1,5 @@
-"""Learns how long holds last from what the leader publishes, as every candidate hears it, and from the own journal: so
-who begins to lead knows what the others know."""
+"""Learns how long holds last from the leader's publications, which every candidate receives, and from the journal: a
+new leader knows as much as the last."""
 
 from __future__ import annotations
 
