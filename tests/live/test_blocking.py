@@ -117,7 +117,7 @@ def test_a_sleep_is_interrupted_when_the_hold_is_preempted(fleet: CliFleet) -> N
     take(fleet, "robot/a", "--priority", "5")
     told, restored = rest_of(survey)
     assert told.startswith("preempted False | ")
-    assert held_by("request") in told
+    assert held_by("taker") in told
     assert restored == "restored True"
     assert fleet.idle("robot/a")
 
@@ -131,7 +131,7 @@ def test_a_body_whose_time_is_over_is_interrupted(fleet: CliFleet, how: str, *, 
         take(fleet, "robot/a")
     (told,) = rest_of(survey)
     assert told.startswith("completed True | its minimum runtime is over")
-    assert (held_by("request") in told) == waits
+    assert (held_by("taker") in told) == waits
 
 
 def test_the_end_of_an_inner_hold_leaves_the_outer_one(fleet: CliFleet) -> None:
