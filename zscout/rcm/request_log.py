@@ -19,7 +19,7 @@ from zscout.rcm.roster import Roster
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcStatus, Dropped, Effect, Granted, HoldEnded, Outcome, Queued
-from zscout.scheduling.reason import Party, Reason, ended, waits
+from zscout.scheduling.reason import ITS_CLIENT, Party, Reason, ended, waits
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.types import SECOND, ArcId, Grant, Ns, RcName
 
@@ -45,8 +45,8 @@ def reason_info(reason: Reason | None, now: Ns) -> ReasonInfo | None:
     if reason is None:
         return None
     by = [party_info(one, now) for one in reason.by]
-    rcs, patterns = list(reason.rcs), list(reason.patterns)
-    return ReasonInfo(reason.code, rcs, by, reason.detail, reason.number, reason.pattern, patterns)
+    rcs, patterns, detail = list(reason.rcs), list(reason.patterns), ITS_CLIENT if reason.own else reason.detail
+    return ReasonInfo(reason.code, rcs, by, detail, reason.number, reason.pattern, patterns, reason.own)
 
 
 def party_info(party: Party, now: Ns) -> ReasonParty:
@@ -282,7 +282,7 @@ class RequestLog:
         details: dict[str, Any] = {"reason": str(effect.reason), "outcome": effect.outcome, "why": why}
         requeued = isinstance(effect, HoldEnded) and effect.requeued
         again = "; queued again" if requeued else ""
-        self.record(now, effect.arc, f"{ended(effect.outcome, str(effect.reason))}{again}")
+        self.record(now, effect.arc, f"{ended(effect.outcome, str(effect.reason), effect.reason)}{again}")
         arc = self._core.arc(effect.arc)
         if isinstance(effect, HoldEnded):
             details |= {"by": effect.by, "grant": effect.grant, "rcs": list(effect.rcs)}
@@ -358,7 +358,7 @@ class RequestLog:
         changed, self._changed = self._changed, {}
         for arc in filter(None, map(self._core.arc, changed)):
             if arc.hold is None:
-                self.record(now, arc.id, waits(str(arc.reported)))
+                self.record(now, arc.id, waits(str(arc.reported), arc.reported))
 
     def _log_text(self) -> str:
         lines, self._unlogged, self._log_at = self._unlogged, [], None

@@ -56,7 +56,7 @@ from zscout.scheduling.model import (
     Requested,
     Unconfirmed,
 )
-from zscout.scheduling.reason import ITS_CLIENT, Party, named
+from zscout.scheduling.reason import Party, person
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.services.authority import Authority
 from zscout.services.rcm.bookings import Bookings
@@ -273,8 +273,7 @@ class RequestHandler:
                 )
         event = Cancelled if isinstance(operation, Cancel) else Released
         who = self._authority.known_as(sender, operation.who)
-        by = str(sender) if who is None else named(who, str(sender), operation.id)
-        self._gather(query, arc, event(arc, ITS_CLIENT if owner == sender else by))
+        self._gather(query, arc, event(arc, "" if owner == sender else person(who, str(sender))))
 
     def _goes_on_elsewhere(self, ask: Ask) -> bool:
         """Whether another client has this ARC: what one RCM handed over, the next knows by its place only."""
