@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from zscout.services.rcm.registry import reason_info
 
 from zscout.messages import ReasonInfo, Who
 from zscout.scheduling.reason import Party, Reason, ReasonCode, ended, named, reason_of, waits
-from zscout.services.rcm.registry import reason_info
 from zscout.types import SECOND, Ns
 
 ALICE, BOB = Who("alice", "ws1", "survey.py"), Who("bob", command="zscout take", comment="the gripper is stuck")

@@ -87,7 +87,7 @@ def test_a_wait_is_from_the_queue_to_the_grant_and_begins_anew_when_it_is_preemp
     assert fleet.heard.waits == [("one", 0), ("two", 0), ("one", 7)]
     assert fleet.heard.ends == [("one", "preempted", 5), ("two", "released", 7), ("one", "cancelled", 8)]
     assert fleet.heard.over[0].requeued
-    assert str(fleet.heard.over[0].reason) == "preempted by h/c (two), priority 5"
+    assert str(fleet.heard.over[0].reason) == "preempted by two (h/c), priority 5"
 
 
 def test_who_waited_under_an_earlier_rcm_and_asks_again_alone_has_waited_since_then() -> None:

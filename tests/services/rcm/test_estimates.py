@@ -10,8 +10,8 @@ import pytest
 from tests.mesh.kit import until
 from tests.services.rcm.kit import FakeFleet, fleet_of
 from zscout.messages import Release
-from zscout.scheduling.forecast import forecast
 from zscout.rcm import request_log
+from zscout.scheduling.forecast import forecast
 
 
 @pytest.fixture
