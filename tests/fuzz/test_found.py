@@ -19,7 +19,7 @@ from tests.services.rcm.kit import FakeFleet
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
 from zscout.messages import RcState, RcView
-from zscout.services.rcm.devices import ExpectedDevices, SeenHome, homes_in
+from zscout.rcm.devices import ExpectedDevices, SeenHome, homes_in
 from zscout.services.rcm.inventory import FILE, Inventory
 from zscout.testing.memory import MemoryNetwork
 from zscout.types import SECOND

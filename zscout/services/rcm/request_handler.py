@@ -36,6 +36,7 @@ from zscout.messages import (
     duration,
     exact_amounts,
 )
+from zscout.rcm.devices import ExpectedDevices
 from zscout.rcm.places import Places, arc_id, request_id
 from zscout.rcm.request_log import RequestLog, party_info, reason_info
 from zscout.rcm.roster import Change, Roster
@@ -60,7 +61,6 @@ from zscout.scheduling.reason import Party, person
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.services.authority import Authority
 from zscout.services.rcm.bookings import Bookings
-from zscout.services.rcm.devices import ExpectedDevices
 from zscout.services.rcm.door import check_door
 from zscout.types import SECOND, ArcId, ClientId, Place, RcName
 
