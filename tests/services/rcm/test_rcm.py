@@ -29,7 +29,7 @@ async def test_a_grant_is_published_and_the_loser_told_while_its_answer_is_on_th
     assert (preempted.outcome, preempted.by, preempted.grant) == ("preempted", "desk/operator/drive", first.grant)
     # Why it waits now is told a little later.
     await until(lambda: len(survey.notices) == 2)
-    assert survey.notices[1].reason == "waits for desk/operator (drive): robot/a"
+    assert survey.notices[1].reason == "waits for drive (desk/operator): robot/a"
     # The end of a hold that its own client released is told by the answer alone.
     await operator.do(Release("drive"))
     await until(lambda: survey.notices[-1].state == "running")
@@ -39,8 +39,8 @@ async def test_a_grant_is_published_and_the_loser_told_while_its_answer_is_on_th
     assert story == [
         "asked for robot/a at priority 0",
         "granted robot/a",
-        "preempted by desk/operator (drive), priority 10; queued again",
-        "waits for desk/operator (drive): robot/a",
+        "preempted by drive (desk/operator), priority 10; queued again",
+        "waits for drive (desk/operator): robot/a",
         "granted robot/a",
     ]
 
@@ -111,7 +111,7 @@ async def test_a_vote_that_is_late_grants_later_and_a_veto_is_a_reason() -> None
     await until(lambda: client.notices and client.notices[-1].state == "running")
     # A veto is a reason. It stands until the rules of the RC change.
     radio.accept = False
-    assert (await client.ask("more", "radio/f:9")).reason == "waits for desk/one (talk): radio/f refuses more: too much"
+    assert (await client.ask("more", "radio/f:9")).reason == "waits for talk (desk/one): radio/f refuses more: too much"
     await client.ask("more", "radio/f:9")
     assert [len(proposal.holders) for proposal in radio.proposals] == [1, 2]
     radio.accept, radio.rules = True, 1

@@ -20,7 +20,7 @@ from zscout.messages import Notice, ReasonInfo, ReasonParty, State, StoryLine
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcStatus, Dropped, Effect, Granted, HoldEnded, Outcome, Queued
-from zscout.scheduling.reason import Party, Reason, ended, waits
+from zscout.scheduling.reason import ITS_CLIENT, Party, Reason, ended, waits
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.services.rcm.places import Places, client_id, request_id
 from zscout.types import SECOND, ArcId, Grant, HostName, Ns, RcName, Term
@@ -50,8 +50,8 @@ def reason_info(reason: Reason | None, now: Ns) -> ReasonInfo | None:
     if reason is None:
         return None
     by = [party_info(one, now) for one in reason.by]
-    rcs, patterns = list(reason.rcs), list(reason.patterns)
-    return ReasonInfo(reason.code, rcs, by, reason.detail, reason.number, reason.pattern, patterns)
+    rcs, patterns, detail = list(reason.rcs), list(reason.patterns), ITS_CLIENT if reason.own else reason.detail
+    return ReasonInfo(reason.code, rcs, by, detail, reason.number, reason.pattern, patterns, reason.own)
 
 
 def party_info(party: Party, now: Ns) -> ReasonParty:
@@ -258,7 +258,8 @@ class RequestRegistry:
         why = reason_info(effect.reason, self._mesh.now())
         details: dict[str, Any] = {"reason": str(effect.reason), "outcome": effect.outcome, "why": why}
         requeued = isinstance(effect, HoldEnded) and effect.requeued
-        self.record(effect.arc, f"{ended(effect.outcome, str(effect.reason))}{'; queued again' if requeued else ''}")
+        how = ended(effect.outcome, str(effect.reason), effect.reason)
+        self.record(effect.arc, f"{how}{'; queued again' if requeued else ''}")
         arc = self._core.arc(effect.arc)
         if isinstance(effect, HoldEnded):
             details |= {"by": effect.by, "grant": effect.grant, "rcs": list(effect.rcs)}
@@ -334,7 +335,7 @@ class RequestRegistry:
         changed, self._changed = self._changed, {}
         for arc in filter(None, map(self._core.arc, changed)):
             if arc.hold is None:
-                self.record(arc.id, waits(str(arc.reported)))
+                self.record(arc.id, waits(str(arc.reported), arc.reported))
 
     def _write_log(self) -> None:
         lines, self._unlogged = self._unlogged, []

@@ -54,7 +54,7 @@ from zscout.scheduling.model import (
     Requested,
     Unconfirmed,
 )
-from zscout.scheduling.reason import ITS_CLIENT, Party, named
+from zscout.scheduling.reason import Party, person
 from zscout.services.authority import Authority
 from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.devices import ExpectedDevices
@@ -275,8 +275,7 @@ class RequestHandler:
                 self._registry.give_up(arc, Outcome.CANCELLED if isinstance(operation, Cancel) else Outcome.RELEASED)
         event = Cancelled if isinstance(operation, Cancel) else Released
         who = self._authority.known_as(sender, operation.who)
-        by = str(sender) if who is None else named(who, str(sender), operation.id)
-        self._gather(query, arc, event(arc, ITS_CLIENT if owner == sender else by))
+        self._gather(query, arc, event(arc, "" if owner == sender else person(who, str(sender))))
 
     def _goes_on_elsewhere(self, ask: Ask) -> bool:
         """Whether another client has this ARC: what one RCM handed over, the next knows by its place only."""
