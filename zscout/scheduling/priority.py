@@ -259,7 +259,7 @@ def reasons_of_now(state: SchedulerState) -> Iterator[tuple[Arc, Reason]]:
 
 def reason_of_now(state: SchedulerState, arc: Arc) -> Reason | None:
     """The present reason of a watcher, apart from votes."""
-    if isinstance(arc.watched, PatternClass) and not bind(state, arc, None):
+    if arc.patterns and not bind(state, arc, None):
         return no_match(state, arc)
     obstacle = AdmissionCheck(state, arc).obstacle(0)
     return None if obstacle is None else obstacle.reason._replace(pattern=_pattern_of(arc, obstacle.rc))

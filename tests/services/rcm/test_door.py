@@ -135,7 +135,7 @@ async def test_more_of_a_pattern_than_the_fleet_knows_of_is_refused_at_the_first
     await asyncio.sleep(fleet.fleet.timing.hold_lease / SECOND)
     fleet.network.kill(rc.mesh)
     await asyncio.sleep(2)
-    with pytest.raises(Refusal, match="unknown_device: 3 devices that match .* but only robot/arm1, robot/arm2 can"):
+    with pytest.raises(Refusal, match=r"unknown_device: 3 devices that match .* but only robot/arm1, robot/arm2 can"):
         await client.ask("three", *three, check=True)
     assert (await client.ask("two", *three[:2], check=True)).state == "queued", "an absent device counts"
     assert (await client.ask("foreign", *three)).state == "queued"
