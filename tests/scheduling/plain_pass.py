@@ -32,8 +32,7 @@ class PlainPriority(Priority):
         one_pass = Pass(state, actions)
         while order:
             _, arc = heapq.heappop(order)
-            verdict = judged(one_pass, arc)
-            check = AdmissionCheck(state, arc)
+            check, verdict = judged(one_pass, arc)
             match verdict:
                 case None:
                     actions.wait(arc, no_match(state, arc))
@@ -63,23 +62,23 @@ class PlainPriority(Priority):
                     actions.start(arc)
 
 
-def judged(one_pass: Pass, arc: Arc) -> _Verdict | None:
+def judged(one_pass: Pass, arc: Arc) -> tuple[AdmissionCheck, _Verdict | None]:
     """Of its bindings, one after the other, the first that nothing but a vote keeps out, else the best."""
-    state = one_pass.state
+    state, check = one_pass.state, AdmissionCheck(one_pass.state, arc)
+    if not arc.patterns:
+        return check, one_pass._verdict(arc, check)
     best: _Verdict | None = None
-    bound, without = arc.bound, 0
-    for _ in range(MAX_BINDINGS if arc.patterns else 1):
-        if arc.patterns:
-            found = Choices(state, arc, 0).best(without=without)
-            if found is None:
-                break
-            state.bind(arc, found)
+    bound, without, choices = {}, 0, Choices(state, arc, 0)
+    for _ in range(MAX_BINDINGS):
+        if (found := choices.best(without=without)) is None:
+            break
+        state.bind(arc, found)
         verdict = one_pass._verdict(arc, AdmissionCheck(state, arc))
         blamed = one_pass._blamed(arc, verdict)
         if best is None or not blamed:
-            best, bound = verdict, arc.bound
+            best, bound = verdict, found
         if not blamed:
             break
         without |= blamed
-    state.bind(arc, bound if best is not None else {})
-    return best
+    state.bind(arc, bound)
+    return AdmissionCheck(state, arc), best

@@ -88,8 +88,10 @@ class Twins:
         self.indexed, self.plain = Core(policy=policy), Core(PlainPriority(), policy)
         self.now = 0
         self.number = 0
-        shared = [number < size.sharable for number in range(size.rcs)]
-        self.sharable = {f"{'radio' if yes else 'rc'}/{number}": yes for number, yes in enumerate(shared)}
+        shared, kind = range(size.sharable), "radio" if size.patterns else "rc"
+        self.sharable = {
+            f"{kind if number in shared else 'rc'}/{number}": number in shared for number in range(size.rcs)
+        }
         self.capacity = {rc: Fraction(self.rng.randint(2, 9)) for rc in self.sharable}
         self.present = set(self.sharable)
         self.out: dict[int, Propose] = {}
