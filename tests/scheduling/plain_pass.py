@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+from collections.abc import Mapping
 
 from zscout.scheduling.model import Arc
 from zscout.scheduling.patterns import Choices, no_match
@@ -68,7 +69,8 @@ def judged(one_pass: Pass, arc: Arc) -> tuple[AdmissionCheck, _Verdict | None]:
     if not arc.patterns:
         return check, one_pass._verdict(arc, check)
     best: _Verdict | None = None
-    bound, without, choices = {}, 0, Choices(state, arc, 0)
+    bound: Mapping[str, str] = {}
+    without, choices = 0, Choices(state, arc, 0)
     for _ in range(MAX_BINDINGS):
         if (found := choices.best(without=without)) is None:
             break
