@@ -61,6 +61,9 @@ class Compared:
     def run_pass(self, state: SchedulerState, actions: Actions) -> None:
         indexed = undecided_arcs(state)
         assert indexed is not None
+        for arc in state.by_pattern.values():
+            assert arc.like is not None
+            state.bind(arc, arc.like.bound(arc))
         assert {arc.id for arc in indexed} == everyone_looked_at(state, state.votes, state.now)
         self.seen[len(indexed)] += 1
         self.strategy.run_pass(state, actions)

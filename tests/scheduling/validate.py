@@ -7,6 +7,7 @@ from collections import Counter
 from zscout.keyexpr import matcher
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Arc, ArcState
+from zscout.scheduling.patterns import short
 from zscout.scheduling.queue_index import QueueIndex
 from zscout.scheduling.state import SchedulerState
 from zscout.types import Place
@@ -98,6 +99,24 @@ def _check_state(state: SchedulerState) -> None:
     assert at_place.keys() == state._at_place.keys(), "places of nobody"
 
 
+def _check_classes(state: SchedulerState, index: QueueIndex) -> None:
+    for key, like in state.classes.items():
+        members = [arc for arc in state.by_pattern.values() if arc.like is like]
+        assert like.members == sorted(arc.rank for arc in members), "not the members of the class"
+        assert members, "a class of nobody"
+        watching = [arc for arc in members if arc.watched is like]
+        assert like.watchers == sorted(arc.rank for arc in watching), "not the watchers of the class"
+        assert bool(watching) == (like in index.watched_classes)
+        assert all(state._class_key(arc) == key for arc in members)
+        for arc in watching:
+            assert short(state, arc), f"{arc.id} waits for a change of {list(arc.patterns)}, and there are enough"
+            assert arc.claim is None
+        for need, mask in like.masks.items():
+            out = members[0].named_mask | state.barred(members[0])
+            assert [rc.bit for rc in state.matching(need) if not rc.bit & out] == [rc.bit for rc in state.rcs_in(mask)]
+    assert all(arc.like in state.classes.values() for arc in state.by_pattern.values())
+
+
 def _check_index(state: SchedulerState, index: QueueIndex) -> None:
     queued = state.queued.values()
     assert index.ranks == sorted(arc.rank for arc in queued), "the ranks are not those of the queue"
@@ -114,7 +133,9 @@ def _check_index(state: SchedulerState, index: QueueIndex) -> None:
         undecided = arc.state in {ArcState.VOTING, ArcState.DEFERRED, ArcState.PARKED}
         assert (arc.footprint is not None) == undecided, f"{arc.id} is {arc.state}"
         assert arc.watched is None or arc.rank in arc.watched.watchers, f"{arc.id} is not among the watchers"
+    _check_classes(state, index)
     for arc in state.running.values():
+        assert arc.like is None
         assert arc.watched is None
         assert arc.footprint is None
         assert not arc.starving

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from zscout.scheduling.booking import Booking, BookingChanged, BookingState, BookingThreatened
 from zscout.scheduling.dangers import Undecided, danger
-from zscout.scheduling.model import Arc, ArcRequest, Claim, Effect, Outcome, Rc, union
+from zscout.scheduling.model import Arc, ArcRequest, ArcState, Claim, Effect, Outcome, PatternClass, Rc, union
 from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.reservations import Reservations, reservations
 from zscout.scheduling.slots import slots
@@ -92,6 +92,8 @@ class Claims:
         for rc in self._state.possible_sharables(claim.arc):
             self._state.votes.rename_arc(rc.name, claim.arc.id, arc.id)
         claim.arc, arc.claim = arc, claim
+        if isinstance(arc.watched, PatternClass):
+            self._state.index.put(arc, ArcState.READY)
         self._state.claims_changed()
         self._emit(BookingChanged(claim.booking.id, BookingState.TAKEN, arc.id))
         self._wait_again(arc, claim.booking.start)

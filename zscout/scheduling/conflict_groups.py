@@ -16,6 +16,7 @@ from operator import attrgetter
 from zscout.scheduling.model import Arc, Rank, Rc, union
 from zscout.scheduling.packing import PackingItem, PackingProblem
 from zscout.scheduling.patterns import bind_all
+from zscout.scheduling.queue_index import Watched
 from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.state import Actions, SchedulerState
 from zscout.scheduling.votes import HolderSet
@@ -35,8 +36,10 @@ class _Search:
     def __init__(self, state: SchedulerState, reserved: Reservations | None) -> None:
         self.state, self.votes, self.reserved = state, state.votes, reserved
         self.preemptible: dict[ArcId, Arc] = {}  # running ARCs that might have to end
-        self._heap: list[tuple[Rank, int, Arc, Rc | None]] = []  # candidates, each by itself or as a watcher of an RC
-        self._called = 0  # bits of the RCs whose watchers are in the heap
+        self._heap: list[
+            tuple[Rank, int, Arc, Watched | None]
+        ] = []  # candidates, each by itself or as a watcher of an RC
+        self._called: set[Watched] = set()  # those with a watcher in the heap
         self._started: Counter[str] = Counter()  # by owner with a quota: ARCs that might start
         self._taken: Counter[str] = Counter()  # by owner with a quota: RCs of these ARCs
         self._shared_taken = 0  # sharable RCs where one ARC already passed the starving ones; a second was not checked
@@ -49,7 +52,9 @@ class _Search:
         found: list[Arc] = []
         last: Rank | None = None
         while self._heap:
-            rank, _, arc, rc = heapq.heappop(self._heap)
+            rank, _, arc, on = heapq.heappop(self._heap)
+            if arc.like is not None and rank != last:
+                self.state.bind(arc, arc.like.bound(arc))
             # An ARC may be queued twice in the heap; duplicates are adjacent because ranks are unique.
             if rank != last and self._might_start(arc):
                 found.append(arc)
@@ -57,18 +62,18 @@ class _Search:
                     return None
                 self._note_preemptible(arc)
             last = rank
-            if rc is not None:
-                self._call_next_watcher(rc, rank)
+            if on is not None:
+                self._call_next_watcher(on, rank)
         return [*found, *self.preemptible.values()]
 
     def _call_watchers(self, bits: int, rank: Rank | None) -> None:
-        new = bits & self.state.index.watched & ~self._called
-        self._called |= new
-        for rc in self.state.rcs_in(new):
-            self._call_next_watcher(rc, rank)
+        for on in self.state.watched_at(bits):
+            if on not in self._called:
+                self._called.add(on)
+                self._call_next_watcher(on, rank)
 
-    def _call_next_watcher(self, rc: Rc, rank: Rank | None) -> None:
-        following = self.state.next_watcher(rc, rank)
+    def _call_next_watcher(self, on: Watched, rank: Rank | None) -> None:
+        following = self.state.next_watcher(on, rank)
         if following is not None:
             heapq.heappush(self._heap, following)
 

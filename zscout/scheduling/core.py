@@ -22,7 +22,7 @@ from zscout.scheduling.booking import Booked, Booking, BookingStatus, Redated, U
 from zscout.scheduling.claims import Claims
 from zscout.scheduling.model import Arc, ArcState, ArcStatus, Hold, Outcome, Rc, RcStatus, Status
 from zscout.scheduling.overlaps import Overlaps, overlaps
-from zscout.scheduling.priority import AdmissionCheck, Priority, reasons_of_now
+from zscout.scheduling.priority import AdmissionCheck, Priority, reason_of_now, reasons_of_now
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.scheduling.slots import SlotsFound, slots
@@ -244,9 +244,7 @@ class Core:
     def _arc_status(self, arc: Arc) -> ArcStatus:
         reason, ahead = arc.reason, self._state.index.ahead(arc) if arc.hold is None else None
         if arc.state is ArcState.WATCHING:
-            check = AdmissionCheck(self._state, arc)
-            obstacle = check.obstacle(0)
-            reason = obstacle.reason if obstacle is not None else check.refusal() or reason
+            reason = reason_of_now(self._state, arc) or AdmissionCheck(self._state, arc).refusal() or reason
         known = arc.request, arc.place, arc.hold, arc.needs, arc.bound, arc.since, arc.preemptions
         return ArcStatus(*known, ahead, reason, arc.reason)
 

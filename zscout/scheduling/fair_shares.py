@@ -49,6 +49,7 @@ class FleetState(Protocol):
 
     def rcs_in(self, mask: int) -> Iterator[Rc]: ...
     def matching(self, need: Need) -> list[Rc]: ...
+    def matching_mask(self, need: Need) -> int: ...
     def operator(self, priority: int) -> bool: ...
 
 
@@ -212,7 +213,7 @@ class Shares:
         if any(level >= priority and other != group for other, level in self._waiting.get(rc.bit, ())):
             return True
         return any(
-            level >= priority and other != group and rc in self._state.matching(need)
+            level >= priority and other != group and rc.bit & self._state.matching_mask(need)
             for need, waiting in self._patterns.items()
             for other, level in waiting
         )

@@ -7,9 +7,11 @@ from __future__ import annotations
 import functools
 import math
 import operator
+from bisect import bisect_right
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from operator import itemgetter
 from typing import Final, TypeAlias
 
 from msgspec import Struct
@@ -127,7 +129,8 @@ class Arc:
     footprint: int | None = None  # while VOTING, DEFERRED or PARKED: bits of the RCs that it would take or free
     masked_obstacles: int = 0
     """While VOTING or DEFERRED: bits of the RCs whose obstacle was off limits and did not count."""
-    watched: Rc | None = None
+    watched: Rc | PatternClass | None = None
+    like: PatternClass | None = None  # while queued, with patterns
     unconfirmed: int = 0  # unconfirmed holds in a row
     held_back: tuple[Ns, tuple[RcName, ...]] | None = None
     """While HELD_BACK: until when, and for which RCs; None where another ARC has its place."""
@@ -231,6 +234,28 @@ class Rc:
 
     def non_preemptible_holders(self, arc: Arc, now: Ns) -> list[Arc]:
         return [holder for holder in self.holders.values() if not holder.preemptible_by(arc, now)]
+
+
+@dataclass(slots=True, eq=False)
+class PatternClass:
+    """Queued ARCs with equal patterns, named RCs, priority and barred RCs: where no vote, booking or reservation
+    matters, a binding found for one serves all (`patterns.py`)."""
+
+    masks: dict[Need, int] = field(default_factory=dict)  # bits of the RCs for each pattern, present or not
+    reach: int = 0  # bits of the RCs for any of them
+    members: list[Rank] = field(default_factory=list)
+    watchers: list[Rank] = field(default_factory=list)  # members that wait for any change within `reach`
+    turns: list[tuple[Rank, Mapping[Need, RcName]]] = field(default_factory=list)
+    """Bindings to different RCs as far as possible: each from this rank on, to the next."""
+    usable: int = 0  # `patterns.usable` and `short`, as of this version of the state
+    usable_of: int = -1
+    short: bool = False
+    choices: dict[int, object] = field(default_factory=dict)
+    """`patterns.Choices` that serve several members, by bits of the RCs reserved for others."""
+    choices_of: tuple[int, int] = (-1, -1)  # versions of holders and demand
+
+    def bound(self, arc: Arc) -> Mapping[Need, RcName]:
+        return self.turns[bisect_right(self.turns, arc.rank, key=itemgetter(0)) - 1][1]
 
 
 def absences(rcs: Iterable[Rc]) -> str:

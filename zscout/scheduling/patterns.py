@@ -16,16 +16,19 @@ so their other RCs count as free.
 
 from __future__ import annotations
 
+import heapq
+from bisect import bisect_right
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from enum import IntEnum
 from operator import attrgetter
 from typing import Final, NamedTuple
 
-from zscout.scheduling.model import Arc, Rank, Rc, absences, union
+from zscout.scheduling.model import Arc, PatternClass, Rank, Rc, absences, union
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.state import SchedulerState
-from zscout.types import Need
+from zscout.types import Need, RcName
 
 
 class Fitness(IntEnum):
@@ -56,33 +59,142 @@ class _Choice(NamedTuple):
     rc: Rc
 
 
-def bind(state: SchedulerState, arc: Arc, reserved: Reservations | None, *, without: int = 0, claimed: int = 0) -> bool:
-    """Bind `arc` to the best RCs outside `without`, where `claimed` RCs are bound to others (bit masks). False: no
-    binding exists; the old one stays."""
-    taken = without | state.barred(arc) | arc.named_mask
-    ending = set(_exclusive_victims(state, arc, arc.named_mask))
-    options: dict[Need, list[_Choice]] = {}
-    for need in arc.patterns:
-        matching = (rc for rc in state.matching(need) if rc.present and not rc.bit & taken)
-        options[need] = sorted(
-            _Choice(*_fitness(state, arc, rc, reserved, claimed, ending), rc.bit, rc) for rc in matching
+class Choices:
+    """The RCs that an ARC with patterns may have at this instant, and the best bindings to them."""
+
+    def __init__(self, state: SchedulerState, arc: Arc, closed: int) -> None:
+        """`closed`: bits of RCs reserved for others."""
+        like = class_of(arc)
+        self._state, self._arc, self._masks = state, arc, like.masks
+        ending = set(_exclusive_victims(state, arc, arc.named_mask))
+        self._best_first = sorted(
+            _Choice(*_fitness(state, arc, rc, bool(rc.bit & closed), ending), rc.bit, rc)
+            for rc in state.rcs_in(like.reach & state.present)
         )
-    for worst in Fitness:
-        allowed = {need: [choice.rc for choice in found if choice.fitness <= worst] for need, found in options.items()}
-        if all(allowed.values()) and (chosen := distinct(allowed)) is not None:
-            if worst <= Fitness.PREEMPTIBLE and state.running:
-                chosen = _least_ending(state, arc, chosen, options, claimed if worst < Fitness.CLAIMED else 0)
-            state.bind(arc, {need: rc.name for need, rc in chosen.items()})
+        self.contended = union(choice.bit for choice in self._best_first if choice.fitness <= Fitness.PREEMPTIBLE)
+        """RCs of which it matters whether they are claimed."""
+        self._found: dict[tuple[int, int], Mapping[Need, RcName] | None] = {}
+
+    def best(self, *, without: int = 0, claimed: int = 0) -> Mapping[Need, RcName] | None:
+        """The best RCs outside `without`, where `claimed` RCs are bound to others (bit masks). None: no binding."""
+        key = without, claimed & self.contended
+        if key not in self._found:
+            self._found[key] = self._bind(*key)
+        return self._found[key]
+
+    def _bind(self, without: int, claimed: int) -> Mapping[Need, RcName] | None:
+        found = self._best_first
+        if without:
+            found = [choice for choice in found if not choice.bit & without]
+        if claimed:
+            free = found[: _count(found, Fitness.FREED)]
+            taken = [choice for choice in free if choice.bit & claimed and not choice.rc.sharable]
+            taken = [_Choice(Fitness.CLAIMED, choice.rc.demand, choice.bit, choice.rc) for choice in taken]
+            left = [choice for choice in free if not choice.bit & claimed or choice.rc.sharable]
+            found = [*left, *sorted(taken), *found[len(free) :]]
+        numbers = Counter(self._masks.values())
+        by_mask = {mask: [choice for choice in found if choice.bit & mask] for mask in numbers}
+        for worst in Fitness:
+            fitting = {mask: _count(some, worst) for mask, some in by_mask.items()}
+            if any(fitting[mask] < number for mask, number in numbers.items()):
+                continue
+            fit = {mask: [choice.rc for choice in some[: fitting[mask]]] for mask, some in by_mask.items()}
+            if (chosen := distinct({need: fit[mask] for need, mask in self._masks.items()})) is not None:
+                if worst <= Fitness.PREEMPTIBLE and self._state.running:
+                    options = {need: by_mask[mask] for need, mask in self._masks.items()}
+                    claimed = claimed if worst < Fitness.CLAIMED else 0
+                    chosen = _least_ending(self._state, self._arc, chosen, options, claimed)
+                return {need: rc.name for need, rc in chosen.items()}
+        return None
+
+
+def _count(best_first: Sequence[_Choice], worst: Fitness) -> int:
+    return bisect_right(best_first, worst, key=attrgetter("fitness"))
+
+
+def choices(state: SchedulerState, arc: Arc, reserved: Reservations | None) -> Choices:
+    """The choices of a queued ARC with patterns: those of its class, unless votes or its booking matter."""
+    like, reserved_bits = class_of(arc), 0 if reserved is None else usable(state, arc) & reserved.bits
+    closed = union(rc.bit for rc in state.rcs_in(reserved_bits) if reserved is not None and reserved.reserves(rc, arc))
+    if not _are_shared(state, arc):
+        return Choices(state, arc, closed)
+    versions = state.version, state.demand_version
+    if like.choices_of != versions:
+        like.choices, like.choices_of = {}, versions
+    found = like.choices.get(closed)
+    if not isinstance(found, Choices):
+        found = like.choices[closed] = Choices(state, arc, closed)
+    return found
+
+
+def _are_shared(state: SchedulerState, arc: Arc) -> bool:
+    """Whether members of its class have the same choices where the same RCs are reserved for others."""
+    matters = (class_of(arc).reach | arc.named_mask) & state.sharable
+    return not matters and not usable(state, arc) & state.claimed
+
+
+def class_of(arc: Arc) -> PatternClass:
+    if arc.like is None:
+        raise ValueError(f"ARC {arc.id} is not queued, or has no pattern")
+    return arc.like
+
+
+def bind(state: SchedulerState, arc: Arc, reserved: Reservations | None) -> bool:
+    """Bind a queued ARC to its best RCs. False: no binding exists."""
+    bound = choices(state, arc, reserved).best()
+    state.bind(arc, bound or {})
+    return bound is not None
+
+
+def usable(state: SchedulerState, arc: Arc) -> int:
+    """Bits of the RCs that match, are present and not held without preemption, apart from sharable ones."""
+    like = class_of(arc)
+    if like.usable_of != state.version:
+        like.usable_of, like.usable = state.version, like.reach & state.present
+        for rc in state.rcs_in(like.usable & state.busy):
+            if rc.non_preemptible_holders(arc, state.now):
+                like.usable &= ~rc.bit
+        like.short = not enough(mask & like.usable for mask in like.masks.values())
+    return like.usable
+
+
+def short(state: SchedulerState, arc: Arc) -> bool:
+    """Return True if too few RCs are usable, whatever is bound."""
+    usable(state, arc)
+    return class_of(arc).short
+
+
+def all_present(state: SchedulerState, arc: Arc) -> bool:
+    """Return True if enough RCs are present for all patterns."""
+    return enough(mask & state.present for mask in class_of(arc).masks.values())
+
+
+def enough(masks: Iterable[int]) -> bool:
+    """Return True if each mask can have a bit of its own (Kuhn's algorithm)."""
+    wanted = sorted(masks, key=int.bit_count)
+    owner: dict[int, int] = {}
+    taken = 0
+
+    def place(number: int, seen: list[int]) -> bool:
+        nonlocal taken
+        if free := wanted[number] & ~taken:
+            owner[free & -free] = number
+            taken |= free & -free
             return True
-    return False
+        while left := wanted[number] & ~seen[0]:
+            bit = left & -left
+            seen[0] |= bit
+            if place(owner[bit], seen):
+                owner[bit] = number
+                return True
+        return False
+
+    return all(place(number, [0]) for number in range(len(wanted)))
 
 
-def _fitness(
-    state: SchedulerState, arc: Arc, rc: Rc, reserved: Reservations | None, claimed: int, ending: Collection[Arc]
-) -> tuple[Fitness, float]:
-    """The fitness of `rc` where the holders `ending` end anyway, and a tie-breaker."""
-    non_preemptible = rc.non_preemptible_holders(arc, state.now)
-    closed = reserved is not None and reserved.reserves(rc, arc)
+def _fitness(state: SchedulerState, arc: Arc, rc: Rc, closed: bool, ending: Collection[Arc]) -> tuple[Fitness, float]:
+    """The fitness of `rc` where the holders `ending` end anyway, and a tie-breaker. `closed`: reserved for another."""
+    non_preemptible = rc.non_preemptible_holders(arc, state.now) if rc.holders else []
     kept = arc.claim is not None and bool(rc.bit & arc.claim.kept)
     if rc.sharable:
         answer = state.votes.known(rc.name, frozenset((*(holder.id for holder in non_preemptible), arc.id)))
@@ -103,8 +215,6 @@ def _fitness(
         return Fitness.RESERVED, rc.demand
     if others := [holder for holder in rc.holders.values() if holder not in ending]:
         return Fitness.PREEMPTIBLE, max(holder.priority for holder in others)
-    if rc.bit & claimed:
-        return Fitness.CLAIMED, rc.demand
     return Fitness.FREED if rc.holders else Fitness.FREE, -1 if kept else rc.demand
 
 
@@ -136,6 +246,8 @@ def _least_ending(
 ) -> dict[Need, Rc]:
     """Separate RCs for all needs, none of `claimed`, with the fewest victims: first within their minimum runtimes,
     then of all, then the lowest-ranked. Branch and bound from `start`, the best of MAX_TRIED choices."""
+    if not arc.named_mask & state.sharable and not any(rc.holders for rc in start.values()):
+        return start
     now, best = state.now, start
 
     def cost(ending: Collection[Arc]) -> tuple[int, int]:
@@ -178,27 +290,49 @@ def _ranks(arcs: Iterable[Arc]) -> list[Rank]:
 
 
 def bind_all(state: SchedulerState, reserved: Reservations | None = None) -> None:
-    """Bind all queued ARCs with patterns, best-ranked first, to different RCs as far as possible."""
-    claimed = 0
-    for arc in sorted(state.by_pattern.values(), key=lambda arc: arc.rank):
-        if bind(state, arc, reserved, claimed=claimed):
-            claimed |= arc.mask & ~arc.named_mask
+    """Find bindings of all queued ARCs with patterns (`PatternClass.bound`), best-ranked first, to different RCs as
+    far as possible. Once a class claims no more, its other members have the same, until others claim what it may
+    have."""
+    claimed, asleep = 0, dict[PatternClass, int]()  # with the RCs of which it matters whether they are claimed
+    heap = [(like.members[0], number, like) for number, like in enumerate(state.classes.values())]
+    numbers = {like: number for _, number, like in heap}
+    heapq.heapify(heap)
+    for like in state.classes.values():
+        like.turns.clear()
+    while heap:
+        rank, _, like = heapq.heappop(heap)
+        arc = state.queued[rank[-1]]
+        found = choices(state, arc, reserved)
+        bound = found.best(claimed=claimed) or {}
+        like.turns.append((rank, bound))
+        new = state.mask(bound.values()) & ~claimed
+        claimed |= new
+        awake = [other for other, contended in asleep.items() if contended & new]
+        reserved_bits = 0 if reserved is None else reserved.bits
+        if not (found.contended & new or usable(state, arc) & reserved_bits) and _are_shared(state, arc):
+            asleep[like] = found.contended
         else:
-            state.bind(arc, {})
+            awake.append(like)
+        for other in awake:
+            asleep.pop(other, None)
+            if (at := bisect_right(other.members, rank)) < len(other.members):
+                heapq.heappush(heap, (other.members[at], numbers[other], other))
 
 
 def no_match(state: SchedulerState, arc: Arc) -> Reason:
-    there = {need: sum(rc.present for rc in state.matching(need)) for need in arc.patterns}
+    there = {need: state.matching_mask(need) & state.present for need in arc.patterns}
     # Patterns without any RC; else all, as there are too few for all.
-    short = sorted(need for need, count in there.items() if not count) or sorted(there)
-    lost = [rc for need in short for rc in state.matching(need) if not rc.present]
+    short = sorted(need for need, mask in there.items() if not mask) or sorted(there)
+    lost = [rc for mask in map(state.matching_mask, short) for rc in state.rcs_in(mask & ~state.present)]
     return of_rcs(ReasonCode.NO_MATCH, short, absences(dict.fromkeys(lost)))
 
 
 def distinct(allowed: dict[Need, list[Rc]]) -> dict[Need, Rc] | None:
     """Separate RCs for all needs, each the best that leaves one for the others; None: impossible."""
+    if (chosen := _apart(allowed)) is not None:
+        return chosen
     owner: dict[int, Need] = {}
-    chosen: dict[Need, Rc] = {}
+    chosen = {}
 
     def place(need: Need, seen: set[int]) -> bool:
         for rc in allowed[need]:
@@ -214,3 +348,21 @@ def distinct(allowed: dict[Need, list[Rc]]) -> dict[Need, Rc] | None:
         if not place(need, set()):
             return None
     return chosen
+
+
+def _apart(allowed: dict[Need, list[Rc]]) -> dict[Need, Rc] | None:
+    """As `distinct` chooses where needs have the same RCs or none in common; None: elsewhere, or impossible."""
+    lists = {id(rcs): rcs for rcs in allowed.values()}
+    seen = 0
+    for rcs in lists.values() if len(lists) > 1 else ():
+        mask = union(rc.bit for rc in rcs)
+        if mask & seen:
+            return None
+        seen |= mask
+    needs: dict[int, list[Need]] = {}
+    for need in sorted(allowed, reverse=True):
+        needs.setdefault(id(allowed[need]), []).append(need)
+    if any(len(lists[key]) < len(some) for key, some in needs.items()):
+        return None
+    # The last to be placed takes the best, and the others move up.
+    return {need: rc for key, some in needs.items() for need, rc in zip(some, lists[key], strict=False)}

@@ -33,7 +33,9 @@ ARC is skipped only where its check would again end in "waits", stopping no othe
 - VOTING or DEFERRED without changes in its footprint: its RCs and the mask of its obstacles are still off limits, or it
   waits for the same votes as before.
 
-An ARC with patterns is always checked, unless an RC that it names keeps it out."""
+An ARC with patterns is always checked, unless an RC that it names keeps it out, or it is WATCHING with its class: too
+many of the RCs that match are absent or held without preemption (`patterns.short`), for all of the class, until one of
+them joins, is freed or becomes off limits. Then its members are checked in rank order until it is short again."""
 
 from __future__ import annotations
 
@@ -44,8 +46,9 @@ from operator import attrgetter
 from typing import Final, Literal, TypeAlias
 
 from zscout.config.scheduling_policy import RcQuota, StrategyName
-from zscout.scheduling.model import Arc, ArcState, Rank, Rc, absences, union
-from zscout.scheduling.patterns import bind, no_match
+from zscout.scheduling.model import Arc, ArcState, PatternClass, Rank, Rc, absences, union
+from zscout.scheduling.patterns import all_present, bind, choices, class_of, no_match, short
+from zscout.scheduling.queue_index import Watched
 from zscout.scheduling.reason import SHOWN, SHOWN_CHOICES, Reason, ReasonCode, of_rcs
 from zscout.scheduling.reservations import Inadmissible, Reservations
 from zscout.scheduling.state import Actions, SchedulerState, Strategy
@@ -114,14 +117,14 @@ class AdmissionCheck:
             return Reason(ReasonCode.HELD, rcs, parties, self._preferred(), number)
         bound = {rc: need for need, rc in arc.bound.items()}
         held = [(rc, holder, "") for rc, holder in self.non_preemptible if rc.name not in bound]
-        known = {rc.bit for rc, _, _ in held}
+        known = union(rc.bit for rc, _, _ in held)
         for rc, _ in self.non_preemptible:
-            if rc.bit in known:  # two patterns may have the same choices
+            if rc.bit & known:  # two patterns may have the same choices
                 continue
             need = bound[rc.name]
             for choice in sorted(self.state.matching(need), key=attrgetter("name")):
-                if choice.present and not choice.sharable and not choice.bit & (union(known) | arc.named_mask):
-                    known.add(choice.bit)
+                if choice.present and not choice.sharable and not choice.bit & (known | arc.named_mask):
+                    known |= choice.bit
                     held += [(choice, holder, need) for holder in choice.non_preemptible_holders(arc, self.now)[:1]]
         first = held[:SHOWN_CHOICES]
         return Reason(
@@ -246,11 +249,24 @@ def reasons_of_now(state: SchedulerState) -> Iterator[tuple[Arc, Reason]]:
     """New reasons of the best MAX_REPORTED watchers of each RC taken since the last call. No pass computes them:
     most are out of date before they are read."""
     unreported, state.index.unreported = state.index.unreported & state.index.watched, 0
-    for rc in state.rcs_in(unreported):
-        for rank in rc.watchers[:MAX_REPORTED]:
-            arc = state.queued[rank[-1]]
-            if (obstacle := AdmissionCheck(state, arc).obstacle(0)) is not None:
-                yield arc, obstacle.reason
+    classes, state.index.unreported_classes = state.index.unreported_classes, {}
+    reported: list[Watched] = [*state.rcs_in(unreported), *classes]
+    for on in reported:
+        for rank in on.watchers[:MAX_REPORTED]:
+            if (reason := reason_of_now(state, state.queued[rank[-1]])) is not None:
+                yield state.queued[rank[-1]], reason
+
+
+def reason_of_now(state: SchedulerState, arc: Arc) -> Reason | None:
+    """The present reason of a watcher, apart from votes."""
+    if arc.patterns and not bind(state, arc, None):
+        return no_match(state, arc)
+    obstacle = AdmissionCheck(state, arc).obstacle(0)
+    return None if obstacle is None else obstacle.reason._replace(pattern=_pattern_of(arc, obstacle.rc))
+
+
+def _pattern_of(arc: Arc, rc: Rc) -> Need | None:
+    return next((need for need, name in arc.bound.items() if name == rc.name), None)
 
 
 class Pass:
@@ -261,9 +277,9 @@ class Pass:
         self.votes, self.index = state.votes, state.index
         self.off_limits = 0
         self.changed = 0  # bits of the RCs changed since the last pass began
-        self._heap: list[tuple[Rank, int, Arc, Rc | None]] = []
-        """The next ARCs to check, beside the ready ones; each RC has one watcher here."""
-        self._walked: set[int] = set()  # bits of the RCs with a watcher in the heap
+        self._heap: list[tuple[Rank, int, Arc, Watched | None]] = []
+        """The next ARCs to check, beside the ready ones; each RC and class has one watcher here."""
+        self._walked: set[Watched] = set()  # those with a watcher in the heap
         self._changed_here = 0  # bits of the RCs changed by this pass
 
     def run(self, ready_arcs: Iterable[Arc], off_limits: int = 0) -> None:
@@ -274,19 +290,19 @@ class Pass:
         heap, at, last = self._heap, 0, None
         while heap or at < len(ready):
             if at < len(ready) and (not heap or ready[at].rank <= heap[0][0]):
-                arc, rc = ready[at], None
+                arc, on = ready[at], None
                 at += 1
             else:
-                _, _, arc, rc = heapq.heappop(heap)
-                if rc is not None and not self._needs_check(rc, arc):
+                _, _, arc, on = heapq.heappop(heap)
+                if on is not None and not self._needs_check(on, arc):
                     continue
             # An ARC may be queued twice in the heap; duplicates are adjacent because ranks are unique.
             if arc.rank != last:
                 last = arc.rank
                 if arc.footprint is None or not self._still_deferred(arc, arc.footprint):
                     self._check(arc)
-            if rc is not None:
-                self._call_next_watcher(rc, last)
+            if on is not None:
+                self._call_next_watcher(on, last)
         # ARCs checked before a later change have not seen it.
         self.index.touched |= self._changed_here
 
@@ -298,11 +314,17 @@ class Pass:
             self._apply(arc, check, self._verdict(arc, check))
 
     def _check_patterns(self, arc: Arc) -> None:
-        """Try bindings, best first, until the ARC starts or asks votes."""
-        without, tried = 0, 0
+        """Try bindings, best first, until the ARC starts or asks votes. With too few RCs none can do."""
+        if not self.off_limits & class_of(arc).reach and short(self.state, arc):
+            self._watch_class(arc)
+            return
+        without, found = 0, choices(self.state, arc, self.reserved)
         best: tuple[Mapping[Need, RcName], _Verdict] | None = None
-        while tried < MAX_BINDINGS and bind(self.state, arc, self.reserved, without=without):
-            tried += 1
+        for _ in range(MAX_BINDINGS):
+            bound = found.best(without=without)
+            if bound is None:
+                break
+            self.state.bind(arc, bound)
             check = AdmissionCheck(self.state, arc)
             verdict = self._verdict(arc, check)
             blamed = self._blamed(arc, verdict)
@@ -318,6 +340,21 @@ class Pass:
             return
         self.state.bind(arc, best[0])
         self._apply(arc, AdmissionCheck(self.state, arc), best[1])
+
+    def _watch_class(self, arc: Arc) -> None:
+        on: Watched = class_of(arc)
+        bound = bind(self.state, arc, self.reserved)
+        obstacle = AdmissionCheck(self.state, arc).obstacle(self.off_limits) if bound else None
+        if obstacle is None:
+            reason = no_match(self.state, arc)
+        else:
+            reason = obstacle.reason._replace(pattern=_pattern_of(arc, obstacle.rc))
+            on = on if reason.pattern is not None else obstacle.rc
+        if arc.claim is None or isinstance(on, Rc):
+            self.index.watch(arc, on)
+        else:
+            self.index.put(arc, ArcState.READY)  # its reason is its booking's danger
+        self.actions.wait(arc, reason)
 
     def _blamed(self, arc: Arc, verdict: _Verdict) -> int:
         """Bits of the bound RCs that keep the ARC out, where others might not."""
@@ -357,7 +394,7 @@ class Pass:
                 self.actions.wait(arc, reason if silent else VOTING, settled=silent)
                 self.actions.propose(rc, proposal)
             case Inadmissible(rc, reason, _, early):
-                pattern = next((need for need, name in arc.bound.items() if name == rc.name), None)
+                pattern = _pattern_of(arc, rc)
                 if pattern is None:
                     if early:
                         self.index.put(arc, ArcState.READY)
@@ -449,27 +486,32 @@ class Pass:
 
     def _call_concerned(self, watched: int, touched: int, rank: Rank | None) -> None:
         index = self.index
-        for rc in self.state.rcs_in(watched & index.watched):
-            if rc.bit not in self._walked:
-                self._walked.add(rc.bit)
-                self._call_next_watcher(rc, rank)
+        for on in self.state.watched_at(watched):
+            if on not in self._walked:
+                self._walked.add(on)
+                self._call_next_watcher(on, rank)
         for arc in [arc for arc in index.parked.values() if (arc.footprint or 0) & touched]:
             if rank is None or arc.rank > rank:
                 index.put(arc, ArcState.READY)
                 heapq.heappush(self._heap, (arc.rank, 0, arc, None))
 
-    def _call_next_watcher(self, rc: Rc, rank: Rank | None) -> None:
-        following = self.state.next_watcher(rc, rank)
+    def _call_next_watcher(self, on: Watched, rank: Rank | None) -> None:
+        following = self.state.next_watcher(on, rank)
         if following is None:
-            self._walked.discard(rc.bit)
+            self._walked.discard(on)
         else:
             heapq.heappush(self._heap, following)
 
-    def _needs_check(self, rc: Rc, arc: Arc) -> bool:
-        """Return False to end the walk along the watchers of `rc`: held again, and no watcher from `arc` on may
-        preempt its holder. `reasons_of_now` reports their reasons later."""
-        if rc.sharable or rc.bit & self.off_limits or not rc.non_preemptible_holders(arc, self.state.now):
-            return True
-        self._walked.discard(rc.bit)
-        self.index.unreported |= rc.bit
+    def _needs_check(self, on: Watched, arc: Arc) -> bool:
+        """Return False to end the walk along these watchers: RC or class are held again, and no watcher from `arc` on
+        may preempt the holder. `reasons_of_now` reports their reasons later."""
+        if isinstance(on, PatternClass):
+            if on.reach & self.off_limits or not all_present(self.state, arc) or not short(self.state, arc):
+                return True
+            self.index.unreported_classes[on] = None
+        else:
+            if on.sharable or on.bit & self.off_limits or not on.non_preemptible_holders(arc, self.state.now):
+                return True
+            self.index.unreported |= on.bit
+        self._walked.discard(on)
         return False

@@ -3,9 +3,12 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right, insort
 from collections.abc import Callable, Iterable, Mapping
 from operator import itemgetter
+from typing import TypeAlias
 
-from zscout.scheduling.model import Arc, ArcState, Rank, Rc
+from zscout.scheduling.model import Arc, ArcState, PatternClass, Rank, Rc
 from zscout.types import ArcId, Ns
+
+Watched: TypeAlias = Rc | PatternClass
 
 
 class QueueIndex:
@@ -15,7 +18,7 @@ class QueueIndex:
       without an index. VOTING and DEFERRED have a *footprint*, the RCs that the ARC would take or free: without changes
       there, another check would end alike.
     - WATCHING one RC that alone keeps it out: absent, held without preemption, or vetoing. No event elsewhere can let
-      it start.
+      it start. Or, as part of its class, all RCs that its patterns match, where too few are left (`patterns.short`).
     - PARKED before an RC that does not answer: a change within its footprint makes it ready.
 
     Sorted lists: 10,000 ranks move in a few microseconds."""
@@ -25,9 +28,11 @@ class QueueIndex:
         self.ready: dict[ArcId, Arc] = {}  # READY, VOTING or DEFERRED
         self.parked: dict[ArcId, Arc] = {}
         self.watched = 0  # bits of the RCs with watchers
+        self.watched_classes: dict[PatternClass, None] = {}  # classes with watchers
         self.freed = 0  # bits of the RCs that may admit watchers since the last pass
         self.touched = 0  # bits of the RCs with other changes: these affect all but watchers
         self.unreported = 0  # bits of the RCs with new holders that are not reported to watchers yet
+        self.unreported_classes: dict[PatternClass, None] = {}
         self.ranks: list[Rank] = []  # of all queued ARCs, best first
         self._not_starving: list[tuple[Ns, ArcId]] = []  # queued ARCs, by the start of their wait
         self.starving: list[tuple[int, Ns, ArcId]] = []  # by band of priorities (negated), then waiting time
@@ -70,19 +75,23 @@ class QueueIndex:
         self.starving.clear()
         self.starving_version += 1
         self.ranks = sorted(arc.rank for arc in queued.values())
-        for rc in rcs:
-            rc.watchers = sorted(queued[rank[-1]].rank for rank in rc.watchers)
+        watched: list[Watched] = [*rcs, *self.watched_classes]
+        for on in watched:
+            on.watchers = sorted(queued[rank[-1]].rank for rank in on.watchers)
 
     def ahead(self, arc: Arc) -> int:
         return bisect_left(self.ranks, arc.rank)
 
-    def watch(self, arc: Arc, rc: Rc) -> None:
-        if arc.watched is not rc:
+    def watch(self, arc: Arc, on: Watched) -> None:
+        if arc.watched is not on:
             self._leave(arc)
             arc.move_to(ArcState.WATCHING)
-            arc.watched = rc
-            insort(rc.watchers, arc.rank)
-            self.watched |= rc.bit
+            arc.watched = on
+            insort(on.watchers, arc.rank)
+            if isinstance(on, Rc):
+                self.watched |= on.bit
+            else:
+                self.watched_classes[on] = None
 
     def put(self, arc: Arc, state: ArcState, footprint: int | None = None, masked_obstacles: int = 0) -> None:
         """Put `arc` in this state, not WATCHING. READY has no footprint."""
@@ -95,8 +104,11 @@ class QueueIndex:
         self.ready.pop(arc.id, None)
         self.parked.pop(arc.id, None)
         arc.footprint = None
-        rc, arc.watched = arc.watched, None
-        if rc is not None:
-            del rc.watchers[bisect_left(rc.watchers, arc.rank)]
-            if not rc.watchers:
-                self.watched &= ~rc.bit
+        on, arc.watched = arc.watched, None
+        if on is not None:
+            del on.watchers[bisect_left(on.watchers, arc.rank)]
+            if isinstance(on, PatternClass) and not on.watchers:
+                del self.watched_classes[on]
+                self.unreported_classes.pop(on, None)
+            elif isinstance(on, Rc) and not on.watchers:
+                self.watched &= ~on.bit

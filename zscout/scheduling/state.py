@@ -5,9 +5,9 @@ Sets of RCs are integer bit masks; `needs & ~free == 0` is the whole test for an
 from __future__ import annotations
 
 import heapq
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right, insort
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Protocol
 
@@ -17,8 +17,8 @@ from zscout.config.scheduling_policy import DEFAULT, RcQuota, SchedulingPolicy, 
 from zscout.keyexpr import is_pattern, matcher
 from zscout.scheduling.booking import Booking
 from zscout.scheduling.fair_shares import Shares
-from zscout.scheduling.model import Arc, ArcRequest, ArcState, Claim, Hold, Rank, Rc, union
-from zscout.scheduling.queue_index import QueueIndex
+from zscout.scheduling.model import Arc, ArcRequest, ArcState, Claim, Hold, PatternClass, Rank, Rc, union
+from zscout.scheduling.queue_index import QueueIndex, Watched
 from zscout.scheduling.reason import Reason
 from zscout.scheduling.votes import HolderSet, Votes
 from zscout.types import ArcId, ClientId, Need, Ns, Params, Place, RcName
@@ -54,12 +54,15 @@ class SchedulerState:
         self.index = QueueIndex(self.band)
         self.by_pattern: dict[ArcId, Arc] = {}  # queued ARCs with patterns
         self._matching: dict[Need, list[Rc]] = {}
+        self._matching_masks: dict[Need, int] = {}
+        self.classes: dict[Hashable, PatternClass] = {}
         self.running_by_owner: Counter[str] = Counter()
         self.held_by_owner: Counter[str] = Counter()
         self._by_bit: list[Rc] = []
         self._clients: dict[ClientId, dict[ArcId, Arc]] = {}
         self._owners: dict[str, dict[ArcId, Arc]] = {}
         self.entries = 0
+        self.demand_version = 0  # grows with each change of `Rc.demand`
         self.version = 0  # grows with each change of holders, present RCs and preemptibility
         self.changed = 0  # bits of the RCs where it grew, since `Claims` last emptied this
         self.shares = Shares(self, policy.fair_shares) if policy.fair_shares is not None else None
@@ -72,6 +75,9 @@ class SchedulerState:
             rc = self.rcs[name] = Rc(name, 1 << len(self._by_bit))
             self._by_bit.append(rc)
             self._matching.clear()
+            self._matching_masks.clear()
+            for like in self.classes.values():
+                self._find_matches(like, self.queued[like.members[0][-1]])
         return rc
 
     def matching(self, need: Need) -> list[Rc]:
@@ -80,6 +86,12 @@ class SchedulerState:
             matches = matcher(need)
             found = self._matching[need] = [rc for rc in self.rcs.values() if matches(rc.name)]
         return found
+
+    def matching_mask(self, need: Need) -> int:
+        mask = self._matching_masks.get(need)
+        if mask is None:
+            mask = self._matching_masks[need] = union(rc.bit for rc in self.matching(need))
+        return mask
 
     def bind(self, arc: Arc, bound: Mapping[Need, RcName]) -> None:
         """Bind the patterns of an ARC that does not run to these RCs; empty if a pattern has none."""
@@ -110,7 +122,7 @@ class SchedulerState:
         return arc.request.needs[next(need for need in arc.patterns if rc in self.matching(need))]
 
     def possible_sharables(self, arc: Arc) -> Iterator[Rc]:
-        matching = union(rc.bit for need in arc.patterns for rc in self.matching(need)) if arc.patterns else 0
+        matching = union(map(self.matching_mask, arc.patterns))
         return self.rcs_in((arc.mask | matching) & self.sharable)
 
     def mask(self, names: Iterable[RcName]) -> int:
@@ -122,12 +134,17 @@ class SchedulerState:
             yield self._by_bit[low.bit_length() - 1]
             mask ^= low
 
-    def next_watcher(self, rc: Rc, rank: Rank | None) -> tuple[Rank, int, Arc, Rc] | None:
-        """The best watcher of `rc` below `rank` (None: of all), as a heap entry."""
-        at = 0 if rank is None else bisect_right(rc.watchers, rank)
-        if at == len(rc.watchers):
+    def watched_at(self, bits: int) -> list[Watched]:
+        """The RCs and classes whose watchers a change of these RCs concerns."""
+        classes = [like for like in self.index.watched_classes if like.reach & bits]
+        return [*self.rcs_in(bits & self.index.watched), *classes]
+
+    def next_watcher(self, on: Watched, rank: Rank | None) -> tuple[Rank, int, Arc, Watched] | None:
+        """The best watcher below `rank` (None: of all), as a heap entry."""
+        at = 0 if rank is None else bisect_right(on.watchers, rank)
+        if at == len(on.watchers):
             return None
-        return rc.watchers[at], rc.bit, self.queued[rc.watchers[at][-1]], rc
+        return on.watchers[at], on.bit if isinstance(on, Rc) else -1, self.queued[on.watchers[at][-1]], on
 
     def arc(self, arc: ArcId) -> Arc | None:
         return self.running.get(arc) or self.queued.get(arc) or self.held_back.get(arc)
@@ -178,10 +195,11 @@ class SchedulerState:
             self.held_back[arc.id] = arc
             return
         self.queued[arc.id] = arc
-        if arc.patterns:
-            self.by_pattern[arc.id] = arc
         if self.shares is not None:
             self._put(arc, self.shares)
+        if arc.patterns:
+            self.by_pattern[arc.id] = arc
+            self._classify(arc)
         self._count_demand(arc, 1)
         self.index.add(arc)
 
@@ -190,9 +208,35 @@ class SchedulerState:
             arc.held_back = None
             return
         del self.queued[arc.id]
-        self.by_pattern.pop(arc.id, None)
         self._count_demand(arc, -1)
         self.index.remove(arc)
+        if arc.patterns:
+            del self.by_pattern[arc.id]
+            self._declassify(arc)
+
+    def _classify(self, arc: Arc) -> None:
+        key = self._class_key(arc)
+        like = arc.like = self.classes.get(key)
+        if like is None:
+            like = arc.like = self.classes[key] = PatternClass()
+            self._find_matches(like, arc)
+        insort(like.members, arc.rank)
+
+    def _declassify(self, arc: Arc) -> None:
+        like, arc.like = arc.like, None
+        if like is not None:
+            del like.members[bisect_left(like.members, arc.rank)]
+            if not like.members:
+                del self.classes[self._class_key(arc)]
+
+    def _class_key(self, arc: Arc) -> Hashable:
+        return frozenset(arc.patterns), arc.named_mask, arc.priority, self.policy.barred.get(arc.owner, ())
+
+    def _find_matches(self, like: PatternClass, arc: Arc) -> None:
+        taken = arc.named_mask | self.barred(arc)
+        like.masks = {need: self.matching_mask(need) & ~taken for need in arc.patterns}
+        like.reach = union(like.masks.values())
+        like.usable_of, like.choices = -1, {}
 
     def hold_back(self, arc: Arc, until: Ns, rcs: tuple[RcName, ...]) -> None:
         """A queued ARC is not considered before then, unless `readmit` admits it."""
@@ -394,7 +438,12 @@ class SchedulerState:
 
     def take_policy(self, policy: SchedulingPolicy) -> None:
         charged, same = self.charged(), policy.fair_shares == self.policy.fair_shares
+        for arc in self.by_pattern.values():  # other RCs may be barred now
+            self.index.put(arc, ArcState.READY)
+            self._declassify(arc)
         self.policy = policy
+        for arc in self.by_pattern.values():
+            self._classify(arc)
         if same:
             return
         self.shares = None if policy.fair_shares is None else Shares(self, policy.fair_shares)
@@ -411,6 +460,8 @@ class SchedulerState:
         for arc in self.queued.values():
             self._put(arc, shares)
         self.index.sort(self.queued, self.rcs_in(self.index.watched))
+        for like in self.classes.values():
+            like.members = sorted(self.queued[rank[-1]].rank for rank in like.members)
 
     def _put(self, arc: Arc, shares: Shares | None) -> None:
         arc.put_at(0 if shares is None else shares.position(arc))
@@ -458,7 +509,7 @@ class SchedulerState:
     def barred(self, arc: Arc) -> int:
         """Bits of the RCs to which no pattern of `arc` is bound."""
         patterns = self.policy.barred.get(arc.owner, ()) if arc.patterns else ()
-        return union(rc.bit for pattern in patterns for rc in self.matching(pattern))
+        return union(map(self.matching_mask, patterns))
 
     def _add_running(self, arc: Arc) -> None:
         self.running[arc.id] = arc
@@ -487,6 +538,7 @@ class SchedulerState:
     def _count_demand(self, arc: Arc, by: int) -> None:
         for rc in self.rcs_in(arc.named_mask) if arc.patterns else arc.rcs:
             rc.demand += by
+            self.demand_version += 1
         if self.shares is not None:
             self.shares.count_waiting(arc, by)
 

@@ -82,17 +82,18 @@ def test_what_can_never_start_is_refused_with_what_to_mend(need: str, params: di
             "unknown_device: 3 devices that match radio/* are requested, but only radio/rf0, radio/rf1 can be used",
         ),
         (["robot/*", "robot/arm1"], "unknown_device: robot/* is requested, but none but those you named"),
-        (["tank/x"], "unknown_device: unknown device tank/x; zscout status lists"),
+        (["tank/*"], "unknown_device: no device matches tank/*; "),
     ],
 )
-def test_what_never_waits_for_a_device_is_refused_where_too_few_meet_a_pattern(needs: list[str], words: str) -> None:
+def test_more_of_a_pattern_than_the_fleet_knows_of_is_refused(needs: list[str], words: str) -> None:
     said = refusal(*needs, may_wait=False)
     assert said.startswith(words)
     assert bool(said) is bool(words)
-
-
-def test_who_may_wait_for_a_device_may_ask_for_more_than_there_are() -> None:
-    assert refusal("radio/*", "radio/*#2", "radio/*#3") == ""
+    may_wait = refusal(*needs)
+    assert may_wait.startswith(words)
+    assert ("add --wait-for-device" in may_wait) is bool(words)
+    assert "--wait-for-device" not in said
+    assert refusal(*needs, waits=True) == ""
 
 
 def test_who_waits_for_a_device_is_still_told_of_bad_parameters() -> None:
@@ -124,6 +125,21 @@ async def test_the_leader_refuses_what_it_knows_only_to_who_asks_for_that() -> N
 
     with pytest.raises(Refusal, match="unknown_device"):
         await do(client, Foresee("f", "dry", {"robot/arn2": {}}, 0, Decimal(1), check=True), Foresight)
+
+
+async def test_more_of_a_pattern_than_the_fleet_knows_of_is_refused_at_the_first_asking() -> None:
+    fleet, (rc, _) = await fleet_of("robot/arm1", "robot/arm2")
+    client = fleet.client("one")
+    three = "robot/*", "robot/*#2", "robot/*#3"
+    assert (await client.ask("early", *three, check=True)).state == "queued", "it may not know all devices yet"
+    await asyncio.sleep(fleet.fleet.timing.hold_lease / SECOND)
+    fleet.network.kill(rc.mesh)
+    await asyncio.sleep(2)
+    with pytest.raises(Refusal, match=r"unknown_device: 3 devices that match .* but only robot/arm1, robot/arm2 can"):
+        await client.ask("three", *three, check=True)
+    assert (await client.ask("two", *three[:2], check=True)).state == "queued", "an absent device counts"
+    assert (await client.ask("foreign", *three)).state == "queued"
+    assert (await client.ask("patient", *three, check=True, wait_for_device=True)).state == "queued"
 
 
 async def test_a_device_that_went_is_waited_for() -> None:

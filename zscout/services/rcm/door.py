@@ -27,8 +27,8 @@ def check_door(
     waits: bool,
     may_wait: bool = True,
 ) -> None:
-    """Raises Refused for what is neither among those that are expected nor there; with `waits`, it is waited for. What
-    never waits (`may_wait` is false) has enough RCs for all its patterns, too."""
+    """Raises Refused for what is neither among those that are expected nor there, and for more RCs of a pattern than
+    match it; with `waits`, they are waited for. `may_wait`: whether the requester may choose that."""
     wanted = Counter(need.partition("#")[0] for need in needs if is_pattern(need))
     for need, params in needs.items():
         if not params and (is_there(need) or need in expected):
@@ -40,22 +40,23 @@ def check_door(
         if not matching and not waits:
             raise _unknown(need, expected, may_wait=may_wait)
         left = [rc for rc in matching if rc not in needs]
-        if is_pattern(need) and not waits and not may_wait and len(left) < wanted[need.partition("#")[0]]:
-            raise _too_few(need.partition("#")[0], left, wanted)
+        if is_pattern(need) and not waits and len(left) < wanted[need.partition("#")[0]]:
+            raise _too_few(need.partition("#")[0], left, wanted, may_wait=may_wait)
         refusals = [_objection(rc, params, parameters_of(rc)) for rc in matching]
         # One that takes it is enough.
         if refusals and all(refusals):
             raise next(filter(None, refusals))
 
 
-def _too_few(pattern: str, left: Sequence[RcName], wanted: Mapping[str, int]) -> Refused:
+def _too_few(pattern: str, left: Sequence[RcName], wanted: Mapping[str, int], *, may_wait: bool) -> Refused:
     what = (
         f"{wanted[pattern]} devices that match {pattern} are requested"
         if wanted[pattern] > 1
         else f"{pattern} is requested"
     )
     there = f"only {', '.join(left[:MAX_NAMED])}" if left else "none but those you named"
-    return Refused("unknown_device", f"{what}, but {there} can be used; request fewer")
+    more = ", or to wait for more, add --wait-for-device" if may_wait else ""
+    return Refused("unknown_device", f"{what}, but {there} can be used; request fewer{more}")
 
 
 def _unknown(need: Need, known: Collection[RcName], *, may_wait: bool) -> Refused:
