@@ -25,7 +25,7 @@ from zscout.drivers.repeated import CommandMemory
 from zscout.drivers.resource_controller import ResourceController
 from zscout.mesh.renewal import Suspicions
 from zscout.messages import BookingRecord, Problem
-from zscout.scheduling.claims import Claims
+from zscout.scheduling.calendar import Calendar
 from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.state import SchedulerState
 from zscout.services.bookings import records
@@ -283,9 +283,9 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "dates first": Guard(
             "a leader knows of all dates before it grants", {(Bookings, "recovered"): _none_recovered}
         ),
-        "one stands": Guard("of two bookings that can't both be one stands", {(BookedDates, "_judge"): _nothing}),
+        "one stands": Guard("of two bookings that can't both be one stands", {(Calendar, "_judge"): _nothing}),
         "awaited": Guard("who has taken up a date does not begin before it", {(BookedDates, "dated"): _undated}),
-        "had again": Guard("who has taken up a date has it again once it can be", {(Claims, "_offer"): _nothing}),
+        "had again": Guard("who has taken up a date has it again once it can be", {(Calendar, "_offer"): _nothing}),
         "withdrawn": Guard(
             "what nobody asks for is given back",
             {(RcmLink, "give_back"): _do_nothing, (Membership, "ask_requests"): _nothing},

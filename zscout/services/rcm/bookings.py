@@ -13,7 +13,7 @@ from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, Mesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import Amounts, BookingRecord, BookingsAsk, BookingsKept, Instant, ProposedHolder, decimals
-from zscout.scheduling.booking import Booked
+from zscout.scheduling.booking import BookingConflict, BookingThreatened, Dates
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Effect, Event, Propose, Vote, VoteOverdue
 from zscout.services.authority import Authority
@@ -114,7 +114,7 @@ class Bookings:
 
     def recovered(self, taken: Collection[str]) -> list[Event]:
         """The events by which the core knows of all dates; `taken`: those that ARCs have taken up."""
-        return self.dates.recovered(taken)
+        return [self.dates.recovered(taken)]
 
     def start(self) -> None:
         """From now on it answers, and shares what it knows."""
@@ -135,14 +135,15 @@ class Bookings:
             declared.close()
         self.handler.close()
 
-    def note(self, events: Collection[Event], effects: Iterable[Effect]) -> None:
+    def note(self, events: Collection[Event], effects: Collection[Effect]) -> None:
         """What has happened in an instant: what follows of it follows in another one."""
-        if self.dates.note(events, effects, settled=self.settled):
+        if self.dates.note(effects, settled=self.settled):
             self._on_news()
-        self._tell_soon()
-        if not self._booked and any(isinstance(event, Booked) for event in events):
+        if any(isinstance(effect, (BookingThreatened, BookingConflict)) for effect in effects):
+            self._tell_soon()
+        if not self._booked and any(isinstance(event, Dates) for event in events):
             self._booked = True
-            self._supervisor.call_later(GATHERS, self._await_another, self.dates.time)
+            self._supervisor.call_later(GATHERS, self._await_another)
         if self.handler.waits_for_votes and any(isinstance(event, (Vote, VoteOverdue)) for event in events):
             self._supervisor.call_later(0, self.handler.try_again)
 
@@ -170,13 +171,13 @@ class Bookings:
         self._reconciling = False
         self.dates.reconcile()
         self._tell_soon()
-        self._await_another(self.dates.time)
+        self._await_another()
 
-    def _await_another(self, since: float) -> None:
+    def _await_another(self) -> None:
         """What is repeated is to have its dates in time."""
         if self._another is not None:
             self._another.cancel()
-        until, self._booked = self.dates.until_another(since), False
+        until, self._booked = self.dates.until_another(), False
         delay = max(0.0, until) + SLACK
         self._another = self._supervisor.call_later(delay, self._on_news) if math.isfinite(until) else None
 
