@@ -65,10 +65,12 @@ class BookingState(StrEnum):
 
 class Dates(Struct, frozen=True):
     """All that is booked, best-ranked first: of what can't all be kept the first stands, and the others are in
-    conflict. What is missing is unbooked; at present only, if it is `forgotten`."""
+    conflict. What is missing is unbooked; at present only, if it is `forgotten`. `more`: these are a part, and nothing
+    is judged before all are sent."""
 
     ranked: tuple[Booking, ...]
     forgotten: frozenset[str] = frozenset()
+    more: bool = False
 
 
 class Booked(Struct, frozen=True):

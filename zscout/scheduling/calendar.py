@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import chain, pairwise
 from operator import itemgetter
 from typing import Final
@@ -28,6 +28,7 @@ from zscout.scheduling.booking import (
     BookingConflict,
     BookingState,
     BookingThreatened,
+    Dates,
 )
 from zscout.scheduling.claim_index import Timeline, bits, by_date
 from zscout.scheduling.dangers import Undecided, danger
@@ -69,6 +70,8 @@ class Calendar:
         self._lost_at: dict[int, Timeline] = {}  # by bit of each RC that would do
         self._unjudged: set[str] = set()
         self._order: list[tuple[int, str]] = []  # a heap of these, by rank
+        self._entered: list[str] = []
+        self.is_partial = False  # further dates follow
         self._wants: dict[RcName, list[tuple[Ns, int, HolderSet]]] = {}  # votes to ask: a heap for each RC
         self._asked: dict[RcName, dict[HolderSet, Ns]] = {}  # those not answered yet
         self._askable: dict[RcName, None] = {}  # RCs that may be asked more
@@ -87,10 +90,16 @@ class Calendar:
             self._state.bind(arc, booking.bound)
         return arc
 
-    def set_dates(self, ranked: Iterable[Booking], forgotten: Collection[str]) -> None:
-        state, wanted = self._state, {booking.id: booking for booking in ranked}
+    def set_dates(self, dates: Dates) -> None:
+        self.is_partial = dates.more
+        if dates.more:
+            for booking in dates.ranked:
+                self.book(booking)
+                self._entered.append(booking.id)
+            return
+        state, wanted = self._state, {booking.id: booking for booking in dates.ranked}
         for name in [name for name in state.claims if name not in wanted]:
-            self.unbook(name, at_present=name in forgotten)
+            self.unbook(name, at_present=name in dates.forgotten)
         for name in [name for name in self._lost if name not in wanted]:
             claim = self._recall(name)
             self._forget_votes(claim)
@@ -98,7 +107,8 @@ class Calendar:
         known = [name for name in wanted if name in before]
         same_order = all(before[name] < before[other] for name, other in pairwise(known))
         unjudged, self._unjudged, self._order = self._unjudged if same_order else {*known}, set(), []
-        self._look_again(unjudged)
+        self._look_again((*unjudged, *self._entered))
+        self._entered.clear()
         for name, booking in wanted.items():
             claim = state.claims.get(name)
             if claim is None and (claim := self._lost.get(name)) is None:
@@ -356,7 +366,7 @@ class Calendar:
             for holders in sets or ():
                 vetoed = not state.votes.accepts(name, holders)
                 for holder in holders:
-                    claim, until = self._claim_of(holder), state.now
+                    claim = self._claim_of(holder)
                     if claim is not None:
                         self._concerned[claim] = None
                         self._look_again((claim.booking.id,))
@@ -392,8 +402,7 @@ class Calendar:
             self._spread()
 
     def _judge_claim(self, claim: Claim) -> None:
-        name, bound = claim.booking.id, claim.booking.bound
-        if claim.arc.patterns and not bound and claim.arc.hold is None:
+        if claim.arc.patterns and not claim.booking.bound and claim.arc.hold is None:
             self._bind(claim, "")
             return
         by, unknown = self._obstacle(claim)
@@ -499,9 +508,7 @@ class Calendar:
                 return before[0].booking.id, []
         return None, unknown
 
-    def _refused(
-        self, rc: Rc, claim: Claim, before: list[Claim], unknown: list[tuple[Rc, HolderSet]]
-    ) -> bool:
+    def _refused(self, rc: Rc, claim: Claim, before: list[Claim], unknown: list[tuple[Rc, HolderSet]]) -> bool:
         """Return True if the RC would refuse it beside the others, at any time of it."""
         for time in sorted({claim.booking.start, *(other.booking.start for other in before)}):
             if not claim.booking.start <= time < claim.booking.end:

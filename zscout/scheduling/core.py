@@ -11,7 +11,7 @@ and a `Tick` at the latest when `WakeAt` asks for it."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 
 from msgspec.structs import replace
 
@@ -74,8 +74,9 @@ class Core:
         for arc in self._state.held_back.values():
             if arc.held_back is None and (other := self._state.at_place(arc.place)) is not None:
                 self.wait(arc, _claimed_by(other))
-        self._calendar.follow_up()
-        self._set_wake()
+        if not self._calendar.is_partial:
+            self._calendar.follow_up()
+            self._set_wake()
         return self._effects
 
     @property
@@ -206,7 +207,8 @@ class Core:
         proposals = []
         for rc, holders in unknown:
             if (number := self._votes.propose(rc.name, holders, self._state.now)) is not None:
-                arcs = [self._state.voter(holder) or self._calendar.stranger(holder) or stranger for holder in sorted(holders)]
+                known = [self._state.voter(holder) or self._calendar.stranger(holder) for holder in sorted(holders)]
+                arcs = [arc or stranger for arc in known]
                 params = {arc.id: self._state.params(arc, rc) for arc in arcs if arc is not None}
                 proposals.append(model.Propose(number, rc.name, params))
         return proposals
@@ -283,8 +285,8 @@ class Core:
                 self._take_lead(event)
             case model.Adopted(held):
                 self._adopt(held)
-            case Dates(ranked, forgotten):
-                self._calendar.set_dates(ranked, forgotten)
+            case Dates():
+                self._calendar.set_dates(event)
             case Booked(booking, tentative):
                 self._calendar.book(booking, tentative=tentative)
             case Unbooked(booking, at_present):

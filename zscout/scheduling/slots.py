@@ -181,5 +181,6 @@ class _Search:
 
     def latest(self, start: Ns, bound: Iterable[RcName]) -> Ns:
         rcs = (*self._named, *(self._state.rc(name) for name in bound))
-        coming = (spans[at].start for rc in rcs if (at := bisect_left(spans := self._taken[rc.bit], (start + 1,))) < len(spans))
+        after = (spans[bisect_left(spans, (start + 1,)) :][:1] for spans in (self._taken[rc.bit] for rc in rcs))
+        coming = (span.start for spans in after for span in spans)
         return max(start, min(coming, default=start + (1 << 62)) - self._wanted.runtime)

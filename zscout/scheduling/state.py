@@ -157,7 +157,9 @@ class SchedulerState:
     def is_free(self, arc: Arc) -> bool:
         """Return True if a new ARC without quota or pattern finds all RCs exclusive and free, and the queue is
         empty."""
-        if self.queued or self.held_back or arc.patterns or arc.place in self._at_place or arc.mask & self.dates.claimed:
+        if self.queued or self.held_back or arc.patterns or arc.place in self._at_place:
+            return False
+        if arc.mask & self.dates.claimed:
             return False
         bound = self.policy.max_running_per_host is not None or self.policy.rc_quotas
         return not bound and not arc.mask & ~self.present and not arc.mask & (self.busy | self.sharable)

@@ -49,7 +49,9 @@ class Repetition:
         return self._known[bisect_left(self._known, after) : bisect_left(self._known, before)]
 
     def first_from(self, time: float) -> float:
-        """The first date of a repeated booking from then on; infinite if there is none."""
+        """The first date from then on; infinite if there is none."""
+        if not self._booking.every:
+            return self._booking.start if self._booking.start >= time else math.inf
         self._find(time, time)
         at = bisect_left(self._known, time)
         return self._known[at] if at < len(self._known) else math.inf

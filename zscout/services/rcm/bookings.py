@@ -116,6 +116,12 @@ class Bookings:
         """The events by which the core knows of all dates; `taken`: those that ARCs have taken up."""
         return [self.dates.recovered(taken)]
 
+    async def enter(self, core: Core) -> None:
+        """Has the core know of dates, in parts between which others run, before it begins to lead."""
+        for part in self.dates.parts():
+            core.handle(self._mesh.now(), part)
+            await asyncio.sleep(0)
+
     def start(self) -> None:
         """From now on it answers, and shares what it knows."""
         keys, mesh, guard = self._mesh.keys, self._mesh, self._supervisor.guard
