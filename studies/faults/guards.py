@@ -281,7 +281,8 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "fleet time": Guard("a leader goes on in the time of the fleet", {(bookings, "_time"): _own_wall}),
         "slewed": Guard("fleet time does not jump in a reign", {(FleetClock, "_slewed"): _jumps}),
         "dates first": Guard(
-            "a leader knows of all dates before it grants", {(Bookings, "recovered"): _none_recovered}
+            "a leader knows of all dates before it grants",
+            {(Bookings, "recovered"): _none_recovered, (Bookings, "enter"): _do_nothing},
         ),
         "one stands": Guard("of two bookings that can't both be one stands", {(Calendar, "_judge"): _nothing}),
         "awaited": Guard("who has taken up a date does not begin before it", {(BookedDates, "dated"): _undated}),

@@ -93,6 +93,8 @@ class Fleet:
                 self.wake = effect.at
             elif isinstance(effect, Granted):
                 self.served[effect.arc] = since.get(effect.arc, self.now), self.now
+            elif isinstance(effect, BookingChanged) and effect.state is BookingState.UNBOOKED:
+                self.dangers.pop(effect.booking, None)
             elif isinstance(effect, BookingThreatened):
                 assert effect.reason != self.dangers.get(effect.booking), "told again"
                 self.dangers[effect.booking] = effect.reason

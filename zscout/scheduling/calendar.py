@@ -71,6 +71,7 @@ class Calendar:
         self._unjudged: set[str] = set()
         self._order: list[tuple[int, str]] = []  # a heap of these, by rank
         self._entered: list[str] = []
+        self._unbound: dict[str, None] = {}  # dates whose patterns wait for votes
         self.is_partial = False  # further dates follow
         self._wants: dict[RcName, list[tuple[Ns, int, HolderSet]]] = {}  # votes to ask: a heap for each RC
         self._asked: dict[RcName, dict[HolderSet, Ns]] = {}  # those not answered yet
@@ -101,8 +102,7 @@ class Calendar:
         for name in [name for name in state.claims if name not in wanted]:
             self.unbook(name, at_present=name in dates.forgotten)
         for name in [name for name in self._lost if name not in wanted]:
-            claim = self._recall(name)
-            self._forget_votes(claim)
+            self._forget_votes(self._recall(name))
         before, self._ranks = self._ranks, {name: rank for rank, name in enumerate(wanted)}
         known = [name for name in wanted if name in before]
         same_order = all(before[name] < before[other] for name, other in pairwise(known))
@@ -110,8 +110,7 @@ class Calendar:
         self._look_again((*unjudged, *self._entered))
         self._entered.clear()
         for name, booking in wanted.items():
-            claim = state.claims.get(name)
-            if claim is None and (claim := self._lost.get(name)) is None:
+            if (claim := state.claims.get(name) or self._lost.get(name)) is None:
                 self.book(booking, tentative=name in self._wanting)
                 self._look_again((name,))
             elif claim.date != booking.start:
@@ -140,12 +139,12 @@ class Calendar:
 
     def redate(self, booking: str, start: Ns) -> None:
         """Move a booking's date. The booking of a hold stays as it is, and is judged by that date."""
+        self._look_again((booking,))
         if (lost := self._lost.get(booking)) is not None:
             by = self._lost_to[booking]
             self._recall(booking)
             lost.booking, lost.date = replace(lost.booking, start=start), start
             self._lose(lost, by)
-            self._look_again((booking,))
         if (claim := self._state.claims.get(booking)) is None:
             return
         claim.date = start
@@ -231,6 +230,7 @@ class Calendar:
             self._forget_votes(claim)
         self._state.dates.remove(claim)
         claim.arc.claim = None
+        self._unbound.pop(claim.booking.id, None)
         self._endangered.pop(claim, None)
         claim.danger = None
         self._emit(BookingChanged(claim.booking.id, state, None if arc is None else arc.id))
@@ -269,6 +269,7 @@ class Calendar:
     def rc_joined(self, rc: Rc) -> None:
         self._look_again(claim.booking.id for claim in self._state.dates.of(rc, self._state.now))
         self._look_again(self._lost)
+        self._look_again(self._unbound)
 
     def _keep_others(self, mask: int, claims: Iterable[Claim]) -> None:
         """Rebind the patterns of bookings that have some of these RCs, the next dates first, where other RCs are free
@@ -402,7 +403,7 @@ class Calendar:
             self._spread()
 
     def _judge_claim(self, claim: Claim) -> None:
-        if claim.arc.patterns and not claim.booking.bound and claim.arc.hold is None:
+        if _is_unbound(claim):
             self._bind(claim, "")
             return
         by, unknown = self._obstacle(claim)
@@ -438,6 +439,7 @@ class Calendar:
     def _bind(self, claim: Claim, by: str) -> None:
         """Bind the patterns of a date to RCs that are free then; if there are none, `by` is in its way."""
         name, stands = claim.booking.id, claim.booking.id in self._state.claims
+        self._unbound.pop(name, None)
         if claim.arc.patterns:
             self._left -= SEARCH
             unbound = replace(claim.booking, start=claim.date, bound={})
@@ -445,6 +447,7 @@ class Calendar:
             if found.unknown:
                 self._want(claim, found.unknown)
                 if not by and stands:
+                    self._unbound[name] = None
                     return  # judged again when they are in
             elif found.found:
                 bound = found.found[0].bound
@@ -605,7 +608,8 @@ class Calendar:
         while concerned and self._left > 0:
             claim = next(iter(concerned))
             del concerned[claim]
-            if state.claims.get(claim.booking.id) is claim and claim.booking.id not in self._unjudged:
+            name = claim.booking.id
+            if state.claims.get(name) is claim and name not in self._unjudged and name not in self._unbound:
                 self._left -= 1
                 self._report_danger(claim)
 
@@ -633,6 +637,10 @@ class Calendar:
         else:
             self._endangered[claim] = None
         self._emit(BookingThreatened(claim.booking.id, found))
+
+
+def _is_unbound(claim: Claim) -> bool:
+    return bool(claim.arc.patterns) and not claim.booking.bound and claim.arc.hold is None
 
 
 def _meet(claim: Claim, other: Claim) -> bool:
