@@ -1,4 +1,4 @@
-"""Bookings: all of some RCs at once, from a date. `claims.py` keeps them."""
+"""Bookings: all of some RCs at once, from a date. `calendar.py` keeps them."""
 
 from __future__ import annotations
 

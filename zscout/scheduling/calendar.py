@@ -15,6 +15,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from itertools import chain, pairwise
 from operator import itemgetter
 from typing import Final
@@ -61,6 +62,25 @@ def request_for(booking: Booking) -> ArcRequest:
     )
 
 
+@dataclass(slots=True)
+class _Questions:
+    """The sets that one RC is to be asked about, those of the next dates first."""
+
+    heap: list[tuple[Ns, int, HolderSet]] = field(default_factory=list)
+    waiting: set[HolderSet] = field(default_factory=set)
+    asked: dict[HolderSet, Ns] = field(default_factory=dict)
+    count: int = 0
+
+    def add(self, date: Ns, holders: HolderSet) -> None:
+        if holders not in self.waiting and holders not in self.asked:
+            self.count += 1
+            self.waiting.add(holders)
+            heapq.heappush(self.heap, (date, self.count, holders))
+
+    def pop(self) -> None:
+        self.waiting.discard(heapq.heappop(self.heap)[2])
+
+
 class Calendar:
     def __init__(self, state: SchedulerState, actions: Actions, emit: Callable[[Effect], None]) -> None:
         self._state, self._actions, self._emit = state, actions, emit
@@ -73,12 +93,11 @@ class Calendar:
         self._entered: list[str] = []
         self._unbound: dict[str, None] = {}  # dates whose patterns wait for votes
         self.is_partial = False  # further dates follow
-        self._wants: dict[RcName, list[tuple[Ns, int, HolderSet]]] = {}  # votes to ask: a heap for each RC
-        self._asked: dict[RcName, dict[HolderSet, Ns]] = {}  # those not answered yet
+        self._questions: dict[RcName, _Questions] = {}
         self._askable: dict[RcName, None] = {}  # RCs that may be asked more
-        self._wanted = 0
         self._concerned: dict[Claim, None] = {}  # bookings that may be newly in danger, or no longer
         self._left = WORK
+        self._turn = 0  # counts checks of overdue bookings, which take turns
         self._reserved: Reservations | None = None  # the reservations at the last search for dangers
         self._endangered: dict[Claim, None] = {}  # bookings last reported as endangered
         self._wanting: dict[str, list[Arc]] = {}  # by booking: ARCs that want it while it is absent or taken
@@ -109,12 +128,14 @@ class Calendar:
         unjudged, self._unjudged, self._order = self._unjudged if same_order else {*known}, set(), []
         self._look_again((*unjudged, *self._entered))
         self._entered.clear()
+        known_claims = (state.claims.get(name) or self._lost.get(name) for name in known)
+        moves = {wanted[claim.booking.id].start - claim.date for claim in known_claims if claim is not None}
         for name, booking in wanted.items():
             if (claim := state.claims.get(name) or self._lost.get(name)) is None:
                 self.book(booking, tentative=name in self._wanting)
                 self._look_again((name,))
             elif claim.date != booking.start:
-                self.redate(name, booking.start)
+                self.redate(name, booking.start, alike=len(moves) == 1)
 
     def book(self, booking: Booking, *, tentative: bool = False) -> None:
         if (known := self._state.claims.get(booking.id)) is not None:
@@ -137,9 +158,11 @@ class Calendar:
         if (claim := self._state.claims.get(booking)) is not None:
             self._end(claim, BookingState.UNBOOKED, at_present=at_present)
 
-    def redate(self, booking: str, start: Ns) -> None:
-        """Move a booking's date. The booking of a hold stays as it is, and is judged by that date."""
-        self._look_again((booking,))
+    def redate(self, booking: str, start: Ns, *, alike: bool = False) -> None:
+        """Move a booking's date. The booking of a hold stays as it is, and is judged by that date. Nothing is judged
+        where all dates move `alike`."""
+        if not alike:
+            self._look_again((booking,))
         if (lost := self._lost.get(booking)) is not None:
             by = self._lost_to[booking]
             self._recall(booking)
@@ -150,12 +173,12 @@ class Calendar:
         claim.date = start
         if claim.arc.hold is None:
             claim.booking = replace(claim.booking, start=start)
-        self._state.dates.put(claim)
-        if claim.arc.hold is not None:
-            return
-        if claim.arc.held_back is not None:
+        self._state.dates.put(claim, changed=not alike)
+        self._concerned[claim] = None
+        if claim.arc.hold is None and claim.arc.held_back is not None:
             self._wait_again(claim.arc, start)
-        self.expire()
+        if claim.arc.hold is None:
+            self.expire()
 
     def take_up(self, booking: str, arc: Arc) -> None:
         """Let a waiting or running ARC take its booking up, now or once that is there and open. The ARC waits for
@@ -310,8 +333,7 @@ class Calendar:
             self._concerned.clear()
             self._unjudged.clear()
             self._order.clear()
-            self._wants.clear()
-            self._asked.clear()
+            self._questions.clear()
             self._askable.clear()
             state.dates.touched.clear()
             state.changed.clear()
@@ -330,7 +352,7 @@ class Calendar:
     def _spread(self) -> None:
         """Look again at what overlaps changed claims."""
         state, touched = self._state, self._state.dates.touched
-        if self._reserved is None and not self._lost and len(self._unjudged) >= len(state.claims):
+        if self._reserved is None and not self._lost and len(self._unjudged) >= len(self._ranks):
             touched.clear()  # all are looked at
         while touched:
             claim, mask, start, end = touched.popitem()[0]
@@ -358,7 +380,7 @@ class Calendar:
         changed, state.votes.changed = state.votes.changed, {}
         for name, sets in changed.items():
             rc = state.rc(name)
-            if name in self._wants or name in self._asked:
+            if name in self._questions:
                 self._askable[name] = None
             if sets is None:
                 claims = state.dates.of(rc, state.now)
@@ -488,9 +510,7 @@ class Calendar:
         return claim
 
     def _choices(self, claim: Claim) -> int:
-        patterns = claim.arc.patterns
-        matching = union(rc.bit for need in patterns for rc in self._state.matching(need)) if patterns else 0
-        return claim.kept | matching
+        return claim.kept | union(map(self._state.matching_mask, claim.arc.patterns))
 
     def _obstacle(self, claim: Claim) -> tuple[str | None, list[tuple[Rc, HolderSet]]]:
         """A better-ranked date in the way of this one, if any, and the votes that would tell. Absent RCs are not
@@ -529,53 +549,45 @@ class Calendar:
 
     def _want(self, claim: Claim, unknown: Iterable[tuple[Rc, HolderSet]]) -> None:
         for rc, holders in unknown:
-            self._wanted += 1
-            heapq.heappush(self._wants.setdefault(rc.name, []), (claim.booking.start, self._wanted, holders))
+            self._questions.setdefault(rc.name, _Questions()).add(claim.booking.start, holders)
             self._askable[rc.name] = None
 
     @property
     def next_question(self) -> Ns | None:
         """When an RC that does not answer may be asked again."""
         votes = self._state.votes
-        silent = votes.unresponsive and (self._wants.keys() | self._asked.keys()) & votes.unresponsive
-        return min(map(votes.retry_at, silent), default=None) if silent else None
+        silent = self._questions.keys() & votes.unresponsive if votes.unresponsive else ()
+        return min(map(votes.retry_at, silent), default=None)
 
     def _ask(self) -> None:
         """Ask each RC about a few sets at a time, those of the next dates first."""
         votes = self._state.votes
         for name in votes.due(self._state.now) if votes.unresponsive else ():
-            if name in self._wants or name in self._asked:
+            if name in self._questions:
                 self._askable[name] = None
         for name in list(self._askable):
             if self._left <= 0:
                 return
-            self._ask_rc(self._state.rc(name))
             del self._askable[name]
+            questions = self._questions[name]
+            self._ask_rc(self._state.rc(name), questions)
+            if not questions.heap and not questions.asked:
+                del self._questions[name]
 
-    def _ask_rc(self, rc: Rc) -> None:
-        votes, wants = self._state.votes, self._wants.get(rc.name, [])
-        asked = self._asked.setdefault(rc.name, {})
+    def _ask_rc(self, rc: Rc, questions: _Questions) -> None:
+        votes, asked = self._state.votes, questions.asked
         for holders, date in list(asked.items()):
-            if not self._may_ask(rc, holders):
+            if not votes.is_asked(rc.name, holders):
                 del asked[holders]
-            elif not votes.is_asked(rc.name, holders):
-                del asked[holders]
-                self._wanted += 1
-                heapq.heappush(wants, (date, self._wanted, holders))
-        while wants and votes.open(rc.name) < IN_FLIGHT:
-            date, _, holders = wants[0]
-            if holders not in asked and self._may_ask(rc, holders):
+                questions.add(date, holders)
+        while questions.heap and votes.open(rc.name) < IN_FLIGHT:
+            date, _, holders = questions.heap[0]
+            if self._may_ask(rc, holders):
                 self._left -= SEARCH
                 if not self._actions.propose(rc, holders) and rc.name in votes.unresponsive:
-                    break
+                    return
                 asked[holders] = date
-            heapq.heappop(wants)
-        if wants:
-            self._wants[rc.name] = wants
-        else:
-            self._wants.pop(rc.name, None)
-        if not asked:
-            del self._asked[rc.name]
+            questions.pop()
 
     def _may_ask(self, rc: Rc, holders: HolderSet) -> bool:
         there = rc.present and rc.sharable and all(self._claim_of(holder) is not None for holder in holders)
@@ -597,21 +609,26 @@ class Calendar:
         for bit, until in changed.items() if before is not None else ():
             if until > state.now and bit & state.dates.claimed:
                 self._concerned |= dict.fromkeys(state.dates.of(state.rc_of(bit), state.now, until))
-        waiting = (claim for claim in state.dates.begun(state.now) if claim.arc.hold is None)
-        self._concerned |= dict.fromkeys(waiting)
         mask = union(changed)
         self._concerned |= {claim: None for claim in self._endangered if mask and self._choices(claim) & mask}
 
     def _report_dangers(self) -> None:
         """Report bookings newly in danger, or no longer."""
-        state, concerned = self._state, self._concerned
+        state, concerned, uncertain = self._state, self._concerned, self._unjudged | self._unbound.keys()
         while concerned and self._left > 0:
             claim = next(iter(concerned))
             del concerned[claim]
             name = claim.booking.id
-            if state.claims.get(name) is claim and name not in self._unjudged and name not in self._unbound:
+            if state.claims.get(name) is claim and name not in uncertain:
                 self._left -= 1
                 self._report_danger(claim)
+        # The reasons of overdue bookings change with their ARCs.
+        begun = state.dates.begun(state.now)
+        waiting = [claim for claim in begun if claim.arc.hold is None and claim.booking.id not in uncertain]
+        for _ in range(min(len(waiting), self._left)):
+            self._turn += 1
+            self._left -= 1
+            self._report_danger(waiting[self._turn % len(waiting)])
 
     @property
     def next_start(self) -> Ns | None:

@@ -72,10 +72,10 @@ class ClaimIndex:
             self.maintenance[booking.id] = claim
         self._enter(claim)
 
-    def put(self, claim: Claim) -> None:
-        """Index an active claim again after it has changed."""
-        self._leave(claim)
-        self._enter(claim)
+    def put(self, claim: Claim, *, changed: bool = True) -> None:
+        """Index an active claim again after it has changed, or moved as all have."""
+        self._leave(claim, changed=changed)
+        self._enter(claim, changed=changed)
 
     def remove(self, claim: Claim) -> None:
         del self.by_id[claim.booking.id]
@@ -83,7 +83,7 @@ class ClaimIndex:
         self._leave(claim)
         self._suspended.discard(claim)
 
-    def _enter(self, claim: Claim) -> None:
+    def _enter(self, claim: Claim, *, changed: bool = True) -> None:
         booking = claim.booking
         start, end = min(booking.start, claim.date), max(booking.start, claim.date) + booking.runtime
         mask = claim.kept | claim.mask
@@ -94,10 +94,10 @@ class ClaimIndex:
         insort(self._by_date, (start, booking.id))
         for at in _instants(booking):
             heapq.heappush(self._ends, (at, booking.id))
-        self._touch(claim)
+        self._touch(claim, changed=changed)
 
-    def _leave(self, claim: Claim) -> None:
-        self._touch(claim)
+    def _leave(self, claim: Claim, *, changed: bool = True) -> None:
+        self._touch(claim, changed=changed)
         mask, start, end = self._spans.pop(claim)
         for bit in bits(mask):
             timeline = self._by_rc[bit]
@@ -107,10 +107,11 @@ class ClaimIndex:
                 self.claimed &= ~bit
         del self._by_date[bisect_left(self._by_date, (start, claim.booking.id))]
 
-    def _touch(self, claim: Claim) -> None:
+    def _touch(self, claim: Claim, *, changed: bool = True) -> None:
         self.version += 1
         mask, start, end = self._spans[claim]
-        self.touched[claim, mask, start, end] = None
+        if changed:
+            self.touched[claim, mask, start, end] = None
         for bit in bits(mask):
             self._touched_at[bit] = self.version
 

@@ -49,6 +49,7 @@ class SchedulerState:
         self.index = QueueIndex(self.band)
         self.by_pattern: dict[ArcId, Arc] = {}  # queued ARCs with patterns
         self._matching: dict[Need, list[Rc]] = {}
+        self._matching_masks: dict[Need, int] = {}
         self.running_by_owner: Counter[str] = Counter()
         self.held_by_owner: Counter[str] = Counter()
         self._by_bit: list[Rc] = []
@@ -68,6 +69,7 @@ class SchedulerState:
             rc = self.rcs[name] = Rc(name, 1 << len(self._by_bit))
             self._by_bit.append(rc)
             self._matching.clear()
+            self._matching_masks.clear()
         return rc
 
     def rc_of(self, bit: int) -> Rc:
@@ -78,6 +80,12 @@ class SchedulerState:
         if found is None:
             matches = matcher(need)
             found = self._matching[need] = [rc for rc in self.rcs.values() if matches(rc.name)]
+        return found
+
+    def matching_mask(self, need: Need) -> int:
+        found = self._matching_masks.get(need)
+        if found is None:
+            found = self._matching_masks[need] = union(rc.bit for rc in self.matching(need))
         return found
 
     def bind(self, arc: Arc, bound: Mapping[Need, RcName]) -> None:
@@ -109,7 +117,7 @@ class SchedulerState:
         return arc.request.needs[next(need for need in arc.patterns if rc in self.matching(need))]
 
     def possible_sharables(self, arc: Arc) -> Iterator[Rc]:
-        matching = union(rc.bit for need in arc.patterns for rc in self.matching(need)) if arc.patterns else 0
+        matching = union(map(self.matching_mask, arc.patterns))
         return self.rcs_in((arc.mask | matching) & self.sharable)
 
     def mask(self, names: Iterable[RcName]) -> int:

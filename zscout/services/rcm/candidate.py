@@ -361,8 +361,10 @@ class Candidate:
             kept,
             self._runtimes.estimator,
         )
+        self._leading.callback(rcm.stop)
         await rcm.bookings.enter(rcm.core)
         if self.known > term:
+            self._leading.close()
             self.election.rivalled(self.mesh.now())
             return False
         self.rcm, self._goes_above = rcm, False
@@ -371,7 +373,6 @@ class Candidate:
         self.terms_led += 1
         rcm.membership.on_disbelieved = self._disbelieved
         rcm.bookings.on_danger = self.on_danger
-        self._leading.callback(rcm.stop)
         rcm.start(recovered)
         balancer = self.balancer = LoadBalancer(self.mesh, self._failed)
         inherited = self.ledger.inherited()
