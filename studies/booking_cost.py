@@ -142,7 +142,8 @@ def on_shared_rcs(rounds: int, rcs: int, need: str = "") -> list[Row]:
         start = day + 2 * (number // rcs) * half_hour
         return Booking(name, {need or rc: params}, 0, start, 3 * half_hour, half_hour, 0, bound, owner="h")
 
-    core, longest, now = Core(Adaptive()), 0.0, 0
+    core, now = Core(Adaptive()), 0
+    longest = spent = 0.0
 
     def instant(*events: Event) -> list[Effect]:
         nonlocal longest, spent
@@ -166,7 +167,7 @@ def on_shared_rcs(rounds: int, rcs: int, need: str = "") -> list[Row]:
             else:
                 return
 
-    ballots, spent = list[float](), 0.0
+    ballots = list[float]()
     gc.collect()
     gc.freeze()  # collections of what others have left are no cost of dates
     dates = tuple(date(number, f"d{number}@0") for number in range(DATES))
@@ -189,13 +190,14 @@ def on_shared_rcs(rounds: int, rcs: int, need: str = "") -> list[Row]:
     for number in range(rounds):
         added = replace(date(number, f"a{number}@0"), start=day + number * half_hour // 7)
         request = ArcRequest(f"h/c/{number}", "h/c", {names[0]: params}, 0, 60 * SECOND)
-        for name, events in {
+        events: dict[str, list[Event]] = {
             "booking": [Dates((*dates, added))],
             "unbooking": [Dates(dates)],
             "a request and its release": [Requested(request), Released(request.arc)],
-        }.items():
+        }
+        for name, in_turn in events.items():
             now, spent = now + SECOND, 0.0
-            for event in events:
+            for event in in_turn:
                 settle(instant(event))
             samples[name].add(spent)
     for name, found in samples.items():

@@ -20,6 +20,7 @@ from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.booking import Booking, BookingBound, BookingConflict, BookingThreatened, Dates
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
+from zscout.scheduling.forecast import play_instant
 from zscout.scheduling.model import (
     ArcRequest,
     Effect,
@@ -156,6 +157,24 @@ def led(number: int) -> tuple[Core, list[Effect]]:
     core = Core(Adaptive())
     joined = [RcJoined(RADIO, sharable=True), RcJoined("robot/a", sharable=False)]
     return core, core.handle(0, *joined, Dates(many(number)), LeadTaken(Term(1, "x")))
+
+
+def test_dates_that_come_in_parts_are_judged_once_all_are_there() -> None:
+    dates = many(300, "robot/a", apart=SECOND)  # each overlaps the next: every other one stands
+    core = Core(Adaptive())
+    for at in range(0, 300, 100):
+        assert not core.handle(0, Dates(dates[at : at + 100], more=True))
+    effects = play(core, RcJoined("robot/a", sharable=False), Dates(dates), LeadTaken(Term(1, "x")))
+    assert [one.id for one, _ in core.bookings()] == [one.id for one in dates[::2]]
+    assert sum(isinstance(effect, BookingConflict) for effect in effects) == 150
+    whole = Core(Adaptive())
+    assert effects == play(whole, RcJoined("robot/a", sharable=False), Dates(dates), LeadTaken(Term(1, "x")))
+
+
+def play(core: Core, *events: Event) -> list[Effect]:
+    """All but the wakes of one instant."""
+    effects = [effect for batch in play_instant(core, 0, events, vote) for effect in batch]
+    return [effect for effect in effects if not isinstance(effect, WakeAt)]
 
 
 def test_an_rc_is_asked_about_few_sets_at_a_time_and_a_grant_waits_for_none() -> None:
