@@ -28,7 +28,7 @@ from zscout.scheduling.booking import (
     Unbooked,
 )
 from zscout.scheduling.needs import check_request
-from zscout.scheduling.reason import ITS_CLIENT, SHOWN, Party, Reason
+from zscout.scheduling.reason import SHOWN, Party, Reason
 from zscout.types import SECOND, ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName, Term
 
 QUANTUM: Ns = SECOND
@@ -266,13 +266,15 @@ class Requested(Struct, frozen=True):
 
 
 class Cancelled(Struct, frozen=True):
+    """`by`: who ended it; empty: its own client."""
+
     arc: ArcId
-    by: str = ITS_CLIENT
+    by: str = ""
 
 
 class Released(Struct, frozen=True):
     arc: ArcId
-    by: str = ITS_CLIENT
+    by: str = ""
 
 
 class Vote(Struct, frozen=True):

@@ -29,6 +29,7 @@ from zscout.messages import (
     absurd,
     disbelieved,
 )
+from zscout.rcm.places import Places
 from zscout.scheduling.fair_shares import decayed
 from zscout.services.authority import Authority
 from zscout.services.bookings.keeper import BookingKeeper
@@ -42,7 +43,6 @@ from zscout.services.rcm.digest import HoldListener
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.inventory import Inventory
 from zscout.services.rcm.observed_runtimes import RuntimeObserver
-from zscout.services.rcm.places import Places
 from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.recovery import aged, take_over
 from zscout.types import NO_TERM, SECOND, Ns, RcName, Term
@@ -371,7 +371,7 @@ class Candidate:
         counts = len(recovered.rcs), len(recovered.holds), len(recovered.waiting)
         log.info("leading in term %d: %d RCs, %d holds, %d waiting", term.counter, *counts)
         self.terms_led += 1
-        rcm.membership.on_disbelieved = self._disbelieved
+        rcm.on_disbelieved = self._disbelieved
         rcm.bookings.on_danger = self.on_danger
         rcm.start(recovered)
         balancer = self.balancer = LoadBalancer(self.mesh, self._failed)

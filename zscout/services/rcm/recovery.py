@@ -17,8 +17,8 @@ from msgspec.structs import replace
 
 from zscout.keyexpr import BadName, check_name, check_need, check_rc, client_of, is_pattern, matcher
 from zscout.messages import Amounts, ClientRequests, Holder, OpenRequest, RcState, duration, exact_amounts
+from zscout.rcm.places import arc_id, request_id
 from zscout.scheduling.model import ArcRequest, RecoveredHold, Requested
-from zscout.services.rcm.places import arc_id, request_id
 from zscout.types import NO_TERM, SECOND, ArcId, ClientId, Grant, HostName, Need, Ns, Place, RcName
 
 log = logging.getLogger(__name__)
