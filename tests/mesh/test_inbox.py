@@ -67,14 +67,33 @@ async def test_what_concerns_a_host_with_surplus_may_wait_behind_it() -> None:
     box, handled = Inbox(asyncio.get_running_loop()), list[str]()
 
     def cancel() -> None:
-        assert box.behind("greedy", handled.append, "cancel")
-        assert not box.behind("desk", handled.append, "never")
+        assert box.behind(Lane.ASK, "greedy", handled.append, "cancel")
+        assert not box.behind(Lane.ASK, "desk", handled.append, "never")
 
     for number in range(SHARE + 2):
         box.offer(Backlog(), handled.append, f"a{number}", lane=Lane.ASK, host="greedy")
     box.offer(Backlog(), cancel, lane=Lane.ASK, host="boss")
     await until(lambda: "cancel" in handled)
     assert handled == [*(f"a{number}" for number in range(SHARE + 2)), "cancel"]
+
+
+async def test_of_questions_one_of_each_host_is_let_in_before_asks_that_have_come_meanwhile() -> None:
+    box, handled = Inbox(asyncio.get_running_loop()), list[str]()
+
+    def dry_run(text: str) -> None:
+        """It comes as an ask, and turns out to be a question."""
+        if not box.behind(Lane.QUESTION, "viewer", answer, text):
+            answer(text)
+
+    def answer(text: str) -> None:
+        handled.append(text)
+        if text == "q1":
+            box.offer(Backlog(), handled.append, "ask", lane=Lane.ASK, host="desk")
+
+    for number in range(5):
+        box.offer(Backlog(), dry_run, f"q{number}", lane=Lane.ASK, host="viewer")
+    await until(lambda: len(handled) == 6)
+    assert handled == ["q0", "q1", "ask", "q2", "q3", "q4"]
 
 
 @pytest.mark.real_time

@@ -104,11 +104,13 @@ class Inbox:
         state.pending += 1
         return self._put(_Item(state, lane, host, call, args))
 
-    def behind(self, host: str, call: Callable[..., None], *args: Any) -> bool:
-        """Call `call(*args)` behind the surplus asks of `host`; return False if there are none."""
-        if (others := self.surplus.get((Lane.ASK, host))) is None:
+    def behind(self, lane: Lane, host: str, call: Callable[..., None], *args: Any) -> bool:
+        """Call `call(*args)` behind the surplus of `host`. Return False if it would not wait: there is no surplus, and
+        no ask waits for a question."""
+        of = lane, host
+        if of not in self.surplus and not (lane is Lane.QUESTION and (self.ready or self.items or self.surplus)):
             return False
-        others.append(_Item(None, Lane.ASK, host, call, args))
+        self.surplus.setdefault(of, deque()).append(_Item(None, lane, host, call, args))
         self.set_aside += 1
         return True
 
@@ -185,7 +187,7 @@ class Inbox:
         self.shares.clear()
         lane = min((lane for lane, _ in self.surplus), default=None)
         for of in [of for of in self.surplus if of[0] is lane]:
-            for _ in range(min(SHARE, len(self.surplus[of]))):
+            for _ in range(min(SHARE if lane is Lane.ASK else 1, len(self.surplus[of]))):
                 self.ready.append(self.surplus[of].popleft())
                 self.shares[of] += 1
                 self.set_aside -= 1
@@ -242,6 +244,10 @@ class Mesh:
 
     def admit(self, members: Iterable[FleetMember]) -> None:
         """Replace the members that are admitted, with their rights. A mesh without certificates admits all."""
+
+    def behind(self, lane: Lane, host: str, call: Callable[..., None], *args: Any) -> bool:
+        """Call `call(*args)` later, where surplus of that host, or asks before a question, wait: see `Inbox`."""
+        return self._inbox.behind(lane, host, call, *args)
 
     def after_burst(self, then: Callable[[], None]) -> None:
         """Call `then` after the present burst; at once outside a burst."""

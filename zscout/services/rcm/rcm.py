@@ -21,8 +21,8 @@ from msgspec.structs import replace
 
 from zscout import messages, trace
 from zscout.config.fleet import Fleet
-from zscout.keyexpr import Role, Token, client_of
-from zscout.mesh import Declaration, IncomingQuery, Lane, Mesh, MeshError, Reply, Tally
+from zscout.keyexpr import BadName, Role, Token, client_of
+from zscout.mesh import Declaration, IncomingQuery, Lane, Mesh, MeshError, Refused, Reply, Tally
 from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.rcm.places import Places, arc_id, client_id, request_id
 from zscout.rcm.request_log import REMEMBERED, RequestLog, reason_info
@@ -263,8 +263,29 @@ class Rcm:
         return self.mesh.now()
 
     def _on_operation(self, query: IncomingQuery[messages.Operation]) -> None:
+        """Carry an operation out: behind the surplus of the host whose request it concerns, or, where it only asks
+        what would be, behind all others."""
+        operation, host = query.message, self.mesh.keys.sender_of(query.key).host
+        question = isinstance(operation, (messages.Foresee, messages.FindSlots))
+        owner = getattr(operation, "client", None)
+        of = client_of(owner).host if owner is not None else host
+        lane = Lane.QUESTION if question else Lane.ASK
+        if not ((question or of != host) and self.mesh.behind(lane, of, self._operate_later, query)):
+            self._operate(query)
+
+    def _operate(self, query: IncomingQuery[messages.Operation]) -> None:
         self.requests.on_operation(query)
         self._send_notices()
+
+    def _operate_later(self, query: IncomingQuery[messages.Operation]) -> None:
+        try:
+            if not self.supervisor.active:
+                raise Refused("not_leading", "this manager stopped leading; try again")
+            self.supervisor.guard(self._operate)(query)
+        except Refused as refused:
+            query.refuse(refused.problem)
+        except BadName as error:
+            query.refuse(messages.Problem("bad_name", str(error)))
 
     def _send_notices(self) -> None:
         notices, self.requests.notices = self.requests.notices, []
