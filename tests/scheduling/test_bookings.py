@@ -272,7 +272,7 @@ def story(seed: int) -> Iterator[tuple[Fleet, Booking, bool]]:
                 yield fleet, one, fleet.core.is_running(arc_id)
 
 
-@pytest.mark.parametrize("seeds", in_parts(SEEDS, quick=30, size=250))
+@pytest.mark.parametrize("seeds", in_parts(SEEDS, quick=20, size=250))
 def test_what_is_taken_up_starts_at_its_date(seeds: Sequence[int]) -> None:
     started = late = 0
     for seed in seeds:

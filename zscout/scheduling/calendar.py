@@ -328,14 +328,13 @@ class Calendar:
         """Judge dates, ask votes and report dangers where something has changed."""
         state = self._state
         if not state.claims and not self._lost:
-            self._reserved = None
-            self._endangered.clear()
-            self._concerned.clear()
-            self._unjudged.clear()
-            self._order.clear()
-            self._questions.clear()
-            self._askable.clear()
-            state.dates.touched.clear()
+            if self._reserved is not None or state.dates.touched:
+                self._reserved = None
+                state.dates.touched.clear()
+                for of_claims in (self._endangered, self._concerned, self._questions, self._askable):
+                    of_claims.clear()
+                self._unjudged.clear()
+                self._order.clear()
             state.changed.clear()
             state.votes.changed.clear()
             return

@@ -39,10 +39,11 @@ class Timeline:
 
     def overlapping(self, start: Ns, end: float) -> list[Claim]:
         """The claims that may overlap this span: at most twice as far away as they are long."""
-        found = list[Claim]()
+        found: list[Claim] = []
         for level, entries in self._levels.items():
-            first = bisect_left(entries, (start - (1 << level),))
-            found += [entry[2] for entry in entries[first : bisect_left(entries, (end,))]]
+            first, last = bisect_left(entries, (start - (1 << level),)), bisect_left(entries, (end,))
+            if first < last:
+                found += [entry[2] for entry in entries[first:last]]
         return found
 
 
@@ -143,8 +144,8 @@ class ClaimIndex:
         return [
             claim
             for claim in self.of(rc, start, end)
-            if claim.booking.start < end
-            and claim.booking.end > start
+            if (booking := claim.booking).start < end
+            and booking.start + booking.runtime > start
             and claim.mask & rc.bit
             and claim not in self._suspended
         ]

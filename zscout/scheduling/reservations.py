@@ -107,10 +107,12 @@ class Reservations:
     def at(self, rc: Rc, start: Ns, end: float) -> list[Reservation]:
         """The bookings of `rc` in this span, and all its reservations for starving ARCs, in their order."""
         state, found = self._state, list(self.starving.get(rc.bit, ()))
-        for claim in state.dates.booked(rc, start, end):
-            booking = claim.booking
-            found.append(Reservation(claim.arc, booking.start, order_of(state, booking), booking.end))
-        found.sort(key=attrgetter("order"))
+        if rc.bit & state.dates.claimed and (claims := state.dates.booked(rc, start, end)):
+            for claim in claims:
+                booking = claim.booking
+                found.append(Reservation(claim.arc, booking.start, order_of(state, booking), booking.end))
+            if len(found) > 1:
+                found.sort(key=attrgetter("order"))
         return found
 
     def before(self, rc: Rc, order: Order, start: Ns, end: float) -> list[Reservation]:

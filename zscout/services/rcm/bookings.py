@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 
 SLACK: Final = 0.01
 """Seconds: timers may be a little early."""
+BALLOTS: Final = 0.002
+"""Seconds for which ballots on a booking are gathered: one for each of its dates."""
 GATHERS: Final = 1.0
 """Seconds for which bookings are gathered before it is found out when there is one more date of them to keep."""
 LASTS: Final = 3.0
@@ -90,7 +92,7 @@ class Bookings:
             check_door,
             lambda: self.settled,
         )
-        self._reconciling = False
+        self._reconciling = self._trying = False
         self._another: asyncio.TimerHandle | None = None
         """What is repeated has one more date within 60 days then."""
         self._booked = False
@@ -150,8 +152,14 @@ class Bookings:
         if not self._booked and any(isinstance(event, Dates) for event in events):
             self._booked = True
             self._supervisor.call_later(GATHERS, self._await_another)
-        if self.handler.waits_for_votes and any(isinstance(event, (Vote, VoteOverdue)) for event in events):
-            self._supervisor.call_later(0, self.handler.try_again)
+        voted = any(isinstance(event, (Vote, VoteOverdue)) for event in events)
+        if voted and self.handler.waits_for_votes and not self._trying:
+            self._trying = True
+            self._supervisor.call_later(BALLOTS, self._try_again)
+
+    def _try_again(self) -> None:
+        self._trying = False
+        self.handler.try_again()
 
     def proposed(self, name: ArcId, params: Params) -> ProposedHolder:
         """A booking as an RC is asked about it."""
