@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from zscout.rcm.request_log import reason_info
 
 from zscout.messages import ReasonInfo, Who
-from zscout.rcm.request_log import reason_info
 from zscout.scheduling.reason import Party, Reason, ReasonCode, ended, named, reason_of, waits
 from zscout.types import SECOND, Ns
 
