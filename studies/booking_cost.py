@@ -1,17 +1,23 @@
 """What a booking costs, beside a bare query: `python -m studies booking-cost`.
 
 Two candidates with disks: a booking is told once the other one has it on its disk. Then what a leader of 100 RCs pays
-for 1,000 dates that are booked: a request that is granted at once, and one that a booking keeps out."""
+for 1,000 dates that are booked: a request that is granted at once, and one that a booking keeps out. Last, in processor
+time of the core, 1,000 dates on RCs that vote, each overlapping the next: a takeover with all votes, and what one
+booking, one request or one ballot costs then."""
 
 from __future__ import annotations
 
 import argparse
+import gc
 import tempfile
 import time
 from collections.abc import Awaitable, Callable
 from datetime import UTC, datetime, timedelta
+from fractions import Fraction
 from pathlib import Path
 from typing import Final
+
+from msgspec.structs import replace
 
 from benchmarks.latency import ANSWER, bare_query, hot
 from benchmarks.loop import run
@@ -20,10 +26,22 @@ from tests.live.lab import Lab
 from zscout.behaviors.client.bookings import BookingsClient
 from zscout.messages import BookingView
 from zscout.scheduling.adaptive import Adaptive
-from zscout.scheduling.booking import Booked, Booking
+from zscout.scheduling.booking import Booked, Booking, Dates
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import ArcRequest, LeadTaken, RcJoined, Released, Requested
-from zscout.types import SECOND, Term
+from zscout.scheduling.model import (
+    ArcRequest,
+    Effect,
+    Event,
+    LeadTaken,
+    Propose,
+    RcJoined,
+    Released,
+    Requested,
+    Tick,
+    Vote,
+    WakeAt,
+)
+from zscout.types import SECOND, Params, Term
 
 HOSTS: Final = ("lead", "other")
 BOOKED: Final = 100
@@ -112,10 +130,86 @@ def in_the_core(rounds: int) -> list[Row]:
     ]
 
 
+def on_shared_rcs(rounds: int, rcs: int, need: str = "") -> list[Row]:
+    """1,000 dates on this many RCs that vote. `need`: a pattern, of which each date has the RC that is kept for it."""
+    half_hour, day = 1800 * SECOND, 86_400 * SECOND
+    params: Params = {"seats": Fraction(1)}
+    names = [f"room/r{number}" for number in range(rcs)]
+
+    def date(number: int, name: str) -> Booking:
+        rc = names[number % rcs]
+        bound = {need: rc} if need else {}
+        start = day + 2 * (number // rcs) * half_hour
+        return Booking(name, {need or rc: params}, 0, start, 3 * half_hour, half_hour, 0, bound, owner="h")
+
+    core, now = Core(Adaptive()), 0
+    longest = spent = 0.0
+
+    def instant(*events: Event) -> list[Effect]:
+        nonlocal longest, spent
+        began = time.process_time()
+        effects = core.handle(now, *events)
+        took = time.process_time() - began
+        longest, spent = max(longest, took), spent + took
+        return effects
+
+    def settle(effects: list[Effect]) -> None:
+        """All that follows, each ballot in an instant of its own."""
+        asked = list[Propose]()
+        while True:
+            asked += [effect for effect in effects if isinstance(effect, Propose)]
+            if asked:
+                ballots.append(-spent)
+                effects = instant(Vote(asked.pop(0).proposal, accept=True))
+                ballots[-1] += spent
+            elif WakeAt(now) in effects:
+                effects = instant(Tick())
+            else:
+                return
+
+    ballots = list[float]()
+    gc.collect()
+    gc.freeze()  # collections of what others have left are no cost of dates
+    dates = tuple(date(number, f"d{number}@0") for number in range(DATES))
+    for at in range(0, DATES, 100):
+        instant(Dates(dates[at : at + 100], more=True))
+    led = instant(*(RcJoined(rc, sharable=True) for rc in names), Dates(dates), LeadTaken(Term(1, "bench")))
+    leads, entered = spent, longest
+    settle(led)
+    on = f"{DATES} dates on {rcs} voting RC{'s' * (rcs > 1)}{' by pattern' * bool(need)}"
+    rows = [
+        Row(f"takeover, {on}: until it leads", 1e3 * leads, "ms", aim=50),
+        Row("its longest instant", 1e3 * entered, "ms", aim=20),
+        Row(f"the same, with its {len(ballots)} ballots", 1e3 * spent, "ms"),
+    ]
+    one = Samples()
+    for ballot in ballots:
+        one.add(ballot)
+    rows.append(Row(f"one ballot, {on}", 1e3 * one.median, "ms", p99=1e3 * one.p99, aim=5, rounds=len(ballots)))
+    samples = {name: Samples() for name in ("booking", "unbooking", "a request and its release")}
+    for number in range(rounds):
+        added = replace(date(number, f"a{number}@0"), start=day + number * half_hour // 7)
+        request = ArcRequest(f"h/c/{number}", "h/c", {names[0]: params}, 0, 60 * SECOND)
+        events: dict[str, list[Event]] = {
+            "booking": [Dates((*dates, added))],
+            "unbooking": [Dates(dates)],
+            "a request and its release": [Requested(request), Released(request.arc)],
+        }
+        for name, in_turn in events.items():
+            now, spent = now + SECOND, 0.0
+            for event in in_turn:
+                settle(instant(event))
+            samples[name].add(spent)
+    for name, found in samples.items():
+        rows.append(Row(f"{name}, {on}", 1e3 * found.median, "ms", p99=1e3 * found.p99, aim=5, rounds=rounds))
+    return [*rows, Row("the longest instant of all", 1e3 * longest, "ms", aim=20)]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m studies booking-cost", description=__doc__)
     parser.add_argument("--rounds", type=int, default=100)
     rounds = parser.parse_args().rounds
     with tempfile.TemporaryDirectory(prefix="zscout-bench-") as name:
         rows = run(on_the_mesh(Path(name), rounds))
-    print(table(rows + in_the_core(10 * rounds)))
+    shared = [*on_shared_rcs(rounds, 1), *on_shared_rcs(rounds, 10), *on_shared_rcs(rounds, 10, "room/*")]
+    print(table(rows + in_the_core(10 * rounds) + shared))

@@ -29,7 +29,7 @@ from zscout.rcm import roster
 from zscout.rcm.places import Places
 from zscout.rcm.request_log import RequestLog
 from zscout.rcm.roster import Roster
-from zscout.scheduling.claims import Claims
+from zscout.scheduling.calendar import Calendar
 from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.state import SchedulerState
 from zscout.services.bookings import records
@@ -282,11 +282,12 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "fleet time": Guard("a leader goes on in the time of the fleet", {(bookings, "_time"): _own_wall}),
         "slewed": Guard("fleet time does not jump in a reign", {(FleetClock, "_slewed"): _jumps}),
         "dates first": Guard(
-            "a leader knows of all dates before it grants", {(Bookings, "recovered"): _none_recovered}
+            "a leader knows of all dates before it grants",
+            {(Bookings, "recovered"): _none_recovered, (Bookings, "enter"): _do_nothing},
         ),
-        "one stands": Guard("of two bookings that can't both be one stands", {(BookedDates, "_judge"): _nothing}),
+        "one stands": Guard("of two bookings that can't both be one stands", {(Calendar, "_judge"): _nothing}),
         "awaited": Guard("who has taken up a date does not begin before it", {(BookedDates, "dated"): _undated}),
-        "had again": Guard("who has taken up a date has it again once it can be", {(Claims, "_offer"): _nothing}),
+        "had again": Guard("who has taken up a date has it again once it can be", {(Calendar, "_offer"): _nothing}),
         "withdrawn": Guard(
             "what nobody asks for is given back",
             {(RcmLink, "give_back"): _do_nothing, (Roster, "ask_requests"): _no_change},

@@ -11,10 +11,10 @@ ROOT = Path(__file__).parents[2]
 SURFACE = {
     "handle", "status", "arc", "is_queued", "waiting", "holders", "arcs_of", "arcs", "arcs_of_owners", "count_of",
     "count_of_owner", "is_open", "is_running", "place_of", "at_place", "could_have_issued", "reasons_changed",
-    "tell_reasons", "slots", "likely_slot", "overlaps", "ask_votes", "booking", "bookings", "charged",
+    "tell_reasons", "slots", "likely_slot", "ask_votes", "booking", "bookings", "charged",
     "charged_in_all",
 }  # fmt: skip
-SURFACE |= {"as_events", "is_wanted", "expects_yes", "number", "batches", "term", "seq", "strategy", "policy"}
+SURFACE |= {"as_events", "expects_yes", "number", "batches", "term", "seq", "strategy", "policy"}
 ACTIONS = {"start", "preempt", "wait", "propose", "run_again"}
 
 

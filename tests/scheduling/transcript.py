@@ -30,7 +30,16 @@ from tests.transcripts import ns, seconds, settings
 from zscout.config.scheduling_policy import DEFAULT, FairShares
 from zscout.keyexpr import is_pattern
 from zscout.scheduling import model
-from zscout.scheduling.booking import Booked, Booking, BookingChanged, BookingThreatened, Redated, Unbooked
+from zscout.scheduling.booking import (
+    Booked,
+    Booking,
+    BookingBound,
+    BookingChanged,
+    BookingConflict,
+    BookingThreatened,
+    Redated,
+    Unbooked,
+)
 from zscout.scheduling.core import Core
 from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.strategies import STRATEGIES
@@ -229,6 +238,10 @@ def _print(effect: model.Effect) -> str:
             return f"booking {booking} {state.value}" + (f" by {arc}" if arc is not None else "")
         case BookingThreatened(booking=booking, reason=reason):
             return f"booking {booking} " + ("in danger no more" if reason is None else f"in danger: {_told(reason)}")
+        case BookingBound(booking=booking, bound=bound):
+            return f"booking {booking} bound to {', '.join(bound.values())}"
+        case BookingConflict(booking=booking, by=by):
+            return f"booking {booking} " + ("stands again" if by is None else f"in conflict with {by or 'all choices'}")
         case model.WakeAt(at=at):
             return "wake " + ("never" if at is None else f"at {seconds(at)}")
 

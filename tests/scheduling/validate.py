@@ -37,14 +37,14 @@ def validate(core: Core) -> None:
         else:
             assert arc.state is ArcState.NEW, f"what stands for {claim.booking.id} is {arc.state}"
             assert state.now < claim.booking.lapses, f"{claim.booking.id} has lapsed"
-        assert claim.kept & ~state.claimed == 0, f"what is kept for {claim.booking.id} is not known to be"
+        assert claim.kept & ~state.dates.claimed == 0, f"what is kept for {claim.booking.id} is not known to be"
     for arc in (*state.queued.values(), *state.held_back.values(), *state.running.values()):
         assert arc.claim is None or state.claims.get(arc.claim.booking.id) is arc.claim, f"{arc.id}: no such booking"
         wanted = state.claims.get(arc.request.booking)
         if wanted is not None and not (wanted.booking.maintenance or wanted.tentative):
             assert wanted.is_taken, f"{arc.id} has not taken up {wanted.booking.id}, which is open"
     open_arcs = [*state.queued.values(), *state.held_back.values(), *state.running.values()]
-    for wanting in core._claims._wanting.values():
+    for wanting in core._calendar._wanting.values():
         assert all(arc in open_arcs for arc in wanting), f"of {wanting} one is over"
 
 

@@ -1,4 +1,4 @@
-"""Bookings: all of some RCs at once, from a date. `claims.py` keeps them."""
+"""Bookings: all of some RCs at once, from a date. `calendar.py` keeps them."""
 
 from __future__ import annotations
 
@@ -63,6 +63,16 @@ class BookingState(StrEnum):
     UNBOOKED = "unbooked"
 
 
+class Dates(Struct, frozen=True):
+    """All that is booked, best-ranked first: of what can't all be kept the first stands, and the others are in
+    conflict. What is missing is unbooked; at present only, if it is `forgotten`. `more`: these are a part, and nothing
+    is judged before all are sent."""
+
+    ranked: tuple[Booking, ...]
+    forgotten: frozenset[str] = frozenset()
+    more: bool = False
+
+
 class Booked(Struct, frozen=True):
     """A booking made by this RCM or an earlier one. `tentative`: conflicts are unknown; its ARC waits until it is
     certain."""
@@ -97,9 +107,28 @@ class BookingThreatened(Struct, frozen=True):
     reason: Reason | None
 
 
+class BookingBound(Struct, frozen=True):
+    """Other RCs are kept for the patterns of a booking, to resolve a conflict."""
+
+    booking: str
+    bound: Mapping[Need, RcName]
+
+
+class BookingConflict(Struct, frozen=True):
+    """A booking can't be kept because of another one, or (empty) as no RC for its patterns is free; None: it stands
+    again."""
+
+    booking: str
+    by: str | None
+
+
 class BookingStatus(Struct, frozen=True):
     """An active booking, its ARC, and the RCs bound to its patterns."""
 
     booking: Booking
     arc: ArcId | None
     bound: Mapping[Need, RcName]
+
+    @property
+    def is_unbound(self) -> bool:
+        return not self.bound and any(map(is_pattern, self.booking.needs))

@@ -11,17 +11,15 @@ and a `Tick` at the latest when `WakeAt` asks for it."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
-from types import MappingProxyType
+from collections.abc import Collection, Iterable
 
 from msgspec.structs import replace
 
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
 from zscout.scheduling import model
-from zscout.scheduling.booking import Booked, Booking, BookingStatus, Redated, Unbooked
-from zscout.scheduling.claims import Claims
+from zscout.scheduling.booking import Booked, Booking, BookingStatus, Dates, Redated, Unbooked
+from zscout.scheduling.calendar import Calendar
 from zscout.scheduling.model import Arc, ArcState, ArcStatus, Hold, Outcome, Rc, RcStatus, Status
-from zscout.scheduling.overlaps import Overlaps, overlaps
 from zscout.scheduling.priority import AdmissionCheck, Priority, reason_of_now, reasons_of_now
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.runtimes import RuntimeEstimator
@@ -41,7 +39,7 @@ class Core:
         self.batches = 0
         self._arrivals = 0
         self._effects: list[model.Effect] = []
-        self._claims = Claims(self._state, self, lambda effect: self._effects.append(effect))
+        self._calendar = Calendar(self._state, self, lambda effect: self._effects.append(effect))
         self._over: set[Grant] = set()  # grants of earlier terms that ended in this term
         self._wake: Ns | None = None
         self._run_again = False
@@ -53,15 +51,16 @@ class Core:
         2. Apply the events, in the order given.
         3. End the kept holds that block maintenance.
         4. Run a pass of the strategy, if the queue is not empty.
-        5. Report endangered bookings and the next wake-up."""
+        5. Report conflicts and dangers of bookings, and the next wake-up."""
         if now < self._state.now:
             raise ValueError(f"time went backwards: {now} after {self._state.now}")
         self._state.now = now
         self.batches += 1
         self._effects = []
         self._run_again = False
+        self._calendar.begin()
         self._expire()
-        self._claims.expire()
+        self._calendar.expire()
         self._state.readmit()
         if len(events) == 1 and isinstance(events[0], model.Requested):
             self._ask(events[0], alone=True)
@@ -75,8 +74,9 @@ class Core:
         for arc in self._state.held_back.values():
             if arc.held_back is None and (other := self._state.at_place(arc.place)) is not None:
                 self.wait(arc, _claimed_by(other))
-        self._claims.report_dangers()
-        self._set_wake()
+        if not self._calendar.is_partial:
+            self._calendar.follow_up()
+            self._set_wake()
         return self._effects
 
     @property
@@ -191,7 +191,7 @@ class Core:
     def slots(self, wanted: Booking, until: Ns, limit: int, *, bookings_only: bool = False) -> SlotsFound:
         """The first `limit` times between the start of `wanted` and `until` at which it would be kept.
         `bookings_only` ignores holds and queue."""
-        arc = self._claims.stand_in(wanted)
+        arc = self._calendar.stand_in(wanted)
         return slots(self._state, wanted, arc, until, limit, bookings_only=bookings_only)
 
     def likely_slot(self, wanted: Booking, until: Ns, runtimes: RuntimeEstimator) -> Ns | None:
@@ -199,21 +199,17 @@ class Core:
         now, running = self._state.now, self._state.running.values()
         ends = {arc.id: runtimes.end(arc.request, arc.hold, now) for arc in running if arc.hold is not None}
         likely = {arc: end for arc, end in ends.items() if end is not None}
-        found = slots(self._state, wanted, self._claims.stand_in(wanted), until, 1, likely=likely).found
+        found = slots(self._state, wanted, self._calendar.stand_in(wanted), until, 1, likely=likely).found
         return found[0].start if found else None
-
-    def overlaps(self, order: Iterable[str], starts: Mapping[str, Ns] = MappingProxyType({})) -> Overlaps:
-        """The bookings that conflict with earlier ones in this `order` of ids. `starts` overrides dates unknown
-        here."""
-        return overlaps(self._state, order, starts)
 
     def ask_votes(self, unknown: Iterable[tuple[Rc, HolderSet]], wanted: Booking | None = None) -> list[model.Propose]:
         """Proposals for unknown votes on bookings; `wanted` is not made yet."""
-        stranger = None if wanted is None else self._claims.stand_in(wanted)
+        stranger = None if wanted is None else self._calendar.stand_in(wanted)
         proposals = []
         for rc, holders in unknown:
             if (number := self._votes.propose(rc.name, holders, self._state.now)) is not None:
-                arcs = [self._state.voter(holder) or stranger for holder in sorted(holders)]
+                known = [self._state.voter(holder) or self._calendar.stranger(holder) for holder in sorted(holders)]
+                arcs = [arc or stranger for arc in known]
                 params = {arc.id: self._state.params(arc, rc) for arc in arcs if arc is not None}
                 proposals.append(model.Propose(number, rc.name, params))
         return proposals
@@ -223,9 +219,6 @@ class Core:
             return None
         bound = claim.booking.bound if claim.arc.hold is None else claim.arc.bound
         return BookingStatus(claim.booking, claim.arc.id if claim.is_taken else None, bound)
-
-    def is_wanted(self, name: str) -> bool:
-        return self._claims.is_wanted(name)
 
     def charged(self) -> dict[str, float]:
         return self._state.charged()
@@ -264,6 +257,7 @@ class Core:
                 if self._state.rc(rc).present:
                     self._lose_rc(rc, "it started anew")
                 self._state.join(rc, sharable=sharable)
+                self._calendar.rc_joined(self._state.rc(rc))
                 self._state.readmit(rc)
             case model.RcReported(rc, ended, rules_changed):
                 for arc in ended:
@@ -290,12 +284,14 @@ class Core:
                 self._take_lead(event)
             case model.Adopted(held):
                 self._adopt(held)
+            case Dates():
+                self._calendar.set_dates(event)
             case Booked(booking, tentative):
-                self._claims.book(booking, tentative=tentative)
+                self._calendar.book(booking, tentative=tentative)
             case Unbooked(booking, at_present):
-                self._claims.unbook(booking, at_present=at_present)
+                self._calendar.unbook(booking, at_present=at_present)
             case Redated(booking, start):
-                self._claims.redate(booking, start)
+                self._calendar.redate(booking, start)
             case model.Tick():
                 pass
 
@@ -311,7 +307,7 @@ class Core:
             return
         since = self._state.now if asked.since is None else min(asked.since, self._state.now)
         self._state.enqueue(arc, since)
-        self._claims.take_up(asked.request.booking, arc)
+        self._calendar.take_up(asked.request.booking, arc)
 
     def _new_arc(self, request: model.ArcRequest, place: Place | None) -> Arc:
         if place is None:
@@ -332,7 +328,7 @@ class Core:
         self._state.dequeue(arc)
         self._forget(arc)
         self._effects.append(model.Dropped(arc.id, arc.request.client, outcome, reason))
-        self._claims.give_up(arc, outcome, had_it=False)
+        self._calendar.give_up(arc, outcome, had_it=False)
 
     def _lose_rc(self, name: str, reason: str) -> None:
         """End each gang of a lost RC as a whole and queue it at its place."""
@@ -341,7 +337,7 @@ class Core:
             self._end_hold(arc, Outcome.LOST, Reason(ReasonCode.RC_LOST, (name,), detail=reason))
         self._state.leave(name)
         self._votes.forget_rc(name)
-        self._claims.rc_lost(rc)
+        self._calendar.rc_lost(rc)
 
     def _show_place(self, arc_id: ArcId, place: Place) -> None:
         arc = self._state.arc(arc_id)
@@ -384,7 +380,7 @@ class Core:
                 return
             self._state.dequeue(existing)
             self._forget(existing)
-            self._claims.leave(existing)
+            self._calendar.leave(existing)
         if arc.hold is None:
             self._effects.append(model.Dropped(arc.id, arc.request.client, Outcome.HANDED_OVER, reason))
         else:
@@ -404,7 +400,7 @@ class Core:
         self.term, self.seq, self._arrivals = lead.term, 0, 0
         if self._state.shares is not None:
             self._state.shares.restore(lead.charged)
-        self._claims.certain_from = lead.dates_from
+        self._calendar.certain_from = lead.dates_from
         # The newest grant is the truth where two claim one exclusive RC.
         for held in sorted(lead.recovered_holds, key=lambda held: held.grant, reverse=True):
             if self._state.arc(held.request.arc) is None:
@@ -422,17 +418,17 @@ class Core:
         if known is not None:
             self._state.dequeue(known)
             self._forget(known)
-            self._claims.leave(known)
+            self._calendar.leave(known)
             held = replace(held, place=min(known.place, held.place))
         arc = self._take_up(held)
         if known is not None and arc.hold is None and self._state.arc(arc.id) is arc:
             # Use its client's request: the report lacks parameters of absent RCs.
             self._state.dequeue(arc)
             self._forget(arc)
-            self._claims.leave(arc)
+            self._calendar.leave(arc)
             arc = self._new_arc(known.request, held.place)
             self._state.enqueue(arc, self._state.now)
-            self._claims.take_up(known.request.booking, arc)
+            self._calendar.take_up(known.request.booking, arc)
         if arc.hold is not None and (arc.request.keep or not arc.past_min_runtime(self._state.now)):
             self._effects.append(self._granted(arc, arc.hold))
         self._expire()
@@ -463,7 +459,7 @@ class Core:
         else:
             self._state.start(arc, hold)
         if self._state.arc(arc.id) is arc:
-            self._claims.take_up(held.request.booking, arc)
+            self._calendar.take_up(held.request.booking, arc)
         return arc
 
     def _expire(self) -> None:
@@ -476,7 +472,7 @@ class Core:
                 self._end_hold(arc, Outcome.COMPLETED, Reason(ReasonCode.EXPIRED), requeue=False)
 
     def _begin_maintenance(self) -> None:
-        for claim, rc, arc in self._claims.in_maintenance():
+        for claim, rc, arc in self._calendar.in_maintenance():
             if arc.hold is not None:
                 party = claim.booking.party._replace(until=claim.booking.end)
                 self._end_hold(arc, Outcome.COMPLETED, Reason(ReasonCode.MAINTENANCE, (rc.name,), (party,)))
@@ -502,8 +498,10 @@ class Core:
         arc.reason = reason
         self._effects.append(model.Queued(arc.id, arc.request.client, reason, settled))
 
-    def propose(self, rc: Rc, holders: HolderSet) -> None:
-        self._effects += self.ask_votes([(rc, holders)])
+    def propose(self, rc: Rc, holders: HolderSet) -> bool:
+        proposals = self.ask_votes([(rc, holders)])
+        self._effects += proposals
+        return bool(proposals)
 
     def run_again(self) -> None:
         self._run_again = True
@@ -519,7 +517,7 @@ class Core:
             self._state.enqueue(arc, self._state.now)
         else:
             self._forget(arc)
-            self._claims.give_up(arc, outcome, had_it=True)
+            self._calendar.give_up(arc, outcome, had_it=True)
 
     def _forget(self, arc: Arc) -> None:
         self._state.forget(arc)
@@ -546,7 +544,13 @@ class Core:
 
     def _set_wake(self) -> None:
         at = min((arc.held_back[0] for arc in self._state.held_back.values() if arc.held_back), default=None)
-        for end in (self._state.next_end(), self._state.next_claim_change(), self._claims.next_start):
+        calendar = self._calendar
+        for end in (
+            self._state.next_end(),
+            self._state.dates.next_change(),
+            calendar.next_start,
+            calendar.next_question,
+        ):
             if end is not None:
                 at = end if at is None else min(at, end)
         if self._state.queued:

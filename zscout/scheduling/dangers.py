@@ -51,7 +51,7 @@ def danger(state: SchedulerState, reserved: Reservations, claim: Claim) -> Reaso
     for rc in rcs:
         before = [
             promise
-            for promise in reserved.before(rc, order_of(state, booking))
+            for promise in reserved.before(rc, order_of(state, booking), date, booking.end)
             if _overlaps(state, claim, promise, date)
         ]
         for promise in before:

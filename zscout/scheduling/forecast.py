@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from zscout.scheduling import model
 from zscout.scheduling.booking import Booking
-from zscout.scheduling.claims import request_for
+from zscout.scheduling.calendar import request_for
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, Effect, Event, Granted, Hold, HoldEnded, Outcome, Propose, Released
 from zscout.scheduling.reason import Reason

@@ -18,7 +18,17 @@ from msgspec import Struct
 
 from zscout.keyexpr import is_pattern, matcher
 from zscout.messages import Who
-from zscout.scheduling.booking import Booked, Booking, BookingChanged, BookingThreatened, Redated, Unbooked
+from zscout.scheduling.booking import (
+    Booked,
+    Booking,
+    BookingBound,
+    BookingChanged,
+    BookingConflict,
+    BookingThreatened,
+    Dates,
+    Redated,
+    Unbooked,
+)
 from zscout.scheduling.needs import check_request
 from zscout.scheduling.reason import SHOWN, Party, Reason
 from zscout.types import SECOND, ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName, Term
@@ -207,6 +217,10 @@ class Claim:
     kept: int  # bits of the RCs kept for it; its ARC may choose others for its patterns
     tentative: bool = False  # conflicts are not checked yet: it can't be taken up
     danger: Reason | None = None  # the last reported danger
+    date: Ns = field(init=False)  # its start by the fleet's clock, which holds do not follow
+
+    def __post_init__(self) -> None:
+        self.date = self.booking.start
 
     @property
     def is_taken(self) -> bool:
@@ -396,7 +410,7 @@ class Tick(Struct, frozen=True):
 
 _ArcEvent: TypeAlias = Requested | Cancelled | Released | ClientLost | PlaceShown | Unconfirmed | Reachable | HandedOver
 _RcEvent: TypeAlias = Vote | VoteOverdue | RcJoined | RcReported | RcLost
-Event: TypeAlias = _ArcEvent | _RcEvent | LeadTaken | Adopted | Booked | Unbooked | Redated | Tick
+Event: TypeAlias = _ArcEvent | _RcEvent | LeadTaken | Adopted | Dates | Booked | Unbooked | Redated | Tick
 
 
 class Outcome(StrEnum):
@@ -466,7 +480,8 @@ class WakeAt(Struct, frozen=True):
     at: Ns | None
 
 
-Effect: TypeAlias = Propose | Granted | HoldEnded | Queued | Dropped | BookingChanged | BookingThreatened | WakeAt
+_BookingEffect: TypeAlias = BookingChanged | BookingThreatened | BookingBound | BookingConflict
+Effect: TypeAlias = Propose | Granted | HoldEnded | Queued | Dropped | _BookingEffect | WakeAt
 
 
 class ArcStatus(Struct, frozen=True):

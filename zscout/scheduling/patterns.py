@@ -130,7 +130,7 @@ def choices(state: SchedulerState, arc: Arc, reserved: Reservations | None) -> C
 def _are_shared(state: SchedulerState, arc: Arc) -> bool:
     """Whether members of its class have the same choices where the same RCs are reserved for others."""
     matters = (class_of(arc).reach | arc.named_mask) & state.sharable
-    return not matters and not usable(state, arc) & state.claimed
+    return not matters and not usable(state, arc) & state.dates.claimed
 
 
 def class_of(arc: Arc) -> PatternClass:

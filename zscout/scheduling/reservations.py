@@ -20,8 +20,7 @@ With fair shares an ARC whose group had more than another waiting group counts a
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, insort
-from collections.abc import Mapping
+from bisect import insort
 from operator import attrgetter
 from typing import Final, NamedTuple, TypeAlias
 
@@ -80,81 +79,61 @@ def reservations(state: SchedulerState, patience: Ns | None, last: Reservations 
     RCs or order; for a due ARC no backfill is possible."""
     if patience is not None:
         state.index.mark_starving(state.now - patience // 2, state.queued)
+    state.dates.pass_time(state.now, state.present)
     if last is not None and last.made_of == _versions(state):
         return last
-    return Reservations(state, patience, last)
+    return Reservations(state, patience)
 
 
 def _versions(state: SchedulerState) -> tuple[int, ...]:
-    return state.version, state.votes.version, state.index.starving_version, *_booked_versions(state)
-
-
-def _booked_versions(state: SchedulerState) -> tuple[int, ...]:
-    # After its date a booking is kept only while all its RCs are present.
-    begun = state.begun
-    return state.claims_version, begun, state.present if begun else 0
+    return state.version, state.votes.version, state.index.starving_version, state.dates.version
 
 
 class Reservations:
-    def __init__(self, state: SchedulerState, patience: Ns | None, last: Reservations | None = None) -> None:
-        """Without a patience no ARC starves. Bookings are copied from `last` if unchanged."""
+    """Those of bookings are looked up as they are now: while held too, as this pass may preempt them."""
+
+    def __init__(self, state: SchedulerState, patience: Ns | None) -> None:
+        """Without a patience no ARC starves."""
         self._state, self._votes, self._patience = state, state.votes, patience
         self.made_of = _versions(state)
-        self._booked_of = _booked_versions(state)
-        known = last is not None and last._booked_of == self._booked_of
-        self._booked: dict[int, list[Reservation]] = last._booked if last is not None and known else self._all_booked()
-        self.by_rc: dict[int, list[Reservation]] = dict(self._booked)  # by bit of the RC, in their order
+        self.starving: dict[int, list[Reservation]] = {}  # of starving ARCs, by bit of the RC, in their order
         self._free: dict[int, Ns] = {}  # by bit: the end of earlier reservations
         self.starts: list[Ns] = []  # reserved times of starving ARCs
         for priority, since, arc in state.index.starving[:MAX_STARVING]:
             if state.queued[arc].claim is None:
                 self._reserve(state.queued[arc], (True, priority, since + (patience or 0) // 2, arc))
-        self.bits = union(self.by_rc)
+        self.bits = state.dates.claimed | union(self.starving)
 
-    def _all_booked(self) -> dict[int, list[Reservation]]:
-        """Bookings are reserved while held too: this pass may preempt them. After its date an incomplete booking is
-        not kept."""
-        state, found = self._state, dict[int, list[Reservation]]()
-        for claim in state.claims.values():
-            booking = claim.booking
-            begun = booking.start <= state.now and not booking.maintenance
-            if begun and claim.mask & ~state.present:
-                continue
-            reservation = Reservation(claim.arc, booking.start, order_of(state, booking), booking.end)
-            for rc in state.rcs_in(claim.mask):
-                found.setdefault(rc.bit, []).append(reservation)
-        for reserved in found.values():
-            reserved.sort(key=attrgetter("order"))
+    def at(self, rc: Rc, start: Ns, end: float) -> list[Reservation]:
+        """The bookings of `rc` in this span, and all its reservations for starving ARCs, in their order."""
+        state, found = self._state, list(self.starving.get(rc.bit, ()))
+        if rc.bit & state.dates.claimed and (claims := state.dates.booked(rc, start, end)):
+            for claim in claims:
+                booking = claim.booking
+                found.append(Reservation(claim.arc, booking.start, order_of(state, booking), booking.end))
+            if len(found) > 1:
+                found.sort(key=attrgetter("order"))
         return found
 
-    def booked_changed(self, earlier: Reservations) -> int:
-        """Bits of the RCs with other bookings than in `earlier`."""
-        return 0 if self._booked is earlier._booked else _changed(self._booked, earlier._booked)
-
-    def horizon(self, rc: Rc) -> float:
-        """The latest time at which present holds or starving ARCs may block an RC."""
-        if not rc.present:
-            return math.inf
-        ends = (holder.known_end() for holder in rc.holders.values())
-        starving = (promise.over() for promise in self.by_rc.get(rc.bit, ()) if promise.booked is None)
-        return max((*ends, *starving), default=0)
-
-    def before(self, rc: Rc, order: Order) -> list[Reservation]:
-        reserved = self.by_rc.get(rc.bit, [])
-        return reserved[: bisect_left(reserved, order, key=attrgetter("order"))]
+    def before(self, rc: Rc, order: Order, start: Ns, end: float) -> list[Reservation]:
+        return [promise for promise in self.at(rc, start, end) if promise.order < order]
 
     def _beside_bookings(self, arc: Arc, rcs: list[Rc], start: Ns, order: Order) -> Ns:
         """The earliest time from `start` at which `arc` meets no booking."""
-        end = arc.ends(start)
+        while (blocking := self._meets(arc, rcs, start, order)) is not None:
+            start = blocking  # each booking is passed once, as time only increases
+        return start
+
+    def _meets(self, arc: Arc, rcs: list[Rc], start: Ns, order: Order) -> Ns | None:
+        """The end of a booking in the way of `arc` if it starts then."""
         for rc in rcs:
-            for promise in self.before(rc, order):
-                if promise.booked is None or promise.booked <= start or promise.start >= end:
+            for promise in self.before(rc, order, start, arc.ends(start)):
+                if promise.booked is None:
                     continue
                 beside = rc.sharable and not promise.excludes
                 if not (beside and self._votes.accepts(rc.name, frozenset((promise.arc.id, arc.id)))):
-                    # Each booking is passed once, as time only increases.
-                    return self._beside_bookings(arc, rcs, promise.booked, order)
-        return start
+                    return promise.booked
+        return None
 
     def _reserve(self, arc: Arc, order: Order) -> None:
         rcs = self._rcs(arc, order)
@@ -167,9 +146,7 @@ class Reservations:
         reservation = Reservation(arc, start, order)
         self.starts.append(start)
         for rc in rcs:
-            # A copy: the next reservations share the list of bookings.
-            self.by_rc[rc.bit] = list(self.by_rc.get(rc.bit, ()))
-            insort(self.by_rc[rc.bit], reservation, key=attrgetter("order"))
+            insort(self.starving.setdefault(rc.bit, []), reservation, key=attrgetter("order"))
             self._free[rc.bit] = max(self._free.get(rc.bit, 0), arc.ends(start))
 
     def _rcs(self, arc: Arc, order: Order) -> list[Rc]:
@@ -199,7 +176,9 @@ class Reservations:
         """When `rc` has room for `arc` at the latest; infinite if unknown."""
         non_preemptible = rc.non_preemptible_holders(arc, self._state.now)
         if rc.sharable:
-            sharing = (promise.arc.id for promise in self.before(rc, order) if not promise.excludes)
+            now = self._state.now
+            before = self.before(rc, order, now, arc.ends(now))
+            sharing = (promise.arc.id for promise in before if not promise.excludes)
             if self._votes.accepts(rc.name, frozenset((*(holder.id for holder in non_preemptible), *sharing, arc.id))):
                 return self._state.now
             alone = self._votes.known(rc.name, frozenset((arc.id,)))
@@ -226,8 +205,6 @@ class Reservations:
             blocking: Reservation | None = None
             binding, early = self._binding(rc, arc)
             for reservation in binding:
-                if reservation.booked is not None and reservation.start >= arc.ends(self._state.now):
-                    continue
                 if reservation.excludes:
                     if self._delays(arc, reservation):
                         return Inadmissible(rc, kept_for(rc, reservation), early=early)
@@ -247,14 +224,25 @@ class Reservations:
         return None
 
     def _binding(self, rc: Rc, arc: Arc) -> tuple[list[Reservation], bool]:
-        """The reservations of `rc` that bind `arc`: those before its own and, until its own time, all bookings; and
-        whether any of these would let it start early."""
-        reserved = self.by_rc.get(rc.bit, [])
-        own = next((number for number, promise in enumerate(reserved) if promise.arc is arc), len(reserved))
-        if own == len(reserved) or reserved[own].start <= self._state.now:
-            return reserved[:own], False
-        later = [promise for promise in reserved[own + 1 :] if promise.booked is not None]
-        return [*reserved[:own], *later], bool(later)
+        """The reservations of `rc` that bind `arc` if it starts now: those before its own and, until its own time, all
+        bookings; and whether any of these would let it start early."""
+        now = self._state.now
+        reserved = self.at(rc, now, arc.ends(now))
+        own = self._own(rc, arc)
+        if own is None:
+            return reserved, False
+        before = [promise for promise in reserved if promise.order < own.order]
+        if own.start <= now:
+            return before, False
+        later = [promise for promise in reserved if promise.order > own.order and promise.booked is not None]
+        return [*before, *later], bool(later)
+
+    def _own(self, rc: Rc, arc: Arc) -> Reservation | None:
+        if (claim := arc.claim) is None:
+            return next((promise for promise in self.starving.get(rc.bit, ()) if promise.arc is arc), None)
+        if not claim.mask & rc.bit or self._state.dates.is_suspended(claim):
+            return None
+        return Reservation(arc, claim.booking.start, order_of(self._state, claim.booking), claim.booking.end)
 
     def _together(self, rc: Rc, arc: Arc, before: list[Reservation]) -> list[HolderSet]:
         """The holder sets beside `arc`, from now on: at each arrival, without the holders that yield to it."""
@@ -290,12 +278,18 @@ class Reservations:
         return binds and arc.ends(now) > reservation.start
 
     def changed(self, earlier: Reservations) -> int:
-        return _changed(self.by_rc, earlier.by_rc)
+        """Bits of the RCs with other reservations than when `earlier` was made."""
+        booked = self._state.dates.changed_since(earlier.made_of[-1])
+        return booked | union(self.starving_changed(earlier))
 
-
-def _changed(now: Mapping[int, list[Reservation]], earlier: Mapping[int, list[Reservation]]) -> int:
-    either = now.keys() | earlier.keys()
-    return union(bit for bit in either if now.get(bit) is not earlier.get(bit) and now.get(bit) != earlier.get(bit))
+    def starving_changed(self, earlier: Reservations) -> dict[int, Ns]:
+        """By bit of the RCs where starving ARCs have other reservations: the end of the last of them."""
+        now, before = self.starving, earlier.starving
+        return {
+            bit: max(promise.over() for promise in (*now.get(bit, ()), *before.get(bit, ())))
+            for bit in now.keys() | before.keys()
+            if now.get(bit) != before.get(bit)
+        }
 
 
 def kept_for(rc: Rc, reservation: Reservation) -> Reason:

@@ -7,6 +7,7 @@ change them."""
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
@@ -62,7 +63,7 @@ def slots(
 ) -> SlotsFound:
     """The first `limit` times at which `wanted` might start, until `until`; `arc` represents it. `bookings_only`
     ignores holds and queue; `presume` counts unknown votes as yes; `likely` has earlier ends of holds, for a guess."""
-    search, result = _Search(state, wanted, arc, bookings_only, presume, likely), SlotsFound()
+    search, result = _Search(state, wanted, arc, until, bookings_only, presume, likely), SlotsFound()
     latest: Ns = wanted.start - 1
     for tried, start in enumerate(search.starts(until)):
         if start <= latest:
@@ -89,11 +90,13 @@ class _Search:
         state: SchedulerState,
         wanted: Booking,
         arc: Arc,
+        until: Ns,
         bookings_only: bool,
         presume: bool,
         likely: Mapping[ArcId, Ns],
     ) -> None:
         self._state, self._wanted, self._arc, self._presume, self._likely = state, wanted, arc, presume, likely
+        self._end = max(until, wanted.start) + wanted.runtime
         self._named = list(state.rcs_in(arc.named_mask))
         barred = state.barred(arc) | arc.named_mask
         self._choices: dict[Need, list[Rc]] = {}
@@ -103,9 +106,13 @@ class _Search:
             self._choices[need] = [rc for rc in known if rc.present] or known
         self._taken: dict[int, list[_Taken]] = {}
         for rc in {rc.bit: rc for rc in chain(self._named, *self._choices.values())}.values():
-            self._taken[rc.bit] = sorted(chain(self._booked(rc), () if bookings_only else self._held(rc)))
+            self._taken[rc.bit] = [*self._booked(rc), *(() if bookings_only else self._held(rc))]
         if not bookings_only:
             self._add_reserved()
+        for taken in self._taken.values():
+            taken.sort()
+        self._over = dict.fromkeys(self._taken, 0)
+        """By bit: how many of those are over at the start tried last. Starts are tried in order."""
 
     def _held(self, rc: Rc) -> Iterable[_Taken]:
         now = self._state.now
@@ -114,7 +121,7 @@ class _Search:
             yield _Taken(now, min(end, self._likely.get(holder.id, end)), holder.id)
 
     def _booked(self, rc: Rc) -> Iterable[_Taken]:
-        for claim in self._state.claims.values():
+        for claim in self._state.dates.of(rc, self._wanted.start, self._end):
             booking = claim.booking
             if claim.mask & rc.bit and booking.id != self._wanted.id:
                 yield _Taken(booking.start, booking.end, claim.arc.id, booking.maintenance)
@@ -123,9 +130,9 @@ class _Search:
         state = self._state
         if state.policy.patience is None or not state.queued:
             return
-        for bit, reserved in reservations(state, state.policy.patience, None).by_rc.items():
+        for bit, reserved in reservations(state, state.policy.patience, None).starving.items():
             for promise in reserved if bit in self._taken else ():
-                if promise.booked is None and state.band(promise.arc.priority) >= state.band(self._wanted.priority):
+                if state.band(promise.arc.priority) >= state.band(self._wanted.priority):
                     self._taken[bit].append(_Taken(promise.start, promise.arc.ends(promise.start), promise.arc.id))
 
     def starts(self, until: Ns) -> list[Ns]:
@@ -160,7 +167,12 @@ class _Search:
     def _is_free(self, rc: Rc, start: Ns) -> bool | HolderSet:
         """True if `rc` is free from `start` for long enough; or the holders of an unknown vote."""
         end = start + self._wanted.runtime
-        taken = [span for span in self._taken[rc.bit] if span.start < end and span.end > start]
+        spans, over = self._taken[rc.bit], self._over[rc.bit]
+        while over < len(spans) and spans[over].end <= start:
+            over += 1
+        self._over[rc.bit] = over
+        last = bisect_left(spans, (end,))
+        taken = [span for span in spans[over:last] if span.end > start]
         if not rc.sharable or self._wanted.maintenance or any(span.excludes for span in taken):
             return not taken
         there = frozenset(span.arc for span in taken)
@@ -169,5 +181,6 @@ class _Search:
 
     def latest(self, start: Ns, bound: Iterable[RcName]) -> Ns:
         rcs = (*self._named, *(self._state.rc(name) for name in bound))
-        coming = (span.start for rc in rcs for span in self._taken[rc.bit] if span.start > start)
+        after = (spans[bisect_left(spans, (start + 1,)) :][:1] for spans in (self._taken[rc.bit] for rc in rcs))
+        coming = (span.start for spans in after for span in spans)
         return max(start, min(coming, default=start + (1 << 62)) - self._wanted.runtime)

@@ -5,6 +5,7 @@ Sets of RCs are integer bit masks; `needs & ~free == 0` is the whole test for an
 from __future__ import annotations
 
 import heapq
+import math
 from bisect import bisect_left, bisect_right, insort
 from collections import Counter
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping
@@ -15,9 +16,9 @@ from msgspec import structs
 
 from zscout.config.scheduling_policy import DEFAULT, RcQuota, SchedulingPolicy, StrategyName
 from zscout.keyexpr import is_pattern, matcher
-from zscout.scheduling.booking import Booking
+from zscout.scheduling.claim_index import ClaimIndex, bits
 from zscout.scheduling.fair_shares import Shares
-from zscout.scheduling.model import Arc, ArcRequest, ArcState, Claim, Hold, PatternClass, Rank, Rc, union
+from zscout.scheduling.model import Arc, ArcRequest, ArcState, Hold, PatternClass, Rank, Rc, union
 from zscout.scheduling.queue_index import QueueIndex, Watched
 from zscout.scheduling.reason import Reason
 from zscout.scheduling.votes import HolderSet, Votes
@@ -38,14 +39,8 @@ class SchedulerState:
         self.running: dict[ArcId, Arc] = {}
         self.held_back: dict[ArcId, Arc] = {}
         """Queued ARCs not considered for a while, or while another has their place."""
-        self.claims: dict[str, Claim] = {}  # active bookings by id
-        self.maintenance: dict[str, Claim] = {}
-        self.claimed = 0  # bits of the RCs booked at any time
-        self.claims_version = 0  # grows with each change of bookings and of the ARCs that took them up
-        self._claim_ends: list[tuple[Ns, str]] = []
-        """A heap of lapses and ends of bookings and starts of maintenance. Outdated entries are skipped."""
-        self._by_date: list[Claim] = []
-        self._claims_at: dict[int, list[Claim]] = {}  # by bit of the RC: its bookings by date
+        self.dates = ClaimIndex()
+        self.claims, self.maintenance = self.dates.by_id, self.dates.maintenance
         self._at_place: dict[Place, Arc] = {}
         """By place: the ARC considered or running. Two clients may claim one ARC, which has to run once."""
         self.present = 0
@@ -64,7 +59,8 @@ class SchedulerState:
         self.entries = 0
         self.demand_version = 0  # grows with each change of `Rc.demand`
         self.version = 0  # grows with each change of holders, present RCs and preemptibility
-        self.changed = 0  # bits of the RCs where it grew, since `Claims` last emptied this
+        self.changed: dict[int, float] = {}
+        """By bit of the RCs where it grew: until when that may matter; `Calendar` empties it."""
         self.shares = Shares(self, policy.fair_shares) if policy.fair_shares is not None else None
         """None where fair shares are off."""
 
@@ -79,6 +75,9 @@ class SchedulerState:
             for like in self.classes.values():
                 self._find_matches(like, self.queued[like.members[0][-1]])
         return rc
+
+    def rc_of(self, bit: int) -> Rc:
+        return self._by_bit[bit.bit_length() - 1]
 
     def matching(self, need: Need) -> list[Rc]:
         found = self._matching.get(need)
@@ -175,7 +174,9 @@ class SchedulerState:
     def is_free(self, arc: Arc) -> bool:
         """Return True if a new ARC without quota or pattern finds all RCs exclusive and free, and the queue is
         empty."""
-        if self.queued or self.held_back or arc.patterns or arc.place in self._at_place or arc.mask & self.claimed:
+        if self.queued or self.held_back or arc.patterns or arc.place in self._at_place:
+            return False
+        if arc.mask & self.dates.claimed:
             return False
         bound = self.policy.max_running_per_host is not None or self.policy.rc_quotas
         return not bound and not arc.mask & ~self.present and not arc.mask & (self.busy | self.sharable)
@@ -281,58 +282,6 @@ class SchedulerState:
         self._forget_client(arc)
         self.leave_place(arc)
 
-    def claim(self, claim: Claim) -> None:
-        self.claims[claim.booking.id] = claim
-        if claim.booking.maintenance:
-            self.maintenance[claim.booking.id] = claim
-        self.redated(claim)
-
-    def redated(self, claim: Claim) -> None:
-        for at in _instants(claim.booking):
-            heapq.heappush(self._claim_ends, (at, claim.booking.id))
-        self.claims_changed()
-
-    def unclaim(self, claim: Claim) -> None:
-        del self.claims[claim.booking.id]
-        self.maintenance.pop(claim.booking.id, None)
-        claim.arc.claim = None
-        self.claims_changed()
-
-    def claims_changed(self) -> None:
-        """Update the indexes after bookings, their ARCs or their RCs have changed."""
-        self._by_date = sorted(self.claims.values(), key=_date)
-        self._claims_at = {}
-        for claim in self._by_date:
-            for rc in self.rcs_in(claim.kept):
-                self._claims_at.setdefault(rc.bit, []).append(claim)
-        self.claimed = union(self._claims_at)
-        self.claims_version += 1
-
-    @property
-    def begun(self) -> int:
-        return bisect_right(self._by_date, self.now, key=_date)
-
-    def claims_before(self, time: float, rc: Rc | None = None) -> list[Claim]:
-        claims = self._by_date if rc is None else self._claims_at.get(rc.bit, [])
-        return claims[: bisect_right(claims, time, key=_date)]
-
-    def claims_over(self) -> Iterator[Claim]:
-        """Bookings whose time or patience is over; each may come twice."""
-        while self._claim_ends and self._claim_ends[0][0] <= self.now:
-            at, booking = heapq.heappop(self._claim_ends)
-            claim = self.claims.get(booking)
-            if claim is not None and at in (claim.booking.lapses, claim.booking.end):
-                yield claim
-
-    def next_claim_change(self) -> Ns | None:
-        while self._claim_ends:
-            at, booking = self._claim_ends[0]
-            claim = self.claims.get(booking)
-            if claim is not None and at in _instants(claim.booking):
-                return at
-            heapq.heappop(self._claim_ends)
-        return None
-
     def voter(self, arc: ArcId) -> Arc | None:
         """The ARC of an id in a set of holders, or the placeholder of a booking."""
         return self.arc(arc) or (self.claims[arc].arc if arc in self.claims else None)
@@ -393,6 +342,8 @@ class SchedulerState:
         assert hold is not None, arc.id  # noqa: S101
         self._remove_running(arc)
         arc.hold = None
+        if arc.claim is not None:
+            self.dates.put(arc.claim)
         self.busy &= ~arc.mask
         self.index.freed |= arc.mask
         return hold
@@ -417,11 +368,12 @@ class SchedulerState:
     def min_runtime_over(self, arc: Arc) -> None:
         """From now on equals may preempt a kept hold."""
         self.index.freed |= arc.mask
-        self._grow(arc.mask)
+        self._grow(arc.mask, 0)
 
-    def _grow(self, mask: int) -> None:
+    def _grow(self, mask: int, until: float = math.inf) -> None:
         self.version += 1
-        self.changed |= mask
+        for bit in bits(mask):
+            self.changed[bit] = max(until, self.changed.get(bit, 0))
 
     def operator(self, priority: int) -> bool:
         """Return True for an operator's priority, which no setting delays."""
@@ -513,8 +465,9 @@ class SchedulerState:
 
     def _add_running(self, arc: Arc) -> None:
         self.running[arc.id] = arc
-        self._grow(arc.mask)
-        self.claims_version += arc.claim is not None
+        self._grow(arc.mask, arc.known_end())
+        if arc.claim is not None:
+            self.dates.put(arc.claim)
         self.running_by_owner[arc.owner] = self.running_by_owner.get(arc.owner, 0) + 1
         self.held_by_owner[arc.owner] = self.held_by_owner.get(arc.owner, 0) + len(arc.rcs)
         for rc in arc.rcs:
@@ -526,8 +479,7 @@ class SchedulerState:
         if self.shares is not None:
             self.shares.end(arc)
         del self.running[arc.id]
-        self._grow(arc.mask)
-        self.claims_version += arc.claim is not None
+        self._grow(arc.mask, arc.known_end())
         self.running_by_owner[arc.owner] -= 1
         self.held_by_owner[arc.owner] -= len(arc.rcs)
         if not self.running_by_owner[arc.owner]:
@@ -547,14 +499,6 @@ class SchedulerState:
         return self.entries
 
 
-def _date(claim: Claim) -> Ns:
-    return claim.booking.start
-
-
-def _instants(booking: Booking) -> tuple[Ns, ...]:
-    return (booking.start, booking.end) if booking.maintenance else (booking.lapses, booking.end)
-
-
 class Actions(Protocol):
     """Actions of a strategy: each changes the state at once and becomes an effect."""
 
@@ -562,7 +506,10 @@ class Actions(Protocol):
     def preempt(self, arc: Arc, by: Arc) -> bool: ...
 
     def wait(self, arc: Arc, reason: Reason, *, settled: bool = True) -> None: ...
-    def propose(self, rc: Rc, holders: HolderSet) -> None: ...
+    def propose(self, rc: Rc, holders: HolderSet) -> bool:
+        """Return False if the RC is asked about it already, or silent and not due."""
+        ...
+
     def run_again(self) -> None:
         """Ask for another pass at once: the strategy needs more time, after others."""
         ...

@@ -122,7 +122,8 @@ class Votes:
         self.version = 0
         self.answered: set[RcName] = set()  # RCs that answered or became unresponsive, since a pass last emptied this
         self.invalidated: set[RcName] = set()  # RCs whose answers were dropped, since a pass last emptied this
-        self.changed: set[RcName] = set()  # RCs with new or dropped answers, since `Claims` last emptied this
+        self.changed: dict[RcName, list[HolderSet] | None] = {}
+        """By RC: the sets that it answered or was late for; None: its answers were dropped. `Calendar` empties it."""
 
     def known(self, rc: RcName, holders: HolderSet) -> Answer | None:
         """The answer in force for exactly this set, direct or implied; None if unknown."""
@@ -167,7 +168,7 @@ class Votes:
         self._close(votes, holders)
         self.unresponsive.discard(rc)
         self.answered.add(rc)
-        self.changed.add(rc)
+        self._change(rc, holders)
         self.version += 1
         if accept:
             votes.accept(holders)
@@ -184,6 +185,7 @@ class Votes:
             return
         votes.overdue.add(holders)
         self.answered.add(rc)
+        self._change(rc, holders)
         self.version += 1
         if rc not in self.unresponsive:
             self.unresponsive.add(rc)
@@ -192,7 +194,7 @@ class Votes:
     def forget_rc(self, rc: RcName) -> None:
         """Drop the votes and proposals of an RC that left, restarted or changed its rules."""
         self.invalidated.add(rc)
-        self.changed.add(rc)
+        self.changed[rc] = None
         self.version += 1
         self.unresponsive.discard(rc)
         votes = self._by_rc.pop(rc, None)
@@ -214,6 +216,23 @@ class Votes:
         if votes is not None:
             for number in votes.rename(arc, renamed):
                 self.proposals[number] = (rc, _renamed(self.proposals[number][1], arc, renamed))
+
+    def open(self, rc: RcName) -> int:
+        """How many sets this RC is asked about and not late for."""
+        votes = self._by_rc[rc]
+        return len(votes.proposals) - len(votes.overdue)
+
+    def is_asked(self, rc: RcName, holders: HolderSet) -> bool:
+        """Return True if this RC is asked about this set, and not late."""
+        votes = self._by_rc[rc]
+        return holders in votes.proposals and holders not in votes.overdue
+
+    def retry_at(self, rc: RcName) -> Ns:
+        return self._by_rc[rc].retry_at
+
+    def _change(self, rc: RcName, holders: HolderSet) -> None:
+        if (sets := self.changed.setdefault(rc, [])) is not None:
+            sets.append(holders)
 
     def _close(self, votes: RcVotes, holders: HolderSet) -> None:
         votes.overdue.discard(holders)

@@ -12,6 +12,8 @@ from tests.mesh.kit import until
 from tests.services.rcm.booked_fleet import NOON, BookedFleet, book, booked, dangers_at, do, led, states
 from tests.services.rcm.kit import Refusal, request
 from zscout.messages import BookingView, FindSlots, Release, SlotsTold, Unbook
+from zscout.scheduling.core import Core
+from zscout.services.rcm.bookings import Bookings
 from zscout.types import Place, Term
 
 
@@ -227,6 +229,25 @@ async def test_what_is_no_booking_is_refused_in_one_line() -> None:
     with pytest.raises(Refusal, match="unknown_booking"):
         await client.ask("mine", "robot/a", booking="c")
     assert set(await fleet.bookings()) == {"b"}
+
+
+async def test_a_candidate_that_sees_a_higher_term_while_dates_enter_leads_above_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fleet, enter = BookedFleet("x"), Bookings.enter
+
+    async def interrupted(bookings: Bookings, core: Core) -> None:
+        await enter(bookings, core)
+        candidate._learn(Term(7, "other"))
+
+    monkeypatch.setattr(Bookings, "enter", interrupted)
+    candidate = fleet.candidate("x")
+    await asyncio.sleep(3)
+    monkeypatch.undo()
+    assert candidate.terms_led == 0 or candidate.known.counter > 7
+    await until(lambda: candidate.rcm)
+    assert candidate.rcm is not None
+    assert candidate.rcm.term.counter == 8
 
 
 async def test_other_strategies_keep_no_bookings() -> None:

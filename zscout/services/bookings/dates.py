@@ -4,11 +4,12 @@ Repeated hours are the first, missing ones use the offset before the gap: RFC 55
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_left
 from collections.abc import Iterator
 from contextlib import suppress
 from datetime import datetime, timedelta
 from functools import lru_cache
-from itertools import dropwhile, takewhile
 from typing import Final
 from zoneinfo import ZoneInfo
 
@@ -29,9 +30,41 @@ def zone_of(name: str) -> ZoneInfo:
 
 def dates(booking: BookingRecord, after: float, before: float) -> list[Instant]:
     """Starts from `after`, before `before`, including dates given up. Raises ValueError for an unknown zone."""
-    if not booking.every:
-        return [booking.start] if after <= booking.start < before else []
-    return [*takewhile(lambda at: at < before, dropwhile(lambda at: at < after, _repeated(booking, after)))]
+    return Repetition(booking).between(after, before)
+
+
+class Repetition:
+    """The dates of a booking, each found once. Raises ValueError, OverflowError as `dates` does."""
+
+    def __init__(self, booking: BookingRecord) -> None:
+        self._booking = booking
+        self._known: list[Instant] = []
+        self._coming: Iterator[Instant] | None = None
+        self._from = math.inf
+
+    def between(self, after: float, before: float) -> list[Instant]:
+        if not self._booking.every:
+            return [self._booking.start] if after <= self._booking.start < before else []
+        self._find(after, before)
+        return self._known[bisect_left(self._known, after) : bisect_left(self._known, before)]
+
+    def first_from(self, time: float) -> float:
+        """The first date from then on; infinite if there is none."""
+        if not self._booking.every:
+            return self._booking.start if self._booking.start >= time else math.inf
+        self._find(time, time)
+        at = bisect_left(self._known, time)
+        return self._known[at] if at < len(self._known) else math.inf
+
+    def _find(self, after: float, before: float) -> None:
+        """Find those from `after`, and the first that is not before `before`."""
+        if self._coming is None or after < self._from:
+            self._coming, self._known, self._from = _repeated(self._booking, after), [], after
+        while not self._known or self._known[-1] < before:
+            at = next(self._coming, None)
+            if at is None:
+                return
+            self._known.append(at)
 
 
 def last_end(booking: BookingRecord) -> float:

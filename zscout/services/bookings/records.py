@@ -12,6 +12,7 @@ from msgspec.structs import replace
 
 from zscout.messages import MAX_MERGED, BookingRecord, encode
 from zscout.services.bookings.dates import DAY, last_end
+from zscout.types import NO_TERM, Grant
 
 MAX_BYTES: Final = 12_000_000  # of all records: the limit of one answer, and of a file
 KEEP: Final = DAY  # seconds a record is kept after its last end: clocks may differ
@@ -39,7 +40,9 @@ class Records:
 
     def __init__(self) -> None:
         self._records: dict[str, BookingRecord] = {}
+        self._encoded: dict[str, bytes] = {}
         self.size = 0  # encoded bytes
+        self.latest = Grant(NO_TERM, 0)  # the number of the last change of any record
         self._digest: str | None = None
 
     def __iter__(self) -> Iterator[BookingRecord]:
@@ -59,9 +62,11 @@ class Records:
             new = record if known is None else merged(known, record)
             if new == known:
                 continue
-            grown = len(encode(new)) - (0 if known is None else len(encode(known)))
+            encoded = encode(new)
+            grown = len(encoded) - len(self._encoded.get(record.id, b""))
             if self.size + grown <= MAX_BYTES and (known is not None or len(self) < MAX_MERGED):
-                self._records[record.id] = new
+                self._records[record.id], self._encoded[record.id] = new, encoded
+                self.latest = max(self.latest, new.changed)
                 self.size += grown
                 changed.append(new)
         if changed:
@@ -70,8 +75,8 @@ class Records:
 
     def remove(self, booking: str) -> None:
         """Remove it without a trace."""
-        if (record := self._records.pop(booking, None)) is not None:
-            self.size -= len(encode(record))
+        if self._records.pop(booking, None) is not None:
+            self.size -= len(self._encoded.pop(booking))
             self._digest = None
 
     def forget_old(self, time: float) -> bool:
@@ -84,8 +89,6 @@ class Records:
     def digest(self) -> str:
         """Equal for equal records."""
         if self._digest is None:
-            found = hashlib.sha256()
-            for _, record in sorted(self._records.items()):
-                found.update(encode(record))
-            self._digest = found.hexdigest()[:32]
+            encoded = b"".join(self._encoded[booking] for booking in sorted(self._encoded))
+            self._digest = hashlib.sha256(encoded).hexdigest()[:32]
         return self._digest

@@ -1,19 +1,19 @@
-"""The dates of bookings in the core of a leader: as claims, as the records that are kept say it.
-
-What of two halves of a fleet can't both be is not in the core: higher priority stands, then what was made earlier."""
+"""The dates of bookings for the core of a leader, ranked: of two that can't both be kept that of higher priority
+stands, then what was made earlier. The core judges them; records and views say what it found."""
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from functools import partial
+from operator import attrgetter
 from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from zscout.keyexpr import check_need, is_pattern
+from zscout.keyexpr import check_need
 from zscout.mesh.sparse_log import SparseLog
 from zscout.messages import (
     MAX_AHEAD,
@@ -27,19 +27,19 @@ from zscout.messages import (
     exact_amounts,
 )
 from zscout.scheduling.booking import (
-    Booked,
     Booking,
+    BookingBound,
     BookingChanged,
+    BookingConflict,
     BookingState,
     BookingThreatened,
-    Redated,
-    Unbooked,
+    Dates,
 )
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import ArcRequest, Effect, Event, Propose, Rc, RcJoined, Vote, VoteOverdue
+from zscout.scheduling.model import ArcRequest, Effect, Propose, Rc
 from zscout.scheduling.reason import Reason
 from zscout.scheduling.votes import HolderSet
-from zscout.services.bookings.dates import DAY, dates, told
+from zscout.services.bookings.dates import DAY, Repetition, told
 from zscout.services.bookings.fleet_clock import FleetClock
 from zscout.services.bookings.records import Records
 from zscout.types import SECOND, ArcId, Grant, Need, Ns, RcName
@@ -48,6 +48,8 @@ log = logging.getLogger(__name__)
 
 MAX_CLAIMS = 4_000
 """Dates of all bookings that a leader keeps free: of what is repeated those of the next 60 days."""
+PART = 100
+"""Dates that a core takes in at a time: some 5 ms."""
 MAX_DIGITS = 11
 """Of an instant."""
 STEPPED: Ns = SECOND
@@ -71,10 +73,16 @@ class Date(NamedTuple):
     def bound(self) -> dict[Need, RcName]:
         return self.record.kept.get(self.start, {})
 
-    @property
-    def rank(self) -> tuple[int, Grant, str, Instant]:
-        """Of two that can't both be the lesser stands."""
-        return -self.record.priority, self.record.made, self.record.id, self.start
+
+class _Expanded(NamedTuple):
+    """A record with its dates, and the core's bookings for them, until another one begins to be kept or is over."""
+
+    record: BookingRecord
+    rank: tuple[int, Grant, str]
+    ahead: Ns
+    until: float
+    next: float
+    bookings: list[Booking]
 
 
 class BookedDates:
@@ -95,17 +103,16 @@ class BookedDates:
         self._emit, self._vote, self._changed = emit, vote, changed
         self._strange = SparseLog(log, now)
         self._conflicts: dict[str, str] = {}
-        """Dates that are not in the core, with the one that stands; nothing where no RC of a pattern is free."""
-        self._judged: dict[str, tuple[str, int, Mapping[Need, RcName]]] = {}
-        """In which situation each of those was found to be in conflict."""
-        self._joined = 0
-        """How many times an RC has joined."""
+        """Dates that are not kept, with the one that stands; nothing where no RC of a pattern is free."""
+        self._repetitions: dict[str, tuple[BookingRecord, Repetition]] = {}
+        self._expanded: dict[str, _Expanded] = {}
+        self._sent: frozenset[str] = frozenset()
+        """Dates that the core knows of."""
         self._danger: dict[str, str] = {}
         """Why dates may not be kept, in words."""
         self._dated_by: Ns = clock.at(now()) - now()
         """By how much fleet time is ahead of the host's clock for all dates in the core, so that what follows upon
         another does so there as well."""
-        self._waits_for_votes = False
 
     @property
     def time(self) -> float:
@@ -151,28 +158,30 @@ class BookedDates:
         """Those of a booking that are not over; of what is repeated within the next 60 days."""
         if record.unbooked:
             return []
-        time = self.time
-        if not 0 < record.runtime <= MAX_AHEAD:
-            return []
-        try:
-            ahead = WINDOW if record.every else MAX_AHEAD + DAY  # the clock that it was booked by may have been ahead
-            starts = dates(record, time - float(record.runtime), time + ahead)
-        except (ValueError, OverflowError) as error:
-            self._strange.warning(record.id, "booking %s is not kept: %s", record.id, error)
+        if not 0 < record.runtime <= MAX_AHEAD or (starts := self._starts(record)) is None:
             return []
         final = {*record.dropped, *record.over}
         left = [Date(record, start) for start in starts if start not in final]
         return [date for date in left if date.id in taken or not self._lapsed(date)]
 
-    def until_another(self, since: float) -> float:
-        """Seconds until what is repeated has one more date within 60 days than it had then (fleet time); infinite where
-        nothing is."""
-        first, coming = since + WINDOW, list[Instant]()
-        for record in self._records:
-            if record.every and not record.unbooked:
-                with suppress(ValueError, OverflowError):  # it is not kept, and that was said
-                    coming += dates(record, first, first + (record.every + 1) * DAY)[:1]
-        return min(coming, default=math.inf) - WINDOW - self.time
+    def _starts(self, record: BookingRecord) -> list[Instant] | None:
+        """The dates of a booking that are not past; None: it is malformed, and is not kept."""
+        time = self.time
+        try:
+            return self._repetition(record).between(time - float(record.runtime), time + _ahead(record))
+        except (ValueError, OverflowError) as error:
+            self._strange.warning(record.id, "booking %s is not kept: %s", record.id, error)
+            return None
+
+    def _repetition(self, record: BookingRecord) -> Repetition:
+        known = self._repetitions.get(record.id)
+        if known is None or not _repeats_alike(known[0], record):
+            known = self._repetitions[record.id] = record, Repetition(record)
+        return known[1]
+
+    def until_another(self) -> float:
+        """Seconds until what is repeated has one more date within 60 days; infinite where nothing is."""
+        return min((known.next for known in self._expanded.values()), default=math.inf) - WINDOW - self.time
 
     def _lapsed(self, date: Date) -> bool:
         """Whether nobody took it up in time: that follows from the time alone, and is not kept."""
@@ -184,101 +193,85 @@ class BookedDates:
 
     # The core's claims
 
-    def recovered(self, taken: Collection[str]) -> list[Event]:
-        """The events by which a core that begins to lead knows of all dates; `taken`: those that ARCs have taken up."""
-        return [
-            booked for date in self._all(taken) if (booked := self._booked(date, taken=date.id in taken)) is not None
+    def recovered(self, taken: Collection[str]) -> Dates:
+        """The event by which a core that begins to lead knows of all dates; `taken`: those that ARCs have taken up."""
+        found = Dates(tuple(self._ranked(taken)))
+        self._sent = frozenset(booking.id for booking in found.ranked)
+        return found
+
+    def parts(self) -> Iterator[Dates]:
+        """The same in parts of bounded size, to be sent before it; those that may be taken up after they lapsed are
+        not among them."""
+        part = list[Booking]()
+        for record in list(self._records):
+            known = self._expanded[record.id] = self._expand(record, ())
+            part += known.bookings
+            if len(part) >= PART:
+                yield Dates(tuple(part), more=True)
+                part = []
+
+    def _ranked(self, taken: Collection[str] = ()) -> list[Booking]:
+        """All dates as bookings of the core, best-ranked first."""
+        time, before, ahead = self.time, self._expanded, self._dated_by
+        looked_up = {name.partition("@")[0] for name in taken}
+        expanded = [
+            known
+            if (known := before.get(record.id)) is not None
+            and known.record is record
+            and known.ahead == ahead
+            and time < known.until
+            and record.id not in looked_up
+            else self._expand(record, taken)
+            for record in self._records
         ]
+        expanded.sort(key=attrgetter("rank"))
+        self._expanded = {known.record.id: known for known in expanded}
+        found = [booking for known in expanded for booking in known.bookings]
+        if len(found) > MAX_CLAIMS:
+            self._strange.warning("", "more than %d dates are booked: the last are not kept", MAX_CLAIMS)
+        return found[:MAX_CLAIMS]
 
-    def _all(self, taken: Collection[str] = ()) -> list[Date]:
-        found = list[Date]()
-        for record in sorted(self._records, key=lambda one: (-one.priority, one.made, one.id)):
-            found += self.open_dates(record, taken)
-            if len(found) > MAX_CLAIMS:
-                self._strange.warning("", "more than %d dates are booked: the last are not kept", MAX_CLAIMS)
-                break
-        return sorted(found[:MAX_CLAIMS], key=lambda one: one.rank)
-
-    def _booked(self, date: Date, *, taken: bool = False) -> Booked | None:
+    def _expand(self, record: BookingRecord, taken: Collection[str]) -> _Expanded:
+        time = self.time
+        bookings, dates = list[Booking](), self.open_dates(record, taken)
         try:
-            return Booked(self.claim(date, taken=taken))
+            if dates:
+                of_all = self.claim(dates[0])
+                bookings = [
+                    of_all,
+                    *(
+                        replace(of_all, id=date.id, start=self.local(date.start), bound=date.bound)
+                        for date in dates[1:]
+                    ),
+                ]
+                bookings = [replace(one, patience=one.runtime) if one.id in taken else one for one in bookings]
         except ValueError as error:
-            self._strange.warning(date.record.id, "booking %s is not kept: %s", date.record.id, error)
-            return None
+            self._strange.warning(record.id, "booking %s is not kept: %s", record.id, error)
+        coming, ahead = math.inf, _ahead(record)
+        if not record.unbooked and (bookings or not dates):
+            with suppress(ValueError, OverflowError):  # logged by `_starts`
+                coming = self._repetition(record).first_from(time + ahead)
+        first = min((date.start for date in dates), default=math.inf)
+        until = 0.0 if first <= time or taken else min(first, coming - ahead)
+        rank = -record.priority, record.made, record.id
+        return _Expanded(record, rank, self._dated_by, until, coming if record.every else math.inf, bookings)
 
     def reconcile(self) -> None:
-        """Brings the core's claims to what the records say, and finds which can't be."""
-        wanted = {date.id: date for date in self._all()}
-        known = {booking.id for booking, _ in self._core.bookings()}
+        """Brings the core's claims to what the records say."""
+        ranked = tuple(self._ranked())
+        before, self._sent = self._sent, frozenset(booking.id for booking in ranked)
         # What is only forgotten here, as it could be kept nowhere, another host may have.
-        gone = [Unbooked(name, at_present=not self._has(name)) for name in known if name not in wanted]
-        missing = [date for name, date in wanted.items() if name not in known and not self._is_settled(name)]
-        found = (self._booked(date) for date in missing if not _unbound(date))
-        coming = [replace(one, tentative=self._core.is_wanted(one.booking.id)) for one in found if one is not None]
-        if events := [*gone, *coming]:
-            self._emit(*events)
-        for date in missing:
-            if _unbound(date):
-                self._bind(date, "")
-        self._judge(wanted)
-        left = [one for one in coming if one.tentative and self._core.booking(one.booking.id) is not None]
-        if left:
-            self._emit(*(replace(one, tentative=False) for one in left))
-        self._conflicts = {name: by for name, by in self._conflicts.items() if name in wanted}
-        self._judged = {name: found for name, found in self._judged.items() if name in self._conflicts}
-        self._danger = {name: why for name, why in self._danger.items() if name in wanted}
+        gone = before - self._sent
+        self._emit(Dates(ranked, frozenset(name for name in gone if not self._has(name))))
+        for name in gone:
+            self._conflicts.pop(name, None)
+            self._danger.pop(name, None)
+        if len(self._repetitions) > 2 * len(self._records) + 64:
+            self._repetitions = {name: known for name, known in self._repetitions.items() if self._records.get(name)}
 
     def _has(self, name: str) -> bool:
         """Whether there is a record of the booking whose date this is."""
         return self._records.get(name.partition("@")[0]) is not None
-
-    def _is_settled(self, name: str) -> bool:
-        """Whether a date is in conflict as it was when that was found: to enter it again would only ask RCs again for
-        votes that are forgotten as it goes."""
-        by = self._conflicts.get(name)
-        if by is None or (by and self._core.booking(by) is None):
-            return False
-        return self._judged.get(name) == self._situation(by)
-
-    def _situation(self, by: str) -> tuple[str, int, Mapping[Need, RcName]]:
-        """What a conflict with that date follows from. For its patterns other RCs may be kept later."""
-        kept = self._core.booking(by)
-        return self._records.digest(), self._joined, {} if kept is None else kept.bound
-
-    def _judge(self, wanted: dict[str, Date]) -> None:
-        # What is held was not moved as fleet time was slewed: what comes right after it would seem to meet it.
-        starts = {name: self.local(date.start) for name, date in wanted.items()}
-        found = self._core.overlaps(wanted, starts)
-        self._waits_for_votes = bool(found.unknown)
-        self.ask(found.unknown)
-        self._conflicts = {name: by for name, by in self._conflicts.items() if self._core.booking(name) is None}
-        for name, by in found.losers.items():
-            self._emit(Unbooked(name, at_present=True))
-            # The core does not tell of it any more, and begins anew where it is entered again.
-            self._danger.pop(name, None)
-            self._bind(wanted[name], by)
-
-    def _bind(self, date: Date, by: str) -> None:
-        """Enters a date with RCs for its patterns that are free then; if there are none, `by` is in its way."""
-        if any(map(is_pattern, date.record.needs)):
-            record = replace(date.record, kept={})
-            if (booked := self._booked(Date(record, date.start))) is None:
-                return
-            found = self._core.slots(booked.booking, booked.booking.start, 1, bookings_only=True)
-            if found.unknown:
-                self._waits_for_votes = True
-                self.ask(found.unknown, booked.booking)
-                if not by:
-                    return  # it is looked at again when they are in
-            elif found.found:
-                # Another of its dates may have been bound just now.
-                latest = self._records.get(date.record.id) or date.record
-                self._conflicts.pop(date.id, None)
-                new = self.change(latest, kept={**latest.kept, date.start: dict(found.found[0].bound)})
-                if (again := self._booked(Date(new, date.start))) is not None:
-                    self._emit(again)
-                return
-        self._conflicts[date.id], self._judged[date.id] = by, self._situation(by)
 
     def ask(self, unknown: Iterable[tuple[Rc, HolderSet]], wanted: Booking | None = None) -> None:
         """Has RCs vote; `wanted` is not among the claims yet."""
@@ -293,15 +286,14 @@ class BookedDates:
         if abs(moved) < REDATED:
             return False
         self._dated_by = ahead
-        if events := [Redated(one.id, one.start + moved) for one, _ in self._core.bookings()]:
-            self._emit(*events)
+        self.reconcile()
         return abs(moved) > STEPPED
 
     def number(self) -> Grant:
         """(term, seq) of what is made or changed now: above all that is known. Where all hosts were started anew terms
         began anew."""
         own = Grant(self._core.term, self._core.number())
-        latest = max((record.changed for record in self._records), default=own)
+        latest = self._records.latest
         return own if own > latest else Grant(latest.term, latest.seq + 1)
 
     def change(self, record: BookingRecord, **to: object) -> BookingRecord:
@@ -312,7 +304,7 @@ class BookedDates:
         self._changed([new])
         return self._records.get(record.id) or new
 
-    def note(self, events: Collection[Event], effects: Iterable[Effect], *, settled: bool) -> bool:
+    def note(self, effects: Iterable[Effect], *, settled: bool) -> bool:
         """What became of dates in an instant; whether `reconcile` is to be called, in another one. What was used by a
         time that is not `settled` may still be to come."""
         over: dict[str, list[Instant]] = {}
@@ -329,13 +321,18 @@ class BookedDates:
                     self._danger.pop(name, None)
                 case BookingThreatened(name, Reason() as reason) if (date := self.date(name)) is not None:
                     self._danger[name] = reason.text(partial(self._told, date.record.zone))
+                case BookingConflict(booking=name, by=None):
+                    self._conflicts.pop(name, None)
+                case BookingConflict(booking=name, by=str() as by):
+                    # The core does not tell of it any more, and begins anew where it stands again.
+                    self._danger.pop(name, None)
+                    self._conflicts[name] = by
+                case BookingBound(booking=name, bound=bound) if (date := self.date(name)) is not None:
+                    self.change(date.record, kept={**date.record.kept, date.start: dict(bound)})
         for booking, starts in over.items():
             if (record := self._records.get(booking)) is not None:
                 self.change(record, over=sorted({*record.over, *starts}))
-        self._joined += (joined := sum(isinstance(event, RcJoined) for event in events))
-        votes = self._waits_for_votes and any(isinstance(event, (Vote, VoteOverdue)) for event in events)
-        relieved = not all(map(self._is_settled, self._conflicts))
-        return bool(over) or lapsed or votes or bool(joined) or relieved
+        return bool(over) or lapsed
 
     def _told(self, zone: str, time: Ns) -> str:
         return told(self.to_fleet(time) / SECOND, zone)
@@ -366,7 +363,7 @@ class BookedDates:
             taken = kept.arc if kept is not None else None
             state: DateState = "conflict" if by is not None else "open" if taken is None else "taken"
             danger = self._danger.get(date.id, "") if by is None else self._conflict(by)
-            if kept is None and by is None and self._waits_for_votes:
+            if by is None and kept is not None and kept.is_unbound and not danger:
                 danger = "a shared device has not yet answered whether it can carry it"
             bound = dict(kept.bound) if kept is not None else date.bound
             told.append(BookedDate(date.start, date.start + runtime, state, bound, taken, danger))
@@ -388,5 +385,9 @@ def start_of(name: str) -> Instant | None:
     return int(start) if start.isascii() and start.isdecimal() and len(start) <= MAX_DIGITS else None
 
 
-def _unbound(date: Date) -> bool:
-    return not date.bound and any(map(is_pattern, date.record.needs))
+def _ahead(record: BookingRecord) -> float:
+    return WINDOW if record.every else MAX_AHEAD + DAY  # the clock that it was booked by may have been ahead
+
+
+def _repeats_alike(one: BookingRecord, other: BookingRecord) -> bool:
+    return (one.start, one.every, one.until, one.zone) == (other.start, other.every, other.until, other.zone)

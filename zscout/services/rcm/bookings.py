@@ -13,7 +13,7 @@ from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, Lane, Mesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import Amounts, BookingRecord, BookingsAsk, BookingsKept, Instant, ProposedHolder, decimals
-from zscout.scheduling.booking import Booked
+from zscout.scheduling.booking import BookingConflict, BookingThreatened, Dates
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Effect, Event, Propose, Vote, VoteOverdue
 from zscout.services.authority import Authority
@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 
 SLACK: Final = 0.01
 """Seconds: timers may be a little early."""
+BALLOTS: Final = 0.002
+"""Seconds for which ballots on a booking are gathered: one for each of its dates."""
 GATHERS: Final = 1.0
 """Seconds for which bookings are gathered before it is found out when there is one more date of them to keep."""
 LASTS: Final = 3.0
@@ -90,7 +92,7 @@ class Bookings:
             check_door,
             lambda: self.settled,
         )
-        self._reconciling = False
+        self._reconciling = self._trying = False
         self._another: asyncio.TimerHandle | None = None
         """What is repeated has one more date within 60 days then."""
         self._booked = False
@@ -114,7 +116,13 @@ class Bookings:
 
     def recovered(self, taken: Collection[str]) -> list[Event]:
         """The events by which the core knows of all dates; `taken`: those that ARCs have taken up."""
-        return self.dates.recovered(taken)
+        return [self.dates.recovered(taken)]
+
+    async def enter(self, core: Core) -> None:
+        """Has the core know of dates, in parts between which others run, before it begins to lead."""
+        for part in self.dates.parts():
+            core.handle(self._mesh.now(), part)
+            await asyncio.sleep(0)
 
     def start(self) -> None:
         """From now on it answers, and shares what it knows."""
@@ -138,16 +146,23 @@ class Bookings:
             declared.close()
         self.handler.close()
 
-    def note(self, events: Collection[Event], effects: Iterable[Effect]) -> None:
+    def note(self, events: Collection[Event], effects: Collection[Effect]) -> None:
         """What has happened in an instant: what follows of it follows in another one."""
-        if self.dates.note(events, effects, settled=self.settled):
+        if self.dates.note(effects, settled=self.settled):
             self._on_news()
-        self._tell_soon()
-        if not self._booked and any(isinstance(event, Booked) for event in events):
+        if any(isinstance(effect, (BookingThreatened, BookingConflict)) for effect in effects):
+            self._tell_soon()
+        if not self._booked and any(isinstance(event, Dates) for event in events):
             self._booked = True
-            self._supervisor.call_later(GATHERS, self._await_another, self.dates.time)
-        if self.handler.waits_for_votes and any(isinstance(event, (Vote, VoteOverdue)) for event in events):
-            self._supervisor.call_later(0, self.handler.try_again)
+            self._supervisor.call_later(GATHERS, self._await_another)
+        voted = any(isinstance(event, (Vote, VoteOverdue)) for event in events)
+        if voted and self.handler.waits_for_votes and not self._trying:
+            self._trying = True
+            self._supervisor.call_later(BALLOTS, self._try_again)
+
+    def _try_again(self) -> None:
+        self._trying = False
+        self.handler.try_again()
 
     def proposed(self, name: ArcId, params: Params) -> ProposedHolder:
         """A booking as an RC is asked about it."""
@@ -173,13 +188,13 @@ class Bookings:
         self._reconciling = False
         self.dates.reconcile()
         self._tell_soon()
-        self._await_another(self.dates.time)
+        self._await_another()
 
-    def _await_another(self, since: float) -> None:
+    def _await_another(self) -> None:
         """What is repeated is to have its dates in time."""
         if self._another is not None:
             self._another.cancel()
-        until, self._booked = self.dates.until_another(since), False
+        until, self._booked = self.dates.until_another(), False
         delay = max(0.0, until) + SLACK
         self._another = self._supervisor.call_later(delay, self._on_news) if math.isfinite(until) else None
 

@@ -307,8 +307,7 @@ class Candidate:
         states = [aged(state, now - arrived) for state, arrived in answers]
         open_requests = self._credible(clients, lambda one: keys.requests(client_of(one.client)))
         asking = [one for one, _ in open_requests if one.term in (term, NO_TERM)]
-        self._lead(term, states, asking, credible(keepers, keys, now))
-        return True
+        return await self._lead(term, states, asking, credible(keepers, keys, now))
 
     async def _refused(self, key: str, term: Term) -> None:
         """An RC or a client obeys a higher term. What has no token may be anybody's word."""
@@ -331,9 +330,9 @@ class Candidate:
                 log.warning("ignored an answer on %.200r: %s", reply.key, error)
         return messages
 
-    def _lead(
+    async def _lead(
         self, term: Term, states: list[RcState], open_requests: list[ClientRequests], kept: list[BookingsKept]
-    ) -> None:
+    ) -> bool:
         places = Places(self.fleet.name, self._places_key, term)
         recovered = take_over(
             states,
@@ -346,10 +345,8 @@ class Candidate:
             passed = self.mesh.now() - self._charged_at
             recovered.charged = {group: decayed(had, passed, fair.half_life) for group, had in self._charged.items()}
         recovered.patient = self.election.links_return(self.mesh.now(), self._leader)
-        self.known, self._goes_above = term, False
-        counts = len(recovered.rcs), len(recovered.holds), len(recovered.waiting)
-        log.info("leading in term %d: %d RCs, %d holds, %d waiting", term.counter, *counts)
-        rcm = self.rcm = Rcm(
+        self._learn(term)
+        rcm = Rcm(
             self.mesh,
             self.fleet,
             term,
@@ -364,10 +361,18 @@ class Candidate:
             kept,
             self._runtimes.estimator,
         )
+        self._leading.callback(rcm.stop)
+        await rcm.bookings.enter(rcm.core)
+        if self.known > term:
+            self._leading.close()
+            self.election.rivalled(self.mesh.now())
+            return False
+        self.rcm, self._goes_above = rcm, False
+        counts = len(recovered.rcs), len(recovered.holds), len(recovered.waiting)
+        log.info("leading in term %d: %d RCs, %d holds, %d waiting", term.counter, *counts)
         self.terms_led += 1
         rcm.on_disbelieved = self._disbelieved
         rcm.bookings.on_danger = self.on_danger
-        self._leading.callback(rcm.stop)
         rcm.start(recovered)
         balancer = self.balancer = LoadBalancer(self.mesh, self._failed)
         inherited = self.ledger.inherited()
@@ -375,6 +380,7 @@ class Candidate:
         for service in (balancer, placer):
             self._leading.callback(service.stop)
             service.start()
+        return True
 
 
 def _refusal(reply: Reply[RcState] | Reply[ClientRequests], promise: Term) -> tuple[str, Term] | None:

@@ -1,0 +1,671 @@
+"""Bookings in the core: a claim with a date, until its owner's request takes it up.
+
+`Dates` brings all that is booked, best-ranked first. Of two dates that can't both be kept, after two halves of a fleet
+have booked separately, the better-ranked stands; the other is bound to other RCs, or is in conflict and no claim.
+
+`reservations.py` keeps their RCs free, `slots.py` finds times, `dangers.py` finds threats. Maintenance is a claim
+that is never taken up.
+
+A change is followed up where it matters: at the claims that overlap it in time and have one of its RCs. An instant does
+a bounded part of this, and asks for the next one. So does a sharable RC: it is asked about few sets at a time, those of
+the next dates first, and a vote that is not known yet causes neither conflict nor danger."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from itertools import chain, pairwise
+from operator import itemgetter
+from typing import Final
+
+from msgspec.structs import replace
+
+from zscout.scheduling.booking import (
+    Booking,
+    BookingBound,
+    BookingChanged,
+    BookingConflict,
+    BookingState,
+    BookingThreatened,
+    Dates,
+)
+from zscout.scheduling.claim_index import Timeline, bits, by_date
+from zscout.scheduling.dangers import Undecided, danger
+from zscout.scheduling.model import Arc, ArcRequest, ArcState, Claim, Effect, Outcome, PatternClass, Rc, union
+from zscout.scheduling.reason import Reason, ReasonCode
+from zscout.scheduling.reservations import Reservations, reservations
+from zscout.scheduling.slots import slots
+from zscout.scheduling.state import Actions, SchedulerState
+from zscout.scheduling.votes import HolderSet
+from zscout.types import NO_TERM, ArcId, Ns, Place, RcName
+
+WORK: Final = 256
+"""Checks of one claim in one instant: some 5 ms."""
+SEARCH: Final = 8
+"""Of these for a search of other RCs, or a proposal."""
+IN_FLIGHT: Final = 8
+"""Sets of holders that one RC is asked about at a time."""
+
+
+def request_for(booking: Booking) -> ArcRequest:
+    return ArcRequest(
+        booking.id,
+        f"{booking.owner}/",
+        booking.needs,
+        booking.priority,
+        booking.runtime,
+        label=booking.label,
+        booking=booking.id,
+        who=booking.who,
+    )
+
+
+@dataclass(slots=True)
+class _Questions:
+    """The sets that one RC is to be asked about, those of the next dates first."""
+
+    heap: list[tuple[Ns, int, HolderSet]] = field(default_factory=list)
+    waiting: set[HolderSet] = field(default_factory=set)
+    asked: dict[HolderSet, Ns] = field(default_factory=dict)
+    count: int = 0
+
+    def add(self, date: Ns, holders: HolderSet) -> None:
+        if holders not in self.waiting and holders not in self.asked:
+            self.count += 1
+            self.waiting.add(holders)
+            heapq.heappush(self.heap, (date, self.count, holders))
+
+    def pop(self) -> None:
+        self.waiting.discard(heapq.heappop(self.heap)[2])
+
+
+class Calendar:
+    def __init__(self, state: SchedulerState, actions: Actions, emit: Callable[[Effect], None]) -> None:
+        self._state, self._actions, self._emit = state, actions, emit
+        self._ranks: dict[str, int] = {}  # of all dates; bookings without a rank are not judged
+        self._lost: dict[str, Claim] = {}  # dates in conflict; their votes are kept, to ask nothing again
+        self._lost_to: dict[str, str] = {}
+        self._lost_at: dict[int, Timeline] = {}  # by bit of each RC that would do
+        self._unjudged: set[str] = set()
+        self._order: list[tuple[int, str]] = []  # a heap of these, by rank
+        self._entered: list[str] = []
+        self._unbound: dict[str, None] = {}  # dates whose patterns wait for votes
+        self.is_partial = False  # further dates follow
+        self._questions: dict[RcName, _Questions] = {}
+        self._askable: dict[RcName, None] = {}  # RCs that may be asked more
+        self._concerned: dict[Claim, None] = {}  # bookings that may be newly in danger, or no longer
+        self._left = WORK
+        self._turn = 0  # counts checks of overdue bookings, which take turns
+        self._reserved: Reservations | None = None  # the reservations at the last search for dangers
+        self._endangered: dict[Claim, None] = {}  # bookings last reported as endangered
+        self._wanting: dict[str, list[Arc]] = {}  # by booking: ARCs that want it while it is absent or taken
+        self.certain_from: Ns = 0  # dates before this are uncertain: no booking begins or expires for good
+
+    def stand_in(self, booking: Booking) -> Arc:
+        """An ARC that represents a booking until it is taken up."""
+        arc = self._state.new_arc(request_for(booking), Place(NO_TERM, 0))
+        if arc.patterns:
+            self._state.bind(arc, booking.bound)
+        return arc
+
+    def set_dates(self, dates: Dates) -> None:
+        self.is_partial = dates.more
+        if dates.more:
+            for booking in dates.ranked:
+                self.book(booking)
+                self._entered.append(booking.id)
+            return
+        state, wanted = self._state, {booking.id: booking for booking in dates.ranked}
+        for name in [name for name in state.claims if name not in wanted]:
+            self.unbook(name, at_present=name in dates.forgotten)
+        for name in [name for name in self._lost if name not in wanted]:
+            self._forget_votes(self._recall(name))
+        before, self._ranks = self._ranks, {name: rank for rank, name in enumerate(wanted)}
+        known = [name for name in wanted if name in before]
+        same_order = all(before[name] < before[other] for name, other in pairwise(known))
+        unjudged, self._unjudged, self._order = self._unjudged if same_order else {*known}, set(), []
+        self._look_again((*unjudged, *self._entered))
+        self._entered.clear()
+        known_claims = (state.claims.get(name) or self._lost.get(name) for name in known)
+        moves = {wanted[claim.booking.id].start - claim.date for claim in known_claims if claim is not None}
+        for name, booking in wanted.items():
+            if (claim := state.claims.get(name) or self._lost.get(name)) is None:
+                self.book(booking, tentative=name in self._wanting)
+                self._look_again((name,))
+            elif claim.date != booking.start:
+                self.redate(name, booking.start, alike=len(moves) == 1)
+
+    def book(self, booking: Booking, *, tentative: bool = False) -> None:
+        if (known := self._state.claims.get(booking.id)) is not None:
+            known.tentative = tentative
+            self._offer(known)
+            return
+        if booking.lapses <= self._state.now:
+            state = BookingState.USED if booking.maintenance else BookingState.LAPSED
+            self._emit(BookingChanged(booking.id, state))
+            return
+        arc = self.stand_in(booking)
+        claim = Claim(booking, arc, arc.mask, tentative)
+        self._state.dates.add(claim)
+        if booking.maintenance:
+            overlapping = (self._state.dates.of(rc, booking.start, booking.end) for rc in self._state.rcs_in(arc.mask))
+            self._keep_others(arc.mask, chain.from_iterable(overlapping))
+        self._offer(claim)
+
+    def unbook(self, booking: str, *, at_present: bool) -> None:
+        if (claim := self._state.claims.get(booking)) is not None:
+            self._end(claim, BookingState.UNBOOKED, at_present=at_present)
+
+    def redate(self, booking: str, start: Ns, *, alike: bool = False) -> None:
+        """Move a booking's date. The booking of a hold stays as it is, and is judged by that date. Nothing is judged
+        where all dates move `alike`."""
+        if not alike:
+            self._look_again((booking,))
+        if (lost := self._lost.get(booking)) is not None:
+            by = self._lost_to[booking]
+            self._recall(booking)
+            lost.booking, lost.date = replace(lost.booking, start=start), start
+            self._lose(lost, by)
+        if (claim := self._state.claims.get(booking)) is None:
+            return
+        claim.date = start
+        if claim.arc.hold is None:
+            claim.booking = replace(claim.booking, start=start)
+        self._state.dates.put(claim, changed=not alike)
+        self._concerned[claim] = None
+        if claim.arc.hold is None and claim.arc.held_back is not None:
+            self._wait_again(claim.arc, start)
+        if claim.arc.hold is None:
+            self.expire()
+
+    def take_up(self, booking: str, arc: Arc) -> None:
+        """Let a waiting or running ARC take its booking up, now or once that is there and open. The ARC waits for
+        the date."""
+        claim = self._state.claims.get(booking)
+        if not booking or (claim is not None and (claim.booking.maintenance or claim is arc.claim)):
+            return
+        if claim is None or claim.is_taken or claim.tentative:
+            wanting = self._wanting.setdefault(booking, [])
+            wanting += [arc] if arc not in wanting else []
+            self._wait_until(arc, arc.request.not_before)
+            return
+        for rc in self._state.possible_sharables(claim.arc):
+            self._state.votes.rename_arc(rc.name, claim.arc.id, arc.id)
+        claim.arc, arc.claim = arc, claim
+        if isinstance(arc.watched, PatternClass):
+            self._state.index.put(arc, ArcState.READY)
+        self._state.dates.put(claim)
+        self._emit(BookingChanged(claim.booking.id, BookingState.TAKEN, arc.id))
+        self._wait_again(arc, claim.booking.start)
+
+    def _offer(self, claim: Claim) -> None:
+        """Offer an open booking to the ARCs that want it, if they are its owner's: not checked before."""
+        booking = claim.booking
+        for arc in [] if claim.tentative else self._wanting.pop(booking.id, ()):
+            asked = arc.request
+            same = asked.needs == booking.needs and asked.priority == booking.priority
+            if same and asked.client.partition("/")[0] == booking.owner:
+                self.take_up(booking.id, arc)
+
+    def _wait_until(self, arc: Arc, date: Ns) -> None:
+        date = max(date, self.certain_from)
+        if date > self._state.now and arc.id in self._state.queued:
+            self._state.hold_back(arc, date, ())
+            self._actions.wait(arc, Reason(ReasonCode.NOT_YET))
+
+    def _wait_again(self, arc: Arc, date: Ns) -> None:
+        self._stop_waiting(arc)
+        self._wait_until(arc, date)
+
+    def _stop_waiting(self, arc: Arc) -> None:
+        if arc.held_back is not None and not arc.held_back[1]:
+            self._state.consider_again(arc)
+
+    def give_up(self, arc: Arc, outcome: Outcome, *, had_it: bool) -> None:
+        """End the booking of an ended ARC; reopen it if the program is gone or gave up before it held."""
+        claim = arc.claim
+        again = outcome is Outcome.CLIENT_LOST or not had_it
+        if claim is not None and not (again and self._state.now < claim.booking.lapses):
+            self._end(claim, BookingState.USED)
+        else:
+            self.leave(arc)
+
+    def leave(self, arc: Arc) -> None:
+        """Reopen the booking of an ARC that has ended or is replaced."""
+        name, claim = arc.request.booking, arc.claim
+        if wanting := [waiting for waiting in self._wanting.pop(name, ()) if waiting is not arc]:
+            self._wanting[name] = wanting
+        if (lost := self._lost.get(name)) is not None and lost.arc is arc:
+            lost.arc = self.stand_in(lost.booking)
+            self._look_again((name,))
+        if claim is not None:
+            arc.claim = None
+            if claim.booking.start != claim.date:
+                claim.booking = replace(claim.booking, start=claim.date)
+            claim.arc = self.stand_in(claim.booking)
+            self._state.dates.put(claim)
+            self._emit(BookingChanged(claim.booking.id, BookingState.OPEN, arc.id))
+            self._offer(claim)
+
+    def _end(self, claim: Claim, state: BookingState, *, at_present: bool = False, forget: bool = True) -> None:
+        arc = claim.arc if claim.is_taken else None
+        if arc is None and forget:
+            self._forget_votes(claim)
+        self._state.dates.remove(claim)
+        claim.arc.claim = None
+        self._unbound.pop(claim.booking.id, None)
+        self._endangered.pop(claim, None)
+        claim.danger = None
+        self._emit(BookingChanged(claim.booking.id, state, None if arc is None else arc.id))
+        if arc is not None and (at_present or self._state.now < self.certain_from):
+            self._wanting[claim.booking.id] = [*self._wanting.get(claim.booking.id, ()), arc]
+        if arc is not None and not at_present:
+            self._stop_waiting(arc)
+            self._wait_until(arc, self.certain_from)
+
+    def _forget_votes(self, claim: Claim) -> None:
+        for rc in list(self._state.possible_sharables(claim.arc)):
+            self._state.votes.forget_arc(rc.name, claim.booking.id)
+
+    def expire(self) -> None:
+        """End the bookings whose time or patience is over."""
+        for claim in self._state.dates.over(self._state.now):
+            if claim.booking.end <= self._state.now:
+                used = claim.is_taken or claim.booking.maintenance
+                self._end(claim, BookingState.USED if used else BookingState.LAPSED)
+            elif not claim.is_taken:
+                self._end(claim, BookingState.LAPSED)
+
+    def in_maintenance(self) -> Iterator[tuple[Claim, Rc, Arc]]:
+        """Holders that maintenance ends: of equal or lower priority, past their minimum runtimes. The caller may end
+        them meanwhile."""
+        now = self._state.now
+        for claim in self._state.maintenance.values() if self._state.maintenance else ():
+            for rc in self._state.rcs_in(claim.kept) if claim.booking.start <= now else ():
+                for holder in list(rc.holders.values()):
+                    if holder.priority <= claim.booking.priority and holder.past_min_runtime(now):
+                        yield claim, rc, holder
+
+    def rc_lost(self, rc: Rc) -> None:
+        self._keep_others(rc.bit, self._state.dates.of(rc, self._state.now))
+
+    def rc_joined(self, rc: Rc) -> None:
+        self._look_again(claim.booking.id for claim in self._state.dates.of(rc, self._state.now))
+        self._look_again(self._lost)
+        self._look_again(self._unbound)
+
+    def _keep_others(self, mask: int, claims: Iterable[Claim]) -> None:
+        """Rebind the patterns of bookings that have some of these RCs, the next dates first, where other RCs are free
+        then. Dangers do so later for those that are too many for one instant."""
+        for claim in by_date(claim for claim in {*claims} if claim.kept & mask & ~claim.arc.named_mask):
+            if self._left > 0:
+                self._keep_another(claim)
+
+    def _keep_another(self, claim: Claim) -> bool:
+        arc, booking, now = claim.arc, claim.booking, self._state.now
+        if not arc.patterns or arc.hold is not None:
+            return False
+        self._left -= SEARCH
+        date = max(booking.start, now)
+        found = slots(self._state, replace(booking, start=date), arc, date, 1, presume=True).found
+        kept = arc.named_mask | self._state.mask(found[0].bound.values()) if found else claim.kept
+        if kept == claim.kept or kept & ~self._state.present & ~arc.named_mask:
+            return False
+        claim.booking = replace(booking, bound=found[0].bound)
+        claim.kept = kept
+        if not claim.is_taken:
+            self._state.bind(arc, found[0].bound)
+        self._state.dates.put(claim)
+        return True
+
+    # Changes, followed up in parts
+
+    def begin(self) -> None:
+        """An instant begins."""
+        self._left = WORK
+
+    def follow_up(self) -> None:
+        """Judge dates, ask votes and report dangers where something has changed."""
+        state = self._state
+        if not state.claims and not self._lost:
+            if self._reserved is not None or state.dates.touched:
+                self._reserved = None
+                state.dates.touched.clear()
+                for of_claims in (self._endangered, self._concerned, self._questions, self._askable):
+                    of_claims.clear()
+                self._unjudged.clear()
+                self._order.clear()
+            state.changed.clear()
+            state.votes.changed.clear()
+            return
+        self._take_votes()
+        self._spread()
+        self._judge()
+        self._ask()
+        self._take_changes()
+        self._spread()
+        self._report_dangers()
+        if self._unjudged or self._concerned or self._askable:
+            self._actions.run_again()
+
+    def _spread(self) -> None:
+        """Look again at what overlaps changed claims."""
+        state, touched = self._state, self._state.dates.touched
+        if self._reserved is None and not self._lost and len(self._unjudged) >= len(self._ranks):
+            touched.clear()  # all are looked at
+        while touched:
+            claim, mask, start, end = touched.popitem()[0]
+            rank = self._ranks.get(claim.booking.id, math.inf)
+            if claim.booking.id in state.claims:
+                self._concerned[claim] = None
+            for bit in bits(mask):
+                for other in state.dates.of(state.rc_of(bit), start, end):
+                    self._concerned[other] = None
+                    if self._ranks.get(other.booking.id, -1) > rank:
+                        self._look_again((other.booking.id,))
+                if bit in self._lost_at:
+                    self._look_again(lost.booking.id for lost in self._lost_at[bit].overlapping(start, end))
+
+    def _look_again(self, names: Iterable[str]) -> None:
+        """Judge these dates."""
+        for name in names:
+            if name not in self._unjudged and (rank := self._ranks.get(name)) is not None:
+                self._unjudged.add(name)
+                heapq.heappush(self._order, (rank, name))
+
+    def _take_votes(self) -> None:
+        """Look again at what new and dropped votes are about."""
+        state = self._state
+        changed, state.votes.changed = state.votes.changed, {}
+        for name, sets in changed.items():
+            rc = state.rc(name)
+            if name in self._questions:
+                self._askable[name] = None
+            if sets is None:
+                claims = state.dates.of(rc, state.now)
+                self._concerned |= dict.fromkeys(claims)
+                self._look_again(claim.booking.id for claim in claims)
+            for holders in sets or ():
+                vetoed = not state.votes.accepts(name, holders)
+                for holder in holders:
+                    claim = self._claim_of(holder)
+                    if claim is not None:
+                        self._concerned[claim] = None
+                        self._look_again((claim.booking.id,))
+                    elif vetoed and (arc := state.running.get(holder)) is not None:
+                        self._concerned |= dict.fromkeys(state.dates.of(rc, state.now, arc.known_end()))
+                    if vetoed and claim is not None:
+                        spans = state.dates.of(rc, claim.booking.start, claim.booking.end)
+                        self._concerned |= dict.fromkeys(spans)
+
+    def _claim_of(self, holder: ArcId) -> Claim | None:
+        """The claim of an ARC, or of a booking that none has taken up."""
+        arc = self._state.arc(holder)
+        if arc is not None and (arc.claim is not None or arc.request.booking in self._lost):
+            return arc.claim or self._lost[arc.request.booking]
+        return self._state.claims.get(holder) or self._lost.get(holder)
+
+    def stranger(self, holder: ArcId) -> Arc | None:
+        """What stands in votes for a date in conflict."""
+        return self._lost[holder].arc if holder in self._lost else None
+
+    # Which dates stand
+
+    def _judge(self) -> None:
+        """Find which dates stand, best-ranked first: a date counts against all that rank below it."""
+        while self._order and self._left > 0:
+            name = heapq.heappop(self._order)[1]
+            self._unjudged.discard(name)
+            self._left -= 1
+            if (claim := self._state.claims.get(name)) is not None:
+                self._judge_claim(claim)
+            elif name in self._lost:
+                self._judge_lost(name)
+            self._spread()
+
+    def _judge_claim(self, claim: Claim) -> None:
+        if _is_unbound(claim):
+            self._bind(claim, "")
+            return
+        by, unknown = self._obstacle(claim)
+        if by is None:
+            self._want(claim, unknown)
+            self._concerned[claim] = None
+            if claim.tentative:
+                claim.tentative = False
+                self._offer(claim)
+            return
+        self._end(claim, BookingState.UNBOOKED, at_present=True, forget=False)
+        self._bind(claim, by)
+
+    def _judge_lost(self, name: str) -> None:
+        claim = self._lost[name]
+        by, _ = self._obstacle(claim)
+        if by is None and not (claim.arc.patterns and not self._lost_to[name]):
+            self._recall(name)
+            self._emit(BookingConflict(name, None))
+            self._enter(claim)
+        else:
+            self._bind(claim, by or "")
+
+    def _enter(self, claim: Claim) -> None:
+        """A date stands again."""
+        claim.booking = replace(claim.booking, start=claim.date)
+        claim.arc = self.stand_in(claim.booking)
+        claim.kept, claim.tentative = claim.arc.mask, False
+        self._state.dates.add(claim)
+        self._look_again((claim.booking.id,))
+        self._offer(claim)
+
+    def _bind(self, claim: Claim, by: str) -> None:
+        """Bind the patterns of a date to RCs that are free then; if there are none, `by` is in its way."""
+        name, stands = claim.booking.id, claim.booking.id in self._state.claims
+        self._unbound.pop(name, None)
+        if claim.arc.patterns:
+            self._left -= SEARCH
+            unbound = replace(claim.booking, start=claim.date, bound={})
+            found = slots(self._state, unbound, self.stand_in(unbound), claim.date, 1, bookings_only=True)
+            if found.unknown:
+                self._want(claim, found.unknown)
+                if not by and stands:
+                    self._unbound[name] = None
+                    return  # judged again when they are in
+            elif found.found:
+                bound = found.found[0].bound
+                claim.booking = replace(unbound, bound=bound)
+                if stands:
+                    self._state.bind(claim.arc, bound)
+                    claim.kept = claim.arc.mask
+                    self._state.dates.put(claim)
+                    self._offer(claim)
+                else:
+                    if name in self._lost:
+                        self._recall(name)
+                        self._emit(BookingConflict(name, None))
+                    self._enter(claim)
+                self._emit(BookingBound(name, bound))
+                return
+        if stands:
+            self._end(claim, BookingState.UNBOOKED, at_present=True, forget=False)
+        if self._lost_to.get(name) != by:
+            if name in self._lost:
+                self._recall(name)
+            self._lose(claim, by)
+            self._emit(BookingConflict(name, by))
+
+    def _lose(self, claim: Claim, by: str) -> None:
+        name = claim.booking.id
+        self._lost[name], self._lost_to[name] = claim, by
+        for bit in bits(self._choices(claim)):
+            self._lost_at.setdefault(bit, Timeline()).add(claim.date, claim.date + claim.booking.runtime, claim)
+
+    def _recall(self, name: str) -> Claim:
+        claim = self._lost.pop(name)
+        del self._lost_to[name]
+        for bit in list(self._lost_at):
+            self._lost_at[bit].discard(claim.date, claim.date + claim.booking.runtime, claim)
+            if not self._lost_at[bit]:
+                del self._lost_at[bit]
+        return claim
+
+    def _choices(self, claim: Claim) -> int:
+        return claim.kept | union(map(self._state.matching_mask, claim.arc.patterns))
+
+    def _obstacle(self, claim: Claim) -> tuple[str | None, list[tuple[Rc, HolderSet]]]:
+        """A better-ranked date in the way of this one, if any, and the votes that would tell. Absent RCs are not
+        judged: whether they are sharable is unknown."""
+        state, unknown, rank = self._state, list[tuple[Rc, HolderSet]](), self._ranks[claim.booking.id]
+        # A running ARC keeps the RCs of its patterns.
+        needed = claim.kept if claim.arc.hold is None else claim.arc.named_mask
+        for rc in state.rcs_in(needed & state.present):
+            found = [
+                (other_rank, other)
+                for other in state.dates.of(rc, claim.date, claim.date + claim.booking.runtime)
+                if (other_rank := self._ranks.get(other.booking.id, rank)) < rank
+                and other.mask & rc.bit
+                and _meet(claim, other)
+            ]
+            before = [other for _, other in sorted(found, key=itemgetter(0))]
+            if before and (not rc.sharable or _excluded(claim, before) or self._refused(rc, claim, before, unknown)):
+                return before[0].booking.id, []
+        return None, unknown
+
+    def _refused(self, rc: Rc, claim: Claim, before: list[Claim], unknown: list[tuple[Rc, HolderSet]]) -> bool:
+        """Return True if the RC would refuse it beside the others, at any time of it."""
+        for time in sorted({claim.booking.start, *(other.booking.start for other in before)}):
+            if not claim.booking.start <= time < claim.booking.end:
+                continue
+            there = [booked for booked in (*before, claim) if booked.booking.start <= time < booked.booking.end]
+            holders = frozenset(booked.arc.id for booked in there)
+            answer = self._state.votes.known(rc.name, holders)
+            if answer is None:
+                unknown.append((rc, holders))
+            elif not answer.accept:
+                return True
+        return False
+
+    # Votes
+
+    def _want(self, claim: Claim, unknown: Iterable[tuple[Rc, HolderSet]]) -> None:
+        for rc, holders in unknown:
+            self._questions.setdefault(rc.name, _Questions()).add(claim.booking.start, holders)
+            self._askable[rc.name] = None
+
+    @property
+    def next_question(self) -> Ns | None:
+        """When an RC that does not answer may be asked again."""
+        votes = self._state.votes
+        silent = self._questions.keys() & votes.unresponsive if votes.unresponsive else ()
+        return min(map(votes.retry_at, silent), default=None)
+
+    def _ask(self) -> None:
+        """Ask each RC about a few sets at a time, those of the next dates first."""
+        votes = self._state.votes
+        for name in votes.due(self._state.now) if votes.unresponsive else ():
+            if name in self._questions:
+                self._askable[name] = None
+        for name in list(self._askable):
+            if self._left <= 0:
+                return
+            del self._askable[name]
+            questions = self._questions[name]
+            self._ask_rc(self._state.rc(name), questions)
+            if not questions.heap and not questions.asked:
+                del self._questions[name]
+
+    def _ask_rc(self, rc: Rc, questions: _Questions) -> None:
+        votes, asked = self._state.votes, questions.asked
+        for holders, date in list(asked.items()):
+            if not votes.is_asked(rc.name, holders):
+                del asked[holders]
+                questions.add(date, holders)
+        while questions.heap and votes.open(rc.name) < IN_FLIGHT:
+            date, _, holders = questions.heap[0]
+            if self._may_ask(rc, holders):
+                self._left -= SEARCH
+                if not self._actions.propose(rc, holders) and rc.name in votes.unresponsive:
+                    return
+                asked[holders] = date
+            questions.pop()
+
+    def _may_ask(self, rc: Rc, holders: HolderSet) -> bool:
+        there = rc.present and rc.sharable and all(self._claim_of(holder) is not None for holder in holders)
+        return there and self._state.votes.known(rc.name, holders) is None
+
+    # Dangers
+
+    def _take_changes(self) -> None:
+        """Look again at the bookings that changed holders, RCs and reservations may affect, those in danger and overdue
+        ones."""
+        state, before = self._state, self._reserved
+        self._reserved = reserved = reservations(state, state.policy.patience, before)
+        changed, state.changed = state.changed, {}
+        if before is not None and before is not reserved:
+            for bit, over in reserved.starving_changed(before).items():
+                changed[bit] = max(over, changed.get(bit, 0))
+        if before is None:
+            self._concerned |= dict.fromkeys(state.claims.values())
+        for bit, until in changed.items() if before is not None else ():
+            if until > state.now and bit & state.dates.claimed:
+                self._concerned |= dict.fromkeys(state.dates.of(state.rc_of(bit), state.now, until))
+        mask = union(changed)
+        self._concerned |= {claim: None for claim in self._endangered if mask and self._choices(claim) & mask}
+
+    def _report_dangers(self) -> None:
+        """Report bookings newly in danger, or no longer."""
+        state, concerned, uncertain = self._state, self._concerned, self._unjudged | self._unbound.keys()
+        while concerned and self._left > 0:
+            claim = next(iter(concerned))
+            del concerned[claim]
+            name = claim.booking.id
+            if state.claims.get(name) is claim and name not in uncertain:
+                self._left -= 1
+                self._report_danger(claim)
+        # The reasons of overdue bookings change with their ARCs.
+        begun = state.dates.begun(state.now)
+        waiting = [claim for claim in begun if claim.arc.hold is None and claim.booking.id not in uncertain]
+        for _ in range(min(len(waiting), self._left)):
+            self._turn += 1
+            self._left -= 1
+            self._report_danger(waiting[self._turn % len(waiting)])
+
+    @property
+    def next_start(self) -> Ns | None:
+        starts = self._reserved.starts if self._reserved is not None else ()
+        return min((start for start in starts if start > self._state.now), default=None)
+
+    def _report_danger(self, claim: Claim) -> None:
+        state, reserved = self._state, reservations(self._state, self._state.policy.patience, self._reserved)
+        found = danger(state, reserved, claim)
+        if isinstance(found, Reason) and self._keep_another(claim):
+            reserved = reservations(state, state.policy.patience, reserved)
+            found = danger(state, reserved, claim)
+        self._reserved = reserved
+        if isinstance(found, Undecided):
+            if claim.danger is not None and found.rc is not None:
+                self._actions.propose(found.rc, found.proposal)
+            found = claim.danger
+        if found == claim.danger:
+            return
+        claim.danger = found
+        if found is None:
+            del self._endangered[claim]
+        else:
+            self._endangered[claim] = None
+        self._emit(BookingThreatened(claim.booking.id, found))
+
+
+def _is_unbound(claim: Claim) -> bool:
+    return bool(claim.arc.patterns) and not claim.booking.bound and claim.arc.hold is None
+
+
+def _meet(claim: Claim, other: Claim) -> bool:
+    """Return True if both are at one time; maintenance does not conflict with maintenance."""
+    both = claim.booking.maintenance and other.booking.maintenance
+    return not both and -other.booking.runtime < other.date - claim.date < claim.booking.runtime
+
+
+def _excluded(claim: Claim, before: list[Claim]) -> bool:
+    return claim.booking.maintenance or any(other.booking.maintenance for other in before)
