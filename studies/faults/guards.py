@@ -25,19 +25,20 @@ from zscout.drivers.repeated import CommandMemory
 from zscout.drivers.resource_controller import ResourceController
 from zscout.mesh.renewal import Suspicions
 from zscout.messages import BookingRecord, Problem
+from zscout.rcm import recovery
+from zscout.rcm.places import Places
 from zscout.scheduling.claims import Claims
 from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.state import SchedulerState
 from zscout.services.bookings import records
 from zscout.services.bookings.fleet_clock import FleetClock, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
-from zscout.services.rcm import bookings, candidate, membership, recovery
+from zscout.services.rcm import bookings, candidate, membership
 from zscout.services.rcm.booked_dates import BookedDates
 from zscout.services.rcm.booking_sharing import BookingSharing
 from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.membership import Membership
-from zscout.services.rcm.places import Places
 from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.registry import RequestRegistry
 from zscout.services.rcm.request_handler import RequestHandler
@@ -231,9 +232,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "instances": Guard(
             "of two instances of an RC one serves", {(Instances, "begin"): _nothing, (Membership, "named"): _no_names}
         ),
-        "whole": Guard(
-            "a new leader carries on whole gangs only", {(recovery, "all"): _yes, (membership, "all"): _yes}
-        ),
+        "whole": Guard("a new leader carries on whole gangs only", {(recovery, "all"): _yes}),
         "pending": Guard(
             "holds wait for the rest of their gang to answer",
             {(recovery, "gangs_of"): _alone, (membership, "gangs_of"): _alone},

@@ -136,6 +136,7 @@ class Arc:
     """The RC of each pattern (`patterns.py`), while it runs or is checked. Empty if some pattern has none."""
     claim: Claim | None = None  # the active booking that it has taken up
     position: int = 0  # the position of its group (`fair_shares.py`); while it runs, as of its start
+    vouched: bool = True  # by its client; False: RCs alone told of it, and nothing is charged for it
     late: Ns = 0  # delay that its group's share adds to its waiting time (`reservations.py`)
     owner: str = field(init=False)  # its client's host, for quotas
     id: ArcId = field(init=False)
@@ -325,14 +326,16 @@ class HandedOver(Struct, frozen=True):
 
 
 class RecoveredHold(Struct, frozen=True):
-    """A hold in force at a change of RCM: its grant is kept, `end` is on the core's clock."""
+    """A hold in force at a change of RCM: its grant is kept, `end` is on the core's clock. One that only RCs tell of,
+    where they are not believed the rest, is not `vouched` for and has no place."""
 
     request: ArcRequest
-    place: Place
+    place: Place | None
     grant: Grant
     start: Ns
     end: Ns
     bound: Mapping[Need, RcName] = {}
+    vouched: bool = True
 
     def __post_init__(self) -> None:
         patterns = {need for need in self.request.needs if is_pattern(need)}
@@ -363,13 +366,22 @@ class Adopted(Struct, frozen=True):
     held: RecoveredHold
 
 
+class Vouched(Struct, frozen=True):
+    """The client of an ARC of which only RCs had told answers: `request` and place are its word. `bound`: the RC for
+    each pattern; None: what is held is not what it asks for, and ends."""
+
+    request: ArcRequest
+    place: Place | None
+    bound: Mapping[Need, RcName] | None
+
+
 class Tick(Struct, frozen=True):
     """Time has passed."""
 
 
 _ArcEvent: TypeAlias = Requested | Cancelled | Released | ClientLost | PlaceShown | Unconfirmed | Reachable | HandedOver
 _RcEvent: TypeAlias = Vote | VoteOverdue | RcJoined | RcReported | RcLost
-Event: TypeAlias = _ArcEvent | _RcEvent | LeadTaken | Adopted | Booked | Unbooked | Redated | Tick
+Event: TypeAlias = _ArcEvent | _RcEvent | LeadTaken | Adopted | Vouched | Booked | Unbooked | Redated | Tick
 
 
 class Outcome(StrEnum):
@@ -456,6 +468,8 @@ class ArcStatus(Struct, frozen=True):
     """The full reason to wait; None while it runs."""
     reported: Reason | None
     """The reason of its latest `Queued` effect, which may be out of date."""
+    vouched: bool = True
+    """False: only RCs have told of it so far."""
 
     @property
     def id(self) -> ArcId:

@@ -33,9 +33,9 @@ from zscout.messages import (
     Revocation,
     StateAsk,
 )
+from zscout.rcm.recovery import RecoveredState
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.rcm import Rcm
-from zscout.services.rcm.recovery import RecoveredState
 from zscout.testing.memory import MemoryMesh
 from zscout.types import NO_TERM, Grant, Place, Term
 

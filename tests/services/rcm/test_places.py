@@ -12,8 +12,8 @@ from tests.services.rcm.kit import FakeFleet, Refusal, request
 from zscout.behaviors.client.request import OpenArc
 from zscout.keyexpr import client_of
 from zscout.messages import Notice, OpenRequest
+from zscout.rcm.places import MAX_KEPT, Places
 from zscout.services.rcm.candidate import Candidate
-from zscout.services.rcm.places import MAX_KEPT, Places
 from zscout.types import SECOND, Place, Term
 
 OLD, NEW = Term(3, "old"), Term(4, "new")

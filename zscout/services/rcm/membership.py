@@ -20,10 +20,11 @@ from zscout.keyexpr import Role, Token, client_of
 from zscout.mesh import Declaration, Mesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import ClientRequests, RcAsk, RcState, disbelieved
-from zscout.scheduling.model import Adopted, ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
+from zscout.rcm.admission import Admission
+from zscout.rcm.recovery import adopted, aged, gangs_of
+from zscout.scheduling.model import ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
 from zscout.services.rcm.absence import Absence, Asked
 from zscout.services.rcm.devices import ExpectedDevices
-from zscout.services.rcm.recovery import aged, gangs_of, recover
 from zscout.types import SECOND, ArcId, ClientId, Grant, HostName, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
@@ -69,8 +70,12 @@ class Membership:
         on_reported: Callable[[RcName, RcState], None],
         on_newer: Callable[[Term, str | None], object],
         devices: ExpectedDevices,
+        admission: Admission,
+        known: Callable[[ArcId], ArcStatus | None],
     ) -> None:
+        """`known`: what is open here."""
         self.mesh, self.term, self._devices = mesh, term, devices
+        self._admission, self._known = admission, known
         self._lease = fleet.mesh.lease
         self._hold_lease = fleet.timing.hold_lease / SECOND
         self._timeout = fleet.timing.rebuild / SECOND
@@ -93,8 +98,8 @@ class Membership:
         """RCs that answered with holds of earlier terms: the other RCs of those gangs may answer too."""
         self.on_settled: Callable[[], None] = lambda: None
         """Called when RCs are not pending any more."""
-        self.on_requests: Callable[[ClientId, set[str]], None] = lambda *_: None
-        """Called with what a client that was asked says that it asks for: ids."""
+        self.on_requests: Callable[[ClientRequests], None] = lambda _: None
+        """Called with what a client that was asked says that it asks for."""
         self._asked: set[ClientId] = set()
         self.on_disbelieved: Callable[[RcName, Term], object] = lambda *_: None
         """Called when no RC has joined, and one obeys an RCM of so low a term that this one is none to it."""
@@ -231,8 +236,8 @@ class Membership:
             reply = await self.mesh.ask_one(key, ask, ClientRequests, timeout=self._timeout)
             if reply is not None and reply.problem is not None and reply.problem.term is not None:
                 self.see(reply.problem.term, obeyed_by=client if client in self.clients else None)
-            if reply is not None and reply.message is not None:
-                self.on_requests(client, {request.id for request in reply.message.requests})
+            if reply is not None and reply.message is not None and reply.message.client == client:
+                self.on_requests(reply.message)
                 break
             self.mesh.suspicions.suspect(unheard, so=reply is None and client in self.clients)
             await asyncio.sleep(self._timeout)
@@ -505,15 +510,10 @@ class Membership:
     def _admit(self, states: list[RcState]) -> None:
         self._joined.update({state.rc: state for state in states})
         self._named |= {state.rc: (state.instance, state.host) for state in states}
-        well = {state.rc: state for state in states if state.health == "ok"}
-        held = {(rc, holder.grant) for rc, state in well.items() for holder in state.holders}
-        recovered = recover(well.values(), [], self.mesh.now()).holds
-        adopted = [
-            Adopted(hold)
-            for hold in recovered
-            if all((rc, hold.grant) in held or rc not in self._joined for rc in hold.rcs)
-        ]
-        self._emit(*map(_as_it_is, states), *adopted)
+        holds, remarks = adopted(states, self._joined, self.mesh.now(), self._admission, self._known)
+        for remark in remarks:
+            log.info("%s", remark)
+        self._emit(*map(_as_it_is, states), *holds)
         for state in states:
             self._on_reported(state.rc, state)
             if state.duplicate_of or len(self._rc_tokens.get(state.rc, ())) > 1:

@@ -16,13 +16,13 @@ from zscout import trace
 from zscout.keyexpr import BadName, client_of, is_pattern
 from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import Notice, ReasonInfo, ReasonParty, State, StoryLine
+from zscout.messages import Notice, Problem, ReasonInfo, ReasonParty, State, StoryLine
+from zscout.rcm.places import Places, client_id, request_id
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcStatus, Dropped, Effect, Granted, HoldEnded, Outcome, Queued
 from zscout.scheduling.reason import Party, Reason, ended, waits
 from zscout.scheduling.runtimes import RuntimeEstimator
-from zscout.services.rcm.places import Places, client_id, request_id
 from zscout.types import SECOND, ArcId, Grant, HostName, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
@@ -246,6 +246,13 @@ class RequestRegistry:
         self.publish(changed)
         for arc in undecided:
             self._change(arc)
+
+    def refuse(self, arc: ArcId, name: str, problem: Problem) -> None:
+        """Has a client know that what it listed is refused, as it is told when it asks."""
+        reason = f"the leader refuses it: {problem.message}"
+        self.record(arc, reason)
+        notice = self._notice(arc, "ended", reason=reason, outcome=Outcome.LOST, problem=problem)
+        self._put(replace(notice, arc=name))
 
     def _put(self, notice: Notice) -> None:
         try:
