@@ -11,7 +11,7 @@ Where names are proven, an RC's word counts for the grant, its RCs, and how long
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import Decimal
 from itertools import islice
@@ -64,7 +64,7 @@ class RecoveredState:
     waiting: list[Requested] = field(default_factory=list)
     expected: dict[str, set[ClientId]] = field(default_factory=dict)
     """By request id: the clients to which it is to be handed over, as they say."""
-    believed: dict[ArcId, list[RcName]] = field(default_factory=dict)
+    believed: dict[ArcId, Sequence[RcName]] = field(default_factory=dict)
     """Of what waits: the RCs that its client believes to hold. They may not have answered yet."""
     answered: set[ClientId] = field(default_factory=set)
     """The clients that have said what they ask for."""
@@ -100,10 +100,11 @@ def take_over(
     answered = {state.rc: state for state in sorted(by_host, key=_newest_grant)}
     pending = {rc for rc in answered if not gangs_of(rc, answered) <= answered.keys()}
     let_in = [state for rc, state in answered.items() if rc not in pending]
-    result = recover(let_in, clients, now, admission, record_of)
+    held = [holder for rc in sorted(pending) for holder in answered[rc].holders]
+    undecided = {(arc_id(one.client, one.id), one.grant) for one in held}
+    result = recover(let_in, clients, now, admission, record_of, undecided=undecided)
     result.pending = [answered[rc] for rc in sorted(pending)]
     asked = {one.client: {request.id for request in one.requests} for one in clients}
-    held = [holder for state in result.pending for holder in state.holders]
     result.given_up = {arc_id(one.client, one.id) for one in held if one.id not in asked.get(one.client, {one.id})}
     return result
 
@@ -134,8 +135,10 @@ class Listed(NamedTuple):
     expects: bool = False
     """It has no place as yet: its client asked for it and had no answer, or another is to hand it over."""
     waited: float = 0.0
-    believes: list[RcName] | None = None
-    """The RCs that its client believes to hold."""
+    grant: Grant | None = None
+    """What its client believes to hold,"""
+    rcs: Sequence[RcName] = ()
+    """and the RCs of it."""
     problem: Problem | None = None
     """Why it may not have the place or the booking that it names."""
 
@@ -178,19 +181,19 @@ def listed_by(
             request = replace(request, booking=admission.listed_booking(asked, sender, record))
     except Refused as refused:
         problem = refused.problem
-    believes = None if asked.grant is None else asked.rcs
-    return Listed(request, place, asked.place is None, asked.waited, believes, problem)
+    return Listed(request, place, asked.place is None, asked.waited, asked.grant, asked.rcs, problem)
 
 
 def _enter(
     result: RecoveredState,
     listed: Mapping[ArcId, Listed],
     over: Collection[tuple[Place, str]],
+    undecided: Collection[tuple[ArcId, Grant | None]],
     now: Ns,
     admission: Admission,
 ) -> None:
     """Lets in what clients list as waiting, by the door of what they ask for: the earliest places first. `over`: places
-    and ids of what RCs hold."""
+    and ids of what RCs hold. `undecided`: what pending RCs hold may go on yet, and is clamped."""
     let_in, running = LetIn(), {held.request.arc for held in result.holds}
     for held in result.holds:
         let_in.add(held.request, waits=False)
@@ -204,14 +207,17 @@ def _enter(
             try:
                 if one.problem is not None:
                     raise Refused.by(one.problem)
-                admission.check(request, let_in)
+                if (request.arc, one.grant) in undecided:
+                    request = admission.clamped(request)
+                else:
+                    admission.check(request, let_in)
             except Refused as refused:
                 result.refused.append(NotLetIn(request.arc, request.label, refused.problem))
                 continue
             let_in.add(request, waits=True)
             result.waiting.append(Requested(request, one.place, now - round(one.waited * SECOND)))
-            if one.believes is not None:
-                result.believed[request.arc] = one.believes
+            if one.grant is not None:
+                result.believed[request.arc] = one.rcs
 
 
 # What RCs hold
@@ -224,9 +230,10 @@ def recover(
     admission: Admission,
     record_of: Callable[[str], BookingRecord | None] = lambda _: None,
     known: Callable[[ArcId], ArcStatus | None] = lambda _: None,
+    undecided: Collection[tuple[ArcId, Grant | None]] = (),
 ) -> RecoveredState:
     """Combines the answers. What is malformed is left out, and all else is recovered. `known`: what is open here
-    already."""
+    already; `undecided`: what pending RCs hold."""
     result = RecoveredState(rcs={state.rc: state for state in states})
     result.answered = {one.client for one in clients}
     listed = _listed(result, clients, admission, record_of)
@@ -237,6 +244,9 @@ def recover(
     seen, places = set[ArcId](), set[tuple[Place, str]]()
     for (arc, grant), held in sorted(parts.items(), key=lambda item: item[0][1], reverse=True):
         if arc in seen:
+            continue
+        if grant.term >= admission.places.term:
+            result.remarks.append(f"the hold of {arc} is not carried on: its grant is of no earlier term")
             continue
         seen.add(arc)
         some, mine = _most_telling(held), listed.get(arc)
@@ -254,13 +264,14 @@ def recover(
         whole = all(name in held or name not in result.rcs for name in some.rcs)
         if whole and hold is not None:
             result.holds.append(hold)
-            places.add((some.place, some.id))
-            if not hold.vouched and some.booking:
+            if hold.vouched:
+                places.add((some.place, some.id))
+            elif some.booking:
                 result.booked.add(some.booking)
         elif hold is not None and not admission.closed and (mine is None or mine.expects):
             result.waiting.append(Requested(hold.request, some.place))
             listed.pop(arc, None)
-    _enter(result, listed, places, now, admission)
+    _enter(result, listed, places, undecided, now, admission)
     result.waiting.sort(key=lambda one: (one.place is None, one.place))
     return result
 

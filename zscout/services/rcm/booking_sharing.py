@@ -34,12 +34,11 @@ LOOK: Final = 0.5
 """Seconds within which candidates that live are found."""
 
 
-def credible(replies: Iterable[Reply[BookingsKept]], keys: Keys, now: Ns, authority: Authority) -> list[BookingsKept]:
-    """What keepers answered, each for its own host, with the times of `now`: some have waited for the others. Where
-    names are proven, only those that may lead are believed."""
+def credible(replies: Iterable[Reply[BookingsKept]], keys: Keys, now: Ns) -> list[BookingsKept]:
+    """What keepers answered, each for its own host, with the times of `now`: some have waited for the others."""
     told = [(reply, reply.message) for reply in replies if reply.message is not None]
     own = [(now - reply.arrived, message) for reply, message in told if reply.key == keys.bookings(message.host)]
-    return [_aged(message, waited / SECOND) for waited, message in own if authority.may_lead(message.host)]
+    return [_aged(message, waited / SECOND) for waited, message in own]
 
 
 def _aged(one: BookingsKept, seconds: float) -> BookingsKept:
@@ -146,7 +145,8 @@ class BookingSharing:
     def _take(self, replies: Collection[Reply[BookingsKept]], question: ShareBookings) -> list[BookingsKept]:
         """What keepers answered."""
         now = self._mesh.now()
-        answers = credible(replies, self._mesh.keys, now, self._authority)
+        heard = credible(replies, self._mesh.keys, now)
+        answers = [one for one in heard if self._authority.may_lead(one.host)]
         changed = self._keeper.records.take(record for one in answers for record in one.records)
         known = {record.id: record for record in self._keeper.records}
         latest = replace(question, digest=self._keeper.records.digest())
@@ -174,6 +174,7 @@ class BookingSharing:
         else:
             self._clock.step(agreed(map(wall_ns, walls.values())), now)
         time = self._clock.at(now) / SECOND
+        walls |= {one.host: one.wall for one in heard}
         self.clocks = {host: wall - time for host, wall in walls.items() if abs(wall - time) > DIFFERS}
         return answers
 

@@ -308,7 +308,8 @@ class Candidate:
         states = [aged(state, now - arrived) for state, arrived in answers]
         open_requests = self._credible(clients, lambda one: keys.requests(client_of(one.client)))
         asking = [one for one, _ in open_requests if one.term in (term, NO_TERM)]
-        self._lead(term, states, asking, credible(keepers, keys, now, self._authority))
+        kept = [one for one in credible(keepers, keys, now) if self._authority.may_lead(one.host)]
+        self._lead(term, states, asking, kept)
         return True
 
     async def _refused(self, key: str, term: Term) -> None:
