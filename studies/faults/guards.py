@@ -23,9 +23,12 @@ from zscout.drivers.holds import HoldChange, HoldEntry, HoldTable
 from zscout.drivers.instances import Instances
 from zscout.drivers.repeated import CommandMemory
 from zscout.drivers.resource_controller import ResourceController
+from zscout.keyexpr import Sender
 from zscout.mesh.renewal import Suspicions
-from zscout.messages import BookingRecord, Problem
+from zscout.messages import BookingRecord, Problem, Who
 from zscout.rcm import recovery
+from zscout.rcm.admission import Admission
+from zscout.rcm.authority import Authority
 from zscout.rcm.places import Places
 from zscout.scheduling.claims import Claims
 from zscout.scheduling.model import ArcRequest
@@ -60,6 +63,14 @@ def _nothing(*_: object, **__: object) -> None:
 
 def _no(*_: object, **__: object) -> bool:
     return False
+
+
+def _as_told(_self: Admission, request: ArcRequest) -> ArcRequest:
+    return request
+
+
+def _as_it_says(_self: Authority, _sender: Sender, who: Who | None) -> Who | None:
+    return who
 
 
 def _yes(*_: object, **__: object) -> bool:
@@ -228,6 +239,10 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         ),
         "snapshots": Guard("what a snapshot adds passes the RC's own vote", {(ResourceController, "_carries"): _yes}),
         "once": Guard("a command that arrives again is not carried out again", {(CommandMemory, "is_new"): _yes}),
+        "door": Guard("what clients list passes the door of what they ask for", {(Admission, "check"): _nothing}),
+        "clamped": Guard("what RCs report is no more than its client may ask for", {(Admission, "clamped"): _as_told}),
+        "certified": Guard("who asks has the name of its certificate", {(Authority, "known_as"): _as_it_says}),
+        "managers": Guard("records of bookings come from managers only", {(Authority, "may_lead"): _yes}),
         "sealed": Guard("a place is had by whom it was given to", {(Places, "may_claim"): _yes}),
         "instances": Guard(
             "of two instances of an RC one serves", {(Instances, "begin"): _nothing, (Membership, "named"): _no_names}

@@ -110,11 +110,11 @@ class Rcm:
         `runtimes`."""
         self.mesh, self.fleet, self.term = mesh, fleet, term
         self.supervisor = Supervisor(f"the RCM of term {term.counter}", on_failure)
-        self._authority = authority or Authority(fleet)
-        self.core = Core(STRATEGIES[fleet.strategy](), self._authority.bound(fleet.scheduling))
+        self.authority = authority or Authority(fleet)
+        self.core = Core(STRATEGIES[fleet.strategy](), self.authority.bound(fleet.scheduling))
         supervisor, receive = self.supervisor, self._receive
         self.places = places or Places(fleet.name, None, term)
-        self._admission = Admission(fleet.limits, self._authority, self.places)
+        self._admission = Admission(fleet.limits, self.authority, self.places)
         self.registry = RequestRegistry(mesh, self.core, term, supervisor, self.places)
         self._runtimes = self.registry.runtimes = runtimes
         self._own_inventory = inventory is None
@@ -226,7 +226,7 @@ class Rcm:
 
     def on_reload(self) -> None:
         """The rights have changed: who has none any more holds and waits for nothing."""
-        self.core.policy = self._authority.bound(self.fleet.scheduling)
+        self.core.policy = self.authority.bound(self.fleet.scheduling)
         known = filter(None, map(self.core.arc, self.core.arcs()))
         self._receive(Tick(), *removed((arc.request for arc in known), self._admission))
 
