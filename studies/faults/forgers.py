@@ -1,5 +1,5 @@
-"""Who has a certificate of a simulated fleet, and says what is not so: a client, a node's RC, and a keeper of bookings;
-and what no leader may believe of it."""
+"""A client, an RC and a keeper of bookings with a certificate of a simulated fleet, whose every answer is forged; and
+the check that no leader believes them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ FORGED: Final = Who("somebody else")
 
 
 def closed(fleet: Fleet, hosts: Iterable[str], candidates: Iterable[str]) -> Fleet:
-    """The fleet with certificates: all are who they are, and the forger serves one RC."""
+    """The fleet with certificates, in which the forger may ask, and serve one RC."""
     nodes = dict.fromkeys(hosts, ("*/*",)) | {"forger": (ITS_RC,)}
     roles = Roles(operator=(next(iter(nodes)),), client=("forger",), manager=tuple(candidates), node=nodes)
     limits = replace(fleet.limits, max_requests_per_client=MAY_LIST)
@@ -51,7 +51,7 @@ def closed(fleet: Fleet, hosts: Iterable[str], candidates: Iterable[str]) -> Fle
 
 
 async def forge(mesh: Mesh, devices: Mapping[str, object], over: Callable[[], bool]) -> None:
-    """Lists, reports and keeps what is not so, until it is over."""
+    """Answer with forged requests, holds and records, until the run is over."""
     rng, me, others, instance = RANDOM.get(), mesh.me, list[WaitView](), new_instance()
 
     def lists(query: IncomingQuery[RcAsk]) -> None:
@@ -60,11 +60,11 @@ async def forge(mesh: Mesh, devices: Mapping[str, object], over: Callable[[], bo
             OpenRequest(f"f{number}", "f", {ITS_RC: {}}, 0, Decimal(2), place=PLACE, who=FORGED)
             for number in range(LISTED)
         ]
-        stolen = [OpenRequest(one.id, "stolen", {ITS_RC: {}}, 0, Decimal(2), place=one.place) for one in others]
+        stolen = [OpenRequest(wait.id, "stolen", {ITS_RC: {}}, 0, Decimal(2), place=wait.place) for wait in others]
         query.answer(ClientRequests(str(me), [*wanted, *stolen, *flood]))
 
     def reports(query: IncomingQuery[RcAsk]) -> None:
-        names = [(one.id, one.client, one.place) for one in others] or [("q", "h0/nobody", PLACE)]
+        names = [(wait.id, wait.client, wait.place) for wait in others] or [("q", "h0/nobody", PLACE)]
         id_, client, place = rng.choice(names)
         held = Holder(
             id_, "q", client, Grant(Term(1, "0"), rng.randrange(1, 1_000)), place, [ITS_RC], Decimal(600), 600.0, HIGH,
@@ -76,8 +76,8 @@ async def forge(mesh: Mesh, devices: Mapping[str, object], over: Callable[[], bo
     def keeps(query: IncomingQuery[ShareBookings]) -> None:
         start = round(query.message.time or 0) + 3_600
         record = BookingRecord("forged", "forged", {rc: {} for rc in devices}, HIGH, start, Decimal(600), Decimal(600))
-        told = replace(record, owner="forger", since=start - 3_600)
-        query.answer(BookingsKept(me.host, True, start + 86_400.0, "?", start + 86_400.0, 1e8, records=[told]))
+        forged = replace(record, owner="forger", since=start - 3_600)
+        query.answer(BookingsKept(me.host, True, start + 86_400.0, "?", start + 86_400.0, 1e8, records=[forged]))
 
     keys = mesh.keys
     declared = [
@@ -92,7 +92,7 @@ async def forge(mesh: Mesh, devices: Mapping[str, object], over: Callable[[], bo
         await asyncio.sleep(rng.uniform(0, 2 * LOOKS_EVERY))
         state = await mesh.ask_one(keys.rcm_state, StateAsk(), RcmState, timeout=LOOKS_EVERY)
         queue = state.message.queue if state is not None and state.message is not None else []
-        others[:] = [one for one in queue if one.client != str(me)][:LISTED]
+        others[:] = [wait for wait in queue if wait.client != str(me)][:LISTED]
         token.close()
         instance = new_instance()
     for left in declared:
@@ -101,7 +101,7 @@ async def forge(mesh: Mesh, devices: Mapping[str, object], over: Callable[[], bo
 
 
 def believed(rcm: Rcm) -> str:
-    """What a leader believes that it may not; empty: nothing."""
+    """The forgery that a leader believes; empty: none."""
     status, authority, of_forger = rcm.core.status(), rcm.authority, 0
     for arc in (*status.running, *status.queued):
         host, request = arc.request.client.partition("/")[0], arc.request

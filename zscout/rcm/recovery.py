@@ -6,7 +6,7 @@ under the same grant; one that an RC of the gang does not hold is broken, and qu
 of the gang has not answered, the others are pending (`membership.py`). What a client that answers does not ask for any
 more is not carried on: it gave it up while nobody led.
 
-Where names are proven, an RC's word counts for the grant, its RCs, and how long it goes on; the rest is its client's.
+With certificates an RC is trusted for the grant, its RCs and the remaining time; its client for the rest.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ REMOVED: Final = "the fleet file, which names its owner under no role"
 
 
 class NotLetIn(NamedTuple):
-    """What a client listed, and is refused as if it had asked for it."""
+    """A listed request, refused as an Ask would be."""
 
     arc: ArcId
     name: str
@@ -72,7 +72,7 @@ class RecoveredState:
     """By group: what it lately had, as the leader before told (`fair_shares.py`)."""
     refused: list[NotLetIn] = field(default_factory=list)
     booked: set[str] = field(default_factory=set)
-    """Dates of bookings that holds are reported to have taken up, by the word of RCs alone: they do not lapse."""
+    """Dates of bookings that only RCs report as taken up: they do not lapse meanwhile."""
     remarks: list[str] = field(default_factory=list)
     """For the log."""
 
@@ -92,7 +92,7 @@ def take_over(
 ) -> RecoveredState:
     """What a new leader recovers. RCs whose gangs have not all answered are `pending`: their holds are not decided.
     `home_of`: the host at which the fleet file has an RC; one that is free elsewhere is taken in later, as its device
-    may still be used at home. `record_of`: what is known of a booking."""
+    may still be used at home. `record_of`: the known record of a booking."""
     states = [state for state in states if state.holders or home_of(state.rc) in (None, state.host)]
     # Of two instances of one RC the one with the newest hold is meant, else the one at home.
     by_host = sorted(states, key=attrgetter("host", "instance"), reverse=True)
@@ -124,23 +124,23 @@ def gangs_of(rc: RcName, states: Mapping[RcName, RcState]) -> set[RcName]:
     return found
 
 
-# What clients list
+# Listed requests
 
 
 class Listed(NamedTuple):
-    """A request by the word of its client: well-formed, and with a place and a booking only if these are its own."""
+    """A valid request in its client's words, with a place and a booking only if they are its own."""
 
     request: ArcRequest
     place: Place | None
     expects: bool = False
-    """It has no place as yet: its client asked for it and had no answer, or another is to hand it over."""
+    """It has no place yet: its Ask was not answered, or another client hands it over."""
     waited: float = 0.0
     grant: Grant | None = None
-    """What its client believes to hold,"""
+    """The hold that its client believes in,"""
     rcs: Sequence[RcName] = ()
-    """and the RCs of it."""
+    """and its RCs."""
     problem: Problem | None = None
-    """Why it may not have the place or the booking that it names."""
+    """The reason why it may not have its place or booking."""
 
 
 def _listed(
@@ -149,20 +149,20 @@ def _listed(
     admission: Admission,
     record_of: Callable[[str], BookingRecord | None],
 ) -> dict[ArcId, Listed]:
-    """Of each client no more than it may have open."""
+    """The valid requests; of each client at most as many as it may have open."""
     found, most = dict[ArcId, Listed](), admission.limits.max_requests_per_client
-    for one in clients:
-        if len(one.requests) > most:
-            result.remarks.append(f"{one.client} lists {len(one.requests)} requests: {most} are looked at")
-        for request in islice(one.requests, most):
+    for answer in clients:
+        if len(answer.requests) > most:
+            result.remarks.append(f"{answer.client} lists {len(answer.requests)} requests: {most} are looked at")
+        for request in islice(answer.requests, most):
             try:
-                client_of(one.client)
+                client_of(answer.client)
                 check_name(request.id, "id")
-                listed = listed_by(one.client, request, admission, record_of)
+                listed = listed_by(answer.client, request, admission, record_of)
                 found[listed.request.arc] = listed
             except Refused as refused:
                 name = request.arc if NAME.fullmatch(request.arc) else request.id
-                result.refused.append(NotLetIn(arc_id(one.client, request.id), name, refused.problem))
+                result.refused.append(NotLetIn(arc_id(answer.client, request.id), name, refused.problem))
             except BadName as error:
                 result.remarks.append(f"what a client lists is passed over: {error}")
     return found
@@ -192,22 +192,22 @@ def _enter(
     now: Ns,
     admission: Admission,
 ) -> None:
-    """Lets in what clients list as waiting, by the door of what they ask for: the earliest places first. `over`: places
-    and ids of what RCs hold. `undecided`: what pending RCs hold may go on yet, and is clamped."""
+    """Admit the waiting requests as if they were asked for, the earliest places first. `over`: places and ids of
+    recovered holds. `undecided`: holds of pending RCs, which may yet continue: they are clamped instead."""
     let_in, running = LetIn(), {held.request.arc for held in result.holds}
     for held in result.holds:
         let_in.add(held.request, waits=False)
-    waiting = [one for arc, one in listed.items() if arc not in running]
-    for one in sorted(waiting, key=lambda one: (one.place is None, one.place or ())):
-        request = one.request
-        if one.expects:
+    waiting = [known for arc, known in listed.items() if arc not in running]
+    for known in sorted(waiting, key=lambda known: (known.place is None, known.place or ())):
+        request = known.request
+        if known.expects:
             result.expected.setdefault(request_id(request.arc), set()).add(request.client)
-        elif (one.place, request_id(request.arc)) not in over:
+        elif (known.place, request_id(request.arc)) not in over:
             # Else it was handed over, and its client missed the answer: what the RCs hold counts.
             try:
-                if one.problem is not None:
-                    raise Refused.by(one.problem)
-                if (request.arc, one.grant) in undecided:
+                if known.problem is not None:
+                    raise Refused.by(known.problem)
+                if (request.arc, known.grant) in undecided:
                     request = admission.clamped(request)
                 else:
                     admission.check(request, let_in)
@@ -215,12 +215,12 @@ def _enter(
                 result.refused.append(NotLetIn(request.arc, request.label, refused.problem))
                 continue
             let_in.add(request, waits=True)
-            result.waiting.append(Requested(request, one.place, now - round(one.waited * SECOND)))
-            if one.grant is not None:
-                result.believed[request.arc] = one.rcs
+            result.waiting.append(Requested(request, known.place, now - round(known.waited * SECOND)))
+            if known.grant is not None:
+                result.believed[request.arc] = known.rcs
 
 
-# What RCs hold
+# Reported holds
 
 
 def recover(
@@ -232,8 +232,8 @@ def recover(
     known: Callable[[ArcId], ArcStatus | None] = lambda _: None,
     undecided: Collection[tuple[ArcId, Grant | None]] = (),
 ) -> RecoveredState:
-    """Combines the answers. What is malformed is left out, and all else is recovered. `known`: what is open here
-    already; `undecided`: what pending RCs hold."""
+    """Combine the answers. Malformed parts are left out, and the rest is recovered. `known`: ARCs open here already;
+    `undecided`: holds of pending RCs."""
     result = RecoveredState(rcs={state.rc: state for state in states})
     result.answered = {one.client for one in clients}
     listed = _listed(result, clients, admission, record_of)
@@ -284,8 +284,8 @@ def _most_telling(held: Mapping[RcName, Holder]) -> Holder:
 def _hold(
     arc: ArcId, grant: Grant, held: Mapping[RcName, Holder], mine: Listed | None, now: Ns, admission: Admission
 ) -> RecoveredHold | None:
-    """A hold as these RCs report it, and its client if it has answered; None: that one asks for something else. Raises
-    BadName, ValueError."""
+    """A hold as these RCs report it, with the request of its client if that answered; None: the client asks for
+    something else. Raises BadName, ValueError."""
     some = _most_telling(held)
     end = now + round(min(holder.remaining for holder in held.values()) * SECOND)
     direct = any(holder.direct for holder in held.values()) or (mine is not None and mine.request.direct)
@@ -310,7 +310,7 @@ def _hold(
 
 
 def _agree(needs: Mapping[Need, Params], bound: Mapping[Need, RcName], held: Mapping[RcName, Holder]) -> bool:
-    """Whether the RCs say the same of what is asked of each of them."""
+    """Return True if the RCs report the parameters that the client asked for."""
     by_rc = _by_rc(needs, bound)
     return all(exact_amounts(holder.params) == by_rc[rc] for rc, holder in held.items())
 
@@ -345,7 +345,7 @@ def _patterns(holder: Holder) -> dict[RcName, Need]:
 
 
 def _told(arc: ArcId, holder: Holder, needs: Mapping[Need, Params]) -> ArcRequest:
-    """By the word of an RC. Raises BadName, ValueError."""
+    """The request in the words of an RC. Raises BadName, ValueError."""
     client_of(holder.client)
     check_name(holder.id, "id")
     check_name(holder.arc, "arc")
@@ -376,7 +376,7 @@ def adopted(
     admission: Admission,
     known: Callable[[ArcId], ArcStatus | None],
 ) -> tuple[list[Adopted | Released], list[str]]:
-    """What goes on of what RCs hold that have just `joined`, and remarks for the log."""
+    """The holds of late joiners that continue, and remarks for the log. `joined`: the RCs that count as there."""
     well = [state for state in states if state.health == "ok"]
     held = {(state.rc, holder.grant) for state in well for holder in state.holders}
     found = recover(well, [], now, admission, known=known)
@@ -385,16 +385,16 @@ def adopted(
 
 
 def removed(requests: Iterable[ArcRequest], admission: Admission) -> list[Released]:
-    """The end of what its owner may not have any more, whoever it is."""
+    """Ends the ARCs of clients without a role."""
     gone = [one.arc for one in requests if admission.authority.is_removed(one.client)]
     return [Released(arc, REMOVED) for arc in gone]
 
 
-# What a client says of what RCs alone told of
+# Late answers of clients
 
 
 def vouched(status: ArcStatus, one: Listed, admission: Admission) -> Vouched:
-    """What its client says of an ARC that stands by the word of RCs. Raises Refused where that waits, and may not."""
+    """The client's words for an ARC reported by RCs only. Raises Refused if it waits, and may not be asked for."""
     if status.hold is None:
         admission.authority.check_ask(client_of(one.request.client).host, one.request, lambda _: 0)
     bound = binding(one.request.needs, status.needs, {})

@@ -435,7 +435,7 @@ class Core:
         self._expire()
 
     def _vouch(self, told: model.Vouched) -> None:
-        """Put the word of its client in the place of what RCs told: also what runs is entered anew with it."""
+        """Replace a request reported by RCs with its client's own, and re-enter its hold."""
         arc = self._state.arc(told.request.arc)
         if arc is not None and arc.hold is not None and not arc.vouched and told.bound is None:
             self._end_hold(arc, Outcome.LOST, of_rcs(ReasonCode.SUPERSEDED, sorted(arc.needs)[:1]))
@@ -455,7 +455,7 @@ class Core:
             self._effects.append(self._granted(arc, arc.hold))
 
     def _remove(self, arc: Arc) -> None:
-        """Take a queued ARC out, for another that replaces it."""
+        """Remove a queued ARC that another replaces."""
         self._state.dequeue(arc)
         self._forget(arc)
         self._claims.leave(arc)

@@ -136,7 +136,7 @@ class Arc:
     """The RC of each pattern (`patterns.py`), while it runs or is checked. Empty if some pattern has none."""
     claim: Claim | None = None  # the active booking that it has taken up
     position: int = 0  # the position of its group (`fair_shares.py`); while it runs, as of its start
-    vouched: bool = True  # by its client; False: RCs alone told of it, and nothing is charged for it
+    vouched: bool = True  # by its client; False: only RCs have reported it, and it is not charged
     late: Ns = 0  # delay that its group's share adds to its waiting time (`reservations.py`)
     owner: str = field(init=False)  # its client's host, for quotas
     id: ArcId = field(init=False)
@@ -326,8 +326,8 @@ class HandedOver(Struct, frozen=True):
 
 
 class RecoveredHold(Struct, frozen=True):
-    """A hold in force at a change of RCM: its grant is kept, `end` is on the core's clock. One that only RCs tell of,
-    where they are not believed the rest, is not `vouched` for and has no place."""
+    """A hold in force at a change of RCM: its grant is kept, `end` is on the core's clock. With certificates, a hold
+    reported by RCs only is not `vouched` for by its client, and has no place."""
 
     request: ArcRequest
     place: Place | None
@@ -367,8 +367,8 @@ class Adopted(Struct, frozen=True):
 
 
 class Vouched(Struct, frozen=True):
-    """The client of an ARC of which only RCs had told answers: `request` and place are its word. `bound`: the RC for
-    each pattern; None: what is held is not what it asks for, and ends."""
+    """The client of an ARC reported by RCs only has answered, with its request and place. `bound`: the RC for each
+    pattern; None: the hold does not meet the request, and ends."""
 
     request: ArcRequest
     place: Place | None
@@ -469,7 +469,7 @@ class ArcStatus(Struct, frozen=True):
     reported: Reason | None
     """The reason of its latest `Queued` effect, which may be out of date."""
     vouched: bool = True
-    """False: only RCs have told of it so far."""
+    """False: so far only RCs have reported it."""
 
     @property
     def id(self) -> ArcId:

@@ -1,4 +1,4 @@
-"""A secured fleet in memory: what is believed of clients that list, of nodes whose RCs report, and of keepers."""
+"""Forged lists of clients, states of RCs and records of keepers, on a secured fleet in memory."""
 
 from __future__ import annotations
 
@@ -60,16 +60,16 @@ def listed(name: str, *needs: str, priority: int = 0, **more: Any) -> OpenReques
 
 
 def lists(notice: Notice, **more: Any) -> OpenRequest:
-    """What an honest client lists of what it was told."""
+    """An honest client's open request, from its notice."""
     return listed(notice.arc, *notice.rcs, place=notice.place, seal=notice.seal, **more)
 
 
 def refusals(client: FakeClient) -> dict[str, str]:
-    return {one.id: one.problem.code for one in client.notices if one.problem is not None and one.state == "ended"}
+    return {item.id: item.problem.code for item in client.notices if item.problem is not None and item.state == "ended"}
 
 
 async def served(client: FakeClient, robot: str) -> None:
-    """An honest client has its grant at once."""
+    """Awaits a grant for an honest client within 0.5 s."""
     async with asyncio.timeout(0.5):
         assert (await client.ask("honest", robot)).state == "running"
 
@@ -98,12 +98,12 @@ async def test_what_a_client_lists_passes_the_door_of_what_it_asks_for() -> None
     await until(lambda: len(refusals(eve)) == 6)
     refused = dict.fromkeys(["never", "nothing"], "bad_request")
     assert refusals(eve) == refused | dict.fromkeys(["high", "operators", "barred", "theirs"], "not_allowed")
-    [why] = [one.reason for one in eve.notices if one.id == "operators"]
+    [why] = [item.reason for item in eve.notices if item.id == "operators"]
     assert why == "the leader refuses it: eve (client) may not request priority 10; at most 9; ada may"
     state = await fleet.state()
-    assert [(one.client, one.arc) for one in state.holds] == [("bob/one", "held")]
-    # Nobody believes a place without its seal, nor another's name.
-    assert [(one.arc, one.who and one.who.user) for one in state.queue] == [("waits", None), ("posing", "eve")]
+    assert [(item.client, item.arc) for item in state.holds] == [("bob/one", "held")]
+    # A place without its seal and another's name are ignored.
+    assert [(item.arc, item.who and item.who.user) for item in state.queue] == [("waits", None), ("posing", "eve")]
     assert (state.queue[0].place, state.queue[1].place.term) == (waits.place, state.term)
     assert not bob.notices
     assert next(iter(await fleet.bookings())) == "hers"
@@ -120,7 +120,7 @@ async def test_of_what_a_client_lists_no_more_counts_than_it_may_have_open() -> 
     await fleet.taken_over(leader, heir)
     await until(lambda: sum(map(len, map(refusals, (flood, more)))) == 2)
     state = await fleet.state()
-    assert Counter(one.client for one in state.queue).total() == 4
+    assert Counter(item.client for item in state.queue).total() == 4
     assert {*refusals(flood).values(), *refusals(more).values()} == {"too_many"}
     await served(bob, "robot/b")
 
@@ -131,7 +131,7 @@ async def test_quotas_and_ceilings_count_for_what_waits_and_end_nothing_that_run
     runs = await bob.ask("runs", "robot/a", priority=9, keep=True, seconds=600)
     waits = [await bob.ask(f"w{number}", "robot/a", priority=number) for number in (5, 4, 3)]
     bob.open = [lists(runs, priority=9, keep=True, grant=runs.grant, rcs=runs.rcs)]
-    bob.open += [lists(one, priority=5 - number) for number, one in enumerate(waits)]
+    bob.open += [lists(item, priority=5 - number) for number, item in enumerate(waits)]
     lowered = AccessPolicy(
         ROLES,
         access={"robot/a": ("bob",)},
@@ -145,8 +145,14 @@ async def test_quotas_and_ceilings_count_for_what_waits_and_end_nothing_that_run
     assert refusals(bob) == dict.fromkeys(["w5", "w3"], "not_allowed")
     state = await fleet.state()
     [hold] = state.holds
-    assert (hold.arc, hold.grant, hold.priority, hold.keep, hold.min_runtime) == ("runs", runs.grant, 4, False, 60)
-    assert [one.arc for one in state.queue] == ["w4"]
+    assert (hold.arc, hold.grant, hold.priority, hold.keep, hold.min_runtime) == (
+        "runs",
+        grant_of(runs),
+        4,
+        False,
+        Decimal(60),
+    )
+    assert [item.arc for item in state.queue] == ["w4"]
 
 
 async def test_what_is_asked_again_while_it_runs_is_not_refused_for_what_was_lowered_meanwhile() -> None:
@@ -157,7 +163,7 @@ async def test_what_is_asked_again_while_it_runs_is_not_refused_for_what_was_low
     leader.on_reload()
     again = await bob.ask("held", "robot/a", seconds=600, grant=held.grant, rcs=held.rcs)
     assert again.grant == held.grant
-    # It counts when that is queued again: it is not.
+    # The rights count once it would be queued again.
     await ada.ask("takes", "robot/a", priority=10)
     await until(lambda: bob.notices)
     assert (bob.notices[-1].state, bob.notices[-1].outcome) == ("ended", "preempted")
@@ -176,7 +182,7 @@ def forged(grant: Grant, *rcs: str, client: str = "bob/one", **more: Any) -> Hol
 
 
 async def reporting(client: str = "bob/one", **more: Any) -> tuple[ClosedFleet, Candidate, FakeRc, FakeClient]:
-    """An heir that found an RC which reports a hold that nobody granted; an honest client."""
+    """An heir that found a forged hold at an RC, and an honest client."""
     fleet, leader, heir, (robot, *_) = await closed("a", "b")
     ada = fleet.client("three", "ada")
     await do(ada, book("hers", "robot/a", at=5000), BookingView)
@@ -190,9 +196,9 @@ async def test_of_a_hold_that_an_rc_reports_the_rest_is_its_clients_word() -> No
     [hold] = (await fleet.state()).holds
     assert (hold.grant, hold.priority, hold.bound, hold.booking, hold.who) == (Grant(OLD, 7), 9, {}, "", None)
     assert hold.place.term > OLD
-    assert [(one.priority, one.bound, one.continues) for one in robot.holders] == [(9, {}, "")]
+    assert [(item.priority, item.bound, item.continues) for item in robot.holders] == [(9, {}, "")]
     await served(ada, "robot/b")
-    # An operator takes it, whatever its RC says.
+    # Its RC's word does not protect it from an operator.
     assert (await ada.ask("over", "robot/a", priority=10)).state == "running"
 
 
@@ -202,7 +208,7 @@ async def test_what_its_client_says_counts_once_it_answers() -> None:
     client = FakeClient(bob, fleet.log)
     client.open = [listed("q", "robot/*", priority=3, grant=Grant(OLD, 7), rcs=["robot/a"], who=Who("x", "desk"))]
     client.start()
-    await until(lambda: [one.priority for one in robot.holders] == [3])
+    await until(lambda: [item.priority for item in robot.holders] == [3])
     [hold] = (await fleet.state()).holds
     assert (hold.grant, hold.bound, hold.who) == (Grant(OLD, 7), {"robot/*": "robot/a"}, Who("bob", "desk"))
     assert hold.keep is False
@@ -215,9 +221,9 @@ async def test_what_its_client_does_not_ask_for_ends(needs: tuple[str, ...]) -> 
     client = FakeClient(fleet.mesh("bob", "one"), fleet.log)
     client.open = [listed("q", *needs, grant=Grant(OLD, 7), rcs=["robot/a"])] if needs else []
     client.start()
-    await until(lambda: Grant(OLD, 7) not in [one.grant for one in robot.holders])
-    assert Grant(OLD, 7) in [one.grant for one in fleet.revoked]
-    assert "ended" not in [one.state for one in client.notices] or not needs
+    await until(lambda: Grant(OLD, 7) not in [item.grant for item in robot.holders])
+    assert Grant(OLD, 7) in [item.grant for item in fleet.revoked]
+    assert "ended" not in [item.state for item in client.notices] or not needs
 
 
 @pytest.mark.parametrize("client", ["mallory/c1", "wall/c1"])
@@ -235,14 +241,14 @@ async def test_a_client_that_answered_has_its_own_word_in_the_same_instant() -> 
     bob, ada = fleet.client("one", "bob"), fleet.client("three", "ada")
     held = await bob.ask("q", "robot/*", priority=2)
     bob.open = [listed("q", "robot/*", priority=2, place=held.place, seal=held.seal, grant=held.grant, rcs=held.rcs)]
-    robot = next(one for one in (robot, other) if one.holders)
+    robot = next(item for item in (robot, other) if item.holders)
     robot.holders = [forged(grant_of(held), *held.rcs, bound={"*/a#9": held.rcs[0]})]
     await fleet.taken_over(leader, heir)
     [hold] = (await fleet.state()).holds
     assert (hold.grant, hold.priority, hold.keep, hold.place) == (held.grant, 2, False, held.place)
     assert hold.bound == held.bound
     assert not bob.notices
-    await served(ada, next(one for one in ("robot/a", "robot/b") if one not in held.rcs))
+    await served(ada, next(item for item in ("robot/a", "robot/b") if item not in held.rcs))
 
 
 async def test_an_rc_that_joins_later_is_believed_no_more() -> None:
@@ -253,8 +259,8 @@ async def test_an_rc_that_joins_later_is_believed_no_more() -> None:
     late.start()
     await fleet.joined(late)
     holds = (await fleet.state()).holds
-    assert [(one.client, one.priority) for one in holds if one.client == "bob/one"] in ([], [("bob/one", 9)])
-    assert "wall/c1" not in [one.client for one in holds]
+    assert [(item.client, item.priority) for item in holds if item.client == "bob/one"] in ([], [("bob/one", 9)])
+    assert "wall/c1" not in [item.client for item in holds]
     await served(ada, "robot/a")
 
 
@@ -275,12 +281,12 @@ async def test_records_and_fleet_time_are_taken_from_managers_only() -> None:
         if candidate is leader:
             await fleet.taken_over(leader, heir)
             await asyncio.sleep(5)
-    # It is told all the same, and nobody is told again and again for what it has besides.
+    # It still gets the records, and its own ones cause no repeated sharing.
     bob = fleet.client("one", "bob")
     fleet.candidate("x")
     await do(bob, book("his", "robot/a", at=500), BookingView)
     await asyncio.sleep(2)
-    assert {one.id for one in keeper.records} == {"forged", "his"}
+    assert {item.id for item in keeper.records} == {"forged", "his"}
     assert heir.rcm is not None
     assert heir.rcm.bookings._sharing._behind is False
     token.close()
@@ -294,8 +300,8 @@ async def test_a_dry_run_and_a_hand_over_pass_the_same_door() -> None:
     bob, eve = fleet.client("one", "bob"), fleet.client("two", "eve")
     await bob.ask("one", "robot/a")
     await bob.ask("two", "robot/a")
-    for forbidden, code in (({}, "too_many"), ({"priority": 10}, "not_allowed"), ({"priority": 10**7}, "bad_request")):
-        asked = request("dry", "robot/a", **forbidden)
+    for priority, code in ((0, "too_many"), (10, "not_allowed"), (10**7, "bad_request")):
+        asked = request("dry", "robot/a", priority=priority)
         for operation in (asked, Foresee("dry", "dry", asked.needs, asked.priority, Decimal(60))):
             with pytest.raises(Refusal) as refused:
                 await do(bob, operation, Foresight)

@@ -248,7 +248,7 @@ class RequestRegistry:
             self._change(arc)
 
     def refuse(self, arc: ArcId, name: str, problem: Problem) -> None:
-        """Has a client know that what it listed is refused, as it is told when it asks."""
+        """Publish to its client that a listed request is refused."""
         reason = f"the leader refuses it: {problem.message}"
         self.record(arc, reason)
         notice = self._notice(arc, "ended", reason=reason, outcome=Outcome.LOST, problem=problem)

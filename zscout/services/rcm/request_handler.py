@@ -272,7 +272,7 @@ class RequestHandler:
         """Whether another client has this ARC: what one RCM handed over, the next knows by its place only."""
         return ask.place is not None and any(request_id(arc) == ask.id for arc in self.core.at_place(ask.place))
 
-    # What is open at present, as limits and quotas count it: what this burst has brought counts
+    # Open requests, as limits and quotas count them: those of this burst included
 
     @property
     def waiting_now(self) -> int:
@@ -287,7 +287,7 @@ class RequestHandler:
         return owned - sum(self.core.is_open(arc) and arc.partition("/")[0] in names for arc in but)
 
     def held_by(self, names: Collection[str], *but: ArcId) -> int:
-        """How many RCs these hold."""
+        """The number of RCs held by these owners."""
         arcs = filter(None, map(self.core.arc, {*self.core.arcs_of_owners(names)} - {*but}))
         return sum(len(arc.needs) for arc in arcs if arc.hold is not None)
 
