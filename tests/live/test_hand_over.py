@@ -233,7 +233,7 @@ async def test_bodies_go_on_after_a_hand_over_that_was_refused(lab: Lab) -> None
     assert client.internals.open_requests()[0].grant is None
     client.internals.resume()
     await asyncio.wait({body.task}, timeout=HANG)
-    assert re.search(r"preempted by \S+@\S+ \(.+\), priority 9$", str(body.task.exception()))
+    assert re.search(r"preempted by \S+ \(\S+@\S+\), priority 9$", str(body.task.exception()))
     await other.end(taker)
 
 

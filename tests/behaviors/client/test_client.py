@@ -282,7 +282,7 @@ async def test_the_fleet_s_longest_time_ends_it(*, keep: bool) -> None:
 async def test_a_grant_is_waited_for_at_most_so_long() -> None:
     async with small_fleet("one", "two") as (fleet, (one, two)):
         async with hold(one, "first", {RC: {}}):
-            with pytest.raises(TimeoutError, match=r"second was not granted within 30 s: waits for h/one"):
+            with pytest.raises(TimeoutError, match=r"second was not granted within 30 s: waits for first \(h/one\)"):
                 await hold(two, "second", {RC: {}}, timeout=30).granted()
             state = await fleet.state()
             assert not state.queue

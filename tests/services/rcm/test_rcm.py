@@ -29,7 +29,7 @@ async def test_a_grant_is_published_and_the_loser_told_while_its_answer_is_on_th
     assert (preempted.outcome, preempted.by, preempted.grant) == ("preempted", "desk/operator/drive", first.grant)
     # Why it waits now is told a little later.
     await until(lambda: len(survey.notices) == 2)
-    assert survey.notices[1].reason == "waits for desk/operator (drive): robot/a"
+    assert survey.notices[1].reason == "waits for drive (desk/operator): robot/a"
     # The end of a hold that its own client released is told by the answer alone.
     await operator.do(Release("drive"))
     await until(lambda: survey.notices[-1].state == "running")
@@ -39,8 +39,8 @@ async def test_a_grant_is_published_and_the_loser_told_while_its_answer_is_on_th
     assert story == [
         "asked for robot/a at priority 0",
         "granted robot/a",
-        "preempted by desk/operator (drive), priority 10; queued again",
-        "waits for desk/operator (drive): robot/a",
+        "preempted by drive (desk/operator), priority 10; queued again",
+        "waits for drive (desk/operator): robot/a",
         "granted robot/a",
     ]
 
@@ -111,7 +111,7 @@ async def test_a_vote_that_is_late_grants_later_and_a_veto_is_a_reason() -> None
     await until(lambda: client.notices and client.notices[-1].state == "running")
     # A veto is a reason. It stands until the rules of the RC change.
     radio.accept = False
-    assert (await client.ask("more", "radio/f:9")).reason == "waits for desk/one (talk): radio/f refuses more: too much"
+    assert (await client.ask("more", "radio/f:9")).reason == "waits for talk (desk/one): radio/f refuses more: too much"
     await client.ask("more", "radio/f:9")
     assert [len(proposal.holders) for proposal in radio.proposals] == [1, 2]
     radio.accept, radio.rules = True, 1
@@ -194,7 +194,7 @@ async def test_a_client_has_a_lease_to_show_itself_and_longer_where_the_leader_s
     await ghost.ask("first", "robot/a")
     await until(lambda: robot.arcs == ["first"])
     await asyncio.sleep(0.7 * lease)
-    stall = rcm.membership._absence._stall
+    stall = rcm._stall
     stall.length, stall.ended = round(0.6 * lease * SECOND), rcm.mesh.now()
     await asyncio.sleep(lease)
     assert robot.arcs == ["first"]
@@ -256,7 +256,7 @@ async def test_a_hand_over_is_one_publication_and_can_be_repeated() -> None:
 async def test_a_hold_that_is_adopted_and_displaced_in_one_instant_is_told_as_it_ended() -> None:
     fleet = FakeFleet()
     rcm, one, two = fleet.rcm(counter=5), fleet.client("one"), fleet.client("two")
-    await until(lambda: rcm.membership.clients.keys() >= {one.name, two.name})
+    await until(lambda: rcm.roster.clients.keys() >= {one.name, two.name})
     assert (await two.ask("next", "robot/a")).state == "queued"
     before, at = Term(4, "before"), rcm.mesh.now()
     kept = ArcRequest(f"{one.name}/id", one.name, {"robot/a": {}}, 0, SECOND, keep=True, label="tally")

@@ -17,10 +17,11 @@ from zscout.cli.device_words import ending, remarks
 from zscout.cli.fleet.fleet_view import Devices, FleetView, Host
 from zscout.cli.fleet.selection import Selection
 from zscout.cli.fleet.watching import Overview, show
-from zscout.cli.requests.waiting import comment, person, reason_text, request_words, whose
+from zscout.cli.requests.waiting import comment, reason_text, request_words, whose
 from zscout.config.access import AccessPolicy
 from zscout.keyexpr import Role
 from zscout.messages import BookingsTold, HoldView, Notice, RcmState, RcState, RcView, WaitView, version_words
+from zscout.scheduling.reason import person
 from zscout.terminal import Table, clock, many, span
 from zscout.types import SECOND, VERSION, Ns
 

@@ -24,7 +24,7 @@ from zscout.cli.common import Failed
 from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather, hold_options
 from zscout.cli.requests.run_command import RunningCommand, environment
 from zscout.cli.requests.taking_up import check_options, taking_up
-from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text, reason_text, whose
+from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text, reason_text, request_words
 from zscout.config.strict import BadInput
 from zscout.mesh.supervision import done_within
 from zscout.messages import Foresight, RcmState, StateAsk, version_words
@@ -345,7 +345,7 @@ def _words(foretold: Foresight) -> Iterator[str]:
     else:
         yield f"{foretold.arc} would start at once"
     if foretold.preempts:
-        told = [f"{one.arc} of {whose(one)}" for one in foretold.victims]
+        told = [request_words(victim.arc, victim.who, victim.client) for victim in foretold.victims]
         yield f"it would preempt {', '.join(told or foretold.preempts)}"
 
 
@@ -440,7 +440,7 @@ class Report(LiveLine):
         in_way = [rc for rc in met.values() if not rc.sharable or (arc.why and rc.rc in arc.why.rcs)]
         holders = [f"{rc.rc}: {'; '.join(hold_text(hold, arc.priority) for hold in rc.holds)}" for rc in in_way]
         holders += [f"{rc.rc}: {rc.lost}" for need in needs if need.rc for rc in need.rcs if rc.lost]
-        words = f"{arc.name} {waits(reason_text(arc.reason, arc.why, (now - arc.told) / SECOND))}"
+        words = f"{arc.name} {waits(reason_text(arc.reason, arc.why, (now - arc.told) / SECOND), arc.why)}"
         ahead = f"{arc.ahead} ahead" if arc.ahead else ""
         waited = self._since(arc)
         since = ", ".join(filter(None, (f"waits since {clock(-waited)} ({span(waited)})", ahead, start)))

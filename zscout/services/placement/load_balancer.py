@@ -76,7 +76,7 @@ class LoadBalancer:
             check_name(host, "host")
         now = self.mesh.now()
         ranking = self.core.rank(now, RankQuery.of(ask), ask.at_most)
-        left_out = dict(itertools.islice(ranking.left_out.items(), ask.at_most))
+        left_out = {host: str(why) for host, why in itertools.islice(ranking.left_out.items(), ask.at_most)}
         reports = None
         if ask.reports:
             named = [*(ranked.host for ranked in ranking.hosts), *left_out]

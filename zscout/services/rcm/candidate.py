@@ -366,7 +366,7 @@ class Candidate:
             self._runtimes.estimator,
         )
         self.terms_led += 1
-        rcm.membership.on_disbelieved = self._disbelieved
+        rcm.on_disbelieved = self._disbelieved
         rcm.bookings.on_danger = self.on_danger
         self._leading.callback(rcm.stop)
         rcm.start(recovered)

@@ -21,13 +21,15 @@ from msgspec.structs import replace
 
 from zscout import messages, trace
 from zscout.config.fleet import Fleet
-from zscout.keyexpr import BadName, Role, Token
+from zscout.keyexpr import BadName, Role, Token, client_of
 from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError, Refused, Reply, Tally
-from zscout.mesh.supervision import Supervisor
+from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
-from zscout.rcm.places import Places, request_id
+from zscout.rcm.places import Places, arc_id, request_id
 from zscout.rcm.recovery import RecoveredState, listed_by, removed, vouched
+from zscout.rcm.request_log import REMEMBERED, RequestLog, reason_info
+from zscout.rcm.roster import Change, Question, Roster, discrepancies
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     Adopted,
@@ -62,8 +64,6 @@ from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.digest import HoldDigest, HoldListener
 from zscout.services.rcm.inventory import Inventory
-from zscout.services.rcm.membership import Membership, discrepancies
-from zscout.services.rcm.registry import REMEMBER, RequestRegistry, reason_info
 from zscout.services.rcm.request_handler import RequestHandler
 from zscout.types import SECOND, VERSION, ArcId, ClientId, Ns, RcName, Term
 
@@ -113,25 +113,32 @@ class Rcm:
         self.authority = authority or Authority(fleet)
         self.core = Core(STRATEGIES[fleet.strategy](), self.authority.bound(fleet.scheduling))
         supervisor, receive = self.supervisor, self._receive
+        self._on_newer = on_newer
+        self.on_disbelieved: Callable[[RcName, Term], object] = lambda *_: None
+        """Called when no RC has joined, and one obeys an RCM of so low a term that this one is none to it."""
         self.places = places or Places(fleet.name, None, term)
         self._admission = Admission(fleet.limits, self.authority, self.places)
-        self.registry = RequestRegistry(mesh, self.core, term, supervisor, self.places)
-        self._runtimes = self.registry.runtimes = runtimes
+        self._runtimes = runtimes
         self._own_inventory = inventory is None
         self.inventory = inventory or Inventory(mesh, fleet)
         devices = self.inventory.devices
-        self.membership = Membership(
-            mesh, fleet, term, supervisor, receive, self._compare, on_newer, devices, self._admission, self.core.arc
-        )
-        self.membership.on_requests = self._on_requests
-        self.registry.hosts_of = self.membership.hosts_of
+        self.roster = Roster(mesh.keys, mesh.me.host, fleet, term, devices, self._admission, self.core.arc, mesh.now())
+        self._stall = StallWatch(mesh.now)
+        self.registry = RequestLog(self.core, self.roster, self.places, runtimes)
         self._digest = HoldDigest(self.core, listeners) if listeners else None
-        if self._digest is not None:
-            self.registry.on_foretold = self._digest.foretell
         self._tally = tally
-        self.membership.on_named = lambda rc: self._publish([], [rc])
         self.requests = RequestHandler(
-            mesh, fleet, self.core, self.registry, self.membership, devices, self._admission, supervisor, receive
+            mesh,
+            fleet,
+            self.core,
+            self.registry,
+            self.roster,
+            devices,
+            self._admission,
+            supervisor,
+            receive,
+            self._follow,
+            runtimes,
         )
         self.bookings = self.requests.bookings = Bookings(
             mesh,
@@ -163,7 +170,7 @@ class Rcm:
         self._voted = supervisor.guard(self._on_ballot)
         self._declared: list[Declaration] = []
         self._wake: asyncio.TimerHandle | None = None
-        self._wake_at: Ns | None = None
+        self._core_wake: Ns | None = None
         self._armed: Ns = 0
         """When the timer goes off: it may be earlier than it need be."""
 
@@ -174,16 +181,19 @@ class Rcm:
         keys, mesh, guard = self.mesh.keys, self.mesh, self.supervisor.guard
         if self._own_inventory:
             self.inventory.start(self.supervisor)
-        joined = self.membership.join(recovered.rcs, recovered.pending, patient=recovered.patient)
+        self._stall.start()
+        now = self._look()
+        joined = self.roster.start(now, recovered.rcs.values(), recovered.pending, patient=recovered.patient)
         for arc in recovered.given_up:
-            self.registry.give_up(arc, Outcome.RELEASED)
+            self.registry.give_up(now, arc, Outcome.RELEASED)
         requests = [*(hold.request for hold in recovered.holds), *(one.request for one in recovered.waiting)]
         for request in requests:
             self.registry.enter(request.arc, request.name)
-            self.membership.expect(request.client)
+            self.roster.expect(now, request.client)
             if request.client not in recovered.answered:
                 self._recover(request)
-        self.requests.believed = recovered.believed
+        for arc, rcs in recovered.believed.items():
+            self.registry.believe(arc, rcs)
         waiting = (replace(one, request=self.bookings.dates.dated(one.request)) for one in recovered.waiting)
         certain = 0 if self.bookings.settled else self.bookings.settles_at
         lead = LeadTaken(self.term, tuple(recovered.holds), tuple(waiting), recovered.charged, certain)
@@ -191,9 +201,8 @@ class Rcm:
         booked = self.bookings.recovered(taken | recovered.booked)
         gone = removed((hold.request for hold in recovered.holds), self._admission)
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
-        self._decide([*joined, *booked, lead, *gone], named=recovered.rcs)
-        for arc, name, problem in recovered.refused:
-            self.registry.refuse(arc, name, problem)
+        self._decide([*joined.events, *booked, lead, *gone], named=recovered.rcs)
+        self._notify(self.registry.refuse(now, *refused) for refused in recovered.refused)
         for arc in self.core.arcs():
             self._bind(arc)
             if (expecting := recovered.expected.get(request_id(arc))) is not None:
@@ -201,10 +210,12 @@ class Rcm:
         limit = self.fleet.limits.max_payload
         self._declared = [
             mesh.serve(
-                keys.schedule_any, messages.Operation, guard(self.requests.on_operation), limit=limit, tally=self._tally
+                keys.schedule_any, messages.Operation, guard(self._on_operation), limit=limit, tally=self._tally
             ),
             mesh.serve(keys.rcm_state, messages.StateAsk, guard(self._on_state_asked)),
-            *self.membership.watch(),
+            mesh.subscribe(keys.rc_state_any, messages.RcState, guard(self._on_rc_state)),
+            mesh.watch(keys.alive_any(Role.CLIENT), guard(self._on_client)),
+            mesh.watch(keys.alive_any(Role.RC), guard(self._on_rc_token)),
             mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, self.term.rcm)),
         ]
         self.bookings.start()
@@ -216,10 +227,11 @@ class Rcm:
             self._digest.close(self.mesh.now())
         for declared in reversed(self._declared):
             declared.close()
+        self._stall.stop()
         self.supervisor.cancel()
         if self._own_inventory:
             self.inventory.stop()
-        self.registry.close()
+        self._log(self.registry.close(self.mesh.now()))
         self.bookings.close()
         self.requests.close()
         self._grants.close()
@@ -232,22 +244,88 @@ class Rcm:
 
     # In
 
+    def _look(self) -> Ns:
+        """The present time. The roster learns of a stall of this process."""
+        stall, fresh = self._stall, self._stall.fresh()
+        self.roster.stalled(stall.length, stall.ended, fresh=fresh)
+        return self.mesh.now()
+
+    def _on_operation(self, query: IncomingQuery[messages.Operation]) -> None:
+        self.requests.on_operation(query)
+        self._send_notices()
+
+    def _send_notices(self) -> None:
+        notices, self.requests.notices = self.requests.notices, []
+        self._notify(notices)
+
+    def _on_rc_state(self, key: str, state: messages.RcState) -> None:
+        self._follow(self.roster.rc_state(self._look(), key, state))
+
+    def _on_client(self, token: Token, alive: bool) -> None:
+        self._follow(self.roster.client_token(self._look(), token, alive=alive))
+
+    def _on_rc_token(self, token: Token, alive: bool) -> None:
+        self._follow(self.roster.rc_token(self._look(), token, alive=alive))
+
+    def _follow(self, change: Change) -> None:
+        """Carry out what follows for the roster, in its order."""
+        for term, obeyed_by in change.higher:
+            self._on_newer(term, obeyed_by)
+        for rc, term in change.disbelieved:
+            self.on_disbelieved(rc, term)
+        if not self.supervisor.active:
+            return
+        if change.events:
+            self._receive(*change.events)
+        for state in change.reported:
+            self._compare(state)
+        if change.named:
+            self._publish([], change.named)
+        for listed in change.listed:
+            self._on_requests(listed)
+        for number, found in change.found:
+            self.requests.on_new_client(number, found=found)
+            self._send_notices()
+        if change.settled:
+            self.requests.resume()
+            self._send_notices()
+        for asked in change.questions:
+            self.supervisor.spawn(self._ask(asked))
+        for sign, so in change.suspicions:
+            self.mesh.suspicions.suspect(sign, so=so)
+        for remark in change.remarks:
+            log.info("%s", remark)
+        for rc, host in change.duplicates:
+            log.warning("duplicate device %s at %s; another host's is used", rc, host)
+        self._set_wake(self._core_wake)
+
+    async def _ask(self, asked: Question) -> None:
+        if asked.kind is None:
+            tokens = await self.mesh.living(asked.key, timeout=asked.timeout)
+            self._follow(self.roster.seen(self._look(), asked, tokens))
+            return
+        reply = await self.mesh.ask_one(asked.key, asked.message, asked.kind, timeout=asked.timeout)
+        message, problem = (None, None) if reply is None else (reply.message, reply.problem)
+        self._follow(self.roster.answered(self._look(), asked, message, problem))
+
     def _receive(self, *events: Event) -> None:
         """What has happened; events that come together are one instant."""
-        match events:
-            case [ClientLost(client)]:
-                self._recovered.pop(client, None)
-                if not self.core.arcs_of(client):
-                    return
+        for event in events:
+            if isinstance(event, ClientLost):
+                self._recovered.pop(event.client, None)
+        # A client that asked for nothing changes nothing.
+        if all(isinstance(event, ClientLost) and not self.core.arcs_of(event.client) for event in events):
+            return
         if self.supervisor.active:
             # What was asked before is decided before.
             self.requests.flush()
             self._decide(events)
 
-    def _compare(self, rc: RcName, state: messages.RcState) -> None:
+    def _compare(self, state: messages.RcState) -> None:
         """Makes an RC and the core agree: what the RC lost has ended, what is too much there is revoked."""
         if not self.supervisor.active:
             return
+        rc = state.rc
         current = state.term == self.term and state.seq >= self._named.get(rc, 0)
         ended, superfluous = discrepancies(state, self.core.holders(rc), self.mesh.now(), current=current)
         if ended:
@@ -277,7 +355,7 @@ class Rcm:
     def _recover(self, request: ArcRequest) -> None:
         """Has a client say whether it still asks for what RCs hold for it."""
         self._recovered.setdefault(request.client, set()).add(request.arc)
-        self.membership.ask_requests(request.client)
+        self._follow(self.roster.ask_requests(self.mesh.now(), request.client))
 
     # Events, and out
 
@@ -286,19 +364,23 @@ class Rcm:
         over = self.registry.ended
         events = [one for one in events if not (isinstance(one, Adopted) and over(one.held.request.arc))]
         effects = self.core.handle(self.mesh.now(), *events)
+        now = self.mesh.now()
         told = self.requests.answer_grants(effects)
         if not any(isinstance(event, CONTINUED) for event in events):
-            told |= self.registry.tell_grants(effects, told)
+            notices = self.registry.grants(now, effects, told)
+            told |= self._notify(notices)
+        self._trace()
         self._publish(effects, named)
         self._note(events)
-        self.registry.report(effects, told | self.requests.waiting.keys(), self.requests.given_up)
+        answered = told | self.requests.waiting.keys()
+        self._notify(self.registry.report(now, effects, answered, self.requests.given_up))
         self.requests.answer(effects)
         for effect in effects:
             match effect:
                 case Dropped(arc=arc, outcome=outcome) | HoldEnded(arc=arc, outcome=outcome) if not self.core.is_open(
                     arc
                 ):
-                    self.places.end(arc, self.mesh.now(), KEPT.get(outcome, REMEMBER))
+                    self.places.end(arc, now, KEPT.get(outcome, REMEMBERED))
                 case Propose():
                     self._propose(effect)
                 case WakeAt(at):
@@ -308,20 +390,39 @@ class Rcm:
             log.info("%s", line)
         if self._digest is not None:
             # All who wait for an answer have it by now.
-            self._digest.take(self.mesh.now(), events, effects)
+            self._digest.take(now, events, effects, self.registry.foretold)
+        self._trace()
+
+    def _notify(self, notices: Iterable[messages.Notice]) -> set[ArcId]:
+        """Send notices to their clients; return their ARCs."""
+        notified = set()
+        for notice in notices:
+            self.mesh.put(self.mesh.keys.notice(client_of(notice.client)), notice)
+            notified.add(arc_id(notice.client, notice.id))
+        return notified
+
+    def _trace(self) -> None:
+        if trace.enabled():
+            for did, arc in self.registry.traced:
+                trace.write(self.mesh.now(), did, term=self.term, arc=arc)
+        self.registry.traced.clear()
+
+    def _log(self, text: str) -> None:
+        if text:
+            log.info("%s", text)
 
     def _note(self, events: Iterable[Event]) -> None:
         """What is remembered of an instant."""
-        seen = self.membership.clients
+        now = self.mesh.now()
         for event in events:
             match event:
-                case Requested(ArcRequest(client=client)) | HandedOver(to=client) if client not in seen:
-                    self.membership.expect(client)
+                case Requested(ArcRequest(client=client)) | HandedOver(to=client):
+                    self.roster.expect(now, client)
             match event:
                 case Requested(request):
                     self._bind(request.arc)
                     asked = f"asked for {', '.join(sorted(request.needs))} at priority {request.priority}"
-                    self.registry.record(request.arc, asked)
+                    self.registry.record(now, request.arc, asked)
                 case PlaceShown(arc) | Vouched(ArcRequest(arc=arc)):
                     self._bind(arc)
                 case HandedOver(renamed=arc):
@@ -331,10 +432,10 @@ class Rcm:
                 case Adopted(RecoveredHold(ArcRequest(client=client) as request)) if self.core.arc(request.arc):
                     self._bind(request.arc)
                     self.registry.enter(request.arc, request.name)
-                    if client not in seen:
+                    if client not in self.roster.clients:
                         # As the links to its RCs came back just now, so may its own.
-                        self.membership.heard(client)
-                        self.membership.expect(client)
+                        self._follow(self.roster.heard(now, client))
+                        self.roster.expect(now, client)
                     self._recover(request)
 
     def _bind(self, arc: ArcId) -> None:
@@ -342,24 +443,28 @@ class Rcm:
             self.places.bind(place, arc, self.mesh.now())
 
     def _set_wake(self, at: Ns | None) -> None:
-        """Sets when the core is woken. A timer that is set for earlier stays, and is set anew when it goes off: most
+        """Sets when the core is woken. A timer that is set for earlier stays, and is set again when it goes off: most
         ends are put off before they come."""
-        self._wake_at = at
+        self._core_wake = at
+        at = min((time for time in (at, self.roster.next, self.registry.next) if time is not None), default=None)
         if at is None or (self._wake is not None and self._armed <= at):
             return
         if self._wake is not None:
             self._wake.cancel()
         self._armed = at
-        delay = max(0.0, (at - self.mesh.now()) / SECOND)
-        self._wake = self.supervisor.call_later(delay, self._on_wake)
+        self._wake = self.supervisor.call_later(max(0.0, (at - self.mesh.now()) / SECOND), self._on_wake)
 
     def _on_wake(self) -> None:
         self._wake = None
-        at = self._wake_at
-        if at is not None and self.mesh.now() < at:
-            self._set_wake(at)
-        elif at is not None:
+        now = self._look()
+        if self.roster.next is not None and self.roster.next <= now:
+            self._follow(self.roster.tick(now))
+        if self._core_wake is not None and self._core_wake <= now:
             self._receive(Tick())
+        notices, text = self.registry.tick(now)
+        self._notify(notices)
+        self._log(text)
+        self._set_wake(self._core_wake)
 
     # Out: grants
 
@@ -377,11 +482,11 @@ class Rcm:
         ]
         number = self.core.seq if self.core.seq > self.seq else self.core.number()
         # One that has not joined holds what is not known here: to name it would end that.
-        concerned = filter(self.membership.has_joined, {rc for effect in changed for rc in effect.rcs})
+        concerned = filter(self.roster.has_joined, {rc for effect in changed for rc in effect.rcs})
         names = sorted({*(rcs or ()), *concerned})
         self._named |= dict.fromkeys(names, number)
         holders = {name: holders_of(self.core.holders(name), name, now) for name in names}
-        instances = {rc: instance for rc, (instance, _) in self.membership.named(names).items()}
+        instances = {rc: instance for rc, (instance, _) in self.roster.named(names).items()}
         begun = [
             (effect.grant.seq, effect.waited / SECOND)
             for effect in changed
@@ -470,16 +575,16 @@ class Rcm:
             return
         status = self.core.status(0 if asked.holds_only else MAX_LISTED)
         holds = [_hold_view(arc, arc.hold, now, self._runtimes) for arc in status.running if arc.hold is not None]
-        instances = self.membership.named(sorted({rc for hold in holds for rc in hold.needs}))
+        instances = self.roster.named(sorted({rc for hold in holds for rc in hold.needs}))
         me = self.mesh.me.host
         state = messages.RcmState(self.term, self.seq, me, holds, instances=instances, version=VERSION)
         if not asked.holds_only:
-            starts = self.registry.starts() if asked.forecast else {}
+            starts = self.registry.starts(now) if asked.forecast else {}
             state = replace(
                 state,
                 queue=[_wait_view(arc, now, starts.get(arc.id)) for arc in status.queued],
                 rcs=self._devices(status, now),
-                story=self.registry.story(asked.arc) if asked.arc is not None else [],
+                story=self.registry.story(now, asked.arc) if asked.arc is not None else [],
                 more=status.waiting - len(status.queued),
                 charged=self.core.charged(),
             )
@@ -490,11 +595,11 @@ class Rcm:
         known = {rc.name: rc for rc in status.rcs}
         devices = self.inventory.devices
         devices.forget_old(now)
-        named = self.membership.named(known)
+        named = self.roster.named(known)
         there = {rc.name for rc in status.rcs if rc.present}
         views = []
         for name in sorted(there | devices.names):
-            rc, state = known.get(name), self.membership.reported(name)
+            rc, state = known.get(name), self.roster.reported(name)
             view = messages.RcView(name, present=False, sharable=False)
             if rc is not None:
                 view = messages.RcView(name, rc.present, rc.sharable, [*map(request_id, rc.holders)])
