@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from decimal import Decimal
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import structs
 
+from zscout.config.access import AccessPolicy, Roles
 from zscout.config.fleet import default_fleet
 from zscout.drivers.holds import HoldTable
 from zscout.messages import ClientRequests, Holder, HoldView, OpenRequest, RcmState, RcState
@@ -16,7 +19,7 @@ from zscout.rcm.authority import Authority
 from zscout.rcm.places import Places
 from zscout.rcm.recovery import RecoveredState, recover
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import LeadTaken, RcJoined
+from zscout.scheduling.model import ArcRequest, ArcStatus, LeadTaken, RcJoined
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import SECOND, Grant, Ns, Place, Term
 
@@ -230,3 +233,15 @@ def test_requests_of_two_clients_may_share_an_id() -> None:
     clients = [client(asked(), name="h/one"), client(asked(), name="h/two")]
     found = recover_plain([], clients, NOW)
     assert [one.request.arc for one in found.waiting] == ["h/one/gang-id", "h/two/gang-id"]
+
+
+@pytest.mark.parametrize("vouched", [True, False])
+def test_a_hold_known_from_rcs_only_is_not_vouched_for_by_another_report(vouched: bool) -> None:
+    """With certificates. A run of the fault simulator (seed 1466) found it."""
+    access = AccessPolicy(Roles(client=("h",), manager=("m",)))
+    fleet = structs.replace(default_fleet(), security=Path("keys"), access=access)
+    admission = Admission(fleet.limits, Authority(fleet), Places("test", None, LATER))
+    request = ArcRequest("h/one/gang-id", "h/one", {"robot/a": {}}, 3, 60 * SECOND)
+    known = ArcStatus(request, PLACE, None, request.needs, {}, NOW, 0, 0, None, None, vouched)
+    found = recover([rc("robot/a", hold(ALONE))], [], NOW, admission, known=lambda _: known)
+    assert [(held.vouched, held.place) for held in found.holds] == [(vouched, PLACE if vouched else None)]

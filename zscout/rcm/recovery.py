@@ -253,7 +253,7 @@ def recover(
         if mine is None and some.client in result.answered:
             result.remarks.append(f"{arc} is given up by its client")
             continue
-        if mine is None and (status := known(arc)) is not None:
+        if mine is None and (status := known(arc)) is not None and status.vouched:
             mine = Listed(status.request, status.place)
         try:
             hold = _hold(arc, grant, held, mine, now, admission)

@@ -429,7 +429,7 @@ class Core:
         if known is not None and arc.hold is None and self._state.arc(arc.id) is arc:
             # Use its client's request: the report lacks parameters of absent RCs.
             self._remove(arc)
-            arc = self._queue_anew(known.request, held.place)
+            arc = self._queue_anew(known.request, held.place, vouched=known.vouched)
         if arc.hold is not None and (arc.request.keep or not arc.past_min_runtime(self._state.now)):
             self._effects.append(self._granted(arc, arc.hold))
         self._expire()
@@ -460,8 +460,9 @@ class Core:
         self._forget(arc)
         self._claims.leave(arc)
 
-    def _queue_anew(self, request: model.ArcRequest, place: Place | None) -> Arc:
+    def _queue_anew(self, request: model.ArcRequest, place: Place | None, *, vouched: bool = True) -> Arc:
         arc = self._new_arc(request, place)
+        arc.vouched = vouched
         self._state.enqueue(arc, self._state.now)
         self._claims.take_up(request.booking, arc)
         return arc

@@ -226,6 +226,23 @@ async def test_what_its_client_does_not_ask_for_ends(needs: tuple[str, ...]) -> 
     assert "ended" not in [item.state for item in client.notices] or not needs
 
 
+async def test_a_forged_hold_that_is_reported_again_stays_the_word_of_its_rc() -> None:
+    fleet, heir, robot, _ = await reporting()
+    robot.token.close()
+    robot.instance, robot.holders = "i2", [forged(Grant(OLD, 9), "robot/a")]
+    again = robot.mesh.alive(Token("devices", Role.RC, "robot/a", "i2"))
+    await until(lambda: [hold.priority for hold in robot.holders] == [9])
+    assert heir.rcm is not None
+    arc = heir.rcm.core.arc("bob/one/q")
+    assert arc is not None
+    assert not arc.vouched
+    client = FakeClient(fleet.mesh("bob", "one"), fleet.log)
+    client.open = [listed("q", "robot/b")]
+    client.start()
+    await until(lambda: client.notices and client.notices[-1].rcs == ["robot/b"])
+    again.close()
+
+
 @pytest.mark.parametrize("client", ["mallory/c1", "wall/c1"])
 async def test_a_hold_for_nobody_is_revoked_by_name(client: str) -> None:
     fleet, _, robot, ada = await reporting(client)
