@@ -94,7 +94,7 @@ _remove = HoldTable._remove
 _expire = HoldTable.expire
 _apply_grants = HoldTable.apply_grants
 _as_asked = OpenArc._as_asked
-_take = OpenArc.take
+_take = OpenArc._take
 
 
 def _check_any(self: HoldTable, grant: Grant, client: str, now: Ns) -> Problem | None:
@@ -147,7 +147,7 @@ def _without_place(self: OpenArc, now: Ns, grant: Grant | None) -> dict[str, Any
 
 
 def _take_any(self: OpenArc, *args: Any) -> bool:
-    self.last = (NO_TERM, 0)
+    self._last = (NO_TERM, 0)
     return _take(self, *args)
 
 
@@ -263,7 +263,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "places": Guard("a client shows the place that it had", {(OpenArc, "_as_asked"): _without_place}),
         "claims": Guard("of the ARCs that claim one place one runs", {(SchedulerState, "_is_first"): _yes}),
         "unheard": Guard("what had its time unheard is asked for anew", {(RequestStore, "_ask_anew"): _nothing}),
-        "notices": Guard("of two notices the newer counts", {(OpenArc, "take"): _take_any}),
+        "notices": Guard("of two notices the newer counts", {(OpenArc, "_take"): _take_any}),
         "terms": Guard("a client believes nothing of an older term", {(RcmLink, "accept"): _accept_any}),
         "absurd": Guard(
             "nobody believes a term far above the fleet's",

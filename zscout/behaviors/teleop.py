@@ -194,7 +194,7 @@ class Teleop:
                 await self._while_wanted(self._drive())
                 if self._wanted.is_set():
                     # To ask again would take it back from an operator of the same rank, and so on in turns.
-                    ending = self.held.arc.ending if self.held is not None else None
+                    ending = self.held.arc._ending if self.held is not None else None
                     successor = (ending.by or ending.reason) if ending is not None else ""
                     why = f"it was taken by {successor or 'another'}"
                     self.give_back()

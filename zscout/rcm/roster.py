@@ -5,7 +5,7 @@ An RC that reports holds of earlier terms is pending until its gangs have answer
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -39,6 +39,8 @@ NEAR_END: Final[Ns] = SECOND // 20
 """A hold with less than this left may have ended at its RC: clocks differ a little."""
 AWAY_PART: Final = 0.25
 """A leader that stalled for this part of the mesh lease, or lost several hosts within it, was away itself."""
+MAX_TOKENS: Final = 2_000
+"""Tokens of one host that count: later ones are ignored."""
 PRESENT_WITHIN: Final = 0.05
 """Seconds within which others answer a leader that is not away: a later answer may follow its return."""
 MAX_WITNESSES: Final = 3
@@ -108,6 +110,8 @@ class Change:
     """RCs that a second host offers, and that host."""
     remarks: list[str] = field(default_factory=list)
     """On holds that do not continue, for the log."""
+    surplus: HostName = ""
+    """This host shows more than MAX_TOKENS, since this token."""
 
 
 @dataclass(slots=True, eq=False)
@@ -163,6 +167,9 @@ class Roster:
         """Living instances of each client that has a token."""
         self._unshown: dict[ClientId, int] = {}
         """Clients that must show a token, each with the number of its deadline."""
+        self._tokens: Counter[HostName] = Counter()
+        self._surplus: set[HostName] = set()
+        """Hosts whose surplus was reported."""
         self._asked: set[ClientId] = set()
         self._doubted: set[ClientId] = set()
         """Clients that disappeared while it was unknown whether this leader was away."""
@@ -213,9 +220,11 @@ class Roster:
     def client_token(self, now: Ns, token: Token, *, alive: bool) -> Change:
         self._now = now
         client = f"{token.host}/{token.name}"
-        instances = self.clients.setdefault(client, set())
+        instances = self.clients.get(client, set())
+        if not self._counts(token, alive=alive, known=token.instance in instances):
+            return self._taken()
         if alive:
-            instances.add(token.instance)
+            self.clients.setdefault(client, instances).add(token.instance)
             if self._unshown.pop(client, None) is not None:
                 self._suspect(self._keys.requests(client_of(client)), so=False)
         else:
@@ -230,6 +239,8 @@ class Roster:
         rc = self._rc(token.name)
         if rc.tokens.get(token.instance, token if alive else None) != token:
             return Change()  # a second host shows this instance, or stopped doing so: it belongs to the first
+        if not self._counts(token, alive=alive, known=token.instance in rc.tokens):
+            return self._taken()
         if alive:
             self._token_came(rc, token)
         else:
@@ -466,7 +477,7 @@ class Roster:
         now = self._now
         if now >= self._away_until:
             self._doubted.clear()
-        if not self._sees(token.host):
+        if not self._tokens[token.host]:
             self._gone_hosts.append((now, token.host))
         while self._gone_hosts and self._gone_hosts[0][0] < now - self._span:
             self._gone_hosts.popleft()
@@ -511,9 +522,17 @@ class Roster:
         keys |= {token.host: (self._keys.rc_state(token.name), RcState) for token in tokens}
         return [keys[host] for host in sorted(keys) if host != self._me]
 
-    def _sees(self, host: HostName) -> bool:
-        shown = any(token.host == host for rc in self._rcs.values() for token in rc.tokens.values())
-        return shown or any(client.startswith(f"{host}/") for client in self.clients)
+    def _counts(self, token: Token, *, alive: bool, known: bool) -> bool:
+        """Return True if a token that came or went counts: its host has no more than MAX_TOKENS, or it did before."""
+        if alive is known:
+            return alive
+        if alive and self._tokens[token.host] >= MAX_TOKENS:
+            if token.host not in self._surplus:
+                self._surplus.add(token.host)
+                self._change.surplus = token.host
+            return False
+        self._tokens[token.host] += 1 if alive else -1
+        return True
 
     # Contradictions of the mesh
 

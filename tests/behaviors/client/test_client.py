@@ -215,8 +215,8 @@ async def test_it_is_protected_for_the_fleet_s_time_and_goes_on_until_an_equal_w
             await asyncio.sleep(LONG)
         assert held.completed
         assert (held.arc.outcome, (one.mesh.now() - began) // SECOND) == ("completed", 90)
-        assert held.arc.ending is not None
-        assert held.arc.ending.by == f"h/two/{waits.id}"
+        assert held.arc._ending is not None
+        assert held.arc._ending.by == f"h/two/{waits.id}"
         assert await two.granted(waits) is not None
         # Nobody waits: it goes on.
         await asyncio.sleep(LONG)

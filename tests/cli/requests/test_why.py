@@ -84,6 +84,8 @@ async def test_the_story_of_an_arc(lab: Lab) -> None:
     unknown = await zscout_soon("why", "mappin", env=lab.env)
     assert (unknown.returncode, unknown.stdout) == (1, "")
     assert unknown.stderr == 'zscout: unknown request "mappin"; did you mean mapping?\n'
+    device = (await zscout_soon("why", "robot/a", env=lab.env)).stderr
+    assert device == "zscout: robot/a is a device: zscout status robot/a shows which requests hold it or wait\n"
 
 
 @in_lab()

@@ -226,6 +226,14 @@ async def test_what_its_client_does_not_ask_for_ends(needs: tuple[str, ...]) -> 
     assert "ended" not in [item.state for item in client.notices] or not needs
 
 
+async def test_what_its_client_asks_for_counts_as_well() -> None:
+    fleet, _, robot, _ = await reporting()
+    client = FakeClient(fleet.mesh("bob", "one"), fleet.log)
+    asked = await client.ask("q", "robot/b", priority=2)
+    assert (asked.state, asked.rcs, asked.priority) == ("running", ["robot/b"], 2)
+    await until(lambda: not robot.holders)
+
+
 async def test_a_forged_hold_that_is_reported_again_stays_the_word_of_its_rc() -> None:
     fleet, heir, robot, _ = await reporting()
     robot.token.close()

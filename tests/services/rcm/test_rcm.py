@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -13,6 +14,7 @@ from tests.services.rcm.kit import FakeClient, FakeFleet, Refusal, fleet_of, gra
 from zscout.config.access import AccessPolicy, Quota, Roles
 from zscout.messages import Cancel, EndedHold, HandOver, Release
 from zscout.scheduling.model import Adopted, ArcRequest, RcJoined, RecoveredHold
+from zscout.services.rcm.rcm import MAX_BUILT, Rcm
 from zscout.types import SECOND, Grant, Place, Term
 
 
@@ -340,3 +342,23 @@ async def test_an_arc_that_is_open_at_its_new_client_already_counts_once_against
     await old.ask("b", "robot/b")
     with pytest.raises(Refusal, match="not_allowed: h2 may have 1 open requests, and would have more"):
         await old.do(HandOver("b", new.name))
+
+
+async def test_many_questions_about_the_state_cost_what_a_few_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    fleet, _ = await fleet_of("robot/a")
+    built, real = [], Rcm._state
+
+    def counted(self: Rcm, *args: Any) -> Any:
+        built.append(args)
+        return real(self, *args)
+
+    monkeypatch.setattr(Rcm, "_state", counted)
+    client = fleet.client("one")
+    asked = [fleet.state(forecast=bool(number % 2)) for number in range(400)]
+    states = await asyncio.gather(*asked, *(client.ask(f"a{number}", "robot/a") for number in range(20)))
+    assert len(states) == 420
+    assert len(built) <= 2 * MAX_BUILT * 2  # two kinds, in at most two spans
+    # RCs reckon ends by this one.
+    built.clear()
+    await asyncio.gather(*(fleet.state(holds_only=True) for _ in range(5)))
+    assert len(built) == 5

@@ -39,7 +39,7 @@ a host that was alone went on, which had differed by 2 s; and at 519734 a candid
 RC. At 1466 a hold that a forger had made up was vouched for by its second report."""
 MISSED = {
     "order": 15, "grant": 1, "safe first": 1, "snapshots": 1, "step down": 1, "reopen": 2, "places": 2,
-    "withdrawn": 55, "believed": 47, "settling": 8, "deadline": 8, "once": 10, "sealed": 10, "copied": 3,
+    "withdrawn": 55, "believed": 130, "settling": 8, "deadline": 8, "once": 10, "sealed": 10, "copied": 3,
     "dates": 1043, "merged": 3, "caught up": 4, "one stands": 33, "awaited": 103, "had again": 13, "dates first": 94,
     "fleet time": 4, "late": 173, "slewed": 3, "door": 6, "clamped": 6, "certified": 6, "managers": 6,
 }  # fmt: skip

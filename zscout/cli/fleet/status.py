@@ -165,8 +165,9 @@ class Standing:
             there = "held" if holders else "maintenance" if view.rc in maintained else "free"
             words = there if view.present else "lost" if view.rc in lost else "absent"
             kind = "shared" if view.sharable else "exclusive"
-            names = ",\n".join(request_words(hold.arc, hold.who, hold.client, hold.needs[view.rc]) for hold in holders)
-            rows.append((view.rc, kind, words, homes.get(view.rc, "-"), names))
+            holds = ",\n".join(request_words(hold.arc, hold.who, hold.client, hold.needs[view.rc]) for hold in holders)
+            held_by = maintained[view.rc] if words == "maintenance" else holds
+            rows.append((view.rc, kind, words, homes.get(view.rc, "-"), held_by))
             styles.append(
                 {"absent": "red", "lost": "red", "held": "yellow", "maintenance": "yellow", "free": "green"}[words]
             )

@@ -210,7 +210,7 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
         again = wanted.again and arc.keep and not ended_by_hand
         line = f"the time of {arc.name} is over" + (f": {why}" if arc.keep else "")
         details = {"outcome": "completed", "reason": why, "by": ending.by, "again": again}
-        arc.finish("completed", why, client.mesh.now())
+        arc._finish("completed", why, client.mesh.now())
         report.event("ended", f"{line}; asking anew" if again else line, **details)
         if again:
             return None
@@ -265,7 +265,7 @@ async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) 
 
 async def _tell_who_is_old(report: Report, held: Held, client: Client, direct: DirectHold | None) -> None:
     """Says who does not know that the next holder is to wait until the command is gone."""
-    key, asked = client.mesh.keys.rcm_state, StateAsk(holds_only=True)
+    key, asked = client.mesh.keys.ask_state(client.mesh.me), StateAsk(holds_only=True)
     reply = await client.mesh.ask_one(key, asked, RcmState, timeout=QUERY_TIMEOUT)
     state, who = reply.message if reply is not None else None, [] if direct is None else direct.never_settle
     if state is not None and any(hold.grant == held.grant and not hold.direct for hold in state.holds):
@@ -317,7 +317,7 @@ def _kept(longest: Ns | None) -> str:
 
 
 def _ending(arc: OpenArc) -> HoldEnd:
-    return arc.ending or HoldEnd("lost", "")
+    return arc._ending or HoldEnd("lost", "")
 
 
 async def _foresee(client: Client, wanted: HoldOptions) -> int:
@@ -396,12 +396,12 @@ class Report(LiveLine):
             arc = self._arc
             if arc is None:
                 self.draw(f"{self._name}: asking the leader")
-            elif arc.state == "running" and arc.settling == arc.grant:
+            elif arc.state == "running" and arc._settling == arc.grant:
                 self._show_settling(arc)
             elif arc.state in ("asking", "queued") and arc.reason:
-                news = arc.last != self._seen if self.watched else _how(arc) != self._printed
+                news = arc._last != self._seen if self.watched else _how(arc) != self._printed
                 if arc.state == "queued" and news:
-                    self._looked, self._seen = self._mesh.now(), arc.last
+                    self._looked, self._seen = self._mesh.now(), arc._last
                     self._state = await self._client.state()
                 if arc.state in ("asking", "queued"):
                     self._show_wait(arc)
@@ -440,7 +440,7 @@ class Report(LiveLine):
         in_way = [rc for rc in met.values() if not rc.sharable or (arc.why and rc.rc in arc.why.rcs)]
         holders = [f"{rc.rc}: {'; '.join(hold_text(hold, arc.priority) for hold in rc.holds)}" for rc in in_way]
         holders += [f"{rc.rc}: {rc.lost}" for need in needs if need.rc for rc in need.rcs if rc.lost]
-        words = f"{arc.name} {waits(reason_text(arc.reason, arc.why, (now - arc.told) / SECOND), arc.why)}"
+        words = f"{arc.name} {waits(reason_text(arc.reason, arc.why, (now - arc._told) / SECOND), arc.why)}"
         ahead = f"{arc.ahead} ahead" if arc.ahead else ""
         waited = self._since(arc)
         since = ", ".join(filter(None, (f"waits since {clock(-waited)} ({span(waited)})", ahead, start)))

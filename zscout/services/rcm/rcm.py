@@ -15,21 +15,21 @@ import logging
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from msgspec.structs import replace
 
 from zscout import messages, trace
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import BadName, Role, Token, client_of
-from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError, Refused, Reply, Tally
+from zscout.mesh import Declaration, IncomingQuery, Lane, Mesh, MeshError, Refused, Reply, Tally
 from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
 from zscout.rcm.places import Places, arc_id, request_id
 from zscout.rcm.recovery import RecoveredState, listed_by, removed, vouched
 from zscout.rcm.request_log import REMEMBERED, RequestLog, reason_info
-from zscout.rcm.roster import Change, Question, Roster, discrepancies
+from zscout.rcm.roster import MAX_TOKENS, Change, Question, Roster, discrepancies
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     Adopted,
@@ -81,8 +81,22 @@ KEPT: Final[Mapping[Outcome, Ns]] = MappingProxyType(
 """For how long a client may ask again for the place of what ended so; else it is for as long as that is known."""
 CONTINUED: Final = (LeadTaken, Adopted, Vouched, HandedOver)
 """Events by which holds that stand go on: the RCs hear of that before anybody else."""
+STATE_AGE: Final[Ns] = SECOND // 20
+"""An answer about the state may be this old (rule 20): building it costs as much as many grants."""
+MAX_BUILT: Final = 4
+"""Answers of one kind that are built within STATE_AGE, where the state changes."""
 MAX_REASON = 500
 """Characters of a veto's reason."""
+
+
+class _Built(NamedTuple):
+    """An answer about the state, and after which batch of events it was built."""
+
+    state: messages.RcmState
+    encoded: bytes
+    batches: int
+    built: int
+    """How many were built within STATE_AGE."""
 
 
 class Rcm:
@@ -166,6 +180,8 @@ class Rcm:
         """The number of the last publication that named an RC."""
         self._recovered: dict[ClientId, set[ArcId]] = {}
         """By client: the ARCs that only RCs have told of."""
+        self._states: dict[messages.StateAsk, _Built] = {}
+        self._states_since: Ns = 0
         self._vote_timeout = fleet.timing.vote_timeout / SECOND
         self._voted = supervisor.guard(self._on_ballot)
         self._declared: list[Declaration] = []
@@ -212,7 +228,10 @@ class Rcm:
             mesh.serve(
                 keys.schedule_any, messages.Operation, guard(self._on_operation), limit=limit, tally=self._tally
             ),
-            mesh.serve(keys.rcm_state, messages.StateAsk, guard(self._on_state_asked)),
+            *(
+                mesh.serve(key, messages.StateAsk, guard(self._on_state_asked), lane=Lane.QUESTION)
+                for key in (keys.rcm_state, keys.rcm_state_any)
+            ),
             mesh.subscribe(keys.rc_state_any, messages.RcState, guard(self._on_rc_state)),
             mesh.watch(keys.alive_any(Role.CLIENT), guard(self._on_client)),
             mesh.watch(keys.alive_any(Role.RC), guard(self._on_rc_token)),
@@ -251,8 +270,29 @@ class Rcm:
         return self.mesh.now()
 
     def _on_operation(self, query: IncomingQuery[messages.Operation]) -> None:
+        """Carry an operation out: behind the surplus of the host whose request it concerns, or, where it only asks
+        what would be, behind all others."""
+        operation, host = query.message, self.mesh.keys.sender_of(query.key).host
+        question = isinstance(operation, (messages.Foresee, messages.FindSlots))
+        owner = getattr(operation, "client", None)
+        of = client_of(owner).host if owner is not None else host
+        lane = Lane.QUESTION if question else Lane.ASK
+        if not ((question or of != host) and self.mesh.behind(lane, of, self._operate_later, query)):
+            self._operate(query)
+
+    def _operate(self, query: IncomingQuery[messages.Operation]) -> None:
         self.requests.on_operation(query)
         self._send_notices()
+
+    def _operate_later(self, query: IncomingQuery[messages.Operation]) -> None:
+        try:
+            if not self.supervisor.active:
+                raise Refused("not_leading", "this manager stopped leading; try again")
+            self.supervisor.guard(self._operate)(query)
+        except Refused as refused:
+            query.refuse(refused.problem)
+        except BadName as error:
+            query.refuse(messages.Problem("bad_name", str(error)))
 
     def _send_notices(self) -> None:
         notices, self.requests.notices = self.requests.notices, []
@@ -297,6 +337,8 @@ class Rcm:
             log.info("%s", remark)
         for rc, host in change.duplicates:
             log.warning("duplicate device %s at %s; another host's is used", rc, host)
+        if change.surplus:
+            log.warning("%s shows more than %d tokens: later ones are ignored", change.surplus, MAX_TOKENS)
         self._set_wake(self._core_wake)
 
     async def _ask(self, asked: Question) -> None:
@@ -569,10 +611,27 @@ class Rcm:
 
     def _on_state_asked(self, query: IncomingQuery[messages.StateAsk]) -> None:
         asked, now = query.message, self.mesh.now()
+        if asked.holds_only:
+            query.answer(self._state(asked, now))  # RCs reckon ends by it: it is never of an earlier instant
+            return
+        alike = replace(asked, arc=None)
+        if now - self._states_since > STATE_AGE:
+            self._states_since = now
+            self._states.clear()
+        known = self._states.get(alike)
+        if known is None or (known.built < MAX_BUILT and known.batches != self.core.batches):
+            state = self._state(alike, now)
+            built = 1 if known is None else known.built + 1
+            known = self._states[alike] = _Built(state, messages.encode(state), self.core.batches, built)
+        if asked.arc is None:
+            query.answer_encoded(known.encoded, messages.RcmState)
+        else:
+            query.answer(replace(known.state, story=self.registry.story(now, asked.arc)))
+
+    def _state(self, asked: messages.StateAsk, now: Ns) -> messages.RcmState:
         if asked.devices_only:
             rcs = self._devices(self.core.status(0), now)
-            query.answer(messages.RcmState(self.term, self.seq, self.mesh.me.host, rcs=rcs, version=VERSION))
-            return
+            return messages.RcmState(self.term, self.seq, self.mesh.me.host, rcs=rcs, version=VERSION)
         status = self.core.status(0 if asked.holds_only else MAX_LISTED)
         holds = [_hold_view(arc, arc.hold, now, self._runtimes) for arc in status.running if arc.hold is not None]
         instances = self.roster.named(sorted({rc for hold in holds for rc in hold.needs}))
@@ -584,11 +643,10 @@ class Rcm:
                 state,
                 queue=[_wait_view(arc, now, starts.get(arc.id)) for arc in status.queued],
                 rcs=self._devices(status, now),
-                story=self.registry.story(now, asked.arc) if asked.arc is not None else [],
                 more=status.waiting - len(status.queued),
                 charged=self.core.charged(),
             )
-        query.answer(state)
+        return state
 
     def _devices(self, status: Status, now: Ns) -> list[messages.RcView]:
         """All RCs that are there or expected. What somebody asks for and nobody ever offered is not among them."""

@@ -35,6 +35,7 @@ from zscout.rcm.admission import Admission
 from zscout.rcm.devices import ExpectedDevices
 from zscout.rcm.door import check_door
 from zscout.rcm.places import arc_id, request_id
+from zscout.rcm.recovery import Listed, vouched
 from zscout.rcm.request_log import RequestLog, party_info, reason_info
 from zscout.rcm.roster import Change, Roster
 from zscout.scheduling.core import Core
@@ -159,7 +160,11 @@ class RequestHandler:
             self.waiting[arc].append(query)
         elif self.core.is_open(arc):
             self._registry.enter(arc, ask.arc, estimate=ask.estimate)
-            if (place := self._own_place(ask, client)) is not None:
+            place, known = self._own_place(ask, client), self.core.arc(arc)
+            if known is not None and not known.vouched:
+                own = Listed(self._admission.form(ask, sender), place)
+                self._emit(vouched(known, own, self._admission))
+            elif place is not None:
                 self._emit(PlaceShown(arc, place))
             if ask.grant is not None and ask.unconfirmed:
                 self._emit(Unconfirmed(arc, ask.grant, tuple(sorted(ask.unconfirmed))))
