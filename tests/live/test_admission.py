@@ -115,7 +115,7 @@ async def test_nobody_is_believed_more_than_its_role_allows(tmp_path: Path) -> N
                 assert max(item.priority for item in state.holds) < 10
                 assert {item.grant for item in state.holds if item.client == "wall/c1"} == set()
             assert (after.term, "wall/c1", Grant(OLD, 8)) in revoked
-            key = ada.mesh.keys.rcm_bookings
+            key = ada.mesh.keys.ask_bookings(ada.mesh.me)
             told = await answered(lambda: ada.mesh.ask_one(key, BookingsAsk(), BookingsTold, timeout=HANG))
             assert [view.id for view in told.bookings] == ["hers"]
             assert abs(told.time - time.time()) < 60
