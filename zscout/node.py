@@ -36,7 +36,7 @@ from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh import Mesh, MeshError, ZenohMesh
 from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.messages import LoadReport
-from zscout.services.authority import Authority
+from zscout.rcm.authority import Authority
 from zscout.services.bookings.keeper import BookingFile, BookingKeeper
 from zscout.services.journal.journal import Journal
 from zscout.services.metrics.node_figures import NodeFigures

@@ -23,9 +23,12 @@ from zscout.drivers.holds import HoldChange, HoldEntry, HoldTable
 from zscout.drivers.instances import Instances
 from zscout.drivers.repeated import CommandMemory
 from zscout.drivers.resource_controller import ResourceController
+from zscout.keyexpr import Sender
 from zscout.mesh.renewal import Suspicions
-from zscout.messages import BookingRecord, Problem
-from zscout.rcm import roster
+from zscout.messages import BookingRecord, Problem, Who
+from zscout.rcm import recovery, roster
+from zscout.rcm.admission import Admission
+from zscout.rcm.authority import Authority
 from zscout.rcm.places import Places
 from zscout.rcm.request_log import RequestLog
 from zscout.rcm.roster import Roster
@@ -35,7 +38,7 @@ from zscout.scheduling.state import SchedulerState
 from zscout.services.bookings import records
 from zscout.services.bookings.fleet_clock import FleetClock, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
-from zscout.services.rcm import bookings, candidate, recovery
+from zscout.services.rcm import bookings, candidate
 from zscout.services.rcm.booked_dates import BookedDates
 from zscout.services.rcm.booking_sharing import BookingSharing
 from zscout.services.rcm.bookings import Bookings
@@ -63,6 +66,14 @@ def _no_change(*_: object) -> roster.Change:
 
 def _no(*_: object, **__: object) -> bool:
     return False
+
+
+def _as_told(_self: Admission, request: ArcRequest) -> ArcRequest:
+    return request
+
+
+def _as_it_says(_self: Authority, _sender: Sender, who: Who | None) -> Who | None:
+    return who
 
 
 def _yes(*_: object, **__: object) -> bool:
@@ -231,11 +242,15 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         ),
         "snapshots": Guard("what a snapshot adds passes the RC's own vote", {(ResourceController, "_carries"): _yes}),
         "once": Guard("a command that arrives again is not carried out again", {(CommandMemory, "is_new"): _yes}),
+        "door": Guard("what clients list passes the door of what they ask for", {(Admission, "check"): _nothing}),
+        "clamped": Guard("what RCs report is no more than its client may ask for", {(Admission, "clamped"): _as_told}),
+        "certified": Guard("who asks has the name of its certificate", {(Authority, "known_as"): _as_it_says}),
+        "managers": Guard("records of bookings come from managers only", {(Authority, "may_lead"): _yes}),
         "sealed": Guard("a place is had by whom it was given to", {(Places, "may_claim"): _yes}),
         "instances": Guard(
             "of two instances of an RC one serves", {(Instances, "begin"): _nothing, (Roster, "named"): _no_names}
         ),
-        "whole": Guard("a new leader carries on whole gangs only", {(recovery, "all"): _yes, (roster, "all"): _yes}),
+        "whole": Guard("a new leader carries on whole gangs only", {(recovery, "all"): _yes}),
         "pending": Guard(
             "holds wait for the rest of their gang to answer",
             {(recovery, "gangs_of"): _alone, (roster, "gangs_of"): _alone},

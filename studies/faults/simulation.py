@@ -20,7 +20,7 @@ from typing import Any, Final, TypeVar
 import msgspec
 from msgspec.structs import replace
 
-from studies.faults import plan
+from studies.faults import forgers, plan
 from studies.faults.bookers import Booker, Hosts
 from studies.faults.booking_promises import BookingPromises
 from studies.faults.components import DEEDS, KINDS, Deeds, SimulatedComponent, operate, report_load
@@ -99,11 +99,14 @@ class Size:
     """Nothing fails but nodes, in the steps of a component's move: no other fault excuses what breaks."""
     bookers: int = 0
     """Programs that book, give up and take up."""
+    forger: bool = False
+    """Names are proven, and one that has a certificate lists, reports and keeps what is not so."""
 
     @classmethod
     def of(cls, seed: int) -> Size:
         """Every tenth run is a long one of many, every tenth one of moves that fail, every tenth one of programs that
-        touch devices past their RCs, every tenth one with a thief, and every fifth one of bookings."""
+        touch devices past their RCs, every tenth one with a thief, every fifth one of bookings, and every twentieth one
+        with a forger."""
         match seed % 10:
             case 3 | 4:
                 return cls(bookers=2, clients=3, faults=4, span=40.0)
@@ -115,6 +118,8 @@ class Size:
                 return cls(moves_only=True)
             case 0:
                 return cls(thief=True)
+            case 6 if seed % 20 == 6:
+                return cls(forger=True)
         return cls()
 
 
@@ -170,6 +175,8 @@ class Simulation:
         self.fleet = replace(fleet, strategy=self.random.choice(("priority", "adaptive")))
         if size.bookers:
             self.fleet = replace(self.fleet, strategy="adaptive")
+        if size.forger:
+            self.fleet = forgers.closed(replace(self.fleet, strategy="adaptive"), self.hosts, self.candidates_at)
         self.where = {rc: f"{self.random.choice(self.hosts)}/{self._program(rc)}" for rc in DEVICES}
         """In which process each RC is: in its host's node, or in one of its own, without a candidate beside it."""
         bookers = [f"{self.random.choice(self.hosts)}/b{number}" for number in range(size.bookers)]
@@ -261,6 +268,10 @@ class Simulation:
             self.network.twice = ("command",)
             process, mesh = self.open_process(THIEF)
             process.main = process.run(asyncio.create_task, self._guard(steal_places(mesh, lambda: self.work.over)))
+        if self.size.forger:
+            process, mesh = self.open_process(forgers.FORGER)
+            forging = forgers.forge(mesh, DEVICES, lambda: self.work.over)
+            process.main = process.run(asyncio.create_task, self._guard(forging))
         look = asyncio.create_task(self._look())
         timers = [loop.call_later(fault.at, self._begin, fault) for fault in self.faults]
         done = asyncio.create_task(self._served())
@@ -367,6 +378,9 @@ class Simulation:
             calm = all(fault.kind == "double" for fault in self.present)
             lasting = dict(self.booked.look(self._leading_hosts(), calm=not self.present)) if self.bookers else {}
             self.promises.look(clients, self.rcs, self._leaders(), silence, calm=calm, lasting=lasting)
+            if self.size.forger:
+                for why in filter(None, map(forgers.believed, self._leaders().values())):
+                    self.broken(f"a leader believes a forger: {why}")
             if self.work.over and not any(self.busy.values()):
                 self.idle.set()
 
@@ -447,7 +461,7 @@ class Simulation:
         )
         if leads:
             self.keepers[host] = keeper
-            key = PLACES_KEY if self.size.thief else None
+            key = PLACES_KEY if self.size.thief or self.size.forger else None
             candidate = self.candidates[host] = Candidate(mesh, self.fleet, places_key=key, keeper=keeper)
             candidate.start()
         elif self.size.bookers and str(mesh.me) in self.where.values():

@@ -28,8 +28,8 @@ from zscout.mesh import ZenohMesh
 from zscout.mesh.frames import Frame, FrameWatch
 from zscout.mesh.transport import Quality
 from zscout.messages import MAX_FRAME, FrameHead, RcAsk, RcState
+from zscout.rcm.recovery import RecoveredState
 from zscout.services.rcm.rcm import Rcm
-from zscout.services.rcm.recovery import RecoveredState
 from zscout.types import Term
 
 pytestmark = pytest.mark.live

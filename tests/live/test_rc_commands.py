@@ -20,8 +20,8 @@ from zscout.drivers.work_queue import COMMANDS_PER_HOST
 from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import IncomingQuery, ZenohMesh, clock
 from zscout.messages import Done, Grants, HoldView, RcmState, RcState, StateAsk
+from zscout.rcm.recovery import RecoveredState
 from zscout.services.rcm.rcm import Rcm
-from zscout.services.rcm.recovery import RecoveredState
 from zscout.types import SECOND, Grant, Place, Term
 
 pytestmark = pytest.mark.live

@@ -5,14 +5,19 @@ from __future__ import annotations
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Keys, Role, Token
 from zscout.rcm import roster
+from zscout.rcm.admission import Admission
+from zscout.rcm.authority import Authority
 from zscout.rcm.devices import ExpectedDevices
+from zscout.rcm.places import Places
 from zscout.rcm.roster import MAX_TOKENS, Roster, Why
 from zscout.scheduling.model import ClientLost
 from zscout.types import SECOND, Term
 
 
 def a_roster() -> Roster:
-    return Roster(Keys("lab"), "leader", default_fleet(), Term(1, "rcm"), ExpectedDevices({}), 0)
+    fleet, term = default_fleet(), Term(1, "rcm")
+    admission = Admission(fleet.limits, Authority(fleet), Places("lab", None, term))
+    return Roster(Keys("lab"), "leader", fleet, term, ExpectedDevices({}), admission, lambda _: None, 0)
 
 
 def token(number: int, host: str = "greedy") -> Token:

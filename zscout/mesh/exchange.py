@@ -14,7 +14,8 @@ from msgspec import structs
 from zscout import messages
 from zscout.mesh.transport import TransportPublisher, TransportQuery, Undeclare
 from zscout.messages import Malformed, Problem, version_words
-from zscout.types import VERSION, Ns, Term
+from zscout.messages import Refused as Refused
+from zscout.types import VERSION, Ns
 
 QUEUE_DEPTH = 1_024  # items of one declaration that may wait for the event loop
 MAX_CODES: Final = 32  # refusal codes a tally counts separately: drivers and other hosts choose some of them
@@ -29,20 +30,6 @@ S = TypeVar("S")
 
 class MeshError(Exception):
     """The mesh can't be joined, or is closed; the message names the remedy."""
-
-
-class Refused(Exception):
-    """Raised by a handler to answer a query with an error."""
-
-    def __init__(self, code: str, message: str, term: Term | None = None) -> None:
-        super().__init__(message)
-        self.problem = Problem(code, message, term)
-
-    @classmethod
-    def by(cls, problem: Problem) -> Refused:
-        refused = cls(problem.code, problem.message)
-        refused.problem = problem
-        return refused
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,6 +77,20 @@ class Problem(Message, frozen=True):
     """Of who did not understand what was asked."""
 
 
+class Refused(Exception):
+    """Raised by a handler to answer a query with an error."""
+
+    def __init__(self, code: str, message: str, term: Term | None = None) -> None:
+        super().__init__(message)
+        self.problem = Problem(code, message, term)
+
+    @classmethod
+    def by(cls, problem: Problem) -> Refused:
+        refused = cls(problem.code, problem.message)
+        refused.problem = problem
+        return refused
+
+
 T = TypeVar("T")
 _ENCODER = msgspec.json.Encoder(decimal_format="number")
 _decoder: Callable[[Any], msgspec.json.Decoder[Any]] = cache(msgspec.json.Decoder)

@@ -7,7 +7,18 @@ from typing import Annotated, TypeAlias
 
 import msgspec
 
-from zscout.messages.base import Amounts, Elapsed, Message, RcSeconds, Seconds, ShortText, State, VersionText, WallTime
+from zscout.messages.base import (
+    Amounts,
+    Elapsed,
+    Message,
+    Problem,
+    RcSeconds,
+    Seconds,
+    ShortText,
+    State,
+    VersionText,
+    WallTime,
+)
 from zscout.types import NO_TERM, Grant, Place, Term
 
 DOOR_CODES = frozenset({"unknown_device", "unknown_parameter", "too_much"})
@@ -226,6 +237,8 @@ class Notice(_ArcParty, frozen=True):
     """While it runs: where its RCs are, by RC, as far as that is known."""
     booking: BookingRef = ""
     """The date of a booking that it has taken up: `<id>@<start>`."""
+    problem: Problem | None = None
+    """Why it ended, where an RCM that took the lead refuses what its client listed."""
 
 
 class Holder(_ArcParty, frozen=True):

@@ -33,7 +33,7 @@ class Places:
     """The places of one fleet, as the leader of `term` knows them; `key` is the one that managers share."""
 
     def __init__(self, fleet: str, key: bytes | None, term: Term) -> None:
-        self._fleet, self._key, self._term = fleet, key, term
+        self._fleet, self._key, self.term = fleet, key, term
         self._places: dict[ArcId, Place] = {}
         """Of open ARCs."""
         self._owners: dict[Place, dict[ClientId, int]] = {}
@@ -57,7 +57,7 @@ class Places:
         owners = self._owners.get(place)
         if owners is not None and client in owners:
             return True
-        if place.term == self._term:
+        if place.term == self.term:
             return False
         if self._key is not None:
             expected = self.seal(place, arc_id(client, id_)) or ""

@@ -13,7 +13,7 @@ from typing import Any, Final
 from msgspec.structs import replace
 
 from zscout.keyexpr import is_pattern
-from zscout.messages import Notice, ReasonInfo, ReasonParty, State, StoryLine
+from zscout.messages import Notice, Problem, ReasonInfo, ReasonParty, State, StoryLine
 from zscout.rcm.places import Places, client_id, request_id
 from zscout.rcm.roster import Roster
 from zscout.scheduling.core import Core
@@ -210,6 +210,12 @@ class RequestLog:
             step=self._step,
             **details,
         )
+
+    def refuse(self, now: Ns, arc: ArcId, name: str, problem: Problem) -> Notice:
+        """The notice that a listed request is refused."""
+        reason = f"the leader refuses it: {problem.message}"
+        self.record(now, arc, reason)
+        return replace(self._notice(arc, "ended", reason=reason, outcome=Outcome.LOST, problem=problem), arc=name)
 
     def grants(self, now: Ns, effects: Collection[Effect], answered: Collection[ArcId]) -> list[Notice]:
         """The notices of an instant's grants that precede its publication: not of ARCs that are `answered` so, or had

@@ -6,7 +6,7 @@ An RC that reports holds of earlier terms is pending until its gangs have answer
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Final, NamedTuple
@@ -17,10 +17,11 @@ from zscout.config.devices import SETTLE
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Keys, Role, Token, client_of
 from zscout.messages import ClientRequests, Problem, RcAsk, RcState, disbelieved
+from zscout.rcm.admission import Admission
 from zscout.rcm.deadlines import Deadlines
 from zscout.rcm.devices import ExpectedDevices
-from zscout.scheduling.model import Adopted, ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
-from zscout.services.rcm.recovery import aged, gangs_of, recover
+from zscout.rcm.recovery import adopted, aged, gangs_of
+from zscout.scheduling.model import ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
 from zscout.types import SECOND, ArcId, ClientId, Grant, HostName, Ns, RcName, Term
 
 PROBE_PERIOD: Final[Ns] = SECOND
@@ -107,6 +108,8 @@ class Change:
     """Contradictions of the mesh, and those that are over."""
     duplicates: list[tuple[RcName, HostName]] = field(default_factory=list)
     """RCs that a second host offers, and that host."""
+    remarks: list[str] = field(default_factory=list)
+    """On holds that do not continue, for the log."""
     surplus: HostName = ""
     """This host shows more than MAX_TOKENS, since this token."""
 
@@ -142,8 +145,20 @@ class _Rc:
 
 
 class Roster:
-    def __init__(self, keys: Keys, me: HostName, fleet: Fleet, term: Term, devices: ExpectedDevices, now: Ns) -> None:
+    def __init__(
+        self,
+        keys: Keys,
+        me: HostName,
+        fleet: Fleet,
+        term: Term,
+        devices: ExpectedDevices,
+        admission: Admission,
+        known: Callable[[ArcId], ArcStatus | None],
+        now: Ns,
+    ) -> None:
+        """`known`: an ARC of the core."""
         self._keys, self._me, self.term, self._devices = keys, me, term, devices
+        self._admission, self._known = admission, known
         self._lease: Ns = round(fleet.mesh.lease * SECOND)
         self._hold_lease: Ns = fleet.timing.hold_lease
         self._timeout: Ns = fleet.timing.rebuild
@@ -409,7 +424,7 @@ class Roster:
         silent = f"{client} is seen and does not answer"
         if problem is not None and problem.term is not None:
             self._see(problem.term, client if client in self.clients else None)
-        if isinstance(message, ClientRequests):
+        if isinstance(message, ClientRequests) and message.client == client:
             self._asked.discard(client)
             self._change.suspicions.append((silent, False))
             self._change.listed.append(message)
@@ -681,15 +696,10 @@ class Roster:
         for state in states:
             rc = self._rc(state.rc)
             rc.joined, rc.named = state, (state.instance, state.host)
-        well = {state.rc: state for state in states if state.health == "ok"}
-        held = {(name, holder.grant) for name, state in well.items() for holder in state.holders}
-        recovered = recover(well.values(), [], self._now).holds
-        adopted = [
-            Adopted(hold)
-            for hold in recovered
-            if all((name, hold.grant) in held or self._rc(name).joined is None for name in hold.rcs)
-        ]
-        self._change.events += [*map(_presence, states), *adopted]
+        joined = {name for name, rc in self._rcs.items() if rc.joined is not None}
+        holds, remarks = adopted(states, joined, self._now, self._admission, self._known)
+        self._change.events += [*map(_presence, states), *holds]
+        self._change.remarks += remarks
         self._change.reported += states
         for state in states:
             if state.duplicate_of or len(self._rc(state.rc).tokens) > 1:

@@ -179,7 +179,9 @@ class Core:
             if rc.present or rc.absence
         ]
         recovered_holds = tuple(
-            model.RecoveredHold(arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end, arc.bound)
+            model.RecoveredHold(
+                arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end, arc.bound, arc.vouched
+            )
             for arc in state.running.values()
             if arc.hold is not None
         )
@@ -239,7 +241,7 @@ class Core:
         if arc.state is ArcState.WATCHING:
             reason = reason_of_now(self._state, arc) or AdmissionCheck(self._state, arc).refusal() or reason
         known = arc.request, arc.place, arc.hold, arc.needs, arc.bound, arc.since, arc.preemptions
-        return ArcStatus(*known, ahead, reason, arc.reason)
+        return ArcStatus(*known, ahead, reason, arc.reason, arc.vouched)
 
     def _apply(self, event: model.Event) -> None:
         match event:
@@ -286,6 +288,8 @@ class Core:
                 self._adopt(held)
             case Dates():
                 self._calendar.set_dates(event)
+            case model.Vouched():
+                self._vouch(event)
             case Booked(booking, tentative):
                 self._calendar.book(booking, tentative=tentative)
             case Unbooked(booking, at_present):
@@ -378,9 +382,7 @@ class Core:
             if existing.hold is not None or arc.hold is None:
                 self._end_request(arc_id, Outcome.HANDED_OVER, reason)
                 return
-            self._state.dequeue(existing)
-            self._forget(existing)
-            self._calendar.leave(existing)
+            self._remove(existing)
         if arc.hold is None:
             self._effects.append(model.Dropped(arc.id, arc.request.client, Outcome.HANDED_OVER, reason))
         else:
@@ -416,27 +418,55 @@ class Core:
         if over or (known is not None and known.hold is not None):
             return
         if known is not None:
-            self._state.dequeue(known)
-            self._forget(known)
-            self._calendar.leave(known)
-            held = replace(held, place=min(known.place, held.place))
+            self._remove(known)
+            held = replace(held, place=min(known.place, held.place or known.place))
         arc = self._take_up(held)
         if known is not None and arc.hold is None and self._state.arc(arc.id) is arc:
             # Use its client's request: the report lacks parameters of absent RCs.
-            self._state.dequeue(arc)
-            self._forget(arc)
-            self._calendar.leave(arc)
-            arc = self._new_arc(known.request, held.place)
-            self._state.enqueue(arc, self._state.now)
-            self._calendar.take_up(known.request.booking, arc)
+            self._remove(arc)
+            arc = self._queue_anew(known.request, held.place, vouched=known.vouched)
         if arc.hold is not None and (arc.request.keep or not arc.past_min_runtime(self._state.now)):
             self._effects.append(self._granted(arc, arc.hold))
         self._expire()
+
+    def _vouch(self, told: model.Vouched) -> None:
+        """Replace a request reported by RCs with its client's own, and re-enter its hold."""
+        arc = self._state.arc(told.request.arc)
+        if arc is not None and arc.hold is not None and not arc.vouched and told.bound is None:
+            self._end_hold(arc, Outcome.LOST, of_rcs(ReasonCode.SUPERSEDED, sorted(arc.needs)[:1]))
+            arc = self._state.arc(told.request.arc)
+        if arc is None or arc.vouched:
+            return
+        place, hold = told.place or arc.place, arc.hold
+        if hold is None or told.bound is None:
+            self._remove(arc)
+            self._queue_anew(told.request, place)
+            return
+        self._state.stop(arc)
+        self._forget(arc)
+        held = model.RecoveredHold(told.request, place, hold.grant, hold.start, hold.end, told.bound)
+        arc = self._take_up(held)
+        if arc.hold is not None:
+            self._effects.append(self._granted(arc, arc.hold))
+
+    def _remove(self, arc: Arc) -> None:
+        """Remove a queued ARC that another replaces."""
+        self._state.dequeue(arc)
+        self._forget(arc)
+        self._calendar.leave(arc)
+
+    def _queue_anew(self, request: model.ArcRequest, place: Place | None, *, vouched: bool = True) -> Arc:
+        arc = self._new_arc(request, place)
+        arc.vouched = vouched
+        self._state.enqueue(arc, self._state.now)
+        self._calendar.take_up(request.booking, arc)
+        return arc
 
     def _take_up(self, held: model.RecoveredHold) -> Arc:
         """Continue a hold of an earlier term if all its RCs are present and free, and no other ARC runs at its
         place; else end it and queue its ARC."""
         arc = self._new_arc(held.request, held.place)
+        arc.vouched = held.vouched
         if arc.patterns:
             self._state.bind(arc, held.bound)
         hold = Hold(held.grant, held.start, held.end, self._state.protected_below(arc), self._state.longest(held.start))
@@ -450,7 +480,7 @@ class Core:
             broken = _claimed_by(other)
         elif other is not None:
             self._state.put_before(arc, other)
-        over = held.end <= self._state.now
+        over = held.end <= self._state.now or (broken is not None and self._state.is_barred(arc))
         if not over or not broken:
             self._state.enqueue(arc, self._state.now)
         if broken:
@@ -507,8 +537,9 @@ class Core:
         self._run_again = True
 
     def _end_hold(self, arc: Arc, outcome: Outcome, reason: Reason, *, requeue: bool = True) -> None:
-        """End a hold. An ARC past its minimum runtime is not queued again."""
-        requeue = requeue and not arc.past_min_runtime(self._state.now)
+        """End a hold. An ARC past its minimum runtime is not queued again, nor one that names what its owner
+        may not hold any more."""
+        requeue = requeue and not arc.past_min_runtime(self._state.now) and not self._state.is_barred(arc)
         hold = self._state.stop(arc)
         self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=requeue))
         arc.unconfirmed = 0

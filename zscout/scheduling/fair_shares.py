@@ -122,7 +122,7 @@ class Shares:
                 self._count(arc, by)
 
     def hold(self, arc: Arc) -> None:
-        if self._state.operator(arc.priority):
+        if self._state.operator(arc.priority) or not arc.vouched:
             return
         self._charged[arc.id] = 0
         for rc in arc.rcs:

@@ -149,6 +149,7 @@ class Arc:
     """The RC of each pattern (`patterns.py`), while it runs or is checked. Empty if some pattern has none."""
     claim: Claim | None = None  # the active booking that it has taken up
     position: int = 0  # the position of its group (`fair_shares.py`); while it runs, as of its start
+    vouched: bool = True  # by its client; False: only RCs have reported it, and it is not charged
     late: Ns = 0  # delay that its group's share adds to its waiting time (`reservations.py`)
     owner: str = field(init=False)  # its client's host, for quotas
     id: ArcId = field(init=False)
@@ -366,14 +367,16 @@ class HandedOver(Struct, frozen=True):
 
 
 class RecoveredHold(Struct, frozen=True):
-    """A hold in force at a change of RCM: its grant is kept, `end` is on the core's clock."""
+    """A hold in force at a change of RCM: its grant is kept, `end` is on the core's clock. With certificates, a hold
+    reported by RCs only is not `vouched` for by its client, and has no place."""
 
     request: ArcRequest
-    place: Place
+    place: Place | None
     grant: Grant
     start: Ns
     end: Ns
     bound: Mapping[Need, RcName] = {}
+    vouched: bool = True
 
     def __post_init__(self) -> None:
         patterns = {need for need in self.request.needs if is_pattern(need)}
@@ -404,13 +407,22 @@ class Adopted(Struct, frozen=True):
     held: RecoveredHold
 
 
+class Vouched(Struct, frozen=True):
+    """The client of an ARC reported by RCs only has answered, with its request and place. `bound`: the RC for each
+    pattern; None: the hold does not meet the request, and ends."""
+
+    request: ArcRequest
+    place: Place | None
+    bound: Mapping[Need, RcName] | None
+
+
 class Tick(Struct, frozen=True):
     """Time has passed."""
 
 
 _ArcEvent: TypeAlias = Requested | Cancelled | Released | ClientLost | PlaceShown | Unconfirmed | Reachable | HandedOver
 _RcEvent: TypeAlias = Vote | VoteOverdue | RcJoined | RcReported | RcLost
-Event: TypeAlias = _ArcEvent | _RcEvent | LeadTaken | Adopted | Dates | Booked | Unbooked | Redated | Tick
+Event: TypeAlias = _ArcEvent | _RcEvent | LeadTaken | Adopted | Vouched | Dates | Booked | Unbooked | Redated | Tick
 
 
 class Outcome(StrEnum):
@@ -498,6 +510,8 @@ class ArcStatus(Struct, frozen=True):
     """The full reason to wait; None while it runs."""
     reported: Reason | None
     """The reason of its latest `Queued` effect, which may be out of date."""
+    vouched: bool = True
+    """False: so far only RCs have reported it."""
 
     @property
     def id(self) -> ArcId:

@@ -463,6 +463,11 @@ class SchedulerState:
         patterns = self.policy.barred.get(arc.owner, ()) if arc.patterns else ()
         return union(map(self.matching_mask, patterns))
 
+    def is_barred(self, arc: Arc) -> bool:
+        """Whether it names an RC that its owner may not hold (any more)."""
+        patterns = self.policy.barred.get(arc.owner, ()) if self.policy.barred else ()
+        return any(matcher(pattern)(need) for pattern in patterns for need in arc.request.needs if not is_pattern(need))
+
     def _add_running(self, arc: Arc) -> None:
         self.running[arc.id] = arc
         self._grow(arc.mask, arc.known_end())

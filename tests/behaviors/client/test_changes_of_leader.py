@@ -16,7 +16,7 @@ from zscout.behaviors.client.request import OpenArc
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, IncomingQuery
 from zscout.messages import Ask, Notice
-from zscout.services.rcm import request_handler
+from zscout.rcm import admission
 from zscout.services.rcm.candidate import Candidate
 from zscout.testing.link import Disturbance
 from zscout.types import SECOND, Place, Term
@@ -27,7 +27,7 @@ async def test_a_queued_request_that_the_next_leader_refuses_ends(monkeypatch: p
         fleet.candidate("h1")
         await one.granted(await one.request("first", {RC: {}}, priority=5, min_runtime=600))
         waits = await two.request("second", {RC: {}}, priority=5, min_runtime=600)
-        monkeypatch.setattr(request_handler, "MAX_PRIORITY", 4)
+        monkeypatch.setattr(admission, "MAX_PRIORITY", 4)
         await fleet.lose_leader()
         # The new leader does not hear of it while it takes the lead.
         link = fleet.network.link(two.mesh, fleet.candidates["h1"].mesh)

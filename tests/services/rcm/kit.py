@@ -14,7 +14,7 @@ from tests.services.kit import MemoryFleet, answer
 from tests.services.kit import Refusal as Refusal
 from zscout.config.fleet import Fleet, default_fleet
 from zscout.keyexpr import Role, Token
-from zscout.mesh import IncomingQuery, Refused
+from zscout.mesh import IncomingQuery, Mesh, Refused
 from zscout.messages import (
     Ask,
     Ballot,
@@ -33,9 +33,9 @@ from zscout.messages import (
     Revocation,
     StateAsk,
 )
+from zscout.rcm.recovery import RecoveredState
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.rcm import Rcm
-from zscout.services.rcm.recovery import RecoveredState
 from zscout.testing.memory import MemoryMesh
 from zscout.types import NO_TERM, Grant, Place, Term
 
@@ -44,7 +44,7 @@ from zscout.types import NO_TERM, Grant, Place, Term
 class FakeRc:
     """An RC that holds what is published, and votes as it is told to."""
 
-    mesh: MemoryMesh
+    mesh: Mesh
     name: str
     instance: str = "i1"
     sharable: bool = False
@@ -126,7 +126,7 @@ class FakeRc:
 class FakeClient:
     """A program that asks, and keeps all that it hears."""
 
-    mesh: MemoryMesh
+    mesh: Mesh
     log: list[tuple[str, str, str]]
     """(who, what, state) in the order in which it arrived, of all clients of a fleet."""
     notices: list[Notice] = field(default_factory=list)

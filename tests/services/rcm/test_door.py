@@ -12,7 +12,7 @@ from tests.services.rcm.booked_fleet import do
 from tests.services.rcm.kit import FakeFleet, Refusal, fleet_of, grant_of, request
 from zscout.mesh import Refused
 from zscout.messages import Amounts, Foresee, Foresight, Parameter, Parameters
-from zscout.services.rcm.door import check_door
+from zscout.rcm.door import check_door
 from zscout.types import SECOND
 
 RADIO = [

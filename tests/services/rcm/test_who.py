@@ -8,10 +8,11 @@ from decimal import Decimal
 import pytest
 
 from tests.mesh.kit import until
+from tests.rcm.test_recovery import plain
 from tests.services.rcm.booked_fleet import do
 from tests.services.rcm.kit import FakeFleet, Refusal, fleet_of
 from zscout.messages import Cancel, ClientRequests, Foresee, Foresight, HandOver, OpenRequest, Who
-from zscout.services.rcm.recovery import take_over
+from zscout.rcm.recovery import take_over
 from zscout.types import Place, Term
 
 ALICE = Who("alice", "ws1", "survey.py")
@@ -120,7 +121,7 @@ async def test_the_next_leader_knows_it_from_the_rcs_and_from_the_clients() -> N
     first.stop()
     waits = OpenRequest("late", "late", {"robot/a": {}}, 0, Decimal(60), place=Place(Term(1, "rcm"), 9), who=BOB)
     other.open = [waits]
-    recovered = take_over([robot.state()], [ClientRequests(other.name, [waits])], client.mesh.now())
+    recovered = take_over([robot.state()], [ClientRequests(other.name, [waits])], client.mesh.now(), plain())
     assert [held.grant for held in recovered.holds] == [held.grant]
     fleet.rcm(2, recovered)
     await fleet.joined(robot)

@@ -20,11 +20,11 @@ from tests.studies.tools import STUDIES
 
 SEEDS = [seed for seed in range(1, 200) if seed % 10 != 9]
 """Small runs; every tenth is one of many programs."""
-QUICK = [1, 2, 3, 4, 8, 10, 13, 15, 47, 103]
+QUICK = [1, 2, 3, 4, 6, 8, 10, 13, 15, 47, 103]
 """Seeds that break a promise without most of the guards below: of each size one at least, but of 47 only moves fail."""
 FOUND = [
     1923, 302274, 302324, 302513, 400894, 407164, 434963, 435554, 440263, 502073, 517214, 519734, 550493, 567963,
-    579603, 600943, 700043, 892734, 900973, 918193, 965924, 967464,
+    579603, 600943, 700043, 892734, 900973, 918193, 965924, 967464, 1466,
 ]  # fmt: skip
 """Runs that once broke a promise: a keeper that nobody asked, an old publication read after a standstill, a silent
 radio beside a date, maintenance that one wrong clock ended, a conflict with what was kept elsewhere by then; one that
@@ -36,12 +36,12 @@ before fleet time was certain, or as its leader could keep the booking nowhere. 
 was in the way of a date that had been hours away; at 550493 a booking was refused, which another host kept, and brought
 back within milliseconds; at 579603 a date was in conflict for the first milliseconds of a reign; at 517214 the time of
 a host that was alone went on, which had differed by 2 s; and at 519734 a candidate was alone with a host that has no
-RC."""
+RC. At 1466 a hold that a forger had made up was vouched for by its second report."""
 MISSED = {
     "order": 15, "grant": 1, "safe first": 1, "snapshots": 1, "step down": 1, "reopen": 2, "places": 2,
     "withdrawn": 55, "believed": 130, "settling": 8, "deadline": 8, "once": 10, "sealed": 10, "copied": 3,
     "dates": 1043, "merged": 3, "caught up": 4, "one stands": 33, "awaited": 103, "had again": 13, "dates first": 94,
-    "fleet time": 4, "late": 173, "slewed": 3,
+    "fleet time": 4, "late": 173, "slewed": 3, "door": 6, "clamped": 6, "certified": 6, "managers": 6,
 }  # fmt: skip
 """Guards without which some promise breaks within a few runs, and the seed of docs/promises.md, which is tried first;
 `python -m studies faults --without` tries the others."""

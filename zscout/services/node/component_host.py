@@ -18,7 +18,7 @@ from zscout.config.strict import quoted
 from zscout.keyexpr import BadName, check_name
 from zscout.mesh import IncomingQuery, Mesh, Refused, Supervisor
 from zscout.mesh.supervision import done_within
-from zscout.services.authority import Authority
+from zscout.rcm.authority import Authority
 from zscout.services.node.component_process import ComponentProcess
 from zscout.services.node.limits import ControlGroups
 from zscout.services.node.process_use import RunningComponent

@@ -18,7 +18,7 @@ from zscout.mesh.supervision import Supervisor
 from zscout.messages import ListComponents, Placement, Placements, PlacerOperation
 from zscout.placement import events
 from zscout.placement.placer import Placer
-from zscout.services.authority import Authority
+from zscout.rcm.authority import Authority
 from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.placement.node_client import NodeClient
 from zscout.services.placement.request_handler import PlacerRequestHandler

@@ -17,7 +17,7 @@ from zscout.mesh.supervision import Supervisor
 from zscout.placement.events import PlacementRefused, PlacerEvent
 from zscout.placement.placer import Placer
 from zscout.placement.state import OVER
-from zscout.services.authority import Authority
+from zscout.rcm.authority import Authority
 from zscout.types import HostName, Term
 
 MAX_WAIT: Final = 60.0

@@ -9,14 +9,13 @@ from decimal import Decimal
 from typing import Final, TypeAlias
 
 from zscout.config.fleet import Fleet
-from zscout.keyexpr import BadName, Sender, check_name, check_need, is_pattern, matcher
+from zscout.keyexpr import BadName, Sender, check_name, is_pattern, matcher
 from zscout.mesh import IncomingQuery, Refused
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import (
     MAX_AHEAD,
     MAX_BOOKINGS,
     MAX_KEPT,
-    MAX_PARAMS,
     WINDOW,
     Amounts,
     Ask,
@@ -26,7 +25,6 @@ from zscout.messages import (
     BookingsTold,
     BookingView,
     FindSlots,
-    Foresee,
     Operation,
     SlotsTold,
     SlotView,
@@ -34,11 +32,11 @@ from zscout.messages import (
     duration,
     exact_amounts,
 )
+from zscout.rcm.admission import Admission
 from zscout.scheduling.booking import Booking
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Tick
 from zscout.scheduling.runtimes import RuntimeEstimator
-from zscout.services.authority import Authority
 from zscout.services.bookings.dates import DAY, dates, told, zone_of
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.rcm.booked_dates import MAX_CLAIMS, BookedDates, Date, start_of
@@ -53,7 +51,6 @@ MAX_UNDECIDED: Final = 64
 """Operations that wait for votes, or for a keeper, at one time."""
 DECIDE_WITHIN: Final = 1.5
 """Seconds: an RC that does not vote is asked again meanwhile."""
-MAX_PRIORITY: Final = 1_000_000
 NAMED: Final = 3
 """Of what is in the way, so many are named."""
 
@@ -78,14 +75,14 @@ class BookingHandler:
         keeper: BookingKeeper,
         dates_: BookedDates,
         sharing: BookingSharing,
-        authority: Authority,
+        admission: Admission,
         supervisor: Supervisor,
         emit: Callable[..., None],
         check_door: Callable[[Mapping[str, Amounts]], None],
         settled: Callable[[], bool],
     ) -> None:
         self._fleet, self._core, self._keeper, self._dates, self._sharing = fleet, core, keeper, dates_, sharing
-        self._authority, self._supervisor, self._emit, self._check_door = authority, supervisor, emit, check_door
+        self._admission, self._supervisor, self._emit, self._check_door = admission, supervisor, emit, check_door
         self._settled = settled
         self._now, self._keys = keeper.mesh.now, keeper.mesh.keys
         self.runtimes: RuntimeEstimator | None = None
@@ -117,11 +114,11 @@ class BookingHandler:
     def _book(self, query: Query, wanted: Book, sender: Sender) -> None:
         known = self._keeper.records.get(wanted.id)
         if known is not None:
-            self._check_owner(sender, known, "ask for it")
+            self._admission.check_owner(sender, known, "ask for it")
             self._answer_kept(query, known)
             return
+        self._admission.check_booking(wanted, sender)
         record = self._record(wanted, sender)
-        self._check_allowed(wanted, sender)
         self._check_room(record)
         self._check_door(wanted.needs)
         self._try(_Undecided(query, lambda: self._decide(query, record)))
@@ -131,15 +128,12 @@ class BookingHandler:
         time = self._dates.time
         try:
             check_name(wanted.name, "name of the booking")
-            check_needs(wanted.needs, self._fleet.limits.max_needs)
             zone_of(wanted.zone)
             runtime, patience = duration(wanted.runtime, "runtime"), duration(wanted.patience, "patience")
             if wanted.maintenance and any(map(is_pattern, wanted.needs)):
                 raise ValueError("name each device for maintenance; patterns are not allowed")
         except (BadName, ValueError) as error:
             raise Refused("bad_request", str(error)) from None
-        if not -MAX_PRIORITY <= wanted.priority <= MAX_PRIORITY:
-            raise Refused("bad_request", f"priority must lie between -{MAX_PRIORITY} and {MAX_PRIORITY}")
         self._check_length(wanted.runtime)
         over = wanted.start + min(patience, runtime) / SECOND
         if over <= time:
@@ -156,7 +150,7 @@ class BookingHandler:
             raise Refused("bad_date", "each date would overlap the next; make it shorter, or less often")
         made = self._dates.number()
         fields = {name: getattr(wanted, name) for name in Book.__struct_fields__}
-        fields["who"] = self._authority.known_as(sender, wanted.who)
+        fields["who"] = self._admission.authority.known_as(sender, wanted.who)
         if wanted.maintenance:
             fields["priority"] = max(wanted.priority, self._fleet.operator_priority)
         return BookingRecord(**fields, owner=sender.host, since=int(time), made=made, changed=made)
@@ -164,13 +158,6 @@ class BookingHandler:
     def _check_length(self, runtime: Decimal) -> None:
         if runtime > MAX_AHEAD:
             raise Refused("bad_date", "a booking can't be longer than a year; ask for less")
-
-    def _check_allowed(self, wanted: Book | FindSlots, sender: Sender) -> None:
-        if isinstance(wanted, Book) and wanted.maintenance:
-            self._authority.check_operator(sender, "put devices in maintenance")
-            return
-        asked = Foresee(wanted.id, wanted.id, wanted.needs, wanted.priority, wanted.runtime)
-        self._authority.check_ask(sender, asked, lambda _: 0)
 
     def _check_room(self, record: BookingRecord) -> None:
         records, owner = self._keeper.records, record.owner
@@ -249,7 +236,7 @@ class BookingHandler:
         record = self._keeper.records.get(operation.id)
         if record is None:
             raise Refused("unknown_booking", f"there is no booking {operation.id}; see zscout booking list")
-        self._check_owner(sender, record, "unbook it")
+        self._admission.check_owner(sender, record, "unbook it")
         if operation.start is None:
             new = record if record.unbooked else self._dates.change(record, unbooked=True)
         elif operation.start in record.dropped:
@@ -262,21 +249,13 @@ class BookingHandler:
         self._dates.reconcile()
         self._answer_kept(query, new)
 
-    def _check_owner(self, sender: Sender, record: BookingRecord, what: str) -> None:
-        if sender.host != record.owner:
-            self._authority.check_operator(sender, f"{what}: {record.name} is {record.owner}'s")
-
     # Looking for a time
 
     def _find_slots(self, query: Query, asked: FindSlots, sender: Sender) -> None:
-        try:
-            check_needs(asked.needs, self._fleet.limits.max_needs)
-            needs = {need: exact_amounts(params) for need, params in asked.needs.items()}
-            runtime = duration(asked.runtime, "runtime")
-        except (BadName, ValueError) as error:
-            raise Refused("bad_request", str(error)) from None
+        self._admission.check_booking(asked, sender)
+        needs = {need: exact_amounts(params) for need, params in asked.needs.items()}
+        runtime = duration(asked.runtime, "runtime")
         self._check_length(asked.runtime)
-        self._check_allowed(asked, sender)
         self._check_door(asked.needs)
         now = self._now()
         start = self._dates.local(max(asked.start or 0, -(-self._dates.to_fleet(now) // SECOND)))
@@ -344,11 +323,7 @@ class BookingHandler:
             if goes_on:
                 return ask.booking if record is None and start_of(ask.booking) is not None else ""
             raise Refused("unknown_booking", f"no booking {booking}, or it was cancelled; see zscout booking list")
-        self._check_owner(sender, record, "take it up")
-        if record.maintenance:
-            raise Refused("bad_request", f"{record.name} is maintenance, which no request can use")
-        if ask.needs != record.needs or ask.priority != record.priority:
-            raise Refused("bad_request", f"needs or priority differ from booking {record.name}; leave them out")
+        self._admission.check_take_up(ask, sender, record)
         dates_ = [date for date in self._dates.standing(record) if not start or str(date.start) == start]
         free = [date for date in dates_ if self._dates.taken_by(date) is None]
         if free:
@@ -377,18 +352,6 @@ class BookingHandler:
             if view.dates or (record.every and (record.until or 0) > self._dates.time + WINDOW):
                 views.append(view)
         return sorted(views, key=lambda view: (view.dates[0].start if view.dates else 1 << 60, view.id))
-
-
-def check_needs(needs: Mapping[str, Amounts], most: int) -> None:
-    """Raises ValueError, BadName."""
-    if not needs or len(needs) > most:
-        raise ValueError(f"{len(needs)} needs; from 1 to {most} are allowed")
-    for need, params in needs.items():
-        check_need(need)
-        if len(params) > MAX_PARAMS:
-            raise ValueError(f"{need} has more than {MAX_PARAMS} parameters")
-        for parameter in params:
-            check_name(parameter, f"parameter of {need}")
 
 
 def _share(one: Booking, other: Booking) -> bool:

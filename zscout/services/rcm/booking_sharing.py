@@ -15,6 +15,7 @@ from zscout.keyexpr import Keys, Role
 from zscout.mesh import Mesh, Reply
 from zscout.mesh.supervision import Supervisor, done_within
 from zscout.messages import BookingRecord, BookingsKept, ShareBookings
+from zscout.rcm.authority import Authority
 from zscout.services.bookings.fleet_clock import DIFFERS, SAME, FleetClock, agreed, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.bookings.records import merged
@@ -62,6 +63,7 @@ class BookingSharing:
         term: Term,
         keeper: BookingKeeper,
         clock: FleetClock,
+        authority: Authority,
         supervisor: Supervisor,
         on_news: Callable[[], None],
         on_shared: Callable[[], None],
@@ -69,7 +71,7 @@ class BookingSharing:
     ) -> None:
         """`on_news` is called when others told of what was not known here, `on_shared` each time all were
         asked. Before it is `settled` fleet time is what most clocks say, and nothing is forgotten by it."""
-        self._mesh, self._term, self._keeper, self._clock = mesh, term, keeper, clock
+        self._mesh, self._term, self._keeper, self._clock, self._authority = mesh, term, keeper, clock, authority
         self._supervisor, self._on_news, self._on_shared = supervisor, on_news, on_shared
         self._settled = settled
         self._begun = mesh.now()
@@ -128,7 +130,7 @@ class BookingSharing:
         saved, replies = await asyncio.gather(
             keeper.save(), mesh.ask(mesh.keys.bookings_any, question, BookingsKept, timeout=TIMEOUT)
         )
-        answers, me, why = self._take(replies), mesh.me.host, ""
+        answers, me, why = self._take(replies, question), mesh.me.host, ""
         if sent and not any(one.candidate and one.host != me and _keeps(one, question, sent) for one in answers):
             living = await mesh.living(mesh.keys.alive_any(Role.CANDIDATE), timeout=LOOK)
             if others := sorted({token.host for token in living} - {me}):
@@ -140,13 +142,24 @@ class BookingSharing:
         self._not_kept |= dict.fromkeys(sent, why) if why else {}
         return why
 
-    def _take(self, replies: Collection[Reply[BookingsKept]]) -> list[BookingsKept]:
+    def _take(self, replies: Collection[Reply[BookingsKept]], question: ShareBookings) -> list[BookingsKept]:
         """What keepers answered."""
         now = self._mesh.now()
-        answers = credible(replies, self._mesh.keys, now)
+        heard = credible(replies, self._mesh.keys, now)
+        answers = [one for one in heard if self._authority.may_lead(one.host)]
         changed = self._keeper.records.take(record for one in answers for record in one.records)
-        digest = self._keeper.records.digest()
-        self._behind = any(reply.message is None or reply.message.digest != digest for reply in replies)
+        known = {record.id: record for record in self._keeper.records}
+        latest = replace(question, digest=self._keeper.records.digest())
+        # One that is not believed may have more, which changes nothing here.
+        self._behind = any(
+            reply.message is None
+            or (
+                reply.message.digest != latest.digest
+                if reply.message in answers
+                else not _keeps(reply.message, latest, known)
+            )
+            for reply in replies
+        )
         if changed:
             self._on_news()
             self._news.set()
@@ -161,6 +174,7 @@ class BookingSharing:
         else:
             self._clock.step(agreed(map(wall_ns, walls.values())), now)
         time = self._clock.at(now) / SECOND
+        walls |= {one.host: one.wall for one in heard}
         self.clocks = {host: wall - time for host, wall in walls.items() if abs(wall - time) > DIFFERS}
         return answers
 

@@ -13,10 +13,10 @@ from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, Lane, Mesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import Amounts, BookingRecord, BookingsAsk, BookingsKept, Instant, ProposedHolder, decimals
+from zscout.rcm.admission import Admission
 from zscout.scheduling.booking import BookingConflict, BookingThreatened, Dates
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Effect, Event, Propose, Vote, VoteOverdue
-from zscout.services.authority import Authority
 from zscout.services.bookings.fleet_clock import FleetClock, agreed, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.rcm.booked_dates import BookedDates, Date
@@ -58,7 +58,7 @@ class Bookings:
         core: Core,
         keeper: BookingKeeper,
         kept: Sequence[BookingsKept],
-        authority: Authority,
+        admission: Admission,
         supervisor: Supervisor,
         emit: Callable[..., None],
         propose: Callable[[Propose], None],
@@ -77,7 +77,15 @@ class Bookings:
                 propose(proposal)
 
         self._sharing = BookingSharing(
-            mesh, term, keeper, self.clock, supervisor, self._on_news, self._redate, lambda: self.settled
+            mesh,
+            term,
+            keeper,
+            self.clock,
+            admission.authority,
+            supervisor,
+            self._on_news,
+            self._redate,
+            lambda: self.settled,
         )
         self.dates = BookedDates(core, keeper.records, self.clock, mesh.now, emit, vote, self._sharing.tell)
         self.handler = BookingHandler(
@@ -86,7 +94,7 @@ class Bookings:
             keeper,
             self.dates,
             self._sharing,
-            authority,
+            admission,
             supervisor,
             emit,
             check_door,
@@ -113,6 +121,9 @@ class Bookings:
     def time(self) -> float | None:
         """Fleet time, in seconds since 1970 (UTC), as others may go by it; None: it is not settled."""
         return self.dates.time if self.settled else None
+
+    def record(self, booking: str) -> BookingRecord | None:
+        return self._keeper.records.get(booking)
 
     def recovered(self, taken: Collection[str]) -> list[Event]:
         """The events by which the core knows of all dates; `taken`: those that ARCs have taken up."""

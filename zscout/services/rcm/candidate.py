@@ -29,9 +29,11 @@ from zscout.messages import (
     absurd,
     disbelieved,
 )
+from zscout.rcm.admission import Admission
+from zscout.rcm.authority import Authority
 from zscout.rcm.places import Places
+from zscout.rcm.recovery import aged, take_over
 from zscout.scheduling.fair_shares import decayed
-from zscout.services.authority import Authority
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.journal.journal import Journal
 from zscout.services.placement.component_placer import ComponentPlacer
@@ -44,7 +46,6 @@ from zscout.services.rcm.election import Election
 from zscout.services.rcm.inventory import Inventory
 from zscout.services.rcm.observed_runtimes import RuntimeObserver
 from zscout.services.rcm.rcm import Rcm
-from zscout.services.rcm.recovery import aged, take_over
 from zscout.types import NO_TERM, SECOND, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
@@ -307,7 +308,8 @@ class Candidate:
         states = [aged(state, now - arrived) for state, arrived in answers]
         open_requests = self._credible(clients, lambda one: keys.requests(client_of(one.client)))
         asking = [one for one, _ in open_requests if one.term in (term, NO_TERM)]
-        return await self._lead(term, states, asking, credible(keepers, keys, now))
+        kept = [one for one in credible(keepers, keys, now) if self._authority.may_lead(one.host)]
+        return await self._lead(term, states, asking, kept)
 
     async def _refused(self, key: str, term: Term) -> None:
         """An RC or a client obeys a higher term. What has no token may be anybody's word."""
@@ -334,13 +336,12 @@ class Candidate:
         self, term: Term, states: list[RcState], open_requests: list[ClientRequests], kept: list[BookingsKept]
     ) -> bool:
         places = Places(self.fleet.name, self._places_key, term)
-        recovered = take_over(
-            states,
-            open_requests,
-            self.mesh.now(),
-            self.inventory.devices.home_of,
-            lambda client, one, place: places.may_recover(place, client, one.was or one.id, one.seal),
-        )
+        self._keeper.records.take(record for one in kept for record in one.records)
+        admission = Admission(self.fleet.limits, self._authority, places)
+        home_of, record_of = self.inventory.devices.home_of, self._keeper.records.get
+        recovered = take_over(states, open_requests, self.mesh.now(), admission, home_of, record_of)
+        for remark in recovered.remarks:
+            log.info("%s", remark)
         if (fair := self.fleet.scheduling.fair_shares) is not None:
             passed = self.mesh.now() - self._charged_at
             recovered.charged = {group: decayed(had, passed, fair.half_life) for group, had in self._charged.items()}

@@ -24,7 +24,10 @@ from zscout.config.fleet import Fleet
 from zscout.keyexpr import BadName, Role, Token, client_of
 from zscout.mesh import Declaration, IncomingQuery, Lane, Mesh, MeshError, Refused, Reply, Tally
 from zscout.mesh.supervision import StallWatch, Supervisor
-from zscout.rcm.places import Places, arc_id, client_id, request_id
+from zscout.rcm.admission import Admission
+from zscout.rcm.authority import Authority
+from zscout.rcm.places import Places, arc_id, request_id
+from zscout.rcm.recovery import RecoveredState, listed_by, removed, vouched
 from zscout.rcm.request_log import REMEMBERED, RequestLog, reason_info
 from zscout.rcm.roster import MAX_TOKENS, Change, Question, Roster, discrepancies
 from zscout.scheduling.core import Core
@@ -52,16 +55,15 @@ from zscout.scheduling.model import (
     Tick,
     Vote,
     VoteOverdue,
+    Vouched,
     WakeAt,
 )
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.scheduling.strategies import STRATEGIES
-from zscout.services.authority import Authority
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.digest import HoldDigest, HoldListener
 from zscout.services.rcm.inventory import Inventory
-from zscout.services.rcm.recovery import RecoveredState
 from zscout.services.rcm.request_handler import RequestHandler
 from zscout.types import SECOND, VERSION, ArcId, ClientId, Ns, RcName, Term
 
@@ -73,12 +75,11 @@ TELL_CHARGED: Final[Ns] = 10 * SECOND
 """From one time that candidates are told what groups had to the next: what is lost with a leader."""
 LATE_VOTE = 2.0
 """Seconds within which a late vote still counts."""
-REMOVED = "the fleet file, which names its owner under no role"
 KEPT: Final[Mapping[Outcome, Ns]] = MappingProxyType(
     {Outcome.RELEASED: 0, Outcome.CANCELLED: 0, Outcome.CLIENT_LOST: 86_400 * SECOND}
 )
 """For how long a client may ask again for the place of what ended so; else it is for as long as that is known."""
-CONTINUED: Final = (LeadTaken, Adopted, HandedOver)
+CONTINUED: Final = (LeadTaken, Adopted, Vouched, HandedOver)
 """Events by which holds that stand go on: the RCs hear of that before anybody else."""
 STATE_AGE: Final[Ns] = SECOND // 20
 """An answer about the state may be this old (rule 20): building it costs as much as many grants."""
@@ -123,18 +124,19 @@ class Rcm:
         `runtimes`."""
         self.mesh, self.fleet, self.term = mesh, fleet, term
         self.supervisor = Supervisor(f"the RCM of term {term.counter}", on_failure)
-        self._authority = authority or Authority(fleet)
-        self.core = Core(STRATEGIES[fleet.strategy](), self._authority.bound(fleet.scheduling))
+        self.authority = authority or Authority(fleet)
+        self.core = Core(STRATEGIES[fleet.strategy](), self.authority.bound(fleet.scheduling))
         supervisor, receive = self.supervisor, self._receive
         self._on_newer = on_newer
         self.on_disbelieved: Callable[[RcName, Term], object] = lambda *_: None
         """Called when no RC has joined, and one obeys an RCM of so low a term that this one is none to it."""
         self.places = places or Places(fleet.name, None, term)
+        self._admission = Admission(fleet.limits, self.authority, self.places)
         self._runtimes = runtimes
         self._own_inventory = inventory is None
         self.inventory = inventory or Inventory(mesh, fleet)
         devices = self.inventory.devices
-        self.roster = Roster(mesh.keys, mesh.me.host, fleet, term, devices, mesh.now())
+        self.roster = Roster(mesh.keys, mesh.me.host, fleet, term, devices, self._admission, self.core.arc, mesh.now())
         self._stall = StallWatch(mesh.now)
         self.registry = RequestLog(self.core, self.roster, self.places, runtimes)
         self._digest = HoldDigest(self.core, listeners) if listeners else None
@@ -146,8 +148,7 @@ class Rcm:
             self.registry,
             self.roster,
             devices,
-            self._authority,
-            self.places,
+            self._admission,
             supervisor,
             receive,
             self._follow,
@@ -160,7 +161,7 @@ class Rcm:
             self.core,
             keeper or BookingKeeper(mesh),
             kept,
-            self._authority,
+            self._admission,
             supervisor,
             receive,
             self._propose,
@@ -212,9 +213,12 @@ class Rcm:
         waiting = (replace(one, request=self.bookings.dates.dated(one.request)) for one in recovered.waiting)
         certain = 0 if self.bookings.settled else self.bookings.settles_at
         lead = LeadTaken(self.term, tuple(recovered.holds), tuple(waiting), recovered.charged, certain)
-        booked = self.bookings.recovered({request.booking for request in requests if request.booking})
+        taken = {request.booking for request in requests if request.booking}
+        booked = self.bookings.recovered(taken | recovered.booked)
+        gone = removed((hold.request for hold in recovered.holds), self._admission)
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
-        self._decide([*joined.events, *booked, lead], named=recovered.rcs)
+        self._decide([*joined.events, *booked, lead, *gone], named=recovered.rcs)
+        self._notify(self.registry.refuse(now, *refused) for refused in recovered.refused)
         for arc in self.core.arcs():
             self._bind(arc)
             if (expecting := recovered.expected.get(request_id(arc))) is not None:
@@ -253,9 +257,9 @@ class Rcm:
 
     def on_reload(self) -> None:
         """The rights have changed: who has none any more holds and waits for nothing."""
-        self.core.policy = self._authority.bound(self.fleet.scheduling)
-        gone = [arc for arc in self.core.arcs() if self._authority.is_removed(client_id(arc))]
-        self._receive(Tick(), *(Released(arc, REMOVED) for arc in gone))
+        self.core.policy = self.authority.bound(self.fleet.scheduling)
+        known = filter(None, map(self.core.arc, self.core.arcs()))
+        self._receive(Tick(), *removed((arc.request for arc in known), self._admission))
 
     # In
 
@@ -318,7 +322,7 @@ class Rcm:
         if change.named:
             self._publish([], change.named)
         for listed in change.listed:
-            self._on_requests(listed.client, {request.id for request in listed.requests})
+            self._on_requests(listed)
         for number, found in change.found:
             self.requests.on_new_client(number, found=found)
             self._send_notices()
@@ -329,6 +333,8 @@ class Rcm:
             self.supervisor.spawn(self._ask(asked))
         for sign, so in change.suspicions:
             self.mesh.suspicions.suspect(sign, so=so)
+        for remark in change.remarks:
+            log.info("%s", remark)
         for rc, host in change.duplicates:
             log.warning("duplicate device %s at %s; another host's is used", rc, host)
         if change.surplus:
@@ -369,11 +375,24 @@ class Rcm:
         if superfluous:
             self._publish([], [rc])
 
-    def _on_requests(self, client: ClientId, ids: Collection[str]) -> None:
-        """What RCs alone told of, and a client does not ask for: it gave that up where no RCM heard of it."""
-        known = self._recovered.pop(client, set()) & {*self.core.arcs_of(client)}
-        if given_up := [Released(arc) for arc in sorted(known) if request_id(arc) not in ids]:
-            self._receive(*given_up)
+    def _on_requests(self, answer: messages.ClientRequests) -> None:
+        """What RCs alone told of, and a client does not ask for, it gave up where no RCM heard of it; else its own word
+        is the one that counts."""
+        known = self._recovered.pop(answer.client, set()) & {*self.core.arcs_of(answer.client)}
+        listed = {one.id: one for one in answer.requests[: self.fleet.limits.max_requests_per_client]}
+        events = list[Event]()
+        for arc in filter(None, map(self.core.arc, sorted(known))):
+            if (request := listed.get(request_id(arc.id))) is None:
+                events.append(Released(arc.id))
+            elif not arc.vouched:
+                try:
+                    own = listed_by(answer.client, request, self._admission, self.bookings.record)
+                    events.append(vouched(arc, own, self._admission))
+                except (Refused, BadName) as error:
+                    log.warning("%s lists what can't be: %s", answer.client, error)
+                    events.append(Released(arc.id, f"the leader, as it is no valid request: {error}"))
+        if events:
+            self._receive(*events)
 
     def _recover(self, request: ArcRequest) -> None:
         """Has a client say whether it still asks for what RCs hold for it."""
@@ -446,8 +465,12 @@ class Rcm:
                     self._bind(request.arc)
                     asked = f"asked for {', '.join(sorted(request.needs))} at priority {request.priority}"
                     self.registry.record(now, request.arc, asked)
-                case PlaceShown(arc) | HandedOver(renamed=arc):
+                case PlaceShown(arc) | Vouched(ArcRequest(arc=arc)):
                     self._bind(arc)
+                case HandedOver(renamed=arc):
+                    self._bind(arc)
+                    if (moved := self.core.arc(arc)) is not None and not moved.vouched:
+                        self._recover(moved.request)
                 case Adopted(RecoveredHold(ArcRequest(client=client) as request)) if self.core.arc(request.arc):
                     self._bind(request.arc)
                     self.registry.enter(request.arc, request.name)

@@ -11,13 +11,12 @@ from typing import TypeAlias
 
 from msgspec.structs import replace
 
-from zscout.config.fleet import Fleet, RcmLimits
-from zscout.keyexpr import BadName, Sender, check_name, check_need, client_of
+from zscout.config.fleet import Fleet
+from zscout.keyexpr import Sender, check_name, client_of
 from zscout.mesh import IncomingQuery, Mesh, Refused
 from zscout.mesh.sparse_log import SparseLog
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import (
-    MAX_PARAMS,
     Amounts,
     Ask,
     Book,
@@ -31,19 +30,17 @@ from zscout.messages import (
     Parameters,
     Release,
     Unbook,
-    Who,
-    absurd,
-    duration,
-    exact_amounts,
 )
+from zscout.rcm.admission import Admission
 from zscout.rcm.devices import ExpectedDevices
-from zscout.rcm.places import Places, arc_id, request_id
+from zscout.rcm.door import check_door
+from zscout.rcm.places import arc_id, request_id
+from zscout.rcm.recovery import Listed, vouched
 from zscout.rcm.request_log import RequestLog, party_info, reason_info
 from zscout.rcm.roster import Change, Roster
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import (
-    ArcRequest,
     Cancelled,
     Dropped,
     Effect,
@@ -59,9 +56,7 @@ from zscout.scheduling.model import (
 )
 from zscout.scheduling.reason import Party, person
 from zscout.scheduling.runtimes import RuntimeEstimator
-from zscout.services.authority import Authority
 from zscout.services.rcm.bookings import Bookings
-from zscout.services.rcm.door import check_door
 from zscout.types import SECOND, ArcId, ClientId, Place, RcName
 
 log = logging.getLogger(__name__)
@@ -72,7 +67,6 @@ REPLY_SLACK = 0.1
 """Seconds after an overdue vote in which the first answer is given all the same."""
 MAX_BATCH = 64
 """Operations that are decided together at most."""
-MAX_PRIORITY = 1_000_000
 
 
 class RequestHandler:
@@ -86,15 +80,14 @@ class RequestHandler:
         registry: RequestLog,
         roster: Roster,
         devices: ExpectedDevices,
-        authority: Authority,
-        places: Places,
+        admission: Admission,
         supervisor: Supervisor,
         emit: Callable[..., None],
         follow: Callable[[Change], None],
         runtimes: RuntimeEstimator | None,
     ) -> None:
-        self.mesh, self.limits, self.core, self._devices = mesh, fleet.limits, core, devices
-        self._authority, self._places = authority, places
+        self.mesh, self.core, self._devices = mesh, core, devices
+        self._admission, self._authority, self._places = admission, admission.authority, admission.places
         self._knows_all = mesh.now() + fleet.timing.hold_lease
         """From when on an RC that was not seen yet is none of this fleet."""
         self._first_answer_timeout = fleet.timing.vote_timeout / SECOND + REPLY_SLACK
@@ -159,7 +152,6 @@ class RequestHandler:
             raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
         arc = arc_id(client, ask.id)
         self._keep_order(arc)
-        self._authority.check_ask(sender, ask, lambda names: self._open_of(names, arc))
         undecided = self._may_hold(arc, ask) and self._roster.awaits(self.mesh.now(), arc, ask.rcs)
         undecided = undecided or bool(ask.booking and not self.bookings.settled)
         if undecided and len(self._deferred) < MAX_BATCH:
@@ -168,7 +160,11 @@ class RequestHandler:
             self.waiting[arc].append(query)
         elif self.core.is_open(arc):
             self._registry.enter(arc, ask.arc, estimate=ask.estimate)
-            if (place := self._own_place(ask, client)) is not None:
+            place, known = self._own_place(ask, client), self.core.arc(arc)
+            if known is not None and not known.vouched:
+                own = Listed(self._admission.form(ask, sender), place)
+                self._emit(vouched(known, own, self._admission))
+            elif place is not None:
                 self._emit(PlaceShown(arc, place))
             if ask.grant is not None and ask.unconfirmed:
                 self._emit(Unconfirmed(arc, ask.grant, tuple(sorted(ask.unconfirmed))))
@@ -185,8 +181,7 @@ class RequestHandler:
     def _enter(self, query: Query, ask: Ask, sender: Sender, client: ClientId, arc: ArcId) -> None:
         """Takes a new request. This is the way of every grant: nothing is done here that can be done once it is
         answered."""
-        self._check_room(sender.host, client)
-        request = admit(ask, client, arc, self.core, self.limits, self._authority.known_as(sender, ask.who))
+        request = self._admission.admit(ask, sender, self)
         if ask.booking:
             request = replace(request, booking=self.bookings.handler.take_up(ask, sender))
             request = self.bookings.dates.dated(request)
@@ -212,7 +207,7 @@ class RequestHandler:
         """The place that a request shows, if it is its client's. Raises Refused for one that can't be."""
         if ask.place is None:
             return None
-        check_place(ask.place, self.core)
+        self._admission.check_place(ask.place, self.core.could_have_issued)
         seen = client in self._roster.clients
         if self._places.may_claim(ask.place, client, ask.was or ask.id, ask.seal, seen=seen):
             if self._places.takes_the_word_for(ask.place):
@@ -279,32 +274,28 @@ class RequestHandler:
         """Whether another client has this ARC: what one RCM handed over, the next knows by its place only."""
         return ask.place is not None and any(request_id(arc) == ask.id for arc in self.core.at_place(ask.place))
 
-    def _open_of(self, names: Collection[str], *but: ArcId) -> int:
-        """How many ARCs these have, waiting or running; what this burst has brought counts."""
+    # Open requests, as limits and quotas count them: those of this burst included
+
+    @property
+    def waiting_now(self) -> int:
+        return self.core.waiting + len(self._coming())
+
+    def of_client(self, client: ClientId) -> int:
+        return self.core.count_of(client) + self._coming().count(client)
+
+    def of_owners(self, names: Collection[str], *but: ArcId) -> int:
         owned = sum(map(self.core.count_of_owner, names))
         owned += sum(client.partition("/")[0] in names for client in self._coming())
         return owned - sum(self.core.is_open(arc) and arc.partition("/")[0] in names for arc in but)
 
-    def _coming(self) -> list[ClientId]:
-        """The clients of the requests of this burst."""
-        return [event.request.client for event in self._batch.values() if isinstance(event, Requested)]
-
-    def _held_by(self, names: Collection[str], *but: ArcId) -> int:
-        """How many RCs these hold."""
+    def held_by(self, names: Collection[str], *but: ArcId) -> int:
+        """The number of RCs held by these owners."""
         arcs = filter(None, map(self.core.arc, {*self.core.arcs_of_owners(names)} - {*but}))
         return sum(len(arc.needs) for arc in arcs if arc.hold is not None)
 
-    def _check_room(self, host: str, client: ClientId) -> None:
-        """Refuses what is too much at once; what this burst has brought already counts."""
-        coming = self._coming() if self._batch else []
-        if self.core.waiting + len(coming) >= self.limits.max_queued:
-            raise Refused("queue_full", f"{self.limits.max_queued} requests already wait; try again later")
-        most = self.limits.max_requests_per_client
-        if coming.count(client) + self.core.count_of(client) >= most:
-            raise Refused("too_many", f"{client} already has {most} open requests, the most; cancel one")
-        most = self.limits.max_requests_per_host
-        if self.core.count_of_owner(host) + sum(one.startswith(f"{host}/") for one in coming) >= most:
-            raise Refused("too_many", f"clients of {host} already have {most} open requests, the most; cancel one")
+    def _coming(self) -> list[ClientId]:
+        """The clients of the requests of this burst."""
+        return [event.request.client for event in self._batch.values() if isinstance(event, Requested)]
 
     def _forecast(self, query: Query, asked: Foresee, sender: Sender) -> None:
         self.flush()
@@ -312,8 +303,7 @@ class RequestHandler:
         if self.core.arc(arc) is not None:
             raise Refused("bad_request", f"{asked.id} is already a request; ask how it stands")
         now = self.mesh.now()
-        self._authority.check_ask(sender, asked, lambda names: self._open_of(names, arc))
-        request = admit(asked, str(sender), arc, self.core, self.limits)
+        request = self._admission.admit(asked, sender, self)
         if asked.check:
             self.check_door(asked.needs, waits=asked.wait_for_device)
         expected = forecast(self.core, now, request, self._runtimes)
@@ -438,17 +428,10 @@ class RequestHandler:
         if not moves or moves[0].arc != arc_id(sender, operation.id):
             self._answer_handed_over(query, operation, sender, to)
             return
-        self._check_room_for(moves, sender, to)
         arcs = [arc for move in moves if (arc := self.core.arc(move.arc)) is not None]
         # An ARC that is open at its new client already is replaced by the one that comes.
-        replaced = [move.renamed for move in moves]
-        self._authority.check_hand_over(
-            client_of(sender),
-            client_of(to),
-            arcs,
-            lambda names: self._open_of(names, *replaced),
-            lambda names: self._held_by(names, *replaced),
-        )
+        replaced = [move.renamed for move in moves if self.core.is_open(move.renamed)]
+        self._admission.check_hand_over(client_of(sender), client_of(to), arcs, replaced, self)
         for move in moves:
             self._registry.rename(move.arc, move.renamed)
         places = {move.renamed: place for move in moves if (place := self.core.place_of(move.arc)) is not None}
@@ -459,16 +442,6 @@ class RequestHandler:
         queued = [move.renamed for move in moves if self.core.is_queued(move.renamed)]
         self.notices += self._registry.present(self.mesh.now(), queued)
         query.answer(self._registry.notice(self.mesh.now(), moves[0].renamed))
-
-    def _check_room_for(self, moves: Collection[HandedOver], sender: ClientId, to: ClientId) -> None:
-        added = sum(self.core.arc(move.renamed) is None for move in moves)
-        host = to.partition("/")[0]
-        rooms = [(f"{to} has", self.limits.max_requests_per_client - self.core.count_of(to))]
-        if host != sender.partition("/")[0]:
-            rooms.append((f"the clients of {host} have", self.limits.max_requests_per_host - self._open_of((host,))))
-        for who, room in rooms:
-            if added > room:
-                raise Refused("too_many", f"{who} room for {max(0, room)} more requests, not for {added}")
 
     def _moves(self, operation: HandOver, sender: ClientId, to: ClientId) -> list[HandedOver]:
         """What a hand-over comes to: of the ARCs that it names, those that are open at the sender."""
@@ -495,53 +468,3 @@ class RequestHandler:
         arcs = [arc_id(to, one) for one in (operation.id, *operation.others)]
         self.notices += self._registry.present(self.mesh.now(), arcs)
         query.answer(self._registry.notice(self.mesh.now(), goal))
-
-
-def check_place(place: Place, core: Core) -> None:
-    """Raises Refused for a place that no RCM can have given."""
-    if absurd(place.term, core.term):
-        raise Refused("bad_request", "place has a future term; omit it")
-    if place.term > core.term:
-        raise Refused("old_term", "place has a higher term than this leader; ask the leader of that term", core.term)
-    if place.arrival < 1 or not core.could_have_issued(place):
-        raise Refused("bad_request", "place was never given; omit it")
-
-
-def admit(
-    ask: Ask | Foresee, client: ClientId, arc: ArcId, core: Core, limits: RcmLimits, who: Who | None = None
-) -> ArcRequest:
-    """The request, if it may be made. Raises Refused with what is wrong and how to mend it."""
-    if not ask.needs:
-        raise Refused("bad_request", "needs is empty; name at least one device")
-    if len(ask.needs) > limits.max_needs:
-        raise Refused("bad_request", f"{len(ask.needs)} needs; at most {limits.max_needs} are allowed")
-    if not -MAX_PRIORITY <= ask.priority <= MAX_PRIORITY:
-        raise Refused("bad_request", f"priority must lie between -{MAX_PRIORITY} and {MAX_PRIORITY}")
-    if isinstance(ask, Ask) and ask.place is not None:
-        check_place(ask.place, core)
-    try:
-        check_name(ask.arc, "arc")
-        continues = ask.continues if isinstance(ask, Ask) else ""
-        if continues:
-            check_name(continues, "continues")
-        for name, params in ask.needs.items():
-            check_need(name)
-            if len(params) > MAX_PARAMS:
-                raise ValueError(f"{name} has more than {MAX_PARAMS} parameters")
-            for parameter in params:
-                check_name(parameter, f"parameter of {name}")
-        needs = {name: exact_amounts(params) if params else {} for name, params in ask.needs.items()}
-        return ArcRequest(
-            arc=arc,
-            client=client,
-            needs=needs,
-            priority=ask.priority,
-            min_runtime=duration(ask.min_runtime, "min_runtime"),
-            keep=ask.keep,
-            label=ask.arc,
-            direct=isinstance(ask, Ask) and ask.direct,
-            continues=continues,
-            who=who,
-        )
-    except (BadName, ValueError) as error:
-        raise Refused("bad_request", str(error)) from None

@@ -4,20 +4,27 @@ from __future__ import annotations
 
 from decimal import Decimal
 from fractions import Fraction
+from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec import structs
 
+from zscout.config.access import AccessPolicy, Roles
+from zscout.config.fleet import default_fleet
 from zscout.drivers.holds import HoldTable
 from zscout.messages import ClientRequests, Holder, HoldView, OpenRequest, RcmState, RcState
+from zscout.rcm.admission import Admission
+from zscout.rcm.authority import Authority
+from zscout.rcm.places import Places
+from zscout.rcm.recovery import RecoveredState, recover
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import LeadTaken, RcJoined
+from zscout.scheduling.model import ArcRequest, ArcStatus, LeadTaken, RcJoined
 from zscout.scheduling.strategies import STRATEGIES
-from zscout.services.rcm.recovery import RecoveredState, recover
 from zscout.types import SECOND, Grant, Ns, Place, Term
 
 NOW: Ns = 1000 * SECOND
-OLD, TERM = Term(2, "aa"), Term(3, "bb")
+OLD, TERM, LATER = Term(2, "aa"), Term(3, "bb"), Term(4, "cc")
 PLACE = Place(OLD, 7)
 GANG = ("robot/a", "radio/b")
 
@@ -47,6 +54,15 @@ def client(*requests: OpenRequest, name: str = "h/one") -> ClientRequests:
 
 BOTH = [rc("robot/a", hold()), rc("radio/b", hold(params={"rate": Decimal("2.5")}))]
 RUNS = client(asked(grant=Grant(TERM, 5)))
+
+
+def plain() -> Admission:
+    fleet = default_fleet()
+    return Admission(fleet.limits, Authority(fleet), Places("test", None, LATER))
+
+
+def recover_plain(states: list[RcState], clients: list[ClientRequests], now: Ns) -> RecoveredState:
+    return recover(states, clients, now, plain())
 
 
 ALONE = ("robot/a",)
@@ -89,13 +105,13 @@ def summary(found: RecoveredState) -> tuple[list[str], list[str]]:
     ],
 )
 def test_recover(states: list[RcState], clients: list[ClientRequests], holds: list[str], waiting: list[str]) -> None:
-    found = recover(states, clients, NOW)
+    found = recover_plain(states, clients, NOW)
     assert summary(found) == (holds, waiting)
     assert found.rcs == {state.rc: state for state in states}
 
 
 def test_a_standing_hold_is_carried_on_as_it_is() -> None:
-    (held,) = recover(BOTH, [RUNS], NOW).holds
+    (held,) = recover_plain(BOTH, [RUNS], NOW).holds
     assert (held.grant, held.place) == (Grant(TERM, 5), PLACE)
     assert (held.start, held.end) == (NOW - 50 * SECOND, NOW + 10 * SECOND)
     request = held.request
@@ -106,12 +122,12 @@ def test_a_standing_hold_is_carried_on_as_it_is() -> None:
 
 def test_clocks_differ_a_little_and_the_earliest_end_counts() -> None:
     states = [rc("robot/a", hold(remaining=10)), rc("radio/b", hold(remaining=9.5))]
-    (held,) = recover(states, [], NOW).holds
+    (held,) = recover_plain(states, [], NOW).holds
     assert held.end == NOW + 9_500_000_000
 
 
 def test_the_parameters_at_an_absent_rc_are_what_the_client_says() -> None:
-    (held,) = recover(BOTH[:1], [RUNS], NOW).holds
+    (held,) = recover_plain(BOTH[:1], [RUNS], NOW).holds
     assert held.request.needs["radio/b"] == {"rate": Fraction(5, 2)}
 
 
@@ -141,7 +157,7 @@ ASKED = client(asked(grant=Grant(TERM, 5), needs=tuple(BOUND)))
     ],
 )
 def test_patterns_and_what_meets_them_are_restored(states: list[RcState], clients: list[ClientRequests]) -> None:
-    found = recover(states, clients, NOW)
+    found = recover_plain(states, clients, NOW)
     (held,) = found.holds
     rate = {"rate": Fraction(5, 2)}
     assert held.request.needs == {"robot/*": {}, "radio/*": rate, "radio/*#2": rate}
@@ -162,12 +178,12 @@ def test_an_rc_that_read_of_its_hold_in_a_snapshot_passes_on_its_binding() -> No
     view = HoldView("gang-id", "gang", "h/one", 3, grant, PLACE, needs, Decimal(60), 50, 10, bound=bound)
     holding = HoldTable("robot/a", hold_lease=3 * SECOND)
     holding.apply_snapshot(RcmState(TERM, 5, "h", [view]), NOW)
-    (held,) = recover([rc("robot/a", *holding.holders(NOW))], [], NOW).holds
+    (held,) = recover_plain([rc("robot/a", *holding.holders(NOW))], [], NOW).holds
     assert (held.request.needs, held.bound) == ({"robot/*": {}}, {"robot/*": "robot/a"})
 
 
 def test_half_a_gang_waits_for_its_patterns() -> None:
-    found = recover([*BY_PATTERN[:2], rc("radio/c")], [], NOW)
+    found = recover_plain([*BY_PATTERN[:2], rc("radio/c")], [], NOW)
     assert summary(found) == ([], ["gang"])
     assert found.waiting[0].request.needs.keys() == BOUND.keys()
 
@@ -176,7 +192,7 @@ def test_what_waits_by_pattern_waits_on_and_nonsense_does_not() -> None:
     good = asked("good", needs=("radio/*", "radio/*#2"), place=Place(OLD, 8))
     bad = [asked(f"bad-{at}", needs=(need,)) for at, need in enumerate(("radio/**", "radio/*#0", "*/*/*"))]
     cross = asked("cross", needs=("radio/*", "*/rf0"))
-    found = recover([], [client(good, *bad, cross)], NOW)
+    found = recover_plain([], [client(good, *bad, cross)], NOW)
     assert summary(found) == ([], ["good"])
     assert found.waiting[0].request.needs.keys() == {"radio/*", "radio/*#2"}
 
@@ -195,26 +211,37 @@ def test_what_waits_by_pattern_waits_on_and_nonsense_does_not() -> None:
         pytest.param({"*/a": "robot/a", "radio/*": "radio/b"}, id="patterns that may not stand together"),
     ],
 )
-def test_a_hold_with_a_wrong_binding_is_left_out(
-    bound: dict[str, str], missing: str | None, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_hold_with_a_wrong_binding_is_left_out(bound: dict[str, str], missing: str | None) -> None:
     wrong = [
         rc(name, *([] if name == missing else [bound_hold(bound, RATE if name.startswith("radio") else {})]))
         for name in THREE
     ]
     other = rc("robot/x", hold(("robot/x",), name="good"))
-    assert summary(recover([*wrong, other], [], NOW)) == (["good"], [])
-    assert "the hold of h/one/gang-id is not carried on: " in caplog.text
+    found = recover_plain([*wrong, other], [], NOW)
+    assert summary(found) == (["good"], [])
+    assert found.remarks[0].startswith("the hold of h/one/gang-id is not carried on: ")
 
 
 def test_what_waits_keeps_place_and_parameters() -> None:
     place = Place(OLD, 9)
-    (waits,) = recover([], [client(asked(place=place, rate="0.1", waited=2.5))], NOW).waiting
+    (waits,) = recover_plain([], [client(asked(place=place, rate="0.1", waited=2.5))], NOW).waiting
     assert (waits.place, waits.since) == (place, NOW - 2_500_000_000)
     assert waits.request.needs == {"robot/a": {}, "radio/b": {"rate": Fraction(1, 10)}}
 
 
 def test_requests_of_two_clients_may_share_an_id() -> None:
     clients = [client(asked(), name="h/one"), client(asked(), name="h/two")]
-    found = recover([], clients, NOW)
+    found = recover_plain([], clients, NOW)
     assert [one.request.arc for one in found.waiting] == ["h/one/gang-id", "h/two/gang-id"]
+
+
+@pytest.mark.parametrize("vouched", [True, False])
+def test_a_hold_known_from_rcs_only_is_not_vouched_for_by_another_report(vouched: bool) -> None:
+    """With certificates. A run of the fault simulator (seed 1466) found it."""
+    access = AccessPolicy(Roles(client=("h",), manager=("m",)))
+    fleet = structs.replace(default_fleet(), security=Path("keys"), access=access)
+    admission = Admission(fleet.limits, Authority(fleet), Places("test", None, LATER))
+    request = ArcRequest("h/one/gang-id", "h/one", {"robot/a": {}}, 3, 60 * SECOND)
+    known = ArcStatus(request, PLACE, None, request.needs, {}, NOW, 0, 0, None, None, vouched)
+    found = recover([rc("robot/a", hold(ALONE))], [], NOW, admission, known=lambda _: known)
+    assert [(held.vouched, held.place) for held in found.holds] == [(vouched, PLACE if vouched else None)]

@@ -14,10 +14,9 @@ from msgspec import structs
 from zscout.config.fleet import Fleet
 from zscout.config.scheduling_policy import RcQuota, SchedulingPolicy
 from zscout.keyexpr import NODES, USERS, Rank, Sender, as_pattern, is_pattern
-from zscout.mesh import Refused
-from zscout.messages import Amounts, Ask, Foresee, Who, decimal_seconds, duration
-from zscout.scheduling.model import ArcStatus
-from zscout.types import ClientId, RcName
+from zscout.messages import Refused, Who
+from zscout.scheduling.model import ArcRequest, ArcStatus
+from zscout.types import SECOND, ClientId, HostName, Ns, RcName
 
 OPERATORS: Final[frozenset[Rank]] = frozenset({"operator"})
 
@@ -26,7 +25,7 @@ class Authority:
     """The rights of all names, as the fleet file has them at present."""
 
     def __init__(self, fleet: Fleet) -> None:
-        self._policy, self._enforced = fleet.access, fleet.security is not None
+        self._policy, self.enforced = fleet.access, fleet.security is not None
         self._operator_priority = fleet.operator_priority
 
     def reload(self, fleet: Fleet) -> None:
@@ -41,7 +40,7 @@ class Authority:
             listed = reversed([*self._policy.groups.items()])
             groups = {name: group for group, members in listed for name in members}
             policy = replace(policy, fair_shares=replace(policy.fair_shares, groups=groups))
-        if not self._enforced:
+        if not self.enforced:
             return policy
         names = list(self._policy.ranks)
         quotas = {
@@ -58,30 +57,23 @@ class Authority:
             barred={name: found for name in names if (found := self._barred(name))},
         )
 
-    def check_ask(self, sender: Sender, ask: Ask | Foresee, open_by: Callable[[Collection[str]], int]) -> None:
-        """Raises Refused for what `sender` may not ask for. `open_by`: how many ARCs some names have open."""
-        if not self._enforced:
+    def check_ask(self, name: str, asked: ArcRequest, open_by: Callable[[Collection[str]], int]) -> None:
+        """Raises Refused for what `name` may not ask for. `open_by`: how many ARCs some names have open."""
+        if not self.enforced:
             return
-        name = sender.host
         self._check_rank(name, "request devices", USERS)
-        ceiling, most = self._policy.ceiling(name), None
-        if "operator" not in self._policy.ranks_of(name):
-            most = self._operator_priority - 1
-        if ceiling.priority is not None:
-            most = ceiling.priority if most is None else min(most, ceiling.priority)
-        if most is not None and ask.priority > most:
-            raise self._refused(name, f"request priority {ask.priority}; at most {most}")
-        if ceiling.runtime:
-            if ask.keep:
-                raise self._refused(name, "keep a hold")
-            if duration(ask.min_runtime, "min_runtime") > ceiling.runtime:
-                what = f"request {ask.min_runtime} s; at most {ceiling.runtime / 1e9:g}"
-                raise self._refused(name, what)
-        for need in ask.needs:
+        most, longest = self.highest(name), self.longest(name)
+        if most is not None and asked.priority > most:
+            raise self._refused(name, f"request priority {asked.priority}; at most {most}")
+        if longest and asked.keep:
+            raise self._refused(name, "keep a hold")
+        if longest and asked.min_runtime > longest:
+            raise self._refused(name, f"request {asked.min_runtime / SECOND:g} s; at most {longest / SECOND:g}")
+        for need in asked.needs:
             if not is_pattern(need) and not self.may_hold(name, need):
                 raise self._not_its(name, need)
         for owner, members, quota in self._policy.quotas_of(name):
-            if quota.rcs is not None and len(ask.needs) > quota.rcs:
+            if quota.rcs is not None and len(asked.needs) > quota.rcs:
                 raise Refused(
                     "not_allowed",
                     f"{owner} may hold {quota.rcs} devices at one time, and this request needs more; name fewer",
@@ -89,9 +81,26 @@ class Authority:
             if quota.arcs is not None and open_by(members) >= quota.arcs:
                 raise Refused("not_allowed", f"{owner} has {quota.arcs} open requests, its quota; cancel one")
 
+    def highest(self, name: str) -> int | None:
+        """The highest priority that this name may ask for; None: any."""
+        if not self.enforced:
+            return None
+        most = self._policy.ceiling(name).priority
+        if "operator" in self._policy.ranks_of(name):
+            return most
+        below = self._operator_priority - 1
+        return below if most is None else min(below, most)
+
+    def longest(self, name: str) -> Ns:
+        """The longest minimum runtime that this name may ask for; 0: any, and it may keep."""
+        return self._policy.ceiling(name).runtime if self.enforced else 0
+
+    def may_lead(self, host: HostName) -> bool:
+        return not self.enforced or "manager" in self._policy.ranks_of(host)
+
     def known_as(self, sender: Sender, who: Who | None) -> Who | None:
         """Who asks, as people are told it: whoever it says to be, its user is the one that its certificate names."""
-        return structs.replace(who, user=sender.host) if who is not None and self._enforced else who
+        return structs.replace(who, user=sender.host) if who is not None and self.enforced else who
 
     def check_hand_over(
         self,
@@ -103,14 +112,12 @@ class Authority:
     ) -> None:
         """Raises Refused where the new client may not have what it is given. `open_by`, `held_by`: how many ARCs some
         names have open, and how many RCs they hold."""
-        if not self._enforced:
+        if not self.enforced:
             return
         self._check_rank(to.host, "take over a request", USERS)
         for arc in arcs:
-            request = arc.request
-            wanted: dict[str, Amounts] = {need: {} for need in (request.needs if arc.hold is None else arc.needs)}
-            seconds = decimal_seconds(request.min_runtime)
-            self.check_ask(to, Ask("", "", wanted, request.priority, seconds, request.keep), lambda _: 0)
+            wanted = arc.request if arc.hold is None else structs.replace(arc.request, needs=arc.needs)
+            self.check_ask(to.host, wanted, lambda _: 0)
         running = sum(len(arc.needs) for arc in arcs if arc.hold is not None)
         for owner, members, quota in self._policy.quotas_of(to.host):
             if sender.host in members:
@@ -124,21 +131,21 @@ class Authority:
 
     def check_operator(self, sender: Sender, what: str) -> None:
         """Raises Refused for all but operators. `what` stands behind `may not`."""
-        if self._enforced:
+        if self.enforced:
             self._check_rank(sender.host, what, OPERATORS)
 
     def check_user(self, sender: Sender, what: str) -> None:
         """Raises Refused for who may only look."""
-        if self._enforced:
+        if self.enforced:
             self._check_rank(sender.host, what, USERS)
 
     def check_machine(self, sender: Sender, what: str) -> None:
         """Raises Refused for all but the placer, and components that move."""
-        if self._enforced:
+        if self.enforced:
             self._check_rank(sender.host, what, NODES)
 
     def may_hold(self, name: str, rc: RcName) -> bool:
-        holders = self._policy.holders(rc) if self._enforced else None
+        holders = self._policy.holders(rc) if self.enforced else None
         return holders is None or name in holders
 
     def _barred(self, name: str) -> tuple[str, ...]:
@@ -150,7 +157,7 @@ class Authority:
     def is_removed(self, client: ClientId) -> bool:
         """Whether this client's name has no role any more that lets it hold anything."""
         ranks = self._policy.ranks_of(client.partition("/")[0])
-        return self._enforced and not ranks & USERS
+        return self.enforced and not ranks & USERS
 
     def _check_rank(self, name: str, what: str, needed: Collection[Rank]) -> None:
         if why := self._policy.refusal(name, what, needed):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from decimal import Decimal
 from pathlib import Path
 
 import pytest
@@ -12,9 +11,8 @@ from zscout.config.fleet import load_fleet
 from zscout.config.scheduling_policy import DEFAULT, FairShares, SchedulingPolicy
 from zscout.keyexpr import Sender
 from zscout.mesh import Refused
-from zscout.messages import Ask
+from zscout.rcm.authority import Authority
 from zscout.scheduling.model import ArcRequest, ArcStatus, Hold
-from zscout.services.authority import Authority
 from zscout.types import NO_TERM, SECOND, Grant, Place
 
 FILE = """
@@ -48,8 +46,8 @@ def authority(folder: Path, text: str = FILE) -> Authority:
     return Authority(load_fleet(folder / "fleet.toml"))
 
 
-def ask(*needs: str, priority: int = 1, keep: bool = False, min_runtime: int = 5) -> Ask:
-    return Ask("q1", "survey", {need: {} for need in needs}, priority, Decimal(min_runtime), keep)
+def ask(*needs: str, priority: int = 1, keep: bool = False, min_runtime: int = 5) -> ArcRequest:
+    return ArcRequest("h/c1/q1", "h/c1", {need: {} for need in needs}, priority, min_runtime * SECOND, keep)
 
 
 def refusal(check: Callable[[], None]) -> str:
@@ -89,16 +87,16 @@ def test_who_is_in_several_groups_counts_in_the_first(tmp_path: Path) -> None:
         ("eve", ask("a/1", "a/2", "a/3", "a/4"), TOO_MANY_RCS),
     ],
 )
-def test_what_a_name_may_ask_for(tmp_path: Path, name: str, asked: Ask, why: str) -> None:
+def test_what_a_name_may_ask_for(tmp_path: Path, name: str, asked: ArcRequest, why: str) -> None:
     told = authority(tmp_path)
-    assert refusal(lambda: told.check_ask(Sender(name, "c1"), asked, lambda _: 0)) == why
+    assert refusal(lambda: told.check_ask(name, asked, lambda _: 0)) == why
 
 
 def test_a_name_has_no_more_arcs_open_than_its_quota(tmp_path: Path) -> None:
     told = authority(tmp_path)
-    told.check_ask(Sender("bob", "c1"), ask("robot/scout1"), lambda names: len(names))
+    told.check_ask("bob", ask("robot/scout1"), lambda names: len(names))
     with pytest.raises(Refused, match="bob has 2 open requests, its quota; cancel one"):
-        told.check_ask(Sender("bob", "c1"), ask("robot/scout1"), lambda names: 2 * len(names))
+        told.check_ask("bob", ask("robot/scout1"), lambda names: 2 * len(names))
 
 
 def given(*needs: str, priority: int = 1, keep: bool = False, runs: bool = False) -> ArcStatus:
@@ -156,12 +154,12 @@ def test_who_is_named_no_more_has_no_rights_once_the_file_is_read_again(tmp_path
     told.reload(load_fleet(tmp_path / "fleet.toml"))
     assert told.is_removed("bob/c1")
     with pytest.raises(Refused, match="bob, which has no role here, may not request devices"):
-        told.check_ask(Sender("bob", "c1"), ask("robot/scout1"), lambda _: 0)
+        told.check_ask("bob", ask("robot/scout1"), lambda _: 0)
 
 
 def test_without_certificates_nothing_is_refused(tmp_path: Path) -> None:
     told = authority(tmp_path, FILE.replace('[security]\nfolder = "keys"', ""))
-    told.check_ask(Sender("mallory", "c1"), ask("robot/arm1", priority=1_000_000, keep=True), lambda _: 1_000)
+    told.check_ask("mallory", ask("robot/arm1", priority=1_000_000, keep=True), lambda _: 1_000)
     told.check_operator(Sender("mallory", "c1"), "drain hosts")
     assert told.bound(DEFAULT) == DEFAULT
     assert not told.is_removed("mallory/c1")

@@ -10,8 +10,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from decimal import Decimal
 
 from zscout.keyexpr import is_pattern, matcher
-from zscout.mesh import Refused
-from zscout.messages import Amounts, Parameters
+from zscout.messages import Amounts, Parameters, Refused
 from zscout.types import Need, RcName
 
 MAX_NAMED = 8

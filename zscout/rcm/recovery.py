@@ -1,0 +1,406 @@
+"""What is in force when a new RCM takes the lead, from the answers of RCs and clients; and what RCs hold that join
+later. Pure.
+
+RCs know the holds, clients their requests and places. A hold is recovered if every RC of its gang is there and holds it
+under the same grant; one that an RC of the gang does not hold is broken, and queued again with its place. While an RC
+of the gang has not answered, the others are pending (`membership.py`). What a client that answers does not ask for any
+more is not carried on: it gave it up while nobody led.
+
+With certificates an RC is trusted for the grant, its RCs and the remaining time; its client for the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from decimal import Decimal
+from itertools import islice
+from operator import attrgetter
+from typing import Final, NamedTuple
+
+from msgspec.structs import replace
+
+from zscout.keyexpr import NAME, BadName, check_name, check_need, check_rc, client_of, is_pattern, matcher
+from zscout.messages import (
+    MAX_ERROR,
+    BookingRecord,
+    ClientRequests,
+    Holder,
+    OpenRequest,
+    Problem,
+    RcState,
+    Refused,
+    duration,
+    exact_amounts,
+)
+from zscout.rcm.admission import Admission, LetIn, binding
+from zscout.rcm.places import arc_id, request_id
+from zscout.scheduling.model import Adopted, ArcRequest, ArcStatus, RecoveredHold, Released, Requested, Vouched
+from zscout.types import NO_TERM, SECOND, ArcId, ClientId, Grant, HostName, Need, Ns, Params, Place, RcName
+
+REMOVED: Final = "the fleet file, which names its owner under no role"
+
+
+class NotLetIn(NamedTuple):
+    """A listed request, refused as an Ask would be."""
+
+    arc: ArcId
+    name: str
+    problem: Problem
+
+
+@dataclass(slots=True)
+class RecoveredState:
+    """What was in force when the lead was taken: the RCs that promised, holds, queue."""
+
+    rcs: dict[str, RcState] = field(default_factory=dict)
+    pending: list[RcState] = field(default_factory=list)
+    """What those RCs hold they hold together with others that have not answered, which may come a little later."""
+    patient: bool = False
+    """Whether links may be coming back, so that those others have a lease to answer, seen or not."""
+    given_up: set[ArcId] = field(default_factory=set)
+    """Of that, what its client does not ask for any more."""
+    holds: list[RecoveredHold] = field(default_factory=list)
+    waiting: list[Requested] = field(default_factory=list)
+    expected: dict[str, set[ClientId]] = field(default_factory=dict)
+    """By request id: the clients to which it is to be handed over, as they say."""
+    believed: dict[ArcId, Sequence[RcName]] = field(default_factory=dict)
+    """Of what waits: the RCs that its client believes to hold. They may not have answered yet."""
+    answered: set[ClientId] = field(default_factory=set)
+    """The clients that have said what they ask for."""
+    charged: Mapping[str, float] = field(default_factory=dict)
+    """By group: what it lately had, as the leader before told (`fair_shares.py`)."""
+    refused: list[NotLetIn] = field(default_factory=list)
+    booked: set[str] = field(default_factory=set)
+    """Dates of bookings that only RCs report as taken up: they do not lapse meanwhile."""
+    remarks: list[str] = field(default_factory=list)
+    """For the log."""
+
+
+def aged(state: RcState, by: Ns) -> RcState:
+    """What an RC answered that long ago, as it would answer now."""
+    return replace(state, holders=[replace(one, remaining=one.remaining - by / SECOND) for one in state.holders])
+
+
+def take_over(
+    states: Iterable[RcState],
+    clients: Collection[ClientRequests],
+    now: Ns,
+    admission: Admission,
+    home_of: Callable[[RcName], HostName | None] = lambda _: None,
+    record_of: Callable[[str], BookingRecord | None] = lambda _: None,
+) -> RecoveredState:
+    """What a new leader recovers. RCs whose gangs have not all answered are `pending`: their holds are not decided.
+    `home_of`: the host at which the fleet file has an RC; one that is free elsewhere is taken in later, as its device
+    may still be used at home. `record_of`: the known record of a booking."""
+    states = [state for state in states if state.holders or home_of(state.rc) in (None, state.host)]
+    # Of two instances of one RC the one with the newest hold is meant, else the one at home.
+    by_host = sorted(states, key=attrgetter("host", "instance"), reverse=True)
+    by_host.sort(key=lambda state: state.host == home_of(state.rc))
+    answered = {state.rc: state for state in sorted(by_host, key=_newest_grant)}
+    pending = {rc for rc in answered if not gangs_of(rc, answered) <= answered.keys()}
+    let_in = [state for rc, state in answered.items() if rc not in pending]
+    held = [holder for rc in sorted(pending) for holder in answered[rc].holders]
+    undecided = {(arc_id(one.client, one.id), one.grant) for one in held}
+    result = recover(let_in, clients, now, admission, record_of, undecided=undecided)
+    result.pending = [answered[rc] for rc in sorted(pending)]
+    asked = {one.client: {request.id for request in one.requests} for one in clients}
+    result.given_up = {arc_id(one.client, one.id) for one in held if one.id not in asked.get(one.client, {one.id})}
+    return result
+
+
+def _newest_grant(state: RcState) -> Grant:
+    return max((holder.grant for holder in state.holders), default=Grant(NO_TERM, 0))
+
+
+def gangs_of(rc: RcName, states: Mapping[RcName, RcState]) -> set[RcName]:
+    """`rc`, all RCs of its gangs by `states`, and all of theirs."""
+    found, left = set[RcName](), {rc}
+    while left:
+        one = left.pop()
+        found.add(one)
+        if one in states:
+            left |= {other for holder in states[one].holders for other in holder.rcs} - found
+    return found
+
+
+# Listed requests
+
+
+class Listed(NamedTuple):
+    """A valid request in its client's words, with a place and a booking only if they are its own."""
+
+    request: ArcRequest
+    place: Place | None
+    expects: bool = False
+    """It has no place yet: its Ask was not answered, or another client hands it over."""
+    waited: float = 0.0
+    grant: Grant | None = None
+    """The hold that its client believes in,"""
+    rcs: Sequence[RcName] = ()
+    """and its RCs."""
+    problem: Problem | None = None
+    """The reason why it may not have its place or booking."""
+
+
+def _listed(
+    result: RecoveredState,
+    clients: Iterable[ClientRequests],
+    admission: Admission,
+    record_of: Callable[[str], BookingRecord | None],
+) -> dict[ArcId, Listed]:
+    """The valid requests; of each client at most as many as it may have open."""
+    found, most = dict[ArcId, Listed](), admission.limits.max_requests_per_client
+    for answer in clients:
+        if len(answer.requests) > most:
+            result.remarks.append(f"{answer.client} lists {len(answer.requests)} requests: {most} are looked at")
+        for request in islice(answer.requests, most):
+            try:
+                client_of(answer.client)
+                check_name(request.id, "id")
+                listed = listed_by(answer.client, request, admission, record_of)
+                found[listed.request.arc] = listed
+            except Refused as refused:
+                name = request.arc if NAME.fullmatch(request.arc) else request.id
+                result.refused.append(NotLetIn(arc_id(answer.client, request.id), name, refused.problem))
+            except BadName as error:
+                result.remarks.append(f"what a client lists is passed over: {error}")
+    return found
+
+
+def listed_by(
+    client: ClientId, asked: OpenRequest, admission: Admission, record_of: Callable[[str], BookingRecord | None]
+) -> Listed:
+    """Raises Refused."""
+    sender = client_of(client)
+    request, place, problem = admission.form(asked, sender), None, None
+    try:
+        place = admission.listed_place(asked, client)
+        if asked.booking:
+            record = record_of(asked.booking.partition("@")[0])
+            request = replace(request, booking=admission.listed_booking(asked, sender, record))
+    except Refused as refused:
+        problem = refused.problem
+    return Listed(request, place, asked.place is None, asked.waited, asked.grant, asked.rcs, problem)
+
+
+def _enter(
+    result: RecoveredState,
+    listed: Mapping[ArcId, Listed],
+    over: Collection[tuple[Place, str]],
+    undecided: Collection[tuple[ArcId, Grant | None]],
+    now: Ns,
+    admission: Admission,
+) -> None:
+    """Admit the waiting requests as if they were asked for, the earliest places first. `over`: places and ids of
+    recovered holds. `undecided`: holds of pending RCs, which may yet continue: they are clamped instead."""
+    let_in, running = LetIn(), {held.request.arc for held in result.holds}
+    for held in result.holds:
+        let_in.add(held.request, waits=False)
+    waiting = [known for arc, known in listed.items() if arc not in running]
+    for known in sorted(waiting, key=lambda known: (known.place is None, known.place or ())):
+        request = known.request
+        if known.expects:
+            result.expected.setdefault(request_id(request.arc), set()).add(request.client)
+        elif (known.place, request_id(request.arc)) not in over:
+            # Else it was handed over, and its client missed the answer: what the RCs hold counts.
+            try:
+                if known.problem is not None:
+                    raise Refused.by(known.problem)
+                if (request.arc, known.grant) in undecided:
+                    request = admission.clamped(request)
+                else:
+                    admission.check(request, let_in)
+            except Refused as refused:
+                result.refused.append(NotLetIn(request.arc, request.label, refused.problem))
+                continue
+            let_in.add(request, waits=True)
+            result.waiting.append(Requested(request, known.place, now - round(known.waited * SECOND)))
+            if known.grant is not None:
+                result.believed[request.arc] = known.rcs
+
+
+# Reported holds
+
+
+def recover(
+    states: Iterable[RcState],
+    clients: Collection[ClientRequests],
+    now: Ns,
+    admission: Admission,
+    record_of: Callable[[str], BookingRecord | None] = lambda _: None,
+    known: Callable[[ArcId], ArcStatus | None] = lambda _: None,
+    undecided: Collection[tuple[ArcId, Grant | None]] = (),
+) -> RecoveredState:
+    """Combine the answers. Malformed parts are left out, and the rest is recovered. `known`: ARCs open here already;
+    `undecided`: holds of pending RCs."""
+    result = RecoveredState(rcs={state.rc: state for state in states})
+    result.answered = {one.client for one in clients}
+    listed = _listed(result, clients, admission, record_of)
+    parts: dict[tuple[str, Grant], dict[RcName, Holder]] = {}
+    for state in result.rcs.values():
+        for holder in state.holders:
+            parts.setdefault((arc_id(holder.client, holder.id), holder.grant), {})[state.rc] = holder
+    seen, places = set[ArcId](), set[tuple[Place, str]]()
+    for (arc, grant), held in sorted(parts.items(), key=lambda item: item[0][1], reverse=True):
+        if arc in seen:
+            continue
+        if grant.term >= admission.places.term:
+            result.remarks.append(f"the hold of {arc} is not carried on: its grant is of no earlier term")
+            continue
+        seen.add(arc)
+        some, mine = _most_telling(held), listed.get(arc)
+        if mine is None and some.client in result.answered:
+            result.remarks.append(f"{arc} is given up by its client")
+            continue
+        if mine is None and (status := known(arc)) is not None and status.vouched:
+            mine = Listed(status.request, status.place)
+        try:
+            hold = _hold(arc, grant, held, mine, now, admission)
+        except (BadName, ValueError) as error:
+            result.remarks.append(f"the hold of {arc} is not carried on: {str(error)[:MAX_ERROR]}")
+            continue
+        # The core ends a gang with an absent RC, and names what was lost; a present RC without it breaks it.
+        whole = all(name in held or name not in result.rcs for name in some.rcs)
+        if whole and hold is not None:
+            result.holds.append(hold)
+            if hold.vouched:
+                places.add((some.place, some.id))
+            elif some.booking:
+                result.booked.add(some.booking)
+        elif hold is not None and not admission.closed and (mine is None or mine.expects):
+            result.waiting.append(Requested(hold.request, some.place))
+            listed.pop(arc, None)
+    _enter(result, listed, places, undecided, now, admission)
+    result.waiting.sort(key=lambda one: (one.place is None, one.place))
+    return result
+
+
+def _most_telling(held: Mapping[RcName, Holder]) -> Holder:
+    """An RC from before there were patterns passes on nothing about them."""
+    return max(held.values(), key=lambda holder: len(holder.bound))
+
+
+def _hold(
+    arc: ArcId, grant: Grant, held: Mapping[RcName, Holder], mine: Listed | None, now: Ns, admission: Admission
+) -> RecoveredHold | None:
+    """A hold as these RCs report it, with the request of its client if that answered; None: the client asks for
+    something else. Raises BadName, ValueError."""
+    some = _most_telling(held)
+    end = now + round(min(holder.remaining for holder in held.values()) * SECOND)
+    direct = any(holder.direct for holder in held.values()) or (mine is not None and mine.request.direct)
+    bound: Mapping[Need, RcName] = some.bound
+    place: Place | None = some.place
+    if not admission.closed:
+        request = _told(arc, some, _needs(held, mine, _patterns(some)))
+    elif mine is None:
+        for rc in some.rcs:
+            check_rc(rc)
+        request, bound, place = _told(arc, some, _needs(held, None, {})), {}, None
+        request = replace(request, continues="", booking="", who=None)
+    else:
+        found = binding(mine.request.needs, some.rcs, bound)
+        if found is None or not _agree(mine.request.needs, found, held):
+            return None
+        request, bound = mine.request, found
+        place = some.place if mine.expects else mine.place
+    request = admission.clamped(replace(request, direct=direct))
+    vouched = not admission.closed or mine is not None
+    return RecoveredHold(request, place, grant, end - request.min_runtime, end, bound, vouched)
+
+
+def _agree(needs: Mapping[Need, Params], bound: Mapping[Need, RcName], held: Mapping[RcName, Holder]) -> bool:
+    """Return True if the RCs report the parameters that the client asked for."""
+    by_rc = _by_rc(needs, bound)
+    return all(exact_amounts(holder.params) == by_rc[rc] for rc, holder in held.items())
+
+
+def _by_rc(needs: Mapping[Need, Params], bound: Mapping[Need, RcName]) -> dict[RcName, Params]:
+    return {bound.get(need, need): params for need, params in needs.items()}
+
+
+def _needs(held: Mapping[RcName, Holder], mine: Listed | None, patterns: Mapping[RcName, Need]) -> dict[Need, Params]:
+    needs: dict[Need, Params] = {patterns.get(name, name): {} for name in _most_telling(held).rcs}
+    told = {rc: exact_amounts(holder.params) for rc, holder in held.items()}
+    # An absent RC's parameters are known to the client only, unless another RC meets a like pattern: those
+    # of one kind have all the same.
+    kinds = {_kind(patterns[rc]): params for rc, params in told.items() if rc in patterns}
+    needs |= {need: kinds[_kind(need)] for need in patterns.values() if _kind(need) in kinds}
+    if mine is not None:
+        needs |= {need: params for need, params in mine.request.needs.items() if need in needs}
+    return needs | {patterns.get(rc, rc): params for rc, params in told.items()}
+
+
+def _patterns(holder: Holder) -> dict[RcName, Need]:
+    """By RC: the pattern that it meets. Raises BadName, ValueError."""
+    for rc in holder.rcs:
+        check_rc(rc)
+    for need, rc in holder.bound.items():
+        if not is_pattern(check_need(need)) or rc not in holder.rcs or not matcher(need)(rc):
+            raise ValueError(f"it does not hold {rc[:130]!r} for {need[:130]!r}")
+    patterns = {rc: need for need, rc in holder.bound.items()}
+    if len(patterns) < len(holder.bound):
+        raise ValueError("one RC is reported to meet two of its patterns")
+    return patterns
+
+
+def _told(arc: ArcId, holder: Holder, needs: Mapping[Need, Params]) -> ArcRequest:
+    """The request in the words of an RC. Raises BadName, ValueError."""
+    client_of(holder.client)
+    check_name(holder.id, "id")
+    check_name(holder.arc, "arc")
+    for need in needs:
+        check_need(need)
+    return ArcRequest(
+        arc=arc,
+        client=holder.client,
+        needs=needs,
+        priority=holder.priority,
+        min_runtime=duration(Decimal(holder.min_runtime), "min_runtime"),
+        keep=holder.keep,
+        label=holder.arc,
+        continues=holder.continues,
+        booking=holder.booking,
+        who=holder.who,
+    )
+
+
+def _kind(need: str) -> str:
+    return need.partition("/")[0]
+
+
+def adopted(
+    states: Iterable[RcState],
+    joined: Collection[RcName],
+    now: Ns,
+    admission: Admission,
+    known: Callable[[ArcId], ArcStatus | None],
+) -> tuple[list[Adopted | Released], list[str]]:
+    """The holds of late joiners that continue, and remarks for the log. `joined`: the RCs that count as there."""
+    well = [state for state in states if state.health == "ok"]
+    held = {(state.rc, holder.grant) for state in well for holder in state.holders}
+    found = recover(well, [], now, admission, known=known)
+    holds = [one for one in found.holds if all((rc, one.grant) in held or rc not in joined for rc in one.rcs)]
+    return [*map(Adopted, holds), *removed((one.request for one in holds), admission)], found.remarks
+
+
+def removed(requests: Iterable[ArcRequest], admission: Admission) -> list[Released]:
+    """Ends the ARCs of clients without a role."""
+    gone = [one.arc for one in requests if admission.authority.is_removed(one.client)]
+    return [Released(arc, REMOVED) for arc in gone]
+
+
+# Late answers of clients
+
+
+def vouched(status: ArcStatus, one: Listed, admission: Admission) -> Vouched:
+    """The client's words for an ARC reported by RCs only. Raises Refused if it waits, and may not be asked for."""
+    if status.hold is None:
+        admission.authority.check_ask(client_of(one.request.client).host, one.request, lambda _: 0)
+    bound = binding(one.request.needs, status.needs, {})
+    if (
+        bound is not None
+        and {bound.get(need, need): params for need, params in one.request.needs.items()} != status.needs
+    ):
+        bound = None
+    return Vouched(admission.clamped(one.request), one.place, bound)
