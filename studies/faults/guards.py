@@ -25,6 +25,8 @@ from zscout.drivers.repeated import CommandMemory
 from zscout.drivers.resource_controller import ResourceController
 from zscout.mesh.renewal import Suspicions
 from zscout.messages import BookingRecord, Problem
+from zscout.rcm import terms
+from zscout.rcm.terms import BELIEVED, Verdict
 from zscout.scheduling.claims import Claims
 from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.state import SchedulerState
@@ -35,6 +37,7 @@ from zscout.services.rcm import bookings, candidate, membership, recovery
 from zscout.services.rcm.booked_dates import BookedDates
 from zscout.services.rcm.booking_sharing import BookingSharing
 from zscout.services.rcm.bookings import Bookings
+from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.membership import Membership
 from zscout.services.rcm.places import Places
@@ -63,6 +66,10 @@ def _no(*_: object, **__: object) -> bool:
 
 def _yes(*_: object, **__: object) -> bool:
     return True
+
+
+def _believe(*_: object) -> Verdict:
+    return BELIEVED
 
 
 def _promise(self: HoldTable, term: Term, _now: Ns, **_: object) -> bool:
@@ -240,7 +247,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         ),
         "majority": Guard("a candidate that RCs contradict waits", {(Election, "must_wait"): _no}),
         "deposed": Guard("who was deposed waits longer each time", {(Election, "deposed"): _nothing}),
-        "step down": Guard("a leader that sees a higher term steps down", {(candidate.Candidate, "_see"): _yes}),
+        "step down": Guard("a leader that sees a higher term steps down", {(Candidate, "_see"): _believe}),
         "away": Guard("a leader that was away itself drops nobody for it", {(Membership, "_is_away"): _no}),
         "reopen": Guard("who was dropped and lives goes on at its place", {(RequestRegistry, "reopens"): _no}),
         "places": Guard("a client shows the place that it had", {(OpenArc, "_as_asked"): _without_place}),
@@ -250,7 +257,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "terms": Guard("a client believes nothing of an older term", {(RcmLink, "accept"): _accept_any}),
         "absurd": Guard(
             "nobody believes a term far above the fleet's",
-            {(holds, "absurd"): _no, (rcm_link, "absurd"): _no, (candidate, "absurd"): _no},
+            {(holds, "absurd"): _no, (rcm_link, "absurd"): _no, (candidate, "absurd"): _no, (terms, "absurd"): _no},
         ),
         "handed": Guard(
             "what was handed over stays the old client's until the new one has heard of it",

@@ -245,6 +245,17 @@ class OpenArc:
         self.lose("its old client is to hand it over once more", now)
         self.state, self._came, self.last = "awaited", None, (notice.term, notice.step)
 
+    def go_back(self, term: Term) -> None:
+        """Forget what leaders of terms above `term` said: their fleet knows no such term any more."""
+        if self.last[0] > term:
+            self.last = NO_TERM, 0
+        if self.place is not None and self.place.term > term:
+            self.place = self.seal = self.was = None
+        if self.unconfirmed is not None and self.unconfirmed[0].term > term:
+            self.unconfirmed = None
+        if self.unserved is not None and self.unserved.term > term:
+            self.unserved = None
+
     def move(self, now: Ns) -> None:
         """It goes on in another client."""
         self._close(HoldEnd("handed_over", "handed over"), now)
@@ -442,6 +453,11 @@ class RequestStore:
         self.arcs.pop(arc.id, None)
         self.moved[arc.id] = arc
         self.notify(arc)
+
+    def go_back(self, term: Term) -> None:
+        """The client follows the leader of `term` after higher ones."""
+        for arc in (*self.arcs.values(), *self.moved.values(), *self.expected.values()):
+            arc.go_back(term)
 
     def reclaim(self, arc: OpenArc) -> None:
         """A moved one is this client's again, under a new id; it is to be asked for."""

@@ -20,6 +20,7 @@ from zscout.keyexpr import Role, Token, client_of
 from zscout.mesh import Declaration, Mesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import ClientRequests, RcAsk, RcState, disbelieved
+from zscout.rcm.terms import BELIEVED, Source, Verdict, Word
 from zscout.scheduling.model import Adopted, ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
 from zscout.services.rcm.absence import Absence, Asked
 from zscout.services.rcm.devices import ExpectedDevices
@@ -39,6 +40,7 @@ LEASES_AT_MOST: Final = 3
 """For which a pending RC waits, whoever of its gangs goes on answering."""
 MAX_WORDS: Final = 500
 """Characters of what an RC says of its health."""
+SHUNNED: Final = "its host alone shows a term in which nobody leads"
 NEAR_END: Ns = SECOND // 20
 """A hold with less than this left may have ended at its RC already: clocks differ a little."""
 
@@ -67,7 +69,7 @@ class Membership:
         supervisor: Supervisor,
         emit: Callable[..., None],
         on_reported: Callable[[RcName, RcState], None],
-        on_newer: Callable[[Term, str | None], object],
+        on_newer: Callable[[Word], Verdict],
         devices: ExpectedDevices,
     ) -> None:
         self.mesh, self.term, self._devices = mesh, term, devices
@@ -85,6 +87,8 @@ class Membership:
         """What clients hold of RCs of which no token was ever seen: since when that is known."""
         self._blinked: set[str] = set()
         """Instances of RCs that count as there, and whose tokens went as this leader was away."""
+        self._shunned: set[str] = set()
+        """Instances of RCs that count as absent, for what they show of terms."""
         self._rc_seen: dict[RcName, Ns] = {}
         """When each RC was seen first, of those that have a token."""
         self._joined: dict[RcName, RcState] = {}
@@ -225,12 +229,14 @@ class Membership:
             self._supervisor.spawn(self._ask_requests(client))
 
     async def _ask_requests(self, client: ClientId) -> None:
-        key, ask = self.mesh.keys.requests(client_of(client)), RcAsk(promise=self.term)
+        program = client_of(client)
+        key, ask = self.mesh.keys.requests(program), RcAsk(promise=self.term)
         unheard = f"{client} is seen and does not answer"
         while client in self.clients or client in self._unseen:
             reply = await self.mesh.ask_one(key, ask, ClientRequests, timeout=self._timeout)
             if reply is not None and reply.problem is not None and reply.problem.term is not None:
-                self.see(reply.problem.term, obeyed_by=client if client in self.clients else None)
+                seen = client in self.clients
+                self.see(Word(reply.problem.term, Source.CLIENT, client, program.host if seen else ""))
             if reply is not None and reply.message is not None:
                 self.on_requests(client, {request.id for request in reply.message.requests})
                 break
@@ -382,12 +388,12 @@ class Membership:
         self._emit(RcLost(token.name, "it started anew"))
         self.on_named(token.name)
 
-    def _drop(self, name: RcName) -> None:
+    def _drop(self, name: RcName, why: str = "") -> None:
         gone = self._departed[name] = self._joined.pop(name)
         self._blinked.discard(gone.instance)
         self._supervisor.call_later(self._hold_lease + (gone.settle or 0), self._free, gone)
         self._seek(self.mesh.keys.rc_state(name), RcState, lambda: name in self._rc_tokens)
-        self._emit(RcLost(name, why=self._devices.why_gone(name, gone.host)))
+        self._emit(RcLost(name, why=why or self._devices.why_gone(name, gone.host)))
         if gone.leaving:
             self._free(gone)
         for other in self._rc_tokens.get(name, {}).values():
@@ -450,7 +456,7 @@ class Membership:
         while self._is_wanted(token):
             for reply in await self.mesh.ask(key, ask, RcState, timeout=self._timeout):
                 if reply.problem is not None and reply.problem.term is not None:
-                    self.see(reply.problem.term, obeyed_by=token.name)
+                    self._see_rc(token, reply.problem.term)
                     if not (self._joined or self._pending) and disbelieved(self.term, reply.problem.term):
                         self.on_disbelieved(token.name, reply.problem.term)
                 match reply.message:
@@ -525,6 +531,8 @@ class Membership:
         Once the term is over, no RC is asked any more."""
         if not self._supervisor.active or token.instance not in self._rc_tokens.get(token.name, {}):
             return False
+        if token.instance in self._shunned:
+            return False
         pending, gone = self._pending.get(token.name), self._departed.get(token.name)
         present = pending.state if pending is not None else self._joined.get(token.name)
         if present is not None:
@@ -538,7 +546,10 @@ class Membership:
         name = self.mesh.keys.rc_of(key)
         if name != state.rc:
             return
-        self.see(state.term, obeyed_by=name if state.instance in self._rc_tokens.get(name, {}) else None)
+        if (token := self._rc_tokens.get(name, {}).get(state.instance)) is not None:
+            self._see_rc(token, state.term)
+        else:
+            self.see(Word(state.term, Source.RC, name))
         if name in self._pending and self._pending[name].state.instance == state.instance:
             self._pending[name].state, self._pending[name].since = state, self.mesh.now()
         known, gone = self._joined.get(name), self._departed.get(name)
@@ -566,10 +577,27 @@ class Membership:
             # Whoever told it to stand by: it is the one that is meant.
             self.on_named(name)
 
-    def see(self, term: Term, obeyed_by: str | None = None) -> None:
-        """A term that somebody has heard of; `obeyed_by` an RC or a client that is seen."""
-        if term > self.term:
-            self._on_newer(term, obeyed_by)
+    def see(self, word: Word) -> Verdict:
+        """A term that somebody has heard of."""
+        return self._on_newer(word) if word.term > self.term else BELIEVED
+
+    def _see_rc(self, token: Token, term: Term) -> None:
+        """An RC that is seen obeys this term. One that is not believed counts as absent for a while."""
+        if token.instance in self._shunned:
+            return
+        until = self.see(Word(term, Source.RC, token.name, token.host)).absent_until
+        if until <= self.mesh.now() or not self._supervisor.active:
+            return
+        self._shunned.add(token.instance)
+        self._supervisor.call_later((until - self.mesh.now()) / SECOND, self._shun_no_more, token)
+        if token.name in self._pending and self._pending[token.name].state.instance == token.instance:
+            del self._pending[token.name]
+        if token.name in self._joined and self._joined[token.name].instance == token.instance:
+            self._drop(token.name, SHUNNED)
+
+    def _shun_no_more(self, token: Token) -> None:
+        self._shunned.discard(token.instance)
+        self._supervisor.spawn(self._join(token))
 
 
 def _as_it_is(state: RcState) -> RcJoined | RcLost:

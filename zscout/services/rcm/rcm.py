@@ -24,6 +24,7 @@ from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError, Reply, Tally
 from zscout.mesh.supervision import Supervisor
+from zscout.rcm.terms import Verdict, Word
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     Adopted,
@@ -93,7 +94,7 @@ class Rcm:
         mesh: Mesh,
         fleet: Fleet,
         term: Term,
-        on_newer: Callable[[Term, str | None], object],
+        on_newer: Callable[[Word], Verdict],
         on_failure: Callable[[Exception], object],
         inventory: Inventory | None = None,
         authority: Authority | None = None,

@@ -37,6 +37,7 @@ from zscout.messages import (
     duration,
     exact_amounts,
 )
+from zscout.rcm.terms import Source, Word
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import (
@@ -151,10 +152,7 @@ class RequestHandler:
                 self.bookings.handler.on_operation(query)
 
     def _ask(self, query: Query, ask: Ask, sender: Sender, client: ClientId) -> None:
-        if ask.term is not None and ask.term > self.core.term:
-            seen = client if client in self._membership.clients else None
-            self._membership.see(ask.term, obeyed_by=seen)
-            raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
+        self._check_term(ask, sender, client)
         arc = arc_id(client, ask.id)
         self._keep_order(arc)
         self._authority.check_ask(sender, ask, lambda names: self._open_of(names, arc))
@@ -179,6 +177,17 @@ class RequestHandler:
             query.answer(self._registry.handed_over(arc, ask.arc))
         else:
             self._enter(query, ask, sender, client, arc)
+
+    def _check_term(self, ask: Ask, sender: Sender, client: ClientId) -> None:
+        """Raises Refused for one from a later term: this leader steps down, if that counts."""
+        place, see = ask.place, self._membership.see
+        later = place is not None and place.term > self.core.term and self.mesh.keys.closed
+        if later and self._places.proves(place, client, ask.was or ask.id, ask.seal):
+            see(Word(place.term, Source.SEAL, client, sender.host))
+            raise Refused("old_term", "a leader of a later term gave this place; try again", place.term)
+        if ask.term is not None and ask.term > self.core.term:
+            see(Word(ask.term, Source.CLIENT, client, sender.host if client in self._membership.clients else ""))
+            raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
 
     def _enter(self, query: Query, ask: Ask, sender: Sender, client: ClientId, arc: ArcId) -> None:
         """Takes a new request. This is the way of every grant: nothing is done here that can be done once it is
