@@ -58,6 +58,9 @@ IGNORED: Final = Verdict(believed=False)
 
 
 class _Doubt(NamedTuple):
+    """Of a host whose RCs alone showed `term`: until somebody leads in it, it is not believed alone."""
+
+    term: Term
     until: Ns
     times: int
 
@@ -113,32 +116,39 @@ class Terms:
         return word.source is Source.RC and word.host != ""
 
     def _doubted(self, word: Word, now: Ns) -> Ns:
-        """Note what an RC shows. Until when its host is not believed; 0: it is, or is not alone."""
-        if word.term <= self._led or word.term in self._tried:
+        """Note what an RC shows. Until when its host is not believed; 0: it is, for once, or is not alone."""
+        term, host = word.term, word.host
+        if term <= self._led or term in self._tried:
             return 0
-        self._shown[word.host] = max(word.term, self._shown.get(word.host, NO_TERM))
-        if word.term <= self.highest:
+        others = [other for other, shown in self._shown.items() if shown == term and other != host]
+        self._shown[host] = max(term, self._shown.get(host, NO_TERM))
+        for other in others:
+            self._vindicate(other, term, now)
+        if term <= self.highest or others:
             return 0
-        others = (host for host, term in self._shown.items() if term == word.term)
-        return min(self.doubted_until(host, now) for host in (word.host, *others))
+        if until := self.doubted_until(host, now):
+            return until
+        before = self._doubts.get(host, _Doubt(NO_TERM, 0, 0))
+        times = 0 if now - before.until > FORGIVEN_AFTER else before.times
+        self._doubts[host] = _Doubt(term, now + (DOUBT << min(times, MAX_DOUBLINGS)), times + 1)
+        return 0
+
+    def _vindicate(self, host: HostName, term: Term, now: Ns) -> None:
+        doubt = self._doubts.get(host)
+        if doubt is not None and doubt.term == term:
+            self._doubts[host] = _Doubt(NO_TERM, min(now, doubt.until), doubt.times - 1)
 
     def tries(self, term: Term) -> None:
         """This manager asks for promises in `term`: RCs that show it show nobody else's."""
         self._tried.append(term)
 
     def led(self, term: Term, now: Ns) -> None:
-        """Somebody leads in `term`: hosts that alone showed a lower one, in which nobody led, are doubted."""
-        if term <= self._led:
-            return
-        self._led = term
-        shown = [other for other in self._shown.values() if other < term]
-        for host, other in list(self._shown.items()):
-            if other <= term:
-                del self._shown[host]
-            if other < term and shown.count(other) == 1:
-                before = self._doubts.get(host, _Doubt(0, 0))
-                times = 0 if now - before.until > FORGIVEN_AFTER else before.times
-                self._doubts[host] = _Doubt(now + (DOUBT << min(times, MAX_DOUBLINGS)), times + 1)
+        """Somebody leads in `term`: hosts that showed it said so rightly."""
+        if term > self._led:
+            self._led = term
+            self._shown = {host: shown for host, shown in self._shown.items() if shown > term}
+            for host in list(self._doubts):
+                self._vindicate(host, term, now)
 
     def doubted_until(self, host: HostName, now: Ns) -> Ns:
         """Until when `host` is not believed alone; 0: it is."""

@@ -100,7 +100,7 @@ async def test_an_rcm_far_above_is_followed_once_no_other_is_heard() -> None:
         await until(lambda: one.internals.term.counter)
         await fleet.candidates.pop("h0").stop()
         candidate = fleet.candidates["h1"] = Candidate(fleet.mesh("h1", "node"), FLEET)
-        candidate.known = far = Term(10**9, "far")
+        candidate.terms.highest = far = Term(10**9, "far")
         candidate.start()
         await until(lambda: one.internals.term > far, within=FLEET.timing.hold_lease / SECOND + 3)
         await held(one, "first")

@@ -304,13 +304,10 @@ class Candidate:
         return False
 
     async def _hear_rcs(self, states: list[RcState], tokens: list[Token]) -> list[RcState]:
-        """Take the terms of RCs. Return those that count: on hosts that are not doubted."""
+        """Take the terms of RCs. Return those that do not count as absent for what they show."""
         hosts = {(token.name, token.instance): token.host for token in tokens}
-        found = [(state, hosts.get((state.rc, state.instance), "")) for state in states]
-        for state, host in found:
-            self._see(Word(state.term, Source.RC, state.rc, host))
-        now = self.mesh.now()
-        return [state for state, host in found if not self.terms.doubted_until(host, now)]
+        words = [Word(state.term, Source.RC, state.rc, hosts.get((state.rc, state.instance), "")) for state in states]
+        return [state for state, word in zip(states, words, strict=True) if not self._see(word).absent_until]
 
     async def _divided(self, states: list[RcState]) -> bool:
         """Whether an RC that is seen obeys a term which is absurd to others: they are told why this one goes above."""
