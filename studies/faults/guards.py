@@ -26,7 +26,7 @@ from zscout.drivers.resource_controller import ResourceController
 from zscout.mesh.renewal import Suspicions
 from zscout.messages import BookingRecord, Problem
 from zscout.rcm import terms
-from zscout.rcm.terms import BELIEVED, Verdict
+from zscout.rcm.terms import BELIEVED, Terms, Verdict
 from zscout.scheduling.claims import Claims
 from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.state import SchedulerState
@@ -62,6 +62,10 @@ def _nothing(*_: object, **__: object) -> None:
 
 def _no(*_: object, **__: object) -> bool:
     return False
+
+
+def _never_ns(*_: object, **__: object) -> Ns:
+    return 0
 
 
 def _yes(*_: object, **__: object) -> bool:
@@ -259,6 +263,17 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
             "nobody believes a term far above the fleet's",
             {(holds, "absurd"): _no, (rcm_link, "absurd"): _no, (candidate, "absurd"): _no, (terms, "absurd"): _no},
         ),
+        "words": Guard("with certificates a client's word moves no term", {(Terms, "counts"): _yes}),
+        "doubted": Guard(
+            "a host whose RCs alone show a term in which nobody leads is believed once",
+            {(Terms, "_doubted"): _never_ns},
+        ),
+        "sealed terms": Guard("a leader goes above the term of a sealed place", {(Places, "proves"): _no}),
+        "back": Guard(
+            "a client goes back to the leader that it sees",
+            {(RcmLink, "_follow_lower"): _do_nothing, (RcmLink, "_only_promised"): _no},
+        ),
+        "kept": Guard("managers keep their highest term on disk", {(Candidate, "_keep"): _do_nothing}),
         "handed": Guard(
             "what was handed over stays the old client's until the new one has heard of it",
             {(MovableClient, "_awaited_by"): _none_async},

@@ -87,7 +87,7 @@ class Membership:
         """What clients hold of RCs of which no token was ever seen: since when that is known."""
         self._blinked: set[str] = set()
         """Instances of RCs that count as there, and whose tokens went as this leader was away."""
-        self._shunned: set[str] = set()
+        self.shunned: set[str] = set()
         """Instances of RCs that count as absent, for what they show of terms."""
         self._rc_seen: dict[RcName, Ns] = {}
         """When each RC was seen first, of those that have a token."""
@@ -531,7 +531,7 @@ class Membership:
         Once the term is over, no RC is asked any more."""
         if not self._supervisor.active or token.instance not in self._rc_tokens.get(token.name, {}):
             return False
-        if token.instance in self._shunned:
+        if token.instance in self.shunned:
             return False
         pending, gone = self._pending.get(token.name), self._departed.get(token.name)
         present = pending.state if pending is not None else self._joined.get(token.name)
@@ -583,12 +583,12 @@ class Membership:
 
     def _see_rc(self, token: Token, term: Term) -> None:
         """An RC that is seen obeys this term. One that is not believed counts as absent for a while."""
-        if token.instance in self._shunned:
+        if token.instance in self.shunned:
             return
         until = self.see(Word(term, Source.RC, token.name, token.host)).absent_until
         if until <= self.mesh.now() or not self._supervisor.active:
             return
-        self._shunned.add(token.instance)
+        self.shunned.add(token.instance)
         self._supervisor.call_later((until - self.mesh.now()) / SECOND, self._shun_no_more, token)
         if token.name in self._pending and self._pending[token.name].state.instance == token.instance:
             del self._pending[token.name]
@@ -596,7 +596,7 @@ class Membership:
             self._drop(token.name, SHUNNED)
 
     def _shun_no_more(self, token: Token) -> None:
-        self._shunned.discard(token.instance)
+        self.shunned.discard(token.instance)
         self._supervisor.spawn(self._join(token))
 
 
