@@ -97,7 +97,7 @@ class Promises:
         self._running: dict[Term, set[Grant]] = {}
         self._queued: dict[Term, dict[ArcId, Rank]] = {}
         self._believed: dict[str, Term] = {}
-        """By client: the highest term that it believed."""
+        """By client: the highest term that it heard of a leader."""
         self._seen: dict[Term, int] = {}
         """By term: how many instants its RCM had decided about as it was looked at."""
 
@@ -251,12 +251,12 @@ class Promises:
                 self._broken(f"for more than {longest:g} s: {' '.join(map(str, key))}")
 
     def look_who_went_back(self, clients: Mapping[str, Client], silence: Mapping[str, Ns]) -> None:
-        """A client may go back from a term in which nobody led, or after a hold lease of `silence`."""
+        """A client may go back from a term that it only promised, or after a hold lease of `silence`."""
         for name, client in clients.items():
             term, before = client.internals.term, self._believed.get(name, NO_TERM)
-            if term < before and before in self.terms and silence[name] / SECOND < self._hold_lease:
+            self._believed[name] = client.internals.rcm._heard
+            if term < before and silence[name] / SECOND < self._hold_lease:
                 self._broken(f"{name} went back from {before} to {term}, and had heard that lately")
-            self._believed[name] = term
 
     def _in_order(self, rcm: Rcm) -> None:
         """Of two that wait, the better-ranked is granted first, if it needs no more than what the other got."""

@@ -40,9 +40,10 @@ async def beside(folder: Path, name: str, client: str) -> AsyncIterator[tuple[Cl
 
 async def served(bob: PatientClient) -> float:
     """Seconds until bob holds the robot."""
-    began = time.monotonic()
+    began, took = time.monotonic(), 0.0
     async with hold(bob, "survey", {"robot/a": {}}):
-        return time.monotonic() - began
+        took = time.monotonic() - began
+    return took
 
 
 def far(query: IncomingQuery[RcAsk]) -> Term:

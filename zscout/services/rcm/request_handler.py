@@ -181,8 +181,12 @@ class RequestHandler:
     def _check_term(self, ask: Ask, sender: Sender, client: ClientId) -> None:
         """Raises Refused for one from a later term: this leader steps down, if that counts."""
         place, see = ask.place, self._membership.see
-        later = place is not None and place.term > self.core.term and self.mesh.keys.closed
-        if later and self._places.proves(place, client, ask.was or ask.id, ask.seal):
+        if (
+            place is not None
+            and self.mesh.keys.closed
+            and place.term > self.core.term
+            and self._places.proves(place, client, ask.was or ask.id, ask.seal)
+        ):
             see(Word(place.term, Source.SEAL, client, sender.host))
             raise Refused("old_term", "a leader of a later term gave this place; try again", place.term)
         if ask.term is not None and ask.term > self.core.term:
