@@ -64,7 +64,7 @@ def main(arguments: Sequence[str]) -> int:
     run = getattr(import_module(f"studies.{module}"), entry)
     program = f"python -m studies {name}"
     if isinstance(run, click.Command):
-        code = run_command(lambda: run.main(rest, program, standalone_mode=False))
+        code = run_command(lambda: run.main(rest, program, standalone_mode=False), "studies")
         return code if isinstance(code, int) else 0
     sys.argv = [program, *rest]
     return run() or 0

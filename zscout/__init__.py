@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from zscout.behaviors.client.blocking import BlockingHeld, Lab, connect
     from zscout.behaviors.client.bookings import BookingsClient
     from zscout.behaviors.client.client import Client, CommandRefused, NoRcm, RequestRefused
+    from zscout.behaviors.client.request import OpenArc
     from zscout.behaviors.components.component import Component, ComponentContext, Stage
     from zscout.config.fleet import Fleet, load_fleet
     from zscout.config.strict import BadInput
@@ -31,6 +32,7 @@ _NAMES = {
     "zscout.behaviors.client.blocking": "BlockingHeld Lab connect",
     "zscout.behaviors.client.bookings": "BookingsClient",
     "zscout.behaviors.client.client": "Client CommandRefused NoRcm RequestRefused",
+    "zscout.behaviors.client.request": "OpenArc",
     "zscout.behaviors.components.component": "Component ComponentContext Stage",
     "zscout.config.fleet": "Fleet load_fleet",
     "zscout.config.strict": "BadInput",
@@ -40,7 +42,7 @@ _HOME = {name: module for module, names in _NAMES.items() for name in names.spli
 
 __all__ = [
     "BadInput", "BlockingHeld", "BookingsClient", "Client", "CommandRefused", "Component", "ComponentContext",
-    "Fleet", "Held", "Lab", "MeshError", "NoRcm", "RequestRefused", "Revoked",
+    "Fleet", "Held", "Lab", "MeshError", "NoRcm", "OpenArc", "RequestRefused", "Revoked",
     "Stage", "__version__", "connect", "hold", "holds", "load_fleet",
 ]  # fmt: skip
 

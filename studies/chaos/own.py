@@ -35,8 +35,8 @@ class Worker:
             self._ids[arc.name] = arc.id
         before, self._believed[arc.id] = self._believed.get(arc.id), arc.grant
         state = "lost" if arc.state == "asking" else arc.state
-        known = {"place": arc.place, "grant": arc.grant, "rcs": arc.rcs, "outcome": arc.outcome, "reason": arc.reason}
-        say(state, id=arc.id, before=before, **known, term=arc.last[0], step=arc.last[1], ahead=arc.ahead)
+        known = {"place": arc._place, "grant": arc.grant, "rcs": arc.rcs, "outcome": arc.outcome, "reason": arc.reason}
+        say(state, id=arc.id, before=before, **known, term=arc._last[0], step=arc._last[1], ahead=arc.ahead)
 
     async def job(self, name: str) -> None:
         rng = random.Random(f"{name} {self.rng.random()}")  # noqa: S311

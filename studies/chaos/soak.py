@@ -23,7 +23,7 @@ from studies.chaos.run import Fleet, NotServed
 from studies.chaos.work import NODES, OWN_CLIENTS
 from studies.faults import simulation
 from studies.faults.simulation import Result, Simulation, Size, simulate
-from zscout.services.rcm.registry import MAX_LINES
+from zscout.rcm.request_log import MAX_LINES
 
 Figures: TypeAlias = dict[str, float]
 LOOKS: Final = 60

@@ -128,7 +128,7 @@ class Worker(Component):
             deeds.broken(f"what {_here().name} asked for was thrown away: {refused.code}: {refused}")
 
     def checkpoint(self) -> bytes:
-        arc = self.arc.id if self.arc is not None and self.arc.open and self.arc.place is not None else ""
+        arc = self.arc.id if self.arc is not None and self.arc.open and self.arc._place is not None else ""
         return f"{self.done} {arc}".encode()
 
     def restore(self, state: bytes) -> None:

@@ -25,7 +25,10 @@ from zscout.drivers.repeated import CommandMemory
 from zscout.drivers.resource_controller import ResourceController
 from zscout.mesh.renewal import Suspicions
 from zscout.messages import BookingRecord, Problem
-from zscout.rcm import terms
+from zscout.rcm import roster, terms
+from zscout.rcm.places import Places
+from zscout.rcm.request_log import RequestLog
+from zscout.rcm.roster import Roster
 from zscout.rcm.terms import BELIEVED, Terms, Verdict
 from zscout.scheduling.claims import Claims
 from zscout.scheduling.model import ArcRequest
@@ -33,17 +36,13 @@ from zscout.scheduling.state import SchedulerState
 from zscout.services.bookings import records
 from zscout.services.bookings.fleet_clock import FleetClock, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
-from zscout.services.rcm import bookings, candidate, membership, recovery
+from zscout.services.rcm import bookings, candidate, recovery
 from zscout.services.rcm.booked_dates import BookedDates
 from zscout.services.rcm.booking_sharing import BookingSharing
 from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.election import Election
-from zscout.services.rcm.membership import Membership
-from zscout.services.rcm.places import Places
 from zscout.services.rcm.rcm import Rcm
-from zscout.services.rcm.registry import RequestRegistry
-from zscout.services.rcm.request_handler import RequestHandler
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
 
 ABSENT: Final = object()
@@ -58,6 +57,10 @@ class Guard(NamedTuple):
 
 def _nothing(*_: object, **__: object) -> None:
     return None
+
+
+def _no_change(*_: object) -> roster.Change:
+    return roster.Change()
 
 
 def _no(*_: object, **__: object) -> bool:
@@ -90,7 +93,7 @@ _remove = HoldTable._remove
 _expire = HoldTable.expire
 _apply_grants = HoldTable.apply_grants
 _as_asked = OpenArc._as_asked
-_take = OpenArc.take
+_take = OpenArc._take
 
 
 def _check_any(self: HoldTable, grant: Grant, client: str, now: Ns) -> Problem | None:
@@ -143,7 +146,7 @@ def _without_place(self: OpenArc, now: Ns, grant: Grant | None) -> dict[str, Any
 
 
 def _take_any(self: OpenArc, *args: Any) -> bool:
-    self.last = (NO_TERM, 0)
+    self._last = (NO_TERM, 0)
     return _take(self, *args)
 
 
@@ -240,24 +243,22 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "once": Guard("a command that arrives again is not carried out again", {(CommandMemory, "is_new"): _yes}),
         "sealed": Guard("a place is had by whom it was given to", {(Places, "may_claim"): _yes}),
         "instances": Guard(
-            "of two instances of an RC one serves", {(Instances, "begin"): _nothing, (Membership, "named"): _no_names}
+            "of two instances of an RC one serves", {(Instances, "begin"): _nothing, (Roster, "named"): _no_names}
         ),
-        "whole": Guard(
-            "a new leader carries on whole gangs only", {(recovery, "all"): _yes, (membership, "all"): _yes}
-        ),
+        "whole": Guard("a new leader carries on whole gangs only", {(recovery, "all"): _yes, (roster, "all"): _yes}),
         "pending": Guard(
             "holds wait for the rest of their gang to answer",
-            {(recovery, "gangs_of"): _alone, (membership, "gangs_of"): _alone},
+            {(recovery, "gangs_of"): _alone, (roster, "gangs_of"): _alone},
         ),
         "majority": Guard("a candidate that RCs contradict waits", {(Election, "must_wait"): _no}),
         "deposed": Guard("who was deposed waits longer each time", {(Election, "deposed"): _nothing}),
         "step down": Guard("a leader that sees a higher term steps down", {(Candidate, "_see"): _believe}),
-        "away": Guard("a leader that was away itself drops nobody for it", {(Membership, "_is_away"): _no}),
-        "reopen": Guard("who was dropped and lives goes on at its place", {(RequestRegistry, "reopens"): _no}),
+        "away": Guard("a leader that was away itself drops nobody for it", {(Roster, "_was_away"): _no}),
+        "reopen": Guard("who was dropped and lives goes on at its place", {(RequestLog, "reopens"): _no}),
         "places": Guard("a client shows the place that it had", {(OpenArc, "_as_asked"): _without_place}),
         "claims": Guard("of the ARCs that claim one place one runs", {(SchedulerState, "_is_first"): _yes}),
         "unheard": Guard("what had its time unheard is asked for anew", {(RequestStore, "_ask_anew"): _nothing}),
-        "notices": Guard("of two notices the newer counts", {(OpenArc, "take"): _take_any}),
+        "notices": Guard("of two notices the newer counts", {(OpenArc, "_take"): _take_any}),
         "terms": Guard("a client believes nothing of an older term", {(RcmLink, "accept"): _accept_any}),
         "absurd": Guard(
             "nobody believes a term far above the fleet's",
@@ -278,11 +279,10 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
             "what was handed over stays the old client's until the new one has heard of it",
             {(MovableClient, "_awaited_by"): _none_async},
         ),
-        "ids": Guard("a request that has ended is not entered again", {(RequestRegistry, "ended"): _no}),
+        "ids": Guard("a request that has ended is not entered again", {(RequestLog, "ended"): _no}),
         "links": Guard("a session in contradiction is opened anew", {(Suspicions, "suspect"): _nothing}),
         "believed": Guard(
-            "who believes in a hold is not told to wait before its RCs could say so",
-            {(RequestHandler, "_may_be_held"): _no},
+            "who believes in a hold is not told to wait before its RCs could say so", {(RequestLog, "may_be_held"): _no}
         ),
         "beside": Guard("what its RCs do not confirm ends the body", {(Confirmations, "_give_back"): _nothing}),
         "settling": Guard("an RC settles before the next holder begins", {(HoldTable, "settles"): _nothing}),
@@ -310,7 +310,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "had again": Guard("who has taken up a date has it again once it can be", {(Claims, "_offer"): _nothing}),
         "withdrawn": Guard(
             "what nobody asks for is given back",
-            {(RcmLink, "give_back"): _do_nothing, (Membership, "ask_requests"): _nothing},
+            {(RcmLink, "give_back"): _do_nothing, (Roster, "ask_requests"): _no_change},
         ),
     }
 )

@@ -157,12 +157,12 @@ class Promises:
         """A client, which believes no term below `term`, has news of one of its requests. `touched`: a fault may be
         felt by it or by the RCs that the request names."""
         full = f"{name}/{arc.id}"
-        known = self._told.get(full, arc.last)
+        known = self._told.get(full, arc._last)
         if known[0] > term:
-            known = arc.last  # this client went back, as it may: see `look_who_went_back`
-        if arc.last != known and arc.last < max(known, (term, 0)):
-            self._broken(f"{name} {arc.name} believes {arc.last} after {max(known, (term, 0))}")
-        self._told[full] = max(arc.last, known)
+            known = arc._last  # this client went back, as it may: see `look_who_went_back`
+        if arc._last != known and arc._last < max(known, (term, 0)):
+            self._broken(f"{name} {arc.name} believes {arc._last} after {max(known, (term, 0))}")
+        self._told[full] = max(arc._last, known)
         was_over = full in self._over
         if arc.open:
             self._over.discard(full)
@@ -180,16 +180,16 @@ class Promises:
         set_aside = arc.state == "queued" and arc.outcome is None
         lost = (arc.outcome in LOSSES or granted not in ("", held[0]) or set_aside) and self._stood(*held)
         # A direct program that has left does not come back: its client gives such a grant back.
-        given_back = arc.unconfirmed is not None or (
+        given_back = arc._unconfirmed is not None or (
             arc.direct and arc.why is not None and arc.why.code == ReasonCode.UNCONFIRMED
         )
-        if (lost or arc.outcome == "client_lost") and not given_back and arc.unserved is None and not touched:
+        if (lost or arc.outcome == "client_lost") and not given_back and arc._unserved is None and not touched:
             how = f"was granted anew {granted}" if granted else arc.outcome or "is told to wait"
             self._broken(f"{name} {arc.name} {how}, though no fault touched it: {arc.reason}")
-        if arc.place is not None:
-            before = self._places.setdefault((name, arc.id), arc.place)
-            if arc.place > before:
-                self._broken(f"the place of {name} {arc.name} got worse: {before}, then {arc.place}")
+        if arc._place is not None:
+            before = self._places.setdefault((name, arc.id), arc._place)
+            if arc._place > before:
+                self._broken(f"the place of {name} {arc.name} got worse: {before}, then {arc._place}")
         if arc.outcome == "client_lost":
             self._dropped[full] = self._now()
         if arc.outcome == "client_lost" and not arc.open:
@@ -360,7 +360,7 @@ def _doubles(rcs: Mapping[str, ResourceController]) -> Iterator[tuple[object, ..
 
 def _left(leaders: Mapping[str, Rcm], rcs: Mapping[str, ResourceController]) -> Iterator[tuple[object, ...]]:
     for host, rcm in leaders.items():
-        shunned = rcm.membership.shunned
+        shunned = rcm.roster.shunned
         if any(rc.holds.term > rcm.term and rc.instance not in shunned for rc in rcs.values()):
             yield host, "leads in", rcm.term, "though an RC obeys a higher one"
 
@@ -370,5 +370,5 @@ def _worse_places(clients: Mapping[str, Client], leaders: Mapping[str, Rcm]) -> 
         for arc in client._store.acknowledged:
             for rcm in leaders.values():
                 known = rcm.core.arc(f"{name}/{arc.id}")
-                if known is not None and arc.place is not None and known.place > arc.place:
+                if known is not None and arc._place is not None and known.place > arc._place:
                     yield name, arc.name, "is at a worse place than it was told, in", rcm.term

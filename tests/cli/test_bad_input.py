@@ -49,7 +49,10 @@ request robot/a --priority high | --priority: "high" is not a whole number
 request robot/a --priority 1.5 | --priority: "1.5" is not a whole number
 request robot/a --again | --again repeats a command; add one after --
 request robot/a --min-runtime never | --min-runtime: "never" is not a duration
-request robot/a --min-runtime 0 | --min-runtime must be positive, and is 0
+request robot/a --min-runtime 0 | --min-runtime must be positive, and is 0; write more than 0, at most 3660 d
+request robot/a --for 1h | there is no option --for; did you mean --min-runtime or --release-after? (see zscout request
+usage --user ada | there is no option --user (see zscout usage --help)
+history --device robot/a | there is no option --device; did you mean --rc?
 request robot/a --timeout -1 | --timeout: "-1" is not a duration
 request robot/a --name a/b | --name "a/b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
 request robot | device "robot" is not valid; write kind/name, as in robot/scout33; a command goes after --
@@ -90,13 +93,16 @@ book robot/a --for 1h --at 9:00 --zone Berlin | --zone: "Berlin" is not a time z
 book robot/a robot/a --for 1h --at 9:00 | robot/a is named twice; name each device once, with all its parameters after
 book robot/a --for 1h --at 9:00 --name 'a b' | --name "a b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
 maintain robot/* --for 1h --at 9:00 | robot/* is a pattern; name each device for maintenance
-maintain robot/a robot/a --for 1h --at 9:00 | is named twice; name each
-slots robot/a --for 1h --within 500d | --within: 500 d is not within 1.0 s and 366 d
+maintain robot/a robot/a --for 1h --at 9:00 | zscout: robot/a is named twice; name each device once
+slots robot/a --for 1h --within 500d | --within: 500 d is out of range; write 1.0 s to 366 d
 slots robot/a --for 1h --limit 0 | --limit: 0 is out of range; write 1 to 50
-booking cancel x --date someday | --date: "someday" is not a date; write "tue 14:00", "tomorrow 9:00", "14:30"
+booking cancel x --date someday | --date: "someday" is not a date; write "now", "tue 14:00", "tomorrow 9:00", "14:30"
 history --since soon | --since: "soon" is not a time
-history --since 2999-01-01 | --since: "2999-01-01" is in the future
+history --since 2999-01-01 | --since: "2999-01-01" is in the future; write an earlier date
+history --since 0101-01-01 | --since: "0101-01-01" is too far back; write a later date
 history --since 1h --until 2h | --since is not before --until; write an earlier --since
+history robot/a --rc robot/b | DEVICE and --rc are the same; use only one of them
+history robot | device "robot" is not valid; write kind/name, as in robot/scout33
 history --rc robot | device "robot" is not valid; write kind/name, as in robot/scout33
 history --user '' | --user: "" is not a name; write 1 to 64 characters
 history --group arms | --group: the fleet file has no group "arms" with members; there are none
@@ -138,7 +144,7 @@ replay none.toml | none.toml: there is no such file; check the path
 replay bad.toml | bad.toml: fleet: unknown key; known here: arc, rc
 replay none.toml --strategy best | --strategy: "best" is unknown; write one of "priority", "optimal", "adaptive"
 replay work.toml --rrd picture.png | --rrd picture.png: not the name of a recording; end it in .rrd
-replay work.toml --rrd no/such/folder/x.rrd | timeline: can't write the recording no/such/folder/x.rrd (No such file
+replay work.toml --rrd no/such/folder/x.rrd | zscout: can't write the recording no/such/folder/x.rrd (No such file
 replay torn.toml | torn.toml: line 1, column 5, the end: Expected ']]' at the end of an array declaration; fix the
 replay early.toml | early.toml: arc[0].at (a): is -1 s; write 0 to 1000000000 seconds
 replay nan.toml | nan.toml: arc[0].at (a): is not a finite number; write a number
@@ -156,7 +162,7 @@ demo nothing | there is no command "nothing" (see zscout demo --help)
 demo table1 --out picture.png | --out picture.png: not the name of a recording; end it in .rrd
 demo placement --policy best | --policy: "best" is unknown; write one of "least_loaded", "randomized", "two_choices"
 demo robots --building nowhere | unknown building "nowhere"; name one of living_room, office, random:SEED, or a file
-completion tcsh | "tcsh" is unknown; write one of "bash", "zsh", "fish"
+completion tcsh | SHELL: "tcsh" is unknown; write one of "bash", "zsh", "fish"
 bookings x | too many arguments: "x" (see zscout bookings --help)
 calendar export a b | too many arguments: "a b"
 calendar import none.ics | none.ics: there is no such file; check the path
@@ -173,9 +179,11 @@ node --nope | there is no option --nope (see zscout node --help)
 LONG: Final = {
     f"component start {'k' * 49}": "has more than 48 characters; give a shorter --name",
     "component start counter"
-    + "".join(f" --label=l{number}" for number in range(33)): "33 labels; at most 32 are allowed",
+    + "".join(f" --label=l{number}" for number in range(33)): "33 labels; give --label at most 32 times",
     "component start counter"
-    + "".join(f" --host=h{number}" for number in range(257)): "257 hosts; name at most 256, or give them a label",
+    + "".join(
+        f" --host=h{number}" for number in range(257)
+    ): "257 hosts; give --host at most 256 times, or give them a label and use --label",
     f"booking cancel {'x' * 65}": """x..." can't be the name of a booking; see zscout booking list""",
     f"why {'x' * 300}": """x..." can't be the name of a request; see zscout status""",
 }

@@ -29,11 +29,19 @@ def test_a_user_is_what_is_proven_or_what_was_told() -> None:
     assert journals.person(past(1, 10.0, client="ada/one"), proven=False) == "ada"
 
 
+def test_yesterday_is_the_midnight_before_today() -> None:
+    today, yesterday = journals.parse_past("today", "--since"), journals.parse_past("yesterday", "--since")
+    assert 0 <= today <= 25 * 3600
+    assert 23 * 3600 <= yesterday - today <= 25 * 3600 + 1
+
+
 def test_an_end_in_words() -> None:
     by = ReasonParty("i", "take", "desk/two", 10, Who("bob"))
     assert journals.ending(past(1, 10.0)) == "stands"
     assert journals.ending(past(1, 10.0, 20.0, UNHEARD)) == "end not heard"
     assert journals.ending(past(1, 10.0, 20.0, "preempted", by=by)) == "preempted by take of bob"
+    nameless = ReasonParty("i", "take", "desk/two", 10, Who())
+    assert journals.ending(past(1, 10.0, 20.0, "preempted", by=nameless)) == "preempted by take of desk"
 
 
 def test_what_is_not_known_is_told_with_why() -> None:
@@ -42,7 +50,7 @@ def test_what_is_not_known_is_told_with_why() -> None:
     told = Told(Span(100.0, 200.0), [], False, {"anvil": anvil, "bellows": bellows}, ["forge"])
     assert told.unknown == [Span(120.0, 130.0)]
     first, second = journals.remarks(told)
-    assert first.endswith("not all is known: anvil did not run; bellows has nothing of then")
+    assert first.endswith("the journals are incomplete: anvil did not run; bellows has no entries of that time")
     assert second == "no journal of forge: off, older than 0.3.0, or too slow"
 
 

@@ -75,11 +75,6 @@ def by(command: str) -> str:
     return f"{getpass.getuser()}@{host} ({command})"
 
 
-def named(name: str) -> str:
-    """Whose that of `zscout request --name NAME` without a command is."""
-    return by(f"zscout request --name {name}")
-
-
 def held_by(name: str) -> str:
     """The request of `zscout request --name NAME`, and its person."""
     return f"{name} ({by('').partition(' ')[0]})"

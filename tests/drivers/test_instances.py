@@ -131,7 +131,7 @@ async def test_what_another_half_was_granted_ends_though_the_instance_that_is_me
     await until(lambda: told(second))
     kill(fleet, first)
     killed = fleet.watcher.now()
-    await until(lambda: rcm.membership.reported(RC) is None)
+    await until(lambda: rcm.roster.reported(RC) is None)
     fleet.network.heal()
     healed = fleet.watcher.now()
     await until(lambda: "safe" in told(second))

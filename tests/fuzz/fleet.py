@@ -285,7 +285,7 @@ class Fleet:
                 if one.rcm
             ],
             self.held.grant,
-            self.held.place,
+            self.held._place,
             {name: (rc.holds.term, rc.health, list(rc.holds.held)) for name, rc in sorted(self.rcs.items())},
             [client.internals.term for client in self.clients.values()],
             sorted(self.running),

@@ -21,7 +21,7 @@ from zscout.config.strict import BadInput, read_text
 from zscout.drivers.last_holder import LastHolderFile
 from zscout.keyexpr import Sender
 from zscout.messages import encode
-from zscout.services.rcm.devices import SeenHome
+from zscout.rcm.devices import SeenHome
 from zscout.services.rcm.inventory import FILE, Inventory, _DeviceFile
 from zscout.services.recorder.process import decode_job, new_recording, prune
 from zscout.simulation.building.plan_file import load_plan, shipped_plans

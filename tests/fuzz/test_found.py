@@ -19,7 +19,7 @@ from tests.services.rcm.kit import FakeFleet
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role, Sender, Token
 from zscout.messages import RcState, RcView
-from zscout.services.rcm.devices import ExpectedDevices, SeenHome, homes_in
+from zscout.rcm.devices import ExpectedDevices, SeenHome, homes_in
 from zscout.services.rcm.inventory import FILE, Inventory
 from zscout.testing.memory import MemoryNetwork
 from zscout.types import SECOND
@@ -60,10 +60,10 @@ def test_an_rc_that_answers_under_anothers_name_takes_nobodys_place() -> None:
         await asyncio.sleep(0.1)
         thief.publish()
         await asyncio.sleep(0.1)
-        real = rcm.membership.reported("robot/a")
+        real = rcm.roster.reported("robot/a")
         assert real is not None
         assert real.instance == "i1"
-        assert rcm.membership.reported("robot/x") is None
+        assert rcm.roster.reported("robot/x") is None
 
     run(story())
 

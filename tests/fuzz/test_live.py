@@ -90,7 +90,7 @@ def test_a_node_serves_on_after_a_burst_of_what_is_no_message(tmp_path: Path) ->
 
 
 def standing(held: Held) -> object:
-    return held.grant, held.arc.place, held.arc.state
+    return held.grant, held.arc._place, held.arc.state
 
 
 def used(pid: int) -> int:

@@ -108,7 +108,7 @@ async def answer(command: Awaitable[Done]) -> str:
 
 def ended(arc: OpenArc) -> str:
     """How its last hold did."""
-    return arc.ending.outcome if arc.ending is not None else ""
+    return arc._ending.outcome if arc._ending is not None else ""
 
 
 async def comes_to(arc: OpenArc, state: str, reason: str = "") -> None:

@@ -68,7 +68,7 @@ class Holder:
 
     def _told(self, arc: OpenArc) -> None:
         """A new word of the RCM: `queued`, `running` or `ended`."""
-        say(arc.state, arc=arc.name, reason=arc.reason, outcome=arc.outcome, grant=arc.grant, place=arc.place)
+        say(arc.state, arc=arc.name, reason=arc.reason, outcome=arc.outcome, grant=arc.grant, place=arc._place)
 
     async def obey(self, order: dict[str, Any]) -> None:
         match order.pop("order"):

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import by, end, named, out_of, read_until
+from tests.cli.tools import end, held_by, out_of, read_until
 from tests.hang import HANG
 from tests.live.lab import Lab
 
@@ -117,7 +117,7 @@ def test_a_sleep_is_interrupted_when_the_hold_is_preempted(fleet: CliFleet) -> N
     take(fleet, "robot/a", "--priority", "5")
     told, restored = rest_of(survey)
     assert told.startswith("preempted False | ")
-    assert by("true") in told
+    assert held_by("taker") in told
     assert restored == "restored True"
     assert fleet.idle("robot/a")
 
@@ -131,7 +131,7 @@ def test_a_body_whose_time_is_over_is_interrupted(fleet: CliFleet, how: str, *, 
         take(fleet, "robot/a")
     (told,) = rest_of(survey)
     assert told.startswith("completed True | its minimum runtime is over")
-    assert (by("true") in told) == waits
+    assert (held_by("taker") in told) == waits
 
 
 def test_the_end_of_an_inner_hold_leaves_the_outer_one(fleet: CliFleet) -> None:
@@ -267,7 +267,7 @@ def test_a_wait_for_the_grant_ends_with_its_timeout_and_says_why(fleet: CliFleet
     blocker = fleet.holder("blocker", "robot/a")
     (told,) = rest_of(script(fleet.lab, text))
     assert told.startswith("survey was not granted within 10 s: ")
-    assert named("blocker") in told
+    assert held_by("blocker") in told
     fleet.state(lambda state: not state.queue)
     end(blocker)
 

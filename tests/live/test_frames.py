@@ -343,10 +343,10 @@ async def test_a_source_that_falls_silent_loses_the_framegrabber_until_it_is_bac
         await until(lambda: at.driver._capture is not None and at.driver._capture.number > 0)
         at.one.close()
         await until(lambda: arc.state == "queued")
-        assert arc.ending is not None
-        assert arc.ending.outcome == "lost"
-        assert "no picture of video/ch1 for 2 s: http://127.0.0.1" in arc.ending.reason
-        assert "can't be opened" in arc.ending.reason
+        assert arc._ending is not None
+        assert arc._ending.outcome == "lost"
+        assert "no picture of video/ch1 for 2 s: http://127.0.0.1" in arc._ending.reason
+        assert "can't be opened" in arc._ending.reason
         assert "no picture of video/ch1" in (await at.lab.rc(at.client, GRABBER)).health
         await until(lambda: at.driver._holder is None)
         at.one.open()

@@ -143,7 +143,7 @@ async def test_all_goes_over_in_one_step_and_nobody_gets_in_between(
     after = {"drive": drive} | await claimed(new, ["talk", "later"])
 
     assert [after[name].id for name in NEEDS] == [before[name].id for name in NEEDS]
-    assert [after[name].place for name in NEEDS] == [before[name].place for name in NEEDS]
+    assert [after[name]._place for name in NEEDS] == [before[name]._place for name in NEEDS]
     assert [arc.state for arc in before.values()] == ["moved"] * 3
     for name in ("drive", "talk"):
         old_grant, new_grant = grants[name], await new.granted(after[name])
@@ -233,7 +233,7 @@ async def test_bodies_go_on_after_a_hand_over_that_was_refused(lab: Lab) -> None
     assert client.internals.open_requests()[0].grant is None
     client.internals.resume()
     await asyncio.wait({body.task}, timeout=HANG)
-    assert re.search(r"preempted by \S+@\S+ \(.+\), priority 9$", str(body.task.exception()))
+    assert re.search(r"preempted by \S+ \(\S+@\S+\), priority 9$", str(body.task.exception()))
     await other.end(taker)
 
 
@@ -256,7 +256,7 @@ async def test_what_was_handed_to_one_who_died_is_taken_back(lab: Lab, monkeypat
     await until(lambda: bool(entered))
     later = await old.request("later", NEEDS["later"], min_runtime=600)
     rival = await other.request("rival", {"robot/x": {}}, min_runtime=600)
-    places, ids = (entered[0].arc.place, later.place), (entered[0].arc.id, later.id)
+    places, ids = (entered[0].arc._place, later._place), (entered[0].arc.id, later.id)
     old.internals.pause()
     new.internals.expect(old.internals.open_requests())
     await old.internals.hand_over_all(me(new))
@@ -268,7 +268,7 @@ async def test_what_was_handed_to_one_who_died_is_taken_back(lab: Lab, monkeypat
     # Where the rival was quicker, the places decide once it ends.
     await other.end(rival)
     await until(lambda: len(entered) == 2 and entered[1].active and later.state == "queued")
-    assert (entered[1].arc.place, later.place) == places
+    assert (entered[1].arc._place, later._place) == places
     assert not {entered[1].arc.id, later.id} & set(ids)
     done.set()
     await asyncio.wait_for(body, HANG)
@@ -285,7 +285,7 @@ async def test_after_an_unknown_outcome_all_is_the_old_client_s_again(
     old, new = await lab.client("old"), await lab.client("new")
     await lab.ready(old, "robot/x", "radio/f")
     arcs = await claimed(old, list(NEEDS))
-    places, ids = [arc.place for arc in arcs.values()], [arc.id for arc in arcs.values()]
+    places, ids = [arc._place for arc in arcs.values()], [arc.id for arc in arcs.values()]
     grant = arcs["drive"].grant
     old.internals.pause()
     new.internals.expect(old.internals.open_requests())
@@ -308,7 +308,7 @@ async def test_after_an_unknown_outcome_all_is_the_old_client_s_again(
         ),
     )
     await until(lambda: [arc.state for arc in arcs.values()] == ["running", "running", "queued"])
-    assert [arc.place for arc in arcs.values()] == places
+    assert [arc._place for arc in arcs.values()] == places
     assert (arcs["drive"].grant == grant) is (arcs["drive"].id == ids[0])
 
 
@@ -353,7 +353,7 @@ async def test_the_leader_dies_around_a_hand_over(tmp_path: Path) -> None:
         await lab.candidates(old, "b", "c")
         before = await claimed(old, list(NEEDS))
 
-        place = before["later"].place
+        place = before["later"]._place
 
         # Right after it: the next leader has it from the new client and the RCs.
         after = await settle_down(old, new, list(NEEDS))
@@ -379,7 +379,7 @@ async def test_the_leader_dies_around_a_hand_over(tmp_path: Path) -> None:
         )
         assert {client for client, _ in holding(state).values()} == {"test/old"}
         assert [(view.client, view.place) for view in state.queue] == [("test/old", place)]
-        assert [arc.place for arc in back.values()] == [arc.place for arc in before.values()]
+        assert [arc._place for arc in back.values()] == [arc._place for arc in before.values()]
 
 
 @pytest.mark.slow
@@ -409,7 +409,7 @@ async def test_the_leader_dies_in_a_hand_over(tmp_path: Path, delay: float) -> N
         )
         clients = [*(view.client for view in state.holds), *(view.client for view in state.queue)]
         assert clients == ["test/new"] * 3
-        assert [view.place for view in state.queue] == [before["later"].place]
+        assert [view.place for view in state.queue] == [before["later"]._place]
 
 
 async def test_the_old_process_dies_right_after_it(lab: Lab) -> None:

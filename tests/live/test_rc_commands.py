@@ -105,13 +105,13 @@ async def test_a_failing_device_ends_the_whole_gang_which_waits_for_it(lab: Lab,
     rc = await stand.rc("robot/bench", bench)
     await lab.ready(client, "robot/a", "robot/bench")
     arc, grant = await running(client, "gang", "robot/a", "robot/bench")
-    place = arc.place
+    place = arc._place
 
     rc.fail("smoke comes out of it")
     await until(lambda: arc.state == "queued")
-    assert arc.ending is not None
-    assert (arc.ending.outcome, arc.place) == ("lost", place)
-    assert "smoke comes out of it" in arc.ending.reason
+    assert arc._ending is not None
+    assert (arc._ending.outcome, arc._place) == ("lost", place)
+    assert "smoke comes out of it" in arc._ending.reason
     await until(lambda: bench.calls == ["begin gang", "safe"])
     why = "robot/bench is lost: smoke comes out of it"
     await lab.state(client, lambda state: [(wait.arc, wait.reason) for wait in state.queue] == [("gang", why)])
@@ -132,7 +132,7 @@ async def test_a_failing_device_ends_the_whole_gang_which_waits_for_it(lab: Lab,
     rc.recover()
     again = await granted(client, arc)
     assert again > grant
-    assert arc.place == place
+    assert arc._place == place
 
 
 async def test_one_of_two_holders_ends_and_the_device_serves_the_other(lab: Lab, stand: Stand) -> None:

@@ -60,7 +60,7 @@ async def test_what_would_come_is_foretold_and_nothing_is_changed_by_asking(lab:
     assert wait is not None
     assert wait.starts_in is not None
     assert wait.starts_in > view.starts_in + 4
-    assert re.fullmatch(r"waits for \S+@\S+ \(.+\): robot/a", wait.reason)
+    assert re.fullmatch(r"waits for \S+ \(\S+@\S+\): robot/a", wait.reason)
     never = await client.foresee("never", {"robot/b": {}}, min_runtime=Decimal(1), wait_for_device=True)
     assert never is not None
     assert (never.starts_in, never.reason) == (None, "robot/b not on the mesh")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 
 import pytest
 
 from tests.mesh.kit import run, until
 from zscout.mesh import session
 from zscout.mesh.exchange import Backlog, Refused
-from zscout.mesh.session import BURST, Inbox
+from zscout.mesh.session import BURST, BURST_S, SHARE, Inbox, Lane
 
 
 @pytest.mark.real_time
@@ -42,6 +43,72 @@ async def test_others_have_their_turn_between_two_bursts() -> None:
     await asyncio.sleep(0)
     assert len(handled) == BURST
     await until(lambda: len(handled) == 2 * BURST)
+
+
+async def test_a_host_s_surplus_waits_for_the_others_and_questions_wait_for_asks() -> None:
+    box, handled = Inbox(asyncio.get_running_loop()), list[str]()
+
+    def offer(text: str, lane: Lane, host: str) -> None:
+        assert box.offer(Backlog(), handled.append, text, lane=lane, host=host)
+
+    for number in range(40):
+        offer(f"q{number}", Lane.QUESTION, "viewer")
+        offer(f"a{number}", Lane.ASK, "greedy")
+    offer("lone", Lane.ASK, "desk")
+    box.deliver(handled.append, "token")
+    await until(lambda: len(handled) == 82)
+    first = [text for number in range(SHARE) for text in (f"q{number}", f"a{number}")]
+    rest = range(SHARE, 40)
+    assert handled == [*first, "lone", "token", *(f"a{number}" for number in rest), *(f"q{number}" for number in rest)]
+    assert (box.set_aside, box.surplus) == (0, {})
+
+
+async def test_what_concerns_a_host_with_surplus_may_wait_behind_it() -> None:
+    box, handled = Inbox(asyncio.get_running_loop()), list[str]()
+
+    def cancel() -> None:
+        assert box.behind(Lane.ASK, "greedy", handled.append, "cancel")
+        assert not box.behind(Lane.ASK, "desk", handled.append, "never")
+
+    for number in range(SHARE + 2):
+        box.offer(Backlog(), handled.append, f"a{number}", lane=Lane.ASK, host="greedy")
+    box.offer(Backlog(), cancel, lane=Lane.ASK, host="boss")
+    await until(lambda: "cancel" in handled)
+    assert handled == [*(f"a{number}" for number in range(SHARE + 2)), "cancel"]
+
+
+async def test_of_questions_one_of_each_host_is_let_in_before_asks_that_have_come_meanwhile() -> None:
+    box, handled = Inbox(asyncio.get_running_loop()), list[str]()
+
+    def dry_run(text: str) -> None:
+        """It comes as an ask, and turns out to be a question."""
+        if not box.behind(Lane.QUESTION, "viewer", answer, text):
+            answer(text)
+
+    def answer(text: str) -> None:
+        handled.append(text)
+        if text == "q1":
+            box.offer(Backlog(), handled.append, "ask", lane=Lane.ASK, host="desk")
+
+    for number in range(5):
+        box.offer(Backlog(), dry_run, f"q{number}", lane=Lane.ASK, host="viewer")
+    await until(lambda: len(handled) == 6)
+    assert handled == ["q0", "q1", "ask", "q2", "q3", "q4"]
+
+
+@pytest.mark.real_time
+async def test_a_burst_is_short_whatever_its_handlers_do() -> None:
+    box, handled = Inbox(asyncio.get_running_loop()), list[int]()
+
+    def work(number: int) -> None:
+        time.sleep(BURST_S / 2)
+        handled.append(number)
+
+    for number in range(8):
+        box.deliver(work, number)
+    await asyncio.sleep(0)
+    assert 0 < len(handled) < 4
+    await until(lambda: len(handled) == 8)
 
 
 async def test_each_declaration_and_the_inbox_have_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:

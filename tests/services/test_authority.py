@@ -112,7 +112,11 @@ def given(*needs: str, priority: int = 1, keep: bool = False, runs: bool = False
     ("to", "arcs", "why"),
     [
         ("bob", [given("robot/s1")], ""),
-        ("bob", [given("robot/s1"), given("robot/s2")], "bob may have 2 open requests, and would have more"),
+        (
+            "bob",
+            [given("robot/s1"), given("robot/s2")],
+            "bob may have 2 open requests, and would have more; cancel some first",
+        ),
         ("bob", [given("robot/arm1")], "bob (client) may not hold robot/arm1; ada, eve may"),
         ("bob", [given("robot/s1", priority=10)], "bob (client) may not request priority 10; at most 9; ada may"),
         ("bob", [given("robot/s1", keep=True)], "bob (client) may not keep a hold; ada may"),
@@ -133,7 +137,7 @@ def test_who_is_handed_a_hold_has_no_more_rcs_than_its_quota(tmp_path: Path) -> 
     told, to, arcs = authority(tmp_path), Sender("eve", "c1"), [given("a/1", runs=True)]
     told.check_hand_over(Sender("bob", "c1"), to, arcs, lambda _: 0, lambda _: 2)
     told.check_hand_over(Sender("bob", "c1"), to, [given("a/1")], lambda _: 0, lambda _: 3)
-    with pytest.raises(Refused, match="arms may hold 3 devices at one time, and would hold more"):
+    with pytest.raises(Refused, match="arms may hold 3 devices at one time, and would hold more; release some first"):
         told.check_hand_over(Sender("bob", "c1"), to, arcs, lambda _: 0, lambda _: 3)
 
 

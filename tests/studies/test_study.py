@@ -158,7 +158,7 @@ def test_processes_that_can_not_start_are_one_line() -> None:
     few = ("sh", "-c", 'ulimit -n 40; exec "$@"', "sh")
     done = subprocess.run([*few, *STUDIES, *LONG, "--jobs", "200"], capture_output=True, text=True, timeout=HANG)
     assert (done.returncode, done.stdout) == (Failed.exit_code, "")
-    line = "zscout: a process can't be started (Too many open files); use fewer with --jobs 1\n"
+    line = "studies: a process can't be started (Too many open files); use fewer with --jobs 1\n"
     assert done.stderr == line
 
 

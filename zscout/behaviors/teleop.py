@@ -18,6 +18,7 @@ from zscout.behaviors.client.client import Client, CommandRefused, RequestRefuse
 from zscout.behaviors.client.request import OpenArc
 from zscout.behaviors.sensor_net.held_robot import HeldRobot, RobotNeeds
 from zscout.mesh.supervision import done_within
+from zscout.messages import ReasonInfo
 from zscout.types import SECOND, Ns
 
 PERIOD: Final = 0.05
@@ -150,6 +151,8 @@ class Teleop:
         self.client, self.needs, self.pilot, self.priority = client, needs, pilot, priority
         self.state: State = "free"
         self.why = ""
+        self.reason: ReasonInfo | None = None
+        """What `why` says, as data, where it is the leader's reason to wait."""
         """In words: for what it waits, or why it was lost."""
         self.robot: HeldRobot | None = None
         self.held: Held | None = None
@@ -191,7 +194,7 @@ class Teleop:
                 await self._while_wanted(self._drive())
                 if self._wanted.is_set():
                     # To ask again would take it back from an operator of the same rank, and so on in turns.
-                    ending = self.held.arc.ending if self.held is not None else None
+                    ending = self.held.arc._ending if self.held is not None else None
                     successor = (ending.by or ending.reason) if ending is not None else ""
                     why = f"it was taken by {successor or 'another'}"
                     self.give_back()
@@ -210,7 +213,7 @@ class Teleop:
 
     def _on_notice(self, arc: OpenArc) -> None:
         if arc.name == self._name and arc.state == "queued" and self.state == "waiting" and arc.reason:
-            self._set_state("waiting", arc.reason)
+            self._set_state("waiting", arc.reason, arc.why)
 
     async def _while_wanted(self, work: Coroutine[Any, Any, None]) -> None:
         """Does `work`, and ends it when the robot is not wanted any more."""
@@ -245,7 +248,7 @@ class Teleop:
             self.takeover = (self.client.mesh.now() - self._asked_at) / SECOND
             self._changed()
 
-    def _set_state(self, state: State, why: str) -> None:
+    def _set_state(self, state: State, why: str, reason: ReasonInfo | None = None) -> None:
         if (state, why) != (self.state, self.why):
-            self.state, self.why = state, why
+            self.state, self.why, self.reason = state, why, reason
             self._changed()

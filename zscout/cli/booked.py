@@ -19,7 +19,7 @@ from zscout.cli.dates import parse_zone, span_words
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import PEOPLE
 from zscout.messages import BookedDate, BookingsAsk, BookingsTold, BookingView, Who
-from zscout.terminal import clean, span
+from zscout.terminal import clean, clock, span
 
 SHOWN_ID: Final = 8
 """Characters of an id that are shown: it is named by any beginning that no other has."""
@@ -79,10 +79,10 @@ def soon(told: BookingsTold | None) -> int:
     )
 
 
-def in_maintenance(told: BookingsTold | None) -> set[str]:
-    """RCs that are kept free now for whom nobody takes it up."""
+def in_maintenance(told: BookingsTold | None) -> dict[str, str]:
+    """Whose maintenance each RC is in now, and until when: `greased (ada@desk) until 14:30`."""
     return {
-        rc
+        rc: clean(f"{booking.name} ({whose(booking)}) until {clock(date.end - told.time, at_latest=True)}")
         for booking in (told.bookings if told is not None else ())
         for date in booking.dates
         if told is not None and booking.maintenance and date.start <= told.time < date.end

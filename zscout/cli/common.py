@@ -204,7 +204,9 @@ def unknown(what: str, name: str, known: Iterable[str], nothing: str, listed: st
 def hint_at(name: str, known: Iterable[str], nothing: str, listed: str, more: int = 0) -> str:
     """The end of a line that says that nobody knows `name`: what was meant, perhaps."""
     names = sorted(set(known))
-    if near := difflib.get_close_matches(name, names, n=3):
+    # `arm1` for `robot/arm1`.
+    alike = [known for known in names if known.partition("/")[2] == name][:3]
+    if near := alike or difflib.get_close_matches(name, names, n=3):
         return f"; did you mean {' or '.join(near)}?"
     if not names:
         return f", {nothing}"

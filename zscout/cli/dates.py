@@ -21,7 +21,9 @@ from zoneinfo import ZoneInfo, available_timezones
 from zscout.config.strict import BadInput, parse_duration, quoted
 from zscout.messages.bookings import DAYS, MAX_AHEAD
 
-DATE_FORMS: Final = '"tue 14:00", "tomorrow 9:00", "14:30", "2026-12-01 14:00", "2026-12-01T14:00+01:00" or "in 2h"'
+DATE_FORMS: Final = (
+    '"now", "tue 14:00", "tomorrow 9:00", "14:30", "2026-12-01 14:00", "2026-12-01T14:00+01:00" or "in 2h"'
+)
 EVERY_FORMS: Final = 'day, week, "2 weeks" or "10 days"'
 WEEKDAYS: Final = ("monday", "tuesday", "wednesday", "thursday", "friday", "saturday", "sunday")
 SOON: Final = 600.0

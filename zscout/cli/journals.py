@@ -6,7 +6,7 @@ import csv
 import sys
 import time
 from collections.abc import Iterable, Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any, Final
 
 import click
@@ -16,7 +16,7 @@ from zscout.cli.common import LOOK_FOR_RCM, F, Failed, Parsed, see_rcm
 from zscout.config.fleet import Fleet
 from zscout.config.strict import DURATIONS, BadInput, parse_duration, quoted
 from zscout.keyexpr import MAX_NAME, check_need
-from zscout.messages import MAX_ASKED_NAMES, HistoryAsk, PastHold
+from zscout.messages import MAX_ASKED_NAMES, HistoryAsk, PastHold, ReasonParty
 from zscout.services.journal import asking
 from zscout.services.journal.asking import Told
 from zscout.terminal import Table, clean, span
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
 
 MAX_AGO: Final = 1e9
-PAST_FORMS: Final = f"{DURATIONS}, or a date as in 2026-11-20 or 2026-11-20T14:30"
+PAST_FORMS: Final = f"{DURATIONS}, or a date as in yesterday, 2026-11-20 or 2026-11-20T14:30"
 FORMULA: Final = ("=", "+", "-", "@")
 """How a cell begins that a spreadsheet would compute."""
 
@@ -37,16 +37,24 @@ def parse_past(text: str, option: str) -> float:
         ago = float(seconds)
     else:
         try:
-            ago = time.time() - datetime.fromisoformat(text).astimezone().timestamp()
+            ago = time.time() - _date(text).astimezone().timestamp()
         except (ValueError, OverflowError):
             raise BadInput(f"{option}: {quoted(text)} is not a time; write {PAST_FORMS}") from None
     if option == "--until":
         ago = max(0.0, ago)  # up to now
-    if not 0 <= ago <= MAX_AGO:
-        raise BadInput(
-            f"{option}: {quoted(text)} is {'in the future' if ago < 0 else 'too far back'}; write {PAST_FORMS}"
-        )
+    if ago < 0:
+        raise BadInput(f"{option}: {quoted(text)} is in the future; write an earlier date")
+    if ago > MAX_AGO:
+        raise BadInput(f"{option}: {quoted(text)} is too far back; write a later date")
     return ago
+
+
+def _date(text: str) -> datetime:
+    """A date and time, or the midnight with which `today` or `yesterday` begins. Raises ValueError."""
+    days = {"today": 0, "yesterday": 1}.get(text.lower())
+    if days is None:
+        return datetime.fromisoformat(text)
+    return datetime.combine(datetime.now().astimezone().date() - timedelta(days), datetime.min.time())
 
 
 PAST: Final = Parsed("time", parse_past)
@@ -116,7 +124,7 @@ async def ask_journals(client: Client, asked: HistoryAsk, most: int) -> Told:
 
 def remarks(told: Told) -> Iterable[str]:
     for one in told.unknown:
-        yield f"from {local(one.began)} to {local(one.ended)} not all is known: {told.causes(one)}"
+        yield f"from {local(one.began)} to {local(one.ended)} the journals are incomplete: {told.causes(one)}"
     if told.without:
         yield f"no journal of {', '.join(told.without)}: off, older than 0.3.0, or too slow"
 
@@ -152,8 +160,11 @@ def local(at: float) -> str:
 def person(hold: PastHold, *, proven: bool) -> str:
     """Whose a hold was: the name of the certificate where those are `proven`, else the user that its program told; of
     one that told none the host."""
-    told = hold.who.user if hold.who is not None else ""
-    return hold.client.partition("/")[0] if proven or not told else told
+    return hold.client.partition("/")[0] if proven else _owner(hold)
+
+
+def _owner(of: PastHold | ReasonParty) -> str:
+    return (of.who.user if of.who is not None else "") or of.client.partition("/")[0]
 
 
 def held(hold: PastHold, now: float) -> float:
@@ -178,8 +189,7 @@ def ending(hold: PastHold) -> str:
     words = {"unheard": "end not heard", "client_lost": "client lost", "handed_over": "handed over"}
     by = ""
     if hold.by is not None:
-        user = hold.by.who.user if hold.by.who is not None else ""
-        by = f" by {hold.by.arc}" + (f" of {user}" if user else "")
+        by = f" by {hold.by.arc} of {_owner(hold.by)}"
     return words.get(hold.outcome, hold.outcome) + by
 
 

@@ -9,6 +9,7 @@ Every error ends here as one line on stderr and an exit code:
 
 from __future__ import annotations
 
+import difflib
 import errno
 import os
 import re
@@ -115,8 +116,9 @@ class OneLineErrors(LazyGroup):
         sys.exit(code if isinstance(code, int) else OK)
 
 
-def run_command(call: Callable[[], Any]) -> Any:
-    """Return what `call` returns; print an error that people can mend as one line, and return its exit code."""
+def run_command(call: Callable[[], Any], program: str = "zscout") -> Any:
+    """Return what `call` returns; print an error that people can mend as one line that begins with `program`, and
+    return its exit code."""
     try:
         code = call()
         sys.stdout.flush()
@@ -128,7 +130,7 @@ def run_command(call: Callable[[], Any]) -> Any:
         if line:
             # Where nobody reads it, the code still tells.
             with suppress(OSError):
-                click.echo(line, err=True)
+                click.echo(re.sub("^zscout:", f"{program}:", line), err=True)
     _drop_unwritten()
     return code
 
@@ -189,13 +191,13 @@ def usage_words(error: click.UsageError) -> str:
     if isinstance(param, click.Option):
         name = max(param.opts, key=len)
     elif param is not None and error.ctx is not None:
-        name = param.make_metavar(error.ctx)
+        name = param.human_readable_name if param.metavar is None else param.make_metavar(error.ctx)
     match error:
         case click.MissingParameter():
             words = f"{name} is missing"
         case click.NoSuchOption(possibilities=near):
             words = f"there is no option {error.option_name}"
-            words += f"; did you mean {' or '.join(sorted(near))}?" if near else ""
+            words += _meant(error, near or ())
         case click.BadOptionUsage():
             words = f"{error.option_name} needs a value" if "requires an argument" in words else words
         case click.BadParameter() if name:
@@ -204,6 +206,23 @@ def usage_words(error: click.UsageError) -> str:
         words = re.sub(pattern, better, words)
     return words.removesuffix(".")
 
+
+def _meant(error: click.NoSuchOption, near: Sequence[str]) -> str:
+    """The options that an unknown one may stand for; click also names some that are hardly like it."""
+    params = error.ctx.command.params if error.ctx is not None else []
+    known = {name for param in params for name in param.opts}
+    meant = [name for name in OTHER_OPTIONS.get(error.option_name, ()) if name in known]
+    meant = meant or difflib.get_close_matches(error.option_name, sorted(near), n=3, cutoff=0.7)
+    return f"; did you mean {' or '.join(meant)}?" if meant else ""
+
+
+OTHER_OPTIONS: Final = {
+    "--for": ("--min-runtime", "--release-after"),
+    "--device": ("--rc",),
+    "--request": ("--arc",),
+    "--from": ("--since",),
+}
+"""Options that other commands or other programs have, and those that may be meant."""
 
 _CLICK_WORDS: Final = (
     (r"'((?:[^'\\]|\\.)*)'", r'"\1"'),

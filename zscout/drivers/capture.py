@@ -40,9 +40,6 @@ MISSES: Final = 3
 """Reads in a row that may fail: FFmpeg gives up a picture that it can't make out, and reads on."""
 EXIT_WAIT: Final = 2.5
 """Seconds that the end of the process waits for threads that OpenCV holds up: longer than their timeouts."""
-NOT_OPEN: Final = "not open yet"
-NO_PICTURE: Final = "open, no picture yet"
-"""The health of a source that may come yet."""
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://")
 
@@ -67,7 +64,9 @@ class Capture:
     def __init__(self, source: str, *, open_timeout: float = 2.0, read_timeout: float = 1.5) -> None:
         self.source = source
         self.kind = kind_of(source)
-        self.health = NOT_OPEN
+        self.failed = False
+        """Whether its source could not be opened, or gives no pictures any more."""
+        self.health = "not open yet"
         """`ok` while pictures come; or in words what is wrong, without passwords that are in a URL."""
         self.number = 0
         """Of the newest picture; 0 while there was none."""
@@ -95,11 +94,6 @@ class Capture:
         with self._new_picture:
             self._new_picture.notify_all()
         self._thread.join(wait)
-
-    @property
-    def failed(self) -> bool:
-        """Whether its source could not be opened, or gives no pictures any more."""
-        return self.health not in (NOT_OPEN, NO_PICTURE, "ok")
 
     @property
     def alive(self) -> bool:
@@ -143,7 +137,7 @@ class Capture:
                 return
             self.opened += 1
             if self.number == 0:
-                self.health = NO_PICTURE
+                self.health, self.failed = "open, no picture yet", False
             period = _file_period(video) if self.kind == "file" else 0.0
             misses = 0
             while not self._stop.is_set():
@@ -180,7 +174,7 @@ class Capture:
             self._taken = False
             self.number += 1
             self._newest = CapturedFrame(self.number, seconds(), picture)
-            self.health = "ok"
+            self.health, self.failed = "ok", False
             self._new_picture.notify_all()
 
     def _ended(self, waited: float) -> None:
@@ -214,7 +208,7 @@ class Capture:
     def _set_health(self, words: str) -> None:
         if words != self.health:
             log.warning("%s", words)
-            self.health = words
+            self.health, self.failed = words, True
 
 
 _LIVING: weakref.WeakSet[Capture] = weakref.WeakSet()

@@ -173,7 +173,7 @@ class HoldTable:
         if len(holders) > 1 and not sharable:
             holders = [max(holders, key=lambda holder: holder.grant)]
             change.announce = True
-        reasons = {revoked.grant: ended(revoked.outcome, revoked.reason) for revoked in grants.revoked}
+        reasons = {revoked.grant: ended(revoked.outcome, revoked.reason, revoked.why) for revoked in grants.revoked}
         for revoked in grants.revoked:
             if revoked.own:
                 self._leave(revoked.grant, change)

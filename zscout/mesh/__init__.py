@@ -19,6 +19,7 @@ from zscout.mesh.exchange import Refused as Refused
 from zscout.mesh.exchange import Reply as Reply
 from zscout.mesh.exchange import Tally as Tally
 from zscout.mesh.frames import FrameWatch as FrameWatch
+from zscout.mesh.session import Lane as Lane
 from zscout.mesh.session import Mesh as Mesh
 from zscout.mesh.supervision import Supervisor as Supervisor
 from zscout.mesh.supervision import clock as clock

@@ -120,6 +120,14 @@ class IncomingQuery(Generic[R]):
     def answer(self, message: msgspec.Struct) -> None:
         self.end(message)
 
+    def answer_encoded(self, payload: bytes, kind: type[msgspec.Struct]) -> None:
+        """Answer with a message of this kind that is encoded already."""
+        query, self._query = self._query, None
+        if query is not None:
+            query.reply(self._reply_key, payload, kind)
+            if self.tally is not None:
+                self.tally.answered += 1
+
     def refuse(self, problem: Problem) -> None:
         self.end(problem)
 

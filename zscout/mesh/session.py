@@ -8,10 +8,11 @@ from __future__ import annotations
 import asyncio
 import functools
 import logging
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, Self, TypeAlias, TypeVar
+from enum import IntEnum
+from typing import Any, NamedTuple, Self, TypeAlias, TypeVar
 
 from msgspec import Struct
 
@@ -42,6 +43,8 @@ log = logging.getLogger(__name__)
 
 INBOX_DEPTH = 20_000  # items of all kinds that may wait for the event loop
 BURST = 256  # items handled in a row at most
+BURST_S = 0.02  # seconds after which a burst ends: timers and other services run between bursts
+SHARE = 16  # queries of one host in the common order; its surplus waits until that is empty
 RING_DEPTH = 32
 LINK_PERIOD = 1.0  # seconds between two checks that each linked session shows its declarations
 MAX_SESSIONS = 4_096  # sessions remembered
@@ -56,34 +59,73 @@ S = TypeVar("S")
 R = TypeVar("R")
 
 
+class Lane(IntEnum):
+    """Which queries wait for which, where there is more than the event loop can do."""
+
+    REPORT = 0
+    """Tokens, publications, replies and ends of queries: never set aside."""
+    ASK = 1
+    QUESTION = 2
+    """It changes nothing: set aside behind surplus asks."""
+
+
+class _Item(NamedTuple):
+    state: Backlog | None
+    lane: Lane
+    host: str
+    call: Callable[..., None]
+    args: tuple[Any, ...]
+
+
 @dataclass(slots=True)
 class Inbox:
-    """Carries calls from Zenoh's threads into the event loop, with one wake-up per burst."""
+    """Carries calls from Zenoh's threads into the event loop, with one wake-up per burst.
+
+    All keep their order, except the surplus of a host: of its queries in one lane the first SHARE wait in the common
+    order, the others until that is empty."""
 
     loop: asyncio.AbstractEventLoop
-    items: deque[tuple[Backlog | None, Callable[..., None], tuple[Any, ...]]] = field(default_factory=deque)
+    items: deque[_Item] = field(default_factory=deque)  # just arrived
+    ready: deque[_Item] = field(default_factory=deque)
+    surplus: dict[tuple[Lane, str], deque[_Item]] = field(default_factory=dict)
+    shares: Counter[tuple[Lane, str]] = field(default_factory=Counter)  # queries of each host in `ready`
+    set_aside: int = 0  # items in `surplus`
     scheduled: bool = False
     closed: bool = False
     after: list[Callable[[], None]] | None = None  # called after the present burst; None: outside a burst
 
-    def offer(self, state: Backlog, call: Callable[..., None], *args: Any) -> bool:
+    def offer(
+        self, state: Backlog, call: Callable[..., None], *args: Any, lane: Lane = Lane.REPORT, host: str = ""
+    ) -> bool:
         """Call `call(*args)` in the event loop; return False if too much waits."""
-        if self.closed or len(self.items) >= INBOX_DEPTH or state.pending >= state.depth:
+        waiting = len(self.items) + len(self.ready) + self.set_aside
+        if self.closed or waiting >= INBOX_DEPTH or state.pending >= state.depth:
             return False
         state.pending += 1
-        return self._put(state, call, args)
+        return self._put(_Item(state, lane, host, call, args))
+
+    def behind(self, lane: Lane, host: str, call: Callable[..., None], *args: Any) -> bool:
+        """Call `call(*args)` behind the surplus of `host`. Return False if it would not wait: there is no surplus, and
+        no ask waits for a question."""
+        of = lane, host
+        if of not in self.surplus and not (lane is Lane.QUESTION and (self.ready or self.items or self.surplus)):
+            return False
+        self.surplus.setdefault(of, deque()).append(_Item(None, lane, host, call, args))
+        self.set_aside += 1
+        return True
 
     def deliver(self, call: Callable[..., None], *args: Any) -> None:
         """Like `offer`, for what must not be lost, such as deaths and ends of queries; their number is bounded."""
         if not self.closed:
-            self._put(None, call, args)
+            self._put(_Item(None, Lane.REPORT, "", call, args))
 
     def close(self) -> None:
         """Drop all calls, waiting ones included."""
         self.closed = True
-        self.items.clear()
+        for waiting in (self.items, self.ready, self.surplus):
+            waiting.clear()
 
-    def _put(self, *item: Any) -> bool:
+    def _put(self, item: _Item) -> bool:
         self.items.append(item)
         if not self.scheduled:
             self.scheduled = True
@@ -96,14 +138,16 @@ class Inbox:
 
     def drain(self) -> None:
         self.after = []
+        over = self.loop.time() + BURST_S
         try:
             for _ in range(BURST):
-                if not self.items or self.closed:
+                if self.closed or (item := self._next()) is None:
                     break
-                state, call, args = self.items.popleft()
-                if state is not None:
-                    state.pending -= 1
-                guarded(call, *args)
+                if item.state is not None:
+                    item.state.pending -= 1
+                guarded(item.call, *item.args)
+                if self.loop.time() >= over:
+                    break
             after, self.after = self.after, None
             for then in after:
                 guarded(then)
@@ -111,9 +155,44 @@ class Inbox:
             self.after = None
             # In this order, another thread sees the flag cleared, or its item is seen here.
             self.scheduled = False
-            if self.items and not self.closed:
+            if (self.items or self.ready or self.surplus) and not self.closed:
                 self.scheduled = True
                 self.loop.call_soon(self.drain)
+
+    def _next(self) -> _Item | None:
+        while self.items:
+            self._sort(self.items.popleft())
+        if not self.ready:
+            self._let_in()
+        if not self.ready:
+            return None
+        item = self.ready.popleft()
+        if item.lane is not Lane.REPORT:
+            self.shares[item.lane, item.host] -= 1
+        return item
+
+    def _sort(self, item: _Item) -> None:
+        of = item.lane, item.host
+        if item.lane is Lane.REPORT:
+            self.ready.append(item)
+        elif self.shares[of] < SHARE and of not in self.surplus:
+            self.shares[of] += 1
+            self.ready.append(item)
+        else:
+            self.surplus.setdefault(of, deque()).append(item)
+            self.set_aside += 1
+
+    def _let_in(self) -> None:
+        """Let surplus of each host in, asks first."""
+        self.shares.clear()
+        lane = min((lane for lane, _ in self.surplus), default=None)
+        for of in [of for of in self.surplus if of[0] is lane]:
+            for _ in range(min(SHARE if lane is Lane.ASK else 1, len(self.surplus[of]))):
+                self.ready.append(self.surplus[of].popleft())
+                self.shares[of] += 1
+                self.set_aside -= 1
+            if not self.surplus[of]:
+                del self.surplus[of]
 
 
 def guarded(call: Callable[..., None], *args: Any) -> None:
@@ -165,6 +244,10 @@ class Mesh:
 
     def admit(self, members: Iterable[FleetMember]) -> None:
         """Replace the members that are admitted, with their rights. A mesh without certificates admits all."""
+
+    def behind(self, lane: Lane, host: str, call: Callable[..., None], *args: Any) -> bool:
+        """Call `call(*args)` later, where surplus of that host, or asks before a question, wait: see `Inbox`."""
+        return self._inbox.behind(lane, host, call, *args)
 
     def after_burst(self, then: Callable[[], None]) -> None:
         """Call `then` after the present burst; at once outside a burst."""
@@ -258,6 +341,7 @@ class Mesh:
         depth: int = QUEUE_DEPTH,
         limit: int = messages.MAX_PAYLOAD,
         tally: Tally | None = None,
+        lane: Lane = Lane.ASK,
     ) -> Declaration:
         """Call `handler` for queries on `key` with a message of `kind`; `tally` counts how they end.
 
@@ -279,7 +363,7 @@ class Mesh:
                 query.drop()
             elif host and not shares.enter(host):
                 turn_away(query, "busy", f"too many requests of {host[:MAX_NAME]} are waiting here; ask again")
-            elif not self._inbox.offer(state, handle, query, asked, self.now(), host):
+            elif not self._inbox.offer(state, handle, query, asked, self.now(), host, lane=lane, host=host):
                 if host:
                     shares.leave(host)
                 turn_away(query, "busy", "too many requests are waiting here; ask again")

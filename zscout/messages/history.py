@@ -71,6 +71,10 @@ class PastHold(Message, frozen=True):
     who: Who | None = None
     used: dict[str, Elapsed] = {}
     """For how long each RC was used under it, as the RC told (see HoldUse); of one that is missing it is not known."""
+    code: str = ""
+    """The code of `reason`, as in a ReasonInfo; empty: not known, or kept by an older version."""
+    own: bool = False
+    """As in that ReasonInfo."""
 
 
 class JournalGap(Message, frozen=True):

@@ -167,6 +167,8 @@ class ReasonInfo(Message, frozen=True):
     patterns: list[str] = []
     """By each of `rcs` the pattern that it is a choice for, empty where the ARC names it; left out where it names all.
     """
+    own: bool = False
+    """With `cancelled` and `released`: its own client ended it."""
 
 
 class Foresight(Message, frozen=True):

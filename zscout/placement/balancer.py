@@ -22,7 +22,18 @@ from random import Random
 from typing import Final, TypeAlias
 
 from zscout.messages import ComponentUse, LoadReport, RankedHost
-from zscout.placement.model import NO_REPORT, SCORES, STALE, WORDS, MetricLearner, Outlook, Profile, Ranking, RankQuery
+from zscout.placement.model import (
+    NO_REPORT,
+    SCORES,
+    STALE,
+    WORDS,
+    MetricLearner,
+    Outlook,
+    Profile,
+    Ranking,
+    RankQuery,
+    Unfit,
+)
 from zscout.types import SECOND, ComponentId, HostName, Kind, Metric, Ns
 
 LOAD_TIME: Final = 60 * SECOND
@@ -214,7 +225,7 @@ class Balancer:
             return min(first, other, key=lambda found: self._chosen.get(found[1], 0))
         return min(first, other)
 
-    def _fit(self, now: Ns, query: RankQuery) -> tuple[dict[HostName, Outlook], dict[HostName, str]]:
+    def _fit(self, now: Ns, query: RankQuery) -> tuple[dict[HostName, Outlook], dict[HostName, Unfit]]:
         pending = query.policy in COUNTING
         doubtful: Iterable[HostName]
         if query.hosts is not None or self.cordoned or query.labels or query.memory:
@@ -225,7 +236,7 @@ class Balancer:
             fit = self._outlooks.copy()
             overdue = takewhile(lambda host: now - self.reports[host][0] > STALE, self.reports)
             doubtful = {*overdue, *(self._pending.keys() & fit.keys() if pending else ())}
-        left_out: dict[HostName, str] = {}
+        left_out: dict[HostName, Unfit] = {}
         for host in sorted(doubtful):
             reason = self._unfit(now, host, query)
             if reason is None:
@@ -235,21 +246,21 @@ class Balancer:
                 fit.pop(host, None)
         return fit, left_out
 
-    def _unfit(self, now: Ns, host: HostName, query: RankQuery) -> str | None:
+    def _unfit(self, now: Ns, host: HostName, query: RankQuery) -> Unfit | None:
         if host not in self.reports:
             return NO_REPORT
         at, report = self.reports[host]
         if now - at > STALE:
-            return f"its last report is {(now - at) / SECOND:.1f} s old"
+            return Unfit(f"its last report is {(now - at) / SECOND:.1f} s old", "stale")
         if host in self.cordoned:
-            return "it is cordoned"
+            return Unfit("it is cordoned")
         missing = sorted(query.labels.difference(report.labels))
         if missing:
-            return f"it has no label {', '.join(missing)}"
+            return Unfit(f"it has no label {', '.join(missing)}")
         if query.memory:
             available = max(0, self.outlook(now, host, pending=query.policy in COUNTING).memory)
             if available < query.memory:
-                return f"{available:,} bytes available, {query.memory:,} required"
+                return Unfit(f"{available:,} bytes available, {query.memory:,} required", "memory")
         return None
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import re
 from typing import Final
 
 from zscout.messages import ComponentSpec, ComponentState, RankedHost
@@ -23,8 +22,6 @@ TRY_AGAIN: Final[Ns] = SECOND
 AT_ONCE: Final = 100
 """Components placed in one instant; the next follow SHORTLY after."""
 SHORTLY: Final[Ns] = SECOND // 100
-FIGURES: Final = re.compile(r"[\d.,]+ (?=s old|bytes available)")
-"""In the reason why there is no eligible host."""
 KINDS_NAMED: Final = 8
 CAUSES_NAMED: Final = 4
 
@@ -109,14 +106,9 @@ class Lifecycle:
             self._ask_for_kind(record, lacking)
         elif not hosts:
             tried.clear()
-            # Changed figures alone are not published.
-            causes = FIGURES.sub("", why_none)
-            if record.no_host is None and _explains(record.reason, causes):
-                # Inherited: only the reason is known.
-                record.no_host = causes, record.reason
-            if record.no_host != (causes, record.reason):
+            if record.no_host != (why_none, record.reason):
                 record.reason = f"no host will do: {why_none}"
-                record.no_host = causes, record.reason
+                record.no_host = why_none, record.reason
             self.state.wake(record, self.state.now + TRY_AGAIN)
         elif all(tried[ranked.host] for ranked in hosts):
             refusals = list(dict.fromkeys(tried[ranked.host] for ranked in hosts))
@@ -382,12 +374,3 @@ def _cause(end: Termination, host: HostName) -> str:
             return f"it was stopped on {host}, and not by the placer"
         case _:
             return end.reason
-
-
-def _explains(reason: str, causes: str) -> bool:
-    """Return True if an earlier reason names these hosts and causes, or no host is known now."""
-    known = [part.partition(": ") for part in causes.split("; ") if ": " in part]
-    before = FIGURES.sub("", reason)
-    return before.startswith("no host will do") and all(
-        f"{host}: " in before and cause in before for host, _, cause in known
-    )

@@ -78,7 +78,22 @@ class RankQuery:
         return cls(asked.kind, asked.metric, asked.policy, frozenset(asked.labels), asked.memory, hosts)
 
 
-NO_REPORT: Final = "no report of it"
+class Unfit(NamedTuple):
+    """Why a host can't be used; `str` is its text."""
+
+    text: str
+    without_figures: str = ""
+    """The same whatever its figures are; empty: it has none."""
+
+    def __str__(self) -> str:
+        return self.text
+
+    @property
+    def cause(self) -> str:
+        return self.without_figures or self.text
+
+
+NO_REPORT: Final = Unfit("no report of it")
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +104,7 @@ class Ranking:
     hosts: tuple[RankedHost, ...]
     metric: Metric
     why: str
-    left_out: Mapping[HostName, str] = field(default_factory=dict)
+    left_out: Mapping[HostName, Unfit] = field(default_factory=dict)
     more: int = 0
 
 

@@ -9,7 +9,7 @@ from zscout.messages import ComponentState, ComponentView, Incarnation, Placemen
 from zscout.placement.events import ComponentsListed, TokenAppeared, TokenVanished
 from zscout.placement.lifecycle import GRACE, Lifecycle
 from zscout.placement.migration import Migrations
-from zscout.placement.state import OVER, PROBE_TIMEOUT, ComponentRecord, PlacementState, Termination, host_gone
+from zscout.placement.state import OVER, PROBE_TIMEOUT, ComponentRecord, NoHost, PlacementState, Termination, host_gone
 from zscout.types import ComponentId, HostName
 
 RUNNING: Final = ("running", "stopping")
@@ -293,6 +293,8 @@ class Reconciler:
             return
         record.reason = f"it was to move to {status.to}" if moved else status.reason
         record.host_reason, record.tail, record.wanted = status.reason, status.tail, status.wanted
+        if stands == "waiting":
+            record.no_host = NoHost(), record.reason  # it keeps that reason while no host is known
         record.movable, record.restarts = status.movable, status.restarts
         record.moves, record.dead = status.moves, status.dead
         record.running_since = state.now if stands == "running" else None

@@ -16,7 +16,7 @@ from zscout.config.fleet import PlacementPolicy
 from zscout.messages import LAST_TERMS, ComponentSpec, ComponentState, HowEnded, Incarnation, Placement, RankedHost
 from zscout.placement.balancer import LOAD_TIME, MAX_HOSTS, Balancer, RankingCache
 from zscout.placement.events import ComponentChanged, HostCommand, PlacementRefused, PlacerEffect
-from zscout.placement.model import NO_REPORT, RankQuery
+from zscout.placement.model import NO_REPORT, RankQuery, Unfit
 from zscout.types import SECOND, ComponentId, HostName, Kind, Ns
 
 PER_TERM: Final = 1_000
@@ -48,8 +48,21 @@ TRANSITIONS: Final[Mapping[ComponentState, frozenset[ComponentState]]] = {
 }
 OVER: Final[frozenset[ComponentState]] = frozenset({"ended", "given_up"})
 
-GONE: Final = "its node is not there"
-NOT_NAMED: Final = "it is not among the hosts that the component asks for"
+GONE: Final = Unfit("its node is not there")
+NOT_NAMED: Final = Unfit("it is not among the hosts that the component asks for")
+
+
+@dataclass(frozen=True, slots=True)
+class NoHost:
+    """Why no host is eligible, in one bounded line; equal where only figures differ."""
+
+    text: str = field(default="", compare=False)
+    causes: tuple[tuple[HostName, str], ...] = ()
+    count: int = 0
+
+    def __str__(self) -> str:
+        return self.text
+
 
 SideState: TypeAlias = Literal["unknown", "running", "standby", "ended"]
 
@@ -116,7 +129,8 @@ class ComponentRecord:
     token: bool = False
     confirmed: bool = False  # its host reported that it runs, and whether it is movable
     probed: bool = False
-    no_host: tuple[str, str] | None = None  # causes without their figures, and the reason given for them
+    no_host: tuple[NoHost, str] | None = None
+    """Why it has no host, and the reason given for that: changed figures alone are not published."""
     tried: dict[HostName, str] = field(default_factory=dict)
     """Hosts that did not start it in this round, with the reason if another try there would not help."""
     whereabouts_unknown: bool = False  # it reported a move, and no host has reported it yet
@@ -307,8 +321,8 @@ class PlacementState:
 
     def eligible_hosts(
         self, spec: ComponentSpec, *, other_than: HostName | None = None, only: HostName | None = None
-    ) -> tuple[Sequence[RankedHost], str]:
-        """Eligible hosts, best first; if none, why: one bounded line."""
+    ) -> tuple[Sequence[RankedHost], NoHost]:
+        """Eligible hosts, best first; if none, why."""
         query = RankQuery.of(spec)
         if only is not None:
             query = replace(query, hosts=frozenset({only}))
@@ -320,19 +334,21 @@ class PlacementState:
         if only is not None and spec.hosts is not None and only not in spec.hosts:
             left_out = {only: NOT_NAMED}
         elif found:
-            return found, ""
+            return found, NoHost()
         else:
             left_out |= {ranked.host: GONE for ranked in ranking.hosts if ranked.host not in (other_than, *lacking)}
             known = self.alive if query.hosts is None else self.alive & query.hosts
             left_out |= dict.fromkeys(known - self.balancer.reports.keys(), NO_REPORT)
-            left_out |= dict.fromkeys(known & lacking, f"it has no kind {spec.kind}")
+            left_out |= dict.fromkeys(known & lacking, Unfit(f"it has no kind {spec.kind}"))
             if other_than is not None:
                 left_out.pop(other_than, None)
-        named = [f"{host}: {why}" for host, why in heapq.nsmallest(HOSTS_NAMED, left_out.items())]
+        first = heapq.nsmallest(HOSTS_NAMED, left_out.items())
+        named = [f"{host}: {why}" for host, why in first]
         if len(left_out) > HOSTS_NAMED:
             named.append(f"and {len(left_out) - HOSTS_NAMED} more")
         none = "there is no host" if other_than is None else "there is no other that it may use"
-        return (), "; ".join(named) or none
+        causes = tuple((host, why.cause) for host, why in first)
+        return (), NoHost("; ".join(named) or none, causes, len(left_out))
 
     def set_kinds(self, host: HostName, kinds: frozenset[Kind]) -> None:
         self.kinds.pop(host, None)

@@ -169,8 +169,9 @@ class Core:
         """Return True if this core may have given out `place`, or the term is another."""
         return place.term != self.term or place.arrival <= self._arrivals
 
-    def as_events(self, term: Term) -> tuple[list[model.Event], model.LeadTaken]:
-        """The events that bring another core to this state, in a term of its own."""
+    def as_events(self, term: Term, limit: int | None = None) -> tuple[list[model.Event], model.LeadTaken]:
+        """The events that bring another core to this state, in a term of its own, with the best-ranked `limit` of the
+        queue (None: all)."""
         state = self._state
         joined: list[model.Event] = [
             model.RcJoined(rc.name, rc.sharable) if rc.present else model.RcLost(rc.name, why=rc.absence)
@@ -183,7 +184,7 @@ class Core:
             if arc.hold is not None
         )
         joined += [Booked(claim.booking) for claim in state.claims.values()]
-        queued = (*state.queued.values(), *state.held_back.values())
+        queued = (*state.queued.values(), *state.held_back.values()) if limit is None else self._best_ranked(limit)
         waiting = tuple(model.Requested(arc.request, arc.place, arc.since) for arc in queued)
         return joined, model.LeadTaken(term, recovered_holds, waiting, self.charged())
 

@@ -22,6 +22,8 @@ from zscout.types import ArcId, Ns, Term
 
 MAX_CHECKS = 4_000
 """Queued ARCs, summed over all instants: bounds the time that the RCM spends."""
+MAX_WAITING = 1_000
+"""Queued ARCs of a forecast: the best-ranked."""
 
 
 def play_instant(
@@ -52,7 +54,7 @@ def forecast(
     usually do."""
     # A copy, as a strategy may keep unfinished searches.
     copy = Core(STRATEGIES[core.strategy.name](), core.policy)
-    joined, lead = core.as_events(Term(core.term.counter + 1, "forecast"))
+    joined, lead = core.as_events(Term(core.term.counter + 1, "forecast"), MAX_WAITING)
     result = Forecast()
     ends = {held.request.arc: held.end for held in lead.recovered_holds}
     releases: dict[ArcId, Ns] = {}  # likely times of release

@@ -18,7 +18,7 @@ from zscout.keyexpr import is_pattern, matcher
 from zscout.messages import Who
 from zscout.scheduling.booking import Booked, Booking, BookingChanged, BookingThreatened, Redated, Unbooked
 from zscout.scheduling.needs import check_request
-from zscout.scheduling.reason import ITS_CLIENT, SHOWN, Party, Reason
+from zscout.scheduling.reason import SHOWN, Party, Reason
 from zscout.types import SECOND, ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName, Term
 
 QUANTUM: Ns = SECOND
@@ -252,13 +252,15 @@ class Requested(Struct, frozen=True):
 
 
 class Cancelled(Struct, frozen=True):
+    """`by`: who ended it; empty: its own client."""
+
     arc: ArcId
-    by: str = ITS_CLIENT
+    by: str = ""
 
 
 class Released(Struct, frozen=True):
     arc: ArcId
-    by: str = ITS_CLIENT
+    by: str = ""
 
 
 class Vote(Struct, frozen=True):

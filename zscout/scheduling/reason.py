@@ -7,11 +7,10 @@ from enum import StrEnum
 from itertools import groupby
 from typing import Final, NamedTuple
 
-from zscout.messages import Who
-from zscout.types import ArcId, ClientId, Need, Ns, RcName, clean
+from zscout.messages import ReasonInfo, ReasonParty, Who
+from zscout.types import SECOND, ArcId, ClientId, Need, Ns, RcName, clean
 
 ITS_CLIENT: Final = "its client"
-"""`detail` of an end by its own client."""
 SHOWN = 3
 """RCs that a reason names; the rest are counted."""
 SHOWN_CHOICES = 8
@@ -55,7 +54,7 @@ class ReasonCode(StrEnum):
     """A kept hold past its minimum runtime, by `by`."""
     CANCELLED = "cancelled"
     RELEASED = "released"
-    """By `detail`, as CANCELLED."""
+    """By `detail`, as CANCELLED; empty: by its own client."""
     CLIENT_LOST = "client_lost"
     HANDED_OVER = "handed_over"
     """To the client `detail`."""
@@ -66,7 +65,7 @@ class ReasonCode(StrEnum):
 
 
 class Party(NamedTuple):
-    """An ARC in another's way or preferred to it; `str` names its owner."""
+    """An ARC in another's way or preferred to it; `str` is its name and its person."""
 
     arc: ArcId
     name: str
@@ -74,9 +73,11 @@ class Party(NamedTuple):
     who: Who | None = None
     until: Ns | None = None
     """When its hold ends or may be preempted, at the latest; None: unknown."""
+    label: str = ""
+    """Its words in a view that names it otherwise."""
 
     def __str__(self) -> str:
-        return named(self.who, self.arc.rpartition("/")[0], self.name)
+        return self.label or named(self.who, self.arc.rpartition("/")[0], self.name)
 
     @property
     def comment(self) -> str:
@@ -84,12 +85,16 @@ class Party(NamedTuple):
         return f": {clean(self.who.comment)}" if self.who is not None and self.who.comment else ""
 
 
+def person(who: Who | None, client: ClientId) -> str:
+    """The person of an ARC: `alice@ws1`; its client, `ws1/c7`, if it names no user."""
+    host = "" if who is None else who.host or client.partition("/")[0]
+    return clean(client if who is None or not who.user else f"{who.user}@{host}" if host else who.user)
+
+
 def named(who: Who | None, client: ClientId, arc: str) -> str:
-    """The owner of an ARC, for people: `alice@ws1 (survey.py)`, else client and ARC, `ws1/c7 (survey)`."""
-    if who is None or not (who.user or who.command):
-        return f"{client} ({arc})" if client else arc
-    host = who.host or client.partition("/")[0]
-    return clean(f"{who.user}@{host}" if who.user else host) + f" ({clean(who.command or arc)})"
+    """An ARC by its name and its person, for people: `survey (alice@ws1)`."""
+    by = person(who, client)
+    return f"{clean(arc)} ({by})" if by else clean(arc)
 
 
 Until = Callable[[Ns], str]
@@ -113,6 +118,11 @@ class Reason(NamedTuple):
     def __str__(self) -> str:
         return self.text()
 
+    @property
+    def own(self) -> bool:
+        """Return True if its own client ended it."""
+        return self.code in (ReasonCode.CANCELLED, ReasonCode.RELEASED) and not self.detail
+
     def text(self, until: Until | None = None) -> str:
         """In words; with `until` including the ends of others' holds."""
         if self.code is ReasonCode.HELD:
@@ -125,15 +135,50 @@ class Reason(NamedTuple):
         return text if self.pattern is None else f"no {self.pattern} is to be had: {text}"
 
 
-def waits(reason: str) -> str:
-    """How something waits, after its name: `waits for alice@ws1 (survey.py): robot/a`, `waits: votes are out`."""
-    return reason if reason.startswith("waits ") else f"waits: {reason}"
+_NAMING: Final = (ReasonCode.HELD, ReasonCode.VETOED, ReasonCode.MAINTENANCE, ReasonCode.RESERVED, ReasonCode.BOOKED)
+_PREFERRED: Final = (ReasonCode.PREEMPTED, ReasonCode.DISPLACED)
 
 
-def ended(outcome: str, reason: str) -> str:
+def reason_of(why: ReasonInfo | None, label: Callable[[ReasonParty], str] = lambda _: "") -> Reason | None:
+    """A reason that names other ARCs, as a message has it; `until` in ns from then on. None for others: their text
+    says all. `label`: words for an ARC, if not its name and person."""
+    if why is None or not why.by or not (why.code in _PREFERRED or (why.code in _NAMING and why.rcs)):
+        return None
+    by = tuple(
+        Party(
+            f"{party.client}/{party.id}",
+            party.arc,
+            party.priority,
+            party.who,
+            None if party.yields_in is None else round(party.yields_in * SECOND),
+            label(party),
+        )
+        for party in why.by
+    )
+    code, rcs, patterns = ReasonCode(why.code), tuple(why.rcs), tuple(why.patterns)
+    return Reason(code, rcs, by, why.detail, why.count, why.pattern, patterns)
+
+
+def waits_for_others(why: Reason | ReasonInfo | None) -> bool:
+    """Return True if the text of a reason begins with `waits for`."""
+    if why is None or why.code == ReasonCode.HELD:
+        return why is not None
+    return why.code == ReasonCode.VETOED and (len(why.rcs) > 1 or len(why.by) > 0)
+
+
+def waits(reason: str, why: Reason | ReasonInfo | None) -> str:
+    """How something waits, after its name: `waits for survey (alice@ws1): robot/a`, `waits: votes are out`."""
+    return reason if waits_for_others(why) else f"waits: {reason}"
+
+
+_OUTCOMES: Final = (ReasonCode.PREEMPTED, ReasonCode.CANCELLED, ReasonCode.RELEASED, ReasonCode.HANDED_OVER)
+"""Reasons whose text begins with the outcome."""
+
+
+def ended(outcome: str, reason: str, why: Reason | ReasonInfo | None) -> str:
     """How something ended: `preempted by ...`, `lost: robot/a ended the hold`."""
     word = outcome.replace("_", " ")
-    return reason if reason.startswith(word) else f"{word}: {reason}" if reason else word
+    return reason if why is not None and why.code in _OUTCOMES else f"{word}: {reason}" if reason else word
 
 
 def of_rcs(code: ReasonCode, rcs: Sequence[RcName], detail: str = "") -> Reason:
@@ -223,8 +268,8 @@ _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
     ReasonCode.DISPLACED: lambda why: (
         f"its minimum runtime is over, and {why.by[0]}, priority {why.by[0].priority}, needs it{why.by[0].comment}"
     ),
-    ReasonCode.CANCELLED: lambda why: f"cancelled by {why.detail}",
-    ReasonCode.RELEASED: lambda why: f"released by {why.detail}",
+    ReasonCode.CANCELLED: lambda why: f"cancelled by {why.detail or ITS_CLIENT}",
+    ReasonCode.RELEASED: lambda why: f"released by {why.detail or ITS_CLIENT}",
     ReasonCode.CLIENT_LOST: lambda why: why.detail,
     ReasonCode.HANDED_OVER: lambda why: f"handed over to {why.detail}",
     ReasonCode.RC_LOST: lambda why: f"{why.rcs[0]} was lost" + (f": {why.detail}" if why.detail else ""),

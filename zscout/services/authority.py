@@ -116,9 +116,11 @@ class Authority:
             if sender.host in members:
                 continue  # it has no more than before
             if quota.arcs is not None and open_by(members) + len(arcs) > quota.arcs:
-                raise Refused("not_allowed", f"{owner} may have {quota.arcs} open requests, and would have more")
+                words = f"{owner} may have {quota.arcs} open requests, and would have more; cancel some first"
+                raise Refused("not_allowed", words)
             if running and quota.rcs is not None and held_by(members) + running > quota.rcs:
-                raise Refused("not_allowed", f"{owner} may hold {quota.rcs} devices at one time, and would hold more")
+                words = f"{owner} may hold {quota.rcs} devices at one time, and would hold more; release some first"
+                raise Refused("not_allowed", words)
 
     def check_operator(self, sender: Sender, what: str) -> None:
         """Raises Refused for all but operators. `what` stands behind `may not`."""

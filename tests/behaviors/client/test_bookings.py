@@ -120,14 +120,14 @@ async def test_an_instant_is_one_in_any_zone(start: datetime) -> None:
 def test_the_date_that_an_rcm_has_linked_is_shown_to_the_next() -> None:
     it = arc()
     it.booking = "b1"
-    assert it.ask(NOW).booking == "b1"
-    assert it.take(type(WAITS)(**{**asdict(WAITS), "step": 1, "booking": "b1@1796130000"}), NOW)
-    assert it.take(RUNS, NOW), "a notice that says nothing of it changes nothing"
-    assert it.ask(NOW).booking == it.open_request(NOW).booking == "b1@1796130000"
-    assert it.take(TAKEN, NOW)
-    assert it.ask(NOW).booking == "b1@1796130000", "preempted, it waits for the same date"
-    assert isinstance(it.open_request(NOW), OpenRequest)
-    assert OpenArc.expected(it.open_request(NOW), NOW).booking == "b1@1796130000", "handed over as well"
+    assert it._ask(NOW).booking == "b1"
+    assert it._take(type(WAITS)(**{**asdict(WAITS), "step": 1, "booking": "b1@1796130000"}), NOW)
+    assert it._take(RUNS, NOW), "a notice that says nothing of it changes nothing"
+    assert it._ask(NOW).booking == it._open_request(NOW).booking == "b1@1796130000"
+    assert it._take(TAKEN, NOW)
+    assert it._ask(NOW).booking == "b1@1796130000", "preempted, it waits for the same date"
+    assert isinstance(it._open_request(NOW), OpenRequest)
+    assert OpenArc._expected(it._open_request(NOW), NOW).booking == "b1@1796130000", "handed over as well"
 
 
 class BookedFleet(SmallFleet):

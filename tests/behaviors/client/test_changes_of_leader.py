@@ -50,14 +50,14 @@ async def test_holds_and_places_outlive_a_change_of_leader() -> None:
         fleet.candidate("h1")
         async with hold(one, "first", {RC: {}}, min_runtime=60) as held:
             waits = [await client.request("next", {RC: {}}, min_runtime=60) for client in (two, three)]
-            places, term = [arc.place for arc in waits], one.internals.term
+            places, term = [arc._place for arc in waits], one.internals.term
             await fleet.lose_leader()
             await until(lambda: one.leader == "h1" and all(c.internals.term > term for c in (one, two, three)))
             assert held.active
             assert (await held.command(RC, ECHO)).result == 7
             # Each asks again, and keeps its place.
             await asyncio.sleep(7)
-            assert [(arc.state, arc.place) for arc in waits] == [("queued", place) for place in places]
+            assert [(arc.state, arc._place) for arc in waits] == [("queued", place) for place in places]
         assert await two.granted(waits[0]) is not None
 
 
@@ -91,8 +91,8 @@ async def test_without_an_rcm_a_hold_ends_after_its_lease_and_is_asked_again() -
         arc, _ = await held(one, "first")
         await fleet.candidates.pop("h0").stop()
         await until(lambda: arc.state == "asking", within=FLEET.timing.hold_lease / SECOND + 1)
-        assert arc.ending is not None
-        assert arc.ending.outcome == "lost"
+        assert arc._ending is not None
+        assert arc._ending.outcome == "lost"
         fleet.candidate("h1")
         assert await one.granted(arc) is not None
 

@@ -215,8 +215,8 @@ async def test_it_is_protected_for_the_fleet_s_time_and_goes_on_until_an_equal_w
             await asyncio.sleep(LONG)
         assert held.completed
         assert (held.arc.outcome, (one.mesh.now() - began) // SECOND) == ("completed", 90)
-        assert held.arc.ending is not None
-        assert held.arc.ending.by == f"h/two/{waits.id}"
+        assert held.arc._ending is not None
+        assert held.arc._ending.by == f"h/two/{waits.id}"
         assert await two.granted(waits) is not None
         # Nobody waits: it goes on.
         await asyncio.sleep(LONG)
@@ -282,7 +282,7 @@ async def test_the_fleet_s_longest_time_ends_it(*, keep: bool) -> None:
 async def test_a_grant_is_waited_for_at_most_so_long() -> None:
     async with small_fleet("one", "two") as (fleet, (one, two)):
         async with hold(one, "first", {RC: {}}):
-            with pytest.raises(TimeoutError, match=r"second was not granted within 30 s: waits for h/one"):
+            with pytest.raises(TimeoutError, match=r"second was not granted within 30 s: waits for first \(h/one\)"):
                 await hold(two, "second", {RC: {}}, timeout=30).granted()
             state = await fleet.state()
             assert not state.queue

@@ -121,8 +121,8 @@ async def test_a_hold_that_an_rc_has_not_confirmed_for_a_hold_lease_is_over_what
         assert held.ended_at is not None
         assert 0 <= held.ended_at - until_then < 0.05 * SECOND
         assert arc.grant is None
-        assert arc.ending is not None
-        assert "did not confirm it for the hold lease" in arc.ending.reason
+        assert arc._ending is not None
+        assert "did not confirm it for the hold lease" in arc._ending.reason
         fleet.network.disturb({})
         held.returned()
         # It has its place still.
@@ -134,7 +134,7 @@ async def test_who_could_not_enter_in_its_time_is_queued_with_its_full_minimum_r
     async with small_fleet("one", "two", "three") as (fleet, (one, two, three)):
         await enter(one, "first", keep=True)
         arc = await two.request("second", {RC: {}}, priority=1, min_runtime=2, keep=keep)
-        first_grant, place = arc.grant, arc.place
+        first_grant, place = arc.grant, arc._place
         asked = two.mesh.now()
         entering = asyncio.create_task(two.granted(arc, confirmed=True))
         if keep:
@@ -143,7 +143,7 @@ async def test_who_could_not_enter_in_its_time_is_queued_with_its_full_minimum_r
             await three.request("third", {RC: {}}, priority=1, min_runtime=0.5)
         grant = await entering
         assert grant not in (None, first_grant)
-        assert arc.place == place
+        assert arc._place == place
         assert (two.mesh.now() - asked) / SECOND >= SETTLE - 0.1
         # What is kept goes on after its minimum runtime, which passed meanwhile.
         assert keep or (arc.end - two.mesh.now()) / SECOND > 0
@@ -155,7 +155,7 @@ async def test_who_could_not_enter_in_its_time_is_queued_with_its_full_minimum_r
 async def test_a_grant_whose_program_was_told_to_leave_is_not_entered_again() -> None:
     async with small_fleet("one") as (_, (one,)):
         arc, held = await enter(one, "first")
-        arc.lose("one RCM says so", one.mesh.now())
+        arc._lose("one RCM says so", one.mesh.now())
         one._store.notify(arc)
         assert held.over
         held.returned()

@@ -38,13 +38,13 @@ async def runs_and_waits(old: Client) -> tuple[Grant, list[tuple[str, Place | No
     grant = runs.grant
     assert grant is not None
     waits = await old.request("waits", {RC: {}}, min_runtime=3600)
-    return grant, [(arc.id, arc.place) for arc in (runs, waits)]
+    return grant, [(arc.id, arc._place) for arc in (runs, waits)]
 
 
 async def both_go_on(new: Client, grant: Grant, places: list[tuple[str, Place | None]]) -> None:
     """Under their ids, at their places; what ran was granted anew."""
     runs, waits = [await new.request(name, {RC: {}}, min_runtime=3600) for name in ("runs", "waits")]
-    assert [(arc.id, arc.place) for arc in (runs, waits)] == places
+    assert [(arc.id, arc._place) for arc in (runs, waits)] == places
     granted = await new.granted(runs)
     assert granted is not None
     assert granted > grant
@@ -135,7 +135,7 @@ async def test_a_promise_that_is_made_as_a_hand_over_is_answered_counts() -> Non
         begin_move(old, new)
         fleet.network.link(new.mesh, old.mesh).delay = 0.2
         moved: list[Term] = []
-        old.internals.watch(lambda arc: moved.append(arc.last[0]) if arc.state == "moved" else None)
+        old.internals.watch(lambda arc: moved.append(arc._last[0]) if arc.state == "moved" else None)
         moving = asyncio.create_task(old.internals.hand_over_all(new.mesh.me))
         await until(new.internals.open_requests)
         candidate, promised = fleet.mesh("h1", "node"), Term(2, "f" * 12)
@@ -162,14 +162,14 @@ async def test_what_an_rcm_that_was_replaced_has_handed_over_is_awaited_once_mor
         moving = asyncio.create_task(old.internals.hand_over_all(new.mesh.me))
         moved = await new.request("waits", {RC: {}}, min_runtime=3600)
         told: list[tuple[str, int]] = []
-        new.internals.watch(lambda arc: told.append((arc.state, arc.last[0].counter)))
+        new.internals.watch(lambda arc: told.append((arc.state, arc._last[0].counter)))
         granting = asyncio.create_task(new.granted(moved))
         fleet.network.link(old.mesh, next_leader).delay = 0.2
         fleet.network.heal()
         await moving
         await until(lambda: told[-1:] == [("queued", 2)])
         assert "ended" not in dict(told)
-        assert (moved.id, moved.place) == (waits.id, waits.place)
+        assert (moved.id, moved._place) == (waits.id, waits._place)
         await rival.close()
         assert await granting is not None
 
@@ -178,17 +178,17 @@ async def test_what_is_awaited_once_more_is_handed_on() -> None:
     """The RCM of a later term has dropped the old client meanwhile."""
     async with small_fleet("one", "two") as (_, (one, two)):
         arc = await one.request("work", {"robot/z": {}}, min_runtime=3600)
-        before = arc.id, arc.place
+        before = arc.id, arc._place
         # As if it had come in this term, and a later RCM knew it as another client's.
-        arc._came = arc.last[0]
-        told = Notice(arc.id, arc.name, "h/one", "ended", Term(arc.last[0].counter + 1, "later"), 1)
+        arc._came = arc._last[0]
+        told = Notice(arc.id, arc.name, "h/one", "ended", Term(arc._last[0].counter + 1, "later"), 1)
         one._store.take(arc, replace(told, outcome="handed_over"))
         assert (arc.state, one.internals.open_requests()) == ("awaited", [])
         begin_move(one, two)
         moving = asyncio.create_task(one.internals.hand_over_all(two.mesh.me))
         moved = await two.request("work", {"robot/z": {}}, min_runtime=3600)
         await moving
-        assert (moved.id, moved.place) == before
+        assert (moved.id, moved._place) == before
 
 
 async def test_what_lost_its_rcm_as_it_is_handed_over_is_handed_over_all_the_same(
@@ -201,13 +201,13 @@ async def test_what_lost_its_rcm_as_it_is_handed_over_is_handed_over_all_the_sam
     async with small_fleet("old", "new") as (fleet, (old, new)):
         arc = await running(old)
         begin_move(old, new)
-        before, link = (arc.id, arc.place), fleet.network.link(fleet.leader(), old.mesh)
+        before, link = (arc.id, arc._place), fleet.network.link(fleet.leader(), old.mesh)
         link.loss = 1.0
         await until(lambda: arc.state == "asking")
         link.loss = 0.0
         await old.internals.hand_over_all(new.mesh.me)
         after = await new.request("runs", {RC: {}}, min_runtime=3600)
-        assert (after.id, after.place) == before
+        assert (after.id, after._place) == before
 
 
 async def test_what_the_new_client_does_not_hear_of_is_asked_for_as_what_it_was() -> None:

@@ -58,7 +58,7 @@ async def test_what_had_its_time_before_its_client_heard_of_it_is_asked_for_anew
     async with small_fleet("one", "two") as (fleet, (one, two)):
         first = await one.request("first", {RC: {}}, min_runtime=600, keep=True)
         waits = await two.request("second", {RC: {}}, min_runtime=0.5, keep=False)
-        known_as, place = waits.id, waits.place
+        known_as, place = waits.id, waits._place
         fleet.network.disturb({"notice": Disturbance(lost=1.0)})
         await one.end(first)
         assert await fleet.holders() == ["second"]
@@ -66,7 +66,7 @@ async def test_what_had_its_time_before_its_client_heard_of_it_is_asked_for_anew
         fleet.network.disturb({})
         assert waits.state == "queued"
         assert await two.granted(waits) is not None
-        assert (waits.id != known_as, waits.place) == (True, place)
+        assert (waits.id != known_as, waits._place) == (True, place)
 
 
 async def test_a_client_that_hears_no_publication_of_an_rcm_that_it_sees_joins_the_mesh_anew(

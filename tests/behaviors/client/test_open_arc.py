@@ -87,23 +87,23 @@ def runs(bound: dict[str, str], step: int = 2, grant: Grant = FIRST) -> Notice:
 def test_words_of_the_rcm(words: list[Notice], state: str, grant: Grant | None, ending: Any) -> None:
     known = arc()
     for number, word in enumerate(words):
-        known.take(word, NOW + number)
-    assert (known.state, known.grant, known.ending) == (state, grant, ending)
-    assert (known.open_request(NOW).grant, known.place) == (grant, Place(TERM, 1))
+        known._take(word, NOW + number)
+    assert (known.state, known.grant, known._ending) == (state, grant, ending)
+    assert (known._open_request(NOW).grant, known._place) == (grant, Place(TERM, 1))
 
 
 def test_what_meets_a_pattern_is_what_the_newest_hold_says() -> None:
     known = arc("fg/*", "fg/*#2", "robot/x")
-    assert known.take(runs({"fg/*": "fg/b", "fg/*#2": "fg/a"}), NOW)
+    assert known._take(runs({"fg/*": "fg/b", "fg/*#2": "fg/a"}), NOW)
     first = Held(NOBODY, known, FIRST)
     assert (first.rcs, first.rc("fg/*"), first.rc("fg/*#2")) == (["fg/a", "fg/b", "robot/x"], "fg/b", "fg/a")
     assert (first.rc("robot/x"), first.rc("fg/a")) == ("robot/x", "fg/a")
-    known.take(TAKEN, NOW)
-    known.take(runs({"fg/*": "fg/c", "fg/*#2": "fg/a"}, step=5, grant=SECOND_GRANT), NOW)
+    known._take(TAKEN, NOW)
+    known._take(runs({"fg/*": "fg/c", "fg/*#2": "fg/a"}, step=5, grant=SECOND_GRANT), NOW)
     again = Held(NOBODY, known, SECOND_GRANT)
     assert (again.rcs, again.rc("fg/*")) == (["fg/a", "fg/c", "robot/x"], "fg/c")
     assert first.rc("fg/*") == "fg/b"
-    assert known.ask(NOW).needs.keys() == {"fg/*", "fg/*#2", "robot/x"}
+    assert known._ask(NOW).needs.keys() == {"fg/*", "fg/*#2", "robot/x"}
     for unasked in ("fg/*#3", "video/*", "robot/y", "fg/b"):
         with pytest.raises(KeyError, match=re.escape(f"{unasked} is not a need of survey; it asked for fg/*,")):
             again.rc(unasked)
@@ -123,45 +123,45 @@ def test_what_meets_a_pattern_is_what_the_newest_hold_says() -> None:
 )
 def test_a_hold_that_is_not_what_was_asked_for_is_not_believed(bound: dict[str, str]) -> None:
     known = arc("fg/*", "fg/*#2", "robot/x")
-    assert not known.take(runs(bound), NOW)
+    assert not known._take(runs(bound), NOW)
     assert (known.state, known.grant, known.rcs, known.bound) == ("asking", None, [], {})
 
 
 def test_no_binding_makes_another_rc_of_one_that_was_named() -> None:
     known = arc("robot/x")
-    assert known.take(runs({"robot/x": "robot/y"}), NOW)
+    assert known._take(runs({"robot/x": "robot/y"}), NOW)
     assert (known.rcs, known.bound) == (["robot/x"], {})
 
 
 def test_what_the_client_ends_itself() -> None:
     lost, given_up = arc(), arc()
     for known in (lost, given_up):
-        known.take(RUNS, NOW)
-    lost.lose("no RCM was heard", NOW)
-    assert (lost.state, lost.grant, lost.open, lost.ending) == (
+        known._take(RUNS, NOW)
+    lost._lose("no RCM was heard", NOW)
+    assert (lost.state, lost.grant, lost.open, lost._ending) == (
         "asking",
         None,
         True,
         ("lost", "no RCM was heard", None),
     )
     given_up.why = ReasonInfo("held")
-    given_up.finish("released", "given up", NOW)
-    assert (given_up.open, given_up.ending) == (False, ("released", "given up", None))
+    given_up._finish("released", "given up", NOW)
+    assert (given_up.open, given_up._ending) == (False, ("released", "given up", None))
     assert [given_up.why] == [None]
-    assert not given_up.take(AGAIN, NOW)
+    assert not given_up._take(AGAIN, NOW)
 
 
 def test_a_body_is_told_why_it_ended_whatever_came_after() -> None:
     known = arc()
     for word in (RUNS, TAKEN, WAITS):
-        known.take(word, NOW)
+        known._take(word, NOW)
     revoked = Revoked(known)
     assert (revoked.outcome, revoked.by, str(revoked)) == ("preempted", "h/c/op", "preempted by op")
 
 
 def test_what_was_refused_before_any_hold_is_told_as_well() -> None:
     known = arc()
-    known.take(notice(1, "ended", outcome="cancelled", reason="cancelled by an operator"), NOW)
+    known._take(notice(1, "ended", outcome="cancelled", reason="cancelled by an operator"), NOW)
     revoked = Revoked(replace(known))
     assert (revoked.outcome, str(revoked)) == ("cancelled", "cancelled by an operator")
 
@@ -170,45 +170,45 @@ EXPECTED = OpenRequest("id", "survey", {"robot/x": {}}, 3, Decimal(5), True, Pla
 
 
 def test_what_is_expected_is_nobodys_until_there_is_word_of_it() -> None:
-    known = OpenArc.expected(EXPECTED, NOW)
-    assert (known.state, known.open, known.grant, known.place) == ("expected", False, None, Place(TERM, 1))
-    assert known.open_request(NOW).waited == 2.0
+    known = OpenArc._expected(EXPECTED, NOW)
+    assert (known.state, known.open, known.grant, known._place) == ("expected", False, None, Place(TERM, 1))
+    assert known._open_request(NOW).waited == 2.0
     # The old client's end of it is not the new one's.
-    assert not known.take_first(notice(9, "ended", outcome="handed_over"), NOW)
+    assert not known._take_first(notice(9, "ended", outcome="handed_over"), NOW)
     # Nor is what was said of it when it was here before.
-    known.last = (TERM, 1)
-    assert not known.take_first(notice(1, "running", grant=FIRST, remaining=5.0), NOW)
+    known._last = (TERM, 1)
+    assert not known._take_first(notice(1, "running", grant=FIRST, remaining=5.0), NOW)
     assert (known.state, known.open) == ("expected", False)
-    assert known.take_first(RUNS, NOW)
+    assert known._take_first(RUNS, NOW)
     assert (known.state, known.grant, known.rcs) == ("running", FIRST, ["robot/x"])
-    queued = OpenArc.expected(EXPECTED, NOW)
-    assert queued.take_first(WAITS, NOW)
-    assert (queued.state, queued.open_request(NOW + SECOND).waited) == ("queued", 3.0)
+    queued = OpenArc._expected(EXPECTED, NOW)
+    assert queued._take_first(WAITS, NOW)
+    assert (queued.state, queued._open_request(NOW + SECOND).waited) == ("queued", 3.0)
 
 
 @pytest.mark.parametrize("bad", [{"id": "a/b"}, {"arc": ""}, {"needs": {"robot": {}}}])
 def test_nobody_is_handed_what_has_no_name(bad: dict[str, Any]) -> None:
     with pytest.raises(BadName):
-        OpenArc.expected(msgspec.structs.replace(EXPECTED, **bad), NOW)
+        OpenArc._expected(msgspec.structs.replace(EXPECTED, **bad), NOW)
 
 
 @pytest.mark.parametrize("held", [True, False])
 def test_what_moved_and_is_taken_back_keeps_its_place_and_its_wait(held: bool) -> None:
     known = arc()
     for word in (WAITS, RUNS, AGAIN) if held else (RUNS, TAKEN):
-        known.take(word, NOW)
-    known.place = Place(TERM, 1)
-    known.move(NOW + SECOND)
+        known._take(word, NOW)
+    known._place = Place(TERM, 1)
+    known._move(NOW + SECOND)
     assert (known.state, known.open, known.grant) == ("moved", False, None)
-    assert not known.take(notice(99), NOW + SECOND)
-    known.take_back("new", "the new client is gone", NOW + 2 * SECOND)
-    asked = known.ask(NOW + 3 * SECOND)
+    assert not known._take(notice(99), NOW + SECOND)
+    known._take_back("new", "the new client is gone", NOW + 2 * SECOND)
+    asked = known._ask(NOW + 3 * SECOND)
     assert (known.state, known.open) == ("asking", True)
     assert (asked.id, asked.place, asked.waited) == ("new", Place(TERM, 1), 2.0 if held else 3.0)
     revoked = Revoked(known)
     # A hold that moved is a hold that was lost; how an earlier one ended stays as it was.
     assert revoked.outcome == ("lost" if held else "preempted")
-    assert known.take(notice(1, "running", grant=FIRST, remaining=5.0, term=OLD), NOW + 3 * SECOND)
+    assert known._take(notice(1, "running", grant=FIRST, remaining=5.0, term=OLD), NOW + 3 * SECOND)
 
 
 async def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_later() -> None:
@@ -220,9 +220,9 @@ async def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_f
     store.take(known, gone)
     assert (known.state, store.acknowledged) == ("running", [known])
     store.move(known, notice(10, "running", client="h/new", grant=SECOND_GRANT))
-    assert (store.open, store.moved, known.last) == ([], {"id": known}, (TERM, 10))
+    assert (store.open, store.moved, known._last) == ([], {"id": known}, (TERM, 10))
     # What is expected is told of without a place: the RCs decide whose it is.
-    store.expected["other"] = OpenArc.expected(msgspec.structs.replace(EXPECTED, id="other"), NOW)
+    store.expected["other"] = OpenArc._expected(msgspec.structs.replace(EXPECTED, id="other"), NOW)
     assert [(told.id, told.place, told.grant) for told in store.open_requests()] == [("other", None, None)]
     store.resumed.set()
     store.reclaim(known)
@@ -254,7 +254,7 @@ async def test_what_its_rc_does_not_confirm_is_asked_for_again_at_its_place(
 ) -> None:
     client, known = Client(mesh(lambda: NOW), default_fleet()), arc("robot/a")
     client._store.add(known)
-    known.take(runs({}), NOW)
+    known._take(runs({}), NOW)
     ended, asked = list[OpenArc](), list[Any]()
 
     async def command(rc: str, *_: Any, **__: Any) -> Done:
@@ -267,11 +267,11 @@ async def test_what_its_rc_does_not_confirm_is_asked_for_again_at_its_place(
 
     async def submit(again: OpenArc) -> None:
         assert (again.state, again.grant) == ("asking", None)
-        ask = again.ask(NOW)
+        ask = again._ask(NOW)
         asked.append((ask.grant, ask.unconfirmed))
-        again.take(runs({}, 3, SECOND_GRANT), NOW)
+        again._take(runs({}, 3, SECOND_GRANT), NOW)
         client._store.notify(again)
-        assert again.ask(NOW).unconfirmed == []
+        assert again._ask(NOW).unconfirmed == []
 
     client._confirmations._command = command
     client.end, client._rcm.submit = end, submit  # type: ignore[assignment,method-assign]
@@ -288,7 +288,7 @@ async def test_what_its_rc_does_not_confirm_is_asked_for_again_at_its_place(
 async def test_a_grant_is_confirmed_by_an_rc_whose_link_comes_within_the_second() -> None:
     loop = asyncio.get_running_loop()
     client, known = Client(mesh(lambda: round(loop.time() * SECOND)), default_fleet()), arc()
-    known.take(runs({}), client.mesh.now())
+    known._take(runs({}), client.mesh.now())
     linked = loop.time() + 0.99
 
     async def command(rc: str, *_: Any, **__: Any) -> Done:
@@ -303,7 +303,7 @@ async def test_a_grant_is_confirmed_by_an_rc_whose_link_comes_within_the_second(
 async def test_a_client_that_stood_still_itself_gives_its_rcs_a_second_all_the_same() -> None:
     loop, still = asyncio.get_running_loop(), 0.0
     client, known = Client(mesh(lambda: round((loop.time() + still) * SECOND)), default_fleet()), arc()
-    known.take(runs({}), client.mesh.now())
+    known._take(runs({}), client.mesh.now())
 
     async def command(rc: str, *_: Any, **__: Any) -> Done:
         nonlocal still
@@ -329,7 +329,7 @@ async def test_who_shows_a_place_shows_the_term_as_well() -> None:
     client._rcm.query = query  # type: ignore[method-assign]
     await client._rcm.ask(known)
     client._rcm.accept(TERM)
-    known.take(notice(1, place=Place(TERM, 1)), NOW)
+    known._take(notice(1, place=Place(TERM, 1)), NOW)
     await client._rcm.ask(known)
     # An RCM of a lower term steps down at that, and does not refuse the place as one that can't be.
     assert asked == [None, TERM]

@@ -93,7 +93,7 @@ def test_booked_listed_found_taken_up_and_given_up(fleet: CliFleet) -> None:
         assert taken["dates"][0]["state"] == "taken"
     finally:
         end(waiting)
-    assert said(fleet, "unbook", listed["id"][:6]).endswith("is given up\n")
+    assert said(fleet, "unbook", listed["id"][:6]).endswith("is cancelled\n")
     assert said(fleet, "bookings") == "nothing is booked\n"
 
 
@@ -154,16 +154,17 @@ def test_what_is_repeated_is_given_up_date_by_date(fleet: CliFleet) -> None:
     series, single = sorted(both, key=lambda one: -one["every"])
     said(fleet, "unbook", single["id"])
     gone = said(fleet, "unbook", "c", "--date", "tomorrow")
-    assert re.search(r"gives up \w\w\w [-\d]+ 09:00\n$", gone)
+    assert re.search(r"no longer has \w\w\w [-\d]+ 09:00\n$", gone)
     [left] = told(fleet, "bookings")["bookings"]
     assert [date["start"] for date in left["dates"]] == [date["start"] for date in series["dates"]][1:]
     assert "c has no such date; it has " in said(fleet, "unbook", "c", "--date", "tomorrow", code=1)
-    assert said(fleet, "unbook", "c").endswith("is given up, with all its dates\n")
+    assert said(fleet, "unbook", "c").endswith("is cancelled, with all its dates\n")
 
 
 def test_who_would_run_into_maintenance_is_told_until_when(fleet: CliFleet) -> None:
     made = said(fleet, "maintain", "robot/c", "--at", "in 10m", "--for", "1h", "--comment", "new gripper")
-    assert re.search(r"^maintenance \([0-9a-f]{8}\) is kept free: robot/c: .* in 1\d min", made)
+    assert re.search(r"^maintenance \([0-9a-f]{8}\): robot/c: .* in 1\d min", made)
+    assert made.endswith("to end it early: zscout booking cancel maintenance\n")
     waiting, said_first = fleet.begun("request waits", "request", "robot/c", "--min-runtime", "20m")
     try:
         waits = said_first[-1]
@@ -180,7 +181,8 @@ def test_who_would_run_into_maintenance_is_told_until_when(fleet: CliFleet) -> N
 def test_status_shows_what_is_in_maintenance(fleet: CliFleet) -> None:
     said(fleet, "maintain", "robot/b", "--at", "now", "--for", "1h", "--name", "greased")
     for state in ("maintenance", "free"):
-        row = re.compile(rf"^robot/b +exclusive +{state} ", re.MULTILINE)
+        by = r"\S+ +greased \(\S+\) until \d\d:\d\d" if state == "maintenance" else ""
+        row = re.compile(rf"^robot/b +exclusive +{state} +{by}", re.MULTILINE)
         fleet.shown("status", until=row.search)
         if state == "maintenance":
             said(fleet, "unbook", "greased")

@@ -316,11 +316,16 @@ def test_devices_that_are_not_there_are_told_by_host() -> None:
 
 def test_what_no_file_names_may_be_forgotten() -> None:
     gone = led(view("robot/d", present=False, reason="dock is gone", gone=60.0, host="dock"))
-    assert the_mend(seen(state=gone)).remedy == "start zscout-node at dock, or forget it: it is shown for a day"
+    assert (
+        the_mend(seen(state=gone)).remedy
+        == "start zscout-node at dock, or ignore this if it was removed: it is listed for a day"
+    )
     named = replace(PLAIN, devices={"dock": ("robot/d",)})
     assert the_mend(seen(named, state=gone)).remedy == "start zscout-node at dock, or remove it from [devices]"
     there = leading() | host("dock", Role.NODE, version=VERSION)
-    assert the_mend(seen(hosts=there, state=gone)).remedy.endswith(" or forget it: it is shown for a day")
+    assert the_mend(seen(hosts=there, state=gone)).remedy.endswith(
+        " or ignore this if it was removed: it is listed for a day"
+    )
 
 
 def test_what_a_node_should_offer_is_expected_of_it() -> None:

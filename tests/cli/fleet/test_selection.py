@@ -79,3 +79,5 @@ def test_a_name_that_nothing_has() -> None:
     missing = Selection(["robot/a", "survy"], STATE, HOMES, {"anvil": Host()}).missing()
     assert missing is not None
     assert str(missing) == 'unknown device, request or host "survy"; did you mean survey?'
+    missing = Selection(["1"], STATE, HOMES, {}).missing()
+    assert str(missing) == 'unknown device, request or host "1"; did you mean fg/1?'

@@ -118,6 +118,7 @@ class Picture:
             date = BookedDate(round(NOW.timestamp()) - 60, round(NOW.timestamp()) + 60, "open")
             view_of = BookingView(
                 id="b1",
+                owner="anvil",
                 name="service",
                 needs={name: {}},
                 start=date.start,

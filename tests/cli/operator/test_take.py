@@ -35,7 +35,7 @@ def test_a_yes_at_the_terminal_takes_and_ctrl_c_gives_back(fleet: CliFleet) -> N
         terminal.press("\x03")
         assert terminal.code() == 130
     assert survey.wait(HANG) == 1
-    told = f"survey lost its grant: preempted by {by('zscout take')}, priority 10: the gripper is stuck"
+    told = f"survey lost its grant: preempted by {held_by('operator')}, priority 10: the gripper is stuck"
     assert told in out_of(survey).read()
     assert fleet.idle("robot/a")
 

@@ -71,4 +71,9 @@ def test_a_name_of_several_is_refused_with_the_list(fleet: CliFleet) -> None:
 def test_an_unknown_arc_is_one_line(fleet: CliFleet) -> None:
     done = fleet.zscout("cancel", "nobody")
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == 'zscout: no request "nobody" holds or waits; see zscout status\n'
+    assert (
+        done.stderr
+        == 'zscout: no request "nobody" holds or waits; see zscout status, or zscout booking list for bookings\n'
+    )
+    device = fleet.zscout("release", "robot/a").stderr
+    assert device.endswith("it is a device: zscout status robot/a shows which request holds it\n")

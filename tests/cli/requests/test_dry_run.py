@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import end, named
+from tests.cli.tools import end, held_by
 
 pytestmark = pytest.mark.live
 
@@ -23,12 +23,12 @@ def test_it_says_when_it_would_start_and_whom_it_would_preempt(fleet: CliFleet) 
     mine = fleet.holder("mine", "robot/a")
     try:
         take = fleet.zscout("request", "robot/a", "--priority", "5", "--dry-run")
-        assert take.stdout == f"request would start at once\nit would preempt mine of {named('mine')}\n"
+        assert take.stdout == f"request would start at once\nit would preempt {held_by('mine')}\n"
         wait = fleet.zscout("request", "robot/a", "robot/b", "--dry-run", "--json", "--name", "wide")
         told = json.loads(wait.stdout)
         assert (wait.returncode, told["arc"], told["preempts"]) == (0, "wide", [])
         assert told["starts_in"] > 0
-        assert told["reason"] == f"waits for {named('mine')}: robot/a"
+        assert told["reason"] == f"waits for {held_by('mine')}: robot/a"
         state = fleet.state(lambda state: True)
         assert [hold.arc for hold in state.holds] == ["mine"]
         assert not state.queue

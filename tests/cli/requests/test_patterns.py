@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import CLOCK, course, end, events, held_by, named, out_of, read_until
+from tests.cli.tools import CLOCK, course, end, events, held_by, out_of, read_until
 from tests.hang import HANG
 from zscout.cli.operator.take import takeover_cost
 from zscout.cli.requests.options import HoldOptions
@@ -156,7 +156,7 @@ def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
 
     low, high = fleet.holder("low", F1), fleet.holder("high", ANY, "--priority", "1")
     would = fleet.zscout("request", ANY, "--priority", "5", "--dry-run")
-    assert would.stdout == f"request would start at once\nit would preempt low of {named('low')}\n"
+    assert would.stdout == f"request would start at once\nit would preempt {held_by('low')}\n"
     assert fleet.zscout("take", ANY).returncode == 1
     taken = fleet.zscout("take", ANY, "--yes", "--no-keep", "--min-runtime", "8", "--json")
     preview, granted, _ = course(taken.stdout)

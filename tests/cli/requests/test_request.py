@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.cli_fleet import CliFleet, fleet_of
-from tests.cli.tools import CLOCK, COMMAND, by, course, end, events, gone, held_by, out_of, read_until
+from tests.cli.tools import CLOCK, COMMAND, course, end, events, gone, held_by, out_of, read_until
 from tests.hang import HANG
 from tests.live.bench import until
 from zscout.behaviors.client.client import QUERY_TIMEOUT, Client
@@ -134,7 +134,7 @@ def test_a_command_is_ended_when_its_grant_is_taken(fleet: CliFleet) -> None:
     lines = out_of(victim).read()
     assert victim.wait(HANG) == 75
     assert "told" in lines
-    assert f"victim lost its grant: preempted by {by('true')}, priority 5" in lines
+    assert f"victim lost its grant: preempted by {held_by('boss')}, priority 5" in lines
     assert fleet.idle("robot/a")
 
 
@@ -164,7 +164,7 @@ def test_a_command_goes_on_past_its_minimum_runtime_until_an_equal_waits(fleet: 
     lines = out_of(kept).read()
     assert kept.wait(HANG) == 124
     assert "told" in lines
-    why = f"its minimum runtime is over, and {by('true')}, priority 0, needs it"
+    why = f"its minimum runtime is over, and {held_by('next')}, priority 0, needs it"
     assert f"the time of kept is over: {why}\n" in lines
     assert fleet.idle("robot/a")
 

@@ -12,7 +12,8 @@ from tests.cli.tools import CLOCK, mine, ours, zscout_soon
 from tests.live.lab import PATIENT, Lab
 
 pytestmark = pytest.mark.live
-US, TAKE, MAPPING = re.escape(ours()), re.escape(mine("take")), re.escape(mine("mapping"))
+SURVEY, TAKE, MAPPING = (re.escape(mine(name)) for name in ("survey", "take", "mapping"))
+COMMAND = ours().partition(" (")[2][:-1]
 SOON = r"\d+(\.\d)? s"
 
 
@@ -34,8 +35,8 @@ async def test_the_story_of_an_arc(lab: Lab) -> None:
     plain = await zscout_soon("why", "survey", env=lab.env)
     assert (plain.returncode, plain.stderr) == (0, "")
     lines = plain.stdout.splitlines()
-    assert re.fullmatch(rf"survey of {US}, priority 0, has waited since {CLOCK} \({SOON}\)", lines[0])
-    assert lines[1] == f"  id {survey.id}, client test/program"
+    assert re.fullmatch(rf"{SURVEY}, priority 0, has waited since {CLOCK} \({SOON}\)", lines[0])
+    assert lines[1] == f"  id {survey.id}, client test/program, command {COMMAND}"
     assert re.fullmatch(rf"  waits for {TAKE}: robot/a, until {CLOCK} at the latest", lines[2])
     assert lines[3].endswith("in the queue of 2; it wants 10 min")
     spans = r"\(in (10 min|9 min \d+ s)\)"
@@ -50,8 +51,8 @@ async def test_the_story_of_an_arc(lab: Lab) -> None:
     told = [line.split(" ago)  ", 1)[1] for line in lines[10:]]
     assert re.match(rf" +{CLOCK} \(", lines[10])
     assert told[:2] == ["asked for radio/rf0, robot/a at priority 0", "granted radio/rf0, robot/a"]
-    assert re.fullmatch(rf"preempted by {US}, priority 10; queued again", told[2])
-    assert re.fullmatch(rf"waits for {US}: robot/a", told[3])
+    assert re.fullmatch(rf"preempted by {TAKE}, priority 10; queued again", told[2])
+    assert re.fullmatch(rf"waits for {TAKE}: robot/a", told[3])
 
     by_id = json.loads((await zscout_soon("why", survey.id, "--json", env=lab.env)).stdout)
     (arc,) = by_id["arcs"]
@@ -69,10 +70,10 @@ async def test_the_story_of_an_arc(lab: Lab) -> None:
     # Two of one name are told of one by one; ended ones from memory; unknown ones with what is near.
     twin = await client.request("take", {"robot/nowhere": {}}, min_runtime=1, wait_for_device=True)
     runs, waits = (await zscout_soon("why", "take", env=lab.env)).stdout.split("\n\n")
-    assert re.match(rf"take of {US}, priority 10, has run since ", runs)
+    assert re.match(rf"{TAKE}, priority 10, has run since ", runs)
     assert re.search(rf"\n  until {CLOCK} \(.*\), its minimum runtime of 10 min\nHolds\n", runs)
     assert " asked for robot/a at priority 10\n" in runs
-    assert f"  id {twin.id}, client test/program\n" in waits
+    assert f"  id {twin.id}, client test/program, command {COMMAND}\n" in waits
     assert " asked for robot/nowhere at priority 0\n" in waits
     assert "robot/a" not in waits
     await client.end(survey)
@@ -83,6 +84,8 @@ async def test_the_story_of_an_arc(lab: Lab) -> None:
     unknown = await zscout_soon("why", "mappin", env=lab.env)
     assert (unknown.returncode, unknown.stdout) == (1, "")
     assert unknown.stderr == 'zscout: unknown request "mappin"; did you mean mapping?\n'
+    device = (await zscout_soon("why", "robot/a", env=lab.env)).stderr
+    assert device == "zscout: robot/a is a device: zscout status robot/a shows which requests hold it or wait\n"
 
 
 @in_lab()

@@ -59,6 +59,7 @@ def test_a_hold_from_its_grant_to_its_end() -> None:
     assert seen.hold.who is not None
     assert (seen.hold.who.user, seen.hold.who.command) == ("alice", "./survey.py")
     assert (end.hold.grant, end.hold.ended, end.hold.outcome, end.hold.by) == (grant(1), 107.0, "preempted", by)
+    assert (end.hold.code, end.hold.own) == ("preempted", False)
 
 
 def test_an_rcm_that_does_not_tell_of_waits_is_heard_all_the_same() -> None:

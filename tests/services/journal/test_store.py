@@ -59,7 +59,15 @@ def arcs(store: JournalStore, now: float = NOW, **asked: object) -> list[int]:
 def test_a_hold_is_kept_whole(tmp_path: Path) -> None:
     store = opened(tmp_path)
     by = ReasonParty("id-take", "take", "desk/two", 10, Who("bob"))
-    how = {"reason": "taken", "by": by, "priority": 5, "waited": 2.5, "who": Who("alice", "ws1", "./x")}
+    how = {
+        "reason": "taken",
+        "code": "released",
+        "own": True,
+        "by": by,
+        "priority": 5,
+        "waited": 2.5,
+        "who": Who("alice", "ws1", "./x"),
+    }
     whole = past(1, NOW - 20, NOW - 10, "preempted", **how)
     commit(store, HoldSeen(whole), HoldOver(whole))
     answer = store.answer("anvil", HistoryAsk(), NOW)

@@ -103,7 +103,9 @@ def test_who_ends_before_it_has_answered_is_not_waited_for(tmp_path: Path) -> No
         await asyncio.sleep(0)
         await process.stop(5)
         # Its process may still have said so itself, on its way out.
-        with pytest.raises(Refused, match=r"it has ended, stopped|it is not running"):
+        with pytest.raises(
+            Refused, match=r"it has ended, stopped|\w+ is not running on \w+; see zscout component list"
+        ):
             await asking
         with pytest.raises(Refused, match="it must run for that"):
             await process.checkpoint()

@@ -31,8 +31,8 @@ def test_a_grant_is_told_to_its_user_after_a_wait_of_so_long() -> None:
         notices.on_began(one)
     assert {one[0] for one in told} == {"yours_now"}
     assert [one[1:] for one in told] == [
-        ("ada", "zscout lab: survey is yours now", "ada@ws1 (survey.py) holds robot/a after a wait of 50 min"),
-        ("ws1", "zscout lab: survey is yours now", "ws1/c (survey) holds robot/a after a wait of 2 h 30 min"),
+        ("ada", "zscout lab: survey is yours now", "survey (ada@ws1) holds robot/a after a wait of 50 min"),
+        ("ws1", "zscout lab: survey is yours now", "survey (ws1/c) holds robot/a after a wait of 2 h 30 min"),
     ]
 
 
@@ -54,8 +54,8 @@ def test_who_was_preempted_is_told_by_whom_and_why() -> None:
             "preempted",
             "ada",
             "zscout lab: survey was preempted",
-            "ada@ws1 (survey.py) held robot/a for 1 min 30 s: "
-            "preempted by bob@ws2 (drive.py), priority 10: a visitor is here; it waits again",
+            "survey (ada@ws1) held robot/a for 1 min 30 s: "
+            "preempted by drive (bob@ws2), priority 10: a visitor is here; it waits again",
         )
     ]
 

@@ -49,7 +49,7 @@ async def test_it_arrives_as_text_at_the_urls_and_at_the_user_concerned() -> Non
         telling.stop()
         assert lab.titles == ["zscout lab: survey is yours now"]
         assert ada.titles == ["a title", *lab.titles]
-        assert lab.heard[0]["message"] == "ada@ws1 (survey.py) holds robot/a after a wait of 1 min 40 s"
+        assert lab.heard[0]["message"] == "survey (ada@ws1) holds robot/a after a wait of 1 min 40 s"
         assert bob.heard == []
     # A node does without the 28 MB of all the services that Apprise knows.
     assert "apprise" not in sys.modules

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from zscout.keyexpr import Role, Token
 from zscout.messages import Parameter, RcState, RcView
-from zscout.services.rcm.devices import REMEMBERED, ExpectedDevices, SeenHome, homes_in
+from zscout.rcm.devices import REMEMBERED, ExpectedDevices, SeenHome, homes_in
 from zscout.types import SECOND, Ns
 
 ARM = "robot/arm"

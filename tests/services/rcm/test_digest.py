@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import pytest
 
@@ -71,9 +73,9 @@ class Term2:
         joined = [RcJoined(rc, sharable=False) for rc in ("robot/a", "robot/b")]
         self.at(10, *joined, LeadTaken(Term(2, "new"), holds, waiting))
 
-    def at(self, second: float, *events: Event) -> None:
+    def at(self, second: float, *events: Event, foretold: Mapping[str, int] = MappingProxyType({})) -> None:
         now = round(second * SECOND)
-        self.digest.take(now, events, self.core.handle(now, *events))
+        self.digest.take(now, events, self.core.handle(now, *events), foretold)
 
 
 def test_a_wait_is_from_the_queue_to_the_grant_and_begins_anew_when_it_is_preempted() -> None:
@@ -85,7 +87,7 @@ def test_a_wait_is_from_the_queue_to_the_grant_and_begins_anew_when_it_is_preemp
     assert fleet.heard.waits == [("one", 0), ("two", 0), ("one", 7)]
     assert fleet.heard.ends == [("one", "preempted", 5), ("two", "released", 7), ("one", "cancelled", 8)]
     assert fleet.heard.over[0].requeued
-    assert str(fleet.heard.over[0].reason) == "preempted by h/c (two), priority 5"
+    assert str(fleet.heard.over[0].reason) == "preempted by two (h/c), priority 5"
 
 
 def test_who_waited_under_an_earlier_rcm_and_asks_again_alone_has_waited_since_then() -> None:
@@ -130,10 +132,7 @@ def test_what_was_foretold_first_is_compared_with_the_start() -> None:
     fleet = Term2()
     fleet.at(20, Requested(asked("one", "robot/a")))
     fleet.at(21, Requested(asked("two", "robot/a")))
-    for start in (80, 90):
-        fleet.digest.foretell("h/c/two", start * SECOND)
-    fleet.digest.foretell("h/c/one", 90 * SECOND)  # it does not wait
-    fleet.at(30, Released("h/c/one"))
+    fleet.at(30, Released("h/c/one"), foretold={"h/c/two": 80 * SECOND})
     assert [one.late for one in fleet.heard.began] == [None, -50 * SECOND]
 
 
@@ -141,12 +140,10 @@ def test_nothing_is_kept_of_what_has_ended() -> None:
     fleet = Term2(held(asked("zero", "robot/b"), 3))
     for number in range(50):
         fleet.at(20 + number, Requested(asked(f"a{number}", "robot/a")), Requested(asked(f"b{number}", "robot/a")))
-        for client in ("c", "d"):
-            fleet.digest.foretell(f"h/{client}/b{number}", 90 * SECOND)
         fleet.at(20 + number, Released(f"h/c/a{number}"), HandedOver(f"h/c/b{number}", "h/d", f"h/d/b{number}"))
         fleet.at(20 + number, Cancelled(f"h/d/b{number}"), Released(f"h/c/b{number}"))
     fleet.at(71, Released("h/c/zero"), Adopted(held(asked("zero", "robot/b"), 3)))
-    assert [fleet.digest._foretold, fleet.digest._held] == [{}, {}]
+    assert fleet.digest._held == {}
 
 
 def test_a_listener_that_fails_ends_the_telling_and_nothing_else(caplog: pytest.LogCaptureFixture) -> None:

@@ -10,8 +10,8 @@ import pytest
 from tests.mesh.kit import until
 from tests.services.rcm.kit import FakeFleet, fleet_of
 from zscout.messages import Release
+from zscout.rcm import request_log
 from zscout.scheduling.forecast import forecast
-from zscout.services.rcm import registry
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         times.append(asyncio.get_running_loop().time())
         return real(*args)
 
-    monkeypatch.setattr(registry, "forecast", counted)
+    monkeypatch.setattr(request_log, "forecast", counted)
     return times
 
 

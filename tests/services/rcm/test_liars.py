@@ -13,8 +13,8 @@ from tests.mesh.kit import until
 from tests.services.rcm.kit import FakeClient, FakeFleet, FakeRc, Refusal
 from zscout.mesh import IncomingQuery
 from zscout.messages import ClientRequests, OpenRequest, RcAsk
+from zscout.rcm.places import Places
 from zscout.services.rcm.candidate import Candidate
-from zscout.services.rcm.places import Places
 from zscout.services.rcm.term_file import FILE, TermFile
 from zscout.types import NO_TERM, Place, Term
 

@@ -15,10 +15,10 @@ from tests.services.rcm.kit import FakeFleet, FakeRc, fleet_of, sees
 from zscout.config.fleet import default_fleet
 from zscout.mesh import IncomingQuery
 from zscout.messages import Holder, OpenRequest, RcAsk, RcState
+from zscout.rcm.roster import discrepancies
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, HandedOver, LeadTaken, RcJoined, Requested
 from zscout.scheduling.strategies import STRATEGIES
-from zscout.services.rcm.membership import discrepancies
 from zscout.services.rcm.rcm import holders_of
 from zscout.services.rcm.recovery import RecoveredState
 from zscout.testing.link import Disturbance

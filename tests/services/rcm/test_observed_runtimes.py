@@ -14,8 +14,7 @@ from tests.mesh.kit import until
 from tests.services.journal.kit import holder, over, past, published
 from tests.services.rcm.kit import FakeClient, FakeFleet, request
 from zscout.config.node import JournalConfig
-from zscout.messages import Cancel, Release, Who
-from zscout.scheduling.reason import ITS_CLIENT, Reason, ReasonCode
+from zscout.messages import Cancel, ReasonInfo, Release, Who
 from zscout.scheduling.runtimes import Wish
 from zscout.services.journal.follower import Change, HoldOver, HoldSeen
 from zscout.services.journal.journal import Journal
@@ -25,9 +24,8 @@ from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.observed_runtimes import RuntimeObserver
 from zscout.types import SECOND, Ns
 
-RELEASED = str(Reason(ReasonCode.RELEASED, detail=ITS_CLIENT))
+RELEASED = ReasonInfo("released", own=True)
 WHO = Who("alice", "ws1", "./survey.py")
-EXPIRED = str(Reason(ReasonCode.EXPIRED))
 
 
 async def begin(client: FakeClient, number: int, rc: str = "robot/a") -> None:
@@ -106,35 +104,41 @@ def wish(need: str, asked: int = 60) -> Wish:
     return Wish("survey", "./survey.py", frozenset({need}), asked * SECOND)
 
 
-def tell(observer: RuntimeObserver, number: int, lasted: float, outcome: str, reason: str, **more: Any) -> None:
+def tell(
+    observer: RuntimeObserver, number: int, lasted: float, outcome: str, why: ReasonInfo | None, **more: Any
+) -> None:
     """A hold of a minute, from its first publication to that of its end."""
     begun = replace(holder(number, "robot/a"), **more)
-    end = replace(over(number, outcome, "robot/a"), reason=reason)
+    end = replace(over(number, outcome, "robot/a"), why=why)
     observer.hear(number * 100 * SECOND, published(2 * number - 1, [begun]))
     observer.hear(number * 100 * SECOND + round(lasted * SECOND), published(2 * number, [], [end]))
 
 
 @pytest.mark.parametrize(
-    ("outcome", "reason", "learned"),
+    ("outcome", "why", "learned"),
     [
         ("released", RELEASED, 6 * SECOND),
         ("completed", RELEASED, 6 * SECOND),
-        ("released", "released by an operator", None),
-        ("cancelled", "cancelled by its client", None),
-        ("preempted", "preempted by bob", None),
-        ("lost", "robot/a was lost", None),
-        ("completed", "its minimum runtime is over, and bob, priority 0, needs it", None),
-        ("completed", EXPIRED, None),  # all that was asked for
-        ("handed_over", "handed over to ws2/c", None),
+        ("released", ReasonInfo("released", detail="bob@ws2"), None),
+        ("cancelled", ReasonInfo("cancelled", own=True), None),
+        ("preempted", ReasonInfo("preempted"), None),
+        ("lost", ReasonInfo("rc_lost"), None),
+        ("completed", ReasonInfo("displaced"), None),
+        ("completed", ReasonInfo("expired"), None),  # all that was asked for
+        ("handed_over", ReasonInfo("handed_over"), None),
+        ("released", None, None),  # of an older version
     ],
 )
-def test_only_what_ended_by_itself_says_how_long_it_takes(outcome: str, reason: str, learned: Ns | None) -> None:
+def test_only_what_ended_by_itself_says_how_long_it_takes(
+    outcome: str, why: ReasonInfo | None, learned: Ns | None
+) -> None:
     heard, recalled = RuntimeObserver(), RuntimeObserver()
     for number in range(1, 9):
-        tell(heard, number, 6, outcome, reason, bound={"robot/*": "robot/a"})
+        tell(heard, number, 6, outcome, why, bound={"robot/*": "robot/a"})
     assert heard.estimator.runtime(wish("robot/*")) == learned
     assert not heard._open
-    recalled.recall(past(number, 0.0, 6.0, outcome, reason=reason, who=WHO) for number in range(8))
+    ended = {} if why is None else {"code": why.code, "own": why.own}
+    recalled.recall(past(number, 0.0, 6.0, outcome, who=WHO, **ended) for number in range(8))
     assert recalled.estimator.runtime(wish("robot/a")) == learned
 
 

@@ -12,8 +12,8 @@ from tests.services.rcm.kit import FakeFleet, Refusal, request
 from zscout.behaviors.client.request import OpenArc
 from zscout.keyexpr import client_of
 from zscout.messages import Notice, OpenRequest
+from zscout.rcm.places import MAX_KEPT, Places
 from zscout.services.rcm.candidate import Candidate
-from zscout.services.rcm.places import MAX_KEPT, Places
 from zscout.types import SECOND, Place, Term
 
 OLD, NEW = Term(3, "old"), Term(4, "new")
@@ -178,13 +178,13 @@ def test_a_client_shows_its_place_and_seal_and_the_id_it_had_them_under() -> Non
     arc = OpenArc("q1", "arc", {"robot/a": {}}, 0, Decimal(60))
     place = Place(OLD, 7)
     said = {"id": "q1", "arc": "arc", "client": "desk/one", "state": "queued", "term": OLD}
-    assert arc.take(Notice(**said, step=1, place=place, seal="s"), 0)  # type: ignore[arg-type]
-    arc.take_back("q2", "its new client is gone", 0)
-    arc.take_back("q3", "and again", 0)
-    asked, listed = arc.ask(0), arc.open_request(0)
+    assert arc._take(Notice(**said, step=1, place=place, seal="s"), 0)  # type: ignore[arg-type]
+    arc._take_back("q2", "its new client is gone", 0)
+    arc._take_back("q3", "and again", 0)
+    asked, listed = arc._ask(0), arc._open_request(0)
     assert (asked.id, asked.place, asked.seal, asked.was) == ("q3", place, "s", "q1")
     assert (listed.id, listed.place, listed.seal, listed.was) == ("q3", place, "s", "q1")
     said |= {"id": "q3", "term": NEW}
-    assert arc.take(Notice(**said, step=1, place=place, seal="t"), 0)  # type: ignore[arg-type]
-    asked = arc.ask(0)
+    assert arc._take(Notice(**said, step=1, place=place, seal="t"), 0)  # type: ignore[arg-type]
+    asked = arc._ask(0)
     assert (asked.place, asked.seal, asked.was) == (place, "t", None)

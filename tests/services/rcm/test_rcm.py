@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -13,6 +14,7 @@ from tests.services.rcm.kit import FakeClient, FakeFleet, Refusal, fleet_of, gra
 from zscout.config.access import AccessPolicy, Quota, Roles
 from zscout.messages import Cancel, EndedHold, HandOver, Release
 from zscout.scheduling.model import Adopted, ArcRequest, RcJoined, RecoveredHold
+from zscout.services.rcm.rcm import MAX_BUILT, Rcm
 from zscout.types import SECOND, Grant, Place, Term
 
 
@@ -29,7 +31,7 @@ async def test_a_grant_is_published_and_the_loser_told_while_its_answer_is_on_th
     assert (preempted.outcome, preempted.by, preempted.grant) == ("preempted", "desk/operator/drive", first.grant)
     # Why it waits now is told a little later.
     await until(lambda: len(survey.notices) == 2)
-    assert survey.notices[1].reason == "waits for desk/operator (drive): robot/a"
+    assert survey.notices[1].reason == "waits for drive (desk/operator): robot/a"
     # The end of a hold that its own client released is told by the answer alone.
     await operator.do(Release("drive"))
     await until(lambda: survey.notices[-1].state == "running")
@@ -39,8 +41,8 @@ async def test_a_grant_is_published_and_the_loser_told_while_its_answer_is_on_th
     assert story == [
         "asked for robot/a at priority 0",
         "granted robot/a",
-        "preempted by desk/operator (drive), priority 10; queued again",
-        "waits for desk/operator (drive): robot/a",
+        "preempted by drive (desk/operator), priority 10; queued again",
+        "waits for drive (desk/operator): robot/a",
         "granted robot/a",
     ]
 
@@ -111,7 +113,7 @@ async def test_a_vote_that_is_late_grants_later_and_a_veto_is_a_reason() -> None
     await until(lambda: client.notices and client.notices[-1].state == "running")
     # A veto is a reason. It stands until the rules of the RC change.
     radio.accept = False
-    assert (await client.ask("more", "radio/f:9")).reason == "waits for desk/one (talk): radio/f refuses more: too much"
+    assert (await client.ask("more", "radio/f:9")).reason == "waits for talk (desk/one): radio/f refuses more: too much"
     await client.ask("more", "radio/f:9")
     assert [len(proposal.holders) for proposal in radio.proposals] == [1, 2]
     radio.accept, radio.rules = True, 1
@@ -194,7 +196,7 @@ async def test_a_client_has_a_lease_to_show_itself_and_longer_where_the_leader_s
     await ghost.ask("first", "robot/a")
     await until(lambda: robot.arcs == ["first"])
     await asyncio.sleep(0.7 * lease)
-    stall = rcm.membership._absence._stall
+    stall = rcm._stall
     stall.length, stall.ended = round(0.6 * lease * SECOND), rcm.mesh.now()
     await asyncio.sleep(lease)
     assert robot.arcs == ["first"]
@@ -256,7 +258,7 @@ async def test_a_hand_over_is_one_publication_and_can_be_repeated() -> None:
 async def test_a_hold_that_is_adopted_and_displaced_in_one_instant_is_told_as_it_ended() -> None:
     fleet = FakeFleet()
     rcm, one, two = fleet.rcm(counter=5), fleet.client("one"), fleet.client("two")
-    await until(lambda: rcm.membership.clients.keys() >= {one.name, two.name})
+    await until(lambda: rcm.roster.clients.keys() >= {one.name, two.name})
     assert (await two.ask("next", "robot/a")).state == "queued"
     before, at = Term(4, "before"), rcm.mesh.now()
     kept = ArcRequest(f"{one.name}/id", one.name, {"robot/a": {}}, 0, SECOND, keep=True, label="tally")
@@ -340,3 +342,23 @@ async def test_an_arc_that_is_open_at_its_new_client_already_counts_once_against
     await old.ask("b", "robot/b")
     with pytest.raises(Refusal, match="not_allowed: h2 may have 1 open requests, and would have more"):
         await old.do(HandOver("b", new.name))
+
+
+async def test_many_questions_about_the_state_cost_what_a_few_cost(monkeypatch: pytest.MonkeyPatch) -> None:
+    fleet, _ = await fleet_of("robot/a")
+    built, real = [], Rcm._state
+
+    def counted(self: Rcm, *args: Any) -> Any:
+        built.append(args)
+        return real(self, *args)
+
+    monkeypatch.setattr(Rcm, "_state", counted)
+    client = fleet.client("one")
+    asked = [fleet.state(forecast=bool(number % 2)) for number in range(400)]
+    states = await asyncio.gather(*asked, *(client.ask(f"a{number}", "robot/a") for number in range(20)))
+    assert len(states) == 420
+    assert len(built) <= 2 * MAX_BUILT * 2  # two kinds, in at most two spans
+    # RCs reckon ends by this one.
+    built.clear()
+    await asyncio.gather(*(fleet.state(holds_only=True) for _ in range(5)))
+    assert len(built) == 5

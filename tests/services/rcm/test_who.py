@@ -25,7 +25,7 @@ async def test_who_preempts_and_why_is_told_to_whom_it_preempts() -> None:
     assert [holder.who for holder in robot.holders] == [ALICE]
     await operator.ask("drive", "robot/a", priority=10, seconds=60, who=BOB)
     (preempted,) = survey.notices
-    assert preempted.reason == "preempted by bob@ws2 (zscout take), priority 10: the gripper is stuck"
+    assert preempted.reason == "preempted by drive (bob@ws2), priority 10: the gripper is stuck"
     (revoked,) = fleet.published[-1].revoked
     assert revoked.reason == preempted.reason
     for why in (preempted.why, revoked.why):
@@ -33,15 +33,15 @@ async def test_who_preempts_and_why_is_told_to_whom_it_preempts() -> None:
         assert [(one.client, one.id, one.priority, one.who) for one in why.by] == [("desk/operator", "drive", 10, BOB)]
     await until(lambda: len(survey.notices) == 2)
     waits = survey.notices[1]
-    assert (waits.reason, waits.who) == ("waits for bob@ws2 (zscout take): robot/a", ALICE)
+    assert (waits.reason, waits.who) == ("waits for drive (bob@ws2): robot/a", ALICE)
     state = await fleet.state(arc="survey")
     assert [(hold.arc, hold.who) for hold in state.holds] == [("drive", BOB)]
     assert [(wait.arc, wait.who) for wait in state.queue] == [("survey", ALICE)]
     assert [line.text for line in state.story] == [
         "asked for robot/a at priority 0",
         "granted robot/a",
-        "preempted by bob@ws2 (zscout take), priority 10: the gripper is stuck; queued again",
-        "waits for bob@ws2 (zscout take): robot/a",
+        "preempted by drive (bob@ws2), priority 10: the gripper is stuck; queued again",
+        "waits for drive (bob@ws2): robot/a",
     ]
 
 
@@ -72,8 +72,8 @@ async def test_all_choices_of_a_pattern_are_named() -> None:
         await client.ask(f"user{number}", f"framegrabber/fg{number}", priority=1, who=Who(f"u{number}", "ws", "x"))
     answer = await client.ask("any", "framegrabber/*", "robot/a")
     assert answer.reason == (
-        "waits for one of framegrabber/fg0 (held by u0@ws (x)), fg1 (held by u1@ws (x)), "
-        "fg2 (held by u2@ws (x)), fg3 (held by u3@ws (x))"
+        "waits for one of framegrabber/fg0 (held by user0 (u0@ws)), fg1 (held by user1 (u1@ws)), "
+        "fg2 (held by user2 (u2@ws)), fg3 (held by user3 (u3@ws))"
     )
     assert answer.why is not None
     assert (answer.why.pattern, answer.why.count) == ("framegrabber/*", 4)
@@ -81,7 +81,7 @@ async def test_all_choices_of_a_pattern_are_named() -> None:
     await client.ask("drives", "robot/a", priority=1, who=ALICE)
     await until(lambda: client.notices and "robot/a" in client.notices[-1].reason)
     assert client.notices[-1].reason.startswith(
-        "waits for alice@ws1 (survey.py): robot/a; for one of framegrabber/fg0 (held by u0@ws (x)), fg1 "
+        "waits for drives (alice@ws1): robot/a; for one of framegrabber/fg0 (held by user0 (u0@ws)), fg1 "
     )
     assert robot.arcs == ["drives"]
 
@@ -91,10 +91,10 @@ async def test_who_is_unknown_is_named_by_client_and_arc_and_who_cancels_by_name
     plain, operator = fleet.client("plain"), fleet.client("operator")
     await plain.ask("survey", "robot/a")
     answer = await operator.ask("late", "robot/a")
-    assert answer.reason == "waits for desk/plain (survey): robot/a"
+    assert answer.reason == "waits for survey (desk/plain): robot/a"
     await operator.do(Cancel("survey", "desk/plain", BOB))
     await until(lambda: plain.notices)
-    assert plain.notices[-1].reason == "cancelled by bob@ws2 (zscout take)"
+    assert plain.notices[-1].reason == "cancelled by bob@ws2"
     await plain.do(Cancel("late", "desk/operator"))
     await until(lambda: operator.notices and operator.notices[-1].state == "ended")
     assert operator.notices[-1].reason == "cancelled by desk/plain"
@@ -106,7 +106,7 @@ async def test_it_goes_on_elsewhere_under_the_same_user_on_the_new_host() -> Non
     await old.ask("counter", "robot/a", who=ALICE)
     await old.do(HandOver("counter", new.name))
     assert [holder.who for holder in robot.holders] == [Who("alice", "", "survey.py")]
-    assert (await new.ask("late", "robot/a")).reason == "waits for alice@desk (survey.py): robot/a"
+    assert (await new.ask("late", "robot/a")).reason == "waits for counter (alice@desk): robot/a"
 
 
 async def test_the_next_leader_knows_it_from_the_rcs_and_from_the_clients() -> None:
@@ -126,7 +126,7 @@ async def test_the_next_leader_knows_it_from_the_rcs_and_from_the_clients() -> N
     await fleet.joined(robot)
     state = await fleet.state()
     assert [hold.who for hold in state.holds] == [ALICE]
-    assert [(wait.who, wait.reason) for wait in state.queue] == [(BOB, "waits for alice@ws1 (survey.py): robot/a")]
+    assert [(wait.who, wait.reason) for wait in state.queue] == [(BOB, "waits for survey (alice@ws1): robot/a")]
 
 
 async def test_a_forecast_names_whom_it_would_preempt() -> None:

@@ -18,8 +18,8 @@ from zscout.messages import (
     Revocation,
     Who,
 )
+from zscout.rcm.request_log import reason_info
 from zscout.scheduling.model import ArcRequest, Dropped, Effect, Granted, HoldEnded, Queued
-from zscout.services.rcm.registry import reason_info
 from zscout.services.recorder.request_tracker import RequestTracker
 from zscout.services.recorder.timeline import Timeline
 from zscout.simulation.replay import replay

@@ -84,8 +84,8 @@ def test_what_is_not_known_is_told_in_words() -> None:
     ]
     # Nothing is said of when there was no journal yet, nor of what is recorded.
     assert found.gaps == [
-        "from 01 Jan 00:05:00 to 01 Jan 00:06:00 UTC not all is known: anvil did not run",
-        "from 01 Jan 00:16:30 to 01 Jan 00:16:40 UTC not all is known: anvil heard no RCM",
+        "from 01 Jan 00:05:00 to 01 Jan 00:06:00 UTC the journals are incomplete: anvil did not run",
+        "from 01 Jan 00:16:30 to 01 Jan 00:16:40 UTC the journals are incomplete: anvil heard no RCM",
     ]
     assert [at + ZERO for at, _ in found.lanes["robot/a"]] == [200, 250, 300, 360, 990, ZERO]
     latest = past_of(Journals(Span(0.0, ZERO), [past(1, 900, 950)], True, {"anvil": anvil}, []), ZERO, ZERO, 10)

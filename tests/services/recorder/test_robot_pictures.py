@@ -60,10 +60,27 @@ def test_a_minute_of_robots_at_a_glance(path: Path, tmp_path: Path) -> None:
     assert is_a_picture(two)
 
 
-def is_a_picture(pane: Image.Image) -> bool:
+def test_a_camera_that_nobody_holds_is_dimmed_and_nothing_is_red(path: Path, tmp_path: Path) -> None:
+    cameras = ("framegrabber/fgrab1", "framegrabber/fgrab2")
+    with Timeline("lab", path=path) as timeline:
+        tracker = timeline.robots
+        tracker.holds[cameras[0]] = {GRANT: HolderRow("hide", robots=("robot/scout33",))}
+        for camera, grant in zip(cameras, (GRANT, None), strict=True):
+            tracker.frame(1, camera, head(1, grant), jpeg(0, "scout33", None))
+        tracker.holds[cameras[0]] = {}
+        for camera in cameras * 2:
+            tracker.no_frame(4, camera)
+        timeline.event(5, "the last is an old picture")
+    picture, _ = look(path, tmp_path, panes=7, height=HEIGHT)
+    panes = picture.crop((round(WIDTH * PANES), 60, WIDTH, 410))
+    assert is_a_picture(panes, 50), "dimmed, and there"
+    assert [pixel for _, pixel in panes.getcolors(1 << 24) or [] if pixel[0] > max(pixel[1:]) + 40] == []  # type: ignore[index]
+
+
+def is_a_picture(pane: Image.Image, least: int = 100) -> bool:
     """Whether there are as many greys as a noisy picture has."""
     greys = {pixel for _, pixel in pane.getcolors(WIDTH * HEIGHT) or [] if len(set(pixel)) == 1}  # type: ignore[arg-type]
-    return len(greys) > 100
+    return len(greys) > least
 
 
 def test_garbled_pictures_and_words_do_not_end_the_viewer(path: Path, tmp_path: Path) -> None:

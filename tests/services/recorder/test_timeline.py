@@ -284,7 +284,7 @@ def test_a_port_that_is_taken_is_a_clear_error(path: Path) -> None:
         with pytest.raises(TimelineError) as caught:
             Timeline("lab", path=path, port=port)
     assert str(caught.value) == (
-        f"timeline: can't listen on 127.0.0.1, port {port} (Address already in use); "
+        f"can't listen on 127.0.0.1, port {port} (Address already in use); "
         "choose another port, or end the program that has it"
     )
     assert not path.exists()

@@ -32,7 +32,7 @@ class Revoked(Exception):
     `preempted`; `by` names the request that took it; the message is the reason."""
 
     def __init__(self, arc: OpenArc, ending: HoldEnd | None = None) -> None:
-        ending = ending or arc.ending or HoldEnd(arc.outcome or "lost", arc.reason, arc.by)
+        ending = ending or arc._ending or HoldEnd(arc.outcome or "lost", arc.reason, arc.by)
         super().__init__(ending.reason or ending.outcome)
         self.outcome = ending.outcome
         self.by = ending.by
@@ -84,7 +84,7 @@ class Held:
     def settling(self) -> bool:
         """True while some devices are not ready yet. If none of the time is left when they are, the request is
         repeated."""
-        return self.arc.settling == self.grant
+        return self.arc._settling == self.grant
 
     async def confirmed(self) -> bool:
         """Wait until all devices have confirmed the hold, which they do once they are ready. False if the hold

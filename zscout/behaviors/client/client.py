@@ -191,7 +191,7 @@ class Client:
             seconds, now = self._protected(min_runtime), self.mesh.now()
             arc = OpenArc(new_instance(), name, wanted, priority, seconds, keep, estimate, direct, since=now)
             arc.who, arc.booking, arc.continues = who, booking, continues
-            arc.check, arc.wait_for_device = True, self._waits(wait_for_device)
+            arc._check, arc._wait_for_device = True, self._waits(wait_for_device)
             self._store.add(arc)
         elif estimate:
             # Nobody has said that of it here: from the next asking on.
@@ -329,7 +329,7 @@ class Client:
         """An RC of this grant does not know it any more, and no notice has said so."""
         self._denied.discard(grant)
         if arc.grant == grant and arc.id in self._store.arcs and self._store.resumed.is_set():
-            arc.lose(reason, self.mesh.now())
+            arc._lose(reason, self.mesh.now())
             self._store.notify(arc)
             self._supervisor.spawn(self.internals.ask_again(arc))
 

@@ -110,7 +110,7 @@ class Confirmations:
 
     async def _see_confirmed(self, arc: OpenArc, one: Confirmation) -> None:
         grant = one.grant
-        if grant == arc.left:
+        if grant == arc._left:
             # Its RCs have been told that its program leaves, whatever a new RCM has found.
             over = Problem("ended", "its program was asked to end")
             refusals = [CommandRefused(rc, over) for rc in arc.rcs]
@@ -120,8 +120,8 @@ class Confirmations:
             one.all = True
             if grant in self._direct:
                 self._direct[grant].keep_confirming(self._on_unsure)
-            if arc.settling == grant:
-                arc.settling = None
+            if arc._settling == grant:
+                arc._settling = None
                 self._store.notify(arc)
             return
         if (direct := self._direct.get(grant)) is not None:
@@ -138,10 +138,10 @@ class Confirmations:
         rcs = [refused.rc for refused in refusals if refused.code != SETTLING]
         if rcs:
             log.warning("the grant of %s is given back: %s", arc.name, refusals[0])
-            arc.not_confirmed(rcs, str(refusals[0]), self._mesh.now())
+            arc._not_confirmed(rcs, str(refusals[0]), self._mesh.now())
             self._supervisor.spawn(self._ask_when_reachable(arc, rcs))
         else:
-            arc.not_served(one.grant, self._mesh.now())
+            arc._not_served(one.grant, self._mesh.now())
         self._store.notify(arc)
         self._ask_again(arc)
 
@@ -218,8 +218,8 @@ class Confirmations:
                 return refused
             if refused.code == SETTLING:
                 # Neither a refusal nor silence.
-                if arc.settling != grant:
-                    arc.settling, arc.reason = grant, refused.message
+                if arc._settling != grant:
+                    arc._settling, arc.reason = grant, refused.message
                     self._store.notify(arc)
                 if not arc.keep and self._mesh.now() >= arc.end:
                     return refused
@@ -299,7 +299,7 @@ class Confirmations:
         arc, rcs = direct.arc, direct.unanswered(self._mesh.now() - self._fleet.timing.hold_lease)
         direct.end()
         if arc.grant == direct.grant:
-            arc.not_confirmed(rcs, f"{', '.join(rcs)} did not confirm it for the hold lease", self._mesh.now())
+            arc._not_confirmed(rcs, f"{', '.join(rcs)} did not confirm it for the hold lease", self._mesh.now())
             self._store.notify(arc)
             self._supervisor.spawn(self._ask_when_reachable(arc, rcs))
             self._ask_again(arc)

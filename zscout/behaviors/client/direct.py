@@ -134,7 +134,7 @@ class DirectHold:
     def end(self, *, released: bool = False) -> None:
         """The hold is over; `released`: as its own client gives it back, whose program is gone."""
         if not self.over:
-            self.ended_at, self.arc.left = self._now(), self.grant
+            self.ended_at, self.arc._left = self._now(), self.grant
             self._stop_confirming()
             self._notify()
         if released:

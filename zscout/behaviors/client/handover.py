@@ -62,7 +62,7 @@ class MovableClient:
         if len(requests) > MAX_OTHERS + 1:
             raise ValueError(f"{len(requests)} requests are too many to take over; at most {MAX_OTHERS + 1} are")
         now = self.mesh.now()
-        arcs = {request.id: OpenArc.expected(request, now) for request in requests}
+        arcs = {request.id: OpenArc._expected(request, now) for request in requests}
         if here := arcs.keys() & self._store.arcs.keys():
             raise ValueError(f"request {min(here)} is already open here; no other client can hand it over")
         for arc in list(self._store.expected.values()):
@@ -76,7 +76,7 @@ class MovableClient:
     def take_moving(self, notice: Notice) -> bool:
         """Applies a notice of what is expected, or was handed over. False if it is of neither."""
         if (arc := self._store.expected.get(notice.id)) is not None:
-            if arc.take_first(notice, self.mesh.now()):
+            if arc._take_first(notice, self.mesh.now()):
                 self._store.adopt(arc)
                 self._store.notify(arc)
                 self.expected_came.set()
@@ -85,7 +85,7 @@ class MovableClient:
         arc = self._store.moved.get(notice.id)
         if arc is not None and notice.state == "ended" and notice.outcome != "handed_over":
             # It was over before it could be handed over: there is nothing to take back.
-            arc.finish(notice.outcome or "lost", notice.reason, self.mesh.now())
+            arc._finish(notice.outcome or "lost", notice.reason, self.mesh.now())
             self._store.notify(arc)
             self._store.forget(arc)
             return True
@@ -172,7 +172,7 @@ class MovableClient:
     def open_requests(self) -> list[OpenRequest]:
         """What an RCM has answered and is not over: what `hand_over_all` would hand over now."""
         now = self.mesh.now()
-        return [arc.open_request(now) for arc in self._store.acknowledged]
+        return [arc._open_request(now) for arc in self._store.acknowledged]
 
     async def hand_over_all(self, to: Sender) -> None:
         """Hands all `open_requests` of this paused client to another one, which expects them, in one step. On

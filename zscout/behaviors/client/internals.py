@@ -108,7 +108,7 @@ class ClientInternals(MovableClient):
     def _failed(self, error: Exception) -> None:
         """A task of this client failed: its holds end here, and at the RCM when its token has gone."""
         for arc in self.store.open:
-            arc.finish("lost", f"this client failed: {error!r}", self.mesh.now())
+            arc._finish("lost", f"this client failed: {error!r}", self.mesh.now())
             self.store.notify(arc)
         self.leaving = self.leaving or asyncio.create_task(self._leave())
 
@@ -156,6 +156,6 @@ class ClientInternals(MovableClient):
     def expire(self, arc: OpenArc) -> None:
         """An ARC has had its time by this host's clock: it is not asked for any more, though a direct body may clear
         up yet."""
-        arc.finish("completed", "its minimum runtime is over", self.mesh.now())
+        arc._finish("completed", "its minimum runtime is over", self.mesh.now())
         self.store.notify(arc)
         self.store.forget(arc)

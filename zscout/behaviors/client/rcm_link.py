@@ -217,7 +217,7 @@ class RcmLink:
                 continue
             for arc in self.store.open:
                 if arc.state == "running":
-                    arc.lose("no leader published within the hold lease", now)
+                    arc._lose("no leader published within the hold lease", now)
                     self.store.notify(arc)
 
     # Requests
@@ -274,9 +274,9 @@ class RcmLink:
 
     async def ask(self, arc: OpenArc, *, reachable: bool = False) -> Problem | None:
         """Asks once, and applies the answer. Returns why it was refused, if it was."""
-        ask = arc.ask(self.mesh.now(), reachable=reachable)
+        ask = arc._ask(self.mesh.now(), reachable=reachable)
         # To an RCM that has been replaced and does not know it, a later one's place is one that can't be.
-        ahead = self._is_ahead or arc.place is not None
+        ahead = self._is_ahead or arc._place is not None
         reply = await self.query(msgspec.structs.replace(ask, term=self.term) if ahead else ask)
         # One that has been replaced and does not know it has not answered for the one that counts.
         self._unanswered = reply is None or (reply.message is not None and reply.message.term < self.term)
@@ -307,7 +307,7 @@ class RcmLink:
                     if problem is not None and problem.code not in TRY_AGAIN and arc.state == "queued":
                         # It will be refused each time, though an earlier RCM took it.
                         self.store.withdrawn[arc.id] = Cancel(id=arc.id)
-                        arc.finish("lost", f"the leader refuses it: {problem.message}", self.mesh.now())
+                        arc._finish("lost", f"the leader refuses it: {problem.message}", self.mesh.now())
                         self.store.notify(arc)
                         self.store.forget(arc)
             for request_id in list(self.store.withdrawn):
@@ -321,7 +321,7 @@ class RcmLink:
         running = arc.state == "running"
         # What its program touched it has left.
         self.store.withdrawn[arc.id] = (Release if running else Cancel)(id=arc.id, left=True)
-        arc.finish("released" if running else "cancelled", "given up by this client", self.mesh.now())
+        arc._finish("released" if running else "cancelled", "given up by this client", self.mesh.now())
         self.store.notify(arc)
         for _ in range(END_TRIES):
             if await self._withdraw(arc.id) or self.leader is None:

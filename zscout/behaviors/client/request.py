@@ -53,19 +53,23 @@ class HoldEnd(NamedTuple):
 
 @dataclass(slots=True)
 class OpenArc:
-    """A request from its first asking to its end.
+    """A request of this client, as `Client.request` returns it. Read it, and pass it to the methods of `Client`; those
+    change it. Times are in ns on this host's clock.
 
-    `state` is `asking` until the first notice, then `queued`, `running`, `ended` or `refused`. One that
-    another client is to hand over is `expected` until the first notice, and `awaited` where a later RCM knows it as
-    that client's still; one that was handed over is `moved`.
+    `state` is `asking` until the leader has answered, then `queued`, `running`, `ended` or `refused`. A request that
+    another client hands over is `expected` first, and `awaited` where a later leader still counts it as that client's;
+    one that was handed over to another client is `moved`.
     """
 
     id: str
     name: str
     needs: dict[str, Amounts]
+    """Parameters by device or pattern, as requested."""
     priority: int
     min_runtime: Decimal
+    """Seconds for which a hold is protected."""
     keep: bool = False
+    """Whether a hold continues after that until another request waits."""
     estimate: bool = False
     """Whether the RCM is asked to estimate when it will start."""
     direct: bool = False
@@ -75,83 +79,89 @@ class OpenArc:
     who: Who | None = None
     """Who asks, as others are told."""
     booking: str = ""
-    """The booking that it takes up: its id; once the RCM has said so, one date of it: `<id>@<start>`."""
-    check: bool = False
+    """The booking that it takes up: its id; once the leader has answered, with its date: `<id>@<start>`."""
+    _check: bool = False
     """Whether it is to be refused at once if it can never start."""
-    wait_for_device: bool = False
+    _wait_for_device: bool = False
     """Whether it waits for an RC that nobody knows all the same."""
     state: str = "asking"
     reason: str = ""
+    """Why it is in this state, in words."""
     why: ReasonInfo | None = None
     """What `reason` says, as data, where the RCM gave that."""
     outcome: str | None = None
+    """How its last hold, or the request, ended: an outcome of the protocol, such as `preempted`."""
     by: str | None = None
-    place: Place | None = None
-    seal: str | None = None
+    """The name of the request that took its devices."""
+    _place: Place | None = None
+    _seal: str | None = None
     """Proof that the place is its own, by the RCM's word."""
-    was: str | None = None
+    _was: str | None = None
     """The id under which it had that place, if that was another one."""
     ahead: int | None = None
+    """While it is queued: how many requests are before it."""
     start: Ns | None = None
-    """While it is queued: when it will start by the RCM's last estimate, on this host's clock."""
+    """While it is queued: when it will start by the leader's last estimate."""
     grant: Grant | None = None
+    """While it runs: the grant, which commands show."""
     rcs: list[str] = field(default_factory=list)
-    """What it holds, or held last."""
+    """The devices that it holds, or held last."""
     bound: dict[str, str] = field(default_factory=dict)
-    """By each of its patterns: the RC among them that meets it."""
+    """For each pattern, the device among them that satisfies it."""
     hosts: dict[str, str] = field(default_factory=dict)
-    """Where they are, by RC, as far as the RCM says it."""
+    """The host of each device, as far as the leader names it."""
     end: Ns = 0
-    """When the minimum runtime of the present hold is over, on this host's clock."""
+    """When the minimum runtime of the present hold is over."""
     since: Ns = 0
     """When `state` began."""
-    waits_since: Ns | None = None
+    _waits_since: Ns | None = None
     """When it was last queued: its present wait began then, whichever RCM leads."""
-    unconfirmed: tuple[Grant, list[str]] | None = None
+    _unconfirmed: tuple[Grant, list[str]] | None = None
     """The grant that some of its RCs did not confirm, and which, until the RCM has answered that."""
-    settling: Grant | None = None
+    _settling: Grant | None = None
     """The grant whose RCs have not all stopped settling."""
-    left: Grant | None = None
+    _left: Grant | None = None
     """The last grant whose program was told to leave: it is not entered again."""
-    unserved: Grant | None = None
+    _unserved: Grant | None = None
     """The grant whose time went by so, until the RCM has answered that."""
-    ending: HoldEnd | None = None
+    _ending: HoldEnd | None = None
     """How the last hold ended; `outcome` and `reason` are of the newest notice, whatever it is about."""
-    shown: Term = NO_TERM
+    _shown: Term = NO_TERM
     """In which term its place was shown last, to an RCM that had given a worse one."""
-    last: tuple[Term, int] = field(default=(NO_TERM, 0))
-    told: Ns = 0
+    _last: tuple[Term, int] = field(default=(NO_TERM, 0))
+    _told: Ns = 0
     """When the newest notice came."""
     _came: Term | None = field(default=None, init=False, repr=False)
     """In which term another client handed it over, until an RCM of a later one says whose it is."""
     _news: asyncio.Event = field(default_factory=asyncio.Event, init=False, compare=False, repr=False)
 
     @classmethod
-    def expected(cls, request: OpenRequest, now: Ns) -> Self:
+    def _expected(cls, request: OpenRequest, now: Ns) -> Self:
         """What another client will hand over. Raises BadName."""
         for need in request.needs:
             check_need(need)
         id_, name = check_name(request.id, "id"), check_name(request.arc, "arc")
-        arc = cls(id_, name, request.needs, request.priority, request.min_runtime, request.keep, place=request.place)
+        arc = cls(id_, name, request.needs, request.priority, request.min_runtime, request.keep, _place=request.place)
         arc.direct, arc.continues, arc.booking = request.direct, request.continues, request.booking
         arc.who = request.who and msgspec.structs.replace(request.who, host="")
         arc.state, arc.reason = "expected", "another client is to hand it over"
-        arc.since, arc.waits_since = now, now - round(request.waited * SECOND)
+        arc.since, arc._waits_since = now, now - round(request.waited * SECOND)
         return arc
 
     @property
     def open(self) -> bool:
+        """False once it has ended, was refused or belongs to another client."""
         return self.state in ("asking", "queued", "running", "awaited")
 
-    def take(self, notice: Notice, now: Ns) -> bool:
+    def _take(self, notice: Notice, now: Ns) -> bool:
         """Applies a newer notice of this request. False if it is an old one, a replaced RCM's, or reports a
         hold that is not what was asked for."""
-        if (notice.term, notice.step) <= self.last or not self.open:
+        if (notice.term, notice.step) <= self._last or not self.open:
             return False
         if (bound := self._binding(notice)) is None:
             return False
-        self.last, self.unconfirmed, self.unserved = (notice.term, notice.step), None, None
-        self.told = now
+        self._last, self._unconfirmed, self._unserved = (notice.term, notice.step), None, None
+        self._told = now
         self.booking = notice.booking or self.booking
         if self._came is not None and self._came < notice.term:
             self._came = None
@@ -166,8 +176,8 @@ class OpenArc:
         self.outcome, self.by = notice.outcome, notice.by
         self.ahead = notice.ahead
         self.start = None if notice.starts_in is None else now + round(notice.starts_in * SECOND)
-        if notice.place is not None and (self.place is None or notice.place <= self.place):
-            self.place, self.seal, self.was = notice.place, notice.seal, None
+        if notice.place is not None and (self._place is None or notice.place <= self._place):
+            self._place, self._seal, self._was = notice.place, notice.seal, None
         if notice.state == "running":
             self.grant = notice.grant
             self.bound, self.rcs = bound, sorted(bound.get(need, need) for need in self.needs)
@@ -188,108 +198,108 @@ class OpenArc:
 
     def _close(self, ending: HoldEnd, now: Ns) -> None:
         if self.grant is not None:
-            self.grant, self.ending, self.waits_since = None, ending, now
-        elif self.waits_since is None:
-            self.waits_since = now
+            self.grant, self._ending, self._waits_since = None, ending, now
+        elif self._waits_since is None:
+            self._waits_since = now
 
-    def lose(self, reason: str, now: Ns) -> None:
+    def _lose(self, reason: str, now: Ns) -> None:
         """The hold is over by the client's own judgement; the request is asked again."""
         self._close(HoldEnd("lost", reason), now)
         self.state, self.reason, self.outcome, self.since = "asking", reason, "lost", now
         self.why = None
 
-    def not_confirmed(self, rcs: list[str], reason: str, now: Ns) -> None:
+    def _not_confirmed(self, rcs: list[str], reason: str, now: Ns) -> None:
         """These RCs do not confirm its grant: it is not entered, and the RCM is to queue it again."""
         assert self.grant is not None  # noqa: S101 - what is not confirmed was granted
-        self.unconfirmed = self.grant, rcs
-        self.lose(reason, now)
+        self._unconfirmed = self.grant, rcs
+        self._lose(reason, now)
 
-    def not_served(self, grant: Grant | None, now: Ns) -> None:
+    def _not_served(self, grant: Grant | None, now: Ns) -> None:
         """The time of this grant went by while RCs of it settled: it is asked for once more, at its place."""
-        self.lose("its time passed while its devices settled", now)
-        self.unserved, self.settling = grant, None
+        self._lose("its time passed while its devices settled", now)
+        self._unserved, self._settling = grant, None
 
-    def finish(self, outcome: str, reason: str, now: Ns) -> None:
+    def _finish(self, outcome: str, reason: str, now: Ns) -> None:
         """The request is over by the client's own judgement."""
         self._close(HoldEnd(outcome, reason), now)
         self.state, self.outcome, self.reason, self.since = "ended", outcome, reason, now
         self.why = None
 
-    def shows_place(self, notice: Notice) -> bool:
+    def _shows_place(self, notice: Notice) -> bool:
         """Whether the RCM is to be shown its place, once in a term: it gave a worse one, to a question from before."""
-        if notice.state != "queued" or notice.place is None or notice.place == self.place:
+        if notice.state != "queued" or notice.place is None or notice.place == self._place:
             return False
-        shown, self.shown = self.shown, notice.term
+        shown, self._shown = self._shown, notice.term
         return shown != notice.term
 
-    def reopen(self, now: Ns) -> None:
+    def _reopen(self, now: Ns) -> None:
         """It ended because this client seemed gone, which lives: it is asked for again, at its place."""
         self.state, self.since, self.why = "asking", now, None
 
-    def take_first(self, notice: Notice, now: Ns) -> bool:
+    def _take_first(self, notice: Notice, now: Ns) -> bool:
         """Applies the first notice of an expected request. False if it is none: an old one, or not credible."""
         before, self.state = self.state, "asking"
-        if notice.state != "ended" and self.take(notice, now):
+        if notice.state != "ended" and self._take(notice, now):
             self._came = notice.term
             return True
         self.state = before
         return False
 
-    def is_not_here_yet(self, notice: Notice) -> bool:
+    def _is_not_here_yet(self, notice: Notice) -> bool:
         """Whether the notice says that it is another client's still, which had handed it over to this one at an RCM
         that was replaced: it is to hand it over once more."""
         return self.open and notice.outcome == "handed_over" and self._came is not None and self._came < notice.term
 
-    def await_again(self, notice: Notice, now: Ns) -> None:
+    def _await_again(self, notice: Notice, now: Ns) -> None:
         """It is not here yet."""
-        self.lose("its old client is to hand it over once more", now)
-        self.state, self._came, self.last = "awaited", None, (notice.term, notice.step)
+        self._lose("its old client is to hand it over once more", now)
+        self.state, self._came, self._last = "awaited", None, (notice.term, notice.step)
 
-    def go_back(self, term: Term) -> None:
+    def _go_back(self, term: Term) -> None:
         """Forget what leaders of terms above `term` said: their fleet knows no such term any more."""
-        if self.last[0] > term:
-            self.last = NO_TERM, 0
-        if self.place is not None and self.place.term > term:
-            self.place = self.seal = self.was = None
-        if self.unconfirmed is not None and self.unconfirmed[0].term > term:
-            self.unconfirmed = None
-        if self.unserved is not None and self.unserved.term > term:
-            self.unserved = None
+        if self._last[0] > term:
+            self._last = NO_TERM, 0
+        if self._place is not None and self._place.term > term:
+            self._place = self._seal = self._was = None
+        if self._unconfirmed is not None and self._unconfirmed[0].term > term:
+            self._unconfirmed = None
+        if self._unserved is not None and self._unserved.term > term:
+            self._unserved = None
 
-    def move(self, now: Ns) -> None:
+    def _move(self, now: Ns) -> None:
         """It goes on in another client."""
         self._close(HoldEnd("handed_over", "handed over"), now)
         self.state, self.since = "moved", now
 
-    def take_back(self, new_id: str, reason: str, now: Ns) -> None:
+    def _take_back(self, new_id: str, reason: str, now: Ns) -> None:
         """The client to which it was handed over is gone: it is asked for anew, at its old place."""
-        if self.ending is not None and self.ending.outcome == "handed_over":
-            self.ending = HoldEnd("lost", reason)
-        self.id, self.was, self.last = new_id, self.was or self.id, (NO_TERM, 0)
+        if self._ending is not None and self._ending.outcome == "handed_over":
+            self._ending = HoldEnd("lost", reason)
+        self.id, self._was, self._last = new_id, self._was or self.id, (NO_TERM, 0)
         self.state, self.reason, self.outcome, self.since = "asking", reason, None, now
         self.why = None
 
-    def ask(self, now: Ns, *, reachable: bool = False) -> Ask:
+    def _ask(self, now: Ns, *, reachable: bool = False) -> Ask:
         """`reachable`: the RCs that did not confirm its last grant have shown themselves anew."""
-        grant, unconfirmed = self.unconfirmed or (self.grant or self.unserved, [])
+        grant, unconfirmed = self._unconfirmed or (self.grant or self._unserved, [])
         asked = self._as_asked(now, grant)
-        unserved = self.unserved is not None and grant == self.unserved
+        unserved = self._unserved is not None and grant == self._unserved
         return Ask(
             **asked,
             estimate=self.estimate,
             unconfirmed=unconfirmed,
             reachable=reachable,
             unserved=unserved,
-            check=self.check and self.place is None,
-            wait_for_device=self.wait_for_device and self.place is None,
+            check=self._check and self._place is None,
+            wait_for_device=self._wait_for_device and self._place is None,
         )
 
-    def open_request(self, now: Ns) -> OpenRequest:
+    def _open_request(self, now: Ns) -> OpenRequest:
         """As it is reported to an RCM that takes the lead."""
         return OpenRequest(**self._as_asked(now, self.grant))
 
     def _as_asked(self, now: Ns, grant: Grant | None) -> dict[str, Any]:
-        since = now if self.waits_since is None or self.grant is not None else self.waits_since
+        since = now if self._waits_since is None or self.grant is not None else self._waits_since
         return {
             "id": self.id,
             "arc": self.name,
@@ -297,9 +307,9 @@ class OpenArc:
             "priority": self.priority,
             "min_runtime": self.min_runtime,
             "keep": self.keep,
-            "place": self.place,
-            "seal": self.seal,
-            "was": self.was,
+            "place": self._place,
+            "seal": self._seal,
+            "was": self._was,
             "waited": max(0, now - since) / SECOND,
             "grant": grant,
             "rcs": self.rcs if grant is not None else [],
@@ -361,7 +371,7 @@ class RequestStore:
     @property
     def acknowledged(self) -> list[OpenArc]:
         """Those that an RCM has answered: queued, running, or asked for again at their place."""
-        return [arc for arc in self.open if arc.state != "asking" or arc.place is not None]
+        return [arc for arc in self.open if arc.state != "asking" or arc._place is not None]
 
     def add(self, arc: OpenArc) -> None:
         self.arcs[arc.id] = arc
@@ -369,7 +379,7 @@ class RequestStore:
     def expect(self, arc: OpenArc) -> None:
         """`arc` is to be handed to this client. If it comes back, notices from before it went are old."""
         if (before := self.moved.pop(arc.id, None)) is not None:
-            arc.last, arc._news = before.last, before._news
+            arc._last, arc._news = before._last, before._news
         self.withdrawn.pop(arc.id, None)
         self.expected[arc.id] = arc
 
@@ -402,30 +412,30 @@ class RequestStore:
         if notice.id != arc.id:
             # An answer that was on its way when the ARC was taken back under another id.
             return
-        granted, unserved = arc.grant is not None, {arc.settling, arc.unserved} - {None}
+        granted, unserved = arc.grant is not None, {arc._settling, arc._unserved} - {None}
         if notice.outcome == "handed_over" and not self.resumed.is_set():
             # Not before the hand-over is answered: an RCM that dies first may not have notified the other.
             return
         if notice.outcome == "handed_over" and arc.id in self.reclaimed and arc.open:
             self.move(arc, notice)
             self.reclaim(arc)
-        elif arc.is_not_here_yet(notice):
-            arc.await_again(notice, self._now())
+        elif arc._is_not_here_yet(notice):
+            arc._await_again(notice, self._now())
             del self.arcs[arc.id]
             self.expected[arc.id] = arc
             self.notify(arc)
             self.on_awaited(arc)
-        elif arc.take(notice, self._now()):
+        elif arc._take(notice, self._now()):
             self.reclaimed.discard(arc.id)
             if not arc.open and arc.outcome == "client_lost":
-                arc.reopen(self._now())
+                arc._reopen(self._now())
                 self.ask_again(arc)
             elif arc.outcome == "completed" and notice.grant in unserved:
-                arc.not_served(notice.grant, self._now())
+                arc._not_served(notice.grant, self._now())
                 self.ask_again(arc)
             elif not granted and arc.outcome == "completed":
                 self._ask_anew(arc)
-            elif arc.shows_place(notice):
+            elif arc._shows_place(notice):
                 self.ask_again(arc)
             self.notify(arc)
             if not arc.open:
@@ -434,7 +444,7 @@ class RequestStore:
     def _ask_anew(self, arc: OpenArc) -> None:
         """Nobody made use of its time: it is asked for under a new id, at its place."""
         del self.arcs[arc.id]
-        arc.take_back(new_instance(), "it had its time before this client heard of it", self._now())
+        arc._take_back(new_instance(), "it had its time before this client heard of it", self._now())
         arc.booking = ""  # so had that
         self.arcs[arc.id] = arc
         self.ask_again(arc)
@@ -443,13 +453,13 @@ class RequestStore:
         """All, as it is reported to an RCM that takes the lead. What is expected has no place: it is this
         client's if the RCs report it so, and nothing is queued for it otherwise."""
         now = self._now()
-        expected = [msgspec.structs.replace(arc.open_request(now), place=None) for arc in self.expected.values()]
-        return [*(arc.open_request(now) for arc in self.open), *expected]
+        expected = [msgspec.structs.replace(arc._open_request(now), place=None) for arc in self.expected.values()]
+        return [*(arc._open_request(now) for arc in self.open), *expected]
 
     def move(self, arc: OpenArc, notice: Notice) -> None:
         """`arc` goes on in another client, as of `notice`; earlier notices are old."""
-        arc.move(self._now())
-        arc.last = max(arc.last, (notice.term, notice.step))
+        arc._move(self._now())
+        arc._last = max(arc._last, (notice.term, notice.step))
         self.arcs.pop(arc.id, None)
         self.moved[arc.id] = arc
         self.notify(arc)
@@ -457,12 +467,12 @@ class RequestStore:
     def go_back(self, term: Term) -> None:
         """The client follows the leader of `term` after higher ones."""
         for arc in (*self.arcs.values(), *self.moved.values(), *self.expected.values()):
-            arc.go_back(term)
+            arc._go_back(term)
 
     def reclaim(self, arc: OpenArc) -> None:
         """A moved one is this client's again, under a new id; it is to be asked for."""
         del self.moved[arc.id]
         self.reclaimed.discard(arc.id)
-        arc.take_back(new_instance(), "it was handed over, and its new client is gone", self._now())
+        arc._take_back(new_instance(), "it was handed over, and its new client is gone", self._now())
         self.arcs[arc.id] = arc
         self.notify(arc)

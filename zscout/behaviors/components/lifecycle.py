@@ -223,7 +223,8 @@ class ComponentLifecycle:
         component, client = self._component, self._client
         fits = self._job.start.standby and not self._running if standby else self._running
         if component is None or client is None or not fits:
-            raise NotMoved("bad_request", "it is not standing by" if standby else "it is not running")
+            what = f"standing by on {self._job.host}" if standby else f"running on {self._job.host}"
+            raise NotMoved("bad_request", f"{self._job.start.component} is not {what}; see zscout component list")
         if not is_movable(component):
             raise NotMoved("not_movable", "it can't be moved: its kind has no checkpoint() and restore()")
         return component, client

@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass
 from typing import Any, Final, Literal, TypeAlias
 
 ABSENCE_TIMEOUT: Final = 10.0  # seconds of absence after which a robot counts as lost
-GONE: Final = "it is not on the mesh"
 RETRY: Final = 60.0  # seconds before a failed robot is retried, if no other is free
 
 WATCHING: Final = frozenset({"watch", "alert", "present"})
@@ -96,8 +95,9 @@ class SensorNet:
         for member in self.members.values():
             member.there = member.robot in present
             if member.there:
-                member.away_since = None
-                if member.standing == "lost" and member.why == GONE:
+                away_since, member.away_since = member.away_since, None
+                was_gone = away_since is not None and member.lost_at - away_since >= ABSENCE_TIMEOUT
+                if member.standing == "lost" and was_gone:
                     member.standing, member.why = "free", ""
             elif member.away_since is None:
                 member.away_since = now
@@ -105,7 +105,7 @@ class SensorNet:
         effects: list[Effect] = []
         for member in self._active:
             if member.away_since is not None and now - member.away_since >= ABSENCE_TIMEOUT:
-                effects += self._lose(now, member, GONE)
+                effects += self._lose(now, member, "it is not on the mesh")
         return effects + self._fill(now)
 
     def _lose(self, now: float, member: Member, why: str) -> list[Effect]:

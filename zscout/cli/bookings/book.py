@@ -149,11 +149,12 @@ async def maintain(rcs: Sequence[str], **rest: Any) -> None:
 
     \b
     Examples:
+      zscout maintain robot/arm1 --at now --for 1h && zscout booking cancel maintenance
       zscout maintain robot/arm1 --at "sat 8:00" --for 4h --comment 'new gripper'
       zscout maintain robot/arm1 robot/arm2 --at "mon 7:00" --for 30m --every week --until 2027-03-31
     """
-    if len(set(rcs)) < len(rcs):
-        raise BadInput("a device is named twice; name each once")
+    if twice := [rc for rc in rcs if rcs.count(rc) > 1]:
+        raise BadInput(f"{twice[0]} is named twice; name each device once")
     priority = common.the_fleet().operator_priority
     await _make({rc: {} for rc in rcs}, priority=priority, patience=None, maintenance=True, **rest)
 
@@ -301,8 +302,8 @@ def _print(booking: BookingView, asked: Asked, told: BookingsTold) -> None:
     first, zone = next(iter(booking.dates), None), asked.zone
     begins = asked.start.at.timestamp()
     when = f"{span_words(begins, begins + float(asked.runtime), zone)} ({zone.key}), {in_words(begins - told.time)}"
-    done = "is kept free" if booking.maintenance else "is booked"
-    terminal.print_line(clean(f"{booking.name} ({short(booking)}) {done}: {rcs_words(booking, first)}: {when}"))
+    done = "" if booking.maintenance else " is booked"
+    terminal.print_line(clean(f"{booking.name} ({short(booking)}){done}: {rcs_words(booking, first)}: {when}"))
     if booking.every:
         last = "" if booking.until is None else f" until {in_zone(booking.until, zone):%a %Y-%m-%d}"
         soon = many(len(booking.dates), "date")
@@ -313,7 +314,9 @@ def _print(booking: BookingView, asked: Asked, told: BookingsTold) -> None:
         if one.danger or one.state == "conflict":
             text = f"{span_words(one.start, one.end, zone)}: {state_words(booking, one)}"
             click.secho(clean(text), fg="yellow")
-    if not booking.maintenance:
+    if booking.maintenance:
+        terminal.print_line(f"to end it early: zscout booking cancel {bounded(booking.name)}")
+    else:
         within = span(float(booking.patience))
         take_up = f"zscout request --booking {bounded(booking.name)} -- COMMAND"
         terminal.print_line(f"take it up before, or within {within} of its date: {take_up}")

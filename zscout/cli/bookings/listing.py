@@ -193,7 +193,7 @@ async def unbook(booking: str, at: WrittenDate | None, zone: ZoneInfo | None, as
         if as_json:
             terminal.print_json(booking_json(left, me))
             return
-    what = "is given up" if start is None else f"gives up {date_words(start, zone)}"
+    what = "is cancelled" if start is None else f"no longer has {date_words(start, zone)}"
     whole = ", with all its dates" if found.every and start is None else ""
     terminal.print_line(clean(f"{found.name} ({short(found)}) of {whose(found)} {what}{whole}"))
 

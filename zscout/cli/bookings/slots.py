@@ -80,5 +80,5 @@ def _table(told: SlotsTold, zone: ZoneInfo | None) -> Table:
         bound = ", ".join(f"{rc} for {need}" for need, rc in sorted(one.bound.items()))
         latest = date_words(one.latest, zone) if one.latest > one.start else "then only"
         rows.append((date_words(one.start, zone), latest, in_words(one.start - told.time), bound))
-    columns = ("BEGINS", "AT THE LATEST", "THAT IS", "WITH")[: 4 if any(row[3] for row in rows) else 3]
+    columns = ("BEGIN FROM", "AT THE LATEST", "FIRST", "WITH")[: 4 if any(row[3] for row in rows) else 3]
     return Table("", columns, [row[: len(columns)] for row in rows])

@@ -182,9 +182,11 @@ def gather_spec(
     # In order, as the placer lists them.
     hosts, labels = sorted(set(host)), sorted(set(label))
     if len(hosts) > MAX_RANKED:
-        raise BadInput(f"{len(hosts)} hosts; name at most {MAX_RANKED}, or give them a label")
+        raise BadInput(
+            f"{len(hosts)} hosts; give --host at most {MAX_RANKED} times, or give them a label and use --label"
+        )
     if len(labels) > MAX_LABELS:
-        raise BadInput(f"{len(labels)} labels; at most {MAX_LABELS} are allowed")
+        raise BadInput(f"{len(labels)} labels; give --label at most {MAX_LABELS} times")
     given: Any = {"params": gather_params(params, settings), "restart": restart.replace("-", "_")}
     return ComponentSpec(kind=kind, labels=labels, hosts=hosts or None, cpu_limit=cpu_limit or 0.0, **given, **same)
 

@@ -342,7 +342,7 @@ def _devices(seen: Evidence) -> Iterator[Finding]:
         view, device = views.get(rc), seen.devices.get(rc)
         if rc not in offered and (view is None or not view.present):
             home = homes.get(rc) or (view.host if view is not None else "")
-            else_do = files.get(rc, "forget it: it is shown for a day")
+            else_do = files.get(rc, "ignore this if it was removed: it is listed for a day")
             missing[home, absence(view) if view is not None else "", else_do].append(rc)
         elif device is not None and device.health != "ok":
             yield Finding("devices", "mend", f"{rc} at {device.host} is lost: {device.health}", "mend the device")

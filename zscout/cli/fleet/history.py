@@ -30,7 +30,8 @@ ARC = common.Parsed("text", parse_arc)
 
 
 @click.command()
-@click.option("--rc", type=journals.RC, shell_complete=completion.needs, help="Only holds of this device, or pattern.")
+@click.argument("device", required=False, type=journals.RC, metavar="[DEVICE]", shell_complete=completion.needs)
+@click.option("--rc", type=journals.RC, shell_complete=completion.needs, help="The same as DEVICE.")
 @click.option("--user", "users", type=journals.WHO, multiple=True, help="Only holds of this user, person or host.")
 @click.option("--group", help="Only holds of this group of the fleet file.")
 @click.option("--arc", type=ARC, help="Only holds of this request: its name or id.")
@@ -40,6 +41,7 @@ ARC = common.Parsed("text", parse_arc)
 @journals.formats
 @common.runs
 async def history(
+    device: str | None,
     rc: str | None,
     users: tuple[str, ...],
     group: str | None,
@@ -50,7 +52,8 @@ async def history(
     as_json: bool,
     as_csv: bool,
 ) -> None:
-    """List past and present holds, newest last: holder, devices, duration, and how each ended.
+    """List past and present holds, newest last: holder, devices, duration, and how each ended. With DEVICE, a name or
+    a pattern, only holds of that device.
 
     Every node that may lead keeps a journal; all journals are asked, and a hold in several of them is shown once.
     Times are by the clocks of those hosts. Lines name the times for which no journal is complete. A hold granted in
@@ -62,13 +65,16 @@ async def history(
 
     \b
     Examples:
-      zscout history --since 7d
-      zscout history --rc 'robot/*' --user alice --limit 20
+      zscout history robot/arm1 --since yesterday
+      zscout history 'robot/*' --user alice --limit 20
       zscout history --since 2025-11-01 --until 2025-12-01 --limit 100000 --csv > november.csv
       zscout history --json | jq -r '.holds[] | select(.outcome == "preempted") | .by.arc'
     """
     journals.check_formats(as_json=as_json, as_csv=as_csv)
     journals.check_window(since, until)
+    if device is not None and rc is not None:
+        raise BadInput("DEVICE and --rc are the same; use only one of them")
+    rc = device or rc
     who = journals.names_of(common.the_fleet(), users, group)
     async with common.connected("history", need_rcm=False) as client:
         asked = HistoryAsk(arc=arc, rc=rc, who=who, since=since, until=until)

@@ -17,10 +17,11 @@ from zscout.cli.device_words import ending, remarks
 from zscout.cli.fleet.fleet_view import Devices, FleetView, Host
 from zscout.cli.fleet.selection import Selection
 from zscout.cli.fleet.watching import Overview, show
-from zscout.cli.requests.waiting import comment, person, reason_text, request_words, whose
+from zscout.cli.requests.waiting import comment, reason_text, request_words, whose
 from zscout.config.access import AccessPolicy
 from zscout.keyexpr import Role
 from zscout.messages import BookingsTold, HoldView, Notice, RcmState, RcState, RcView, WaitView, version_words
+from zscout.scheduling.reason import person
 from zscout.terminal import Table, clock, many, span
 from zscout.types import SECOND, VERSION, Ns
 
@@ -164,8 +165,9 @@ class Standing:
             there = "held" if holders else "maintenance" if view.rc in maintained else "free"
             words = there if view.present else "lost" if view.rc in lost else "absent"
             kind = "shared" if view.sharable else "exclusive"
-            names = ",\n".join(request_words(hold.arc, hold.who, hold.client, hold.needs[view.rc]) for hold in holders)
-            rows.append((view.rc, kind, words, homes.get(view.rc, "-"), names))
+            holds = ",\n".join(request_words(hold.arc, hold.who, hold.client, hold.needs[view.rc]) for hold in holders)
+            held_by = maintained[view.rc] if words == "maintenance" else holds
+            rows.append((view.rc, kind, words, homes.get(view.rc, "-"), held_by))
             styles.append(
                 {"absent": "red", "lost": "red", "held": "yellow", "maintenance": "yellow", "free": "green"}[words]
             )

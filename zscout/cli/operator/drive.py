@@ -204,7 +204,7 @@ class _Console(terminal.LiveLine):
             rcs = ", ".join(teleop.held.rcs if teleop.held else [])
             self.event("taken", f"{self._robot} is yours: {rcs}")
         elif teleop.state == "waiting":
-            self.event("waiting", f"{self._robot} {waits(teleop.why)}", why=teleop.why)
+            self.event("waiting", f"{self._robot} {waits(teleop.why, teleop.reason)}", why=teleop.why)
         elif before is not None:
             self.event("free", f"{self._robot} is given back")
 
@@ -224,7 +224,7 @@ class _Console(terminal.LiveLine):
         pictures = sum(now - at < SECOND for at in self._pictures)
         wheels = teleop.pilot.wheels(now / SECOND)
         colour = {"driving": "bold green", "waiting": "yellow", "free": "dim"}[teleop.state]
-        state = waits(teleop.why) if teleop.state == "waiting" and teleop.why else teleop.state
+        state = waits(teleop.why, teleop.reason) if teleop.state == "waiting" and teleop.why else teleop.state
         line = Text().append(f"{self._robot}  {terminal.clean(state)}", style=colour)
         if teleop.why and teleop.state != "waiting":
             line.append(f": {terminal.clean(teleop.why)}")

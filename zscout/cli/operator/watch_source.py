@@ -27,8 +27,6 @@ MAX_LEAP: Final = 86_400.0
 HEAD: Final = 4096
 TEXT: Final = bytes((*range(7, 14), 27, *range(32, 256)))
 """Bytes of which a text consists; in the HEAD of a video there are others."""
-UNTRIED: Final = ("not open yet", "open, no picture yet")
-"""A capture's health while it does not know yet."""
 
 
 class Shot(NamedTuple):
@@ -123,9 +121,8 @@ class LiveSource:
             first = None
             while first is None:
                 first = self._capture.wait(0, LOOK)
-                health = self._capture.health
-                if first is None and health not in (*UNTRIED, "ok"):
-                    raise BadInput(f"{health}; name a source that delivers pictures")
+                if first is None and self._capture.failed:
+                    raise BadInput(f"{self._capture.health}; name a source that delivers pictures")
             _check(first.picture, self.name)
         except BaseException:
             self.close()

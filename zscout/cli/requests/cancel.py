@@ -101,12 +101,18 @@ def _choose(state: RcmState, named: str, word: str, *, every: bool) -> list[Targ
         raise common.Failed(f"request {quoted(named)} holds nothing, it waits; to cancel it: zscout cancel {named}")
     if not found:
         more = f"; {state.more} more wait: name them <host>/<client>/<id>" if state.more else ""
-        raise common.Failed(f"no request {quoted(named)} holds or waits{more}; see zscout status")
+        raise common.Failed(f"no request {quoted(named)} holds or waits{more}; {_instead(state, named)}")
     if len(found) > 1 and not every:
         listed = ", ".join(target.full_name for target in found[:MAX_LISTED])
         rest = f" and {len(found) - MAX_LISTED} more" if len(found) > MAX_LISTED else ""
         raise common.Failed(f"{len(found)} requests are called {quoted(named)}: {listed}{rest}; name one, or add --all")
     return found
+
+
+def _instead(state: RcmState, named: str) -> str:
+    if any(view.rc == named for view in state.rcs):
+        return f"it is a device: zscout status {named} shows which request holds it"
+    return "see zscout status, or zscout booking list for bookings"
 
 
 async def _operate(client: Client, target: Target, word: str) -> Notice:

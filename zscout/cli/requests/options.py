@@ -22,7 +22,7 @@ from zscout.cli.requests.run_command import check_command
 from zscout.config import strict
 from zscout.config.strict import DURATIONS, BadInput, quoted
 from zscout.keyexpr import BadName, check_name, check_need, is_pattern, valid_name
-from zscout.messages import MAX_NEEDS, MAX_PARAMS, Who
+from zscout.messages import MAX_NEEDS, MAX_PARAMS, MAX_SECONDS, Who
 from zscout.scheduling.needs import check_patterns
 from zscout.terminal import span
 
@@ -45,7 +45,7 @@ def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:
     try:
         messages.duration(seconds, what)
     except ValueError as error:
-        raise BadInput(f"{error}; write {DURATIONS}") from None
+        raise BadInput(f"{error}; write more than 0, at most {span(float(MAX_SECONDS))}") from None
     return seconds
 
 
@@ -59,7 +59,7 @@ def seconds_within(low: float, high: float) -> Parsed[float]:
     def parse(text: str, option: str) -> float:
         seconds = float(parse_duration(text, option))
         if not low <= seconds <= high:
-            raise BadInput(f"{option}: {span(seconds)} is not within {span(low)} and {span(high)}; write {DURATIONS}")
+            raise BadInput(f"{option}: {span(seconds)} is out of range; write {span(low)} to {span(high)}")
         return seconds
 
     return Parsed("duration", parse)

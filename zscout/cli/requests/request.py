@@ -24,7 +24,7 @@ from zscout.cli.common import Failed
 from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather, hold_options
 from zscout.cli.requests.run_command import RunningCommand, environment
 from zscout.cli.requests.taking_up import check_options, taking_up
-from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text, reason_text, whose
+from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text, reason_text, request_words
 from zscout.config.strict import BadInput
 from zscout.mesh.supervision import done_within
 from zscout.messages import Foresight, RcmState, StateAsk, version_words
@@ -210,7 +210,7 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
         again = wanted.again and arc.keep and not ended_by_hand
         line = f"the time of {arc.name} is over" + (f": {why}" if arc.keep else "")
         details = {"outcome": "completed", "reason": why, "by": ending.by, "again": again}
-        arc.finish("completed", why, client.mesh.now())
+        arc._finish("completed", why, client.mesh.now())
         report.event("ended", f"{line}; asking anew" if again else line, **details)
         if again:
             return None
@@ -317,7 +317,7 @@ def _kept(longest: Ns | None) -> str:
 
 
 def _ending(arc: OpenArc) -> HoldEnd:
-    return arc.ending or HoldEnd("lost", "")
+    return arc._ending or HoldEnd("lost", "")
 
 
 async def _foresee(client: Client, wanted: HoldOptions) -> int:
@@ -345,7 +345,7 @@ def _words(foretold: Foresight) -> Iterator[str]:
     else:
         yield f"{foretold.arc} would start at once"
     if foretold.preempts:
-        told = [f"{one.arc} of {whose(one)}" for one in foretold.victims]
+        told = [request_words(victim.arc, victim.who, victim.client) for victim in foretold.victims]
         yield f"it would preempt {', '.join(told or foretold.preempts)}"
 
 
@@ -396,12 +396,12 @@ class Report(LiveLine):
             arc = self._arc
             if arc is None:
                 self.draw(f"{self._name}: asking the leader")
-            elif arc.state == "running" and arc.settling == arc.grant:
+            elif arc.state == "running" and arc._settling == arc.grant:
                 self._show_settling(arc)
             elif arc.state in ("asking", "queued") and arc.reason:
-                news = arc.last != self._seen if self.watched else _how(arc) != self._printed
+                news = arc._last != self._seen if self.watched else _how(arc) != self._printed
                 if arc.state == "queued" and news:
-                    self._looked, self._seen = self._mesh.now(), arc.last
+                    self._looked, self._seen = self._mesh.now(), arc._last
                     self._state = await self._client.state()
                 if arc.state in ("asking", "queued"):
                     self._show_wait(arc)
@@ -440,7 +440,7 @@ class Report(LiveLine):
         in_way = [rc for rc in met.values() if not rc.sharable or (arc.why and rc.rc in arc.why.rcs)]
         holders = [f"{rc.rc}: {'; '.join(hold_text(hold, arc.priority) for hold in rc.holds)}" for rc in in_way]
         holders += [f"{rc.rc}: {rc.lost}" for need in needs if need.rc for rc in need.rcs if rc.lost]
-        words = f"{arc.name} {waits(reason_text(arc.reason, arc.why, (now - arc.told) / SECOND))}"
+        words = f"{arc.name} {waits(reason_text(arc.reason, arc.why, (now - arc._told) / SECOND), arc.why)}"
         ahead = f"{arc.ahead} ahead" if arc.ahead else ""
         waited = self._since(arc)
         since = ", ".join(filter(None, (f"waits since {clock(-waited)} ({span(waited)})", ahead, start)))

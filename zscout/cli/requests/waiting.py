@@ -6,18 +6,15 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
-from typing import Any, Final
+from typing import Any
 
 from zscout.cli import common
 from zscout.cli.device_words import absence
 from zscout.keyexpr import is_pattern, matcher
 from zscout.messages import HoldView, RcmState, ReasonInfo, ReasonParty, WaitView, Who
-from zscout.scheduling.reason import Party, Reason, ReasonCode, named
+from zscout.scheduling.reason import named, person, reason_of
 from zscout.terminal import clean, clock, span
-from zscout.types import SECOND, Ns
-
-NAMING: Final = (ReasonCode.HELD, ReasonCode.VETOED, ReasonCode.MAINTENANCE, ReasonCode.RESERVED, ReasonCode.BOOKED)
-"""Reasons that name other requests."""
+from zscout.types import SECOND
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,19 +94,13 @@ def contention_of(state: RcmState, needs: Collection[str], own: str = "") -> lis
 
 def whose(view: HoldView | WaitView | ReasonParty) -> str:
     """The person and the command of a request: `alice@ws1 (survey.py)`."""
-    return clean(named(view.who, view.client, view.arc))
-
-
-def person(who: Who | None, client: str) -> str:
-    """The person of a request: `alice@ws1`; its client, `ws1/c7`, if it names no user."""
-    host = "" if who is None else who.host or client.partition("/")[0]
-    return clean(client if who is None or not who.user else f"{who.user}@{host}" if host else who.user)
+    command = view.who.command if view.who is not None else ""
+    return person(view.who, view.client) + (f" ({clean(command)})" if command else "")
 
 
 def request_words(arc: str, who: Who | None, client: str, params: Mapping[str, Decimal] | None = None) -> str:
     """The name of a request and its person: `survey (alice@ws1)`, with the `params` under which it holds a device."""
-    by = person(who, client)
-    return clean(common.with_amounts(f"{arc} ({by})" if by else arc, params or {}))
+    return clean(common.with_amounts(named(who, client, arc), params or {}))
 
 
 def comment(who: Who | None) -> str:
@@ -118,22 +109,11 @@ def comment(who: Who | None) -> str:
 
 
 def reason_text(reason: str, why: ReasonInfo | None, age: float = 0) -> str:
-    """Why a request waits, in words, `age` seconds after the leader sent it: other requests by their names, times of
-    day by this host's clock."""
-    if why is None or why.code not in NAMING or not why.rcs or (why.code != ReasonCode.HELD and not why.by):
+    """Why a request waits, in words, `age` seconds after the leader sent it: times of day by this host's clock."""
+    known = reason_of(why)
+    if known is None:
         return reason
-    # A party without a client is shown by its name alone.
-    parties = [
-        Party("", request_words(by.arc, by.who, by.client), by.priority, until=_ns(by.yields_in, age)) for by in why.by
-    ]
-    words = Reason(
-        ReasonCode(why.code), tuple(why.rcs), tuple(parties), why.detail, why.count, why.pattern, tuple(why.patterns)
-    )
-    return words.text(lambda until: clock(until / SECOND, at_latest=True))
-
-
-def _ns(seconds: float | None, age: float) -> Ns | None:
-    return None if seconds is None else round((seconds - age) * SECOND)
+    return known.text(lambda until: clock(until / SECOND - age, at_latest=True))
 
 
 def hold_text(hold: HoldView, priority: int) -> str:

@@ -14,9 +14,16 @@ from zscout.cli import common
 from zscout.cli.journals import ask_journals, ending, local
 from zscout.cli.journals import hold_json as past_json
 from zscout.cli.requests.options import MAX_ARC_NAME, arc_argument
-from zscout.cli.requests.waiting import NeedContention, comment, contention_of, hold_json, hold_words, reason_text
+from zscout.cli.requests.waiting import (
+    NeedContention,
+    comment,
+    contention_of,
+    hold_json,
+    hold_words,
+    reason_text,
+    request_words,
+)
 from zscout.messages import HistoryAsk, HoldView, RcAsk, RcmState, RcState, WaitView
-from zscout.scheduling.reason import named
 
 MAX_DESCRIBED: Final = 20
 """Requests of one name."""
@@ -47,6 +54,8 @@ async def why(arc: str, as_json: bool) -> None:
         views: list[View] = [*state.holds, *state.queue]
         same = [view for view in views if arc in (view.arc, view.id, _full(view))]
         unknown = common.unknown("request", arc, [view.arc for view in views], "and none is open", "open", state.more)
+        if any(view.rc == arc for view in state.rcs):
+            unknown = common.Failed(f"{arc} is a device: zscout status {arc} shows which requests hold it or wait")
         past = [] if same or state.story else await _past_holds(client, arc, unknown)
         found = [await _described(client, view, state) for view in same[:MAX_DESCRIBED]]
         if not same:
@@ -135,14 +144,15 @@ def _print_holds(holds: list[dict[str, Any]]) -> None:
     for hold in holds:
         waited = "" if hold["waited"] is None else f" after {terminal.span(hold['waited'])} in the queue"
         began = local(datetime.fromisoformat(hold["began"]).timestamp())
-        by = named(hold["who"], hold["client"], hold["arc"])
+        by = request_words(hold["arc"], hold["who"], hold["client"])
         _say(f"  {began}  {by}, priority {hold['priority']}, held {', '.join(hold['rcs'])}")
         _say(f"    for {terminal.span(hold['held'])}{waited}: {hold['end']}")
 
 
 def _print_standing(arc: dict[str, Any]) -> None:
-    who = f"{arc['arc']} of {named(arc['who'], arc['client'], arc['arc'])}, priority {arc['priority']},"
-    names = f"  id {arc['id']}, client {arc['client']}{comment(arc['who'])}"
+    who = f"{request_words(arc['arc'], arc['who'], arc['client'])}, priority {arc['priority']},"
+    command = f", command {arc['who'].command}" if arc["who"] is not None and arc["who"].command else ""
+    names = f"  id {arc['id']}, client {arc['client']}{command}{comment(arc['who'])}"
     runtime = terminal.span(float(arc["min_runtime"]))
     if arc["state"] == "running":
         _say(f"{who} has run since {_past(arc['held'])}", bold=True, fg="green")

@@ -59,7 +59,7 @@ class Told:
                 if gap.began < unknown.ended and (gap.ended is None or gap.ended > unknown.began)
             ]
             if not found and any(span.ended > unknown.began for span in unknown_to(journal, unknown)):
-                found = ["has nothing of then"]
+                found = ["has no entries of that time"]
             words += [f"{host} {', '.join(dict.fromkeys(found))}"] if found else []
         return "; ".join(words)
 

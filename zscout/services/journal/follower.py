@@ -207,7 +207,8 @@ def _viewed(hold: messages.HoldView, at: float) -> messages.PastHold:
 
 
 def _over(revoked: messages.Revocation, at: float) -> messages.PastHold:
-    by = revoked.why.by[0] if revoked.by is not None and revoked.why is not None and revoked.why.by else None
+    why = revoked.why
+    by = why.by[0] if revoked.by is not None and why is not None and why.by else None
     if by is not None:
         by = messages.ReasonParty(_text(by.id), _text(by.arc), _text(by.client), _number(by.priority), _user(by.who))
     return messages.PastHold(
@@ -218,6 +219,8 @@ def _over(revoked: messages.Revocation, at: float) -> messages.PastHold:
         outcome=_text(revoked.outcome),
         reason=_text(revoked.reason),
         by=by,
+        code="" if why is None else _text(why.code),
+        own=why is not None and why.own,
     )
 
 

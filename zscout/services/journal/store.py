@@ -46,14 +46,15 @@ CREATE INDEX holds_ended ON holds (ended);
 CREATE TABLE gaps (began REAL NOT NULL, ended REAL NOT NULL, cause TEXT NOT NULL, count INTEGER NOT NULL);
 CREATE TABLE facts (name TEXT PRIMARY KEY, at REAL NOT NULL);
 """
-_USED: Final = "ALTER TABLE holds ADD COLUMN used TEXT"
-"""Seconds, one line per RC of `rcs`, empty if unknown. Added to older files when opened; older versions ignore it."""
+_ADDED: Final = ("used TEXT", "code TEXT", "own INTEGER")
+"""Added to older files when opened; older versions ignore them. `used`: seconds, one line per RC of `rcs`, empty if
+unknown."""
 _COLUMNS: Final = (
     "term, rcm, seq, request, arc, client, owner, rcs, began, late, ended, outcome, reason, taken_for, priority, "
-    "min_runtime, waited, user, host, command, used"
+    "min_runtime, waited, user, host, command, used, code, own"
 )
 _INSERT: Final = (
-    f"INSERT INTO holds ({_COLUMNS}) VALUES ({', '.join('?' * 21)}) ON CONFLICT (term, rcm, seq) DO UPDATE SET "  # noqa: S608 - constants
+    f"INSERT INTO holds ({_COLUMNS}) VALUES ({', '.join('?' * 23)}) ON CONFLICT (term, rcm, seq) DO UPDATE SET "  # noqa: S608 - constants
 )
 # Complete a hold assumed ended, or known by its end alone.
 _BEGAN: Final = f"""{_INSERT}
@@ -64,7 +65,7 @@ _BEGAN: Final = f"""{_INSERT}
     outcome = CASE outcome WHEN '{messages.UNHEARD}' THEN '' ELSE outcome END"""
 _ENDED: Final = f"""{_INSERT}
     ended = max(holds.began, excluded.ended), outcome = excluded.outcome, reason = excluded.reason,
-    taken_for = excluded.taken_for
+    taken_for = excluded.taken_for, code = excluded.code, own = excluded.own
     WHERE holds.ended IS NULL OR holds.outcome = '{messages.UNHEARD}'"""
 _UNHEARD: Final = f"""
     UPDATE holds SET ended = max(began, ?), outcome = '{messages.UNHEARD}'
@@ -164,8 +165,10 @@ class JournalStore:
             (sound,) = db.execute("PRAGMA quick_check(1)").fetchone()
             if sound != "ok":
                 raise _damaged(sound)
-            if not db.execute("SELECT 1 FROM pragma_table_info('holds') WHERE name = 'used'").fetchone():
-                db.execute(_USED)
+            known = {name for (name,) in db.execute("SELECT name FROM pragma_table_info('holds')")}
+            for column in _ADDED:
+                if column.partition(" ")[0] not in known:
+                    db.execute(f"ALTER TABLE holds ADD COLUMN {column}")
             db.create_function("any_rc", 2, _any_rc, deterministic=True)
         except BaseException:
             db.close()
@@ -310,18 +313,19 @@ def _row(hold: messages.PastHold) -> tuple[object, ...]:
     names = counter, rcm, seq, hold.id, hold.arc, hold.client, owner, "\n".join(hold.rcs)
     times = hold.began, hold.late, hold.ended, hold.outcome, hold.reason, by
     asked = hold.priority, hold.min_runtime, hold.waited, who.user or None, who.host or None, who.command or None
-    return *names, *times, *asked, _used_text(hold.rcs, hold.used)
+    return *names, *times, *asked, _used_text(hold.rcs, hold.used), hold.code or None, hold.own
 
 
 def _hold(row: tuple[Any, ...]) -> messages.PastHold:
     (term, rcm, seq, number, arc, client, _, rcs, began, late, ended, outcome, reason, by, priority, runtime) = row[:16]
-    waited, user, host, command, used = row[16:]
+    waited, user, host, command, used, code, own = row[16:]
     grant, held = Grant(Term(term, rcm), seq), rcs.split("\n") if rcs else []
     by = None if by is None else _PARTY.decode(by)
     who = messages.Who(user or "", host or "", command or "") if user or host or command else None
-    times = began, bool(late), ended, outcome, reason
+    times, asked = (began, bool(late), ended, outcome, reason), (priority, runtime, waited, who)
+    used_by_rc = _used_by_rc(held, used)
     return messages.PastHold(
-        grant, number, arc, client, held, *times, by, priority, runtime, waited, who, _used_by_rc(held, used)
+        grant, number, arc, client, held, *times, by, *asked, used_by_rc, code=code or "", own=bool(own)
     )
 
 

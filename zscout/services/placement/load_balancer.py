@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from typing import Final
 
 from zscout.keyexpr import RANDOM, Role, Token, check_name
-from zscout.mesh import IncomingQuery, Mesh
+from zscout.mesh import IncomingQuery, Lane, Mesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import HostRanking, KnownLoad, LoadReport, RankAsk
 from zscout.placement.balancer import Balancer
@@ -39,7 +39,7 @@ class LoadBalancer:
         for declared in (
             self._reports,
             mesh.watch(keys.alive_any(Role.LOAD), guard(self._on_reporter)),
-            mesh.serve(keys.rank, RankAsk, guard(self._on_query)),
+            mesh.serve(keys.rank, RankAsk, guard(self._on_query), lane=Lane.QUESTION),
         ):
             self._declarations.callback(declared.close)
         self._supervisor.call_later(READ_EVERY, self._read)
@@ -76,7 +76,7 @@ class LoadBalancer:
             check_name(host, "host")
         now = self.mesh.now()
         ranking = self.core.rank(now, RankQuery.of(ask), ask.at_most)
-        left_out = dict(itertools.islice(ranking.left_out.items(), ask.at_most))
+        left_out = {host: str(why) for host, why in itertools.islice(ranking.left_out.items(), ask.at_most)}
         reports = None
         if ask.reports:
             named = [*(ranked.host for ranked in ranking.hosts), *left_out]

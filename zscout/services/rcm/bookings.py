@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
-from zscout.mesh import Declaration, Mesh
+from zscout.mesh import Declaration, Lane, Mesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import Amounts, BookingRecord, BookingsAsk, BookingsKept, Instant, ProposedHolder, decimals
 from zscout.scheduling.booking import Booked
@@ -120,7 +120,7 @@ class Bookings:
         """From now on it answers, and shares what it knows."""
         keys, mesh, guard = self._mesh.keys, self._mesh, self._supervisor.guard
         self._declared = [
-            mesh.serve(keys.rcm_bookings, BookingsAsk, guard(self.handler.answer_bookings)),
+            mesh.serve(keys.rcm_bookings, BookingsAsk, guard(self.handler.answer_bookings), lane=Lane.QUESTION),
             *(mesh.watch(keys.alive_any(role), guard(self._on_token)) for role in (Role.CANDIDATE, Role.NODE)),
         ]
         self._keeper.on_shared = self._on_shared

@@ -29,6 +29,7 @@ from zscout.messages import (
     absurd,
     disbelieved,
 )
+from zscout.rcm.places import Places
 from zscout.rcm.terms import Source, Terms, Verdict, Word
 from zscout.scheduling.fair_shares import decayed
 from zscout.services.authority import Authority
@@ -43,7 +44,6 @@ from zscout.services.rcm.digest import HoldListener
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.inventory import Inventory
 from zscout.services.rcm.observed_runtimes import RuntimeObserver
-from zscout.services.rcm.places import Places
 from zscout.services.rcm.rcm import Rcm
 from zscout.services.rcm.recovery import aged, take_over
 from zscout.services.rcm.term_file import TermDisk
@@ -425,7 +425,7 @@ class Candidate:
             self._runtimes.estimator,
         )
         self.terms_led += 1
-        rcm.membership.on_disbelieved = self._disbelieved
+        rcm.on_disbelieved = self._disbelieved
         rcm.bookings.on_danger = self.on_danger
         self._leading.callback(rcm.stop)
         rcm.start(recovered)

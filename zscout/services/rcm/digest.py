@@ -4,21 +4,12 @@ ends of holds. It is worked out once all answers of an instant are sent."""
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import (
-    ArcRequest,
-    Dropped,
-    Effect,
-    Event,
-    Granted,
-    HandedOver,
-    HoldEnded,
-    LeadTaken,
-    Outcome,
-)
+from zscout.scheduling.model import ArcRequest, Effect, Event, Granted, HoldEnded, LeadTaken, Outcome
 from zscout.scheduling.reason import Reason
 from zscout.types import ArcId, Ns, RcName
 
@@ -60,18 +51,18 @@ class HoldDigest:
 
     def __init__(self, core: Core, listeners: Sequence[HoldListener]) -> None:
         self._core, self._listeners = core, listeners
-        self._foretold: dict[ArcId, Ns] = {}
         self._held: dict[ArcId, Began] = {}
 
-    def foretell(self, arc: ArcId, start: Ns) -> None:
-        """Its client is told that `arc` will start at `start`."""
-        if self._core.is_queued(arc):
-            self._foretold.setdefault(arc, start)
-
-    def take(self, now: Ns, events: Iterable[Event], effects: Iterable[Effect]) -> None:
-        """What happened in one instant, in its order."""
+    def take(
+        self,
+        now: Ns,
+        events: Iterable[Event],
+        effects: Iterable[Effect],
+        foretold: Mapping[ArcId, Ns] = MappingProxyType({}),
+    ) -> None:
+        """What happened in one instant, in its order. `foretold`: the starts that clients were notified of first."""
         try:
-            self._take(now, events, effects)
+            self._take(now, events, effects, foretold)
         except Exception:
             log.exception("holds are neither counted nor told of any more in this term")
             self._listeners = ()
@@ -86,24 +77,20 @@ class HoldDigest:
         except Exception:
             log.exception("holds that go on were not counted")
 
-    def _take(self, now: Ns, events: Iterable[Event], effects: Iterable[Effect]) -> None:
+    def _take(self, now: Ns, events: Iterable[Event], effects: Iterable[Effect], foretold: Mapping[ArcId, Ns]) -> None:
         recovered: list[ArcId] = []
         for event in events:
             match event:
                 case LeadTaken(recovered_holds=holds):
                     recovered += (held.request.arc for held in holds)
-                case HandedOver(arc, _, renamed) if arc in self._foretold and self._core.is_queued(renamed):
-                    self._foretold.setdefault(renamed, self._foretold[arc])
         for effect in effects:
             match effect:
                 case Granted(arc=arc, waited=waited):
-                    start = self._foretold.pop(arc, None)
+                    start = foretold.get(arc)
                     self._begin(arc, now, waited, None if start is None or waited is None else now - start)
                 case HoldEnded(arc=arc, outcome=outcome, reason=reason, requeued=requeued):
                     if (began := self._held.pop(arc, None)) is not None:
                         self._tell_over(Over(began, now, outcome, reason, requeued))
-                case Dropped(arc=arc):
-                    self._foretold.pop(arc, None)
         for arc in recovered:
             # The core says no word of what goes on as it is.
             if arc not in self._held and self._core.is_running(arc):

@@ -22,7 +22,7 @@ from zscout.keyexpr import Role, Token
 from zscout.mesh import Mesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import MAX_STATE, Malformed, RcmState, RcState, StateAsk, decode_told, encode
-from zscout.services.rcm.devices import ExpectedDevices, SeenHome, homes_in
+from zscout.rcm.devices import ExpectedDevices, SeenHome, homes_in
 from zscout.types import SECOND, Ns
 
 log = logging.getLogger(__name__)

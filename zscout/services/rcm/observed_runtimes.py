@@ -1,5 +1,5 @@
-"""Learns how long holds last from what the leader publishes, as every candidate hears it, and from the own journal: so
-who begins to lead knows what the others know."""
+"""Learns how long holds last from the leader's publications, which every candidate receives, and from the journal: a
+new leader knows as much as the last."""
 
 from __future__ import annotations
 
@@ -7,16 +7,14 @@ from collections import OrderedDict
 from collections.abc import Iterable
 from typing import Final, NamedTuple
 
-from zscout.messages import Grants, Holder, PastHold, Revocation, Who, duration
+from zscout.messages import Grants, Holder, PastHold, ReasonInfo, Who, duration
 from zscout.scheduling.model import Outcome
-from zscout.scheduling.reason import ITS_CLIENT, Reason, ReasonCode
+from zscout.scheduling.reason import ReasonCode
 from zscout.scheduling.runtimes import RuntimeEstimator, Wish
 from zscout.types import SECOND, Grant, Ns
 
 MAX_OPEN: Final = 20_000
 """Holds that are followed at one time: of more, those that began last."""
-_BY_ITSELF: Final = {str(Reason(ReasonCode.RELEASED, detail=ITS_CLIENT)), str(Reason(ReasonCode.EXPIRED))}
-"""Reasons of holds that had all that their programs wanted, or asked for."""
 
 
 class _Begun(NamedTuple):
@@ -38,7 +36,7 @@ class RuntimeObserver:
         for revoked in grants.revoked:
             begun = self._open.pop(revoked.grant, None)
             if begun is not None:
-                self._end(begun.wish, now - begun.at, revoked)
+                self._end(begun.wish, now - begun.at, revoked.outcome, revoked.why)
 
     def recall(self, holds: Iterable[PastHold]) -> None:
         """What a journal knows, the oldest first."""
@@ -47,7 +45,8 @@ class RuntimeObserver:
                 asked = round(hold.min_runtime * SECOND)
                 if asked > 0:
                     wish = _wish(hold.arc, hold.who, hold.rcs, asked)
-                    self._end(wish, round((hold.ended - hold.began) * SECOND), hold)
+                    why = ReasonInfo(hold.code, own=hold.own) if hold.code else None
+                    self._end(wish, round((hold.ended - hold.began) * SECOND), hold.outcome, why)
 
     def _begin(self, now: Ns, holder: Holder) -> None:
         try:
@@ -62,13 +61,16 @@ class RuntimeObserver:
         if len(self._open) > MAX_OPEN:
             self._open.popitem(last=False)
 
-    def _end(self, wish: Wish, lasted: Ns, how: Revocation | PastHold) -> None:
-        if how.outcome == Outcome.HANDED_OVER or lasted < 0:
+    def _end(self, wish: Wish, lasted: Ns, outcome: str, why: ReasonInfo | None) -> None:
+        unknown = why is None and outcome in (Outcome.COMPLETED, Outcome.RELEASED)  # of an older version
+        if outcome == Outcome.HANDED_OVER or lasted < 0 or unknown:
             return
-        whole = how.outcome in (Outcome.COMPLETED, Outcome.RELEASED) and how.reason in _BY_ITSELF
-        if how.reason == str(Reason(ReasonCode.EXPIRED)):
+        expired = why is not None and why.code == ReasonCode.EXPIRED
+        given_back = why is not None and why.code == ReasonCode.RELEASED and why.own
+        if expired:
             lasted = wish.runtime  # all that was asked for: what is more is the way of the news
-        self.estimator.observe(wish, lasted, whole=whole)
+        # Whole: it had all that its program wanted, or asked for.
+        self.estimator.observe(wish, lasted, whole=expired or given_back)
 
 
 def _wish(arc: str, who: Who | None, needs: Iterable[str], asked: Ns) -> Wish:

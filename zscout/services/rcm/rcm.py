@@ -15,15 +15,18 @@ import logging
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from msgspec.structs import replace
 
 from zscout import messages, trace
 from zscout.config.fleet import Fleet
-from zscout.keyexpr import Role, Token
-from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError, Reply, Tally
-from zscout.mesh.supervision import Supervisor
+from zscout.keyexpr import BadName, Role, Token, client_of
+from zscout.mesh import Declaration, IncomingQuery, Lane, Mesh, MeshError, Refused, Reply, Tally
+from zscout.mesh.supervision import StallWatch, Supervisor
+from zscout.rcm.places import Places, arc_id, client_id, request_id
+from zscout.rcm.request_log import REMEMBERED, RequestLog, reason_info
+from zscout.rcm.roster import MAX_TOKENS, Change, Question, Roster, discrepancies
 from zscout.rcm.terms import Verdict, Word
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
@@ -59,10 +62,7 @@ from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.digest import HoldDigest, HoldListener
 from zscout.services.rcm.inventory import Inventory
-from zscout.services.rcm.membership import Membership, discrepancies
-from zscout.services.rcm.places import Places, client_id, request_id
 from zscout.services.rcm.recovery import RecoveredState
-from zscout.services.rcm.registry import REMEMBER, RequestRegistry, reason_info
 from zscout.services.rcm.request_handler import RequestHandler
 from zscout.types import SECOND, VERSION, ArcId, ClientId, Ns, RcName, Term
 
@@ -81,8 +81,22 @@ KEPT: Final[Mapping[Outcome, Ns]] = MappingProxyType(
 """For how long a client may ask again for the place of what ended so; else it is for as long as that is known."""
 CONTINUED: Final = (LeadTaken, Adopted, HandedOver)
 """Events by which holds that stand go on: the RCs hear of that before anybody else."""
+STATE_AGE: Final[Ns] = SECOND // 20
+"""An answer about the state may be this old (rule 20): building it costs as much as many grants."""
+MAX_BUILT: Final = 4
+"""Answers of one kind that are built within STATE_AGE, where the state changes."""
 MAX_REASON = 500
 """Characters of a veto's reason."""
+
+
+class _Built(NamedTuple):
+    """An answer about the state, and after which batch of events it was built."""
+
+    state: messages.RcmState
+    encoded: bytes
+    batches: int
+    built: int
+    """How many were built within STATE_AGE."""
 
 
 class Rcm:
@@ -113,31 +127,32 @@ class Rcm:
         self._authority = authority or Authority(fleet)
         self.core = Core(STRATEGIES[fleet.strategy](), self._authority.bound(fleet.scheduling))
         supervisor, receive = self.supervisor, self._receive
+        self._on_newer = on_newer
+        self.on_disbelieved: Callable[[RcName, Term], object] = lambda *_: None
+        """Called when no RC has joined, and one obeys an RCM of so low a term that this one is none to it."""
         self.places = places or Places(fleet.name, None, term)
-        self.registry = RequestRegistry(mesh, self.core, term, supervisor, self.places)
-        self._runtimes = self.registry.runtimes = runtimes
+        self._runtimes = runtimes
         self._own_inventory = inventory is None
         self.inventory = inventory or Inventory(mesh, fleet)
         devices = self.inventory.devices
-        self.membership = Membership(mesh, fleet, term, supervisor, receive, self._compare, on_newer, devices)
-        self.membership.on_requests = self._on_requests
-        self.registry.hosts_of = self.membership.hosts_of
+        self.roster = Roster(mesh.keys, mesh.me.host, fleet, term, devices, mesh.now())
+        self._stall = StallWatch(mesh.now)
+        self.registry = RequestLog(self.core, self.roster, self.places, runtimes)
         self._digest = HoldDigest(self.core, listeners) if listeners else None
-        if self._digest is not None:
-            self.registry.on_foretold = self._digest.foretell
         self._tally = tally
-        self.membership.on_named = lambda rc: self._publish([], [rc])
         self.requests = RequestHandler(
             mesh,
             fleet,
             self.core,
             self.registry,
-            self.membership,
+            self.roster,
             devices,
             self._authority,
             self.places,
             supervisor,
             receive,
+            self._follow,
+            runtimes,
         )
         self.bookings = self.requests.bookings = Bookings(
             mesh,
@@ -165,11 +180,13 @@ class Rcm:
         """The number of the last publication that named an RC."""
         self._recovered: dict[ClientId, set[ArcId]] = {}
         """By client: the ARCs that only RCs have told of."""
+        self._states: dict[messages.StateAsk, _Built] = {}
+        self._states_since: Ns = 0
         self._vote_timeout = fleet.timing.vote_timeout / SECOND
         self._voted = supervisor.guard(self._on_ballot)
         self._declared: list[Declaration] = []
         self._wake: asyncio.TimerHandle | None = None
-        self._wake_at: Ns | None = None
+        self._core_wake: Ns | None = None
         self._armed: Ns = 0
         """When the timer goes off: it may be earlier than it need be."""
 
@@ -180,22 +197,25 @@ class Rcm:
         keys, mesh, guard = self.mesh.keys, self.mesh, self.supervisor.guard
         if self._own_inventory:
             self.inventory.start(self.supervisor)
-        joined = self.membership.join(recovered.rcs, recovered.pending, patient=recovered.patient)
+        self._stall.start()
+        now = self._look()
+        joined = self.roster.start(now, recovered.rcs.values(), recovered.pending, patient=recovered.patient)
         for arc in recovered.given_up:
-            self.registry.give_up(arc, Outcome.RELEASED)
+            self.registry.give_up(now, arc, Outcome.RELEASED)
         requests = [*(hold.request for hold in recovered.holds), *(one.request for one in recovered.waiting)]
         for request in requests:
             self.registry.enter(request.arc, request.name)
-            self.membership.expect(request.client)
+            self.roster.expect(now, request.client)
             if request.client not in recovered.answered:
                 self._recover(request)
-        self.requests.believed = recovered.believed
+        for arc, rcs in recovered.believed.items():
+            self.registry.believe(arc, rcs)
         waiting = (replace(one, request=self.bookings.dates.dated(one.request)) for one in recovered.waiting)
         certain = 0 if self.bookings.settled else self.bookings.settles_at
         lead = LeadTaken(self.term, tuple(recovered.holds), tuple(waiting), recovered.charged, certain)
         booked = self.bookings.recovered({request.booking for request in requests if request.booking})
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
-        self._decide([*joined, *booked, lead], named=recovered.rcs)
+        self._decide([*joined.events, *booked, lead], named=recovered.rcs)
         for arc in self.core.arcs():
             self._bind(arc)
             if (expecting := recovered.expected.get(request_id(arc))) is not None:
@@ -203,10 +223,12 @@ class Rcm:
         limit = self.fleet.limits.max_payload
         self._declared = [
             mesh.serve(
-                keys.schedule_any, messages.Operation, guard(self.requests.on_operation), limit=limit, tally=self._tally
+                keys.schedule_any, messages.Operation, guard(self._on_operation), limit=limit, tally=self._tally
             ),
-            mesh.serve(keys.rcm_state, messages.StateAsk, guard(self._on_state_asked)),
-            *self.membership.watch(),
+            mesh.serve(keys.rcm_state, messages.StateAsk, guard(self._on_state_asked), lane=Lane.QUESTION),
+            mesh.subscribe(keys.rc_state_any, messages.RcState, guard(self._on_rc_state)),
+            mesh.watch(keys.alive_any(Role.CLIENT), guard(self._on_client)),
+            mesh.watch(keys.alive_any(Role.RC), guard(self._on_rc_token)),
             mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, self.term.rcm)),
         ]
         self.bookings.start()
@@ -218,10 +240,11 @@ class Rcm:
             self._digest.close(self.mesh.now())
         for declared in reversed(self._declared):
             declared.close()
+        self._stall.stop()
         self.supervisor.cancel()
         if self._own_inventory:
             self.inventory.stop()
-        self.registry.close()
+        self._log(self.registry.close(self.mesh.now()))
         self.bookings.close()
         self.requests.close()
         self._grants.close()
@@ -234,22 +257,111 @@ class Rcm:
 
     # In
 
+    def _look(self) -> Ns:
+        """The present time. The roster learns of a stall of this process."""
+        stall, fresh = self._stall, self._stall.fresh()
+        self.roster.stalled(stall.length, stall.ended, fresh=fresh)
+        return self.mesh.now()
+
+    def _on_operation(self, query: IncomingQuery[messages.Operation]) -> None:
+        """Carry an operation out: behind the surplus of the host whose request it concerns, or, where it only asks
+        what would be, behind all others."""
+        operation, host = query.message, self.mesh.keys.sender_of(query.key).host
+        question = isinstance(operation, (messages.Foresee, messages.FindSlots))
+        owner = getattr(operation, "client", None)
+        of = client_of(owner).host if owner is not None else host
+        lane = Lane.QUESTION if question else Lane.ASK
+        if not ((question or of != host) and self.mesh.behind(lane, of, self._operate_later, query)):
+            self._operate(query)
+
+    def _operate(self, query: IncomingQuery[messages.Operation]) -> None:
+        self.requests.on_operation(query)
+        self._send_notices()
+
+    def _operate_later(self, query: IncomingQuery[messages.Operation]) -> None:
+        try:
+            if not self.supervisor.active:
+                raise Refused("not_leading", "this manager stopped leading; try again")
+            self.supervisor.guard(self._operate)(query)
+        except Refused as refused:
+            query.refuse(refused.problem)
+        except BadName as error:
+            query.refuse(messages.Problem("bad_name", str(error)))
+
+    def _send_notices(self) -> None:
+        notices, self.requests.notices = self.requests.notices, []
+        self._notify(notices)
+
+    def _on_rc_state(self, key: str, state: messages.RcState) -> None:
+        self._follow(self.roster.rc_state(self._look(), key, state))
+
+    def _on_client(self, token: Token, alive: bool) -> None:
+        self._follow(self.roster.client_token(self._look(), token, alive=alive))
+
+    def _on_rc_token(self, token: Token, alive: bool) -> None:
+        self._follow(self.roster.rc_token(self._look(), token, alive=alive))
+
+    def _follow(self, change: Change) -> None:
+        """Carry out what follows for the roster, in its order."""
+        verdicts = [(token, self._on_newer(word)) for word, token in change.higher]
+        for rc, term in change.disbelieved:
+            self.on_disbelieved(rc, term)
+        if not self.supervisor.active:
+            return
+        if change.events:
+            self._receive(*change.events)
+        for state in change.reported:
+            self._compare(state)
+        if change.named:
+            self._publish([], change.named)
+        for listed in change.listed:
+            self._on_requests(listed.client, {request.id for request in listed.requests})
+        for number, found in change.found:
+            self.requests.on_new_client(number, found=found)
+            self._send_notices()
+        if change.settled:
+            self.requests.resume()
+            self._send_notices()
+        for asked in change.questions:
+            self.supervisor.spawn(self._ask(asked))
+        for sign, so in change.suspicions:
+            self.mesh.suspicions.suspect(sign, so=so)
+        for rc, host in change.duplicates:
+            log.warning("duplicate device %s at %s; another host's is used", rc, host)
+        if change.surplus:
+            log.warning("%s shows more than %d tokens: later ones are ignored", change.surplus, MAX_TOKENS)
+        for token, verdict in verdicts:
+            if token is not None and verdict.absent_until:
+                self._follow(self.roster.shun(self.mesh.now(), token, verdict.absent_until))
+        self._set_wake(self._core_wake)
+
+    async def _ask(self, asked: Question) -> None:
+        if asked.kind is None:
+            tokens = await self.mesh.living(asked.key, timeout=asked.timeout)
+            self._follow(self.roster.seen(self._look(), asked, tokens))
+            return
+        reply = await self.mesh.ask_one(asked.key, asked.message, asked.kind, timeout=asked.timeout)
+        message, problem = (None, None) if reply is None else (reply.message, reply.problem)
+        self._follow(self.roster.answered(self._look(), asked, message, problem))
+
     def _receive(self, *events: Event) -> None:
         """What has happened; events that come together are one instant."""
-        match events:
-            case [ClientLost(client)]:
-                self._recovered.pop(client, None)
-                if not self.core.arcs_of(client):
-                    return
+        for event in events:
+            if isinstance(event, ClientLost):
+                self._recovered.pop(event.client, None)
+        # A client that asked for nothing changes nothing.
+        if all(isinstance(event, ClientLost) and not self.core.arcs_of(event.client) for event in events):
+            return
         if self.supervisor.active:
             # What was asked before is decided before.
             self.requests.flush()
             self._decide(events)
 
-    def _compare(self, rc: RcName, state: messages.RcState) -> None:
+    def _compare(self, state: messages.RcState) -> None:
         """Makes an RC and the core agree: what the RC lost has ended, what is too much there is revoked."""
         if not self.supervisor.active:
             return
+        rc = state.rc
         current = state.term == self.term and state.seq >= self._named.get(rc, 0)
         ended, superfluous = discrepancies(state, self.core.holders(rc), self.mesh.now(), current=current)
         if ended:
@@ -266,7 +378,7 @@ class Rcm:
     def _recover(self, request: ArcRequest) -> None:
         """Has a client say whether it still asks for what RCs hold for it."""
         self._recovered.setdefault(request.client, set()).add(request.arc)
-        self.membership.ask_requests(request.client)
+        self._follow(self.roster.ask_requests(self.mesh.now(), request.client))
 
     # Events, and out
 
@@ -275,19 +387,23 @@ class Rcm:
         over = self.registry.ended
         events = [one for one in events if not (isinstance(one, Adopted) and over(one.held.request.arc))]
         effects = self.core.handle(self.mesh.now(), *events)
+        now = self.mesh.now()
         told = self.requests.answer_grants(effects)
         if not any(isinstance(event, CONTINUED) for event in events):
-            told |= self.registry.tell_grants(effects, told)
+            notices = self.registry.grants(now, effects, told)
+            told |= self._notify(notices)
+        self._trace()
         self._publish(effects, named)
         self._note(events)
-        self.registry.report(effects, told | self.requests.waiting.keys(), self.requests.given_up)
+        answered = told | self.requests.waiting.keys()
+        self._notify(self.registry.report(now, effects, answered, self.requests.given_up))
         self.requests.answer(effects)
         for effect in effects:
             match effect:
                 case Dropped(arc=arc, outcome=outcome) | HoldEnded(arc=arc, outcome=outcome) if not self.core.is_open(
                     arc
                 ):
-                    self.places.end(arc, self.mesh.now(), KEPT.get(outcome, REMEMBER))
+                    self.places.end(arc, now, KEPT.get(outcome, REMEMBERED))
                 case Propose():
                     self._propose(effect)
                 case WakeAt(at):
@@ -297,29 +413,48 @@ class Rcm:
             log.info("%s", line)
         if self._digest is not None:
             # All who wait for an answer have it by now.
-            self._digest.take(self.mesh.now(), events, effects)
+            self._digest.take(now, events, effects, self.registry.foretold)
+        self._trace()
+
+    def _notify(self, notices: Iterable[messages.Notice]) -> set[ArcId]:
+        """Send notices to their clients; return their ARCs."""
+        notified = set()
+        for notice in notices:
+            self.mesh.put(self.mesh.keys.notice(client_of(notice.client)), notice)
+            notified.add(arc_id(notice.client, notice.id))
+        return notified
+
+    def _trace(self) -> None:
+        if trace.enabled():
+            for did, arc in self.registry.traced:
+                trace.write(self.mesh.now(), did, term=self.term, arc=arc)
+        self.registry.traced.clear()
+
+    def _log(self, text: str) -> None:
+        if text:
+            log.info("%s", text)
 
     def _note(self, events: Iterable[Event]) -> None:
         """What is remembered of an instant."""
-        seen = self.membership.clients
+        now = self.mesh.now()
         for event in events:
             match event:
-                case Requested(ArcRequest(client=client)) | HandedOver(to=client) if client not in seen:
-                    self.membership.expect(client)
+                case Requested(ArcRequest(client=client)) | HandedOver(to=client):
+                    self.roster.expect(now, client)
             match event:
                 case Requested(request):
                     self._bind(request.arc)
                     asked = f"asked for {', '.join(sorted(request.needs))} at priority {request.priority}"
-                    self.registry.record(request.arc, asked)
+                    self.registry.record(now, request.arc, asked)
                 case PlaceShown(arc) | HandedOver(renamed=arc):
                     self._bind(arc)
                 case Adopted(RecoveredHold(ArcRequest(client=client) as request)) if self.core.arc(request.arc):
                     self._bind(request.arc)
                     self.registry.enter(request.arc, request.name)
-                    if client not in seen:
+                    if client not in self.roster.clients:
                         # As the links to its RCs came back just now, so may its own.
-                        self.membership.heard(client)
-                        self.membership.expect(client)
+                        self._follow(self.roster.heard(now, client))
+                        self.roster.expect(now, client)
                     self._recover(request)
 
     def _bind(self, arc: ArcId) -> None:
@@ -327,24 +462,28 @@ class Rcm:
             self.places.bind(place, arc, self.mesh.now())
 
     def _set_wake(self, at: Ns | None) -> None:
-        """Sets when the core is woken. A timer that is set for earlier stays, and is set anew when it goes off: most
+        """Sets when the core is woken. A timer that is set for earlier stays, and is set again when it goes off: most
         ends are put off before they come."""
-        self._wake_at = at
+        self._core_wake = at
+        at = min((time for time in (at, self.roster.next, self.registry.next) if time is not None), default=None)
         if at is None or (self._wake is not None and self._armed <= at):
             return
         if self._wake is not None:
             self._wake.cancel()
         self._armed = at
-        delay = max(0.0, (at - self.mesh.now()) / SECOND)
-        self._wake = self.supervisor.call_later(delay, self._on_wake)
+        self._wake = self.supervisor.call_later(max(0.0, (at - self.mesh.now()) / SECOND), self._on_wake)
 
     def _on_wake(self) -> None:
         self._wake = None
-        at = self._wake_at
-        if at is not None and self.mesh.now() < at:
-            self._set_wake(at)
-        elif at is not None:
+        now = self._look()
+        if self.roster.next is not None and self.roster.next <= now:
+            self._follow(self.roster.tick(now))
+        if self._core_wake is not None and self._core_wake <= now:
             self._receive(Tick())
+        notices, text = self.registry.tick(now)
+        self._notify(notices)
+        self._log(text)
+        self._set_wake(self._core_wake)
 
     # Out: grants
 
@@ -362,11 +501,11 @@ class Rcm:
         ]
         number = self.core.seq if self.core.seq > self.seq else self.core.number()
         # One that has not joined holds what is not known here: to name it would end that.
-        concerned = filter(self.membership.has_joined, {rc for effect in changed for rc in effect.rcs})
+        concerned = filter(self.roster.has_joined, {rc for effect in changed for rc in effect.rcs})
         names = sorted({*(rcs or ()), *concerned})
         self._named |= dict.fromkeys(names, number)
         holders = {name: holders_of(self.core.holders(name), name, now) for name in names}
-        instances = {rc: instance for rc, (instance, _) in self.membership.named(names).items()}
+        instances = {rc: instance for rc, (instance, _) in self.roster.named(names).items()}
         begun = [
             (effect.grant.seq, effect.waited / SECOND)
             for effect in changed
@@ -449,37 +588,53 @@ class Rcm:
 
     def _on_state_asked(self, query: IncomingQuery[messages.StateAsk]) -> None:
         asked, now = query.message, self.mesh.now()
+        if asked.holds_only:
+            query.answer(self._state(asked, now))  # RCs reckon ends by it: it is never of an earlier instant
+            return
+        alike = replace(asked, arc=None)
+        if now - self._states_since > STATE_AGE:
+            self._states_since = now
+            self._states.clear()
+        known = self._states.get(alike)
+        if known is None or (known.built < MAX_BUILT and known.batches != self.core.batches):
+            state = self._state(alike, now)
+            built = 1 if known is None else known.built + 1
+            known = self._states[alike] = _Built(state, messages.encode(state), self.core.batches, built)
+        if asked.arc is None:
+            query.answer_encoded(known.encoded, messages.RcmState)
+        else:
+            query.answer(replace(known.state, story=self.registry.story(now, asked.arc)))
+
+    def _state(self, asked: messages.StateAsk, now: Ns) -> messages.RcmState:
         if asked.devices_only:
             rcs = self._devices(self.core.status(0), now)
-            query.answer(messages.RcmState(self.term, self.seq, self.mesh.me.host, rcs=rcs, version=VERSION))
-            return
+            return messages.RcmState(self.term, self.seq, self.mesh.me.host, rcs=rcs, version=VERSION)
         status = self.core.status(0 if asked.holds_only else MAX_LISTED)
         holds = [_hold_view(arc, arc.hold, now, self._runtimes) for arc in status.running if arc.hold is not None]
-        instances = self.membership.named(sorted({rc for hold in holds for rc in hold.needs}))
+        instances = self.roster.named(sorted({rc for hold in holds for rc in hold.needs}))
         me = self.mesh.me.host
         state = messages.RcmState(self.term, self.seq, me, holds, instances=instances, version=VERSION)
         if not asked.holds_only:
-            starts = self.registry.starts() if asked.forecast else {}
+            starts = self.registry.starts(now) if asked.forecast else {}
             state = replace(
                 state,
                 queue=[_wait_view(arc, now, starts.get(arc.id)) for arc in status.queued],
                 rcs=self._devices(status, now),
-                story=self.registry.story(asked.arc) if asked.arc is not None else [],
                 more=status.waiting - len(status.queued),
                 charged=self.core.charged(),
             )
-        query.answer(state)
+        return state
 
     def _devices(self, status: Status, now: Ns) -> list[messages.RcView]:
         """All RCs that are there or expected. What somebody asks for and nobody ever offered is not among them."""
         known = {rc.name: rc for rc in status.rcs}
         devices = self.inventory.devices
         devices.forget_old(now)
-        named = self.membership.named(known)
+        named = self.roster.named(known)
         there = {rc.name for rc in status.rcs if rc.present}
         views = []
         for name in sorted(there | devices.names):
-            rc, state = known.get(name), self.membership.reported(name)
+            rc, state = known.get(name), self.roster.reported(name)
             view = messages.RcView(name, present=False, sharable=False)
             if rc is not None:
                 view = messages.RcView(name, rc.present, rc.sharable, [*map(request_id, rc.holders)])

@@ -2,7 +2,7 @@
 
 RCs know the holds, clients their requests and places. A hold is recovered if every RC of its gang is there and holds it
 under the same grant; one that an RC of the gang does not hold is broken, and queued again with its place. While an RC
-of the gang has not answered, the others are pending (`membership.py`). What a client that answers does not ask for any
+of the gang has not answered, the others are pending (`roster.py`). What a client that answers does not ask for any
 more is not carried on: it gave it up while nobody led."""
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from msgspec.structs import replace
 
 from zscout.keyexpr import BadName, check_name, check_need, check_rc, client_of, is_pattern, matcher
 from zscout.messages import Amounts, ClientRequests, Holder, OpenRequest, RcState, duration, exact_amounts
+from zscout.rcm.places import arc_id, request_id
 from zscout.scheduling.model import ArcRequest, RecoveredHold, Requested
-from zscout.services.rcm.places import arc_id, request_id
 from zscout.types import NO_TERM, SECOND, ArcId, ClientId, Grant, HostName, Need, Ns, Place, RcName
 
 log = logging.getLogger(__name__)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Iterable, Mapping
-from functools import partial
 from typing import TypeAlias
 
 from msgspec.structs import replace
@@ -37,6 +36,10 @@ from zscout.messages import (
     duration,
     exact_amounts,
 )
+from zscout.rcm.devices import ExpectedDevices
+from zscout.rcm.places import Places, arc_id, request_id
+from zscout.rcm.request_log import RequestLog, party_info, reason_info
+from zscout.rcm.roster import Change, Roster
 from zscout.rcm.terms import Source, Word
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
@@ -55,14 +58,11 @@ from zscout.scheduling.model import (
     Requested,
     Unconfirmed,
 )
-from zscout.scheduling.reason import ITS_CLIENT, Party, named
+from zscout.scheduling.reason import Party, person
+from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.services.authority import Authority
 from zscout.services.rcm.bookings import Bookings
-from zscout.services.rcm.devices import ExpectedDevices
 from zscout.services.rcm.door import check_door
-from zscout.services.rcm.membership import Membership
-from zscout.services.rcm.places import Places, arc_id, request_id
-from zscout.services.rcm.registry import RequestRegistry, party_info, reason_info
 from zscout.types import SECOND, ArcId, ClientId, Place, RcName
 
 log = logging.getLogger(__name__)
@@ -84,22 +84,27 @@ class RequestHandler:
         mesh: Mesh,
         fleet: Fleet,
         core: Core,
-        registry: RequestRegistry,
-        membership: Membership,
+        registry: RequestLog,
+        roster: Roster,
         devices: ExpectedDevices,
         authority: Authority,
         places: Places,
         supervisor: Supervisor,
         emit: Callable[..., None],
+        follow: Callable[[Change], None],
+        runtimes: RuntimeEstimator | None,
     ) -> None:
         self.mesh, self.limits, self.core, self._devices = mesh, fleet.limits, core, devices
         self._authority, self._places = authority, places
         self._knows_all = mesh.now() + fleet.timing.hold_lease
         """From when on an RC that was not seen yet is none of this fleet."""
         self._first_answer_timeout = fleet.timing.vote_timeout / SECOND + REPLY_SLACK
-        self._registry, self._membership, self._supervisor = registry, membership, supervisor
+        self._registry, self._roster, self._supervisor = registry, roster, supervisor
         self._strange = SparseLog(log, mesh.now)
         self._flush_guarded = supervisor.guard(self.flush)
+        self._follow, self._runtimes = follow, runtimes
+        self.notices: list[Notice] = []
+        """To be sent, once the caller takes them."""
         self._emit = emit
         """Takes the events of one instant."""
         self.bookings: Bookings
@@ -114,18 +119,15 @@ class RequestHandler:
         """Operations of the present burst that are not decided yet."""
         self._deferred: dict[Query, None] = {}
         """Asked by clients that believe to hold, or handed over by them, while their RCs have not said so."""
-        self.believed: Mapping[ArcId, Collection[RcName]] = {}
-        """Of what waited as the lead was taken: the RCs that its client believed to hold."""
         self._lease = fleet.mesh.lease
-        membership.on_settled = self._resume
-        registry.may_be_held = self._may_be_held
-        self._moving: dict[Query, None] = {}
-        """Hand-overs that wait until it is known whether their new client is there."""
+        self._moving: dict[int, tuple[Query, HandOver, ClientId, ClientId]] = {}
+        """Hand-overs that wait until it is known whether their new client is there, by number."""
+        self._moved = 0
 
     def close(self) -> None:
         """Refuses what still waits: another RCM has to be asked."""
         for query in (
-            *self._moving,
+            *(moving[0] for moving in self._moving.values()),
             *self._deferred,
             *(query for queries in self.waiting.values() for query in queries),
         ):
@@ -136,7 +138,7 @@ class RequestHandler:
     def on_operation(self, query: Query) -> None:
         sender = self.mesh.keys.sender_of(query.key)
         client = str(sender)
-        self._membership.heard(client)
+        self._follow(self._roster.heard(self.mesh.now(), client))
         operation = query.message
         check_name(operation.id, "id")
         match operation:
@@ -156,7 +158,7 @@ class RequestHandler:
         arc = arc_id(client, ask.id)
         self._keep_order(arc)
         self._authority.check_ask(sender, ask, lambda names: self._open_of(names, arc))
-        undecided = self._may_hold(arc, ask) and self._membership.awaits(arc, ask.rcs)
+        undecided = self._may_hold(arc, ask) and self._roster.awaits(self.mesh.now(), arc, ask.rcs)
         undecided = undecided or bool(ask.booking and not self.bookings.settled)
         if undecided and len(self._deferred) < MAX_BATCH:
             self._defer(query)
@@ -172,7 +174,7 @@ class RequestHandler:
                 self._emit(Reachable(arc))
             query.answer(self._standing(arc, ask))
         elif self._registry.ended(arc) and not self._registry.reopens(arc, ask.grant if ask.unserved else None):
-            query.answer(self._registry.notice(arc))
+            query.answer(self._registry.notice(self.mesh.now(), arc))
         elif self._goes_on_elsewhere(ask):
             query.answer(self._registry.handed_over(arc, ask.arc))
         else:
@@ -180,17 +182,17 @@ class RequestHandler:
 
     def _check_term(self, ask: Ask, sender: Sender, client: ClientId) -> None:
         """Raises Refused for one from a later term: this leader steps down, if that counts."""
-        place, see = ask.place, self._membership.see
+        place = ask.place
         if (
             place is not None
             and self.mesh.keys.closed
             and place.term > self.core.term
             and self._places.proves(place, client, ask.was or ask.id, ask.seal)
         ):
-            see(Word(place.term, Source.SEAL, client, sender.host))
+            self._follow(Change(higher=[(Word(place.term, Source.SEAL, client, sender.host), None)]))
             raise Refused("old_term", "a leader of a later term gave this place; try again", place.term)
         if ask.term is not None and ask.term > self.core.term:
-            see(Word(ask.term, Source.CLIENT, client, sender.host if client in self._membership.clients else ""))
+            self._follow(Change(higher=[(self._roster.client_word(client, ask.term), None)]))
             raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
 
     def _enter(self, query: Query, ask: Ask, sender: Sender, client: ClientId, arc: ArcId) -> None:
@@ -224,7 +226,7 @@ class RequestHandler:
         if ask.place is None:
             return None
         check_place(ask.place, self.core)
-        seen = client in self._membership.clients
+        seen = client in self._roster.clients
         if self._places.may_claim(ask.place, client, ask.was or ask.id, ask.seal, seen=seen):
             if self._places.takes_the_word_for(ask.place):
                 told = "%s shows a place of term %d that is not known here: it has it"
@@ -236,12 +238,10 @@ class RequestHandler:
     def check_door(self, needs: Mapping[str, Amounts], *, waits: bool = False, may_wait: bool = True) -> None:
         """Raises Refused for what can never start."""
         waits = waits or self.mesh.now() < self._knows_all
-        check_door(
-            needs, self._devices.names, self._membership.is_known, self._parameters, waits=waits, may_wait=may_wait
-        )
+        check_door(needs, self._devices.names, self._roster.is_known, self._parameters, waits=waits, may_wait=may_wait)
 
     def _parameters(self, rc: RcName) -> Parameters | None:
-        state = self._membership.reported(rc)
+        state = self._roster.reported(rc)
         return state.parameters if state is not None else self._devices.parameters(rc)
 
     def _may_hold(self, arc: ArcId, ask: Ask) -> bool:
@@ -251,21 +251,17 @@ class RequestHandler:
         known = self.core.arc(arc)
         return (known is None or known.hold is None) and not self._registry.ended(arc)
 
-    def _may_be_held(self, arc: ArcId) -> bool:
-        known = self.core.arc(arc)
-        return known is not None and known.hold is None and self._membership.awaits(arc, self.believed.get(arc, ()))
-
     def _standing(self, arc: ArcId, ask: Ask) -> Notice:
         """How an open ARC stands, for a client that may not have heard how its last hold ended."""
         if ask.grant is not None and not ask.unconfirmed and not ask.unserved and self.core.is_queued(arc):
-            return self._registry.interrupted(arc, ask.grant)
-        return self._registry.notice(arc)
+            return self._registry.interrupted(self.mesh.now(), arc, ask.grant)
+        return self._registry.notice(self.mesh.now(), arc)
 
     def _defer(self, query: Query) -> None:
         self._deferred[query] = None
-        self._supervisor.call_later(self._lease, self._resume)
+        self._supervisor.call_later(self._lease, self.resume)
 
-    def _resume(self) -> None:
+    def resume(self) -> None:
         """Looks again at what was asked by clients that believe to hold."""
         deferred, self._deferred = self._deferred, {}
         for query in deferred:
@@ -285,11 +281,12 @@ class RequestHandler:
             if operation.left:
                 self.left.add(arc)
             if not self.core.is_open(arc):
-                self._registry.give_up(arc, Outcome.CANCELLED if isinstance(operation, Cancel) else Outcome.RELEASED)
+                self._registry.give_up(
+                    self.mesh.now(), arc, Outcome.CANCELLED if isinstance(operation, Cancel) else Outcome.RELEASED
+                )
         event = Cancelled if isinstance(operation, Cancel) else Released
         who = self._authority.known_as(sender, operation.who)
-        by = str(sender) if who is None else named(who, str(sender), operation.id)
-        self._gather(query, arc, event(arc, ITS_CLIENT if owner == sender else by))
+        self._gather(query, arc, event(arc, "" if owner == sender else person(who, str(sender))))
 
     def _goes_on_elsewhere(self, ask: Ask) -> bool:
         """Whether another client has this ARC: what one RCM handed over, the next knows by its place only."""
@@ -332,7 +329,7 @@ class RequestHandler:
         request = admit(asked, str(sender), arc, self.core, self.limits)
         if asked.check:
             self.check_door(asked.needs, waits=asked.wait_for_device)
-        expected = forecast(self.core, now, request, self._registry.runtimes)
+        expected = forecast(self.core, now, request, self._runtimes)
         start = expected.starts.get(arc)
         victims = [known.request for known in map(self.core.arc, expected.preempts) if known is not None]
         query.answer(
@@ -407,7 +404,7 @@ class RequestHandler:
     def _answer(self, arcs: Iterable[ArcId]) -> None:
         for arc in arcs:
             if queries := self.waiting.pop(arc, None):
-                notice = self._registry.notice(arc)
+                notice = self._registry.notice(self.mesh.now(), arc)
                 for query in queries:
                     query.answer(notice)
 
@@ -418,7 +415,8 @@ class RequestHandler:
         for other in operation.others:
             check_name(other, "id")
         arcs = [arc_id(sender, one) for one in (operation.id, *operation.others)]
-        if any(self._may_be_held(arc) for arc in arcs) and len(self._deferred) < MAX_BATCH:
+        now = self.mesh.now()
+        if any(self._registry.may_be_held(now, arc) for arc in arcs) and len(self._deferred) < MAX_BATCH:
             self._defer(query)
             return
         self.flush()
@@ -432,17 +430,19 @@ class RequestHandler:
             return
         if len(self._moving) >= MAX_BATCH:
             raise Refused("busy", f"{MAX_BATCH} hand-overs already wait here; try again")
-        self._moving[query] = None
-        self._membership.find(to, partial(self._on_new_client, query, operation, sender, to))
+        self._moved += 1
+        self._moving[self._moved] = query, operation, sender, to
+        self._follow(self._roster.seek(self.mesh.now(), to, self._moved))
 
-    def _on_new_client(self, query: Query, operation: HandOver, sender: ClientId, to: ClientId, found: bool) -> None:
+    def on_new_client(self, number: int, *, found: bool) -> None:
+        """It is known whether the new client of a hand-over has a token."""
+        query, operation, sender, to = self._moving.pop(number)
         try:
             if not found:
                 raise Refused("unknown_client", f"{to} is not on the mesh")
             self._hand_over(query, operation, sender, to)
         except Refused as refused:
             query.refuse(refused.problem)
-        self._moving.pop(query, None)
 
     def _hand_over(self, query: Query, operation: HandOver, sender: ClientId, to: ClientId) -> None:
         """All in one batch of events, and so in one publication: nobody gets in between."""
@@ -463,14 +463,15 @@ class RequestHandler:
             lambda names: self._held_by(names, *replaced),
         )
         for move in moves:
-            self._registry.enter(move.renamed, self._registry.name(move.arc))
+            self._registry.rename(move.arc, move.renamed)
         places = {move.renamed: place for move in moves if (place := self.core.place_of(move.arc)) is not None}
         shown = [
             PlaceShown(arc, place) for arc, place in places.items() if self.core.place_of(arc) not in (None, place)
         ]
         self._emit(*shown, *moves)
-        self._registry.publish(move.renamed for move in moves if self.core.is_queued(move.renamed))
-        query.answer(self._registry.notice(moves[0].renamed))
+        queued = [move.renamed for move in moves if self.core.is_queued(move.renamed)]
+        self.notices += self._registry.present(self.mesh.now(), queued)
+        query.answer(self._registry.notice(self.mesh.now(), moves[0].renamed))
 
     def _check_room_for(self, moves: Collection[HandedOver], sender: ClientId, to: ClientId) -> None:
         added = sum(self.core.arc(move.renamed) is None for move in moves)
@@ -504,8 +505,9 @@ class RequestHandler:
         if self.core.arc(goal) is None and not over:
             raise Refused("not_running", f"{operation.id} is not open at {sender}")
         # The new client may have missed it, where the RCM changed just then.
-        self._registry.publish(arc_id(to, one) for one in (operation.id, *operation.others))
-        query.answer(self._registry.notice(goal))
+        arcs = [arc_id(to, one) for one in (operation.id, *operation.others)]
+        self.notices += self._registry.present(self.mesh.now(), arcs)
+        query.answer(self._registry.notice(self.mesh.now(), goal))
 
 
 def check_place(place: Place, core: Core) -> None:

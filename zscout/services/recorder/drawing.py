@@ -325,9 +325,9 @@ def clean_path(folder: str, name: str, depth: int = 4) -> str:
 
 def with_person(name: str, who: Who | None) -> str:
     """A request as people know it: `survey (alice)`."""
-    if who is None or not who.user or who.command.startswith(COMPONENT):
+    if who is None or not (who.user or who.host) or who.command.startswith(COMPONENT):
         return name
-    return f"{name} ({clean(who.user)})"
+    return f"{name} ({clean(who.user or who.host)})"
 
 
 def with_detail(word: str, detail: str) -> str:

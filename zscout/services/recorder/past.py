@@ -57,7 +57,10 @@ def past_of(told: Told, zero: float, seconds: float, operator_priority: int) -> 
         words = [f"the journals {journals} tell of {count} in the {hours} before this recording"]
     if told.without:
         words.append(f"no journal of {', '.join(told.without[:MAX_NAMED])}: off, older than 0.3.0, or too slow")
-    gaps = [f"from {_at(one.began)} to {_at(one.ended)} UTC not all is known: {told.causes(one)}" for one in unknown]
+    gaps = [
+        f"from {_at(one.began)} to {_at(one.ended)} UTC the journals are incomplete: {told.causes(one)}"
+        for one in unknown
+    ]
     more = [f"and {len(gaps) - MAX_GAPS} more such times before"] if len(gaps) > MAX_GAPS else []
     return Past(past_lanes(told.holds, unknown, window, zero, operator_priority), words, [*gaps[-MAX_GAPS:], *more])
 

@@ -19,7 +19,7 @@ from zscout.messages import (
     WaitView,
     absurd,
 )
-from zscout.scheduling.reason import ReasonCode, ended, named, short_names, waits
+from zscout.scheduling.reason import ReasonCode, ended, reason_of, short_names, waits_for_others
 from zscout.services.recorder.drawing import HolderRow, with_person
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import NO_TERM, Grant, Term, clean
@@ -91,7 +91,7 @@ class RequestTracker:
             return
         key = (notice.client, notice.id)
         if notice.state == "ended":
-            self._ended(at, key, notice.outcome or "ended", notice.reason)
+            self._ended(at, key, notice.outcome or "ended", notice.reason, notice.why)
             return
         request = self._track(key, notice)
         if request is None or (notice.term, notice.step) <= request.last:
@@ -175,7 +175,8 @@ class RequestTracker:
         request.grant = None
         match revoked.outcome:
             case "preempted":
-                how, request.preempted = ended("preempted", self._named(revoked.reason, revoked.why)), True
+                how = ended("preempted", self._named(revoked.reason, revoked.why), revoked.why)
+                request.preempted = True
                 self._set(at, request, "waiting again", f"({how})")
                 by = revoked.why.by if revoked.why is not None else []
                 operator = any(party.priority >= self.operator_priority for party in by)
@@ -187,7 +188,7 @@ class RequestTracker:
             case "handed_over":
                 self._move(at, revoked, grants)
             case outcome:
-                self._ended(at, (revoked.client, revoked.id), outcome, revoked.reason)
+                self._ended(at, (revoked.client, revoked.id), outcome, revoked.reason, revoked.why)
 
     def _move(self, at: float, revoked: Revocation, grants: Grants) -> None:
         """The request continues in another client: it keeps its lane."""
@@ -218,17 +219,16 @@ class RequestTracker:
         state = "waiting again" if request.preempted else "waiting"
         if (request.state, request.detail) != (state, detail):
             self._set(at, request, state, detail)
-            words = f"waits {detail}" if detail.startswith("for ") else waits(self._named(reason, why))
-            self.timeline.event(at, f"{request.label} {words}")
+            self.timeline.event(at, f"{request.label} waits{'' if waits_for_others(why) else ':'} {detail}")
 
-    def _ended(self, at: float, key: Key, outcome: str, reason: str) -> None:
+    def _ended(self, at: float, key: Key, outcome: str, reason: str, why: ReasonInfo | None = None) -> None:
         request = self._requests.pop(key, None)
         if request is None:
             return
         self._labels.discard(request.label)
         self.timeline.arc(at, request.label, "done", "" if outcome == "completed" else outcome)
         level = "WARN" if outcome == "client_lost" else "INFO"
-        self.timeline.event(at, f"{request.label} {ended(outcome, reason)}", level)
+        self.timeline.event(at, f"{request.label} {ended(outcome, reason, why)}", level)
 
     def _track(self, key: Key, view: Holder | HoldView | WaitView | Notice) -> _Request | None:
         """The request, followed from now on; None where too many are open."""
@@ -251,7 +251,8 @@ class RequestTracker:
     def _blocked(self, reason: str, why: ReasonInfo | None) -> str:
         """Who is in its way, by the names of their lanes: in a short bar only the beginning can be read."""
         if why is None or why.code != ReasonCode.HELD or not why.by:
-            return self._named(reason, why).removeprefix("waits ")
+            words = self._named(reason, why)
+            return words.removeprefix("waits ") if waits_for_others(why) else words
         others = dict.fromkeys(self._label(party) for party in why.by)
         patterns = why.patterns or [""] * len(why.rcs)
         wanted = [", ".join(short_names(rc for rc, pattern in zip(why.rcs, patterns, strict=False) if not pattern))]
@@ -263,9 +264,7 @@ class RequestTracker:
 
     def _named(self, reason: str, why: ReasonInfo | None) -> str:
         """The reason with requests named as their lanes are."""
-        for party in why.by if why is not None else ():
-            reason = reason.replace(named(party.who, party.client, party.arc), self._label(party))
-        return reason
+        return str(reason_of(why, self._label) or reason)
 
     def _label(self, view: Holder | HoldView | ReasonParty) -> str:
         request = self._requests.get((view.client, view.id))

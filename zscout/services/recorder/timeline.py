@@ -134,7 +134,7 @@ class Timeline(Drawing):
             path.open("ab").close()
         except OSError as error:
             raise TimelineError(
-                f"timeline: can't write the recording {path} ({error.strerror}); "
+                f"can't write the recording {path} ({error.strerror}); "
                 "give a file in a directory that is there and can be written"
             ) from error
         # A footer needs memory for each chunk, for as long as a fleet is recorded. The finished file has one.
@@ -157,9 +157,7 @@ class Timeline(Drawing):
             stream.flush(timeout_sec=FLUSH_SECONDS)
         except (RuntimeError, ValueError) as error:
             disconnect(stream, DISCONNECT_SECONDS)
-            raise TimelineError(
-                f"timeline: can't write to {where} ({error}); make room there, or choose another"
-            ) from error
+            raise TimelineError(f"can't write to {where} ({error}); make room there, or choose another") from error
         stream.send_recording_name(f"{self._fleet}, {start:%Y-%m-%d %H:%M:%S} UTC")
         stream.send_recording_start_time_nanos(round(start.timestamp() * 1e9))
         self.streams.append(stream)
@@ -289,7 +287,7 @@ class Timeline(Drawing):
             self.flush(FLUSH_SECONDS)
         except (RuntimeError, ValueError) as error:
             raise TimelineError(
-                f"timeline: the end of the recording {self._path or self.url} may be missing ({error}); "
+                f"the end of the recording {self._path or self.url} may be missing ({error}); "
                 "is there room on the disk?"
             ) from error
         finally:
@@ -390,6 +388,6 @@ def _free_port(bind: str, port: int) -> int:
             return int(server.getsockname()[1])
     except OSError as error:
         raise TimelineError(
-            f"timeline: can't listen on {bind}, port {port} ({os.strerror(error.errno or 0)}); "
+            f"can't listen on {bind}, port {port} ({os.strerror(error.errno or 0)}); "
             "choose another port, or end the program that has it"
         ) from error

@@ -15,6 +15,7 @@ from typing import Any, Literal, TypeAlias
 import msgspec
 
 from zscout.mesh import clock
+from zscout.messages import ReasonInfo
 
 Milestone: TypeAlias = Literal["ready", "asked", "answered", "entered", "left", "done"]
 
@@ -34,6 +35,7 @@ class ArcReport(msgspec.Struct, frozen=True):
     what: Milestone
     at: int
     detail: str = ""
+    why: ReasonInfo | None = None
 
 
 async def behave(spec: ArcSpec, signal: asyncio.Event) -> None:
@@ -45,8 +47,8 @@ async def behave(spec: ArcSpec, signal: asyncio.Event) -> None:
     from zscout.keyexpr import Role, Token
     from zscout.messages import Who
 
-    def report(what: Milestone, detail: str = "") -> None:
-        sys.stdout.write(msgspec.json.encode(ArcReport(spec.arc, what, clock.now(), detail)).decode() + "\n")
+    def report(what: Milestone, detail: str = "", why: ReasonInfo | None = None) -> None:
+        sys.stdout.write(msgspec.json.encode(ArcReport(spec.arc, what, clock.now(), detail, why)).decode() + "\n")
         sys.stdout.flush()
 
     async with await Client.connect(spec.arc, host=spec.host) as client:
@@ -71,7 +73,7 @@ async def behave(spec: ArcSpec, signal: asyncio.Event) -> None:
             nonlocal answered
             if not answered and arc.state in ("queued", "running"):
                 answered = True
-                report("answered", arc.reason)
+                report("answered", arc.reason, arc.why)
 
         client.internals.watch(on_state)
         needs: dict[str, dict[str, Decimal]] = {rc: {} for rc in spec.needs}

@@ -117,7 +117,7 @@ class Table1Demo(DemoRunner):
                     needs = f"{', '.join(arc.needs)}; priority {arc.priority}"
                     self.event(f"{arc.arc} asks for {needs}", report.at)
                 case "answered" if report.detail:
-                    self.event(f"{arc.arc} {waits(report.detail)}", report.at)
+                    self.event(f"{arc.arc} {waits(report.detail, report.why)}", report.at)
                 case "entered":
                     self.seen.entered(arc.arc, arc.needs, report.at)
                 case "left":
@@ -131,7 +131,7 @@ class Table1Demo(DemoRunner):
             return
         self._newest = (grants.term, grants.seq)
         for revoked in grants.revoked:
-            self.event(f"{revoked.arc} {ended(revoked.outcome, revoked.reason)}", at)
+            self.event(f"{revoked.arc} {ended(revoked.outcome, revoked.reason, revoked.why)}", at)
         for holder in (holder for held in grants.rcs.values() for holder in held):
             if holder.grant not in self._shown:
                 self._shown.add(holder.grant)

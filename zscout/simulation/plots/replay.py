@@ -46,7 +46,7 @@ class ReplayRecording:
                 timeline.arc(at, arc, "done", outcome.value)
                 timeline.event(at, f"{arc} {outcome.value}")
             case Queued(arc=arc, reason=reason, settled=True):
-                timeline.event(at, f"{arc} {waits(str(reason))}")
+                timeline.event(at, f"{arc} {waits(str(reason), reason)}")
                 if arc not in self._evicted:
                     timeline.arc(at, arc, "waiting", str(reason))
             case _:

@@ -1,0 +1,49 @@
+"""The roster by itself: tokens and reports in, what follows out."""
+
+from __future__ import annotations
+
+from zscout.config.fleet import default_fleet
+from zscout.keyexpr import Keys, Role, Token
+from zscout.rcm import roster
+from zscout.rcm.devices import ExpectedDevices
+from zscout.rcm.roster import MAX_TOKENS, Roster, Why
+from zscout.scheduling.model import ClientLost
+from zscout.types import SECOND, Term
+
+
+def a_roster() -> Roster:
+    return Roster(Keys("lab"), "leader", default_fleet(), Term(1, "rcm"), ExpectedDevices({}), 0)
+
+
+def token(number: int, host: str = "greedy") -> Token:
+    return Token(host, Role.CLIENT, f"c{number}", f"i{number}")
+
+
+def test_tokens_of_one_host_are_bounded_and_the_earliest_stay() -> None:
+    members = a_roster()
+    changes = [members.client_token(0, token(number), alive=True) for number in range(MAX_TOKENS + 50)]
+    assert [change.surplus for change in changes if change.surplus] == ["greedy"]
+    assert len(members.clients) == MAX_TOKENS
+    assert "greedy/c0" in members.clients
+    members.client_token(0, token(MAX_TOKENS + 1), alive=False)  # it never counted
+    members.client_token(0, token(0), alive=False)
+    members.client_token(0, token(MAX_TOKENS + 60), alive=True)
+    members.client_token(0, token(1, "desk"), alive=True)
+    assert len(members.clients) == MAX_TOKENS + 1
+
+
+def test_a_host_s_tokens_disappear_in_one_go() -> None:
+    """Judged together, at a cost that grows with their number alone."""
+    members = a_roster()
+    members.client_token(0, token(1, "desk"), alive=True)
+    for number in range(MAX_TOKENS):
+        members.client_token(0, token(number), alive=True)
+    for number in range(MAX_TOKENS):
+        assert not members.client_token(SECOND, token(number), alive=False).events
+    judged = members.tick(SECOND + roster.TOKEN_SPREAD)
+    # A leader that is not away is answered by another host: then all are lost, in one instant.
+    assert [question.why for question in judged.questions] == [Why.WITNESS]
+    assert not judged.events
+    lost = members.answered(2 * SECOND, judged.questions[0], object(), None)
+    assert len(lost.events) == MAX_TOKENS
+    assert all(isinstance(event, ClientLost) for event in lost.events)

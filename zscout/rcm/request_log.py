@@ -1,0 +1,367 @@
+"""The requests of one term beside the core: names, notices to their clients, recent endings, history. Pure.
+
+Every change that is not the answer to an operation is a notice on the client's key; requests that ended are remembered
+for a while. The history of each ARC is kept as text, for `zscout why` and the log."""
+
+from __future__ import annotations
+
+from collections import OrderedDict, deque
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+from msgspec.structs import replace
+
+from zscout.keyexpr import is_pattern
+from zscout.messages import Notice, ReasonInfo, ReasonParty, State, StoryLine
+from zscout.rcm.places import Places, client_id, request_id
+from zscout.rcm.roster import Roster
+from zscout.scheduling.core import Core
+from zscout.scheduling.forecast import forecast
+from zscout.scheduling.model import ArcStatus, Dropped, Effect, Granted, HoldEnded, Outcome, Queued
+from zscout.scheduling.reason import ITS_CLIENT, Party, Reason, ended, waits
+from zscout.scheduling.runtimes import RuntimeEstimator
+from zscout.types import SECOND, ArcId, Grant, Ns, RcName
+
+REMEMBERED: Final[Ns] = 60 * SECOND
+"""How long ended requests are known: longer than any query's timeout and a lease together."""
+MAX_REMEMBERED: Final = 20_000
+FINAL: Final = (Outcome.RELEASED, Outcome.CANCELLED, Outcome.COMPLETED)
+"""Outcomes of requests that are never granted again."""
+REASONS_DELAY: Final[Ns] = SECOND // 10
+"""Until a changed reason to wait is published: each grant in a busy queue changes many, and only the last counts."""
+FORECAST_AGE: Final[Ns] = SECOND
+"""Age at most of a forecast in notices: each costs the leader as much as many passes."""
+MAX_LINES: Final = 20_000
+MAX_ANSWERED: Final = 200
+"""Lines of history in one answer: the latest."""
+LOG_DELAY: Final[Ns] = SECOND // 10
+"""Lines for the log are gathered: an entry of its own for each would cost as much as a grant."""
+MAX_LOGGED: Final = 50
+"""Lines in one entry of the log; the history has them all."""
+
+
+def reason_info(reason: Reason | None, now: Ns) -> ReasonInfo | None:
+    if reason is None:
+        return None
+    by = [party_info(one, now) for one in reason.by]
+    rcs, patterns, detail = list(reason.rcs), list(reason.patterns), ITS_CLIENT if reason.own else reason.detail
+    return ReasonInfo(reason.code, rcs, by, detail, reason.number, reason.pattern, patterns, reason.own)
+
+
+def party_info(party: Party, now: Ns) -> ReasonParty:
+    yields_in = None if party.until is None else max(0, party.until - now) / SECOND
+    return ReasonParty(request_id(party.arc), party.name, client_id(party.arc), party.priority, party.who, yields_in)
+
+
+@dataclass(slots=True)
+class _Request:
+    """What is known of an ARC beside the core."""
+
+    name: str
+    estimated: bool = False
+    """Its notices include when it will start."""
+    ending: Notice | None = None
+    """How its last hold ended here, while it is queued; or how it ended."""
+    until: Ns | None = None
+    """It ended, and is remembered until then."""
+    believed: Collection[RcName] = ()
+    """RCs that its client believes to hold since an earlier term, which may yet report that."""
+    foretold: Ns | None = None
+    """The first start that its client was notified of."""
+
+
+class RequestLog:
+    def __init__(self, core: Core, roster: Roster, places: Places, runtimes: RuntimeEstimator | None) -> None:
+        self._core, self._roster, self._places = core, roster, places
+        self._runtimes = runtimes
+        self._step = 0  # number of the last notice
+        self._requests: dict[ArcId, _Request] = {}
+        self._over: OrderedDict[ArcId, None] = OrderedDict()  # those that ended, in that order
+        self._changed: dict[ArcId, None] = {}
+        """Queued ARCs with another reason to wait than the one that was published."""
+        self._report_at: Ns | None = None
+        self._starts: Mapping[ArcId, Ns] = {}  # the last forecast
+        self._forecast: tuple[int, Ns] | None = None  # after which batch of events, and when, it was made
+        self._lines: deque[tuple[Ns, ArcId, str, str]] = deque(maxlen=MAX_LINES)  # when, ARC, its name, what happened
+        self.traced: list[tuple[str, ArcId]] = []
+        """Since the caller took them: ARCs that are over for good, and those that were reopened."""
+        self.foretold: dict[ArcId, Ns] = {}
+        """ARCs granted in the last instant, with the start that their clients were notified of first."""
+        self._unlogged: list[str] = []
+        self._log_at: Ns | None = None
+
+    def enter(self, arc: ArcId, name: str, *, estimate: bool = False) -> None:
+        """Call `arc` by `name` from now on; with `estimate` its notices include when it will start."""
+        known = self._requests.get(arc)
+        if known is None or known.until is not None:
+            known = self._requests[arc] = _Request(name)
+            self._over.pop(arc, None)
+        known.name = name
+        known.estimated |= estimate
+
+    def rename(self, arc: ArcId, renamed: ArcId) -> None:
+        """`arc` is handed over, and is `renamed` there."""
+        known = self._requests.get(arc)
+        self.enter(renamed, self.name(arc))
+        if known is not None and self._core.is_queued(arc):
+            self._requests[renamed].foretold = known.foretold
+
+    def believe(self, arc: ArcId, rcs: Collection[RcName]) -> None:
+        """The client of a waiting ARC believes that it holds these RCs."""
+        self._requests[arc].believed = rcs
+
+    def name(self, arc: ArcId) -> str:
+        known = self._requests.get(arc)
+        return request_id(arc) if known is None or known.until is not None else known.name
+
+    def ended(self, arc: ArcId) -> bool:
+        return self._ending(arc) is not None
+
+    def _ending(self, arc: ArcId) -> Notice | None:
+        known = self._requests.get(arc)
+        return None if known is None or known.until is None else known.ending
+
+    def may_be_held(self, now: Ns, arc: ArcId) -> bool:
+        """Return True if a queued ARC's client believes in a hold that RCs may yet report: its notice waits."""
+        known, status = self._requests.get(arc), self._core.arc(arc)
+        if known is None or status is None or status.hold is not None:
+            return False
+        return self._roster.awaits(now, arc, known.believed)
+
+    def reopens(self, arc: ArcId, unserved: Grant | None = None) -> bool:
+        """Return True if `arc` ended only because its client seemed lost, or had its time under the grant `unserved`
+        while RCs of it settled: it may be asked for again, and is forgotten here."""
+        if (notice := self._ending(arc)) is None:
+            return False
+        completed = notice.outcome == Outcome.COMPLETED and notice.grant is not None and notice.grant == unserved
+        if not completed and notice.outcome != Outcome.CLIENT_LOST:
+            return False
+        if completed:
+            self.traced.append(("reopened", arc))
+        del self._requests[arc], self._over[arc]
+        return True
+
+    def give_up(self, now: Ns, arc: ArcId, outcome: Outcome) -> None:
+        """The client of `arc`, which has ended or is unknown, no longer wants it: it is not reopened."""
+        known = self._ending(arc)
+        notice = known or self._notice(arc, "ended", reason="given up by its client")
+        if known is None or notice.outcome == Outcome.CLIENT_LOST:
+            self._remember(now, arc, replace(notice, outcome=outcome))
+        elif notice.outcome == Outcome.COMPLETED:
+            # Nor as one whose time passed while its RCs settled.
+            self._requests[arc].ending = replace(notice, grant=None)
+
+    # Notices
+
+    def notice(self, now: Ns, arc_id: ArcId) -> Notice:
+        """The present state of a request, or how it ended."""
+        arc = self._core.arc(arc_id)
+        if arc is None:
+            return self._ending(arc_id) or self._notice(arc_id, "ended", reason="no such request is open")
+        request, hold = arc.request, arc.hold
+        known = {
+            "priority": request.priority,
+            "who": request.who,
+            "booking": request.booking,
+            "place": arc.place,
+            "seal": self._places.seal(arc.place, arc_id),
+        }
+        if hold is not None:
+            remaining = (hold.end - now) / SECOND
+            rcs, hosts, bound = sorted(arc.needs), self._roster.hosts_of(arc.needs), dict(arc.bound)
+            return self._notice(
+                arc_id, "running", grant=hold.grant, rcs=rcs, bound=bound, remaining=remaining, hosts=hosts, **known
+            )
+        return self._notice(
+            arc_id,
+            "queued",
+            reason=str(arc.reason or ""),
+            why=reason_info(arc.reason, now),
+            ahead=arc.ahead,
+            # What it is bound to is only what it was last checked with.
+            rcs=sorted(need for need in request.needs if not is_pattern(need)),
+            starts_in=self._starts_in(now, arc),
+            **known,
+        )
+
+    def interrupted(self, now: Ns, arc: ArcId, believed: Grant) -> Notice:
+        """The present state of a queued request whose client believes in a hold: with how that ended, or as lost where
+        not all RCs had it."""
+        known = self._requests.get(arc)
+        notice, ending = self.notice(now, arc), None if known is None else known.ending
+        if ending is None or ending.grant != believed:
+            return replace(notice, outcome=Outcome.LOST)
+        return replace(notice, outcome=ending.outcome, by=ending.by, reason=ending.reason, why=ending.why)
+
+    def handed_over(self, arc: ArcId, name: str) -> Notice:
+        """The request continues in another client, where no more than that is known."""
+        reason = "handed over to another client"
+        return replace(self._notice(arc, "ended", reason=reason, outcome=Outcome.HANDED_OVER), arc=name)
+
+    def _notice(self, arc: ArcId, state: State, **details: Any) -> Notice:
+        self._step += 1
+        return Notice(
+            id=request_id(arc),
+            arc=self.name(arc),
+            client=client_id(arc),
+            state=state,
+            term=self._core.term,
+            step=self._step,
+            **details,
+        )
+
+    def grants(self, now: Ns, effects: Collection[Effect], answered: Collection[ArcId]) -> list[Notice]:
+        """The notices of an instant's grants that precede its publication: not of ARCs that are `answered` so, or had
+        another hold until now."""
+        over = {effect.arc for effect in effects if isinstance(effect, (HoldEnded, Dropped))}
+        granted = [effect.arc for effect in effects if isinstance(effect, Granted)]
+        return [
+            self.notice(now, arc)
+            for arc in granted
+            if arc not in over and arc not in answered and self._core.is_running(arc)
+        ]
+
+    def report(
+        self, now: Ns, effects: Iterable[Effect], answered: Collection[ArcId], given_up: Collection[ArcId]
+    ) -> list[Notice]:
+        """The notices of an instant's effects, except where the answer to an operation says the same: the grant of an
+        `answered` ARC, the end of the hold of a `given_up` one."""
+        notices = []
+        self.foretold.clear()
+        for effect in effects:
+            match effect:
+                case Granted(arc=arc, rcs=rcs):
+                    self.record(now, arc, f"granted {', '.join(rcs)}")
+                    if (known := self._requests.get(arc)) is not None and known.until is None:
+                        if known.foretold is not None:
+                            self.foretold[arc] = known.foretold
+                        known.ending = known.foretold = None
+                    # An ARC that ended in the same instant has only that notice.
+                    if arc not in answered and self._core.arc(arc) is not None:
+                        notices.append(self.notice(now, arc))
+                case HoldEnded(arc=arc) | Dropped(arc=arc):
+                    notice = self._close(now, effect)
+                    if isinstance(effect, Dropped) or arc not in given_up:
+                        notices.append(notice)
+                case Queued(arc=arc, settled=True) if self._core.is_queued(arc):
+                    self._changed[arc] = None
+        if self._report_at is None and (self._changed or self._core.reasons_changed):
+            self._report_at = now + REASONS_DELAY
+        return notices
+
+    def present(self, now: Ns, arcs: Iterable[ArcId]) -> list[Notice]:
+        """The present state of these ARCs, as far as they are open."""
+        opened = [arc for arc in arcs if self._core.is_open(arc)]
+        for arc in opened:
+            self._changed.pop(arc, None)
+        return [self.notice(now, arc) for arc in opened]
+
+    @property
+    def next(self) -> Ns | None:
+        """When `tick` is due."""
+        return min((at for at in (self._report_at, self._log_at) if at is not None), default=None)
+
+    def tick(self, now: Ns) -> tuple[list[Notice], str]:
+        """The notices of changed reasons, and lines for the log, as far as they are due."""
+        notices = []
+        if self._report_at is not None and self._report_at <= now:
+            self._changed |= {effect.arc: None for effect in self._core.tell_reasons() if isinstance(effect, Queued)}
+            undecided = [arc for arc in self._changed if self.may_be_held(now, arc)]
+            changed = [arc for arc in self._changed if arc not in undecided and self._core.is_queued(arc)]
+            self._changed = dict.fromkeys(changed)
+            self._record_reasons(now)
+            notices = self.present(now, changed)
+            self._changed = dict.fromkeys(undecided)
+            self._report_at = now + REASONS_DELAY if undecided else None
+        return notices, self._log_text() if self._log_at is not None and self._log_at <= now else ""
+
+    def _close(self, now: Ns, effect: HoldEnded | Dropped) -> Notice:
+        """Record how a hold, or the wait for one, ended. A request that is not queued again has ended with it."""
+        why = reason_info(effect.reason, now)
+        details: dict[str, Any] = {"reason": str(effect.reason), "outcome": effect.outcome, "why": why}
+        requeued = isinstance(effect, HoldEnded) and effect.requeued
+        again = "; queued again" if requeued else ""
+        self.record(now, effect.arc, f"{ended(effect.outcome, str(effect.reason), effect.reason)}{again}")
+        arc = self._core.arc(effect.arc)
+        if isinstance(effect, HoldEnded):
+            details |= {"by": effect.by, "grant": effect.grant, "rcs": list(effect.rcs)}
+        if requeued and arc is not None:
+            details["starts_in"] = self._starts_in(now, arc)
+        notice = self._notice(effect.arc, "queued" if requeued else "ended", **details)
+        if arc is None:
+            self._remember(now, effect.arc, notice)
+        elif requeued and (known := self._requests.get(effect.arc)) is not None:
+            known.ending = notice
+        return notice
+
+    def _remember(self, now: Ns, arc: ArcId, notice: Notice) -> None:
+        if notice.outcome in FINAL:
+            self.traced.append(("over", arc))
+        self._requests[arc] = _Request("", ending=notice, until=now + REMEMBERED)
+        self._over[arc] = None
+        self._over.move_to_end(arc)
+        while self._over and (len(self._over) > MAX_REMEMBERED or self._is_old(next(iter(self._over)), now)):
+            del self._requests[self._over.popitem(last=False)[0]]
+
+    def _is_old(self, arc: ArcId, now: Ns) -> bool:
+        until = self._requests[arc].until
+        return until is not None and until < now
+
+    # Forecasts: one serves all that are wanted in the same instant
+
+    def starts(self, now: Ns) -> Mapping[ArcId, Ns]:
+        """When each queued ARC will start, forecast from the present state; absent: never, or too late."""
+        if self._forecast is None or self._forecast[0] != self._core.batches:
+            self._starts = forecast(self._core, now, None, self._runtimes).starts
+            self._forecast = self._core.batches, now
+        return self._starts
+
+    def _starts_in(self, now: Ns, arc: ArcStatus) -> float | None:
+        """Seconds until a queued ARC starts, by a forecast since it was queued and not older than FORECAST_AGE."""
+        known = self._requests.get(arc.id)
+        if arc.hold is not None or known is None or not known.estimated:
+            return None
+        made = self._forecast[1] if self._forecast is not None else None
+        recent = made is not None and arc.since < made and now - made < FORECAST_AGE
+        start = (self._starts if recent else self.starts(now)).get(arc.id)
+        if start is None:
+            return None
+        if known.foretold is None and self._core.is_queued(arc.id):
+            known.foretold = start
+        return max(0, start - now) / SECOND
+
+    # History
+
+    def record(self, now: Ns, arc: ArcId, text: str) -> None:
+        name = self.name(arc)
+        self._lines.append((now, arc, name, text))
+        if self._log_at is None:
+            self._log_at = now + LOG_DELAY
+        self._unlogged.append(f"{name} {text}")
+
+    def story(self, now: Ns, arc: str) -> list[StoryLine]:
+        """The latest lines about an ARC (its name, id, or `<host>/<client>/<id>`), oldest first."""
+        lines = [
+            StoryLine(ago=(now - at) / SECOND, text=text)
+            for at, full, name, text in self._lines
+            if arc in (name, full, request_id(full))
+        ]
+        return lines[-MAX_ANSWERED:]
+
+    def close(self, now: Ns) -> str:
+        """What was gathered for the log: nothing is published any more."""
+        self._record_reasons(now)
+        return self._log_text()
+
+    def _record_reasons(self, now: Ns) -> None:
+        changed, self._changed = self._changed, {}
+        for arc in filter(None, map(self._core.arc, changed)):
+            if arc.hold is None:
+                self.record(now, arc.id, waits(str(arc.reported), arc.reported))
+
+    def _log_text(self) -> str:
+        lines, self._unlogged, self._log_at = self._unlogged, [], None
+        if len(lines) > MAX_LOGGED:
+            lines[MAX_LOGGED:] = [f"and {len(lines) - MAX_LOGGED} lines more; ask `zscout why`"]
+        return "\n  ".join(lines)

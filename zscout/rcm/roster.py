@@ -1,0 +1,838 @@
+"""Which RCs and clients of a fleet are present, for one term: tokens, reports and answers in, effects out. Pure.
+
+An RC may be granted once it has promised to obey this term. A client with requests must show a token within a lease.
+An RC that reports holds of earlier terms is pending until its gangs have answered (rule 8 of the protocol)."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any, Final, NamedTuple
+
+from msgspec import Struct
+
+from zscout.config.devices import SETTLE
+from zscout.config.fleet import Fleet
+from zscout.keyexpr import Keys, Role, Token, client_of
+from zscout.messages import ClientRequests, Problem, RcAsk, RcState, disbelieved
+from zscout.rcm.deadlines import Deadlines
+from zscout.rcm.devices import ExpectedDevices
+from zscout.rcm.terms import Source, Word
+from zscout.scheduling.model import Adopted, ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
+from zscout.services.rcm.recovery import aged, gangs_of, recover
+from zscout.types import SECOND, ArcId, ClientId, Grant, HostName, Ns, RcName, Term
+
+PROBE_PERIOD: Final[Ns] = SECOND
+MAX_PROBES: Final = 20
+"""Questions to a client or RC whose token disappeared: an answer shows that the mesh contradicts itself."""
+MAX_PROBED: Final = 256
+"""Keys that are probed, and ARCs that are awaited, at one time."""
+TOKEN_SPREAD: Final[Ns] = 3 * SECOND // 1000
+"""The tokens of one lost link disappear within this time."""
+MAX_LEASES_PENDING: Final = 3
+"""A pending RC waits for its gangs at most this many leases."""
+MAX_HEALTH: Final = 500
+"""Characters of an RC's health."""
+NEAR_END: Final[Ns] = SECOND // 20
+"""A hold with less than this left may have ended at its RC: clocks differ a little."""
+AWAY_PART: Final = 0.25
+"""A leader that stalled for this part of the mesh lease, or lost several hosts within it, was away itself."""
+SHUNNED: Final = "its host alone shows a term in which nobody leads"
+MAX_TOKENS: Final = 2_000
+"""Tokens of one host that count: later ones are ignored."""
+PRESENT_WITHIN: Final = 0.05
+"""Seconds within which others answer a leader that is not away: a later answer may follow its return."""
+MAX_WITNESSES: Final = 3
+"""Hosts that are asked whether this one is away."""
+
+
+class Question(NamedTuple):
+    """A question to the mesh. The first answer, or none within `timeout` seconds, goes to `Roster.answered`; the tokens
+    on `key`, where `kind` is None, to `Roster.seen`."""
+
+    why: Why
+    key: str
+    timeout: float
+    message: RcAsk = RcAsk()
+    kind: type[Struct] | None = None
+    token: Token | None = None
+    client: ClientId = ""
+    number: int = 0
+    """Of the client's deadline, or the caller's of `seek`."""
+
+
+class Why(Enum):
+    PROMISE = "an RC's promise to obey this term"
+    RETURN = "the state of an RC whose token is back"
+    REQUESTS = "the requests of a client"
+    OVERDUE = "a client without a token may answer all the same"
+    SOUGHT = "the new client of a hand-over"
+    PROBE = "a client or RC whose token disappeared: an answer shows that the mesh contradicts itself"
+    WITNESS = "any other host: an answer shows that this leader is not away"
+
+
+class _Due(Enum):
+    """What a deadline is for; it stands beside its subject."""
+
+    SHOWN = "a client (and its number) has had a lease to show a token"
+    JUDGE = "tokens that disappeared are judged together: those of a lost host go one after the other"
+    AGAIN = "a question is asked again"
+    WAITED = "a pending RC has waited so long (ns)"
+    FREE = "a departed RC serves nobody any longer"
+    DROP_UNSEEN = "RCs and tokens had a lease to show themselves"
+    SHUNNED = "an RC no longer counts as absent for the term that it shows"
+    JOIN_ALL = "RCs away from home may join"
+
+
+@dataclass(slots=True)
+class Change:
+    """What follows from a stimulus, in the order in which it is carried out."""
+
+    higher: list[tuple[Word, Token | None]] = field(default_factory=list)
+    """Terms above the own, and for an RC that is seen its token."""
+    disbelieved: list[tuple[RcName, Term]] = field(default_factory=list)
+    """RCs that obey a term so low that they take the own one for a forgery, while none has joined."""
+    events: list[Event] = field(default_factory=list)
+    """Of the core, of one instant."""
+    reported: list[RcState] = field(default_factory=list)
+    """RCs that count as present report their holds: compare them with the core's."""
+    named: dict[RcName, None] = field(default_factory=dict)
+    """Publish these RCs, so that their instances learn which one is meant."""
+    listed: list[ClientRequests] = field(default_factory=list)
+    found: list[tuple[int, bool]] = field(default_factory=list)
+    """By number of `seek`: whether the client has a token."""
+    settled: bool = False
+    """RCs are no longer pending."""
+    questions: list[Question] = field(default_factory=list)
+    suspicions: list[tuple[str, bool]] = field(default_factory=list)
+    """Contradictions of the mesh, and those that are over."""
+    duplicates: list[tuple[RcName, HostName]] = field(default_factory=list)
+    """RCs that a second host offers, and that host."""
+    surplus: HostName = ""
+    """This host shows more than MAX_TOKENS, since this token."""
+
+
+@dataclass(slots=True, eq=False)
+class _Pending:
+    """An RC that answered, and does not count yet."""
+
+    state: RcState
+    since: Ns
+    patient: bool
+    """Links may be coming back one by one: it waits a lease for its gang, whether that has tokens or not."""
+    waited: Ns = 0
+
+
+@dataclass(slots=True)
+class _Rc:
+    """What is known of one RC."""
+
+    tokens: dict[str, Token] = field(default_factory=dict)
+    """By instance: those that live."""
+    seen: Ns | None = None
+    """When its first living token was seen."""
+    named: tuple[str, HostName] | None = None
+    """The instance that is meant, and its host."""
+    joined: RcState | None = None
+    """As it reported itself last, while it counts as present."""
+    pending: _Pending | None = None
+    departed: RcState | None = None
+    """It disappeared recently: for a hold lease it may still serve its holders, and then settle."""
+    unseen: bool = False
+    """It counts as present, and its token disappeared while this leader was away."""
+
+
+class Roster:
+    def __init__(self, keys: Keys, me: HostName, fleet: Fleet, term: Term, devices: ExpectedDevices, now: Ns) -> None:
+        self._keys, self._me, self.term, self._devices = keys, me, term, devices
+        self._lease: Ns = round(fleet.mesh.lease * SECOND)
+        self._hold_lease: Ns = fleet.timing.hold_lease
+        self._timeout: Ns = fleet.timing.rebuild
+        self._rcs: dict[RcName, _Rc] = {}
+        self.clients: dict[ClientId, set[str]] = {}
+        """Living instances of each client that has a token."""
+        self._unshown: dict[ClientId, int] = {}
+        """Clients that must show a token, each with the number of its deadline."""
+        self._tokens: Counter[HostName] = Counter()
+        self._surplus: set[HostName] = set()
+        """Hosts whose surplus was reported."""
+        self.shunned: set[str] = set()
+        """Instances of RCs that count as absent, for the terms that they show."""
+        self._asked: set[ClientId] = set()
+        self._doubted: set[ClientId] = set()
+        """Clients that disappeared while it was unknown whether this leader was away."""
+        self._awaited: dict[ArcId, Ns] = {}
+        """ARCs whose clients believe in holds of RCs never seen here: since when that is known."""
+        self._probed: dict[str, int] = {}
+        """By key: how often it is still probed."""
+        self._missed: set[RcName] = set()
+        """Expected devices that this term has not seen, and has reported so."""
+        self._judged: list[tuple[ClientId | RcName, Token]] = []
+        """Tokens that disappeared just now."""
+        self._home_until = now + fleet.timing.hold_lease + SETTLE
+        """Until then an RC that this term has not seen may still be used at the host that the fleet file names."""
+        self._stall: tuple[Ns, Ns, bool] = (0, 0, False)
+        """The last stall of this process: its length, its end, and whether it ended just now."""
+        self._gone_hosts: deque[tuple[Ns, HostName]] = deque()
+        """Hosts whose last tokens disappeared recently, and when."""
+        self._away_until: Ns = 0
+        self._deadlines: Deadlines[tuple[_Due, Any]] = Deadlines()
+        self._numbers = 0
+        self._now = now
+        self._change = Change()
+
+    # In: each call returns what follows
+
+    def start(self, now: Ns, rcs: Iterable[RcState], pending: Iterable[RcState], *, patient: bool) -> Change:
+        """The RCs that promised before the term began, and those that join later. `patient`: the rest of their gangs
+        has a lease to answer."""
+        self._now = now
+        joined, waiting = list(rcs), list(pending)
+        alone = all(state.host == self._me for state in (*joined, *waiting))
+        for state in joined:
+            self._rc(state.rc).joined = state
+        for state in (*joined, *waiting):
+            self._rc(state.rc).named = state.instance, state.host
+        for state in waiting:
+            self._hold_up(state, patient=patient or alone)
+        # An RC that died before its token was watched would never be seen to disappear.
+        self._set(self._lease, _Due.DROP_UNSEEN)
+        self._set(self._home_until - now, _Due.JOIN_ALL)
+        self._change.events += map(_presence, joined)
+        return self._taken()
+
+    def stalled(self, length: Ns, ended: Ns, *, fresh: bool) -> None:
+        """This process stalled. `fresh`: what arrived meanwhile may not be handled yet."""
+        self._stall = length, ended, fresh
+
+    def client_token(self, now: Ns, token: Token, *, alive: bool) -> Change:
+        self._now = now
+        client = f"{token.host}/{token.name}"
+        instances = self.clients.get(client, set())
+        if not self._counts(token, alive=alive, known=token.instance in instances):
+            return self._taken()
+        if alive:
+            self.clients.setdefault(client, instances).add(token.instance)
+            if self._unshown.pop(client, None) is not None:
+                self._suspect(self._keys.requests(client_of(client)), so=False)
+        else:
+            instances.discard(token.instance)
+            if not instances:
+                del self.clients[client]
+                self._judge_soon(client, token)
+        return self._taken()
+
+    def rc_token(self, now: Ns, token: Token, *, alive: bool) -> Change:
+        self._now = now
+        rc = self._rc(token.name)
+        if rc.tokens.get(token.instance, token if alive else None) != token:
+            return Change()  # a second host shows this instance, or stopped doing so: it belongs to the first
+        if not self._counts(token, alive=alive, known=token.instance in rc.tokens):
+            return self._taken()
+        if alive:
+            self._token_came(rc, token)
+        else:
+            rc.tokens.pop(token.instance, None)
+            if rc.pending is not None and rc.pending.state.instance == token.instance:
+                rc.pending = None
+            if not rc.tokens:
+                rc.seen = None
+                self._settle()
+            if rc.joined is not None and rc.joined.instance == token.instance:
+                self._judge_soon(token.name, token)
+        return self._taken()
+
+    def rc_state(self, now: Ns, key: str, state: RcState) -> Change:
+        self._now = now
+        if self._keys.rc_of(key) == state.rc:
+            self._report(self._rc(state.rc), state)
+        return self._taken()
+
+    def shun(self, now: Ns, token: Token, until: Ns) -> Change:
+        """An RC shows a term that is not believed: it counts as absent until then."""
+        self._now = now
+        rc = self._rc(token.name)
+        if until <= now or token.instance in self.shunned:
+            return self._taken()
+        self.shunned.add(token.instance)
+        self._set(until - now, _Due.SHUNNED, token)
+        if rc.pending is not None and rc.pending.state.instance == token.instance:
+            rc.pending = None
+            self._settle()
+        if rc.joined is not None and rc.joined.instance == token.instance:
+            self._drop(token.name, SHUNNED)
+        return self._taken()
+
+    def expect(self, now: Ns, client: ClientId) -> None:
+        """A client with requests has a lease to show a token. It is not dropped if it answers then, or its session is
+        seen."""
+        if client not in self._unshown and client not in self.clients:
+            self._expect(now, client)
+
+    def heard(self, now: Ns, client: ClientId) -> Change:
+        """A client that asks is there, though its token is not seen."""
+        self._now = now
+        if client in self._unshown:
+            self._expect(now, client)
+        if self._probed and client not in self.clients:
+            key = self._keys.requests(client_of(client))
+            self._suspect(key, so=key in self._probed)
+        return self._taken()
+
+    def seek(self, now: Ns, client: ClientId, number: int) -> Change:
+        """Find out whether a client has a token: a new leader does not know all tokens yet."""
+        self._now = now
+        if client in self.clients:
+            self._change.found.append((number, True))
+        else:
+            self._ask(Why.SOUGHT, self._keys.alive_any(Role.CLIENT), client=client, number=number)
+        return self._taken()
+
+    def client_word(self, client: ClientId, term: Term) -> Word:
+        """A client says that it obeys `term`."""
+        return Word(term, Source.CLIENT, client, client_of(client).host if client in self.clients else "")
+
+    def ask_requests(self, now: Ns, client: ClientId) -> Change:
+        """Question a client for its requests, until it answers or is gone."""
+        self._now = now
+        if client not in self._asked:
+            self._asked.add(client)
+            self._ask_client(client)
+        return self._taken()
+
+    def answered(self, now: Ns, asked: Question, message: Any, problem: Problem | None) -> Change:
+        """The first answer to a question. Without `message` and `problem` there was none."""
+        self._now = now
+        silent = message is None and problem is None
+        match asked.why:
+            case Why.PROMISE if asked.token is not None:
+                self._promised(asked.token, message, problem)
+            case Why.RETURN if isinstance(message, RcState):
+                self._report(self._rc(message.rc), message)
+            case Why.REQUESTS:
+                self._listed(asked.client, message, problem)
+            case Why.OVERDUE if silent:
+                self._ask(
+                    asked.why,
+                    self._keys.alive_session(client_of(asked.client)),
+                    client=asked.client,
+                    number=asked.number,
+                )
+            case Why.OVERDUE:
+                self._shown_late(asked)
+            case Why.PROBE if not silent and not self._is_seen(asked):
+                self._suspect(asked.key)
+            case Why.WITNESS if not silent and not self._stall[2] and not self._lost_several:
+                self._away_until = 0
+                self._present()
+        return self._taken()
+
+    def seen(self, now: Ns, asked: Question, tokens: Sequence[Token]) -> Change:
+        """The tokens of a query of the mesh."""
+        self._now = now
+        if asked.why is Why.SOUGHT:
+            found = any(f"{token.host}/{token.name}" == asked.client for token in tokens)
+            self._change.found.append((asked.number, found))
+        elif tokens:
+            self._shown_late(asked)
+        elif self._unshown.get(asked.client) == asked.number:
+            self._lose_client(asked.client)
+        return self._taken()
+
+    def tick(self, now: Ns) -> Change:
+        """Carry out the deadlines that are over."""
+        self._now = now
+        while (due := self._deadlines.pop_due(now)) is not None:
+            match due:
+                case _Due.SHOWN, (client, number) if self._unshown.get(client) == number:
+                    self._overdue(client, number)
+                case _Due.JUDGE, _:
+                    self._judge()
+                case _Due.AGAIN, asked:
+                    self._ask_again(asked)
+                case _Due.WAITED, (pending, wait):
+                    self._wait_over(pending, wait)
+                case _Due.FREE, gone:
+                    self._free(gone)
+                case _Due.SHUNNED, token:
+                    self.shunned.discard(token.instance)
+                    self._ask_promise(token)
+                case _Due.DROP_UNSEEN, _:
+                    self._drop_unseen()
+                case _Due.JOIN_ALL, _:
+                    for rc in self._rcs.values():
+                        self._ask_others(rc)
+        return self._taken()
+
+    @property
+    def next(self) -> Ns | None:
+        """When the next deadline is over."""
+        return self._deadlines.next
+
+    # Out: what is known
+
+    def has_joined(self, name: RcName) -> bool:
+        """Return True if an RC counts as present, or did so until just now."""
+        rc = self._rcs.get(name)
+        return rc is not None and rc.pending is None and (rc.joined or rc.departed) is not None
+
+    def reported(self, name: RcName) -> RcState | None:
+        """The last report of an RC that counts as present."""
+        rc = self._rcs.get(name)
+        return None if rc is None else rc.joined
+
+    def is_known(self, name: RcName) -> bool:
+        """Return True if any host offers this RC."""
+        rc = self._rcs.get(name)
+        return rc is not None and bool(rc.joined or rc.pending or rc.tokens)
+
+    def named(self, names: Iterable[RcName]) -> dict[RcName, tuple[str, HostName]]:
+        """The instance that is meant of each of these RCs, and its host."""
+        known = ((name, self._rcs.get(name)) for name in names)
+        return {name: rc.named for name, rc in known if rc is not None and rc.named is not None}
+
+    def hosts_of(self, names: Iterable[RcName]) -> dict[RcName, HostName]:
+        return {name: host for name, (_, host) in self.named(names).items()}
+
+    def awaits(self, now: Ns, arc: ArcId, names: Iterable[RcName]) -> bool:
+        """Return True if `arc` may still turn out to hold one of these RCs: it is pending; or has not answered, and its
+        token was first seen less than a lease ago, or this term has never seen one and learned of the ARC less than a
+        lease ago. A lease through which this leader stalled does not count."""
+        self._now = now
+        for name in names:
+            rc = self._rcs.get(name, _UNKNOWN)
+            if rc.pending is not None:
+                return True
+            since = rc.seen
+            if since is None and rc.named is None:
+                since = self._awaited_since(arc)
+            if rc.joined is None and since is not None and (now - since < self._lease or self._stood_still):
+                return True
+        return False
+
+    # Clients
+
+    def _expect(self, now: Ns, client: ClientId) -> None:
+        self._numbers += 1
+        self._unshown[client] = self._numbers
+        self._set(self._lease, _Due.SHOWN, (client, self._numbers))
+
+    def _overdue(self, client: ClientId, number: int) -> None:
+        if self._stood_still:
+            self._expect(self._now, client)  # it had less than a lease
+        else:
+            key = self._keys.requests(client_of(client))
+            self._ask(Why.OVERDUE, key, kind=ClientRequests, client=client, number=number)
+
+    def _shown_late(self, asked: Question) -> None:
+        """A client without a token answers, or its session is seen."""
+        if self._unshown.get(asked.client) == asked.number:
+            self._suspect(self._keys.requests(client_of(asked.client)))
+            self._expect(self._now, asked.client)
+
+    def _listed(self, client: ClientId, message: Any, problem: Problem | None) -> None:
+        silent = f"{client} is seen and does not answer"
+        if problem is not None and problem.term is not None:
+            self._see(self.client_word(client, problem.term))
+        if isinstance(message, ClientRequests):
+            self._asked.discard(client)
+            self._change.suspicions.append((silent, False))
+            self._change.listed.append(message)
+            return
+        absent = message is None and problem is None
+        self._change.suspicions.append((silent, absent and client in self.clients))
+        self._set(self._timeout, _Due.AGAIN, Question(Why.REQUESTS, "", 0, client=client))
+
+    def _lose_client(self, client: ClientId) -> None:
+        self._unshown.pop(client, None)
+        self._probe(self._keys.requests(client_of(client)), ClientRequests, client=client)
+        self._change.events.append(ClientLost(client))
+
+    # Tokens that disappear
+
+    def _judge_soon(self, name: str, token: Token) -> None:
+        self._judged.append((name, token))
+        if len(self._judged) == 1:
+            self._set(TOKEN_SPREAD, _Due.JUDGE)
+
+    def _judge(self) -> None:
+        judged, self._judged = self._judged, []
+        for name, token in judged:
+            if token.role == Role.CLIENT:
+                self._judge_client(name, token)
+            else:
+                self._judge_rc(self._rc(name), token)
+
+    def _judge_client(self, client: ClientId, token: Token) -> None:
+        if client in self.clients:
+            return
+        if self._was_away(token):
+            self._doubted.add(client)
+            if client not in self._unshown:
+                self._expect(self._now, client)
+        else:
+            self._lose_client(client)
+
+    def _judge_rc(self, rc: _Rc, token: Token) -> None:
+        if rc.joined is None or rc.joined.instance != token.instance or token.instance in rc.tokens:
+            return
+        if not rc.joined.leaving and self._was_away(token):
+            rc.unseen = True
+            self._set(self._lease, _Due.DROP_UNSEEN)
+        else:
+            self._drop(token.name)
+
+    def _was_away(self, token: Token) -> bool:
+        """Return True if `token` may have disappeared because this leader itself was away (rule 9)."""
+        now = self._now
+        if now >= self._away_until:
+            self._doubted.clear()
+        if not self._tokens[token.host]:
+            self._gone_hosts.append((now, token.host))
+        while self._gone_hosts and self._gone_hosts[0][0] < now - self._span:
+            self._gone_hosts.popleft()
+        if (self._stall[2] and self._stood_still) or self._lost_several:
+            self._away_until = now + self._lease
+        elif now >= self._away_until and (witnesses := self._witnesses()[:MAX_WITNESSES]):
+            # Of several lost links one is the first.
+            self._away_until = now + self._lease
+            for key, kind in witnesses:
+                self._change.questions.append(Question(Why.WITNESS, key, PRESENT_WITHIN, kind=kind))
+        return now < self._away_until
+
+    def _present(self) -> None:
+        """This leader was not away: what disappeared is gone."""
+        doubted, self._doubted = self._doubted, set()
+        for client in sorted(doubted):
+            if client in self._unshown:
+                self._lose_client(client)
+        self._drop_unseen()
+
+    @property
+    def _span(self) -> Ns:
+        return round(AWAY_PART * self._lease)
+
+    @property
+    def _stood_still(self) -> bool:
+        """True if this leader stalled for long, less than a lease ago."""
+        length, ended, _ = self._stall
+        return length > self._span and self._now - ended < self._lease
+
+    @property
+    def _lost_several(self) -> bool:
+        return len({host for _, host in self._gone_hosts}) > 1
+
+    def _witnesses(self) -> list[tuple[str, type[Struct]]]:
+        """For each other host that is seen: a key that it answers on."""
+        clients = map(client_of, self.clients)
+        keys: dict[HostName, tuple[str, type[Struct]]] = {
+            client.host: (self._keys.requests(client), ClientRequests) for client in clients
+        }
+        tokens = (token for rc in self._rcs.values() for token in rc.tokens.values())
+        keys |= {token.host: (self._keys.rc_state(token.name), RcState) for token in tokens}
+        return [keys[host] for host in sorted(keys) if host != self._me]
+
+    def _counts(self, token: Token, *, alive: bool, known: bool) -> bool:
+        """Return True if a token that came or went counts: its host has no more than MAX_TOKENS, or it did before."""
+        if alive is known:
+            return alive
+        if alive and self._tokens[token.host] >= MAX_TOKENS:
+            if token.host not in self._surplus:
+                self._surplus.add(token.host)
+                self._change.surplus = token.host
+            return False
+        self._tokens[token.host] += 1 if alive else -1
+        return True
+
+    # Contradictions of the mesh
+
+    def _probe(self, key: str, kind: type[Struct], *, client: ClientId = "", token: Token | None = None) -> None:
+        fresh = key not in self._probed
+        if not fresh or len(self._probed) < MAX_PROBED:
+            self._probed[key] = MAX_PROBES
+            if fresh:
+                asked = Question(Why.PROBE, key, self._timeout / SECOND, kind=kind, client=client, token=token)
+                self._set(PROBE_PERIOD, _Due.AGAIN, asked)
+
+    def _is_seen(self, asked: Question) -> bool:
+        """Return True if the client or RC that is probed shows a token again."""
+        return asked.client in self.clients if asked.token is None else bool(self._rc(asked.token.name).tokens)
+
+    # RCs
+
+    def _rc(self, name: RcName) -> _Rc:
+        return self._rcs.setdefault(name, _Rc())
+
+    def _token_came(self, rc: _Rc, token: Token) -> None:
+        rc.tokens[token.instance] = token
+        rc.seen = self._now if rc.seen is None else rc.seen
+        if self._is_wanted(rc, token):
+            if rc.joined is not None:
+                self._succeed(rc, token)
+            self._ask_promise(token)
+        elif rc.joined is not None and rc.joined.instance == token.instance:
+            if rc.unseen:
+                rc.unseen = False
+                self._ask_rc(Why.RETURN, token)
+        elif rc.joined is not None:
+            self._change.duplicates.append((token.name, token.host))
+            self._change.named[token.name] = None
+
+    def _succeed(self, rc: _Rc, token: Token) -> None:
+        """A new instance on the same host: its predecessor is gone."""
+        rc.joined, rc.named = None, (token.instance, token.host)
+        self._change.events.append(RcLost(token.name, "it started anew"))
+        self._change.named[token.name] = None
+
+    def _drop(self, name: RcName, why: str = "") -> None:
+        rc = self._rc(name)
+        gone, rc.joined, rc.unseen = rc.joined, None, False
+        if gone is None:
+            return
+        rc.departed = gone
+        self._set(self._hold_lease + round((gone.settle or 0) * SECOND), _Due.FREE, gone)
+        self._probe(self._keys.rc_state(name), RcState, token=Token(gone.host, Role.RC, name, gone.instance))
+        self._change.events.append(RcLost(name, why=why or self._devices.why_gone(name, gone.host)))
+        if gone.leaving:
+            self._free(gone)
+        self._ask_others(rc)
+
+    def _free(self, gone: RcState) -> None:
+        """An RC that disappeared serves nobody any longer: another host may offer it."""
+        rc = self._rc(gone.rc)
+        if rc.departed is not gone:
+            return
+        rc.departed = None
+        others = sorted(rc.tokens.values())
+        if others and rc.joined is None:
+            rc.named = others[0].instance, others[0].host
+            self._change.named[gone.rc] = None
+        self._ask_others(rc)
+
+    def _ask_others(self, rc: _Rc) -> None:
+        for token in sorted(rc.tokens.values()):
+            self._ask_promise(token)
+
+    def _drop_unseen(self) -> None:
+        for name, rc in list(self._rcs.items()):
+            if rc.joined is not None and rc.joined.instance not in rc.tokens:
+                self._drop(name)
+        # Requests that wait for a device never seen in this term get to know why it is absent.
+        there = {name for name, rc in self._rcs.items() if rc.joined or rc.pending or rc.tokens or rc.departed}
+        for name in sorted(self._devices.names - there):
+            if name not in self._missed and (home := self._devices.latest_home(name)) is not None:
+                self._missed.add(name)
+                self._change.events.append(RcLost(name, why=self._devices.why_gone(name, home)))
+
+    def _awaited_since(self, arc: ArcId) -> Ns | None:
+        if arc not in self._awaited and len(self._awaited) >= MAX_PROBED:
+            self._awaited = {other: at for other, at in self._awaited.items() if self._now - at < self._lease}
+        if len(self._awaited) < MAX_PROBED:
+            self._awaited.setdefault(arc, self._now)
+        return self._awaited.get(arc)
+
+    def _is_wanted(self, rc: _Rc, token: Token) -> bool:
+        """Return True if an instance lives and may join: where none has, or as the successor of one on its host."""
+        if token.instance not in rc.tokens or token.instance in self.shunned:
+            return False
+        present = rc.pending.state if rc.pending is not None else rc.joined
+        if present is not None:
+            return present.host == token.host and present.instance != token.instance
+        if rc.departed is not None:
+            return rc.departed.host == token.host
+        home = self._devices.home_of(token.name)
+        return home in (None, token.host) or rc.named is not None or self._now >= self._home_until
+
+    def _promised(self, token: Token, state: Any, problem: Problem | None) -> None:
+        """The answer of an RC that was asked for its promise; without one it is asked again."""
+        rc = self._rc(token.name)
+        if problem is not None and problem.term is not None:
+            self._see_rc(rc, token.name, token.instance, problem.term)
+            alone = not any(rc.joined or rc.pending for rc in self._rcs.values())
+            if alone and disbelieved(self.term, problem.term):
+                self._change.disbelieved.append((token.name, problem.term))
+        if not self._is_wanted(rc, token):
+            return
+        promised = isinstance(state, RcState) and (state.rc, state.instance) == (token.name, token.instance)
+        if not promised or state.term < self.term:  # a report from before the promise
+            # An answer without a promise can come at once, again and again: a token may outlive its RC.
+            self._set(self._timeout, _Due.AGAIN, Question(Why.PROMISE, "", 0, token=token))
+        elif any(holder.grant.term != self.term for holder in state.holders):
+            # A hold that all RCs of its gang report continues: they join together.
+            self._hold_up(state, patient=True)
+            self._settle()
+        else:
+            self._admit([state])
+            self._settle()
+
+    def _hold_up(self, state: RcState, *, patient: bool) -> None:
+        pending = self._rc(state.rc).pending = _Pending(state, self._now, patient)
+        for wait in (self._timeout, self._lease, MAX_LEASES_PENDING * self._lease):
+            self._set(wait, _Due.WAITED, (pending, wait))
+
+    def _wait_over(self, pending: _Pending, wait: Ns) -> None:
+        if self._stood_still:
+            self._set(wait, _Due.WAITED, (pending, wait))  # answers may not be handled yet
+        elif self._rc(pending.state.rc).pending is pending:
+            pending.waited = wait
+            self._settle()
+
+    def _settle(self) -> None:
+        """Admit pending RCs whose gangs have answered. Others wait for a lease after the last RC of their gangs
+        answered; only for the time of an answer where no token shows that another RC of a gang lives and all links of
+        this leader stood as it began."""
+        pending = {name: rc.pending for name, rc in self._rcs.items() if rc.pending is not None}
+        settled = bool(pending)
+        for name in list(pending):
+            if name not in pending:
+                continue
+            gangs = gangs_of(name, {other: waiting.state for other, waiting in pending.items()})
+            joined = {other for other in gangs if self._rc(other).joined is not None}
+            missing = gangs - joined - pending.keys()
+            together = [pending[other] for other in gangs & pending.keys()]
+            patient = any(waiting.patient for waiting in together) or any(self._rc(other).tokens for other in missing)
+            # They join together: the last to answer may be the first whose links came back.
+            waited = min(waiting.waited for waiting in together)
+            over = waited >= (self._lease if patient else self._timeout)
+            if not missing or over or pending[name].waited >= MAX_LEASES_PENDING * self._lease:
+                for other in gangs & pending.keys():
+                    self._rc(other).pending = None
+                admitted = [pending.pop(other) for other in sorted(gangs & pending.keys())]
+                self._admit([aged(waiting.state, self._now - waiting.since) for waiting in admitted])
+        self._change.settled |= settled
+
+    def _admit(self, states: list[RcState]) -> None:
+        """Let RCs join. Holds of which every RC of the gang that has joined reports exactly this grant continue."""
+        for state in states:
+            rc = self._rc(state.rc)
+            rc.joined, rc.named = state, (state.instance, state.host)
+        well = {state.rc: state for state in states if state.health == "ok"}
+        held = {(name, holder.grant) for name, state in well.items() for holder in state.holders}
+        recovered = recover(well.values(), [], self._now).holds
+        adopted = [
+            Adopted(hold)
+            for hold in recovered
+            if all((name, hold.grant) in held or self._rc(name).joined is None for name in hold.rcs)
+        ]
+        self._change.events += [*map(_presence, states), *adopted]
+        self._change.reported += states
+        for state in states:
+            if state.duplicate_of or len(self._rc(state.rc).tokens) > 1:
+                self._change.named[state.rc] = None
+        self._change.settled = True
+
+    def _report(self, rc: _Rc, state: RcState) -> None:
+        if state.instance in self.shunned:
+            return
+        self._see_rc(rc, state.rc, state.instance, state.term)
+        if rc.pending is not None and rc.pending.state.instance == state.instance:
+            rc.pending.state, rc.pending.since = state, self._now
+        known, gone = rc.joined, rc.departed
+        if gone is not None and gone.instance == state.instance and state.leaving:
+            self._free(gone)
+        elif gone is not None and gone.host != state.host and state.holders:
+            # It holds by a leader of another half of the mesh, and is not the one that is meant.
+            self._change.named[state.rc] = None
+        if known is None or known.instance != state.instance:
+            return
+        rc.joined = state
+        if state.leaving and state.instance not in rc.tokens:
+            self._drop(state.rc)
+        elif state.health != "ok":
+            if known.health != state.health:
+                self._change.events.append(_presence(state))
+        else:
+            if known.health != "ok" or known.sharable != state.sharable:
+                self._change.events.append(_presence(state))
+            if state.rules != known.rules:
+                self._change.events.append(RcReported(state.rc, rules_changed=True))
+            self._change.reported.append(state)
+            if state.duplicate_of:
+                # Whatever made it stand by: it is the one that is meant.
+                self._change.named[state.rc] = None
+
+    # What follows
+
+    def _taken(self) -> Change:
+        change, self._change = self._change, Change()
+        return change
+
+    def _set(self, delay: Ns, due: _Due, subject: Any = None) -> None:
+        self._deadlines.set(self._now + delay, (due, subject))
+
+    def _see(self, word: Word, token: Token | None = None) -> None:
+        if word.term > self.term:
+            self._change.higher.append((word, token))
+
+    def _see_rc(self, rc: _Rc, name: RcName, instance: str, term: Term) -> None:
+        token = rc.tokens.get(instance)
+        self._see(Word(term, Source.RC, name, "" if token is None else token.host), token)
+
+    def _suspect(self, key: str, *, so: bool = True) -> None:
+        self._change.suspicions.append((f"{key} answers, and its token is missing", so))
+
+    def _ask(self, why: Why, key: str, **how: Any) -> None:
+        self._change.questions.append(Question(why, key, self._timeout / SECOND, **how))
+
+    def _ask_rc(self, why: Why, token: Token) -> None:
+        message = RcAsk(promise=self.term, instance=token.instance)
+        self._ask(why, self._keys.rc_state(token.name), message=message, kind=RcState, token=token)
+
+    def _ask_promise(self, token: Token) -> None:
+        if self._is_wanted(self._rc(token.name), token):
+            self._ask_rc(Why.PROMISE, token)
+
+    def _ask_client(self, client: ClientId) -> None:
+        if client in self.clients or client in self._unshown:
+            key, message = self._keys.requests(client_of(client)), RcAsk(promise=self.term)
+            self._ask(Why.REQUESTS, key, message=message, kind=ClientRequests, client=client)
+        else:
+            self._asked.discard(client)
+            self._change.suspicions.append((f"{client} is seen and does not answer", False))
+
+    def _ask_again(self, asked: Question) -> None:
+        if asked.why is Why.REQUESTS:
+            self._ask_client(asked.client)
+        elif asked.why is Why.PROMISE and asked.token is not None:
+            self._ask_promise(asked.token)
+        elif not self._probed[asked.key] or self._is_seen(asked):
+            del self._probed[asked.key]
+            self._suspect(asked.key, so=False)
+        else:
+            self._probed[asked.key] -= 1
+            self._change.questions.append(asked)
+            self._set(PROBE_PERIOD, _Due.AGAIN, asked)
+
+
+_UNKNOWN: Final = _Rc()
+
+
+def _presence(state: RcState) -> RcJoined | RcLost:
+    health = state.health[:MAX_HEALTH]
+    return RcJoined(state.rc, state.sharable) if health == "ok" else RcLost(state.rc, why=health)
+
+
+def discrepancies(
+    state: RcState, holders: Iterable[ArcStatus], now: Ns, *, current: bool
+) -> tuple[tuple[ArcId, ...], bool]:
+    """Compare the holds that an RC reports with its `holders` in the core: the ARCs whose holds it has ended, and
+    whether it has any that it should not have.
+
+    `current`: it knows all that was published about it, so that it does not hold what it does not name."""
+    known = {arc.hold.grant: arc for arc in holders if arc.hold is not None}
+    held = {holder.grant for holder in state.holders}
+    unknown = not held <= known.keys()
+    # An RC that reports an unknown hold may have read the leader's state before it received the publication that
+    # ends this hold: what it does not hold yet is not lost. Its list, published again, settles both.
+    complete = current and not unknown
+    timely = {hold.grant for hold in state.ended if hold.why == "time"}
+    ended = {hold.grant for hold in state.ended} - timely
+
+    def is_lost(grant: Grant, arc: ArcStatus) -> bool:
+        due = arc.hold is not None and not arc.request.keep and arc.hold.end - now < NEAR_END
+        return grant in ended or (complete and grant not in held and grant not in timely and not due)
+
+    lost = tuple(arc.id for grant, arc in known.items() if is_lost(grant, arc))
+    return lost, current and unknown
