@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from zscout.services.rcm.registry import reason_info
+from zscout.rcm.request_log import reason_info
 
 from zscout.messages import ReasonInfo, Who
 from zscout.scheduling.reason import Party, Reason, ReasonCode, ended, named, reason_of, waits
