@@ -42,7 +42,7 @@ async def promised_elsewhere(mesh: Mesh, *, timeout: float) -> Term:
         mesh.living(keys.alive_any(), timeout=timeout),
         mesh.ask(keys.rc_state_any, RcAsk(), RcState, timeout=timeout),
         mesh.ask(keys.requests_any, RcAsk(), ClientRequests, timeout=timeout),
-        mesh.ask(keys.rcm_state, StateAsk(holds_only=True), RcmState, timeout=timeout),
+        mesh.ask(keys.ask_state(mesh.me), StateAsk(holds_only=True), RcmState, timeout=timeout),
     )
     seen = {key for token in tokens if (key := _key_of(mesh, token)) is not None}
     # A leader's instance has one term: it vouches for itself.

@@ -132,7 +132,7 @@ class RcmLink:
                 self._go_back(term)
 
     async def _is_obeyed(self, term: Term) -> bool:
-        ask, key = StateAsk(devices_only=True), self.mesh.keys.rcm_state
+        ask, key = StateAsk(devices_only=True), self.mesh.keys.ask_state(self.mesh.me)
         replies = await self.mesh.ask(key, ask, RcmState, timeout=QUERY_TIMEOUT)
         states = [reply.message for reply in replies if reply.message is not None]
         return any(state.term == term and any(rc.present for rc in state.rcs) for state in states)
