@@ -63,6 +63,7 @@ class _Doubt(NamedTuple):
     term: Term
     until: Ns
     times: int
+    since: Ns = 0
 
 
 class Terms:
@@ -130,7 +131,7 @@ class Terms:
             return until
         before = self._doubts.get(host, _Doubt(NO_TERM, 0, 0))
         times = 0 if now - before.until > FORGIVEN_AFTER else before.times
-        self._doubts[host] = _Doubt(term, now + (DOUBT << min(times, MAX_DOUBLINGS)), times + 1)
+        self._doubts[host] = _Doubt(term, now + (DOUBT << min(times, MAX_DOUBLINGS)), times + 1, now)
         return 0
 
     def _vindicate(self, host: HostName, term: Term, now: Ns) -> None:
@@ -149,6 +150,11 @@ class Terms:
             self._shown = {host: shown for host, shown in self._shown.items() if shown > term}
             for host in list(self._doubts):
                 self._vindicate(host, term, now)
+
+    def is_led_nowhere(self, term: Term, host: HostName, now: Ns, silence: Ns) -> bool:
+        """Return True if only `host` shows `term`, and nobody led in it for a silence: its RCs can see no leader."""
+        doubt = self._doubts.get(host)
+        return doubt is not None and doubt.term == term and doubt.since + silence <= now < doubt.until
 
     def doubted_until(self, host: HostName, now: Ns) -> Ns:
         """Until when `host` is not believed alone; 0: it is."""

@@ -16,7 +16,7 @@ from zscout.messages import ClientRequests, OpenRequest, RcAsk
 from zscout.rcm.places import Places
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.term_file import FILE, TermFile
-from zscout.types import NO_TERM, Place, Term
+from zscout.types import NO_TERM, SECOND, Place, Term
 
 KEY = bytes(range(32))
 FAR = Term(2**40, "eve")
@@ -106,6 +106,21 @@ async def test_an_rc_that_claims_terms_costs_one_election_and_then_counts_as_abs
     await asyncio.sleep(SERVED)
     assert (candidate.known, there(candidate)) == (after, {"robot/a"})
     await until(lambda: there(candidate) == {"robot/a", "gripper/g"}, within=11)
+
+
+async def test_rcs_that_claim_to_see_the_leader_of_their_term_delay_one_election_by_a_silence() -> None:
+    fleet = a_fleet()
+    candidate = await led(fleet)
+    liars = [FakeRc(fleet.mesh("cart", name), f"gripper/{name}", leader=True) for name in ("f", "g")]
+    for liar in liars:
+        liar.start()
+    await until(lambda: len(there(candidate)) == 3)
+    for liar in liars:
+        liar.term = FAR
+        liar.publish()
+    await until(lambda: candidate.rcm is None)
+    within = fleet.fleet.silence / SECOND + SERVED
+    await until(lambda: candidate.known > FAR and "robot/a" in there(candidate), within=within)
 
 
 async def test_managers_that_start_anew_go_on_above_the_term_on_their_disk(tmp_path: Path) -> None:

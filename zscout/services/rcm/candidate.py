@@ -307,7 +307,12 @@ class Candidate:
         """Take the terms of RCs. Return those that do not count as absent for what they show."""
         hosts = {(token.name, token.instance): token.host for token in tokens}
         words = [Word(state.term, Source.RC, state.rc, hosts.get((state.rc, state.instance), "")) for state in states]
-        return [state for state, word in zip(states, words, strict=True) if not self._see(word).absent_until]
+        now, silence = self.mesh.now(), self.fleet.silence
+        return [
+            state
+            for state, word in zip(states, words, strict=True)
+            if not self._see(word).absent_until and not self.terms.is_led_nowhere(word.term, word.host, now, silence)
+        ]
 
     async def _divided(self, states: list[RcState]) -> bool:
         """Whether an RC that is seen obeys a term which is absurd to others: they are told why this one goes above."""
