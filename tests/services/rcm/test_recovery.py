@@ -218,3 +218,10 @@ def test_requests_of_two_clients_may_share_an_id() -> None:
     clients = [client(asked(), name="h/one"), client(asked(), name="h/two")]
     found = recover([], clients, NOW)
     assert [one.request.arc for one in found.waiting] == ["h/one/gang-id", "h/two/gang-id"]
+
+
+def test_what_goes_on_at_another_client_is_believed_of_no_request_that_waits() -> None:
+    """Its old client handed it over, missed the answer, and still believes in its grant."""
+    found = recover(BOTH, [RUNS, client(asked(grant=Grant(TERM, 5)), name="h/old")], NOW)
+    assert summary(found) == (["gang"], [])
+    assert found.believed == {}

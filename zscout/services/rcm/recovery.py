@@ -141,6 +141,8 @@ def recover(
         (one for one in result.waiting if (one.place, request_id(one.request.arc)) not in held_requests),
         key=lambda one: (one.place is None, one.place),
     )
+    left = {one.request.arc for one in result.waiting}
+    result.believed = {arc: rcs for arc, rcs in result.believed.items() if arc in left}
     return result
 
 
