@@ -40,7 +40,7 @@ class Word(NamedTuple):
     by: str = ""
     """An RC or a client, for the log."""
     host: HostName = ""
-    """Where a token shows it; empty: none does."""
+    """The host of its token; empty: no token is seen."""
 
 
 class Verdict(NamedTuple):
@@ -58,7 +58,7 @@ IGNORED: Final = Verdict(believed=False)
 
 
 class _Doubt(NamedTuple):
-    """Of a host whose RCs alone showed `term`: until somebody leads in it, it is not believed alone."""
+    """Of a host whose RCs alone showed `term`: until it has a leader, or `until`, the host is not believed alone."""
 
     term: Term
     until: Ns
@@ -74,9 +74,9 @@ class Terms:
         self.highest = highest
         """The highest term that is believed."""
         self.goes_above = False
-        """Whether somebody obeys a term so far above that others must be told why this candidate goes there."""
+        """True while an RC or client obeys a term so far above that promises must be asked for with `above`."""
         self._led = NO_TERM
-        """The highest term in which somebody led."""
+        """The highest term that had a leader."""
         self._tried = deque[Term](maxlen=MAX_TRIED)
         """The last in which this manager tried to lead."""
         self._shown: dict[HostName, Term] = {}
@@ -84,7 +84,7 @@ class Terms:
         self._doubts: dict[HostName, _Doubt] = {}
 
     def hear(self, word: Word, now: Ns, *, heard: bool) -> Verdict:
-        """Weigh a word. `heard`: an RCM that counts was heard within the hold lease."""
+        """Weigh a word. `heard`: a credible leader published within the hold lease."""
         term = word.term
         if not self.counts(word):
             return IGNORED
@@ -144,7 +144,7 @@ class Terms:
         self._tried.append(term)
 
     def led(self, term: Term, now: Ns) -> None:
-        """Somebody leads in `term`: hosts that showed it said so rightly."""
+        """A leader of `term` exists: hosts that showed it were right."""
         if term > self._led:
             self._led = term
             self._shown = {host: shown for host, shown in self._shown.items() if shown > term}
@@ -152,7 +152,7 @@ class Terms:
                 self._vindicate(host, term, now)
 
     def is_led_nowhere(self, term: Term, host: HostName, now: Ns, silence: Ns) -> bool:
-        """Return True if only `host` shows `term`, and nobody led in it for a silence: its RCs can see no leader."""
+        """Return True if only `host` shows `term`, and it had no leader for a silence: its RCs can see none."""
         doubt = self._doubts.get(host)
         return doubt is not None and doubt.term == term and doubt.since + silence <= now < doubt.until
 
