@@ -48,6 +48,7 @@ from zscout.services.notify.notifier import Notifier
 from zscout.services.plain_http import PlainHttpServer
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.digest import HoldListener
+from zscout.services.rcm.term_file import TermFile
 from zscout.services.recorder.process import RecorderProcess
 from zscout.types import SECOND
 
@@ -155,7 +156,15 @@ async def run_services(
                 journal.start()
                 stack.push_async_callback(journal.stop)
             candidate = Candidate(
-                mesh, node.fleet, kept, authority, _places_key(node.fleet), listeners, journal, keeper
+                mesh,
+                node.fleet,
+                kept,
+                authority,
+                _places_key(node.fleet),
+                listeners,
+                journal,
+                keeper,
+                TermFile(kept, node.fleet.name) if kept is not None else None,
             )
             if node.notify is not None:
                 notifier = _notifier(node.notify, node.fleet.name, candidate)

@@ -87,6 +87,9 @@ class Excuses:
                 return bool(names & {*fault.whom})
             case "disk" | "clock":
                 return False
+            case "lie":
+                # RCs and clients that promised to a candidate which died may be led only later.
+                return fault.message == "promised"
             case "freeze":
                 return just_over or bool(names & {*fault.whom})
             case "isolate" | "part":

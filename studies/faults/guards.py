@@ -26,12 +26,13 @@ from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
 from zscout.mesh.renewal import Suspicions
 from zscout.messages import BookingRecord, Problem, Who
-from zscout.rcm import recovery, roster
+from zscout.rcm import recovery, roster, terms
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
 from zscout.rcm.places import Places
 from zscout.rcm.request_log import RequestLog
 from zscout.rcm.roster import Roster
+from zscout.rcm.terms import BELIEVED, Terms, Verdict
 from zscout.scheduling.calendar import Calendar
 from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.state import SchedulerState
@@ -42,6 +43,7 @@ from zscout.services.rcm import bookings, candidate
 from zscout.services.rcm.booked_dates import BookedDates
 from zscout.services.rcm.booking_sharing import BookingSharing
 from zscout.services.rcm.bookings import Bookings
+from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.rcm import Rcm
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
@@ -76,8 +78,16 @@ def _as_it_says(_self: Authority, _sender: Sender, who: Who | None) -> Who | Non
     return who
 
 
+def _never_ns(*_: object, **__: object) -> Ns:
+    return 0
+
+
 def _yes(*_: object, **__: object) -> bool:
     return True
+
+
+def _believe(*_: object) -> Verdict:
+    return BELIEVED
 
 
 def _promise(self: HoldTable, term: Term, _now: Ns, **_: object) -> bool:
@@ -257,7 +267,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         ),
         "majority": Guard("a candidate that RCs contradict waits", {(Election, "must_wait"): _no}),
         "deposed": Guard("who was deposed waits longer each time", {(Election, "deposed"): _nothing}),
-        "step down": Guard("a leader that sees a higher term steps down", {(candidate.Candidate, "_see"): _yes}),
+        "step down": Guard("a leader that sees a higher term steps down", {(Candidate, "_see"): _believe}),
         "away": Guard("a leader that was away itself drops nobody for it", {(Roster, "_was_away"): _no}),
         "reopen": Guard("who was dropped and lives goes on at its place", {(RequestLog, "reopens"): _no}),
         "places": Guard("a client shows the place that it had", {(OpenArc, "_as_asked"): _without_place}),
@@ -267,8 +277,19 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "terms": Guard("a client believes nothing of an older term", {(RcmLink, "accept"): _accept_any}),
         "absurd": Guard(
             "nobody believes a term far above the fleet's",
-            {(holds, "absurd"): _no, (rcm_link, "absurd"): _no, (candidate, "absurd"): _no},
+            {(holds, "absurd"): _no, (rcm_link, "absurd"): _no, (candidate, "absurd"): _no, (terms, "absurd"): _no},
         ),
+        "words": Guard("with certificates a client's word moves no term", {(Terms, "counts"): _yes}),
+        "doubted": Guard(
+            "a host whose RCs alone show a term in which nobody leads is believed once",
+            {(Terms, "_doubted"): _never_ns},
+        ),
+        "sealed terms": Guard("a leader goes above the term of a sealed place", {(Places, "proves"): _no}),
+        "back": Guard(
+            "a client goes back to the leader that it sees",
+            {(RcmLink, "_follow_lower"): _do_nothing, (RcmLink, "_only_promised"): _no},
+        ),
+        "kept": Guard("managers keep their highest term on disk", {(Candidate, "_keep"): _do_nothing}),
         "handed": Guard(
             "what was handed over stays the old client's until the new one has heard of it",
             {(MovableClient, "_awaited_by"): _none_async},

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Final, Literal, TypeAlias
 
+from studies.faults.liars import LIES
 from zscout.messages import MAX_COUNTER
 from zscout.testing.link import Disturbance
 
@@ -27,6 +28,8 @@ FaultKind: TypeAlias = Literal[
     "restart",
     "disk",
     "clock",
+    "lie",
+    "nodes",
 ]
 
 KINDS: Mapping[FaultKind, int] = MappingProxyType(
@@ -112,6 +115,8 @@ class Fault:
             "restart": f"everything is out, and started anew {self.jump / 86_400:g} days later",
             "disk": "can't write to its disk",
             "clock": f"has its clock set by {self.jump} s",
+            "lie": f"has a liar ({self.message}), of terms {self.jump} higher",
+            "nodes": f"all but clients is killed, and started again{' with empty disks' if self.jump else ''}",
         }[self.kind]
         return f"{self.at:7.3f} for {self.lasts:.3f} s: {' '.join(self.whom)} {what}"
 
@@ -193,6 +198,21 @@ def draw_for_bookings(seed: int, hosts: Sequence[str], span: float, drawn: Seque
         add("disk", rng.sample(hosts, rng.choice((1, len(hosts)))), rng.uniform(2, span / 2))
     if rng.random() < 0.3:
         add("clock", [rng.choice(hosts)], 0.0, rng.randrange(-STEP, STEP))
+    return sorted(faults, key=lambda fault: fault.at)
+
+
+def draw_lies(seed: int, hosts: Sequence[str], span: float, drawn: Sequence[Fault]) -> list[Fault]:
+    """The faults that were `drawn`, with lies of members in place of a stranger's forgeries, and all nodes that are
+    killed while clients live."""
+    rng = random.Random(f"lies {seed}")  # noqa: S311
+    faults = [fault for fault in drawn if fault.kind != "forge"]
+    for kind in ("client", "rc", *rng.choices(LIES, k=2)):
+        at, lasts = _when(rng, span)
+        jump = 1 if kind == "promised" else rng.choice(JUMPS)
+        faults.append(Fault(at, 2 * lasts, "lie", (rng.choice(hosts),), message=kind, jump=jump))
+    if rng.random() < 0.5:
+        at, _ = _when(rng, span)
+        faults.append(Fault(at, rng.uniform(*OUT), "nodes", (), jump=rng.random() < 0.5))
     return sorted(faults, key=lambda fault: fault.at)
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from zscout.drivers.instances import InstanceState
 from zscout.scheduling.model import ArcStatus
 from zscout.scheduling.reason import ReasonCode
-from zscout.types import ArcId, Grant, Ns, Place, Term
+from zscout.types import NO_TERM, SECOND, ArcId, Grant, Ns, Place, Term
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
@@ -52,7 +52,7 @@ class Promises:
         self, broken: Callable[[str], None], now: Callable[[], float], hold_lease: float, *, strict: bool, thief: str
     ) -> None:
         self._broken, self._now, self._strict, self._thief = broken, now, strict, thief
-        self._half_a_gang = hold_lease + HALF_A_GANG
+        self._hold_lease, self._half_a_gang = hold_lease, hold_lease + HALF_A_GANG
         self.terms: dict[Term, float] = {}
         """Of every leader that was seen, and when it was seen first."""
         self.unheard = False
@@ -96,6 +96,8 @@ class Promises:
         """Since when each thing that may not last is so."""
         self._running: dict[Term, set[Grant]] = {}
         self._queued: dict[Term, dict[ArcId, Rank]] = {}
+        self._believed: dict[str, Term] = {}
+        """By client: the highest term that it heard of a leader."""
         self._seen: dict[Term, int] = {}
         """By term: how many instants its RCM had decided about as it was looked at."""
 
@@ -148,6 +150,7 @@ class Promises:
 
     def forget_client(self, name: str) -> None:
         """It died: what it was promised was to that life."""
+        self._believed.pop(name, None)
         self._places = {key: place for key, place in self._places.items() if key[0] != name}
 
     def told(self, name: str, arc: OpenArc, term: Term, *, touched: bool) -> None:
@@ -155,6 +158,8 @@ class Promises:
         felt by it or by the RCs that the request names."""
         full = f"{name}/{arc.id}"
         known = self._told.get(full, arc._last)
+        if known[0] > term:
+            known = arc._last  # this client went back, as it may: see `look_who_went_back`
         if arc._last != known and arc._last < max(known, (term, 0)):
             self._broken(f"{name} {arc.name} believes {arc._last} after {max(known, (term, 0))}")
         self._told[full] = max(arc._last, known)
@@ -244,6 +249,14 @@ class Promises:
         for key, longest in lasting.items():
             if self._now() - self._since[key] > longest:
                 self._broken(f"for more than {longest:g} s: {' '.join(map(str, key))}")
+
+    def look_who_went_back(self, clients: Mapping[str, Client], silence: Mapping[str, Ns]) -> None:
+        """A client may go back from a term that it only promised, or after a hold lease of `silence`."""
+        for name, client in clients.items():
+            term, before = client.internals.term, self._believed.get(name, NO_TERM)
+            self._believed[name] = client.internals.rcm._heard
+            if term < before and silence[name] / SECOND < self._hold_lease:
+                self._broken(f"{name} went back from {before} to {term}, and had heard that lately")
 
     def _in_order(self, rcm: Rcm) -> None:
         """Of two that wait, the better-ranked is granted first, if it needs no more than what the other got."""
@@ -347,7 +360,8 @@ def _doubles(rcs: Mapping[str, ResourceController]) -> Iterator[tuple[object, ..
 
 def _left(leaders: Mapping[str, Rcm], rcs: Mapping[str, ResourceController]) -> Iterator[tuple[object, ...]]:
     for host, rcm in leaders.items():
-        if any(rc.holds.term > rcm.term for rc in rcs.values()):
+        shunned = rcm.roster.shunned
+        if any(rc.holds.term > rcm.term and rc.instance not in shunned for rc in rcs.values()):
             yield host, "leads in", rcm.term, "though an RC obeys a higher one"
 
 

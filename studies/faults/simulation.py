@@ -26,12 +26,14 @@ from studies.faults.booking_promises import BookingPromises
 from studies.faults.components import DEEDS, KINDS, Deeds, SimulatedComponent, operate, report_load
 from studies.faults.device import Device, WatchedCapacity, WatchedExclusive
 from studies.faults.excuses import IMPATIENCE, Excuses
+from studies.faults.liars import lie
 from studies.faults.plan import OPERATIONS, Fault
 from studies.faults.programs import Work, steal_places
 from studies.faults.promises import LEFT_OVER, Promises
 from zscout import trace
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import OpenArc
+from zscout.config.access import AccessPolicy, Roles
 from zscout.config.fleet import default_fleet
 from zscout.config.node import ComponentsConfig
 from zscout.drivers.confirm_server import ConfirmServer
@@ -47,9 +49,22 @@ from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.rcm import Rcm
 from zscout.testing.memory import MemoryMesh, MemoryNetwork, MemoryTransport
 from zscout.testing.virtual_time import PROCESS, START, Process, VirtualTimeLoop
-from zscout.types import SECOND, Grant, Term
+from zscout.types import NO_TERM, SECOND, Grant, Term
 
 T = TypeVar("T")
+
+
+class TermMemory:
+    """The highest term, on a disk that outlives processes."""
+
+    term: Term = NO_TERM
+
+    def read(self) -> Term:
+        return self.term
+
+    async def write(self, term: Term) -> None:
+        self.term = term
+
 
 DEVICES: Final[Mapping[str, Mapping[str, Fraction] | None]] = {
     "robot/a": None,
@@ -97,6 +112,8 @@ class Size:
     """Managers share a key, and a program asks at the places of others. Commands arrive twice."""
     moves_only: bool = False
     """Nothing fails but nodes, in the steps of a component's move: no other fault excuses what breaks."""
+    liars: bool = False
+    """Certificates are there, and members lie about terms."""
     bookers: int = 0
     """Programs that book, give up and take up."""
     forger: bool = False
@@ -105,8 +122,8 @@ class Size:
     @classmethod
     def of(cls, seed: int) -> Size:
         """Every tenth run is a long one of many, every tenth one of moves that fail, every tenth one of programs that
-        touch devices past their RCs, every tenth one with a thief, every fifth one of bookings, and every twentieth one
-        with a forger."""
+        touch devices past their RCs, every tenth one with a thief, one with liars, every fifth one of bookings, every
+        twentieth one with a forger."""
         match seed % 10:
             case 3 | 4:
                 return cls(bookers=2, clients=3, faults=4, span=40.0)
@@ -118,7 +135,9 @@ class Size:
                 return cls(moves_only=True)
             case 0:
                 return cls(thief=True)
-            case 6 if seed % 20 == 6:
+            case 6:
+                return cls(liars=True)
+            case 5 if seed % 20 == 5:
                 return cls(forger=True)
         return cls()
 
@@ -202,6 +221,11 @@ class Simulation:
             drawn = plan.draw_moves(seed, self.everybody, count=size.faults, span=size.span)
         else:
             drawn = plan.draw(seed, self.everybody, self.hosts, sorted(DEVICES), count=size.faults, span=size.span)
+        if size.liars:
+            drawn = plan.draw_lies(seed, self.hosts, size.span, drawn)
+            roles = Roles(manager=tuple(self.hosts))
+            self.fleet = replace(self.fleet, access=AccessPolicy(roles=roles))
+        self.term_disks = {host: TermMemory() for host in self.hosts}
         if size.bookers:
             drawn = plan.draw_for_bookings(seed, self.hosts, size.span, drawn)
         if size.direct:
@@ -222,7 +246,11 @@ class Simulation:
         assert isinstance(loop, VirtualTimeLoop)
         self.loop, loop.isolated = loop, True
         self.network = MemoryNetwork(
-            lease=self.fleet.mesh.lease, impatience=IMPATIENCE, relink=plan.RELINK, seed=self.seed
+            lease=self.fleet.mesh.lease,
+            impatience=IMPATIENCE,
+            relink=plan.RELINK,
+            seed=self.seed,
+            closed=self.size.liars,
         )
         self._digest = hashlib.blake2b(digest_size=16)
         self.network.trace = self._trace
@@ -374,6 +402,10 @@ class Simulation:
                 if not (process := self.running[key.split()[0]][0]).stopped
             }
             clients = self._alive(self.programs)
+            unled = {
+                name: self.running[name][0].run(client.mesh.now) - client.internals.rcm._last_contact
+                for name, client in clients.items()
+            }
             # Two instances of an RC on one mesh are settled while there are two.
             calm = all(fault.kind == "double" for fault in self.present)
             lasting = dict(self.booked.look(self._leading_hosts(), calm=not self.present)) if self.bookers else {}
@@ -381,6 +413,7 @@ class Simulation:
             if self.size.forger:
                 for why in filter(None, map(forgers.believed, self._leaders().values())):
                     self.broken(f"a leader believes a forger: {why}")
+            self.promises.look_who_went_back(clients, unled)
             if self.work.over and not any(self.busy.values()):
                 self.idle.set()
 
@@ -461,8 +494,10 @@ class Simulation:
         )
         if leads:
             self.keepers[host] = keeper
-            key = PLACES_KEY if self.size.thief or self.size.forger else None
-            candidate = self.candidates[host] = Candidate(mesh, self.fleet, places_key=key, keeper=keeper)
+            key = PLACES_KEY if self.size.thief or self.size.liars or self.size.forger else None
+            candidate = self.candidates[host] = Candidate(
+                mesh, self.fleet, places_key=key, keeper=keeper, disk=self.term_disks[host]
+            )
             candidate.start()
         elif self.size.bookers and str(mesh.me) in self.where.values():
             self.keepers[host] = keeper
@@ -503,10 +538,15 @@ class Simulation:
         await rc.stop()
         self.rcs.pop(f"{mesh.me} {name}", None)
 
+    def _lives(self, name: str) -> bool:
+        return not self.running[name][0].dead
+
+    def _highest(self) -> int:
+        return max((term.counter for term in self.promises.terms), default=0)
+
     async def _forge(self, mesh: MemoryMesh, jump: int) -> None:
         """Publishes as an RCM, of which nobody sees a token."""
-        highest = max((term.counter for term in self.promises.terms), default=0)
-        term = Term(min(highest + jump, MAX_COUNTER), new_instance())
+        term = Term(min(self._highest() + jump, MAX_COUNTER), new_instance())
         while True:
             mesh.put(mesh.keys.grants, Grants(term, 1, 1, FORGED_EVERY, {}, []))
             await asyncio.sleep(FORGED_EVERY)
@@ -594,6 +634,20 @@ class Simulation:
                 process, mesh = self.open_process(name)
                 process.main = process.run(asyncio.create_task, self._forge(mesh, fault.jump))
                 end = lambda: self.end_process(name)  # noqa: E731
+            case "lie":
+                name = f"{fault.whom[0]}/liar{self.result.counts['faults']}"
+                process, mesh = self.open_process(name)
+                lying = lie(fault.message, mesh, self._highest, fault.jump)
+                process.main = process.run(asyncio.create_task, self._guard(lying))
+                end = lambda: self.end_process(name)  # noqa: E731
+            case "nodes":
+                names = [name for name in self.everybody if name not in self.clients and self._lives(name)]
+                for name in names:
+                    self._take_down(name)
+                if fault.jump:
+                    for disk in self.term_disks.values():
+                        disk.term = NO_TERM
+                end = partial(self._start_all, names)
             case "fail":
                 failing = {key: rc for key, rc in self.rcs.items() if rc.name == fault.whom[0]}
                 self._each(failing, lambda rc: rc.fail("its device failed"))

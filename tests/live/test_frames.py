@@ -29,6 +29,7 @@ from zscout.mesh.frames import Frame, FrameWatch
 from zscout.mesh.transport import Quality
 from zscout.messages import MAX_FRAME, FrameHead, RcAsk, RcState
 from zscout.rcm.recovery import RecoveredState
+from zscout.rcm.terms import BELIEVED
 from zscout.services.rcm.rcm import Rcm
 from zscout.types import Term
 
@@ -157,7 +158,7 @@ async def scene(folder: Path, *, rate: float = 60) -> AsyncIterator[Scene]:
         )
         leader = await ZenohMesh.open(lab.fleet, Sender("leader", "node"))
         stack.push_async_callback(leader.close)
-        rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _term, _rc: None, lambda _: None)
+        rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _: BELIEVED, lambda _: None)
         rcm.start(RecoveredState())
         stack.callback(rcm.stop)
         sources = {"video/ch1": one.url, "video/ch2": two.url}

@@ -21,6 +21,7 @@ from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import IncomingQuery, ZenohMesh, clock
 from zscout.messages import Done, Grants, HoldView, RcmState, RcState, StateAsk
 from zscout.rcm.recovery import RecoveredState
+from zscout.rcm.terms import BELIEVED
 from zscout.services.rcm.rcm import Rcm
 from zscout.types import SECOND, Grant, Place, Term
 
@@ -216,7 +217,7 @@ async def test_an_rc_that_died_while_the_lead_was_taken_is_lost_within_a_lease(t
         rc = await stand.rc("robot/real", Bench())
         client = await lab.client()
         leader = await ZenohMesh.open(lab.fleet, Sender("leader", "node"))
-        rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _term, _rc: None, lambda _: None)
+        rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _: BELIEVED, lambda _: None)
         try:
             # Both answered when they were asked; then one of them died, and nobody saw its token go.
             ghost = RcState(rc="robot/ghost", host="h", instance="gone", sharable=False)

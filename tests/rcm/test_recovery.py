@@ -245,3 +245,10 @@ def test_a_hold_known_from_rcs_only_is_not_vouched_for_by_another_report(vouched
     known = ArcStatus(request, PLACE, None, request.needs, {}, NOW, 0, 0, None, None, vouched)
     found = recover([rc("robot/a", hold(ALONE))], [], NOW, admission, known=lambda _: known)
     assert [(held.vouched, held.place) for held in found.holds] == [(vouched, PLACE if vouched else None)]
+
+
+def test_what_goes_on_at_another_client_is_believed_of_no_request_that_waits() -> None:
+    """Its old client handed it over, missed the answer, and still believes in its grant."""
+    found = recover(BOTH, [RUNS, client(asked(grant=Grant(TERM, 5)), name="h/old")], NOW, plain())
+    assert summary(found) == (["gang"], [])
+    assert found.believed == {}

@@ -31,8 +31,9 @@ async def answer(mesh: Mesh, key: str, question: Any, kind: type[R], timeout: fl
 class MemoryFleet:
     """Processes on one network, one of which only watches."""
 
-    def __init__(self) -> None:
-        self.network = MemoryNetwork()
+    def __init__(self, *, closed: bool = False) -> None:
+        """`closed`: as with certificates."""
+        self.network = MemoryNetwork(closed=closed)
         self.watcher = self.mesh("watcher", "all")
         self.failures: list[Exception] = []
 

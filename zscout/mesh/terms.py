@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Callable
 
 from zscout.keyexpr import BadName, Role, Token, client_of
+from zscout.mesh.exchange import Reply
 from zscout.mesh.session import Mesh
 from zscout.mesh.supervision import Supervisor
 from zscout.messages import MAX_COUNTER, ClientRequests, RcAsk, RcmState, RcState, StateAsk, of_the_last
@@ -41,11 +42,14 @@ async def promised_elsewhere(mesh: Mesh, *, timeout: float) -> Term:
         mesh.living(keys.alive_any(), timeout=timeout),
         mesh.ask(keys.rc_state_any, RcAsk(), RcState, timeout=timeout),
         mesh.ask(keys.requests_any, RcAsk(), ClientRequests, timeout=timeout),
-        mesh.ask(keys.rcm_state, StateAsk(holds_only=True), RcmState, timeout=timeout),
+        mesh.ask(keys.ask_state(mesh.me), StateAsk(holds_only=True), RcmState, timeout=timeout),
     )
     seen = {key for token in tokens if (key := _key_of(mesh, token)) is not None}
     # A leader's instance has one term: it vouches for itself.
     seen |= {token.instance for token in tokens if token.role == Role.RCM}
+    if keys.closed:
+        # There a leader's word counts, or that of the RCs of two hosts.
+        rcs, clients = _second(rcs, tokens), []
     said = [(reply.key, reply.message.term) for reply in rcs if reply.message is not None]
     said += [(reply.key, reply.message.term) for reply in clients if reply.message is not None]
     said += [(reply.message.term.rcm, reply.message.term) for reply in leaders if reply.message is not None]
@@ -54,6 +58,19 @@ async def promised_elsewhere(mesh: Mesh, *, timeout: float) -> Term:
         if witness in seen and term.counter <= MAX_COUNTER:
             words[witness] = min(term, words.get(witness, term))
     return max(words.values(), default=NO_TERM)
+
+
+def _second(replies: list[Reply[RcState]], tokens: list[Token]) -> list[Reply[RcState]]:
+    """Of RCs that are seen, those which obey no higher term than RCs of another host do."""
+    hosts = {(token.name, token.instance): token.host for token in tokens if token.role == Role.RC}
+    shown = [
+        (reply, reply.message.term, host)
+        for reply in replies
+        if reply.message is not None and (host := hosts.get((reply.message.rc, reply.message.instance))) is not None
+    ]
+    return [
+        reply for reply, term, host in shown if any(other != host and another >= term for _, another, other in shown)
+    ]
 
 
 def _key_of(mesh: Mesh, token: Token) -> str | None:

@@ -60,9 +60,13 @@ class Places:
         if place.term == self.term:
             return False
         if self._key is not None:
-            expected = self.seal(place, arc_id(client, id_)) or ""
-            return seal is not None and hmac.compare_digest(expected.encode(), seal.encode())
+            return self.proves(place, client, id_, seal)
         return owners is None and seen
+
+    def proves(self, place: Place, client: ClientId, id_: str, seal: str | None) -> bool:
+        """Return True if a leader of this fleet sealed that place for this request."""
+        expected = self.seal(place, arc_id(client, id_))
+        return None not in (expected, seal) and hmac.compare_digest(f"{expected}".encode(), f"{seal}".encode())
 
     def takes_the_word_for(self, place: Place) -> bool:
         """Whether whoever shows this place first has it: nothing here tells whose it is."""

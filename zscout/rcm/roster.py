@@ -21,6 +21,7 @@ from zscout.rcm.admission import Admission
 from zscout.rcm.deadlines import Deadlines
 from zscout.rcm.devices import ExpectedDevices
 from zscout.rcm.recovery import adopted, aged, gangs_of
+from zscout.rcm.terms import Source, Word
 from zscout.scheduling.model import ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
 from zscout.types import SECOND, ArcId, ClientId, Grant, HostName, Ns, RcName, Term
 
@@ -39,6 +40,7 @@ NEAR_END: Final[Ns] = SECOND // 20
 """A hold with less than this left may have ended at its RC: clocks differ a little."""
 AWAY_PART: Final = 0.25
 """A leader that stalled for this part of the mesh lease, or lost several hosts within it, was away itself."""
+SHUNNED: Final = "its host alone shows a term in which nobody leads"
 MAX_TOKENS: Final = 2_000
 """Tokens of one host that count: later ones are ignored."""
 PRESENT_WITHIN: Final = 0.05
@@ -81,6 +83,7 @@ class _Due(Enum):
     WAITED = "a pending RC has waited so long (ns)"
     FREE = "a departed RC serves nobody any longer"
     DROP_UNSEEN = "RCs and tokens had a lease to show themselves"
+    SHUNNED = "an RC no longer counts as absent for the term that it shows"
     JOIN_ALL = "RCs away from home may join"
 
 
@@ -88,8 +91,8 @@ class _Due(Enum):
 class Change:
     """What follows from a stimulus, in the order in which it is carried out."""
 
-    higher: list[tuple[Term, str | None]] = field(default_factory=list)
-    """Terms above the own, each with the RC or client (with a token) that obeys it."""
+    higher: list[tuple[Word, Token | None]] = field(default_factory=list)
+    """Terms above the own, and for an RC that is seen its token."""
     disbelieved: list[tuple[RcName, Term]] = field(default_factory=list)
     """RCs that obey a term so low that they take the own one for a forgery, while none has joined."""
     events: list[Event] = field(default_factory=list)
@@ -170,6 +173,8 @@ class Roster:
         self._tokens: Counter[HostName] = Counter()
         self._surplus: set[HostName] = set()
         """Hosts whose surplus was reported."""
+        self.shunned: set[str] = set()
+        """Instances of RCs that count as absent, for the terms that they show."""
         self._asked: set[ClientId] = set()
         self._doubted: set[ClientId] = set()
         """Clients that disappeared while it was unknown whether this leader was away."""
@@ -260,6 +265,21 @@ class Roster:
             self._report(self._rc(state.rc), state)
         return self._taken()
 
+    def shun(self, now: Ns, token: Token, until: Ns) -> Change:
+        """An RC shows a term that is not believed: it counts as absent until then."""
+        self._now = now
+        rc = self._rc(token.name)
+        if until <= now or token.instance in self.shunned:
+            return self._taken()
+        self.shunned.add(token.instance)
+        self._set(until - now, _Due.SHUNNED, token)
+        if rc.pending is not None and rc.pending.state.instance == token.instance:
+            rc.pending = None
+            self._settle()
+        if rc.joined is not None and rc.joined.instance == token.instance:
+            self._drop(token.name, SHUNNED)
+        return self._taken()
+
     def expect(self, now: Ns, client: ClientId) -> None:
         """A client with requests has a lease to show a token. It is not dropped if it answers then, or its session is
         seen."""
@@ -284,6 +304,10 @@ class Roster:
         else:
             self._ask(Why.SOUGHT, self._keys.alive_any(Role.CLIENT), client=client, number=number)
         return self._taken()
+
+    def client_word(self, client: ClientId, term: Term) -> Word:
+        """A client says that it obeys `term`."""
+        return Word(term, Source.CLIENT, client, client_of(client).host if client in self.clients else "")
 
     def ask_requests(self, now: Ns, client: ClientId) -> Change:
         """Question a client for its requests, until it answers or is gone."""
@@ -347,6 +371,9 @@ class Roster:
                     self._wait_over(pending, wait)
                 case _Due.FREE, gone:
                     self._free(gone)
+                case _Due.SHUNNED, token:
+                    self.shunned.discard(token.instance)
+                    self._ask_promise(token)
                 case _Due.DROP_UNSEEN, _:
                     self._drop_unseen()
                 case _Due.JOIN_ALL, _:
@@ -423,7 +450,7 @@ class Roster:
     def _listed(self, client: ClientId, message: Any, problem: Problem | None) -> None:
         silent = f"{client} is seen and does not answer"
         if problem is not None and problem.term is not None:
-            self._see(problem.term, client if client in self.clients else None)
+            self._see(self.client_word(client, problem.term))
         if isinstance(message, ClientRequests) and message.client == client:
             self._asked.discard(client)
             self._change.suspicions.append((silent, False))
@@ -574,7 +601,7 @@ class Roster:
         self._change.events.append(RcLost(token.name, "it started anew"))
         self._change.named[token.name] = None
 
-    def _drop(self, name: RcName) -> None:
+    def _drop(self, name: RcName, why: str = "") -> None:
         rc = self._rc(name)
         gone, rc.joined, rc.unseen = rc.joined, None, False
         if gone is None:
@@ -582,7 +609,7 @@ class Roster:
         rc.departed = gone
         self._set(self._hold_lease + round((gone.settle or 0) * SECOND), _Due.FREE, gone)
         self._probe(self._keys.rc_state(name), RcState, token=Token(gone.host, Role.RC, name, gone.instance))
-        self._change.events.append(RcLost(name, why=self._devices.why_gone(name, gone.host)))
+        self._change.events.append(RcLost(name, why=why or self._devices.why_gone(name, gone.host)))
         if gone.leaving:
             self._free(gone)
         self._ask_others(rc)
@@ -623,7 +650,7 @@ class Roster:
 
     def _is_wanted(self, rc: _Rc, token: Token) -> bool:
         """Return True if an instance lives and may join: where none has, or as the successor of one on its host."""
-        if token.instance not in rc.tokens:
+        if token.instance not in rc.tokens or token.instance in self.shunned:
             return False
         present = rc.pending.state if rc.pending is not None else rc.joined
         if present is not None:
@@ -637,7 +664,7 @@ class Roster:
         """The answer of an RC that was asked for its promise; without one it is asked again."""
         rc = self._rc(token.name)
         if problem is not None and problem.term is not None:
-            self._see(problem.term, token.name if token.instance in rc.tokens else None)
+            self._see_rc(rc, token.name, token.instance, problem.term)
             alone = not any(rc.joined or rc.pending for rc in self._rcs.values())
             if alone and disbelieved(self.term, problem.term):
                 self._change.disbelieved.append((token.name, problem.term))
@@ -707,7 +734,9 @@ class Roster:
         self._change.settled = True
 
     def _report(self, rc: _Rc, state: RcState) -> None:
-        self._see(state.term, state.rc if state.instance in rc.tokens else None)
+        if state.instance in self.shunned:
+            return
+        self._see_rc(rc, state.rc, state.instance, state.term)
         if rc.pending is not None and rc.pending.state.instance == state.instance:
             rc.pending.state, rc.pending.since = state, self._now
         known, gone = rc.joined, rc.departed
@@ -743,9 +772,13 @@ class Roster:
     def _set(self, delay: Ns, due: _Due, subject: Any = None) -> None:
         self._deadlines.set(self._now + delay, (due, subject))
 
-    def _see(self, term: Term, obeyed_by: str | None) -> None:
-        if term > self.term:
-            self._change.higher.append((term, obeyed_by))
+    def _see(self, word: Word, token: Token | None = None) -> None:
+        if word.term > self.term:
+            self._change.higher.append((word, token))
+
+    def _see_rc(self, rc: _Rc, name: RcName, instance: str, term: Term) -> None:
+        token = rc.tokens.get(instance)
+        self._see(Word(term, Source.RC, name, "" if token is None else token.host), token)
 
     def _suspect(self, key: str, *, so: bool = True) -> None:
         self._change.suspicions.append((f"{key} answers, and its token is missing", so))

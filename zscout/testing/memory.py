@@ -71,8 +71,16 @@ class MemoryNetwork:
     part of it, `impatience` at most. `relink`: the longest time from when a lost link could work until it does."""
 
     def __init__(
-        self, *, delay: float = 0.0002, lease: float = 1.0, impatience: float = 0.0, relink: float = 0.0, seed: int = 0
+        self,
+        *,
+        delay: float = 0.0002,
+        lease: float = 1.0,
+        impatience: float = 0.0,
+        relink: float = 0.0,
+        seed: int = 0,
+        closed: bool = False,
     ) -> None:
+        self.closed = closed  # keys as with certificates; nobody is refused
         self.delay, self.lease, self.impatience, self.relink = delay, lease, impatience, relink
         self.random = random.Random(seed)  # noqa: S311 - what failed once must fail again
         self.nodes: list[MemoryTransport] = []
@@ -92,7 +100,7 @@ class MemoryNetwork:
 
     def open(self, fleet: str, me: Sender) -> MemoryMesh:
         node = self._session()
-        return MemoryMesh(RenewableTransport(node, [self._another]), Keys(fleet), me, node.now)
+        return MemoryMesh(RenewableTransport(node, [self._another]), Keys(fleet, closed=self.closed), me, node.now)
 
     def _session(self) -> MemoryTransport:
         node = MemoryTransport(self, next(self._ids))

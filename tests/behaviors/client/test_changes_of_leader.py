@@ -7,12 +7,15 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 import pytest
+from msgspec.structs import replace
 
 from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, SmallFleet, held, small_fleet, transport_of
 from tests.mesh.kit import until
 from zscout.behaviors.client.arc import hold
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import OpenArc
+from zscout.config.access import AccessPolicy, Roles
+from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token
 from zscout.mesh import Declaration, IncomingQuery
 from zscout.messages import Ask, Notice
@@ -100,7 +103,7 @@ async def test_an_rcm_far_above_is_followed_once_no_other_is_heard() -> None:
         await until(lambda: one.internals.term.counter)
         await fleet.candidates.pop("h0").stop()
         candidate = fleet.candidates["h1"] = Candidate(fleet.mesh("h1", "node"), FLEET)
-        candidate.known = far = Term(10**9, "far")
+        candidate.terms.highest = far = Term(10**9, "far")
         candidate.start()
         await until(lambda: one.internals.term > far, within=FLEET.timing.hold_lease / SECOND + 3)
         await held(one, "first")
@@ -155,3 +158,40 @@ async def test_the_answer_of_an_rcm_that_has_been_replaced_is_none() -> None:
         await asyncio.sleep(0.5)
         answers.loss = 0.0
         await until(lambda: waits.state == "running", within=1.3)
+
+
+class ClosedFleet(SmallFleet):
+    """As with certificates."""
+
+    def __init__(self, fleet: Fleet = FLEET) -> None:
+        super().__init__(fleet)
+        self.network.closed = True
+
+
+CLOSED = replace(FLEET, access=AccessPolicy(roles=Roles(client=("h",))))
+
+
+async def test_with_certificates_a_client_goes_back_after_a_hold_lease_to_the_leader_that_it_sees() -> None:
+    """What it heard of a higher term is nothing to that fleet, and its word moves nothing."""
+    async with small_fleet("one", config=CLOSED, kind=ClosedFleet) as (fleet, (one,)):
+        await until(lambda: one.internals.term.counter)
+        arc, _ = await held(one, "first")
+        one.internals.rcm.accept(Term(9, "gone"))
+        began, lease = asyncio.get_running_loop().time(), FLEET.timing.hold_lease / SECOND
+        await until(lambda: one.internals.term.counter == 1, within=2 * lease + 1)
+        assert asyncio.get_running_loop().time() - began >= lease - 1
+        assert await one.granted(arc)
+        assert fleet.candidates["h0"].terms_led == 1
+
+
+async def test_with_certificates_a_promise_to_a_candidate_that_died_costs_no_hold() -> None:
+    async with small_fleet("one", config=CLOSED, kind=ClosedFleet) as (fleet, (one,)):
+        arc, grant = await held(one, "first")
+        fleet.candidate("h1")
+        await asyncio.sleep(1)
+        one.internals.rcm.accept(Term(9, "gone"), promise=True)
+        await fleet.lose_leader()
+        await until(lambda: one.leader == "h1")
+        await until(lambda: one.internals.term.counter == 2, within=0.5)
+        await asyncio.sleep(5)
+        assert (arc.grant, await fleet.holders()) == (grant, ["first"])

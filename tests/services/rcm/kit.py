@@ -34,6 +34,7 @@ from zscout.messages import (
     StateAsk,
 )
 from zscout.rcm.recovery import RecoveredState
+from zscout.rcm.terms import BELIEVED, Verdict, Word
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.rcm import Rcm
 from zscout.testing.memory import MemoryMesh
@@ -171,8 +172,8 @@ def request(
 class FakeFleet(MemoryFleet):
     """`published`: what was published on `rcm/grants`, without heartbeats."""
 
-    def __init__(self, *candidates: str, strategy: str = "priority") -> None:
-        super().__init__()
+    def __init__(self, *candidates: str, strategy: str = "priority", closed: bool = False) -> None:
+        super().__init__(closed=closed)
         self.fleet: Fleet = msgspec.structs.replace(default_fleet(), candidates=candidates, strategy=strategy)
         self.log: list[tuple[str, str, str]] = []
         self.published: list[Grants] = []
@@ -188,11 +189,15 @@ class FakeFleet(MemoryFleet):
             self.published.append(grants)
             self.log.append(("all", "grants", " ".join(sorted(grants.rcs))))
 
+    def _on_newer(self, word: Word) -> Verdict:
+        self.newer.append(word.term)
+        return BELIEVED
+
     def rcm(self, counter: int = 1, recovered: RecoveredState | None = None) -> Rcm:
         """A leader without a candidate, on a host of its own."""
         mesh = self.mesh("leader")
         term = Term(counter, "rcm")
-        rcm = Rcm(mesh, self.fleet, term, lambda newer, _: self.newer.append(newer), self.failures.append)
+        rcm = Rcm(mesh, self.fleet, term, self._on_newer, self.failures.append)
         rcm.start(recovered or RecoveredState())
         return rcm
 

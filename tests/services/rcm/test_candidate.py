@@ -287,7 +287,7 @@ async def test_a_candidate_that_alone_believes_a_forged_term_leads_once_rcs_beli
     fleet = FakeFleet("h1", "h3")
     robot, first, misled = await a_robot(fleet), fleet.candidate("h1"), fleet.candidate("h3")
     await until(lambda: robot.holds.term != NO_TERM)
-    misled.known = Term(10**9, "mad")
+    misled.terms.highest = Term(10**9, "mad")
     await first.stop()
     await until(lambda: misled.rcm)
     assert misled.rcm is not None
@@ -301,7 +301,7 @@ async def test_a_candidate_that_rcs_misled_before_it_knew_better_tells_the_other
     fleet = FakeFleet("h1", "h3")
     robot, first, misled = await a_robot(fleet), fleet.candidate("h1"), fleet.candidate("h3")
     await until(lambda: robot.holds.term != NO_TERM)
-    misled.known = far = Term(10**9, "mad")
+    misled.terms.highest = far = Term(10**9, "mad")
     fleet.network.kill(first.mesh)
     mad = fleet.rc("robot/b", term=far)
     if not has_token:
@@ -317,7 +317,7 @@ async def test_a_leader_without_rcs_steps_down_where_those_it_sees_do_not_believ
     robot, first, misled = await a_robot(fleet), fleet.candidate("h1"), fleet.candidate("h3")
     await until(lambda: robot.holds.term != NO_TERM)
     fleet.network.isolate(misled.mesh)
-    misled.known = Term(10**9, "mad")
+    misled.terms.highest = Term(10**9, "mad")
     await until(lambda: misled.rcm)
     fleet.network.heal()
     await until(lambda: misled.rcm is None)

@@ -41,7 +41,8 @@ MISSED = {
     "order": 15, "grant": 1, "safe first": 1, "snapshots": 1, "step down": 1, "reopen": 2, "places": 2,
     "withdrawn": 55, "believed": 130, "settling": 8, "deadline": 8, "once": 10, "sealed": 10, "copied": 3,
     "dates": 1043, "merged": 3, "caught up": 4, "one stands": 33, "awaited": 103, "had again": 13, "dates first": 94,
-    "fleet time": 4, "late": 173, "slewed": 3, "door": 6, "clamped": 6, "certified": 6, "managers": 6,
+    "fleet time": 4, "late": 173, "slewed": 3, "door": 5, "clamped": 5, "certified": 5, "managers": 5,
+    "words": 6, "doubted": 46, "sealed terms": 26, "back": 36,
 }  # fmt: skip
 """Guards without which some promise breaks within a few runs, and the seed of docs/promises.md, which is tried first;
 `python -m studies faults --without` tries the others."""
@@ -87,7 +88,7 @@ def test_a_run_leaves_nothing_in_memory() -> None:
     assert left() == before
 
 
-COSTLY = ("snapshots", "caught up", "one stands", "dates first", "step down")
+COSTLY = ("doubted", "sealed terms", "back", "snapshots", "caught up", "one stands", "dates first", "step down")
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ hold lease, holds end here as they do at their RCs.
 from __future__ import annotations
 
 import asyncio
+import logging
 from typing import Final, NoReturn
 
 import msgspec
@@ -19,8 +20,21 @@ from zscout.mesh.exchange import naming_versions
 from zscout.mesh.renewal import UNHEARD
 from zscout.mesh.supervision import StallWatch, Supervisor, done_within
 from zscout.mesh.terms import LastTerms
-from zscout.messages import Cancel, ClientRequests, Notice, Operation, Problem, RcAsk, Release, absurd
+from zscout.messages import (
+    Cancel,
+    ClientRequests,
+    Notice,
+    Operation,
+    Problem,
+    RcAsk,
+    RcmState,
+    Release,
+    StateAsk,
+    absurd,
+)
 from zscout.types import NO_TERM, SECOND, Ns, Term
+
+log = logging.getLogger(__name__)
 
 QUERY_TIMEOUT = 1.0
 ASK_AGAIN = 5.0
@@ -52,6 +66,10 @@ class RcmLink:
         self.key = mesh.keys.schedule(mesh.me)
         self.term: Term = NO_TERM
         """The highest term received or promised; what is of an older one is ignored."""
+        self._heard: Term = NO_TERM
+        """The highest term received from a leader: a promise alone is no word of one."""
+        self._lower: tuple[Term, Ns] = NO_TERM, 0
+        """A lower term in which a leader publishes, and since when."""
         self._unanswered = False
         """Whether the last question had no answer, or none that counts."""
         self._is_ahead = False
@@ -81,14 +99,51 @@ class RcmLink:
         """The host whose node leads, or None where no RCM is seen."""
         return next((token.host for token in sorted(self._leaders)), None)
 
-    def accept(self, term: Term, *, above: bool = False) -> bool:
-        """Whether what is of `term` counts; the highest term is kept. `above`: the fleet must go above one that an RC
-        obeys already."""
+    def accept(self, term: Term, *, promise: bool = False, above: bool = False) -> bool:
+        """Whether what is of `term` counts; the highest term is kept. `promise`: it is a candidate's. `above`: the
+        fleet must go above one that an RC obeys already."""
+        if term < self.term and not promise and self._only_promised(term):
+            self._go_back(term)
         if term < self.term or absurd(term, self.term, heard=self._hears and not above):
             self._last_terms.shown(term, self.term)
             return False
         self.term = term
+        if not promise:
+            self._heard = term
         return True
+
+    def _only_promised(self, term: Term) -> bool:
+        """Return True if a leader of `term` is seen, and the highest term is but a promise to a candidate."""
+        newer = self._heard < term and self._heard < self.term
+        return self.mesh.keys.closed and newer and any(token.instance == term.rcm for token in self._leaders)
+
+    async def _follow_lower(self, terms: list[Term]) -> None:
+        """Go back to the leader that is seen, where nothing of the highest term was received for the hold lease, and
+        RCs obey it. Without certificates any word moves the fleet above instead."""
+        now, lease = self.mesh.now(), self.fleet.timing.hold_lease
+        term = max(terms, default=NO_TERM)
+        if not self.mesh.keys.closed or self._hears or term >= self.term:
+            self._lower = NO_TERM, now
+        elif term > NO_TERM:
+            if term != self._lower[0]:
+                self._lower = term, now
+            seen = any(token.instance == term.rcm for token in self._leaders)
+            if now - self._lower[1] >= lease and seen and await self._is_obeyed(term) and term < self.term:
+                self._go_back(term)
+
+    async def _is_obeyed(self, term: Term) -> bool:
+        ask, key = StateAsk(devices_only=True), self.mesh.keys.ask_state(self.mesh.me)
+        replies = await self.mesh.ask(key, ask, RcmState, timeout=QUERY_TIMEOUT)
+        states = [reply.message for reply in replies if reply.message is not None]
+        return any(state.term == term and any(rc.present for rc in state.rcs) for state in states)
+
+    def _go_back(self, term: Term) -> None:
+        log.warning("back from term %d to the leader of term %d", self.term.counter, term.counter)
+        self.term = self._heard = term
+        self._is_ahead = False
+        self.store.go_back(term)
+        self._changes += 1
+        self.leader_came.set()
 
     def _learn(self, term: Term) -> None:
         self.term = max(self.term, term)
@@ -130,7 +185,7 @@ class RcmLink:
 
     def _promise(self, request: IncomingQuery[RcAsk], *, above: bool) -> None:
         promise = request.message.promise
-        promised = promise is None or self.accept(promise, above=above)
+        promised = promise is None or self.accept(promise, promise=True, above=above)
         if not promised and not request.message.ordinary:
             raise Refused("old_term", f"this client obeys term {self.term.counter}", self.term)
         request.answer(ClientRequests(client=str(self.mesh.me), requests=self.store.open_requests(), term=self.term))
@@ -149,7 +204,9 @@ class RcmLink:
             await asyncio.sleep(lease / SECOND / CHECKS_PER_LEASE)
             now = self.mesh.now()
             # As at the RCs: an RCM that was replaced, or whose term is absurd, keeps no hold alive.
-            believed = [self.accept(one.term) for _, one in self._published.each()]
+            published = [one.term for _, one in self._published.each()]
+            believed = [self.accept(term) for term in published]
+            await self._follow_lower(published)
             if any(believed):
                 # It may have published right after the last check.
                 self._last_contact = now - lease // CHECKS_PER_LEASE

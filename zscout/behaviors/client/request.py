@@ -255,6 +255,17 @@ class OpenArc:
         self._lose("its old client is to hand it over once more", now)
         self.state, self._came, self._last = "awaited", None, (notice.term, notice.step)
 
+    def _go_back(self, term: Term) -> None:
+        """Forget what leaders of terms above `term` said: their fleet knows no such term any more."""
+        if self._last[0] > term:
+            self._last = NO_TERM, 0
+        if self._place is not None and self._place.term > term:
+            self._place = self._seal = self._was = None
+        if self._unconfirmed is not None and self._unconfirmed[0].term > term:
+            self._unconfirmed = None
+        if self._unserved is not None and self._unserved.term > term:
+            self._unserved = None
+
     def _move(self, now: Ns) -> None:
         """It goes on in another client."""
         self._close(HoldEnd("handed_over", "handed over"), now)
@@ -452,6 +463,11 @@ class RequestStore:
         self.arcs.pop(arc.id, None)
         self.moved[arc.id] = arc
         self.notify(arc)
+
+    def go_back(self, term: Term) -> None:
+        """The client follows the leader of `term` after higher ones."""
+        for arc in (*self.arcs.values(), *self.moved.values(), *self.expected.values()):
+            arc._go_back(term)
 
     def reclaim(self, arc: OpenArc) -> None:
         """A moved one is this client's again, under a new id; it is to be asked for."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TypeVar
@@ -33,6 +33,7 @@ from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
 from zscout.rcm.places import Places
 from zscout.rcm.recovery import aged, take_over
+from zscout.rcm.terms import Source, Terms, Verdict, Word
 from zscout.scheduling.fair_shares import decayed
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.journal.journal import Journal
@@ -46,6 +47,7 @@ from zscout.services.rcm.election import Election
 from zscout.services.rcm.inventory import Inventory
 from zscout.services.rcm.observed_runtimes import RuntimeObserver
 from zscout.services.rcm.rcm import Rcm
+from zscout.services.rcm.term_file import TermDisk
 from zscout.types import NO_TERM, SECOND, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
@@ -57,6 +59,8 @@ WAITS = 4.0
 """Seconds for which a candidate waits for a leader that only others see: longer than RCs believe in one that went."""
 BACKOFF, MAX_BACKOFF = 1.0, 30.0
 """Seconds until a candidate that failed becomes one again: doubled each time, at most."""
+KEPT_WITHIN = 1.0
+"""Seconds that a candidate waits for its disk before it leads."""
 BACKOFF_RESET_AFTER: Ns = 60 * SECOND
 """After a candidacy at least this long the next failure begins with BACKOFF anew."""
 
@@ -74,10 +78,12 @@ class Candidate:
         listeners: Sequence[HoldListener] = (),
         journal: Journal | None = None,
         keeper: BookingKeeper | None = None,
+        disk: TermDisk | None = None,
     ) -> None:
         """`folder`: where it keeps what it must know after a restart; None: it does not. `places_key`: that by which
         the managers of a fleet seal places. `listeners` are told of holds while it leads, `journal` of publications.
-        `keeper` keeps bookings; without one it keeps them in memory, for itself."""
+        `keeper` keeps bookings; without one it keeps them in memory, for itself. `disk` keeps the highest term of a
+        fleet with `[security]`."""
         self._keeper = keeper or BookingKeeper(mesh)
         self._journal, self._runtimes = journal, RuntimeObserver()
         if journal is not None:
@@ -85,10 +91,10 @@ class Candidate:
         self._places_key = places_key
         self._authority = authority or Authority(fleet)
         self.mesh, self.fleet = mesh, fleet
-        self.known: Term = NO_TERM
-        """The highest term seen anywhere."""
-        self._goes_above = False
-        """Whether an RC or a client obeys a term so far above that others must be told why this one goes there."""
+        self._disk = disk if mesh.keys.closed else None
+        self._saved = self._disk.read() if self._disk is not None else NO_TERM
+        self._saving = asyncio.Lock()
+        self.terms = Terms(secured=mesh.keys.closed, highest=self._saved)
         self.rcm: Rcm | None = None
         self.balancer: LoadBalancer | None = None
         """Beside the RCM, while this node leads."""
@@ -114,6 +120,11 @@ class Candidate:
         self._changed = asyncio.Event()
         self._failures = 0
         self._again: asyncio.TimerHandle | None = None
+
+    @property
+    def known(self) -> Term:
+        """The highest term that it believes."""
+        return self.terms.highest
 
     async def stop(self) -> None:
         if self._again is not None:
@@ -180,7 +191,7 @@ class Candidate:
 
     def _on_grants(self, _key: str, grants: Grants) -> None:
         known = grants.term == self.known and (self.rcm is None or self.rcm.term == self.known)
-        if known or self._see(grants.term):
+        if known or self._see(Word(grants.term, Source.LEADER)).believed:
             self.election.published(grants.term, self.mesh.now())
             self._keeper.hear(grants)
             self._runtimes.hear(self.mesh.now(), grants)
@@ -202,35 +213,54 @@ class Candidate:
         self.election.candidate(token.host, alive=alive, now=self.mesh.now())
         self._changed.set()
 
-    def _see(self, term: Term, obeyed_by: str | None = None) -> bool:
-        """False: it is absurd. A term for which an RC that is seen refuses a lower one is none."""
-        heard = self.rcm is not None or self.election.heard_within(self.fleet.timing.hold_lease, self.mesh.now())
-        if self._last_terms.shown(term, self.known):
-            return False
-        if absurd(term, self.known, heard=heard):
-            if obeyed_by is None or absurd(term, self.known, heard=False):
-                log.warning("ignored term %d: absurdly far above %d", term.counter, self.known.counter)
-                return False
-            log.warning("%s obeys term %d: the fleet goes above", obeyed_by, term.counter)
-            self._goes_above = True
-        self._learn(term)
-        if self.rcm is not None and term > self.rcm.term:
-            self._step_down(f"term {term.counter} of another RCM is above {self.rcm.term.counter}")
-        return True
+    def _see(self, word: Word) -> Verdict:
+        """A term was shown. A leader steps down below one that it believes."""
+        now, before = self.mesh.now(), self.known
+        heard = self.rcm is not None or self.election.heard_within(self.fleet.timing.hold_lease, now)
+        verdict = self.terms.hear(word, now, heard=heard)
+        if verdict.last:
+            self._last_terms.shown(word.term, before)
+        if verdict.why:
+            log.warning("%s", verdict.why)
+        if verdict.believed and self.known > before:
+            self._keep_soon()
+        if verdict.believed and self.rcm is not None and word.term > self.rcm.term:
+            led = word.source is Source.LEADER or not self.terms.secured
+            self._step_down(f"term {word.term.counter} of another RCM is above {self.rcm.term.counter}", led=led)
+        return verdict
 
     def _disbelieved(self, rc: RcName, term: Term) -> None:
         """The own RCM has no RC, and one that obeys another takes its term for a forgery."""
         if self.rcm is not None:
             self._step_down(f"{rc} hears an RCM of term {term.counter}, and does not believe {self.rcm.term.counter}")
 
-    def _step_down(self, why: str) -> None:
+    def _step_down(self, why: str, *, led: bool = True) -> None:
+        """`led`: somebody is known to lead, or may be for all that is known."""
         log.warning("stepping down: %s", why)
-        self.election.deposed(self.mesh.now(), RANDOM.get().uniform(0.7, 1.3))
+        self.election.deposed(self.mesh.now(), RANDOM.get().uniform(0.7, 1.3), led=led)
         self._stop_leading()
         self._changed.set()
 
     def _learn(self, term: Term) -> None:
-        self.known = max(self.known, term)
+        self.terms.highest = max(self.known, term)
+
+    def _keep_soon(self) -> None:
+        if self._disk is not None and not self._saving.locked():
+            self._supervisor.spawn(self._keep())
+
+    async def _keep(self, tried: Term = NO_TERM) -> None:
+        """Return once the highest term, `tried` included, is on disk, or can't be."""
+        if self._disk is None:
+            return
+        async with self._saving:
+            while (term := max(self.known, tried)) > self._saved:
+                try:
+                    async with asyncio.timeout(KEPT_WITHIN):
+                        await self._disk.write(term)
+                except (OSError, TimeoutError) as error:
+                    log.warning("term %d can't be kept on disk: %s", term.counter, error)
+                    return
+                self._saved = term
 
     # Leading
 
@@ -250,24 +280,40 @@ class Candidate:
         candidate that may be about to lead."""
         if self._stall.fresh():
             self.election.stood_still(self.mesh.now())
-        replies = await self.mesh.ask(self.mesh.keys.rc_state_any, RcAsk(), RcState, timeout=self._timeout)
-        states = self._credible(replies, lambda state: self.mesh.keys.rc_state(state.rc))
+        keys, tokens = self.mesh.keys, list[Token]()
+        asked = self.mesh.ask(keys.rc_state_any, RcAsk(), RcState, timeout=self._timeout)
+        if self.terms.secured:
+            seen = self.mesh.living(keys.alive_any(Role.RC), timeout=self._timeout)
+            replies, tokens = await asyncio.gather(asked, seen)
+        else:
+            replies = await asked
+        states = [state for state, _ in self._credible(replies, lambda state: keys.rc_state(state.rc))]
         before = self.known
-        for state, _ in states:
-            self._see(state.term)
+        states = await self._hear_rcs(states, tokens)
         if self.known > before:
             self.election.rivalled(self.mesh.now())
             return True
-        self._goes_above |= await self._divided([state for state, _ in states])
+        self.terms.goes_above |= await self._divided(states)
         host = self.mesh.me.host
-        others = [bool(state.leader) for state, _ in states if state.host != host]
-        own = [bool(state.leader) for state, _ in states if state.host == host]
+        others = [bool(state.leader) for state in states if state.host != host]
+        own = [bool(state.leader) for state in states if state.host == host]
         if self.election.must_wait(others, own, self.mesh.now(), self._leader):
             log.info("%d of %d RCs of other hosts still see a leader: waiting", sum(others), len(others))
             if sum(others) * 2 > len(others):
                 self.mesh.suspicions.suspect(UNSEEN, patience=WAITS)
             return True
         return False
+
+    async def _hear_rcs(self, states: list[RcState], tokens: list[Token]) -> list[RcState]:
+        """Take the terms of RCs. Return those that do not count as absent for what they show."""
+        hosts = {(token.name, token.instance): token.host for token in tokens}
+        words = [Word(state.term, Source.RC, state.rc, hosts.get((state.rc, state.instance), "")) for state in states]
+        now, silence = self.mesh.now(), self.fleet.silence
+        return [
+            state
+            for state, word in zip(states, words, strict=True)
+            if not self._see(word).absent_until and not self.terms.is_led_nowhere(word.term, word.host, now, silence)
+        ]
 
     async def _divided(self, states: list[RcState]) -> bool:
         """Whether an RC that is seen obeys a term which is absurd to others: they are told why this one goes above."""
@@ -283,19 +329,25 @@ class Candidate:
         if self.election.sees_leader(self.mesh.now()):
             return False
         if self.known.counter == MAX_COUNTER:
-            log.error("no term is left: end all nodes and clients of the fleet, and start them again")
+            log.error(
+                "no term is left: end all nodes and clients, remove term.json from state folders, and start again"
+            )
             return False
         term = Term(self.known.counter + 1, new_instance())
-        promise_query = RcAsk(promise=term, above=self.mesh.me.host if self._goes_above else None, ordinary=True)
+        self.terms.tries(term)
+        promise_query = RcAsk(promise=term, above=self.mesh.me.host if self.terms.goes_above else None, ordinary=True)
         booked = ShareBookings(term, self._keeper.records.digest())
-        rcs, clients, keepers = await asyncio.gather(
+        rcs, clients, keepers, _ = await asyncio.gather(
             self.mesh.ask(keys.rc_state_any, promise_query, RcState, timeout=self._timeout),
             self.mesh.ask(keys.requests_any, promise_query, ClientRequests, timeout=self._timeout),
             self.mesh.ask(keys.bookings_any, booked, BookingsKept, timeout=self._timeout),
+            self._keep(term),
         )
         refusals = [_refusal(reply, term) for reply in rcs]
-        for key, other in filter(None, [*refusals, *(_refusal(reply, term) for reply in clients)]):
-            await self._refused(key, other)
+        await self._hear_refusals(Source.RC, refusals)
+        await self._hear_refusals(Source.CLIENT, [_refusal(reply, term) for reply in clients])
+        open_requests = self._credible(clients, lambda one: keys.requests(client_of(one.client)))
+        self._hear_seals(one for one, _ in open_requests)
         if self.known > term:
             self.election.rivalled(self.mesh.now())
             return False
@@ -306,19 +358,31 @@ class Candidate:
             return False
         now = self.mesh.now()
         states = [aged(state, now - arrived) for state, arrived in answers]
-        open_requests = self._credible(clients, lambda one: keys.requests(client_of(one.client)))
         asking = [one for one, _ in open_requests if one.term in (term, NO_TERM)]
         kept = [one for one in credible(keepers, keys, now) if self._authority.may_lead(one.host)]
         return await self._lead(term, states, asking, kept)
 
-    async def _refused(self, key: str, term: Term) -> None:
-        """An RC or a client obeys a higher term. What has no token may be anybody's word."""
-        keys, names = self.mesh.keys, set[str]()
-        if absurd(term, self.known):
+    async def _hear_refusals(self, source: Source, refusals: list[tuple[str, Term] | None]) -> None:
+        """RCs or clients obey higher terms. What has no token may be anybody's word."""
+        keys, hosts = self.mesh.keys, dict[str, str]()
+        shown = [(key, term) for key, term in filter(None, refusals) if self.terms.is_news(term, source)]
+        if any(self.terms.secured or absurd(term, self.known) for _, term in shown):
             seen = await self.mesh.living(keys.alive_any(), timeout=self._timeout)
-            names = {keys.rc_state(one.name) for one in seen if one.role == Role.RC}
-            names |= {keys.requests(Sender(one.host, one.name)) for one in seen if one.role == Role.CLIENT}
-        self._see(term, obeyed_by=key if key in names else None)
+            hosts = {keys.rc_state(one.name): one.host for one in seen if one.role == Role.RC}
+            hosts |= {keys.requests(Sender(one.host, one.name)): one.host for one in seen if one.role == Role.CLIENT}
+        for key, term in shown:
+            self._see(Word(term, source, key, hosts.get(key, "")))
+
+    def _hear_seals(self, answers: Iterable[ClientRequests]) -> None:
+        """Take the terms of places that clients list with a right seal."""
+        places = Places(self.fleet.name, self._places_key, NO_TERM)
+        for answer in answers if self.terms.secured else ():
+            for request in answer.requests:
+                place = request.place
+                if place is None or place.term <= self.known:
+                    continue
+                if places.proves(place, answer.client, request.was or request.id, request.seal):
+                    self._see(Word(place.term, Source.SEAL, answer.client, client_of(answer.client).host))
 
     def _credible(self, replies: list[Reply[R]], key_of: Callable[[R], str]) -> list[tuple[R, Ns]]:
         """The messages of `replies` that name in themselves whom their key names, and when they came; others prove
@@ -346,7 +410,7 @@ class Candidate:
             passed = self.mesh.now() - self._charged_at
             recovered.charged = {group: decayed(had, passed, fair.half_life) for group, had in self._charged.items()}
         recovered.patient = self.election.links_return(self.mesh.now(), self._leader)
-        self._learn(term)
+        self.terms.highest = term
         rcm = Rcm(
             self.mesh,
             self.fleet,
@@ -368,7 +432,8 @@ class Candidate:
             self._leading.close()
             self.election.rivalled(self.mesh.now())
             return False
-        self.rcm, self._goes_above = rcm, False
+        self.rcm, self.terms.goes_above = rcm, False
+        self.terms.led(term, self.mesh.now())
         counts = len(recovered.rcs), len(recovered.holds), len(recovered.waiting)
         log.info("leading in term %d: %d RCs, %d holds, %d waiting", term.counter, *counts)
         self.terms_led += 1

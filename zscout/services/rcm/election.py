@@ -42,6 +42,8 @@ class Election:
         """When a leader that counts was seen or heard last."""
         self._deposed: Ns | None = None
         self._depositions = 0
+        self._led = True
+        """Whether somebody may lead in the term that deposed it."""
         self._yields_until: Ns = 0
         self._lost: dict[str, Ns] = {}
         """Hosts whose candidates were seen to go, and when."""
@@ -87,8 +89,12 @@ class Election:
         """A higher term than was known is promised: another candidate leads in it within a turn, or has failed."""
         self._not_before = now + TURN
 
-    def deposed(self, now: Ns, jitter: float) -> None:
-        """A higher term ended the own one. `jitter` is about 1."""
+    def deposed(self, now: Ns, jitter: float, *, led: bool = True) -> None:
+        """A higher term ended the own one. `jitter` is about 1. Not `led`: it was promised, and nobody is known to lead
+        in it; who does shows himself within a turn, or RCs see him."""
+        self._led = led
+        if not led:
+            self._heard, self._not_before = None, now + TURN
         if self._deposed is None or now - self._deposed > CALM:
             self._depositions = 0
         self._yields_until = now + round((self.silence << min(self._depositions, MAX_DOUBLINGS)) * jitter)
@@ -108,7 +114,11 @@ class Election:
             self._alone_since = None
             yields = now < self._yields_until and (self._heard_lately(now) or any(others))
             return yields or sum(others) * 2 > len(others)
-        if self._deposed is not None and now < min(self._yields_until, self._deposed + ALONE * self.silence):
+        if (
+            self._led
+            and self._deposed is not None
+            and now < min(self._yields_until, self._deposed + ALONE * self.silence)
+        ):
             # Who deposed this candidate goes on, though nobody who could say so is seen: the two would take turns.
             return True
         if sum(own) * 2 <= len(own) and not self._was_away(now, leader) and self._alone_since is None:

@@ -30,6 +30,7 @@ from zscout.rcm.places import Places, arc_id, request_id
 from zscout.rcm.recovery import RecoveredState, listed_by, removed, vouched
 from zscout.rcm.request_log import REMEMBERED, RequestLog, reason_info
 from zscout.rcm.roster import MAX_TOKENS, Change, Question, Roster, discrepancies
+from zscout.rcm.terms import Verdict, Word
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
     Adopted,
@@ -108,7 +109,7 @@ class Rcm:
         mesh: Mesh,
         fleet: Fleet,
         term: Term,
-        on_newer: Callable[[Term, str | None], object],
+        on_newer: Callable[[Word], Verdict],
         on_failure: Callable[[Exception], object],
         inventory: Inventory | None = None,
         authority: Authority | None = None,
@@ -309,8 +310,7 @@ class Rcm:
 
     def _follow(self, change: Change) -> None:
         """Carry out what follows for the roster, in its order."""
-        for term, obeyed_by in change.higher:
-            self._on_newer(term, obeyed_by)
+        verdicts = [(token, self._on_newer(word)) for word, token in change.higher]
         for rc, term in change.disbelieved:
             self.on_disbelieved(rc, term)
         if not self.supervisor.active:
@@ -339,6 +339,9 @@ class Rcm:
             log.warning("duplicate device %s at %s; another host's is used", rc, host)
         if change.surplus:
             log.warning("%s shows more than %d tokens: later ones are ignored", change.surplus, MAX_TOKENS)
+        for token, verdict in verdicts:
+            if token is not None and verdict.absent_until:
+                self._follow(self.roster.shun(self.mesh.now(), token, verdict.absent_until))
         self._set_wake(self._core_wake)
 
     async def _ask(self, asked: Question) -> None:

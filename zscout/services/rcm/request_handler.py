@@ -38,6 +38,7 @@ from zscout.rcm.places import arc_id, request_id
 from zscout.rcm.recovery import Listed, vouched
 from zscout.rcm.request_log import RequestLog, party_info, reason_info
 from zscout.rcm.roster import Change, Roster
+from zscout.rcm.terms import Source, Word
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import (
@@ -146,10 +147,7 @@ class RequestHandler:
                 self.bookings.handler.on_operation(query)
 
     def _ask(self, query: Query, ask: Ask, sender: Sender, client: ClientId) -> None:
-        if ask.term is not None and ask.term > self.core.term:
-            seen = client if client in self._roster.clients else None
-            self._follow(Change(higher=[(ask.term, seen)]))
-            raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
+        self._check_term(ask, sender, client)
         arc = arc_id(client, ask.id)
         self._keep_order(arc)
         undecided = self._may_hold(arc, ask) and self._roster.awaits(self.mesh.now(), arc, ask.rcs)
@@ -177,6 +175,21 @@ class RequestHandler:
             query.answer(self._registry.handed_over(arc, ask.arc))
         else:
             self._enter(query, ask, sender, client, arc)
+
+    def _check_term(self, ask: Ask, sender: Sender, client: ClientId) -> None:
+        """Raises Refused for one from a later term: this leader steps down, if that counts."""
+        place = ask.place
+        if (
+            place is not None
+            and self.mesh.keys.closed
+            and place.term > self.core.term
+            and self._places.proves(place, client, ask.was or ask.id, ask.seal)
+        ):
+            self._follow(Change(higher=[(Word(place.term, Source.SEAL, client, sender.host), None)]))
+            raise Refused("old_term", "a leader of a later term gave this place; try again", place.term)
+        if ask.term is not None and ask.term > self.core.term:
+            self._follow(Change(higher=[(self._roster.client_word(client, ask.term), None)]))
+            raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
 
     def _enter(self, query: Query, ask: Ask, sender: Sender, client: ClientId, arc: ArcId) -> None:
         """Takes a new request. This is the way of every grant: nothing is done here that can be done once it is

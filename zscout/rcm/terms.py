@@ -1,0 +1,162 @@
+"""Which terms a manager believes, and which hosts it doubts. Pure: evidence goes in with its time.
+
+Without `[security]` every word counts. With it a term counts if a leader shows it, a sealed place names it, or an RC
+whose token is seen obeys it; a client's word does not. A host whose RCs alone showed a term in which nobody then led
+is not believed alone for a while."""
+
+from __future__ import annotations
+
+from collections import deque
+from enum import Enum, auto
+from typing import Final, NamedTuple
+
+from zscout.messages import absurd, of_the_last
+from zscout.types import NO_TERM, SECOND, HostName, Ns, Term
+
+DOUBT: Final[Ns] = 10 * SECOND
+"""A host is doubted for so long, and each further time for twice as long."""
+MAX_DOUBLINGS: Final = 8
+MAX_TRIED: Final = 64
+FORGIVEN_AFTER: Final[Ns] = 3_600 * SECOND
+"""From the end of a doubt: the next is as long as the first."""
+
+
+class Source(Enum):
+    """Where a term was shown."""
+
+    LEADER = auto()
+    """A publication on `rcm/grants`, or an answer of `rcm/state`."""
+    SEAL = auto()
+    """A place that a leader of that term has sealed."""
+    RC = auto()
+    """An RC obeys it."""
+    CLIENT = auto()
+    """A client obeys it, by its own word."""
+
+
+class Word(NamedTuple):
+    term: Term
+    source: Source
+    by: str = ""
+    """An RC or a client, for the log."""
+    host: HostName = ""
+    """The host of its token; empty: no token is seen."""
+
+
+class Verdict(NamedTuple):
+    believed: bool
+    absent_until: Ns = 0
+    """An RC that shows a term which is not believed counts as absent until then."""
+    why: str = ""
+    """For the log, where it is worth a line."""
+    last: bool = False
+    """It is one of the last terms: another witness is needed."""
+
+
+BELIEVED: Final = Verdict(believed=True)
+IGNORED: Final = Verdict(believed=False)
+
+
+class _Doubt(NamedTuple):
+    """Of a host whose RCs alone showed `term`: until it has a leader, or `until`, the host is not believed alone."""
+
+    term: Term
+    until: Ns
+    times: int
+    since: Ns = 0
+
+
+class Terms:
+    """The terms of one fleet, as one manager knows them."""
+
+    def __init__(self, *, secured: bool, highest: Term = NO_TERM) -> None:
+        self.secured = secured
+        self.highest = highest
+        """The highest term that is believed."""
+        self.goes_above = False
+        """True while an RC or client obeys a term so far above that promises must be asked for with `above`."""
+        self._led = NO_TERM
+        """The highest term that had a leader."""
+        self._tried = deque[Term](maxlen=MAX_TRIED)
+        """The last in which this manager tried to lead."""
+        self._shown: dict[HostName, Term] = {}
+        """By host: the highest term above `_led` that its RCs showed."""
+        self._doubts: dict[HostName, _Doubt] = {}
+
+    def hear(self, word: Word, now: Ns, *, heard: bool) -> Verdict:
+        """Weigh a word. `heard`: a credible leader published within the hold lease."""
+        term = word.term
+        if not self.counts(word):
+            return IGNORED
+        if of_the_last(term, self.highest):
+            until = self.doubted_until(word.host, now) if word.source is Source.RC else 0
+            return Verdict(believed=False, absent_until=until, last=True)
+        if word.source is Source.RC and self.secured and (until := self._doubted(word, now)):
+            why = f"ignored term {term.counter} of {word.by}: {word.host} alone shows it, and is not believed alone now"
+            return Verdict(believed=False, absent_until=until, why=why)
+        why = ""
+        if absurd(term, self.highest, heard=heard):
+            if word.host == "" or absurd(term, self.highest, heard=False):
+                why = f"ignored term {term.counter}: absurdly far above {self.highest.counter}"
+                return Verdict(believed=False, why=why)
+            why, self.goes_above = f"{word.by} obeys term {term.counter}: the fleet goes above", True
+        self.highest = max(self.highest, term)
+        if word.source is Source.LEADER:
+            self.led(term, now)
+        return Verdict(believed=True, why=why)
+
+    def counts(self, word: Word) -> bool:
+        """Return True if such evidence can move the term."""
+        return not self.secured or word.source in (Source.LEADER, Source.SEAL) or self._obeys(word)
+
+    def is_news(self, term: Term, source: Source) -> bool:
+        """Return True if `hear` could learn something from a refusal for this term."""
+        return not self.secured or (source is not Source.CLIENT and term > self._led)
+
+    def _obeys(self, word: Word) -> bool:
+        return word.source is Source.RC and word.host != ""
+
+    def _doubted(self, word: Word, now: Ns) -> Ns:
+        """Note what an RC shows. Until when its host is not believed; 0: it is, for once, or is not alone."""
+        term, host = word.term, word.host
+        if term <= self._led or term in self._tried:
+            return 0
+        others = [other for other, shown in self._shown.items() if shown == term and other != host]
+        self._shown[host] = max(term, self._shown.get(host, NO_TERM))
+        for other in others:
+            self._vindicate(other, term, now)
+        if term <= self.highest or others:
+            return 0
+        if until := self.doubted_until(host, now):
+            return until
+        before = self._doubts.get(host, _Doubt(NO_TERM, 0, 0))
+        times = 0 if now - before.until > FORGIVEN_AFTER else before.times
+        self._doubts[host] = _Doubt(term, now + (DOUBT << min(times, MAX_DOUBLINGS)), times + 1, now)
+        return 0
+
+    def _vindicate(self, host: HostName, term: Term, now: Ns) -> None:
+        doubt = self._doubts.get(host)
+        if doubt is not None and doubt.term == term:
+            self._doubts[host] = _Doubt(NO_TERM, min(now, doubt.until), doubt.times - 1)
+
+    def tries(self, term: Term) -> None:
+        """This manager asks for promises in `term`: RCs that show it show nobody else's."""
+        self._tried.append(term)
+
+    def led(self, term: Term, now: Ns) -> None:
+        """A leader of `term` exists: hosts that showed it were right."""
+        if term > self._led:
+            self._led = term
+            self._shown = {host: shown for host, shown in self._shown.items() if shown > term}
+            for host in list(self._doubts):
+                self._vindicate(host, term, now)
+
+    def is_led_nowhere(self, term: Term, host: HostName, now: Ns, silence: Ns) -> bool:
+        """Return True if only `host` shows `term`, and it had no leader for a silence: its RCs can see none."""
+        doubt = self._doubts.get(host)
+        return doubt is not None and doubt.term == term and doubt.since + silence <= now < doubt.until
+
+    def doubted_until(self, host: HostName, now: Ns) -> Ns:
+        """Until when `host` is not believed alone; 0: it is."""
+        doubt = self._doubts.get(host)
+        return doubt.until if doubt is not None and now < doubt.until else 0

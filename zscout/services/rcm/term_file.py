@@ -1,0 +1,55 @@
+"""The highest term that a manager of a fleet with `[security]` knows, in its state folder."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from pathlib import Path
+from typing import Final, Protocol
+
+import msgspec
+
+from zscout.config.state_folder import write_durably
+from zscout.config.strict import BadInput, read_bytes
+from zscout.messages import MAX_COUNTER, Malformed, decode_told, encode
+from zscout.types import NO_TERM, Term
+
+log = logging.getLogger(__name__)
+
+FILE: Final = "term.json"
+MAX_BYTES: Final = 4_096
+
+
+class TermDisk(Protocol):
+    def read(self) -> Term: ...
+    async def write(self, term: Term) -> None:
+        """Return once it is on disk. Raises OSError."""
+
+
+class _TermFile(msgspec.Struct):
+    fleet: str
+    term: Term
+
+
+class TermFile:
+    """One fleet's, in `folder`."""
+
+    def __init__(self, folder: Path, fleet: str) -> None:
+        self._path, self._fleet = folder / FILE, fleet
+
+    def read(self) -> Term:
+        """The term; NO_TERM, and a line in the log, where the file is of no use."""
+        if not self._path.exists():
+            return NO_TERM
+        try:
+            kept: _TermFile = decode_told(read_bytes(self._path, max_bytes=MAX_BYTES), _TermFile)
+        except (BadInput, Malformed) as error:
+            log.warning("%s can't be read, and is not used: %s", self._path, error)
+            return NO_TERM
+        if kept.fleet != self._fleet or not 0 <= kept.term.counter <= MAX_COUNTER:
+            log.warning("%s is not of fleet %s, and is not used", self._path, self._fleet)
+            return NO_TERM
+        return kept.term
+
+    async def write(self, term: Term) -> None:
+        await asyncio.to_thread(write_durably, self._path, encode(_TermFile(self._fleet, term)), 0o600)
