@@ -126,7 +126,7 @@ async def questions(lab: Lab, folder: Path, rounds: int, progress: Callable[[str
         return await client.mesh.ask_one(key, asked, Notice, timeout=5)
 
     async def ranking() -> object:
-        return await client.mesh.ask_one(client.mesh.keys.rank, RankAsk(), HostRanking, timeout=5)
+        return await client.mesh.ask_one(client.mesh.keys.ask_rank(client.mesh.me), RankAsk(), HostRanking, timeout=5)
 
     measured = {"query, asyncio face": (face_query, None), "balancer's answer": (ranking, 1.2)}
     samples, bare_samples = {name: Samples() for name in measured}, Samples()

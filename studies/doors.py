@@ -51,7 +51,9 @@ async def entered(client: Client) -> float:
 
 async def asked(client: Client) -> float:
     start = time.perf_counter()
-    await client.mesh.ask_one(client.mesh.keys.rcm_state, StateAsk(holds_only=True), RcmState, timeout=5)
+    await client.mesh.ask_one(
+        client.mesh.keys.ask_state(client.mesh.me), StateAsk(holds_only=True), RcmState, timeout=5
+    )
     return time.perf_counter() - start
 
 

@@ -103,7 +103,7 @@ class Node:
 
 
 async def rank(client: Client) -> HostRanking | None:
-    reply = await client.mesh.ask_one(client.mesh.keys.rank, RankAsk(), HostRanking, timeout=5)
+    reply = await client.mesh.ask_one(client.mesh.keys.ask_rank(client.mesh.me), RankAsk(), HostRanking, timeout=5)
     return reply.message if reply is not None else None
 
 

@@ -196,12 +196,15 @@ class Keys:
     schedule_any = _Key("rcm/schedule/*/*")
     grants = _Key("rcm/grants")
     rcm_state = _Key("rcm/state")
+    rcm_state_any = _Key("rcm/state/*/*")
     rcm_bookings = _Key("rcm/bookings")
+    rcm_bookings_any = _Key("rcm/bookings/*/*")
     rc_state_any = _Key("rc/*/*/state")
     frame_any = _Key("rc/*/*/frame")
     load_any = _Key("host/*/load")
     bookings_any = _Key("host/*/bookings")
     rank = _Key("balancer/rank")
+    rank_any = _Key("balancer/rank/*/*")
     placements = _Key("placer/placements")
     notice_any = _Key("client/*/*/notice")
     requests_any = _Key("client/*/*/requests")
@@ -258,6 +261,16 @@ class Keys:
     def _asked(self, key: str, sender: Sender) -> str:
         # Who is older than certificates serves the key without a sender alone.
         return f"{self.base}/{key}/{_sender(sender)}" if self.closed else f"{self.base}/{key}"
+
+    def ask_state(self, sender: Sender) -> str:
+        """Where the leader is asked for the state. RCs, candidates and others of a node ask on `rcm_state`."""
+        return self._asked("rcm/state", sender)
+
+    def ask_bookings(self, sender: Sender) -> str:
+        return self._asked("rcm/bookings", sender)
+
+    def ask_rank(self, sender: Sender) -> str:
+        return self._asked("balancer/rank", sender)
 
     def served_placer(self) -> tuple[str, ...]:
         return self._served("placer/component")
@@ -329,7 +342,8 @@ class Keys:
 def _sender_of(keys: Keys, key: str) -> Sender:
     match keys._chunks(key):
         case (
-            ["rcm", "schedule", host, client]
+            ["rcm", "schedule" | "state" | "bookings", host, client]
+            | ["balancer", "rank", host, client]
             | ["rc", _, _, "command", host, client]
             | ["client", host, client, "notice" | "requests" | "behavior"]
             | ["building", host, client, "plan" | "poses"]
@@ -380,8 +394,10 @@ class Access(NamedTuple):
 ACCESS: Final = (
     Access("rcm/schedule/{by}/*", ask=USERS, serve=_MANAGERS),
     Access("rcm/grants", publish=_MANAGERS, subscribe=_ALL),
-    Access("rcm/state", ask=_ALL, serve=_MANAGERS),
-    Access("rcm/bookings", ask=_ALL, serve=_MANAGERS),
+    Access("rcm/state", ask=NODES, serve=_MANAGERS),
+    Access("rcm/state/{by}/*", ask=_ALL, serve=_MANAGERS),
+    Access("rcm/bookings", ask=NODES, serve=_MANAGERS),
+    Access("rcm/bookings/{by}/*", ask=_ALL, serve=_MANAGERS),
     Access("rc/{rc}/vote", ask=_MANAGERS, serve=NODES),
     Access("rc/{rc}/command/{by}/*", ask=USERS, serve=NODES),
     # Who asks may ask for a promise: a leader's right.
@@ -392,7 +408,8 @@ ACCESS: Final = (
     Access("host/{at}/confirm/{by}/*", ask=USERS, serve=NODES),
     Access("host/{at}/history/{by}/*", ask=_ALL, serve=_MANAGERS),
     Access("host/{at}/bookings", ask=_MANAGERS, serve=NODES),
-    Access("balancer/rank", ask=_ALL, serve=_MANAGERS),
+    Access("balancer/rank", ask=NODES, serve=_MANAGERS),
+    Access("balancer/rank/{by}/*", ask=_ALL, serve=_MANAGERS),
     Access("placer/component/{by}/*", ask=_ALL, serve=_MANAGERS),
     Access("placer/placements", publish=_MANAGERS, subscribe=_ALL),
     Access("client/*/*/notice", publish=_MANAGERS, subscribe=_ALL),

@@ -69,7 +69,7 @@ async def steal_places(mesh: Mesh, over: Callable[[], bool]) -> None:
     ]
     while not over():
         await asyncio.sleep(rng.uniform(0, 2 * STEALS_EVERY))
-        state = await mesh.ask_one(mesh.keys.rcm_state, StateAsk(), RcmState, timeout=STEALS_EVERY)
+        state = await mesh.ask_one(mesh.keys.ask_state(mesh.me), StateAsk(), RcmState, timeout=STEALS_EVERY)
         others = [one for one in state.message.queue if one.client != str(mesh.me)] if state and state.message else []
         if others:
             one = rng.choice(others)

@@ -179,7 +179,7 @@ RCS: Final = {"anvil": "robot/a", "cart": "radio/r"}
 def key_of(row: str, act: str, name: str, rc: str) -> str:
     """A key of that row as `name` would use it for `act`, with that RC."""
     key = row.replace("<kind>/<name>", rc).replace("/**", "/x/1").replace("/*", "/1").replace("<client>", "c1")
-    asker = row.startswith(("rcm/schedule", "rc/", "placer/component"))
+    asker = row.startswith(("rcm/schedule", "rcm/state/", "rcm/bookings/", "balancer/rank/", "rc/", "placer/component"))
     if key.count("<host>") == 2:
         first, last = ("other", name) if act == "asks" else (name, "other")
         return key.replace("<host>", first, 1).replace("<host>", last, 1)

@@ -63,7 +63,9 @@ async def ask_bookings(client: Client, rc: str | None = None) -> BookingsTold:
 
 async def look(client: Client) -> BookingsTold | None:
     """The same at a glance; None: nobody told them."""
-    reply = await client.mesh.ask_one(client.mesh.keys.rcm_bookings, BookingsAsk(), BookingsTold, timeout=QUERY_TIMEOUT)
+    reply = await client.mesh.ask_one(
+        client.mesh.keys.ask_bookings(client.mesh.me), BookingsAsk(), BookingsTold, timeout=QUERY_TIMEOUT
+    )
     return reply.message if reply is not None else None
 
 

@@ -117,7 +117,7 @@ async def bookings(mesh: Mesh, _parameter: str) -> Iterable[str]:
     """Names of bookings that are not over."""
     from zscout.messages import BookingsAsk, BookingsTold
 
-    reply = await mesh.ask_one(mesh.keys.rcm_bookings, BookingsAsk(), BookingsTold, timeout=LOOK)
+    reply = await mesh.ask_one(mesh.keys.ask_bookings(mesh.me), BookingsAsk(), BookingsTold, timeout=LOOK)
     return {one.name for one in reply.message.bookings} if reply is not None and reply.message is not None else ()
 
 
@@ -156,7 +156,7 @@ async def _rc_names(mesh: Mesh) -> set[str]:
 async def _state(mesh: Mesh) -> RcmState | None:
     from zscout.messages import RcmState, StateAsk
 
-    reply = await mesh.ask_one(mesh.keys.rcm_state, StateAsk(), RcmState, timeout=LOOK)
+    reply = await mesh.ask_one(mesh.keys.ask_state(mesh.me), StateAsk(), RcmState, timeout=LOOK)
     return reply.message if reply is not None else None
 
 

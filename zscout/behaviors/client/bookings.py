@@ -67,7 +67,9 @@ class BookingsClient:
         """Return the bookings that are not over, all or those of `owner` (a host or a person) or that may use the
         device `rc`, and the fleet's time. Raises RequestRefused; RcmSilent if no leader answers."""
         question, silent = BookingsAsk(owner=owner, rc=rc), "does not tell of bookings; it may be older than these"
-        return await self._until_told(self._mesh.keys.rcm_bookings, question, BookingsTold, ANSWER, silent)
+        return await self._until_told(
+            self._mesh.keys.ask_bookings(self._mesh.me), question, BookingsTold, ANSWER, silent
+        )
 
     async def book(
         self,

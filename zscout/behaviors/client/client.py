@@ -263,7 +263,7 @@ class Client:
         """Return the leader's state: what is held and what waits. None if no leader answered in `timeout` seconds. With
         `arc`, the state includes the history of that request; with `forecast`, the estimated starts."""
         asked = messages.StateAsk(arc=arc, forecast=forecast)
-        reply = await self.mesh.ask_one(self.mesh.keys.rcm_state, asked, RcmState, timeout=timeout)
+        reply = await self.mesh.ask_one(self.mesh.keys.ask_state(self.mesh.me), asked, RcmState, timeout=timeout)
         return reply.message if reply is not None else None
 
     async def foresee(

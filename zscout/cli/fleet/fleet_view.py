@@ -166,7 +166,7 @@ class FleetView:
 
     async def ask_loads(self) -> None:
         """Takes from the balancer what it knows of all hosts; one of a former version tells nothing."""
-        key, asked = self.mesh.keys.rank, RankAsk(at_most=MAX_RANKED, reports=True)
+        key, asked = self.mesh.keys.ask_rank(self.mesh.me), RankAsk(at_most=MAX_RANKED, reports=True)
         reply = await self.mesh.ask_one(key, asked, HostRanking, timeout=ASK_BALANCER)
         if reply is None or reply.message is None or reply.message.reports is None:
             return

@@ -265,7 +265,7 @@ async def _run(wanted: HoldOptions, report: Report, held: Held, client: Client) 
 
 async def _tell_who_is_old(report: Report, held: Held, client: Client, direct: DirectHold | None) -> None:
     """Says who does not know that the next holder is to wait until the command is gone."""
-    key, asked = client.mesh.keys.rcm_state, StateAsk(holds_only=True)
+    key, asked = client.mesh.keys.ask_state(client.mesh.me), StateAsk(holds_only=True)
     reply = await client.mesh.ask_one(key, asked, RcmState, timeout=QUERY_TIMEOUT)
     state, who = reply.message if reply is not None else None, [] if direct is None else direct.never_settle
     if state is not None and any(hold.grant == held.grant and not hold.direct for hold in state.holds):

@@ -39,7 +39,10 @@ class LoadBalancer:
         for declared in (
             self._reports,
             mesh.watch(keys.alive_any(Role.LOAD), guard(self._on_reporter)),
-            mesh.serve(keys.rank, RankAsk, guard(self._on_query), lane=Lane.QUESTION),
+            *(
+                mesh.serve(key, RankAsk, guard(self._on_query), lane=Lane.QUESTION)
+                for key in (keys.rank, keys.rank_any)
+            ),
         ):
             self._declarations.callback(declared.close)
         self._supervisor.call_later(READ_EVERY, self._read)

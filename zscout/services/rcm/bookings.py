@@ -120,7 +120,10 @@ class Bookings:
         """From now on it answers, and shares what it knows."""
         keys, mesh, guard = self._mesh.keys, self._mesh, self._supervisor.guard
         self._declared = [
-            mesh.serve(keys.rcm_bookings, BookingsAsk, guard(self.handler.answer_bookings), lane=Lane.QUESTION),
+            *(
+                mesh.serve(key, BookingsAsk, guard(self.handler.answer_bookings), lane=Lane.QUESTION)
+                for key in (keys.rcm_bookings, keys.rcm_bookings_any)
+            ),
             *(mesh.watch(keys.alive_any(role), guard(self._on_token)) for role in (Role.CANDIDATE, Role.NODE)),
         ]
         self._keeper.on_shared = self._on_shared

@@ -224,7 +224,10 @@ class Rcm:
             mesh.serve(
                 keys.schedule_any, messages.Operation, guard(self._on_operation), limit=limit, tally=self._tally
             ),
-            mesh.serve(keys.rcm_state, messages.StateAsk, guard(self._on_state_asked), lane=Lane.QUESTION),
+            *(
+                mesh.serve(key, messages.StateAsk, guard(self._on_state_asked), lane=Lane.QUESTION)
+                for key in (keys.rcm_state, keys.rcm_state_any)
+            ),
             mesh.subscribe(keys.rc_state_any, messages.RcState, guard(self._on_rc_state)),
             mesh.watch(keys.alive_any(Role.CLIENT), guard(self._on_client)),
             mesh.watch(keys.alive_any(Role.RC), guard(self._on_rc_token)),

@@ -234,7 +234,7 @@ class Recorder:
 
     async def _read(self) -> bool:
         """Whether the state is known now. Without a leader, the token of the next wakes `_keep_reading`."""
-        key, ask = self.mesh.keys.rcm_state, messages.StateAsk()
+        key, ask = self.mesh.keys.ask_state(self.mesh.me), messages.StateAsk()
         replies = await self.mesh.ask(key, ask, messages.RcmState, timeout=READ_TIMEOUT)
         states = [reply.message for reply in replies if reply.message is not None]
         newest = max(states, key=lambda state: (state.term, state.seq), default=None)
@@ -272,7 +272,7 @@ class Recorder:
 
     async def _keep_asking_for_bookings(self) -> None:
         """Does not return."""
-        key, ask = self.mesh.keys.rcm_bookings, messages.BookingsAsk()
+        key, ask = self.mesh.keys.ask_bookings(self.mesh.me), messages.BookingsAsk()
         while True:
             self._bookings_wanted.clear()
             reply = await self.mesh.ask_one(key, ask, messages.BookingsTold, timeout=READ_TIMEOUT)

@@ -94,7 +94,7 @@ class PlacementDemo(DemoRunner):
 
     async def _all_ranked(self, mesh: Mesh) -> None:
         while True:
-            reply = await mesh.ask_one(mesh.keys.rank, RankAsk(), HostRanking, timeout=1)
+            reply = await mesh.ask_one(mesh.keys.ask_rank(mesh.me), RankAsk(), HostRanking, timeout=1)
             if reply is not None and reply.message is not None and len(reply.message.hosts) == len(HOSTS):
                 return
             await asyncio.sleep(0.1)

@@ -70,7 +70,7 @@ class Table1Demo(DemoRunner):
         await self.all_there(mesh)
         wanted = {rc.name for rc in self.workload.rcs}
         while True:
-            reply = await mesh.ask_one(mesh.keys.rcm_state, StateAsk(), RcmState, timeout=1.0)
+            reply = await mesh.ask_one(mesh.keys.ask_state(mesh.me), StateAsk(), RcmState, timeout=1.0)
             state = reply.message if reply is not None else None
             if state is not None and wanted <= {view.rc for view in state.rcs if view.present}:
                 return
