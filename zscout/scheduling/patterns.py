@@ -67,10 +67,14 @@ class Choices:
         like = class_of(arc)
         self._state, self._arc, self._masks = state, arc, like.masks
         ending = set(_exclusive_victims(state, arc, arc.named_mask))
-        self._best_first = sorted(
+        there = like.reach & state.present
+        free = there & ~(closed | state.busy | state.sharable | (0 if arc.claim is None else arc.claim.kept))
+        self._best_first = [_Choice(Fitness.FREE, rc.demand, rc.bit, rc) for rc in state.rcs_in(free)]
+        self._best_first += [
             _Choice(*_fitness(state, arc, rc, bool(rc.bit & closed), ending), rc.bit, rc)
-            for rc in state.rcs_in(like.reach & state.present)
-        )
+            for rc in state.rcs_in(there & ~free)
+        ]
+        self._best_first.sort()
         self.contended = union(choice.bit for choice in self._best_first if choice.fitness <= Fitness.PREEMPTIBLE)
         """RCs of which it matters whether they are claimed."""
         self._found: dict[tuple[int, int], Mapping[Need, RcName] | None] = {}
@@ -151,9 +155,12 @@ def usable(state: SchedulerState, arc: Arc) -> int:
     like = class_of(arc)
     if like.usable_of != state.version:
         like.usable_of, like.usable = state.version, like.reach & state.present
-        for rc in state.rcs_in(like.usable & state.busy):
-            if rc.non_preemptible_holders(arc, state.now):
-                like.usable &= ~rc.bit
+        held = like.usable & state.busy
+        while held:
+            (holder,) = next(state.rcs_in(held)).holders.values()
+            if not holder.preemptible_by(arc, state.now):
+                like.usable &= ~(held & holder.mask)
+            held &= ~holder.mask
         like.short = not enough(mask & like.usable for mask in like.masks.values())
     return like.usable
 
@@ -194,7 +201,7 @@ def enough(masks: Iterable[int]) -> bool:
 
 def _fitness(state: SchedulerState, arc: Arc, rc: Rc, closed: bool, ending: Collection[Arc]) -> tuple[Fitness, float]:
     """The fitness of `rc` where the holders `ending` end anyway, and a tie-breaker. `closed`: reserved for another."""
-    non_preemptible = rc.non_preemptible_holders(arc, state.now) if rc.holders else []
+    non_preemptible = rc.non_preemptible_holders(arc, state.now)
     kept = arc.claim is not None and bool(rc.bit & arc.claim.kept)
     if rc.sharable:
         answer = state.votes.known(rc.name, frozenset((*(holder.id for holder in non_preemptible), arc.id)))
