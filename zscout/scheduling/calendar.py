@@ -31,7 +31,7 @@ from zscout.scheduling.booking import (
     BookingThreatened,
     Dates,
 )
-from zscout.scheduling.claim_index import Timeline, bits, by_date
+from zscout.scheduling.claim_index import DateIndex, bits, by_date
 from zscout.scheduling.dangers import Undecided, danger
 from zscout.scheduling.model import Arc, ArcRequest, ArcState, Claim, Effect, Outcome, PatternClass, Rc, union
 from zscout.scheduling.reason import Reason, ReasonCode
@@ -87,7 +87,7 @@ class Calendar:
         self._ranks: dict[str, int] = {}  # of all dates; bookings without a rank are not judged
         self._lost: dict[str, Claim] = {}  # dates in conflict; their votes are kept, to ask nothing again
         self._lost_to: dict[str, str] = {}
-        self._lost_at: dict[int, Timeline] = {}  # by bit of each RC that would do
+        self._lost_at: dict[int, DateIndex] = {}  # by bit of each RC that would do
         self._unjudged: set[str] = set()
         self._order: list[tuple[int, str]] = []  # a heap of these, by rank
         self._entered: list[str] = []
@@ -499,7 +499,7 @@ class Calendar:
         name = claim.booking.id
         self._lost[name], self._lost_to[name] = claim, by
         for bit in bits(self._choices(claim)):
-            self._lost_at.setdefault(bit, Timeline()).add(claim.date, claim.date + claim.booking.runtime, claim)
+            self._lost_at.setdefault(bit, DateIndex()).add(claim.date, claim.date + claim.booking.runtime, claim)
 
     def _recall(self, name: str) -> Claim:
         claim = self._lost.pop(name)

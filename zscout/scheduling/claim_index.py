@@ -12,7 +12,7 @@ from zscout.scheduling.model import Claim, Rc, union
 from zscout.types import Ns
 
 
-class Timeline:
+class DateIndex:
     """Claims by time. Those of similar length are sorted by start together, so that a long one slows no search."""
 
     def __init__(self) -> None:
@@ -57,7 +57,7 @@ class ClaimIndex:
         self.version = 0  # grows with each change
         self.touched: dict[tuple[Claim, int, Ns, Ns], None] = {}
         """Changed claims, each with its RCs and span before and after; `Calendar` empties it."""
-        self._by_rc: dict[int, Timeline] = {}
+        self._by_rc: dict[int, DateIndex] = {}
         self._by_date: list[tuple[Ns, str]] = []
         self._ends: list[tuple[Ns, str]] = []
         """A heap of lapses and ends of bookings and starts of maintenance. Outdated entries are skipped."""
@@ -90,7 +90,7 @@ class ClaimIndex:
         mask = claim.kept | claim.mask
         self._spans[claim] = mask, start, end
         for bit in bits(mask):
-            self._by_rc.setdefault(bit, Timeline()).add(start, end, claim)
+            self._by_rc.setdefault(bit, DateIndex()).add(start, end, claim)
         self.claimed |= mask
         insort(self._by_date, (start, booking.id))
         for at in _instants(booking):
