@@ -228,6 +228,10 @@ def _jumps(self: FleetClock, _now: Ns) -> Ns:
     return self._aim
 
 
+def _no_obstacle(*_: object) -> tuple[None, list[Any]]:
+    return None, []
+
+
 def _none_recovered(*_: object) -> list[Any]:
     return []
 
@@ -321,7 +325,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
             "a leader knows of all dates before it grants",
             {(Bookings, "recovered"): _none_recovered, (Bookings, "enter"): _do_nothing},
         ),
-        "one stands": Guard("of two bookings that can't both be one stands", {(Calendar, "_judge"): _nothing}),
+        "one stands": Guard("of two bookings that can't both be one stands", {(Calendar, "_obstacle"): _no_obstacle}),
         "awaited": Guard("who has taken up a date does not begin before it", {(BookedDates, "dated"): _undated}),
         "had again": Guard("who has taken up a date has it again once it can be", {(Calendar, "_offer"): _nothing}),
         "withdrawn": Guard(
