@@ -77,6 +77,22 @@ async def test_what_concerns_a_host_with_surplus_may_wait_behind_it() -> None:
     assert handled == [*(f"a{number}" for number in range(SHARE + 2)), "cancel"]
 
 
+async def test_what_waits_behind_a_host_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(session, "QUEUE_DEPTH", 8)
+    box, handled = Inbox(asyncio.get_running_loop()), list[str]()
+
+    def dry_runs() -> None:
+        for number in range(4):
+            assert box.behind(Lane.QUESTION, "viewer", handled.append, f"q{number}")
+        with pytest.raises(Refused, match="too many requests of viewer are waiting here"):
+            box.behind(Lane.QUESTION, "viewer", handled.append, "q4")
+
+    box.deliver(dry_runs)
+    box.deliver(handled.append, "next")
+    await until(lambda: len(handled) == 5)
+    assert handled == ["next", "q0", "q1", "q2", "q3"]
+
+
 async def test_of_questions_one_of_each_host_is_let_in_before_asks_that_have_come_meanwhile() -> None:
     box, handled = Inbox(asyncio.get_running_loop()), list[str]()
 

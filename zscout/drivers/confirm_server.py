@@ -75,7 +75,7 @@ class _Part(IncomingQuery[Command]):
         self._answers: _Answers | None = answers
         self._rc = rc
 
-    def end(self, said: msgspec.Struct) -> None:
+    def end(self, said: msgspec.Struct, encoded: bytes | None = None) -> None:
         answers, self._answers = self._answers, None
         if answers is not None:
             answers.add(self._rc, said)

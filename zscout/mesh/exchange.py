@@ -104,28 +104,27 @@ class IncomingQuery(Generic[R]):
     outcome: Answered | None = None
     tally: Tally | None = None
 
-    def answer(self, message: msgspec.Struct) -> None:
-        self.end(message)
-
-    def answer_encoded(self, payload: bytes, kind: type[msgspec.Struct]) -> None:
-        """Answer with a message of this kind that is encoded already."""
-        query, self._query = self._query, None
-        if query is not None:
-            query.reply(self._reply_key, payload, kind)
-            if self.tally is not None:
-                self.tally.answered += 1
+    def answer(self, message: msgspec.Struct, encoded: bytes | None = None) -> None:
+        """Answer with `message`; `encoded`: the same, if it is known."""
+        self.end(message, encoded)
 
     def refuse(self, problem: Problem) -> None:
         self.end(problem)
 
-    def end(self, said: msgspec.Struct) -> None:
+    def drop(self) -> None:
+        """Leave it unanswered: its sender does not wait for the whole timeout."""
+        query, self._query = self._query, None
+        if query is not None:
+            query.drop()
+
+    def end(self, said: msgspec.Struct, encoded: bytes | None = None) -> None:
         query, self._query = self._query, None
         if query is None:
             return
         if isinstance(said, Problem):
             refuse(query, said)
         else:
-            query.reply(self._reply_key, messages.encode(said), type(said))
+            query.reply(self._reply_key, encoded or messages.encode(said), type(said))
         if self.outcome is not None:
             self.outcome.tell(said)
         if self.tally is not None:

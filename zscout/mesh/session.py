@@ -106,11 +106,14 @@ class Inbox:
 
     def behind(self, lane: Lane, host: str, call: Callable[..., None], *args: Any) -> bool:
         """Call `call(*args)` behind the surplus of `host`. Return False if it would not wait: there is no surplus, and
-        no ask waits for a question."""
+        no ask waits for a question. Raises Refused if too much waits there."""
         of = lane, host
         if of not in self.surplus and not (lane is Lane.QUESTION and (self.ready or self.items or self.surplus)):
             return False
-        self.surplus.setdefault(of, deque()).append(_Item(None, lane, host, call, args))
+        waiting = self.surplus.setdefault(of, deque())
+        if len(waiting) >= QUEUE_DEPTH // 2:
+            raise Refused("busy", f"too many requests of {host[:MAX_NAME]} are waiting here; ask again")
+        waiting.append(_Item(None, lane, host, call, args))
         self.set_aside += 1
         return True
 
@@ -124,6 +127,7 @@ class Inbox:
         self.closed = True
         for waiting in (self.items, self.ready, self.surplus):
             waiting.clear()
+        self.set_aside = 0
 
     def _put(self, item: _Item) -> bool:
         self.items.append(item)
@@ -245,10 +249,6 @@ class Mesh:
     def admit(self, members: Iterable[FleetMember]) -> None:
         """Replace the members that are admitted, with their rights. A mesh without certificates admits all."""
 
-    def behind(self, lane: Lane, host: str, call: Callable[..., None], *args: Any) -> bool:
-        """Call `call(*args)` later, where surplus of that host, or asks before a question, wait: see `Inbox`."""
-        return self._inbox.behind(lane, host, call, *args)
-
     def after_burst(self, then: Callable[[], None]) -> None:
         """Call `then` after the present burst; at once outside a burst."""
         if self._inbox.after is None:
@@ -342,8 +342,10 @@ class Mesh:
         limit: int = messages.MAX_PAYLOAD,
         tally: Tally | None = None,
         lane: Lane = Lane.ASK,
+        concerns: Callable[[IncomingQuery[Any]], tuple[Lane, str]] | None = None,
     ) -> Declaration:
-        """Call `handler` for queries on `key` with a message of `kind`; `tally` counts how they end.
+        """Call `handler` for queries on `key` with a message of `kind`; `tally` counts how they end. `concerns`: the
+        lane that a query turns out to belong in, and the host whose surplus it waits behind (see `Inbox`).
 
         Refused undecoded: wildcard keys (answered on `key` if that is concrete), and, as `busy`, queries beyond `depth`
         waiting, or half of it from one host if the key names its sender. Bad payloads are `malformed`."""
@@ -387,7 +389,18 @@ class Mesh:
             incoming: IncomingQuery[Any] = IncomingQuery(
                 query, asked, asked if wild else key, message, arrived, tally=tally
             )
+            carry_out(incoming, host, waited=concerns is None)
+
+        def carry_out(incoming: IncomingQuery[Any], host: str, *, waited: bool) -> None:
+            if state.closed:
+                incoming.drop()
+                return
             try:
+                if not waited and concerns is not None:
+                    lane, of = concerns(incoming)
+                    later = functools.partial(carry_out, incoming, host, waited=True)
+                    if (lane is Lane.QUESTION or of != host) and self._inbox.behind(lane, of, later):
+                        return
                 handler(incoming)
             except Refused as refused:
                 incoming.refuse(refused.problem)

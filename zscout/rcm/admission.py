@@ -45,6 +45,9 @@ class Present(Protocol):
     def waiting_now(self) -> int: ...
     def of_client(self, client: ClientId) -> int: ...
     def of_owners(self, names: Collection[str], *but: ArcId) -> int: ...
+
+
+class Holding(Present, Protocol):
     def held_by(self, names: Collection[str], *but: ArcId) -> int:
         """The number of RCs held by these owners."""
         ...
@@ -68,9 +71,6 @@ class LetIn:
 
     def of_owners(self, names: Collection[str], *_: ArcId) -> int:
         return sum(self._owners[name] for name in names)
-
-    def held_by(self, names: Collection[str], *but: ArcId) -> int:
-        raise NotImplementedError("there are no hand-overs at a takeover")
 
 
 class Admission:
@@ -169,7 +169,7 @@ class Admission:
     # Handing over
 
     def check_hand_over(
-        self, sender: Sender, to: Sender, arcs: Sequence[ArcStatus], replaced: Sequence[ArcId], present: Present
+        self, sender: Sender, to: Sender, arcs: Sequence[ArcStatus], replaced: Sequence[ArcId], present: Holding
     ) -> None:
         """Raises Refused if `to` may not have these ARCs; it has `replaced` already."""
         added, client = len(arcs) - len(replaced), str(to)

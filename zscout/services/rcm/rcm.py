@@ -227,7 +227,12 @@ class Rcm:
         limit = self.fleet.limits.max_payload
         self._declared = [
             mesh.serve(
-                keys.schedule_any, messages.Operation, guard(self._on_operation), limit=limit, tally=self._tally
+                keys.schedule_any,
+                messages.Operation,
+                guard(self._on_operation),
+                limit=limit,
+                tally=self._tally,
+                concerns=self._concerns,
             ),
             *(
                 mesh.serve(key, messages.StateAsk, guard(self._on_state_asked), lane=Lane.QUESTION)
@@ -270,30 +275,17 @@ class Rcm:
         self.roster.stalled(stall.length, stall.ended, fresh=fresh)
         return self.mesh.now()
 
-    def _on_operation(self, query: IncomingQuery[messages.Operation]) -> None:
-        """Carry an operation out: behind the surplus of the host whose request it concerns, or, where it only asks
-        what would be, behind all others."""
+    def _concerns(self, query: IncomingQuery[messages.Operation]) -> tuple[Lane, str]:
+        """Dry runs and slots are questions; an operation on another host's request waits behind that host's surplus."""
         operation, host = query.message, self.mesh.keys.sender_of(query.key).host
-        question = isinstance(operation, (messages.Foresee, messages.FindSlots))
-        owner = getattr(operation, "client", None)
-        of = client_of(owner).host if owner is not None else host
-        lane = Lane.QUESTION if question else Lane.ASK
-        if not ((question or of != host) and self.mesh.behind(lane, of, self._operate_later, query)):
-            self._operate(query)
+        if isinstance(operation, (messages.Foresee, messages.FindSlots)):
+            return Lane.QUESTION, host
+        owner = operation.client if isinstance(operation, (messages.Cancel, messages.Release)) else None
+        return Lane.ASK, host if owner is None else client_of(owner).host
 
-    def _operate(self, query: IncomingQuery[messages.Operation]) -> None:
+    def _on_operation(self, query: IncomingQuery[messages.Operation]) -> None:
         self.requests.on_operation(query)
         self._send_notices()
-
-    def _operate_later(self, query: IncomingQuery[messages.Operation]) -> None:
-        try:
-            if not self.supervisor.active:
-                raise Refused("not_leading", "this manager stopped leading; try again")
-            self.supervisor.guard(self._operate)(query)
-        except Refused as refused:
-            query.refuse(refused.problem)
-        except BadName as error:
-            query.refuse(messages.Problem("bad_name", str(error)))
 
     def _send_notices(self) -> None:
         notices, self.requests.notices = self.requests.notices, []
@@ -627,7 +619,7 @@ class Rcm:
             built = 1 if known is None else known.built + 1
             known = self._states[alike] = _Built(state, messages.encode(state), self.core.batches, built)
         if asked.arc is None:
-            query.answer_encoded(known.encoded, messages.RcmState)
+            query.answer(known.state, known.encoded)
         else:
             query.answer(replace(known.state, story=self.registry.story(now, asked.arc)))
 
