@@ -388,6 +388,11 @@ class Roster:
 
     # Out: what is known
 
+    @property
+    def closed(self) -> bool:
+        """Return True if all members prove their names."""
+        return self._keys.closed
+
     def has_joined(self, name: RcName) -> bool:
         """Return True if an RC counts as present, or did so until just now."""
         rc = self._rcs.get(name)
