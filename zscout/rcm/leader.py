@@ -141,7 +141,10 @@ class Leader:
         self._recovered: dict[ClientId, set[ArcId]] = {}
         """By client: the ARCs that only RCs have reported."""
         self._queue: deque[_Work] = deque()
+        self._wake: Ns | None = None
+        """When deadlines are over."""
         self._waking = False
+        """What is due waits among the stimuli."""
         self._core_wake: Ns | None = None
         self._now: Ns = 0
         self._out = Outbox()
@@ -150,22 +153,19 @@ class Leader:
         """One instant: of what waits, as much as is decided together."""
         self._now, self._out = now, Outbox()
         self._queue.extend(stimuli)
-        wake = self._wake()
-        if wake is not None and wake <= now and not self._waking:
+        if self._wake is not None and self._wake <= now and not self._waking:
             self._waking = True
             self._queue.append(_Due())
         if (events := self._next()) is not None:
             self._decide(events)
-        self._out.wake, self._out.more = self._wake(), bool(self._queue)
+        times = (self._core_wake, self.roster.next, self.registry.next, self.operations.next)
+        self._out.wake = self._wake = min([at for at in times if at is not None], default=None)
+        self._out.more = bool(self._queue)
         return self._out
 
     def close(self, now: Ns) -> str:
         """What was gathered for the log: nothing is published any more."""
         return self.registry.close(now)
-
-    def _wake(self) -> Ns | None:
-        times = (self._core_wake, self.roster.next, self.registry.next, self.operations.next)
-        return min((at for at in times if at is not None), default=None)
 
     # In: the events of the next instant
 
@@ -178,7 +178,7 @@ class Leader:
             if isinstance(asked.operation, (messages.HandOver, messages.Foresee)):
                 break
         else:
-            if queue and not operations.instant.touched and not self._out.answers and not self._out.refused:
+            if queue and not operations.instant.touched and not self._out.at_once:
                 return self._events(queue.popleft())
         return operations.events() or None
 
@@ -223,8 +223,7 @@ class Leader:
     def _take(self, taken: Taken) -> None:
         """Carry out what follows at once from operations."""
         out = self._out
-        out.answers += taken.answers
-        out.refused += taken.refused
+        out.at_once += taken.answers
         out.notices += taken.notices
         out.strange += taken.strange
         for change in taken.changes:
@@ -256,7 +255,7 @@ class Leader:
 
     def _tick(self) -> Sequence[Event]:
         answers, again = self.operations.tick(self._now)
-        self._out.answers += answers
+        self._out.at_once += answers
         self._queue.extendleft(reversed([_Tick(), *again]))
         if self.roster.next is not None and self.roster.next <= self._now:
             return self._follow(self.roster.tick(self._now))

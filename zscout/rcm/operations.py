@@ -34,7 +34,7 @@ from zscout.rcm.door import Door
 from zscout.rcm.places import arc_id, request_id
 from zscout.rcm.recovery import Listed, vouched
 from zscout.rcm.request_log import RequestLog, party_info, reason_info
-from zscout.rcm.roster import Change, Roster
+from zscout.rcm.roster import NOTHING, Change, Roster
 from zscout.rcm.step import Asked, Reply, Ticket
 from zscout.rcm.terms import Source, Word
 from zscout.scheduling.core import Core
@@ -101,7 +101,6 @@ class Taken:
     """What follows at once from operations: the rest once the instant is decided."""
 
     answers: list[Reply] = field(default_factory=list)
-    refused: list[tuple[Ticket, Problem]] = field(default_factory=list)
     notices: list[Notice] = field(default_factory=list)
     changes: list[Change] = field(default_factory=list)
     strange: list[tuple[str, str]] = field(default_factory=list)
@@ -179,7 +178,8 @@ class Operations:
         ticket, sender, operation = asked
         client = str(sender)
         try:
-            self._taken.changes.append(self._roster.heard(now, client))
+            if (heard := self._roster.heard(now, client)) is not NOTHING:
+                self._taken.changes.append(heard)
             check_name(operation.id, "id")
             match operation:
                 case Ask():
@@ -191,9 +191,9 @@ class Operations:
                 case Foresee():
                     self._forecast(ticket, operation, sender)
         except Refused as refused:
-            self._taken.refused.append((ticket, refused.problem))
+            self._taken.answers.append((ticket, refused.problem))
         except BadName as error:
-            self._taken.refused.append((ticket, Problem("bad_request", str(error))))
+            self._taken.answers.append((ticket, Problem("bad_request", str(error))))
         taken, self._taken = self._taken, Taken()
         return taken
 
@@ -215,7 +215,7 @@ class Operations:
                 raise Refused("unknown_client", f"{to} is not on the mesh")
             self._hand_over(ticket, operation, sender, to)
         except Refused as refused:
-            self._taken.refused.append((ticket, refused.problem))
+            self._taken.answers.append((ticket, refused.problem))
         taken, self._taken = self._taken, Taken()
         return taken
 

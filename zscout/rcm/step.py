@@ -105,7 +105,8 @@ class Proposed(NamedTuple):
 class Outbox:
     """What follows from a step, in the order in which it is carried out, nothing awaited in between."""
 
-    refused: list[tuple[Ticket, Problem]] = field(default_factory=list)
+    at_once: list[Reply] = field(default_factory=list)
+    """Answers that need no instant: refusals, and how requests stood before it."""
     higher: list[tuple[Word, Token | None]] = field(default_factory=list)
     """Terms above the own, and for an RC that is seen its token. A leader that steps down does nothing of the rest."""
     disbelieved: list[tuple[RcName, Term]] = field(default_factory=list)

@@ -143,7 +143,7 @@ class Rcm:
         """Operations that are not answered yet."""
         self._tickets = count(1)
         self._declared: list[Declaration] = []
-        self._alarm = Alarm(mesh.now, self.supervisor, self._run)
+        self._alarm = Alarm(mesh.now, self.supervisor, self._on_alarm)
 
     @property
     def core(self) -> Core:
@@ -215,10 +215,20 @@ class Rcm:
 
     # In
 
+    def _look(self) -> None:
+        """Before the leader judges by tokens and answers, it is to know of a stall of this process."""
+        stalled = step.Stalled(self._stall.length, self._stall.ended, self._stall.fresh())
+        if stalled != self._stalled:
+            self._stalled = stalled
+            self._coming.append(stalled)
+
     def _take(self, stimulus: step.Stimulus) -> None:
         """Those of one burst are taken together."""
+        first = not self._coming
+        if not isinstance(stimulus, step.Asked):
+            self._look()
         self._coming.append(stimulus)
-        if len(self._coming) == 1:
+        if first:
             self.mesh.after_burst(self._run)
 
     def _now_take(self, stimulus: step.Stimulus) -> None:
@@ -251,6 +261,10 @@ class Rcm:
     def _on_token(self, token: Token, alive: bool) -> None:
         self._take(step.Seen(token, alive))
 
+    def _on_alarm(self) -> None:
+        self._look()
+        self._run()
+
     # A step
 
     def _run(self) -> None:
@@ -262,10 +276,6 @@ class Rcm:
             more = self.supervisor.active
             while more:
                 stimuli, self._coming = self._coming, []
-                stalled = step.Stalled(self._stall.length, self._stall.ended, self._stall.fresh())
-                if stalled != self._stalled:
-                    self._stalled = stalled
-                    stimuli.insert(0, stalled)
                 out = self.leader.step(self.mesh.now(), stimuli)
                 more = self._carry_out(out) and (out.more or bool(self._coming))
         except Exception as error:  # noqa: BLE001 - it is logged there
@@ -276,7 +286,7 @@ class Rcm:
     def _carry_out(self, out: step.Outbox) -> bool:
         """In the order of the fields. Return False if this leader stepped down."""
         mesh, supervisor = self.mesh, self.supervisor
-        self._answer(out.refused)
+        self._answer(out.at_once)
         for word, token in out.higher:
             verdict = self._on_newer(word)
             if token is not None and verdict.absent_until:
