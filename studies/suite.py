@@ -63,12 +63,9 @@ def guards() -> None:
         began = time.monotonic()
         tests = ("-n", "2", "--dist", "worksteal", "-x", "-m", f"{QUICK} and not live", *IN_PROCESS)
         done = _pytest("-p", "studies.suite", *tests, env={VARIABLE: name})
-        failed = [
-            line.split(maxsplit=1)[1].partition(" - ")[0]
-            for line in done.splitlines()
-            if line.startswith(("FAILED ", "ERROR "))
-        ]
-        rows.append([name, failed[0] if failed else "-", f"{time.monotonic() - began:.0f} s"])
+        failed = [line for line in done.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+        first = failed[0].split(maxsplit=1)[1].partition(" - ")[0] if failed else "-"
+        rows.append([name, first, f"{time.monotonic() - began:.0f} s"])
         print_line(f"{name}: {rows[-1][1]}", sys.stderr)
     print_table(["guard taken out", "noticed first by", "after"], rows)
     print_line(f"{sum(row[1] != '-' for row in rows)} of {len(rows)} guards are noticed by the quick tier")
