@@ -49,6 +49,7 @@ from zscout.messages import (
 from zscout.rcm import step
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
+from zscout.rcm.booked import BookingWork
 from zscout.rcm.devices import ExpectedDevices
 from zscout.rcm.door import Door
 from zscout.rcm.leader import Leader
@@ -66,7 +67,15 @@ OPTIONS = ("priority", "runtime", "remaining", "place", "grant", "rcs")
 
 
 class NoBookings:
-    settled, settles_at, time, age = True, 0, None, 0.0
+    settled, settles_at, time, age, next = True, 0, None, 0.0, None
+
+    def at(self, _now: Ns) -> NoBookings:
+        return self
+
+    def note(self, *_: Any, **__: Any) -> BookingWork:
+        return BookingWork()
+
+    operation = again = kept = shared = tick = note
 
     def take_up(self, ask: Ask, _sender: Any) -> str:
         return ask.booking

@@ -17,8 +17,9 @@ from zscout.config.fleet import Fleet
 from zscout.keyexpr import BadName, Role
 from zscout.messages import Refused
 from zscout.rcm.admission import Admission
+from zscout.rcm.booked import Again, Booked, BookingWork
 from zscout.rcm.door import Door
-from zscout.rcm.operations import Booked, Operations, Taken
+from zscout.rcm.operations import Operations, Taken
 from zscout.rcm.places import arc_id, request_id
 from zscout.rcm.recovery import RecoveredState, listed_by, removed, vouched
 from zscout.rcm.request_log import REMEMBERED, RequestLog, reason_info
@@ -29,12 +30,14 @@ from zscout.rcm.step import (
     Asked,
     Found,
     Happened,
+    Kept,
     Lead,
     Outbox,
     Proposed,
     Reloaded,
     Reported,
     Seen,
+    Shared,
     Shunned,
     Stalled,
     Stimulus,
@@ -75,6 +78,9 @@ CONTINUED: Final = (LeadTaken, Adopted, Vouched, HandedOver)
 """Events by which holds that stand go on: the RCs hear of that before anybody else."""
 
 
+BOOKINGS: Final = (messages.Book, messages.Unbook, messages.FindSlots)
+
+
 class _Compare(NamedTuple):
     """An RC that counts as present reports its holds."""
 
@@ -102,6 +108,16 @@ class _Resume(NamedTuple):
     """RCs are no longer pending."""
 
 
+class _Booking(NamedTuple):
+    """An operation on bookings, once the core is at the present time."""
+
+    asked: Asked
+
+
+class _BookingsDue(NamedTuple):
+    """The bookings' deadlines are over."""
+
+
 class _Due(NamedTuple):
     """Deadlines are over."""
 
@@ -110,7 +126,9 @@ class _Tick(NamedTuple):
     """The core's time is over; reasons and lines of the log may be due."""
 
 
-_Work: TypeAlias = Stimulus | _Compare | _Name | _Listed | _NewClient | _Resume | _Due | _Tick
+_Work: TypeAlias = (
+    Stimulus | _Compare | _Name | _Listed | _NewClient | _Resume | _Booking | Again | _BookingsDue | _Due | _Tick
+)
 
 
 class Leader:
@@ -130,6 +148,8 @@ class Leader:
         self._bookings, self.term = bookings, admission.places.term
         self.registry = RequestLog(core, roster, admission.places, runtimes)
         self.operations = Operations(fleet, core, self.registry, roster, admission, door, bookings, runtimes)
+        self._parts = roster, self.registry, self.operations, bookings
+        """All that has deadlines."""
         self.seq = 0
         """The last number that was published."""
         self.published: Ns = 0
@@ -152,13 +172,14 @@ class Leader:
     def step(self, now: Ns, stimuli: Iterable[Stimulus] = ()) -> Outbox:
         """One instant: of what waits, as much as is decided together."""
         self._now, self._out = now, Outbox()
+        self._bookings.at(now)
         self._queue.extend(stimuli)
         if self._wake is not None and self._wake <= now and not self._waking:
             self._waking = True
             self._queue.append(_Due())
         if (events := self._next()) is not None:
             self._decide(events)
-        times = (self._core_wake, self.roster.next, self.registry.next, self.operations.next)
+        times = (self._core_wake, *(part.next for part in self._parts))
         self._out.wake = self._wake = min([at for at in times if at is not None], default=None)
         self._out.more = bool(self._queue)
         return self._out
@@ -174,6 +195,10 @@ class Leader:
         operations, queue = self.operations, self._queue
         while queue and isinstance(asked := queue[0], Asked) and operations.joins(asked):
             queue.popleft()
+            if isinstance(asked.operation, BOOKINGS):
+                self._follow(self.roster.heard(self._now, str(asked.sender)))
+                queue.appendleft(_Booking(asked))
+                return [Tick()]
             self._take(operations.take(self._now, asked))
             if isinstance(asked.operation, (messages.HandOver, messages.Foresee)):
                 break
@@ -199,6 +224,17 @@ class Leader:
                 return self._follow(self.roster.shun(self._now, token, until))
             case Stalled(length, ended, fresh):
                 self.roster.stalled(length, ended, fresh=fresh)
+            case _Booking(asked):
+                return self._booked(self._bookings.operation(*asked))
+            case Again():
+                return self._booked(self._bookings.again(work))
+            case Kept(keep, why):
+                return self._booked(self._bookings.kept(keep, why))
+            case Shared(news):
+                return self._booked(self._bookings.shared(news=news))
+            case _BookingsDue():
+                self._waking = False
+                return self._booked(self._bookings.tick())
             case Reloaded():
                 return self._reload()
             case Lead(recovered):
@@ -253,6 +289,19 @@ class Leader:
             self._queue.extendleft(reversed(later))
         return change.events
 
+    def _booked(self, work: BookingWork) -> Sequence[Event]:
+        """The events of what follows for bookings; all else is done, or put before what waits."""
+        out = self._out
+        out.answers += work.answers
+        out.proposals += [Proposed(asked.rc, self._proposal(asked)) for asked in work.proposals]
+        out.keep += work.keep
+        out.changed += work.changed
+        out.dangers += work.dangers
+        out.log += work.log
+        out.strange += work.strange
+        self._queue.extendleft(reversed(work.again))
+        return work.events
+
     def _tick(self) -> Sequence[Event]:
         answers, again = self.operations.tick(self._now)
         self._out.at_once += answers
@@ -262,7 +311,10 @@ class Leader:
         return ()
 
     def _reports(self) -> None:
-        self._waking = False
+        due = self._bookings.next
+        self._waking = due is not None and due <= self._now
+        if self._waking:
+            self._queue.appendleft(_BookingsDue())
         if self._core_wake is not None and self._core_wake <= self._now:
             self._decide([Tick()])
         notices, text = self.registry.tick(self._now)
@@ -370,9 +422,10 @@ class Leader:
                 ):
                     self._admission.places.end(arc, now, KEPT.get(outcome, REMEMBERED))
                 case Propose():
-                    out.proposals.append(Proposed(effect.rc, self.proposal(effect)))
+                    out.proposals.append(Proposed(effect.rc, self._proposal(effect)))
                 case WakeAt(at):
                     self._core_wake = at
+        self._booked(self._bookings.note(events, effects))
         if line := self.core.strategy.log_line():
             out.log.append(line)
         out.over, registry.traced = registry.traced, []
@@ -442,6 +495,7 @@ class Leader:
     def heartbeat(self, now: Ns) -> messages.Grants:
         """Repeats the last number."""
         self._now = now
+        self._bookings.at(now)
         return self._grants(self.seq, {}, [], {}, [])
 
     def _grants(
@@ -459,7 +513,7 @@ class Leader:
         before, self.seq, self.published = self.seq, number, now
         return messages.Grants(self.term, number, before, every, rcs, revoked, instances, begun, time, age, charged)
 
-    def proposal(self, effect: Propose) -> messages.Proposal:
+    def _proposal(self, effect: Propose) -> messages.Proposal:
         arcs = ((name, self.core.arc(name), params) for name, params in effect.holders.items())
         holders = [
             messages.ProposedHolder(request_id(arc.id), arc.name, arc.request.client, messages.decimals(params))

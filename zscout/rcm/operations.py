@@ -8,39 +8,27 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 from msgspec.structs import replace
 
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import BadName, Sender, check_name, client_of
-from zscout.messages import (
-    Ask,
-    BookingRecord,
-    Cancel,
-    Foresee,
-    Foresight,
-    HandOver,
-    Notice,
-    Problem,
-    ProposedHolder,
-    Refused,
-    Release,
-)
+from zscout.messages import Ask, Cancel, Foresee, Foresight, HandOver, Notice, Problem, Refused, Release
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
+from zscout.rcm.booked import Answer, Booked, Ticket
 from zscout.rcm.deadlines import Deadlines
 from zscout.rcm.door import Door
 from zscout.rcm.places import arc_id, request_id
 from zscout.rcm.recovery import Listed, vouched
 from zscout.rcm.request_log import RequestLog, party_info, reason_info
 from zscout.rcm.roster import NOTHING, Change, Roster
-from zscout.rcm.step import Asked, Reply, Ticket
+from zscout.rcm.step import Asked
 from zscout.rcm.terms import Source, Word
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import (
-    ArcRequest,
     Cancelled,
     Dropped,
     Effect,
@@ -57,30 +45,12 @@ from zscout.scheduling.model import (
 )
 from zscout.scheduling.reason import Party, person
 from zscout.scheduling.runtimes import RuntimeEstimator
-from zscout.types import SECOND, ArcId, ClientId, Ns, Params, Place
+from zscout.types import SECOND, ArcId, ClientId, Ns, Place
 
 REPLY_SLACK: Final[Ns] = SECOND // 10
 """After an overdue vote the first answer is given all the same."""
 MAX_BATCH = 64
 """Operations that are decided together at most."""
-
-
-class Booked(Protocol):
-    """The bookings of the term."""
-
-    @property
-    def settled(self) -> bool: ...
-    @property
-    def settles_at(self) -> Ns: ...
-    @property
-    def time(self) -> float | None: ...
-    @property
-    def age(self) -> float: ...
-    def take_up(self, ask: Ask, sender: Sender) -> str: ...
-    def dated(self, request: ArcRequest) -> ArcRequest: ...
-    def record(self, booking: str) -> BookingRecord | None: ...
-    def recovered(self, taken: Collection[str]) -> list[Event]: ...
-    def proposed(self, name: ArcId, params: Params) -> ProposedHolder: ...
 
 
 class _Due(Enum):
@@ -100,7 +70,7 @@ class _Standing(NamedTuple):
 class Taken:
     """What follows at once from operations: the rest once the instant is decided."""
 
-    answers: list[Reply] = field(default_factory=list)
+    answers: list[Answer] = field(default_factory=list)
     notices: list[Notice] = field(default_factory=list)
     changes: list[Change] = field(default_factory=list)
     strange: list[tuple[str, str]] = field(default_factory=list)
@@ -223,9 +193,9 @@ class Operations:
     def next(self) -> Ns | None:
         return self._deadlines.next
 
-    def tick(self, now: Ns) -> tuple[list[Reply], list[Asked]]:
+    def tick(self, now: Ns) -> tuple[list[Answer], list[Asked]]:
         """First answers that are due, and operations to be looked at again."""
-        answers, again = list[Reply](), list[Asked]()
+        answers, again = list[Answer](), list[Asked]()
         while (due := self._deadlines.pop_due(now)) is not None:
             match due:
                 case _Due.FIRST_ANSWER, arcs:
@@ -236,7 +206,7 @@ class Operations:
 
     # Out: the instant is decided
 
-    def granted(self, now: Ns, effects: Iterable[Effect]) -> tuple[list[Reply], set[ArcId]]:
+    def granted(self, now: Ns, effects: Iterable[Effect]) -> tuple[list[Answer], set[ArcId]]:
         """The answers to those whose ARCs an instant has granted, before anybody else learns of it; and those ARCs."""
         arcs = {
             effect.arc: None
@@ -245,9 +215,9 @@ class Operations:
         }
         return self._answers(now, arcs), {*arcs}
 
-    def decided(self, now: Ns, effects: Iterable[Effect]) -> tuple[list[Reply], list[Notice]]:
+    def decided(self, now: Ns, effects: Iterable[Effect]) -> tuple[list[Answer], list[Notice]]:
         """The other answers that an instant has decided, and what new clients of ARCs are to know."""
-        answers, notices = list[Reply](), list[Notice]()
+        answers, notices = list[Answer](), list[Notice]()
         for effect in effects:
             match effect:
                 case Granted(arc=arc) | Dropped(arc=arc):
@@ -267,8 +237,8 @@ class Operations:
             self._deadlines.set(now + self._first_answer, (_Due.FIRST_ANSWER, undecided))
         return answers, notices
 
-    def _answers(self, now: Ns, arcs: Iterable[ArcId]) -> list[Reply]:
-        answers = list[Reply]()
+    def _answers(self, now: Ns, arcs: Iterable[ArcId]) -> list[Answer]:
+        answers = list[Answer]()
         for arc in arcs:
             if tickets := self.waiting.pop(arc, None):
                 notice = self._registry.notice(now, arc)

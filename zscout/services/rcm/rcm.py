@@ -23,6 +23,7 @@ from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.rcm import step
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
+from zscout.rcm.booked import Answer, BookedDanger, Keep, Ticket
 from zscout.rcm.door import Door
 from zscout.rcm.leader import Leader
 from zscout.rcm.places import Places
@@ -35,7 +36,8 @@ from zscout.scheduling.model import Event, Vote, VoteOverdue
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.bookings.keeper import BookingKeeper
-from zscout.services.rcm.bookings import BookedDanger, Bookings
+from zscout.services.rcm.booking_sharing import BookingSharing
+from zscout.services.rcm.bookings import Bookings, bookings_of
 from zscout.services.rcm.digest import HoldDigest, HoldListener
 from zscout.services.rcm.inventory import Inventory
 from zscout.services.rcm.state_answers import StateAnswers
@@ -113,22 +115,12 @@ class Rcm:
         devices, me, now = self.inventory.devices, mesh.me.host, mesh.now()
         roster = Roster(mesh.keys, me, fleet, term, devices, admission, core.arc, now)
         door = Door(devices, roster, now + fleet.timing.hold_lease)
-        self.bookings = Bookings(
-            mesh,
-            fleet,
-            term,
-            core,
-            parts.keeper or BookingKeeper(mesh),
-            parts.kept,
-            admission,
-            self.supervisor,
-            self._receive,
-            lambda effect: self._propose(step.Proposed(effect.rc, self.leader.proposal(effect))),
-            lambda needs: door.check(mesh.now(), needs, may_wait=False),
-            parts.runtimes,
-            parts.on_danger,
+        self._keeper = parts.keeper or BookingKeeper(mesh)
+        self._bookings = bookings_of(fleet, core, admission, door, self._keeper, parts.kept, parts.runtimes)
+        self.sharing = BookingSharing(
+            mesh, term, self._keeper, self._bookings, self.authority, self.supervisor, self._take
         )
-        self.leader = Leader(fleet, core, admission, roster, door, self.bookings, parts.runtimes)
+        self.leader = Leader(fleet, core, admission, roster, door, self._bookings, parts.runtimes)
         view = StateView(me, core, roster, self.leader.registry, devices, parts.runtimes)
         self._states = StateAnswers(mesh, self.leader, view)
         self._digest = HoldDigest(core, parts.listeners) if parts.listeners else None
@@ -139,7 +131,7 @@ class Rcm:
         self._coming: list[step.Stimulus] = []
         """Of the present burst."""
         self._running = False
-        self._open: dict[step.Ticket, IncomingQuery[messages.Operation]] = {}
+        self._open: dict[Ticket, IncomingQuery[messages.Operation]] = {}
         """Operations that are not answered yet."""
         self._tickets = count(1)
         self._declared: list[Declaration] = []
@@ -162,7 +154,17 @@ class Rcm:
         """The last number that was published."""
         return self.leader.seq
 
+    @property
+    def bookings(self) -> Bookings:
+        return self._bookings.at(self.mesh.now())
+
     # Beginning and end
+
+    async def enter(self) -> None:
+        """Has the core know of dates, in parts between which others run, before it begins to lead."""
+        for part in self.bookings.dates.parts():
+            self.core.handle(self.mesh.now(), part)
+            await asyncio.sleep(0)
 
     def start(self, recovered: RecoveredState) -> None:
         """Begins to lead. Everything that is declared here is declared by the leader only."""
@@ -189,7 +191,7 @@ class Rcm:
             mesh.watch(keys.alive_any(Role.RC), guard(self._on_token)),
             mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, self.term.rcm)),
         ]
-        self.bookings.start()
+        self.sharing.start()
         self.supervisor.spawn(self._send_heartbeats())
 
     def stop(self) -> None:
@@ -204,7 +206,7 @@ class Rcm:
             self.inventory.stop()
         if text := self.leader.close(self.mesh.now()):
             log.info("%s", text)
-        self.bookings.close()
+        self.sharing.close()
         queries, self._open = self._open, {}
         for query in queries.values():
             query.refuse(Refused("not_leading", "this manager stopped leading; try again").problem)
@@ -248,9 +250,6 @@ class Rcm:
         return Lane.ASK, host if owner is None else client_of(owner).host
 
     def _on_operation(self, query: IncomingQuery[messages.Operation]) -> None:
-        if isinstance(query.message, (messages.Book, messages.Unbook, messages.FindSlots)):
-            self.bookings.handler.on_operation(query)
-            return
         ticket = next(self._tickets)
         self._open[ticket] = query
         self._take(step.Asked(ticket, self.mesh.keys.sender_of(query.key), query.message))
@@ -308,8 +307,13 @@ class Rcm:
             supervisor.spawn(self._ask(question))
         for sign, so in out.suspicions:
             mesh.suspicions.suspect(sign, so=so)
-        if out.effects or out.events:
-            self.bookings.note(out.events, out.effects)
+        self.sharing.tell(out.changed)
+        for keep in out.keep:
+            supervisor.spawn(self._keep(keep))
+        for danger in out.dangers:
+            words = f"is in danger: {danger.why}" if danger.why else "is safe again"
+            log.warning("booking %s of %s %s", danger.record.name, danger.record.owner, words)
+            self._parts.on_danger(danger)
         for text in out.log:
             log.info("%s", text)
         for subject, text in out.strange:
@@ -323,10 +327,10 @@ class Rcm:
         self._alarm.set(out.wake)
         return True
 
-    def _answer_grants(self, granted: Sequence[step.Reply]) -> None:
+    def _answer_grants(self, granted: Sequence[Answer]) -> None:
         self._answer(granted)
 
-    def _answer(self, answers: Iterable[tuple[step.Ticket, Struct]]) -> None:
+    def _answer(self, answers: Iterable[tuple[Ticket, Struct]]) -> None:
         for ticket, message in answers:
             if (query := self._open.pop(ticket, None)) is not None:
                 query.end(message)
@@ -358,6 +362,11 @@ class Rcm:
         reply = await self.mesh.ask_one(asked.key, asked.message, asked.kind, timeout=asked.timeout)
         message, problem = (None, None) if reply is None else (reply.message, reply.problem)
         self._take(step.Answered(asked, message, problem))
+
+    async def _keep(self, keep: Keep) -> None:
+        record = self._keeper.records.get(keep.booking)
+        why = await self.sharing.keep(record) if record is not None else ""
+        self._take(step.Kept(keep, why))
 
     async def _send_heartbeats(self) -> None:
         """Repeats the last number whenever nothing was published for a while."""
