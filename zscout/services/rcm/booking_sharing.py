@@ -15,7 +15,7 @@ from zscout.keyexpr import Keys, Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Lane, Mesh, Reply
 from zscout.mesh.supervision import Supervisor, done_within
 from zscout.messages import BookingRecord, BookingsAsk, BookingsKept, BookingsTold, ShareBookings
-from zscout.rcm import step
+from zscout.rcm import steps
 from zscout.rcm.authority import Authority
 from zscout.services.bookings.fleet_clock import DIFFERS, SAME, agreed, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
@@ -61,7 +61,7 @@ class BookingSharing:
         bookings: Bookings,
         authority: Authority,
         supervisor: Supervisor,
-        take: Callable[[step.Stimulus], None],
+        take: Callable[[steps.Stimulus], None],
     ) -> None:
         self._mesh, self._term, self._keeper, self._authority = mesh, term, keeper, authority
         self._bookings, self._clock, self._supervisor, self._give = bookings, bookings.clock, supervisor, take
@@ -134,10 +134,10 @@ class BookingSharing:
             if self._seen != self._keeper.shared:
                 # One that led elsewhere has told of its bookings before it stepped down.
                 self._seen, self._behind = self._keeper.shared, True
-                self._give(step.Shared(news=True))
+                self._give(steps.Shared(news=True))
             async with self._sharing:
                 why = await self._share()
-            self._give(step.Shared(news=False))
+            self._give(steps.Shared(news=False))
             if why:
                 log.warning("bookings are kept by this host alone: %s", why)
 
@@ -185,7 +185,7 @@ class BookingSharing:
             for reply in replies
         )
         if changed:
-            self._give(step.Shared(news=True))
+            self._give(steps.Shared(news=True))
             self._keeper.news.set()
         walls = {one.host: one.wall for one in answers} | {self._mesh.me.host: self._keeper.wall()}
         found, age = oldest(answers), (now - self._clock.since) / SECOND

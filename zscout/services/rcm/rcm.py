@@ -20,7 +20,7 @@ from zscout.keyexpr import Role, Token, client_of
 from zscout.mesh import Declaration, IncomingQuery, Lane, Mesh, MeshError, Refused, Reply, Tally
 from zscout.mesh.sparse_log import SparseLog
 from zscout.mesh.supervision import StallWatch, Supervisor
-from zscout.rcm import step
+from zscout.rcm import steps
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
 from zscout.rcm.booked import Answer, BookedDanger, Keep, Ticket
@@ -40,7 +40,6 @@ from zscout.services.rcm.booking_sharing import BookingSharing
 from zscout.services.rcm.bookings import Bookings, bookings_of
 from zscout.services.rcm.digest import HoldDigest, HoldListener
 from zscout.services.rcm.inventory import Inventory
-from zscout.services.rcm.state_answers import StateAnswers
 from zscout.types import SECOND, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
@@ -121,14 +120,13 @@ class Rcm:
             mesh, term, self._keeper, self._bookings, self.authority, self.supervisor, self._take
         )
         self.leader = Leader(fleet, core, admission, roster, door, self._bookings, parts.runtimes)
-        view = StateView(me, core, roster, self.leader.registry, devices, parts.runtimes)
-        self._states = StateAnswers(mesh, self.leader, view)
+        self._view = StateView(me, core, roster, self.leader.registry, devices, parts.runtimes)
         self._digest = HoldDigest(core, parts.listeners) if parts.listeners else None
         self._grants = mesh.publisher(mesh.keys.grants, messages.Grants)
         self._strange = SparseLog(log, mesh.now)
         self._stall = StallWatch(mesh.now)
-        self._stalled = step.Stalled(0, 0, fresh=False)
-        self._coming: list[step.Stimulus] = []
+        self._stalled = steps.Stalled(0, 0, fresh=False)
+        self._coming: list[steps.Stimulus] = []
         """Of the present burst."""
         self._running = False
         self._open: dict[Ticket, IncomingQuery[messages.Operation]] = {}
@@ -172,7 +170,7 @@ class Rcm:
         if self._parts.inventory is None:
             self.inventory.start(self.supervisor)
         self._stall.start()
-        self._now_take(step.Lead(recovered))
+        self._now_take(steps.Lead(recovered))
         self._declared = [
             mesh.serve(
                 keys.schedule_any,
@@ -183,7 +181,7 @@ class Rcm:
                 concerns=self._concerns,
             ),
             *(
-                mesh.serve(key, messages.StateAsk, guard(self._states.answer), lane=Lane.QUESTION)
+                mesh.serve(key, messages.StateAsk, guard(self._on_state_asked), lane=Lane.QUESTION)
                 for key in (keys.rcm_state, keys.rcm_state_any)
             ),
             mesh.subscribe(keys.rc_state_any, messages.RcState, guard(self._on_rc_state)),
@@ -213,33 +211,33 @@ class Rcm:
         self._grants.close()
 
     def on_reload(self) -> None:
-        self._now_take(step.Reloaded())
+        self._now_take(steps.Reloaded())
 
     # In
 
     def _look(self) -> None:
         """Before the leader judges by tokens and answers, it is to know of a stall of this process."""
-        stalled = step.Stalled(self._stall.length, self._stall.ended, self._stall.fresh())
+        stalled = steps.Stalled(self._stall.length, self._stall.ended, self._stall.fresh())
         if stalled != self._stalled:
             self._stalled = stalled
             self._coming.append(stalled)
 
-    def _take(self, stimulus: step.Stimulus) -> None:
+    def _take(self, stimulus: steps.Stimulus) -> None:
         """Those of one burst are taken together."""
         first = not self._coming
-        if not isinstance(stimulus, step.Asked):
+        if not isinstance(stimulus, steps.Asked):
             self._look()
         self._coming.append(stimulus)
         if first:
             self.mesh.after_burst(self._run)
 
-    def _now_take(self, stimulus: step.Stimulus) -> None:
+    def _now_take(self, stimulus: steps.Stimulus) -> None:
         self._coming.append(stimulus)
         self._run()
 
     def _receive(self, *events: Event) -> None:
         """Events of one instant, decided at once."""
-        self._now_take(step.Happened(events))
+        self._now_take(steps.Happened(events))
 
     def _concerns(self, query: IncomingQuery[messages.Operation]) -> tuple[Lane, str]:
         """Dry runs and slots are questions; an operation on another host's request waits behind that host's surplus."""
@@ -252,13 +250,16 @@ class Rcm:
     def _on_operation(self, query: IncomingQuery[messages.Operation]) -> None:
         ticket = next(self._tickets)
         self._open[ticket] = query
-        self._take(step.Asked(ticket, self.mesh.keys.sender_of(query.key), query.message))
+        self._take(steps.Asked(ticket, self.mesh.keys.sender_of(query.key), query.message))
+
+    def _on_state_asked(self, query: IncomingQuery[messages.StateAsk]) -> None:
+        query.answer(*self._view.answer(query.message, self.seq, self.mesh.now()))
 
     def _on_rc_state(self, key: str, state: messages.RcState) -> None:
-        self._take(step.Reported(key, state))
+        self._take(steps.Reported(key, state))
 
     def _on_token(self, token: Token, alive: bool) -> None:
-        self._take(step.Seen(token, alive))
+        self._take(steps.Seen(token, alive))
 
     def _on_alarm(self) -> None:
         self._look()
@@ -282,14 +283,14 @@ class Rcm:
         finally:
             self._running = False
 
-    def _carry_out(self, out: step.Outbox) -> bool:
+    def _carry_out(self, out: steps.Outbox) -> bool:
         """In the order of the fields. Return False if this leader stepped down."""
         mesh, supervisor = self.mesh, self.supervisor
         self._answer(out.at_once)
         for word, token in out.higher:
             verdict = self._on_newer(word)
             if token is not None and verdict.absent_until:
-                self._take(step.Shunned(token, verdict.absent_until))
+                self._take(steps.Shunned(token, verdict.absent_until))
         for rc, term in out.disbelieved:
             self._parts.on_disbelieved(rc, term)
         if not supervisor.active:
@@ -357,16 +358,16 @@ class Rcm:
 
     async def _ask(self, asked: Question) -> None:
         if asked.kind is None:
-            self._take(step.Found(asked, await self.mesh.living(asked.key, timeout=asked.timeout)))
+            self._take(steps.Found(asked, await self.mesh.living(asked.key, timeout=asked.timeout)))
             return
         reply = await self.mesh.ask_one(asked.key, asked.message, asked.kind, timeout=asked.timeout)
         message, problem = (None, None) if reply is None else (reply.message, reply.problem)
-        self._take(step.Answered(asked, message, problem))
+        self._take(steps.Answered(asked, message, problem))
 
     async def _keep(self, keep: Keep) -> None:
         record = self._keeper.records.get(keep.booking)
         why = await self.sharing.keep(record) if record is not None else ""
-        self._take(step.Kept(keep, why))
+        self._take(steps.Kept(keep, why))
 
     async def _send_heartbeats(self) -> None:
         """Repeats the last number whenever nothing was published for a while."""
@@ -379,7 +380,7 @@ class Rcm:
 
     # Proposals, and ballots
 
-    def _propose(self, proposed: step.Proposed) -> None:
+    def _propose(self, proposed: steps.Proposed) -> None:
         rc, proposal = proposed
         vote_timeout = self.fleet.timing.vote_timeout / SECOND
         # Overdue once; an answer that comes before the query ends still counts.
@@ -398,8 +399,8 @@ class Rcm:
         self.mesh.suspicions.suspect(f"{rc} is seen and does not vote", so=reply is None)
         ballot = reply.message if reply is not None else None
         if ballot is not None and ballot.proposal == proposal:
-            self._take(step.Happened([Vote(proposal, ballot.accept, ballot.reason[:MAX_REASON])]))
+            self._take(steps.Happened([Vote(proposal, ballot.accept, ballot.reason[:MAX_REASON])]))
             return
         if reply is not None and reply.problem is not None:
             log.warning("%s did not vote: %s", rc, reply.problem.message)
-        self._take(step.Happened([VoteOverdue(proposal)]))
+        self._take(steps.Happened([VoteOverdue(proposal)]))
