@@ -306,7 +306,7 @@ class Keys:
     # Parsing: each raises BadName for a key of another form
 
     def sender_of(self, key: str) -> Sender:
-        """The sender of a request or command, or the owner of the key of a client or a building."""
+        """The sender of a request or command, or the owner of the key of a client, recorder or building."""
         return _sender_of(self, key)
 
     def rc_of(self, key: str) -> str:
@@ -347,6 +347,7 @@ def _sender_of(keys: Keys, key: str) -> Sender:
             | ["rc", _, _, "command", host, client]
             | ["client", host, client, "notice" | "requests" | "behavior"]
             | ["building", host, client, "plan" | "poses"]
+            | ["recorder", host, client, "recorded"]
             | ["placer", "component", host, client]
             | ["host", _, "component" | "confirm" | "history", host, client]
         ):
@@ -415,7 +416,7 @@ ACCESS: Final = (
     Access("client/*/*/notice", publish=_MANAGERS, subscribe=_ALL),
     Access("client/{at}/*/requests", ask=_MANAGERS, serve=USERS),
     Access("client/{at}/*/behavior", publish=USERS, subscribe=_ALL),
-    Access("recorder/{at}/*/recorded", ask=_ALL, serve=_ALL),
+    Access("recorder/{at}/*/recorded", ask=_ALL, serve=NODES),
     Access("building/{at}/*/plan", ask=_ALL, serve=USERS),
     Access("building/{at}/*/poses", publish=USERS, subscribe=_ALL),
     *(Access(f"alive/{{at}}/{role}/**", show=_ALL) for role in (Role.CLIENT, Role.RECORDER, Role.SESSION)),

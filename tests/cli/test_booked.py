@@ -11,12 +11,12 @@ import pytest
 from tests.mesh.kit import run
 from zscout.behaviors.client.client import Client
 from zscout.cli.booked import (
-    User,
     ask_bookings,
     booking_json,
     choose,
     free_name,
     in_words,
+    is_own,
     look,
     rcs_words,
     soon,
@@ -24,13 +24,14 @@ from zscout.cli.booked import (
     whose,
 )
 from zscout.cli.common import Failed
+from zscout.cli.ownership import User
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Sender
 from zscout.messages import BookedDate, BookingsAsk, BookingsTold, BookingView, Who
 from zscout.testing.memory import MemoryNetwork
 
 FLEET = default_fleet()
-ALICE = User("alice", "ws1", person=False)
+ALICE = User("alice", "ws1")
 ZONE = ZoneInfo("Europe/Berlin")
 START = 1_796_130_000
 """2026-12-01 14:00 in Berlin."""
@@ -47,23 +48,36 @@ A, B, C = booking("aa11"), booking("ab22", user="bob"), booking("ac33", "demo", 
 
 
 def test_ones_own_is_of_the_same_user_wherever_it_was_made() -> None:
-    assert ALICE.owns(A)
-    assert ALICE.owns(booking("x", owner="ws9"))
-    assert not ALICE.owns(B), "of another user of the same host"
-    assert ALICE.owns(booking("x", user="")), "which tells no user"
-    assert not ALICE.owns(booking("x", user="", owner="ws2"))
-    ada = User("pi", "ada", person=True)
-    assert ada.owns(booking("x", user="alice", owner="ada")), "her certificate, from another account"
-    assert not ada.owns(B)
+    assert is_own(A, ALICE)
+    assert is_own(booking("x", owner="ws9"), ALICE)
+    assert not is_own(B, ALICE), "of another user of the same host"
+    assert is_own(booking("x", user=""), ALICE), "whose user is unknown"
+    assert not is_own(booking("x", user="", owner="ws2"), ALICE)
 
 
-def test_a_name_is_ones_own_first_then_anybodys_then_the_beginning_of_an_id() -> None:
+def test_with_certificates_ones_own_is_of_the_same_certificate() -> None:
+    ada = User("pi", "ada", proved=True)
+    assert is_own(booking("x", user="alice", owner="ada"), ada), "from another account"
+    assert not is_own(booking("x", user="pi", owner="bob"), ada), "an account proves nothing"
+
+
+def test_a_name_is_ones_own_first_then_an_id_then_anybodys() -> None:
     assert choose([A, B, C], "survey", ALICE) == A
     assert choose([B, C], "survey", ALICE) == B
     assert choose([A, B, C], "demo", ALICE) == C
-    assert choose([A, B, C], "ab", ALICE) == B
-    assert choose([A, booking("survey")], "survey", ALICE).id == "survey", "an id goes before names"
+    assert choose([A, booking("survey", user="bob")], "survey", ALICE) == A, "whoever makes an id chooses it"
+    assert choose([B, booking("survey")], "survey", ALICE).id == "survey"
     assert choose([booking("x", unbooked=True), A], "survey", ALICE) == A
+
+
+def test_an_id_is_named_by_four_characters_that_are_nobodys_name() -> None:
+    long, other = booking("abcd11", "1"), booking("abcd22", "abcd", user="bob")
+    assert choose([long, A], "abcd", ALICE) == long
+    assert choose([long, other], "abcd", ALICE) == other, "a name"
+    for short in ("a", "abc"):
+        with pytest.raises(Failed, match=f'unknown booking "{short}"'):
+            choose([long], short, ALICE)
+    assert choose([long], "1", ALICE) == long, "a default name of earlier versions"
 
 
 def test_a_name_of_several_is_refused_with_all_of_them() -> None:
@@ -71,8 +85,8 @@ def test_a_name_of_several_is_refused_with_all_of_them() -> None:
         Failed, match=r'2 bookings are called "survey": aa11 .* of alice@ws1; ad44 .*name one by its id'
     ):
         choose([A, B, booking("ad44")], "survey", ALICE)
-    with pytest.raises(Failed, match='2 bookings are called "a"'):
-        choose([B, C], "a", ALICE)
+    with pytest.raises(Failed, match='2 bookings are called "abcd"'):
+        choose([booking("abcd1"), booking("abcd2")], "abcd", ALICE)
 
 
 def test_what_nobody_booked_is_told_with_what_may_be_meant() -> None:

@@ -160,9 +160,14 @@ class Chaos:
         _, lead = old.as_events(term)
         joins = [RcJoined(name, self.sharable[name]) for name in self.present]
         self.send(*joins, lead)
-        # The next RCM does not know whose RCs did not confirm.
-        others = {arc: grant for arc, grant in self.ledger.open.items() if arc not in old._state.held_back}
-        assert others == before, "a change of RCM disturbed somebody"
+        # The next RCM does not know whose RCs did not confirm: they may start now, and preempt by their rank.
+        starts = old._state.held_back.keys() & self.ledger.open.keys()
+        if not starts:
+            assert self.ledger.open == before, "a change of RCM disturbed somebody"
+        taken = {need for arc in starts for need in self.ledger.requests[arc].needs}
+        for arc, grant in before.items():
+            undisturbed = self.ledger.open.get(arc) == grant or taken & self.ledger.requests[arc].needs.keys()
+            assert undisturbed, "a change of RCM disturbed somebody"
 
     def settle(self) -> None:
         """All is well again: RCs are back, questions are answered (those overdue never), time goes on."""
@@ -200,7 +205,7 @@ class Chaos:
 
 
 @pytest.mark.parametrize("strategy", STRATEGIES)
-@settings(max_examples=times(60))
+@settings(max_examples=times(40))
 @given(st.data(), st.lists(st.tuples(st.sampled_from(OPS), st.integers(0, 11)), max_size=60))
 def test_promises_hold_in_any_chaos_and_in_the_end_all_are_served(
     strategy: StrategyName, draw: st.DataObject, ops: list[tuple[str, int]]

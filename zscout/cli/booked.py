@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import click
 from msgspec import structs
@@ -13,16 +13,18 @@ from msgspec import structs
 from zscout.behaviors.client.bookings import BookingsClient
 from zscout.behaviors.client.client import QUERY_TIMEOUT, Client
 from zscout.behaviors.client.request import RequestRefused
-from zscout.cli import common, completion
+from zscout.cli import common, completion, ownership
 from zscout.cli.common import F, Failed, Parsed
 from zscout.cli.dates import parse_zone, span_words
+from zscout.cli.ownership import User
 from zscout.config.strict import BadInput, quoted
-from zscout.keyexpr import PEOPLE
-from zscout.messages import BookedDate, BookingsAsk, BookingsTold, BookingView, Who
+from zscout.messages import BookedDate, BookingsAsk, BookingsTold, BookingView
 from zscout.terminal import clean, clock, span
 
 SHOWN_ID: Final = 8
-"""Characters of an id that are shown: it is named by any beginning that no other has."""
+"""Characters of an id that are shown."""
+MIN_PREFIX: Final = 4
+"""An id is also named by its beginning, of so many characters at least."""
 SOON: Final = 86_400
 """Seconds."""
 MAX_LISTED: Final = 8
@@ -97,42 +99,27 @@ def explained(refused: RequestRefused) -> Exception:
     return BadInput(str(refused)) if refused.code in BAD else refused
 
 
-# Which one is meant
+# Which booking is meant
 
 
-class User(NamedTuple):
-    """Who runs this program: its user, and the host or the certificate that it comes from; `person` where that is one,
-    and not a machine that several may use."""
-
-    name: str
-    host: str
-    person: bool
-
-    @classmethod
-    def of(cls, client: Client) -> User:
-        host = client.mesh.me.host
-        return cls(client.who.user if client.who is not None else "", host, _is_person(client, host))
-
-    def owns(self, booking: BookingView) -> bool:
-        """Whether it is of the same user, or by certificate the same person; of one that tells no user, of the same
-        host."""
-        user = booking.who.user if booking.who is not None else ""
-        if booking.owner == self.host and (self.person or not user):
-            return True
-        return bool(user) and user == self.name
+def is_own(booking: BookingView, user: User) -> bool:
+    return user.owns(booking.owner, booking.who)
 
 
-def _is_person(client: Client, host: str) -> bool:
-    return bool(client.fleet.access.ranks_of(host) & PEOPLE)
+def label(booking: BookingView) -> str:
+    """`survey (3f2a91c0) of alice@ws1`."""
+    return f"{booking.name} ({short(booking)}) of {whose(booking)}"
 
 
 def choose(bookings: Sequence[BookingView], name: str, user: User) -> BookingView:
-    """The one of this name or id, of the user's own first. Raises Failed where there is none, or more than one."""
-    there = [one for one in bookings if not one.unbooked]
-    alike = [one for one in there if one.name == name]
-    own = [one for one in alike if user.owns(one)]
-    found = [one for one in there if one.id == name] or own or alike
-    found = found or [one for one in there if one.id.startswith(name)]
+    """The user's own booking of this name, else the booking with this id, else another user's of this name, else the
+    booking whose id begins with it. Raises Failed if there is none, or more than one."""
+    there = [booking for booking in bookings if not booking.unbooked]
+    alike = [booking for booking in there if booking.name == name]
+    found = [booking for booking in alike if is_own(booking, user)]
+    found = found or [booking for booking in there if booking.id == name] or alike
+    if not found and len(name) >= MIN_PREFIX:
+        found = [booking for booking in there if booking.id.startswith(name)]
     if not found:
         raise common.unknown("booking", name, [one.name for one in there], "and there are none", "booked")
     if len(found) > 1:
@@ -157,9 +144,8 @@ def short(booking: BookingView) -> str:
 
 
 def whose(booking: BookingView) -> str:
-    """`alice@ws1`; the host or certificate that made it, where no user is told."""
-    who = booking.who or Who()
-    return clean(f"{who.user}@{who.host or booking.owner}" if who.user else booking.owner)
+    """`alice@ws1`; the host or certificate that made it, if its user is unknown."""
+    return ownership.whose(booking.owner, booking.who)
 
 
 def rcs_words(booking: BookingView, date: BookedDate | None = None) -> str:
@@ -196,7 +182,7 @@ def booking_json(booking: BookingView, user: User) -> dict[str, Any]:
     dates = [structs.asdict(one) | {"start": utc(one.start), "end": utc(one.end)} for one in booking.dates]
     until = None if booking.until is None else utc(booking.until)
     return structs.asdict(booking) | {
-        "own": user.owns(booking),
+        "own": is_own(booking, user),
         "start": utc(booking.start),
         "until": until,
         "dates": dates,

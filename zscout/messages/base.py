@@ -22,6 +22,10 @@ MAX_PAYLOAD = 65_536
 """Bytes of one query."""
 MAX_STATE = 16_000_000
 """Bytes of one answer or publication, which may be about a whole fleet."""
+MAX_LISTED = 400_000
+"""Bytes of a client's answer on what it asks for: decoding it takes below 20 ms."""
+MAX_HELD = 1_000_000
+"""Bytes of an RC's state, with all its holders."""
 MAX_NEEDS = 64
 MAX_PARAMS = 16
 MAX_COUNTER = 2**52 - 1
@@ -98,6 +102,9 @@ NAMES_ONCE: set[Any] = set()
 """Kinds in which a name that stands twice in one object is refused. The decoder alone takes the last, which
 in a request would silently drop a need; elsewhere the 6 us are not worth it."""
 
+LIMITS: dict[Any, int] = {}
+"""Bytes of one message of that kind, where they are fewer than of others."""
+
 
 class Malformed(ValueError):
     """A payload that is not the message it should be; the text names what and where."""
@@ -148,7 +155,7 @@ def decode(payload: bytes, kind: type[T] | Any, limit: int = MAX_PAYLOAD) -> T:
 def decode_told(payload: bytes, kind: type[T] | Any, limit: int = MAX_STATE) -> T:
     """The same of what is published or answered, and may be passed on: it holds no decimal that is no number, or of
     implausible size, which others could not read again. (An operation is refused for one in words of its own.)"""
-    message: T = decode(payload, kind, limit)
+    message: T = decode(payload, kind, min(limit, LIMITS.get(kind, limit)))
     check: Callable[[Any], bool] = _plausible(kind)
     if not check(message):
         raise Malformed(f"not a valid {kind.__name__}: a decimal in it is no number, or beyond 1e{MAX_EXPONENT}")

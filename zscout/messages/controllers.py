@@ -6,7 +6,7 @@ from typing import Annotated, Any, TypeAlias
 
 from msgspec import Meta
 
-from zscout.messages.base import MAX_NEEDS, Amounts, Elapsed, Message, Problem, Seconds, VersionText
+from zscout.messages.base import LIMITS, MAX_HELD, MAX_NEEDS, Amounts, Elapsed, Message, Problem, Seconds, VersionText
 from zscout.messages.scheduling import Holder, Parameters
 from zscout.types import NO_TERM, Grant, Term
 
@@ -156,3 +156,6 @@ class FrameHead(Message, frozen=True):
     """The hold under which it was taken; none while the framegrabber is free."""
     source: str = ""
     """The video RC to which the framegrabber is tuned, if it knows several."""
+
+
+LIMITS[RcState] = MAX_HELD

@@ -8,6 +8,8 @@ from typing import Annotated, TypeAlias
 import msgspec
 
 from zscout.messages.base import (
+    LIMITS,
+    MAX_LISTED,
     Amounts,
     Elapsed,
     Message,
@@ -437,3 +439,6 @@ class ClientRequests(Message, frozen=True):
     requests: list[OpenRequest]
     term: Term = NO_TERM
     """The highest that it has promised."""
+
+
+LIMITS[ClientRequests] = MAX_LISTED

@@ -28,7 +28,7 @@ from zscout.scheduling.model import Arc, PatternClass, Rank, Rc, absences, union
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.state import SchedulerState
-from zscout.types import Need, RcName
+from zscout.types import Need, Ns, RcName
 
 
 class Fitness(IntEnum):
@@ -69,10 +69,11 @@ class Choices:
         ending = set(_exclusive_victims(state, arc, arc.named_mask))
         there = like.reach & state.present
         free = there & ~(closed | state.busy | state.sharable | (0 if arc.claim is None else arc.claim.kept))
+        self._there, self._held = there, there & ~(free | state.sharable | usable(state, arc))
         self._best_first = [_Choice(Fitness.FREE, rc.demand, rc.bit, rc) for rc in state.rcs_in(free)]
         self._best_first += [
             _Choice(*_fitness(state, arc, rc, bool(rc.bit & closed), ending), rc.bit, rc)
-            for rc in state.rcs_in(there & ~free)
+            for rc in state.rcs_in(there & ~(free | self._held))
         ]
         self._best_first.sort()
         self.contended = union(choice.bit for choice in self._best_first if choice.fitness <= Fitness.PREEMPTIBLE)
@@ -97,17 +98,24 @@ class Choices:
             left = [choice for choice in free if not choice.bit & claimed or choice.rc.sharable]
             found = [*left, *sorted(taken), *found[len(free) :]]
         numbers = Counter(self._masks.values())
-        by_mask = {mask: [choice for choice in found if choice.bit & mask] for mask in numbers}
+        fit = {mask: list[Rc]() for mask in numbers}
+        seen = 0
         for worst in Fitness:
-            fitting = {mask: _count(some, worst) for mask, some in by_mask.items()}
-            if any(fitting[mask] < number for mask, number in numbers.items()):
+            if worst is Fitness.HELD:
+                rcs = self._state.rcs_in(self._held & ~without)
+                held = [_Choice(worst, _held_until(rc.holders.values()), rc.bit, rc) for rc in rcs]
+                found = sorted([*found, *held])
+            more = found[seen : _count(found, worst)]
+            seen += len(more)
+            for mask, some in fit.items():
+                some += [choice.rc for choice in more if choice.bit & mask]
+            if any(len(fit[mask]) < number for mask, number in numbers.items()):
                 continue
-            fit = {mask: [choice.rc for choice in some[: fitting[mask]]] for mask, some in by_mask.items()}
             if (chosen := distinct({need: fit[mask] for need, mask in self._masks.items()})) is not None:
                 if worst <= Fitness.PREEMPTIBLE and self._state.running:
-                    options = {need: by_mask[mask] for need, mask in self._masks.items()}
                     claimed = claimed if worst < Fitness.CLAIMED else 0
-                    chosen = _least_ending(self._state, self._arc, chosen, options, claimed)
+                    there = self._there & ~without
+                    chosen = _least_ending(self._state, self._arc, chosen, found, there, claimed)
                 return {need: rc.name for need, rc in chosen.items()}
         return None
 
@@ -216,13 +224,16 @@ def _fitness(state: SchedulerState, arc: Arc, rc: Rc, closed: bool, ending: Coll
         )
         return Fitness.FREE, -1 if continues_here or kept else len(rc.holders) + (answer is None)
     if non_preemptible:
-        held_until = max(0 if holder.hold is None else holder.hold.end for holder in non_preemptible)
-        return Fitness.HELD, held_until
+        return Fitness.HELD, _held_until(non_preemptible)
     if closed:
         return Fitness.RESERVED, rc.demand
     if others := [holder for holder in rc.holders.values() if holder not in ending]:
         return Fitness.PREEMPTIBLE, max(holder.priority for holder in others)
     return Fitness.FREED if rc.holders else Fitness.FREE, -1 if kept else rc.demand
+
+
+def _held_until(holders: Iterable[Arc]) -> Ns:
+    return max(0 if holder.hold is None else holder.hold.end for holder in holders)
 
 
 def _exclusive_victims(state: SchedulerState, arc: Arc, mask: int) -> Iterator[Arc]:
@@ -249,10 +260,11 @@ def _victims(state: SchedulerState, arc: Arc, mask: int) -> set[Arc]:
 
 
 def _least_ending(
-    state: SchedulerState, arc: Arc, start: dict[Need, Rc], options: Mapping[Need, Sequence[_Choice]], claimed: int
+    state: SchedulerState, arc: Arc, start: dict[Need, Rc], best_first: Sequence[_Choice], there: int, claimed: int
 ) -> dict[Need, Rc]:
     """Separate RCs for all needs, none of `claimed`, with the fewest victims: first within their minimum runtimes,
-    then of all, then the lowest-ranked. Branch and bound from `start`, the best of MAX_TRIED choices."""
+    then of all, then the lowest-ranked. Branch and bound from `start`, the best of MAX_TRIED choices. `there`: bits of
+    all RCs that could be chosen."""
     if not arc.named_mask & state.sharable and not any(rc.holders for rc in start.values()):
         return start
     now, best = state.now, start
@@ -263,15 +275,10 @@ def _least_ending(
     least = _victims(state, arc, arc.named_mask | union(rc.bit for rc in start.values()))
     if cost(least) == cost(set(_exclusive_victims(state, arc, arc.named_mask))):
         return start
-    needs = sorted(options, key=lambda need: (len(options[need]), need))
-    bits = {
-        need: [
-            (choice.rc, choice.bit)
-            for choice in found
-            if choice.fitness <= Fitness.PREEMPTIBLE and not choice.bit & claimed
-        ]
-        for need, found in options.items()
-    }
+    masks = class_of(arc).masks
+    needs = sorted(masks, key=lambda need: ((there & masks[need]).bit_count(), need))
+    fit = [choice for choice in best_first if choice.fitness <= Fitness.PREEMPTIBLE and not choice.bit & claimed]
+    bits = {need: [(choice.rc, choice.bit) for choice in fit if choice.bit & mask] for need, mask in masks.items()}
     tried = 0
 
     def place(at: int, mask: int, chosen: dict[Need, Rc]) -> None:

@@ -9,7 +9,7 @@ from zoneinfo import ZoneInfo
 
 import pytest
 
-from zscout.cli.bookings.book import Asked
+from zscout.cli.bookings.book import Asked, _named_after
 from zscout.cli.dates import parse_date
 from zscout.config.strict import BadInput
 
@@ -62,3 +62,17 @@ def test_a_year_of_days_is_told_in_a_moment() -> None:
     began = time.process_time()
     asked("2026-12-01 14:00", 1).remarks()
     assert time.process_time() - began < 2
+
+
+@pytest.mark.parametrize(
+    ("need", "name"),
+    [
+        ("gpu/1", "gpu-1"),
+        ("robot/arm1", "robot-arm1"),
+        ("framegrabber/*", "framegrabber"),
+        ("robot/scout$*", "robot"),
+        ("gpu/" + "x" * 64, "gpu-" + "x" * 56),
+    ],
+)
+def test_a_booking_is_named_after_its_first_device(need: str, name: str) -> None:
+    assert _named_after({need: {}}) == name

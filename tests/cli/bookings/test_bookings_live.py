@@ -15,6 +15,7 @@ from tests.cli.tools import end
 from tests.hang import HANG
 from zscout.behaviors.client.blocking import connect
 from zscout.behaviors.client.bookings import BookingsClient
+from zscout.messages import Who
 
 pytestmark = pytest.mark.live
 
@@ -32,7 +33,7 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
 def nothing_is_left(fleet: CliFleet) -> Iterator[None]:
     yield
     for one in told(fleet, "bookings")["bookings"]:
-        said(fleet, "unbook", one["id"])
+        said(fleet, "unbook", one["id"], "--yes")
 
 
 def said(fleet: CliFleet, *args: str, code: int = 0) -> str:
@@ -140,25 +141,25 @@ def test_a_plain_script_books_and_takes_up(fleet: CliFleet) -> None:
 @pytest.mark.slow
 def test_what_is_repeated_is_given_up_date_by_date(fleet: CliFleet) -> None:
     made = said(fleet, "book", "robot/c", "--for", "1h", "--at", "tomorrow 9:00", "--every", "day", "--until", "in 4d")
-    assert re.search(r"^c \(", made)
+    assert re.search(r"^robot-c \(", made)
     assert re.search(r"^it is repeated every day until \w\w\w [-\d]+: [34] dates within 60 days$", made, re.MULTILINE)
     # In whichever zone the list is read, its last day is that of its own.
     listed = [said(fleet, "bookings", "--zone", zone) for zone in ("Pacific/Honolulu", "Pacific/Kiritimati")]
     days = re.findall(r"every day until ([-\d]+)", "".join(listed))
     assert len(days) == 2
     assert len(set(days)) == 1
-    again = said(fleet, "book", "robot/b", "--for", "1h", "--at", "in 2d", "--name", "c")
-    assert again.splitlines()[-1].startswith("you have another booking called c: name it by its id")
-    assert '2 bookings are called "c": ' in said(fleet, "unbook", "c", code=1)
+    again = said(fleet, "book", "robot/b", "--for", "1h", "--at", "in 2d", "--name", "robot-c")
+    assert again.splitlines()[-1].startswith("you have another booking called robot-c: name it by its id")
+    assert '2 bookings are called "robot-c": ' in said(fleet, "unbook", "robot-c", code=1)
     both = told(fleet, "bookings")["bookings"]
     series, single = sorted(both, key=lambda one: -one["every"])
     said(fleet, "unbook", single["id"])
-    gone = said(fleet, "unbook", "c", "--date", "tomorrow")
+    gone = said(fleet, "unbook", "robot-c", "--date", "tomorrow")
     assert re.search(r"no longer has \w\w\w [-\d]+ 09:00\n$", gone)
     [left] = told(fleet, "bookings")["bookings"]
     assert [date["start"] for date in left["dates"]] == [date["start"] for date in series["dates"]][1:]
-    assert "c has no such date; it has " in said(fleet, "unbook", "c", "--date", "tomorrow", code=1)
-    assert said(fleet, "unbook", "c").endswith("is cancelled, with all its dates\n")
+    assert "robot-c has no such date; it has " in said(fleet, "unbook", "robot-c", "--date", "tomorrow", code=1)
+    assert said(fleet, "unbook", "robot-c").endswith("is cancelled, with all its dates\n")
 
 
 def test_who_would_run_into_maintenance_is_told_until_when(fleet: CliFleet) -> None:
@@ -200,3 +201,17 @@ def test_what_the_rcm_refuses_is_bad_input(fleet: CliFleet) -> None:
     assert "speed" in said(fleet, "book", "radio/rf0:speed=1", "--for", "1h", "--at", "9:00", code=2)
     assert "command_rate" in said(fleet, "slots", "radio/rf0:command_rate=11", "--for", "1h", code=2)
     assert 'unknown booking "surveys", and there are none' in said(fleet, "unbook", "surveys", code=1)
+
+
+def test_anothers_booking_is_asked_about(fleet: CliFleet) -> None:
+    with connect("script", fleet=fleet.lab.fleet, host="test") as lab:
+        lab.client.who = Who("bob", "test")
+        bookings = BookingsClient(lab.client)
+        booking = lab.run(bookings.book({"robot/a": {}}, datetime.now(UTC) + timedelta(days=5), 60, name="1"))
+    whose = f"1 ({booking.id[:8]}) of bob@test is not yours; to"
+    assert said(fleet, "unbook", "1", code=1) == f"zscout: {whose} cancel it all the same, add --yes\n"
+    used = said(fleet, "request", "--booking", "1", "--timeout", "0.2", "--", "true", code=1)
+    assert used == f"zscout: {whose} use it all the same, add --yes\n"
+    taken = said(fleet, "request", "--booking", "1", "--yes", "--timeout", "0.2", "--", "true", code=1)
+    assert "was not granted within" in taken
+    assert said(fleet, "unbook", "1", "--yes").endswith("of bob@test is cancelled\n")

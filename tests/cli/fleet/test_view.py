@@ -13,13 +13,14 @@ import time
 import urllib.request
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import psutil
 import pytest
+from msgspec.structs import replace
 
 from tests.cli.cli_fleet import in_lab
 from tests.cli.tools import COMMAND, zscout_here
@@ -27,10 +28,14 @@ from tests.hang import HANG
 from tests.live.lab import Lab
 from tests.ports import free_port
 from tests.services.recorder.paper_run import PERSON, RCS, RERUN, TABLE2, lanes, play_table1, second_by_second
+from zscout.cli.fleet import local_recording
 from zscout.cli.fleet import view as module
+from zscout.cli.fleet.local_recording import MAGIC
+from zscout.config.access import AccessPolicy, Roles
+from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Role
 from zscout.messages import Recorded
-from zscout.services.recorder.process import Recording
+from zscout.services.recorder.process import Recording, writing
 from zscout.services.recorder.timeline import Timeline
 
 OPEN = re.compile(rb"^Open (http://\S+)", re.MULTILINE)
@@ -223,8 +228,8 @@ async def test_where_a_node_of_this_host_records_its_recording_is_shown(lab: Lab
 
 def test_a_recording_of_another_host_is_not_taken_for_one_of_this_host(tmp_path: Path) -> None:
     file = tmp_path / "run.rrd"
-    file.touch()
-    with socket.create_server(("127.0.0.1", 0)) as server:
+    file.write_bytes(MAGIC)
+    with writing(file), socket.create_server(("127.0.0.1", 0)) as server:
         port, inode = server.getsockname()[1], file.stat().st_ino
 
         def reached(page: str = "127.0.0.1", **more: Any) -> Recording | None:
@@ -235,10 +240,60 @@ def test_a_recording_of_another_host_is_not_taken_for_one_of_this_host(tmp_path:
         assert reached() == Recording(str(file), url)
         for other in ({"inode": inode + 1}, {"file": str(tmp_path / "none.rrd")}, {"bind": "evil"}, {"file": "a\0b"}):
             assert reached(**other) is None
+        assert reached(bind="127.0.0.2") is None, "nothing listens there"
+        assert reached(bind="192.0.2.1") is None, "an address of another host"
         # A page that other hosts open needs a live view that they reach.
         assert reached("0.0.0.0") is None  # noqa: S104
+    with writing(file), socket.create_server(("0.0.0.0", 0)) as server:  # noqa: S104
+        port = server.getsockname()[1]
+        url = f"rerun+http://127.0.0.1:{port}/proxy"
         assert reached(bind="0.0.0.0") == Recording(str(file), url)  # noqa: S104
+        assert reached(bind="127.0.0.1") is None, "it listens elsewhere"
     assert reached() is None
+
+
+@pytest.mark.parametrize(
+    "made", ["/proc", "a folder", "a pipe", "a link", "no suffix", "no recording", "an idle file", "another user's"]
+)
+def test_only_a_file_that_a_recorder_writes_is_believed(
+    made: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, real = tmp_path / "run.rrd", tmp_path / "real.rrd"
+    real.write_bytes(MAGIC)
+    with ExitStack() as stack:
+        server = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+        match made:
+            case "/proc":
+                file = Path("/proc")
+            case "a folder":
+                file.mkdir()
+            case "a pipe":
+                os.mkfifo(file)
+            case "a link":
+                file.symlink_to(real)
+                stack.enter_context(writing(real))
+            case "no suffix":
+                file = tmp_path / "passwd"
+                file.write_bytes(MAGIC)
+                stack.enter_context(writing(file))
+            case "no recording":
+                file.write_bytes(b"password")
+                stack.enter_context(writing(file))
+            case "an idle file":
+                file.write_bytes(MAGIC)
+            case "another user's":
+                file.write_bytes(MAGIC)
+                stack.enter_context(writing(file))
+                monkeypatch.setattr(local_recording, "_listeners", lambda _address, _port: [4711])
+        answer = Recorded(str(file), file.stat().st_ino, "127.0.0.1", server.getsockname()[1])
+        assert asyncio.run(module._reached(answer, "127.0.0.1")) is None
+
+
+def test_in_a_secured_fleet_only_nodes_are_believed() -> None:
+    access = AccessPolicy(Roles(operator=("ada",), node={"anvil": ()}))
+    closed = replace(default_fleet(), access=access, security=Path("certs"))
+    assert [module._is_node(closed, host) for host in ("ada", "anvil", "eve")] == [False, True, False]
+    assert module._is_node(default_fleet(), "anvil")
 
 
 @pytest.mark.slow

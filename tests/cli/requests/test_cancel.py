@@ -10,6 +10,8 @@ import pytest
 from tests.cli.cli_fleet import CliFleet, fleet_of
 from tests.cli.tools import end, out_of
 from tests.hang import HANG
+from zscout.behaviors.client.blocking import connect
+from zscout.messages import Who
 
 pytestmark = pytest.mark.live
 
@@ -77,3 +79,22 @@ def test_an_unknown_arc_is_one_line(fleet: CliFleet) -> None:
     )
     device = fleet.zscout("release", "robot/a").stderr
     assert device.endswith("it is a device: zscout status robot/a shows which request holds it\n")
+
+
+def test_anothers_request_is_asked_about(fleet: CliFleet) -> None:
+    with connect("script", fleet=fleet.lab.fleet, host="test") as lab:
+        lab.client.who = Who("bob", "test")
+        arc = lab.run(lab.client.request("survey", {"robot/a": {}}, min_runtime=60))
+        lab.run(lab.client.granted(arc))
+        for word in ("cancel", "release"):
+            done = fleet.zscout(word, "survey")
+            assert done.returncode == 1, done
+            assert done.stderr == (
+                f"zscout: survey (test/script/{arc.id}) of bob@test is not yours; "
+                f"to {word} it all the same, add --yes\n"
+            )
+        done = fleet.zscout("cancel", "survey", "--yes", "--json")
+        assert json.loads(done.stdout)["arcs"] == [
+            {"arc": "survey", "id": arc.id, "client": "test/script", "was": "running"}
+            | {"state": "ended", "outcome": "cancelled"}
+        ]

@@ -17,7 +17,18 @@ from tests.services.rcm.kit import FakeClient, FakeRc, Refusal, grant_of, reques
 from zscout.config.access import AccessPolicy, Ceiling, Quota, Roles
 from zscout.keyexpr import Role, Token
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import BookingView, Foresee, Foresight, HandOver, Holder, Notice, OpenRequest, Who
+from zscout.messages import (
+    MAX_HELD,
+    MAX_LISTED,
+    BookingView,
+    Foresee,
+    Foresight,
+    HandOver,
+    Holder,
+    Notice,
+    OpenRequest,
+    Who,
+)
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.rcm.candidate import Candidate
 from zscout.types import Grant, Place, Term
@@ -115,7 +126,7 @@ async def test_of_what_a_client_lists_no_more_counts_than_it_may_have_open() -> 
     bob, flood, more = fleet.client("one", "bob"), fleet.client("two", "eve"), fleet.client("three", "eve")
     held = await bob.ask("held", "robot/a")
     bob.open = [lists(held, grant=held.grant, rcs=held.rcs)]
-    flood.open = [listed(f"f{number}", "robot/a", place=Place(OLD, 9 + number)) for number in range(30_000)]
+    flood.open = [listed(f"f{number}", "robot/a", place=Place(OLD, 9 + number)) for number in range(1_000)]
     more.open = [listed(f"m{number}", "robot/a", place=Place(OLD, 1 + number)) for number in range(3)]
     await fleet.taken_over(leader, heir)
     await until(lambda: sum(map(len, map(refusals, (flood, more)))) == 2)
@@ -123,6 +134,32 @@ async def test_of_what_a_client_lists_no_more_counts_than_it_may_have_open() -> 
     assert Counter(item.client for item in state.queue).total() == 4
     assert {*refusals(flood).values(), *refusals(more).values()} == {"too_many"}
     await served(bob, "robot/b")
+
+
+async def test_a_list_or_a_state_that_is_too_long_is_not_decoded_and_harms_nobody_else(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    fleet, leader, heir, _ = await closed("a", "b")
+    bob, flood = fleet.client("one", "bob"), fleet.client("two", "eve")
+    held = await bob.ask("held", "robot/a")
+    bob.open = [lists(held, grant=held.grant, rcs=held.rcs)]
+    flood.open = [listed(f"f{number}", "robot/a", place=Place(OLD, 9 + number)) for number in range(30_000)]
+    robot = fleet.rc("robot/c")
+    robot.holders = [
+        Holder(f"q{n}", "q", "eve/two", Grant(OLD, n), Place(OLD, n), ["robot/c"], Decimal(60), 60.0)
+        for n in range(20_000)
+    ]
+    await fleet.taken_over(leader, heir)
+    state = await fleet.state()
+    assert [(item.client, item.arc) for item in state.holds] == [("bob/one", "held")]
+    assert not [item for item in state.queue if item.client == "eve/two"]
+    assert f"at most {MAX_LISTED} are taken" in caplog.text
+    assert f"at most {MAX_HELD} are taken" in caplog.text
+    await served(bob, "robot/b")
+    # What it asks for itself is as good as anybody's.
+    flood.open = []
+    await flood.ask("asked", "robot/b")
+    await until(lambda: heir.rcm and heir.rcm.core.arc("eve/two/asked"))
 
 
 async def test_quotas_and_ceilings_count_for_what_waits_and_end_nothing_that_runs() -> None:

@@ -226,7 +226,8 @@ class ComponentLifecycle:
             what = f"standing by on {self._job.host}" if standby else f"running on {self._job.host}"
             raise NotMoved("bad_request", f"{self._job.start.component} is not {what}; see zscout component list")
         if not is_movable(component):
-            raise NotMoved("not_movable", "it can't be moved: its kind has no checkpoint() and restore()")
+            kept = self._job.start.component
+            raise NotMoved("not_movable", f"{kept} can't be moved: its kind has no checkpoint() and restore()")
         return component, client
 
     async def _take_checkpoint(self, number: int) -> None:

@@ -19,12 +19,12 @@ from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.behaviors.client.identity import bounded
 from zscout.cli import common, completion
 from zscout.cli.booked import (
-    User,
     ask_bookings,
     booking_json,
     explained,
     free_name,
     in_words,
+    is_own,
     rcs_words,
     short,
     state_words,
@@ -46,6 +46,7 @@ from zscout.cli.dates import (
     remarks,
     span_words,
 )
+from zscout.cli.ownership import User
 from zscout.cli.requests.options import Needs, gather_needs, parse_comment, parse_duration, parse_need
 from zscout.cli.requests.request import MAX_PRIORITY
 from zscout.config.strict import BadInput
@@ -60,6 +61,8 @@ A_YEAR: Final = MAX_AHEAD - 25 * 3600
 LOOK_AHEAD: Final = 7 * DAY
 """Seconds in which other times are sought where one is not free."""
 OTHERS: Final = 3
+MAX_NAMED: Final = 60
+"""Characters of a default name: a number may follow."""
 MAX_REMARKS: Final = 4
 DATE: Final = Parsed("date", parse_date)
 DURATION: Final = Parsed("duration", parse_duration)
@@ -76,7 +79,9 @@ def date_options(command: F) -> F:
     for option in (
         common.json_option("Print one JSON object."),
         click.option("--comment", type=Parsed("text", parse_comment), default="", help="A comment shown to others."),
-        click.option("--name", help="Name of the booking. Default: its first device; for maintenance: maintenance."),
+        click.option(
+            "--name", help="Name of the booking. Default: its first device, as in gpu-1; for maintenance: maintenance."
+        ),
         zone_option,
         click.option("--until", type=DATE, help="Last day or date of the repetition. Default: a year ahead."),
         click.option("--every", type=Parsed("days", parse_every), help=f"Repeat it at the same hour: {EVERY_FORMS}."),
@@ -249,7 +254,7 @@ async def _make(
         told, me = await ask_bookings(client), User.of(client)
         late = min(runtime, Decimal(PATIENCE) if patience is None else patience)
         asked = Asked.of(at, runtime, every, until, zone, told.time, float(late))
-        own = [one for one in told.bookings if me.owns(one)]
+        own = [booking for booking in told.bookings if is_own(booking, me)]
         default = "maintenance" if maintenance else _named_after(needs)
         terms: dict[str, Any] = {"priority": priority, "comment": comment}
         try:
@@ -278,10 +283,9 @@ async def _make(
 
 
 def _named_after(needs: Needs) -> str:
-    """`arm1` for robot/arm1, `framegrabber` where any one will do."""
+    """`robot-arm1` for robot/arm1, `framegrabber` for framegrabber/*."""
     kind, _, name = next(iter(needs)).partition("/")
-    named = kind if is_pattern(name) else name
-    return "booking" if is_pattern(named) else valid_name(named)
+    return "booking" if is_pattern(kind) else valid_name(kind if is_pattern(name) else f"{kind}-{name}")[:MAX_NAMED]
 
 
 async def _instead(client: Client, refused: RequestRefused, needs: Needs, asked: Asked, priority: int) -> str:

@@ -14,13 +14,14 @@ from zscout.behaviors.client.bookings import BookingsClient
 from zscout.behaviors.client.client import RequestRefused
 from zscout.cli import common, completion, journals
 from zscout.cli.booked import (
-    User,
     ask_bookings,
     booking_argument,
     booking_json,
     choose,
     clock_words,
     explained,
+    is_own,
+    label,
     rcs_words,
     short,
     state_words,
@@ -31,6 +32,7 @@ from zscout.cli.booked import (
 from zscout.cli.bookings.book import DATE
 from zscout.cli.common import Failed
 from zscout.cli.dates import WrittenDate, date_words, every_words, host_zone, in_zone, span_words
+from zscout.cli.ownership import User, ask_for_others, yes_option
 from zscout.config.strict import BadInput
 from zscout.keyexpr import is_pattern, matcher
 from zscout.messages import MAX_AHEAD, WINDOW, BookedDate, BookingRecord, BookingView
@@ -68,7 +70,7 @@ async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: b
             told = await ask_bookings(client, None if rc is not None and is_pattern(rc) else rc)
         except RequestRefused as refused:
             raise explained(refused) from None
-        found = [one for one in told.bookings if not mine or me.owns(one)]
+        found = [one for one in told.bookings if not mine or is_own(one, me)]
         if rc is not None and is_pattern(rc):
             found = [one for one in found if _may_have(one, matcher(rc), rc)]
         if as_json:
@@ -95,7 +97,7 @@ async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: b
 @common.json_option("Print one JSON object.")
 @common.runs
 async def show(booking: str, zone: ZoneInfo | None, as_json: bool) -> None:
-    """Show one booking with all its dates of the next 60 days: by its name, its id, or the beginning of its id.
+    """Show one booking with all its dates of the next 60 days: by its name, its id, or four or more characters of it.
 
     \b
     Examples:
@@ -158,21 +160,22 @@ def _repeated(booking: BookingView, zone: ZoneInfo | None) -> str:
 def _style(booking: BookingView, date: BookedDate, me: User) -> str:
     if date.danger or date.state == "conflict":
         return "red"
-    return "bold" if me.owns(booking) else ""
+    return "bold" if is_own(booking, me) else ""
 
 
 @click.command()
 @booking_argument
 @click.option("--date", "at", type=DATE, help="Only this date of a repeated booking: a day, or a day and a time.")
 @zone_option
+@yes_option
 @common.json_option("Print one JSON object.")
 @common.runs
-async def unbook(booking: str, at: WrittenDate | None, zone: ZoneInfo | None, as_json: bool) -> None:
-    """Cancel a booking, or one date of it: by its name, its id, or the beginning of its id.
+async def unbook(booking: str, at: WrittenDate | None, zone: ZoneInfo | None, yes: bool, as_json: bool) -> None:
+    """Cancel a booking, or one date of it: by its name, its id, or the first four or more characters of its id.
 
-    A name means your own booking, if you have one of that name, else anybody's; the fleet decides who may cancel it.
-    A request that already uses the booking keeps running. If several bookings have the name, it is refused with the
-    list of them.
+    A name means your own booking, if you have one of that name. Before it cancels another user's it asks; if stdin is
+    not a terminal, add --yes. In a secured fleet only operators may. A request that already uses the booking keeps
+    running. If several bookings have the name, it is refused with the list of them.
 
     \b
     Examples:
@@ -186,6 +189,7 @@ async def unbook(booking: str, at: WrittenDate | None, zone: ZoneInfo | None, as
         told, me = await ask_bookings(client), User.of(client)
         found = choose(told.bookings, booking, me)
         start = None if at is None or zone is None else _date_of(found, at, zone, told.time)
+        await ask_for_others(client, [] if is_own(found, me) else [label(found)], "cancel", yes=yes)
         try:
             left = await BookingsClient(client).unbook(found.id, start)
         except RequestRefused as refused:
@@ -195,7 +199,7 @@ async def unbook(booking: str, at: WrittenDate | None, zone: ZoneInfo | None, as
             return
     what = "is cancelled" if start is None else f"no longer has {date_words(start, zone)}"
     whole = ", with all its dates" if found.every and start is None else ""
-    terminal.print_line(clean(f"{found.name} ({short(found)}) of {whose(found)} {what}{whole}"))
+    terminal.print_line(clean(f"{label(found)} {what}{whole}"))
 
 
 def _date_of(booking: BookingView, at: WrittenDate, zone: ZoneInfo, now: float) -> int:

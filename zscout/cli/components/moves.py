@@ -12,6 +12,7 @@ from zscout.behaviors.client.placer_client import PlacerClient, PlacerSilent
 from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common
 from zscout.cli.components import placing
+from zscout.cli.ownership import yes_option
 from zscout.cli.requests.options import timeout_option
 from zscout.config.strict import BadInput
 from zscout.messages import DrainHost, MigrateComponent, Placement, Placements, UncordonHost
@@ -20,9 +21,10 @@ from zscout.messages import DrainHost, MigrateComponent, Placement, Placements, 
 @click.command()
 @placing.component_argument
 @placing.host_option("--to", "Host to move to. Default: the best other host.")
+@yes_option
 @common.json_option("Print one JSON object.")
 @common.runs
-async def migrate(name: str, to: str | None, as_json: bool) -> None:
+async def migrate(name: str, to: str | None, yes: bool, as_json: bool) -> None:
     """Move a running component to another host, with its state and its holds.
 
     Only a kind with checkpoint() and restore() can be moved. Prints the new host, and for how long the component was
@@ -34,10 +36,11 @@ async def migrate(name: str, to: str | None, as_json: bool) -> None:
       zscout component migrate counter
       zscout component migrate counter --to bellows --json | jq .dead
     """
-    async with placing.connected("migrate", as_json=as_json) as (shown, placer):
+    async with placing.connected("migrate", as_json=as_json) as (client, shown, placer):
         before = placer.placements.get(name)
         if before is None:
             raise placing.unknown(name, placer.placements)
+        await placing.ask_for_others(client, placer, [name], "move", yes=yes)
         interrupted = f"{name} is moved all the same; zscout component list tells how that goes"
         async with shown.within(None, str, interrupted):
             after = await _moved(placer, shown, before, to)
@@ -102,7 +105,7 @@ async def drain(host: str, timeout: float | None, as_json: bool) -> None:
       zscout drain anvil --timeout 2m
     """
     cordoned = f"{host} stays cordoned; to use it again: zscout uncordon {host}"
-    async with placing.connected("drain", as_json=as_json) as (shown, placer):
+    async with placing.connected("drain", as_json=as_json) as (_, shown, placer):
         at_first = {one.component for one in _there(placer, host)}
 
         def late() -> str:
@@ -144,7 +147,7 @@ async def uncordon(host: str, as_json: bool) -> None:
     Example:
       zscout uncordon anvil
     """
-    async with placing.connected("uncordon", as_json=as_json) as (_, placer):
+    async with placing.connected("uncordon", as_json=as_json) as (_, _, placer):
         if host not in placer.cordoned:
             for line in await placing.absent(placer.mesh, [host]):
                 terminal.print_line(f"zscout: {line}", sys.stderr)

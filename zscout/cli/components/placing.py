@@ -13,7 +13,7 @@ from msgspec import structs
 
 from zscout import terminal
 from zscout.behaviors.client.placer_client import PlacerClient
-from zscout.cli import common, completion
+from zscout.cli import common, completion, ownership
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import Role, check_name
 from zscout.messages import ComponentList, ListComponents, ListPlacements, Placement, Placements
@@ -38,13 +38,20 @@ def placer_of(client: Client, only: Collection[str] | None = None) -> PlacerClie
 @asynccontextmanager
 async def connected(
     command: str, only: Collection[str] | None = None, *, as_json: bool
-) -> AsyncIterator[tuple[Progress, PlacerClient]]:
-    """Progress and placer of one command, which knows how all components stand, or those in `only`. Raises
+) -> AsyncIterator[tuple[Client, Progress, PlacerClient]]:
+    """Client, progress and placer of a command, which knows how all components stand, or those in `only`. Raises
     NobodyThere, MeshError, RequestRefused."""
     async with common.connected(command) as client:
         with Progress(quiet=as_json) as shown, placer_of(client, only) as placer:
             await placer.refresh()
-            yield shown, placer
+            yield client, shown, placer
+
+
+async def ask_for_others(client: Client, placer: PlacerClient, names: Iterable[str], verb: str, *, yes: bool) -> None:
+    """Ask before a component of another certificate is touched: a plain mesh has no owners. Raises Failed for a no."""
+    found = [placement for name in names if (placement := placer.placements.get(name)) and placement.spec.owner]
+    others = [f"{one.component} of {one.spec.owner}" for one in found if one.spec.owner != client.mesh.me.host]
+    await ownership.ask_for_others(client, others, verb, yes=yes)
 
 
 class Progress(terminal.LiveLine):

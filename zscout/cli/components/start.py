@@ -18,6 +18,7 @@ from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common, completion
 from zscout.cli.components import placing
+from zscout.cli.ownership import yes_option
 from zscout.cli.requests.options import timeout_option
 from zscout.config.strict import BadInput, quoted
 from zscout.messages import (
@@ -141,7 +142,7 @@ async def start(
         raise BadInput(f"the name {quoted(name)} has more than {MAX_COMPONENT_NAME} characters; give a shorter --name")
     spec = gather_spec(kind, **wanted)
     stays = f"{name} stays placed; to end it: zscout component stop {name}"
-    async with placing.connected("start", {name}, as_json=as_json) as (shown, placer):
+    async with placing.connected("start", {name}, as_json=as_json) as (_, shown, placer):
 
         def late() -> str:
             record = placer.placements.get(name)
@@ -227,12 +228,14 @@ async def _until_settled(placer: PlacerClient, shown: placing.Progress, name: st
     "names", type=placing.COMPONENT, nargs=-1, required=True, metavar="NAME...", shell_complete=completion.components
 )
 @timeout_option("Wait this long for the end, then exit with 1.")
+@yes_option
 @common.json_option("Print one JSON object.")
 @common.runs
-async def stop(names: Sequence[str], timeout: float | None, as_json: bool) -> None:
+async def stop(names: Sequence[str], timeout: float | None, yes: bool, as_json: bool) -> None:
     """End components for good: each is asked to end, and killed if it does not.
 
-    Returns when all have ended; what they held is given back. A component that has already ended is no error.
+    Returns when all have ended; what they held is given back. A component that has already ended is no error. In a
+    secured fleet it asks before it stops another user's; if stdin is not a terminal, add --yes.
 
     \b
     Examples:
@@ -241,7 +244,8 @@ async def stop(names: Sequence[str], timeout: float | None, as_json: bool) -> No
     """
     names = sorted(set(names))
     stays = f"{', '.join(names)} will be stopped all the same; zscout component list tells how that goes"
-    async with placing.connected("stop", names, as_json=as_json) as (shown, placer):
+    async with placing.connected("stop", names, as_json=as_json) as (client, shown, placer):
+        await placing.ask_for_others(client, placer, names, "stop", yes=yes)
 
         def lasting() -> str:
             records = (placer.placements.get(name) for name in names)

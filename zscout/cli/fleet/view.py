@@ -25,9 +25,10 @@ import msgspec
 from zscout import terminal
 from zscout.behaviors.launch import LAUNCH
 from zscout.cli import common
+from zscout.cli.fleet.local_recording import MAGIC, local_address
 from zscout.config.node import MAX_PAST, PAST, RecorderConfig
 from zscout.config.strict import DURATIONS, BadInput, parse_duration, quoted
-from zscout.keyexpr import valid_name
+from zscout.keyexpr import NODES, valid_name
 from zscout.services.recorder.process import BAD_SETTINGS, QUIET, RecorderJob, Recording, encode_job
 from zscout.types import SECOND, Ns
 
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
     from zscout.messages import Recorded
 
 WEB_PORT: Final = 9090
-MAGIC: Final = b"RRF"
-"""How every recording begins."""
 PAGE: Final = "renderer=webgl&hide_welcome_screen=1&theme=dark"
 """What the page's address asks for. On the light theme, which a browser may prefer, names are pale on pale."""
 HOSTING: Final = "Hosting a web-viewer at"
@@ -204,7 +203,9 @@ async def _recorded_here(fleet: Fleet, bind: str) -> tuple[Recording | None, str
         for _ in range(LOOKS_FOR_RECORDER):
             replies = await mesh.ask(mesh.keys.recorded_any, RecordedAsk(), Recorded, timeout=LOOK_FOR_RECORDER)
             for reply in replies:
-                if reply.message is not None and (recording := await _reached(reply.message, bind)) is not None:
+                if reply.message is None or not _is_node(fleet, mesh.keys.sender_of(reply.key).host):
+                    continue
+                if (recording := await _reached(reply.message, bind)) is not None:
                     return recording, ""
             if alone:
                 break
@@ -213,19 +214,21 @@ async def _recorded_here(fleet: Fleet, bind: str) -> tuple[Recording | None, str
     return None, alone
 
 
+def _is_node(fleet: Fleet, host: str) -> bool:
+    """Return True if the answer of this host may be that of a node; a plain mesh proves nothing."""
+    return fleet.security is None or bool(fleet.access.ranks_of(host) & NODES)
+
+
 async def _reached(recorded: Recorded, bind: str) -> Recording | None:
-    """The recording, if it is one of this host: then it is the same file, and its live view answers. `bind` is where
-    the page is served: whoever opens that must reach the live view as well."""
+    """The recording, if a recorder of this host writes and serves it. `bind` is where the page is served: whoever
+    opens that must reach the live view as well."""
+    address = await asyncio.to_thread(local_address, recorded, bind)
+    if address is None:
+        return None
     try:
-        served = ipaddress.ip_address(recorded.bind)
-        if (await asyncio.to_thread(os.stat, recorded.file)).st_ino != recorded.inode:
-            return None
-        if not (served.is_unspecified or str(served) == bind or ipaddress.ip_address(bind).is_loopback):
-            return None
-        address = bind if served.is_unspecified else str(served)
         async with asyncio.timeout(CONNECT):
             _, writer = await asyncio.open_connection(address, recorded.port)
-    except (OSError, ValueError):
+    except OSError:
         return None
     writer.close()
     return Recording(recorded.file, f"rerun+http://{_bracketed(address)}:{recorded.port}/proxy")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import os
 import sys
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,7 +10,8 @@ import click
 
 from zscout.behaviors.client.client import Client
 from zscout.cli import common
-from zscout.cli.common import Failed, Parsed
+from zscout.cli.common import Parsed
+from zscout.cli.ownership import confirm, yes_option
 from zscout.cli.requests.options import (
     DEFAULT_NAMES,
     CommandAfterDashes,
@@ -26,11 +25,9 @@ from zscout.cli.requests.waiting import contention_of, hold_json, hold_text
 from zscout.messages import HoldView, RcmState
 from zscout.terminal import clean, print_json, print_line
 
-MAX_ANSWER = 4_096
-
 
 @click.command(cls=CommandAfterDashes)
-@click.option("-y", "--yes", is_flag=True, help="Don't ask.")
+@yes_option
 @click.option("--no-keep", is_flag=True, hidden=True, help="--min-runtime is what --release-after is.")
 @click.option("--reason", type=Parsed("text", parse_comment), default="", help="Shown in status and to the preempted.")
 @hold_options
@@ -149,22 +146,6 @@ async def _agree(client: Client, wanted: HoldOptions, *, yes: bool) -> None:
                 print_line(clean(f"{wanted.name} {line}"), sys.stderr)
         if not asks:
             return
-        if not possible:
-            raise Failed("stdin is not a terminal, so I can't ask before preempting; add --yes")
-        sys.stderr.write(f"Take {', '.join(sorted(wanted.needs))}? [y/N] ")
-        sys.stderr.flush()
-        if (await _answer()).strip().lower() not in ("y", "yes"):
-            raise Failed("nothing was taken")
+        unasked = "stdin is not a terminal, so I can't ask before preempting; add --yes"
+        await confirm(f"Take {', '.join(sorted(wanted.needs))}?", unasked, "nothing was taken")
         agreed |= victims
-
-
-async def _answer() -> str:
-    """One line from the terminal. Unlike input() it lets Ctrl-C through to the event loop."""
-    loop = asyncio.get_running_loop()
-    readable = asyncio.Event()
-    loop.add_reader(0, readable.set)
-    try:
-        await readable.wait()
-        return os.read(0, MAX_ANSWER).decode(errors="replace")
-    finally:
-        loop.remove_reader(0)

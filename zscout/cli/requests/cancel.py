@@ -9,10 +9,11 @@ import click
 from zscout import terminal
 from zscout.behaviors.client.client import TRY_AGAIN, Client
 from zscout.cli import common
+from zscout.cli.ownership import User, ask_for_others, whose, yes_option
 from zscout.cli.requests.options import arc_argument
 from zscout.config.strict import quoted
 from zscout.keyexpr import check_name, client_of
-from zscout.messages import Cancel, Notice, RcmState, Release
+from zscout.messages import Cancel, Notice, RcmState, Release, Who
 
 MAX_LISTED: Final = 20
 """ARCs of one name, where one has to be chosen."""
@@ -25,13 +26,15 @@ every_option = click.option("--all", "every", is_flag=True, help="All requests o
 @click.command()
 @arc_argument
 @every_option
+@yes_option
 @common.json_option("Print one JSON object.")
 @common.runs
-async def cancel(arc: str, every: bool, as_json: bool) -> None:
+async def cancel(arc: str, every: bool, yes: bool, as_json: bool) -> None:
     """End a request, whether it holds or waits: by name, id, or <host>/<client>/<id>.
 
     Its program is notified; a program that `zscout request` runs is stopped. If several requests have the name, it is
-    refused with the list of them, unless --all is given.
+    refused with the list of them, unless --all is given. It asks before it ends another user's request; if stdin is
+    not a terminal, add --yes. In a secured fleet only operators may.
 
     \b
     Examples:
@@ -39,26 +42,27 @@ async def cancel(arc: str, every: bool, as_json: bool) -> None:
       zscout cancel 5f0c2a9d13be
       zscout cancel survey --all
     """
-    await _end(arc, "cancel", every=every, as_json=as_json)
+    await _end(arc, "cancel", every=every, yes=yes, as_json=as_json)
 
 
 @click.command()
 @arc_argument
 @every_option
+@yes_option
 @common.json_option("Print one JSON object.")
 @common.runs
-async def release(arc: str, every: bool, as_json: bool) -> None:
+async def release(arc: str, every: bool, yes: bool, as_json: bool) -> None:
     """End the hold of a request: by name, id, or <host>/<client>/<id>.
 
-    The same as `zscout cancel`, but it leaves a waiting request alone. If several requests have the name, it is
-    refused, unless --all is given.
+    The same as `zscout cancel`, with the same question, but it leaves a waiting request alone. If several requests
+    have the name, it is refused, unless --all is given.
 
     \b
     Examples:
       zscout release survey
       zscout release anvil/request-5f0c2a9d13be/0b1d3c5e7f90 --json
     """
-    await _end(arc, "release", every=every, as_json=as_json)
+    await _end(arc, "release", every=every, yes=yes, as_json=as_json)
 
 
 class Target(NamedTuple):
@@ -68,18 +72,34 @@ class Target(NamedTuple):
     id: str
     client: str
     was: str
+    who: Who | None = None
+
+    @property
+    def host(self) -> str:
+        return self.client.partition("/")[0]
+
+    @property
+    def label(self) -> str:
+        return f"{self.arc} ({self.full_name}) of {whose(self.host, self.who)}"
 
     @property
     def full_name(self) -> str:
         return f"{self.client}/{self.id}"
 
 
-async def _end(named: str, word: str, *, every: bool, as_json: bool) -> None:
+async def _end(named: str, word: str, *, every: bool, yes: bool, as_json: bool) -> None:
     async with common.connected(word) as client:
         found = _choose(await common.state_of(client), named, word, every=every)
+        me = User.of(client)
+        others = [target.label for target in found if not me.owns(target.host, target.who)]
+        await ask_for_others(client, others, word, yes=yes)
         done = [(target, await _operate(client, target, word)) for target in found]
     if as_json:
-        arcs = [{**target._asdict(), "state": notice.state, "outcome": notice.outcome} for target, notice in done]
+        arcs = [
+            {name: getattr(target, name) for name in ("arc", "id", "client", "was")}
+            | {"state": notice.state, "outcome": notice.outcome}
+            for target, notice in done
+        ]
         terminal.print_json({"op": word, "arcs": arcs})
         return
     for target, notice in done:
@@ -89,8 +109,8 @@ async def _end(named: str, word: str, *, every: bool, as_json: bool) -> None:
 
 def _choose(state: RcmState, named: str, word: str, *, every: bool) -> list[Target]:
     """The ARCs that are meant. Raises Failed where there is none, or more than one without `every`."""
-    known = [Target(hold.arc, hold.id, hold.client, "running") for hold in state.holds]
-    known += [Target(wait.arc, wait.id, wait.client, "queued") for wait in state.queue]
+    known = [Target(hold.arc, hold.id, hold.client, "running", hold.who) for hold in state.holds]
+    known += [Target(wait.arc, wait.id, wait.client, "queued", wait.who) for wait in state.queue]
     matching = [target for target in known if named in (target.arc, target.id, target.full_name)]
     if not matching and state.more and named.count("/") == 2:
         # The answer leaves out the end of a long queue; a full name is enough to end it all the same.

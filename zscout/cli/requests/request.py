@@ -21,6 +21,7 @@ from zscout.behaviors.client.request import HoldEnd, OpenArc
 from zscout.cli import common, completion
 from zscout.cli.booked import BOOKING
 from zscout.cli.common import Failed
+from zscout.cli.ownership import yes_option
 from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather, hold_options
 from zscout.cli.requests.run_command import RunningCommand, environment
 from zscout.cli.requests.taking_up import check_options, taking_up
@@ -53,11 +54,12 @@ REFRESH: Final = 1.0
 )
 @click.option("--keep", is_flag=True, hidden=True, help="What happens without it as well.")
 @click.option("--booking", type=BOOKING, shell_complete=completion.bookings, help="Use this booking: its name or id.")
+@yes_option
 @click.option("--dry-run", is_flag=True, help="Only print when it would start, and what it would preempt.")
 @partial(hold_options, needs_required=False)
 @common.runs
 async def request(
-    needs: Any, priority: int, keep: bool, name: str | None, dry_run: bool, booking: str | None, **rest: Any
+    needs: Any, priority: int, keep: bool, name: str | None, dry_run: bool, booking: str | None, yes: bool, **rest: Any
 ) -> int:
     """Wait until all of the devices are granted at once, then hold them.
 
@@ -69,7 +71,8 @@ async def request(
     After that you keep them until a request of equal or higher priority waits for one of them. --release-after
     gives them back even if nobody waits.
 
-    With --booking the request uses a booking, with its devices, priority and time, and waits for its next date.
+    With --booking the request uses a booking, with its devices, priority and time, and waits for its next date. It
+    asks before it uses another user's; if stdin is not a terminal, add --yes.
 
     With a COMMAND the devices are held while it runs, and given back when none of its processes is left. When its
     time is over or the grant is taken away, the command and its processes get SIGTERM, and SIGKILL after the grace;
@@ -116,7 +119,7 @@ async def request(
     async with common.connected("request") as client:
         if booking is not None:
             given = click.get_current_context().get_parameter_source("priority") is not ParameterSource.DEFAULT
-            wanted = await taking_up(client, wanted, name=name, priority=priority if given else None)
+            wanted = await taking_up(client, wanted, name=name, priority=priority if given else None, yes=yes)
         return await (_foresee(client, wanted) if dry_run else carry_out(client, wanted))
 
 

@@ -6,8 +6,9 @@ from dataclasses import replace
 from typing import Any, Final
 
 from zscout.behaviors.client.client import Client
-from zscout.cli.booked import User, ask_bookings, choose, rcs_words
+from zscout.cli.booked import ask_bookings, choose, is_own, label, rcs_words
 from zscout.cli.common import Failed
+from zscout.cli.ownership import User, ask_for_others
 from zscout.cli.requests.options import HoldOptions
 from zscout.config.strict import BadInput
 from zscout.keyexpr import valid_name
@@ -22,16 +23,20 @@ def check_options(**options: Any) -> None:
             raise BadInput(f"--{name.replace('_', '-')} can't be used with --booking; leave it out")
 
 
-async def taking_up(client: Client, wanted: HoldOptions, *, name: str | None, priority: int | None) -> HoldOptions:
+async def taking_up(
+    client: Client, wanted: HoldOptions, *, name: str | None, priority: int | None, yes: bool
+) -> HoldOptions:
     """What is asked for to take `wanted.booking` up, a name or an id; called after it, if no `name` was given. Raises
     BadInput where NEEDs or a `priority` were given that it has not; Failed, RequestRefused."""
-    booking = choose((await ask_bookings(client)).bookings, wanted.booking, User.of(client))
+    me = User.of(client)
+    booking = choose((await ask_bookings(client)).bookings, wanted.booking, me)
     if booking.maintenance:
         raise Failed(f"{booking.name} is maintenance, not for requests; end it: zscout booking cancel {booking.name}")
     if wanted.needs and wanted.needs != booking.needs:
         raise BadInput(f"{booking.name} is booked with other devices: {rcs_words(booking)}; leave the devices out")
     if priority not in (None, booking.priority):
         raise BadInput(f"--priority: {booking.name} is booked with priority {booking.priority}; leave --priority out")
+    await ask_for_others(client, [] if is_own(booking, me) else [label(booking)], "use", yes=yes)
     return replace(
         wanted,
         name=wanted.name if name is not None else valid_name(booking.name),

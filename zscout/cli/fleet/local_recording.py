@@ -1,0 +1,75 @@
+"""Checks of what a recorder answers on the mesh, before `zscout view` shows it: only a recorder of this host counts.
+
+Any sender may name a file and an address. Both must exist here, and belong to one local user or to root."""
+
+from __future__ import annotations
+
+import fcntl
+import ipaddress
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, TypeAlias
+
+from zscout.messages import Recorded
+
+MAGIC: Final = b"RRF"
+"""The first bytes of every recording."""
+LISTEN: Final = "0A"
+TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
+ROOT: Final = 0
+
+Address: TypeAlias = ipaddress.IPv4Address | ipaddress.IPv6Address
+
+
+def local_address(recorded: Recorded, bind: str) -> str | None:
+    """The address of the live view, if this host serves it and a page on `bind` can show it; else None."""
+    try:
+        served = ipaddress.ip_address(recorded.bind)
+        if not (served.is_unspecified or str(served) == bind or ipaddress.ip_address(bind).is_loopback):
+            return None
+        owner = _owner(recorded)
+        if owner is None or not {owner, ROOT} & {*_listeners(served, recorded.port)}:
+            return None
+    except (OSError, ValueError):
+        return None
+    return bind if served.is_unspecified else str(served)
+
+
+def _owner(recorded: Recorded) -> int | None:
+    """The user id that owns the recording, if it is a regular file that a recorder of this host writes now. Raises
+    OSError, ValueError."""
+    path = Path(recorded.file)
+    if path.suffix != ".rrd" or not path.is_absolute():
+        return None
+    # A link is not followed, a pipe not waited for.
+    opened = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
+        found = os.fstat(opened)
+        if not stat.S_ISREG(found.st_mode) or found.st_ino != recorded.inode or os.read(opened, len(MAGIC)) != MAGIC:
+            return None
+        with suppress(BlockingIOError):
+            fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return None  # no recorder has locked it
+        return found.st_uid
+    finally:
+        os.close(opened)
+
+
+def _listeners(address: Address, port: int) -> Iterator[int]:
+    """The user ids of the sockets of this host that listen there."""
+    for table in TABLES:
+        with suppress(FileNotFoundError):
+            for line in table.read_text().splitlines()[1:]:
+                fields = line.split()
+                host, _, number = fields[1].partition(":")
+                if fields[3] == LISTEN and int(number, 16) == port and _address(host) == address:
+                    yield int(fields[7])
+
+
+def _address(text: str) -> Address:
+    """From the kernel's notation: words of 32 bits in the byte order of this host."""
+    words = (bytes.fromhex(text[at : at + 8])[::-1] for at in range(0, len(text), 8))
+    return ipaddress.ip_address(b"".join(words))
