@@ -7,6 +7,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -35,6 +36,8 @@ ROOMS: Final = ("scheduling", "services", "drivers", "behaviors")
 SUMMED: Final = ("covered_lines", "num_statements", "covered_branches", "num_branches")
 """Of the summary of a file in a report of coverage.py."""
 MOST: Final = 20
+ENDS: Final = 900
+"""Seconds after which a run without a guard counts as failed."""
 QUICK: Final = "not slow"
 ROOT: Final = Path(__file__).parents[1]
 
@@ -60,8 +63,9 @@ def guards() -> None:
         began = time.monotonic()
         tests = ("-n", "2", "--dist", "worksteal", "-x", "-m", f"{QUICK} and not live", *IN_PROCESS)
         done = _pytest("-p", "studies.suite", *tests, env={VARIABLE: name})
-        failed = [line.split()[1] for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
-        rows.append([name, failed[0] if failed else "-", f"{time.monotonic() - began:.0f} s"])
+        failed = [line for line in done.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+        first = failed[0].split(maxsplit=1)[1].partition(" - ")[0] if failed else "-"
+        rows.append([name, first, f"{time.monotonic() - began:.0f} s"])
         print_line(f"{name}: {rows[-1][1]}", sys.stderr)
     print_table(["guard taken out", "noticed first by", "after"], rows)
     print_line(f"{sum(row[1] != '-' for row in rows)} of {len(rows)} guards are noticed by the quick tier")
@@ -88,9 +92,17 @@ def coverage() -> None:
     )
 
 
-def _pytest(*options: str, env: dict[str, str]) -> subprocess.CompletedProcess[str]:
+def _pytest(*options: str, env: dict[str, str]) -> str:
+    """The output of a run, which is ended after ENDS: without its guard a test may wait for ever."""
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *options]
-    return subprocess.run(command, cwd=ROOT, env=os.environ | env, capture_output=True, text=True)
+    whole = os.environ | env
+    pytest = subprocess.Popen(command, cwd=ROOT, env=whole, stdout=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        return pytest.communicate(timeout=ENDS)[0]
+    except subprocess.TimeoutExpired:
+        os.killpg(pytest.pid, signal.SIGKILL)
+        pytest.wait()
+        return f"FAILED a-test-without-end ({ENDS} s)"
 
 
 def _covered(folder: Path, name: str, tier: str) -> Path:

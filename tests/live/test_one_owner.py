@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 import sys
 import time
 from collections import defaultdict
@@ -98,17 +97,17 @@ class Obeyed(NamedTuple):
     term: tuple[Any, ...]
 
 
+def events(folder: Path, host: str, do: str) -> list[Any]:
+    """What a host's log tells."""
+    # The last line may be half written yet.
+    log = (folder / f"{host}.log").read_text().rpartition("\n")[0]
+    return [event for event in trace.lines(log.splitlines()) if event["do"] == do]
+
+
 def obeyed(folder: Path) -> list[Obeyed]:
     """Every command that one of both has carried out, in the order of time."""
-    # The last line may be half written yet.
-    logs = ((folder / f"{host}.log").read_text().rpartition("\n")[0] for host in ("ws1", "ws2"))
-    found = [
-        Obeyed(event["at"], event["instance"], tuple(event["term"]))
-        for log in logs
-        for event in trace.lines(log.splitlines())
-        if event["do"] == "command"
-    ]
-    return sorted(found)
+    found = [event for host in ("ws1", "ws2") for event in events(folder, host, "command")]
+    return sorted(Obeyed(event["at"], event["instance"], tuple(event["term"])) for event in found)
 
 
 def stood_by(folder: Path) -> int:
@@ -166,11 +165,11 @@ def test_of_two_nodes_with_one_rc_never_two_obey_one_reign(tmp_path: Path) -> No
         alone = clock.now() + default_fleet().timing.hold_lease
         until("it goes on after the merge", lambda commands: goes_on(commands, alone))
 
-        terms = {
-            lead: re.findall(r"leading in term (\d+)", (tmp_path / f"{lead}.log").read_text()) for lead, *_ in HALVES
-        }
-        leader = max(terms, key=lambda lead: int(terms[lead][-1]) if terms[lead] else 0)
         before = max(one.term for one in obeyed(tmp_path))
+        # Halves that led before they met have terms of one number: the log names the whole term.
+        (leader,) = {
+            lead for lead, *_ in HALVES for event in events(tmp_path, lead, "publish") if tuple(event["term"]) == before
+        }
         processes.kill(leader)
         until("it goes on with another leader", lambda commands: goes_on([c for c in commands if c.term > before], 0))
     finally:
