@@ -307,8 +307,8 @@ class Promises:
             if name not in excused and (left := {*client._store.arcs, *client._store.withdrawn}):
                 self._broken(f"{name} still keeps {', '.join(sorted(left))}")
         for host, rcm in leaders.items():
-            state, requests = rcm.core.status(), rcm.requests
-            left = {arc.id for arc in (*state.running, *state.queued)} | requests.waiting.keys() | requests.given_up
+            state, waiting = rcm.core.status(), rcm.leader.operations.waiting
+            left = {arc.id for arc in (*state.running, *state.queued)} | waiting.keys()
             if left := {arc for arc in left if arc.rpartition("/")[0] not in excused}:
                 self._broken(f"the leader on {host} still keeps {', '.join(sorted(left))}")
 

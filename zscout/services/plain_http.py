@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import re
+import socket
 from abc import ABC, abstractmethod
+from contextlib import suppress
+from ipaddress import ip_address
 from typing import Final, NamedTuple
 
 from zscout.mesh.sparse_log import SparseLog
@@ -12,12 +16,12 @@ from zscout.mesh.supervision import clock
 
 log = logging.getLogger(__name__)
 
-MAX_CONNECTIONS: Final = 8
-"""That are served at one time; others are closed at once."""
+MAX_CONNECTIONS: Final = 32
+"""Served at one time: one more takes the place of the oldest, of those without a request first."""
 MAX_HEAD: Final = 8_192
 """Bytes of a request."""
-TIMEOUT: Final = 5.0
-"""Seconds from a connection to its end."""
+
+_HOST: Final = re.compile(rb"\r\nhost:[ \t]*([^\r\n]*?)[ \t]*(?=\r\n)", re.IGNORECASE)
 
 
 class Page(NamedTuple):
@@ -33,9 +37,15 @@ class Page(NamedTuple):
 class PlainHttpServer(ABC):
     """`what` it serves, for the log."""
 
+    timeout = 5.0
+    """Seconds from a connection to its end."""
+
     def __init__(self, what: str, bind: str, port: int) -> None:
         self._what, self.bind, self.port = what, bind, port
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks: dict[asyncio.Task[None], bool] = {}
+        """Oldest first; by connection, whether its request has come."""
+        self._names = {"localhost", bind.lower(), socket.gethostname().lower()}
+        self._knows_domain = False
         self._server: asyncio.Server | None = None
         self._strange = SparseLog(log, clock.now)
 
@@ -63,16 +73,20 @@ class PlainHttpServer(ABC):
 
     def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         if len(self._tasks) >= MAX_CONNECTIONS:
-            writer.transport.abort()
-            return
+            oldest = next((task for task, asked in self._tasks.items() if not asked), next(iter(self._tasks)))
+            del self._tasks[oldest]
+            oldest.cancel()
         task = asyncio.create_task(self._serve(reader, writer))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        self._tasks[task] = False
+        task.add_done_callback(lambda done: self._tasks.pop(done, None))
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         try:
-            async with asyncio.timeout(TIMEOUT):
-                writer.write(await self._response(await reader.readuntil(b"\r\n\r\n")))
+            async with asyncio.timeout(self.timeout):
+                head = await reader.readuntil(b"\r\n\r\n")
+                if (task := asyncio.current_task()) in self._tasks:
+                    self._tasks[task] = True
+                writer.write(await self._response(head))
                 await writer.drain()
                 writer.close()
                 await writer.wait_closed()
@@ -87,11 +101,31 @@ class PlainHttpServer(ABC):
         method, _, rest = head.partition(b" ")
         path = rest.partition(b" ")[0].partition(b"?")[0].decode("ascii", "replace")
         found = None
-        if path.startswith("/"):
+        if not await self._is_named(head):
+            # A page of another site, which a browser took for this host.
+            words = f"not a name of this host; use {socket.gethostname()} or its address\n"
+            found = Page(words.encode(), status="421 Misdirected Request")
+        elif path.startswith("/"):
             found = Page(b"GET or HEAD\n", status="405 Method Not Allowed", headers="Allow: GET, HEAD\r\n")
             if method in (b"GET", b"HEAD"):
                 found = await self.page(path)
         page = found or Page(f"{self.where}\n".encode(), status="404 Not Found")
         first = f"HTTP/1.1 {page.status}\r\nContent-Type: {page.kind}\r\n{page.headers}"
-        text = f"{first}Content-Length: {len(page.text)}\r\nConnection: close\r\n\r\n".encode("ascii")
+        first += f"Content-Length: {len(page.text)}\r\nConnection: close\r\n"
+        text = f"{first}X-Content-Type-Options: nosniff\r\n\r\n".encode("ascii")
         return text if method == b"HEAD" else text + page.text
+
+    async def _is_named(self, head: bytes) -> bool:
+        """Return True if a request is for this host by an address or a name of its own, or names none."""
+        hosts = _HOST.findall(head)
+        if len(hosts) != 1:
+            return not hosts
+        name = hosts[0].decode("ascii", "replace").lower()
+        host = name.partition("]")[0].removeprefix("[") if name.startswith("[") else name.partition(":")[0]
+        with suppress(ValueError):
+            return bool(ip_address(host))
+        if host not in self._names and not self._knows_domain:
+            self._names.add((await asyncio.to_thread(socket.getfqdn)).lower())
+            self._names.add(f"{socket.gethostname().partition('.')[0].lower()}.local")
+            self._knows_domain = True
+        return host.removesuffix(".") in self._names

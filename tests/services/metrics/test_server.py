@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
@@ -10,11 +11,10 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from tests.hang import HANG
-from zscout.services import plain_http
 from zscout.services.metrics import server as figures_server
 from zscout.services.metrics.figures import FAMILIES, Histogram, Samples
 from zscout.services.metrics.server import MetricsServer
-from zscout.services.plain_http import MAX_CONNECTIONS, MAX_HEAD
+from zscout.services.plain_http import MAX_CONNECTIONS, MAX_HEAD, Page
 
 pytestmark = pytest.mark.real_time
 
@@ -53,7 +53,7 @@ async def say(server: MetricsServer, request: bytes) -> bytes:
 
 async def test_each_metric_is_written_as_its_family_says() -> None:
     async with served() as server:
-        head, _, text = (await say(server, b"GET /metrics HTTP/1.1\r\nHost: x\r\n\r\n")).partition(b"\r\n\r\n")
+        head, _, text = (await say(server, b"GET /metrics HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")).partition(b"\r\n\r\n")
     assert head.splitlines()[0] == b"HTTP/1.1 200 OK"
     assert f"Content-Length: {len(text)}".encode() in head
     found = {family.name: family for family in text_string_to_metric_families(text.decode())}
@@ -84,24 +84,71 @@ async def test_other_requests_are_answered_in_a_line(request_: bytes, answer: by
 
 
 async def test_who_sends_too_much_or_nothing_is_shut_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plain_http, "TIMEOUT", 0.2)
+    monkeypatch.setattr(MetricsServer, "timeout", 0.2)
     async with served() as server:
         assert await say(server, b"x" * 10 * MAX_HEAD) in (b"", b"reset")
         assert await say(server, b"GET /metrics HTTP/1.1\r\n") in (b"", b"reset")
 
 
-async def test_so_many_are_served_at_one_time_and_then_there_is_room_again() -> None:
+@pytest.mark.parametrize("sent", [b"", b"GET /metrics", b"GET /metrics HTTP/1.1\r\nHost: x"])
+async def test_slow_connections_keep_nobody_from_an_answer(sent: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MetricsServer, "timeout", HANG * 10)
     async with served() as server:
-        waiting = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(MAX_CONNECTIONS)]
-        # The last one that was let in has been seen once one more is turned away.
-        assert await say(server, b"") in (b"", b"reset")
-        for _, writer in waiting:
-            writer.write(b"GET /metrics HTTP/1.1\r\n\r\n")
-        answers = await asyncio.gather(*(reader.read() for reader, _ in waiting))
-        assert all(b" 200 OK" in answer for answer in answers)
-        for _, writer in waiting:
-            writer.close()
+        slow = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(MAX_CONNECTIONS + 8)]
+        for _, writer in slow:
+            writer.write(sent)
         assert b" 200 OK" in await say(server, b"GET /metrics HTTP/1.1\r\n\r\n")
+        # The oldest made room; the others may still ask.
+        assert await slow[0][0].read() == b""
+        slow[-1][1].write(b" HTTP/1.1\r\n\r\n" if sent else b"GET /metrics HTTP/1.1\r\n\r\n")
+        assert (await slow[-1][0].read()).startswith(b"HTTP/1.1 ")
+        for _, writer in slow:
+            writer.close()
+
+
+async def test_a_request_that_is_answered_is_not_shut_out_by_slow_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(MetricsServer, "timeout", HANG * 10)
+    asked, go_on = asyncio.Event(), asyncio.Event()
+
+    class Slow(MetricsServer):
+        async def page(self, path: str) -> Page | None:
+            asked.set()
+            await go_on.wait()
+            return await super().page(path)
+
+    server = Slow(everything, "127.0.0.1", 0)
+    await server.start()
+    first = asyncio.create_task(say(server, b"GET /metrics HTTP/1.1\r\n\r\n"))
+    await asked.wait()
+    slow = [await asyncio.open_connection("127.0.0.1", server.port) for _ in range(3 * MAX_CONNECTIONS)]
+    await slow[0][0].read()
+    go_on.set()
+    assert b" 200 OK" in await first
+    for _, writer in slow:
+        writer.close()
+    await server.stop()
+
+
+@pytest.mark.parametrize(
+    ("host", "status"),
+    [
+        (b"127.0.0.1:9464", b"200"),
+        (b"[::1]:9464", b"200"),
+        (b"localhost", b"200"),
+        (b"LOCALHOST.:1", b"200"),
+        (socket.gethostname().encode() + b":9464", b"200"),
+        (b"evil.example", b"421"),
+        (socket.gethostname().encode() + b".evil.example", b"421"),
+        (b"127.0.0.1.evil.example", b"421"),
+        (b"localhost\r\nHost: evil.example", b"421"),
+        (b"", b"421"),
+        (b"\xff\x1b[2J", b"421"),
+    ],
+)
+async def test_only_names_of_this_host_are_answered(host: bytes, status: bytes) -> None:
+    async with served() as server:
+        answer = await say(server, b"GET /metrics HTTP/1.1\r\nHost: " + host + b"\r\nAccept: */*\r\n\r\n")
+    assert answer.startswith(b"HTTP/1.1 " + status)
 
 
 async def test_figures_are_read_once_a_second_however_many_ask(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,9 +13,10 @@ import socket
 import sys
 from collections import deque
 from collections.abc import AsyncIterator, Mapping, Sequence
-from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
+from contextlib import asynccontextmanager, suppress
 from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 from urllib.parse import quote
 
@@ -26,6 +27,7 @@ from zscout import terminal
 from zscout.behaviors.launch import LAUNCH
 from zscout.cli import common
 from zscout.cli.fleet.local_recording import MAGIC, local_address
+from zscout.cli.fleet.viewer_page import ViewerPage, silent
 from zscout.config.node import MAX_PAST, PAST, RecorderConfig
 from zscout.config.strict import DURATIONS, BadInput, parse_duration, quoted
 from zscout.keyexpr import NODES, valid_name
@@ -150,13 +152,25 @@ async def open_viewer(
             yield window, None
         return
     page = free_port(bind, port) if port is not None else free_port(bind, WEB_PORT, 0)
-    stream = free_port(bind, stream)
-    ports = ("--web-viewer-port", str(page), "--port", str(stream))
-    async with viewer("--serve-web", "--bind", bind, *ports, shown, log="info") as window:
+    # A recording that is live elsewhere needs nothing of this viewer but its files.
+    own = bind if recording.url is None else "127.0.0.1"
+    stream, files = free_port(own, stream), free_port(own, 0)
+    ports = ("--web-viewer-port", str(files), "--port", str(stream))
+    async with viewer("--serve-web", "--bind", own, *ports, shown, log="info") as window:
         await window.says(HOSTING)
         source = recording.url or f"rerun+http://{_host(bind)}:{stream}/proxy"
-        url = quote(source.replace(f"//{_bracketed(bind)}:", f"//{_host(bind)}:"), safe="")
-        yield window, f"http://{_host(bind)}:{page}/?url={url}&{PAGE}"
+        source = source.replace(f"//{_bracketed(bind)}:", f"//{_host(bind)}:")
+        here = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(own, own)  # noqa: S104 - to reach it
+        allowed = source.removeprefix("rerun+").removesuffix("/proxy")
+        served = ViewerPage((here, files), allowed, bind, page)
+        try:
+            await served.start()
+        except OSError as error:
+            raise BadInput(f"can't serve on {bind}, port {page} ({error.strerror}); choose another --port") from None
+        try:
+            yield window, f"http://{_host(bind)}:{page}/?url={quote(source, safe='')}&{PAGE}"
+        finally:
+            await served.stop()
 
 
 @asynccontextmanager
@@ -381,14 +395,18 @@ async def child(
         await started.end()
 
 
-def viewer(*arguments: str, log: str = "error") -> AbstractAsyncContextManager[Child]:
-    """Starts the Rerun viewer; `log` is its level. Raises Failed where it is not installed."""
+@asynccontextmanager
+async def viewer(*arguments: str, log: str = "error") -> AsyncIterator[Child]:
+    """Starts the Rerun viewer, which reports nothing; `log` is its level. Raises Failed where it is not installed."""
     # The viewer itself: the `rerun` script only wraps it, and killing the script would orphan it.
     spec = find_spec("rerun_cli")
     binary = Path(spec.origin).with_name("rerun") if spec is not None and spec.origin is not None else None
     if binary is None or not os.access(binary, os.X_OK):
         raise common.Failed("the Rerun viewer is not installed; install the package rerun-sdk for this platform")
-    return child("the viewer", [str(binary), *arguments], {"RUST_LOG": log})
+    with TemporaryDirectory(prefix="zscout-viewer-", ignore_cleanup_errors=True) as folder:
+        command = [str(binary), *arguments]
+        async with child("the viewer", command, {"RUST_LOG": log, **silent(Path(folder))}) as started:
+            yield started
 
 
 def has_display() -> bool:
