@@ -15,6 +15,7 @@ from zscout.mesh import Refused
 from zscout.messages import (
     ActivateComponent,
     CheckpointComponent,
+    ComponentOperation,
     ComponentSpec,
     ListComponents,
     MoveComponent,
@@ -216,7 +217,7 @@ def test_a_component_counts_against_the_quotas_of_its_starter(tmp_path: Path) ->
         told.check_ask("anvil", its, lambda names: 2 if "bob" in names else 0)
 
 
-COMPONENT = {
+COMPONENT: dict[str, ComponentOperation] = {
     "start": StartComponent("c", 8, ComponentSpec("counter")),
     "stop": StopComponent("c", 8),
     "stop any": StopComponent("c"),
