@@ -33,6 +33,7 @@ from zscout.drivers.lock import only_here
 from zscout.drivers.registry import driver_for, driver_name
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
+from zscout.logs import log_to_stderr
 from zscout.mesh import Mesh, MeshError, ZenohMesh
 from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.messages import LoadReport
@@ -50,7 +51,7 @@ from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.digest import HoldListener
 from zscout.services.rcm.term_file import TermFile
 from zscout.services.recorder.process import RecorderProcess
-from zscout.types import SECOND
+from zscout.types import SECOND, clean
 
 log = logging.getLogger("zscout.node")
 
@@ -299,7 +300,7 @@ def main(file: Path | None, check: bool, log_level: str) -> None:
       zscout-node lab.toml
       zscout-node --check lab.toml
     """
-    logging.basicConfig(level=log_level.upper(), format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
+    log_to_stderr(log_level.upper())
     manager = ServiceManager.from_env()
 
     def read() -> Node:
@@ -315,7 +316,7 @@ def main(file: Path | None, check: bool, log_level: str) -> None:
         uvloop.run(_main(node, read, manager))
     except (BadInput, MeshError, NodeFailed) as error:
         manager.stopping(str(error))
-        click.echo(f"zscout-node: {error}", err=True)
+        click.echo(f"zscout-node: {clean(str(error))}", err=True)
         sys.exit(2 if isinstance(error, BadInput) else 1)
 
 
