@@ -30,7 +30,7 @@ HOSTILE = "\x1b[2J\nERROR forged\r\0\x9b31m\u202egnp\u2028\u200f\U000e0041\ud7ff
 FIGURE = next(name for name, family in FAMILIES.items() if family.kind == "gauge" and len(family.labels) == 1)
 
 
-def kinds(base: type = Message) -> Iterator[type[Message]]:
+def kinds(base: type[Message] = Message) -> Iterator[type[Message]]:
     for kind in base.__subclasses__():
         if kind.__module__.startswith("zscout.messages"):
             if not kind.__name__.startswith("_"):
@@ -152,9 +152,8 @@ def test_what_writes_past_the_edge_is_known() -> None:
     """Everything else is printed by `print_line` and `print_json`, or cleaned where it is written."""
     root = Path(zscout.__file__).parent
     found = set()
-    written = re.compile(
-        r"\b(?:click\.s?echo|(?<![.\w])(?<!def )print|std(?:out|err)\.write|logging\.basicConfig)\((?!.*clean\()(.*)"
-    )
+    writes = r"\b(?:click\.s?echo|(?<![.\w])(?<!def )print|std(?:out|err)\.write|logging\.basicConfig)"
+    written = re.compile(writes + r"\((?!.*clean\()")
     for path in root.rglob("*.py"):
         if any(written.search(line) for line in path.read_text().splitlines()):
             found.add(str(path.relative_to(root)))
