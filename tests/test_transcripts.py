@@ -1,4 +1,4 @@
-"""Stories of the scheduling core and of the placer as text, in `transcripts/` of each."""
+"""Stories of the scheduling core, the leader and the placer as text, in `transcripts/` of each."""
 
 from __future__ import annotations
 
@@ -8,10 +8,15 @@ from pathlib import Path
 import pytest
 
 from tests.placement.transcript import PlacerPlayer
+from tests.rcm.transcript import LeaderPlayer
 from tests.scheduling.transcript import CorePlayer
 from tests.transcripts import Player, check, play
 
-PLAYERS: dict[str, tuple[Callable[[], Player], int]] = {"scheduling": (CorePlayer, 12), "placement": (PlacerPlayer, 10)}
+PLAYERS: dict[str, tuple[Callable[[], Player], int]] = {
+    "scheduling": (CorePlayer, 12),
+    "rcm": (LeaderPlayer, 7),
+    "placement": (PlacerPlayer, 10),
+}
 """By folder: who plays, and how many stories there are at least."""
 
 

@@ -46,7 +46,7 @@ from zscout.services.journal.journal import Journal
 from zscout.services.metrics.node_figures import NodeFigures
 from zscout.services.node.component_host import ComponentHost
 from zscout.services.node.load_reporter import LoadReporter
-from zscout.services.node.reload import Reload
+from zscout.services.node.reload import FilesInForce, Reload, rights_of
 from zscout.services.node.service_manager import ServiceManager
 from zscout.services.notify.notifier import Notifier
 from zscout.services.plain_http import PlainHttpServer
@@ -74,7 +74,7 @@ async def run_node(
     node: Node, stop: asyncio.Event, reload: Reload | None = None, manager: ServiceManager | None = None
 ) -> None:
     """Runs a node until `stop`. Raises MeshError where it can't begin, NodeFailed where it can't go on."""
-    async with await ZenohMesh.open(node.fleet, Sender(node.host, "node")) as mesh:
+    async with await ZenohMesh.open(node.fleet, Sender(node.host, "node"), follow=False) as mesh:
         await run_services(node, mesh, stop, reload, manager)
 
 
@@ -143,7 +143,8 @@ async def run_services(
         authority = Authority(node.fleet)
         components = ComponentHost(mesh, node.fleet, node.components, fail, authority=authority)
         if node.load:
-            reporter = LoadReporter(mesh, node.labels, components.running, tree=node.load == "tree")
+            files = reload.in_force if reload is not None else FilesInForce(rights_of(node))
+            reporter = LoadReporter(mesh, node.labels, components.running, files, tree=node.load == "tree")
             reporter.start()
             stack.push_async_callback(reporter.stop)
         if node.recorder is not None:
@@ -188,7 +189,7 @@ async def run_services(
         status = f"{node.host} is on the mesh of fleet {node.fleet.name}"
         log.info(status)
         if reload is not None:
-            reload.takes("components", lambda new: components.take(new.components))
+            reload.takes(lambda new: components.take(new.components), "components")
 
             def take_rights(new: Node) -> None:
                 authority.reload(new.fleet)
@@ -197,8 +198,7 @@ async def run_services(
                     candidate.on_reload()
                 mesh.admit(new.fleet.access.members())
 
-            for table in ("roles", "groups", "access", "quotas", "ceilings"):
-                reload.takes(table, take_rights)
+            reload.takes(take_rights, "roles", "groups", "access", "quotas", "ceilings")
             reloading = asyncio.create_task(reload.serve(manager, status))
             stack.callback(reloading.cancel)
         manager.ready(status)
@@ -271,14 +271,14 @@ def _say_if_alone(mesh: Mesh) -> None:
         log.warning("no link to any other node or program yet; if you expect one, run zscout doctor NODE_FILE")
 
 
-async def _main(node: Node, read: Callable[[], Node], manager: ServiceManager) -> None:
-    stop, reload = asyncio.Event(), Reload(node, read)
+async def _main(reload: Reload, manager: ServiceManager) -> None:
+    stop = asyncio.Event()
     reload.on_hangup()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGTERM, signal.SIGINT):
         loop.add_signal_handler(number, stop.set)
     try:
-        await run_node(node, stop, reload, manager)
+        await run_node(reload.node, stop, reload, manager)
     finally:
         # Python puts back its handlers as it ends, and would be ended by a late one.
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
@@ -313,18 +313,13 @@ def main(file: Path | None, check: bool, log_level: str) -> None:
     """
     log_to_stderr(log_level.upper())
     manager = ServiceManager.from_env()
-
-    def read() -> Node:
-        return load_node(file) if file is not None else default_node()
-
     try:
-        node = read()
+        reload = Reload(lambda: load_node(file) if file is not None else default_node())
         if check:
-            for rc in node.rcs:
-                driver_for(rc)
+            node = reload.node
             click.echo(f"{node.host} of fleet {node.fleet.name}: {file or 'the defaults'} can be used here")
             return
-        uvloop.run(_main(node, read, manager))
+        uvloop.run(_main(reload, manager))
     except (BadInput, MeshError, NodeFailed) as error:
         manager.stopping(str(error))
         click.echo(f"zscout-node: {clean(str(error))}", err=True)

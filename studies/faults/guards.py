@@ -29,6 +29,7 @@ from zscout.messages import BookingRecord, Problem, Who
 from zscout.rcm import recovery, roster, terms
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
+from zscout.rcm.leader import Leader
 from zscout.rcm.places import Places
 from zscout.rcm.request_log import RequestLog
 from zscout.rcm.roster import Roster
@@ -45,7 +46,6 @@ from zscout.services.rcm.booking_sharing import BookingSharing
 from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.election import Election
-from zscout.services.rcm.rcm import Rcm
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
 
 ABSENT: Final = object()
@@ -248,7 +248,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         ),
         "missed": Guard(
             "an RC that missed a publication reads the state, and a leader sets right what it reports otherwise",
-            {(HoldTable, "apply_grants"): _miss_nothing, (Rcm, "_compare"): _nothing},
+            {(HoldTable, "apply_grants"): _miss_nothing, (Leader, "_compare"): _nothing},
         ),
         "hold lease": Guard(
             "without an RCM for the hold lease a hold ends",

@@ -13,7 +13,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,8 +23,8 @@ from tests.live.lab import Lab
 from zscout.behaviors.client.request import CommandRefused, OpenArc
 from zscout.config.node import load_node
 from zscout.node import run_node
-from zscout.scheduling.model import Effect
-from zscout.services.rcm.request_handler import RequestHandler
+from zscout.rcm.step import Reply
+from zscout.services.rcm.rcm import Rcm
 from zscout.types import Grant
 
 RCS = ("robot/a", "robot/b")
@@ -39,17 +39,16 @@ async def node(file: Path) -> None:
     """Runs a node that kills itself so."""
     settings = load_node(file)
     flag = file.with_suffix(".dies")
-    answer_grants = RequestHandler.answer_grants
+    answer_grants = Rcm._answer_grants
 
-    def then_dies(self: RequestHandler, effects: Iterable[Effect]) -> set[str]:
-        answered = answer_grants(self, effects)
-        if answered and flag.exists():
+    def then_dies(self: Rcm, granted: Sequence[Reply]) -> None:
+        answer_grants(self, granted)
+        if granted and flag.exists():
             flag.unlink()
             time.sleep(OUT)
             os.kill(os.getpid(), signal.SIGKILL)
-        return answered
 
-    RequestHandler.answer_grants = then_dies  # type: ignore[method-assign]
+    Rcm._answer_grants = then_dies  # type: ignore[method-assign]
     await run_node(settings, asyncio.Event())
 
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator, Mapping
 from functools import cached_property
-from typing import Annotated, Final, get_args
+from hashlib import blake2b
+from typing import Annotated, Any, Final, get_args
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, to_builtins
 
 from zscout.config.strict import Where, check_name, check_names, key, quoted, seconds
 from zscout.keyexpr import PEOPLE, FleetMember, Rank, as_pattern, matcher
@@ -84,6 +85,11 @@ class AccessPolicy(Struct, frozen=True, dict=True):
                 found.setdefault(name, set()).add(rank)
         return {name: frozenset(ranks) for name, ranks in found.items()}
 
+    @cached_property
+    def digest(self) -> str:
+        """Equal where the rights are, in whatever order the names stand."""
+        return blake2b(_ordered(to_builtins(self)).encode(), digest_size=6).hexdigest()
+
     def ranks_of(self, name: str) -> frozenset[Rank]:
         return self.ranks.get(name, frozenset())
 
@@ -130,6 +136,16 @@ class AccessPolicy(Struct, frozen=True, dict=True):
         title = f"{name} ({', '.join(sorted(ranks))})" if ranks else f"{name}, which has no role here,"
         more = f" and {len(names) - MAX_TOLD} more" if len(names) > MAX_TOLD else ""
         return f"{title} may not {what}; {', '.join(names[:MAX_TOLD]) + more or 'nobody'} may"
+
+
+def _ordered(value: Any) -> str:
+    match value:
+        case dict():
+            return f"{{{','.join(f'{name!r}:{_ordered(value[name])}' for name in sorted(value))}}}"
+        case list() | tuple():
+            return f"[{','.join(sorted(map(_ordered, value)))}]"
+        case _:
+            return repr(value)
 
 
 def check_access(policy: AccessPolicy, at: Where) -> None:

@@ -174,6 +174,8 @@ class Fleet(Struct, frozen=True):
     security: Path | None = None
     """The folder of this host's or this user's certificate; None: a plain mesh, on which `access` is advice."""
     access: AccessPolicy = AccessPolicy()
+    file: Path | None = None
+    """Of a secured fleet: where this was read. Programs look there for changed rights."""
 
     @property
     def operator_priority(self) -> int:
@@ -269,7 +271,8 @@ class FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
 def load_fleet(path: Path, named_by: str = "") -> Fleet:
     """Reads a fleet file; an error says what named it. Raises BadInput."""
     try:
-        return _fleet(read_toml(path, FleetFile), Where(str(path)), path.parent)
+        fleet = _fleet(read_toml(path, FleetFile), Where(str(path)), path.parent)
+        return fleet if fleet.security is None else structs.replace(fleet, file=path.absolute())
     except BadInput as error:
         raise (BadInput(f"{error} (named by {named_by})") if named_by else error) from None
 

@@ -11,10 +11,28 @@ from decimal import Decimal
 
 from zscout.keyexpr import is_pattern, matcher
 from zscout.messages import Amounts, Parameters, Refused
-from zscout.types import Need, RcName
+from zscout.rcm.devices import ExpectedDevices
+from zscout.rcm.roster import Roster
+from zscout.types import Need, Ns, RcName
 
 MAX_NAMED = 8
 """Parameters that a refusal lists."""
+
+
+class Door:
+    """The check by what one leader knows. Until `settles` an RC that was not seen may still be one of the fleet."""
+
+    def __init__(self, devices: ExpectedDevices, roster: Roster, settles: Ns) -> None:
+        self._devices, self._roster, self._settles = devices, roster, settles
+
+    def check(self, now: Ns, needs: Mapping[Need, Amounts], *, waits: bool = False, may_wait: bool = True) -> None:
+        """Raises Refused for what can never start."""
+        waits = waits or now < self._settles
+        check_door(needs, self._devices.names, self._roster.is_known, self._parameters, waits=waits, may_wait=may_wait)
+
+    def _parameters(self, rc: RcName) -> Parameters | None:
+        state = self._roster.reported(rc)
+        return state.parameters if state is not None else self._devices.parameters(rc)
 
 
 def check_door(

@@ -117,6 +117,10 @@ class Change:
     """This host shows more than MAX_TOKENS, since this token."""
 
 
+NOTHING: Final = Change()
+"""Nothing follows."""
+
+
 @dataclass(slots=True, eq=False)
 class _Pending:
     """An RC that answered, and does not count yet."""
@@ -288,6 +292,8 @@ class Roster:
 
     def heard(self, now: Ns, client: ClientId) -> Change:
         """A client that asks is there, though its token is not seen."""
+        if client in self.clients and not self._probed:
+            return NOTHING
         self._now = now
         if client in self._unshown:
             self._expect(now, client)
@@ -387,6 +393,11 @@ class Roster:
         return self._deadlines.next
 
     # Out: what is known
+
+    @property
+    def closed(self) -> bool:
+        """Return True if all members prove their names."""
+        return self._keys.closed
 
     def has_joined(self, name: RcName) -> bool:
         """Return True if an RC counts as present, or did so until just now."""

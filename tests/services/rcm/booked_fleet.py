@@ -114,7 +114,7 @@ def dangers_at(candidate: Candidate) -> list[BookedDanger]:
     """What this leader tells of dangers from now on."""
     dangers: list[BookedDanger] = []
     assert candidate.rcm is not None
-    candidate.rcm.bookings.on_danger = dangers.append
+    candidate.on_danger = dangers.append
     return dangers
 
 

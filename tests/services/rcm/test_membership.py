@@ -17,10 +17,10 @@ from zscout.mesh import IncomingQuery
 from zscout.messages import Holder, OpenRequest, RcAsk, RcState
 from zscout.rcm.recovery import RecoveredState
 from zscout.rcm.roster import discrepancies
+from zscout.rcm.state_view import holders_of
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, HandedOver, LeadTaken, RcJoined, Requested
 from zscout.scheduling.strategies import STRATEGIES
-from zscout.services.rcm.rcm import holders_of
 from zscout.testing.link import Disturbance
 from zscout.testing.virtual_time import VirtualTimeLoop
 from zscout.types import SECOND, Grant, Place, Term

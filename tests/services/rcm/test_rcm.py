@@ -13,8 +13,9 @@ from tests.mesh.kit import until
 from tests.services.rcm.kit import FakeClient, FakeFleet, Refusal, fleet_of, grant_of
 from zscout.config.access import AccessPolicy, Quota, Roles
 from zscout.messages import Cancel, EndedHold, HandOver, Release
+from zscout.rcm.state_view import StateView
 from zscout.scheduling.model import Adopted, ArcRequest, RcJoined, RecoveredHold
-from zscout.services.rcm.rcm import MAX_BUILT, Rcm
+from zscout.services.rcm.state_answers import MAX_BUILT
 from zscout.types import SECOND, Grant, Place, Term
 
 
@@ -346,13 +347,13 @@ async def test_an_arc_that_is_open_at_its_new_client_already_counts_once_against
 
 async def test_many_questions_about_the_state_cost_what_a_few_cost(monkeypatch: pytest.MonkeyPatch) -> None:
     fleet, _ = await fleet_of("robot/a")
-    built, real = [], Rcm._state
+    built, real = [], StateView.state
 
-    def counted(self: Rcm, *args: Any) -> Any:
+    def counted(self: StateView, *args: Any) -> Any:
         built.append(args)
         return real(self, *args)
 
-    monkeypatch.setattr(Rcm, "_state", counted)
+    monkeypatch.setattr(StateView, "state", counted)
     client = fleet.client("one")
     asked = [fleet.state(forecast=bool(number % 2)) for number in range(400)]
     states = await asyncio.gather(*asked, *(client.ask(f"a{number}", "robot/a") for number in range(20)))

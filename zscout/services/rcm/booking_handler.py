@@ -80,12 +80,13 @@ class BookingHandler:
         emit: Callable[..., None],
         check_door: Callable[[Mapping[str, Amounts]], None],
         settled: Callable[[], bool],
+        runtimes: RuntimeEstimator | None,
     ) -> None:
         self._fleet, self._core, self._keeper, self._dates, self._sharing = fleet, core, keeper, dates_, sharing
         self._admission, self._supervisor, self._emit, self._check_door = admission, supervisor, emit, check_door
         self._settled = settled
         self._now, self._keys = keeper.mesh.now, keeper.mesh.keys
-        self.runtimes: RuntimeEstimator | None = None
+        self._runtimes = runtimes
         """What is known of how long holds last, for hints."""
         self._undecided: list[_Undecided] = []
         self._keeping = 0
@@ -275,7 +276,7 @@ class BookingHandler:
         for one in found.found:
             start, latest = -(-self._dates.to_fleet(one.start) // SECOND), self._dates.to_fleet(one.latest) // SECOND
             slots.append(SlotView(start, max(start, latest), dict(one.bound)))
-        guess = None if self.runtimes is None else self._core.likely_slot(wanted, until, self.runtimes)
+        guess = None if self._runtimes is None else self._core.likely_slot(wanted, until, self._runtimes)
         likely = None if guess is None else -(-self._dates.to_fleet(guess) // SECOND)
         if likely is not None and slots and likely >= slots[0].start:
             likely = None

@@ -9,14 +9,15 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from zscout.config.fleet import Fleet
-from zscout.keyexpr import Role, Token
+from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import Declaration, Lane, Mesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import Amounts, BookingRecord, BookingsAsk, BookingsKept, Instant, ProposedHolder, decimals
+from zscout.messages import Amounts, Ask, BookingRecord, BookingsAsk, BookingsKept, Instant, ProposedHolder, decimals
 from zscout.rcm.admission import Admission
 from zscout.scheduling.booking import BookingConflict, BookingThreatened, Dates
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import Effect, Event, Propose, Vote, VoteOverdue
+from zscout.scheduling.model import ArcRequest, Effect, Event, Propose, Vote, VoteOverdue
+from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.services.bookings.fleet_clock import FleetClock, agreed, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.rcm.booked_dates import BookedDates, Date
@@ -63,7 +64,10 @@ class Bookings:
         emit: Callable[..., None],
         propose: Callable[[Propose], None],
         check_door: Callable[[Mapping[str, Amounts]], None],
+        runtimes: RuntimeEstimator | None,
+        on_danger: Callable[[BookedDanger], object],
     ) -> None:
+        """`on_danger` is called with dangers that last."""
         self._mesh, self._supervisor, self._keeper = mesh, supervisor, keeper
         now, self._known = mesh.now(), _is_known(keeper, kept, fleet)
         self.settles_at: Ns = now + round(fleet.mesh.lease * SECOND)
@@ -99,6 +103,7 @@ class Bookings:
             emit,
             check_door,
             lambda: self.settled,
+            runtimes,
         )
         self._reconciling = self._trying = False
         self._another: asyncio.TimerHandle | None = None
@@ -108,8 +113,7 @@ class Bookings:
         self._told: dict[str, str] = {}
         """Dangers that were told, by date."""
         self._telling = False
-        self.on_danger: Callable[[BookedDanger], object] = lambda _: None
-        """Called with what lasts."""
+        self._on_danger = on_danger
         self._declared: list[Declaration] = []
 
     @property
@@ -121,6 +125,17 @@ class Bookings:
     def time(self) -> float | None:
         """Fleet time, in seconds since 1970 (UTC), as others may go by it; None: it is not settled."""
         return self.dates.time if self.settled else None
+
+    @property
+    def age(self) -> float:
+        """For how many seconds that time has gone on."""
+        return (self._mesh.now() - self.clock.since) / SECOND
+
+    def take_up(self, ask: Ask, sender: Sender) -> str:
+        return self.handler.take_up(ask, sender)
+
+    def dated(self, request: ArcRequest) -> ArcRequest:
+        return self.dates.dated(request)
 
     def record(self, booking: str) -> BookingRecord | None:
         return self._keeper.records.get(booking)
@@ -231,7 +246,7 @@ class Bookings:
         for danger in sorted(found, key=lambda one: (one.start, one.record.id, one.why)):
             words = f"is in danger: {danger.why}" if danger.why else "is safe again"
             log.warning("booking %s of %s %s", danger.record.name, danger.record.owner, words)
-            self.on_danger(danger)
+            self._on_danger(danger)
 
     def _on_token(self, token: Token, alive: bool) -> None:
         if alive and token.host != self._mesh.me.host:

@@ -46,7 +46,7 @@ from zscout.services.rcm.digest import HoldListener
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.inventory import Inventory
 from zscout.services.rcm.observed_runtimes import RuntimeObserver
-from zscout.services.rcm.rcm import Rcm
+from zscout.services.rcm.rcm import Parts, Rcm
 from zscout.services.rcm.term_file import TermDisk
 from zscout.types import NO_TERM, SECOND, Ns, RcName, Term
 
@@ -417,14 +417,18 @@ class Candidate:
             term,
             self._see,
             self._failed,
-            self.inventory,
-            self._authority,
-            places,
-            self.listeners,
-            self.tally,
-            self._keeper,
-            kept,
-            self._runtimes.estimator,
+            Parts(
+                self.inventory,
+                self._authority,
+                places,
+                self.listeners,
+                self.tally,
+                self._keeper,
+                kept,
+                self._runtimes.estimator,
+                self._disbelieved,
+                lambda danger: self.on_danger(danger),
+            ),
         )
         self._leading.callback(rcm.stop)
         await rcm.bookings.enter(rcm.core)
@@ -437,8 +441,6 @@ class Candidate:
         counts = len(recovered.rcs), len(recovered.holds), len(recovered.waiting)
         log.info("leading in term %d: %d RCs, %d holds, %d waiting", term.counter, *counts)
         self.terms_led += 1
-        rcm.on_disbelieved = self._disbelieved
-        rcm.bookings.on_danger = self.on_danger
         rcm.start(recovered)
         balancer = self.balancer = LoadBalancer(self.mesh, self._failed)
         inherited = self.ledger.inherited()

@@ -1,0 +1,485 @@
+"""The leading RCM as one pure step: stimuli in, an Outbox out. No clock, task, logger or mesh.
+
+A step is one instant of the core: operations that arrive together, or one other stimulus. What follows in another
+instant is put before the stimuli that wait, and the Outbox says that there is more."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Final, NamedTuple, TypeAlias
+
+from msgspec.structs import replace
+
+from zscout import messages
+from zscout.config.fleet import Fleet
+from zscout.keyexpr import BadName, Role
+from zscout.messages import Refused
+from zscout.rcm.admission import Admission
+from zscout.rcm.door import Door
+from zscout.rcm.operations import Booked, Operations, Taken
+from zscout.rcm.places import arc_id, request_id
+from zscout.rcm.recovery import RecoveredState, listed_by, removed, vouched
+from zscout.rcm.request_log import REMEMBERED, RequestLog, reason_info
+from zscout.rcm.roster import MAX_TOKENS, Change, Roster, discrepancies
+from zscout.rcm.state_view import holders_of
+from zscout.rcm.step import (
+    Answered,
+    Asked,
+    Found,
+    Happened,
+    Lead,
+    Outbox,
+    Proposed,
+    Reloaded,
+    Reported,
+    Seen,
+    Shunned,
+    Stalled,
+    Stimulus,
+)
+from zscout.scheduling.core import Core
+from zscout.scheduling.model import (
+    Adopted,
+    ArcRequest,
+    ClientLost,
+    Dropped,
+    Effect,
+    Event,
+    Granted,
+    HandedOver,
+    HoldEnded,
+    LeadTaken,
+    Outcome,
+    PlaceShown,
+    Propose,
+    RcReported,
+    RecoveredHold,
+    Released,
+    Requested,
+    Tick,
+    Vouched,
+    WakeAt,
+)
+from zscout.scheduling.runtimes import RuntimeEstimator
+from zscout.types import SECOND, ArcId, ClientId, Ns, RcName
+
+CHARGED_EVERY: Final[Ns] = 10 * SECOND
+"""From one publication of what groups had to the next: what is lost with a leader."""
+KEPT: Final[Mapping[Outcome, Ns]] = MappingProxyType(
+    {Outcome.RELEASED: 0, Outcome.CANCELLED: 0, Outcome.CLIENT_LOST: 86_400 * SECOND}
+)
+"""For how long a client may ask again for the place of what ended so; else it is for as long as that is known."""
+CONTINUED: Final = (LeadTaken, Adopted, Vouched, HandedOver)
+"""Events by which holds that stand go on: the RCs hear of that before anybody else."""
+
+
+class _Compare(NamedTuple):
+    """An RC that counts as present reports its holds."""
+
+    state: messages.RcState
+
+
+class _Name(NamedTuple):
+    """Publish these RCs."""
+
+    rcs: Collection[RcName]
+
+
+class _Listed(NamedTuple):
+    answer: messages.ClientRequests
+
+
+class _NewClient(NamedTuple):
+    """Whether the new client of a hand-over is there."""
+
+    number: int
+    there: bool
+
+
+class _Resume(NamedTuple):
+    """RCs are no longer pending."""
+
+
+class _Due(NamedTuple):
+    """Deadlines are over."""
+
+
+class _Tick(NamedTuple):
+    """The core's time is over; reasons and lines of the log may be due."""
+
+
+_Work: TypeAlias = Stimulus | _Compare | _Name | _Listed | _NewClient | _Resume | _Due | _Tick
+
+
+class Leader:
+    """One term. `bookings`: those of the fleet."""
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        core: Core,
+        admission: Admission,
+        roster: Roster,
+        door: Door,
+        bookings: Booked,
+        runtimes: RuntimeEstimator | None,
+    ) -> None:
+        self._fleet, self.core, self._admission, self.roster = fleet, core, admission, roster
+        self._bookings, self.term = bookings, admission.places.term
+        self.registry = RequestLog(core, roster, admission.places, runtimes)
+        self.operations = Operations(fleet, core, self.registry, roster, admission, door, bookings, runtimes)
+        self.seq = 0
+        """The last number that was published."""
+        self.published: Ns = 0
+        """When that was."""
+        self._charged: Ns = 0
+        """When what groups had was published last."""
+        self._named: dict[RcName, int] = {}
+        """The number of the last publication that named an RC."""
+        self._recovered: dict[ClientId, set[ArcId]] = {}
+        """By client: the ARCs that only RCs have reported."""
+        self._queue: deque[_Work] = deque()
+        self._wake: Ns | None = None
+        """When deadlines are over."""
+        self._waking = False
+        """What is due waits among the stimuli."""
+        self._core_wake: Ns | None = None
+        self._now: Ns = 0
+        self._out = Outbox()
+
+    def step(self, now: Ns, stimuli: Iterable[Stimulus] = ()) -> Outbox:
+        """One instant: of what waits, as much as is decided together."""
+        self._now, self._out = now, Outbox()
+        self._queue.extend(stimuli)
+        if self._wake is not None and self._wake <= now and not self._waking:
+            self._waking = True
+            self._queue.append(_Due())
+        if (events := self._next()) is not None:
+            self._decide(events)
+        times = (self._core_wake, self.roster.next, self.registry.next, self.operations.next)
+        self._out.wake = self._wake = min([at for at in times if at is not None], default=None)
+        self._out.more = bool(self._queue)
+        return self._out
+
+    def close(self, now: Ns) -> str:
+        """What was gathered for the log: nothing is published any more."""
+        return self.registry.close(now)
+
+    # In: the events of the next instant
+
+    def _next(self) -> Sequence[Event] | None:
+        """The events of the next instant; None: there is none to decide."""
+        operations, queue = self.operations, self._queue
+        while queue and isinstance(asked := queue[0], Asked) and operations.joins(asked):
+            queue.popleft()
+            self._take(operations.take(self._now, asked))
+            if isinstance(asked.operation, (messages.HandOver, messages.Foresee)):
+                break
+        else:
+            if queue and not operations.instant.touched and not self._out.at_once:
+                return self._events(queue.popleft())
+        return operations.events() or None
+
+    def _events(self, work: _Work) -> Sequence[Event] | None:
+        match work:
+            case Seen(token, alive):
+                token_moved = self.roster.client_token if token.role == Role.CLIENT else self.roster.rc_token
+                return self._follow(token_moved(self._now, token, alive=alive))
+            case Reported(key, state):
+                return self._follow(self.roster.rc_state(self._now, key, state))
+            case Answered(question, message, problem):
+                return self._follow(self.roster.answered(self._now, question, message, problem))
+            case Found(question, tokens):
+                return self._follow(self.roster.seen(self._now, question, tokens))
+            case Happened(events):
+                return events
+            case Shunned(token, until):
+                return self._follow(self.roster.shun(self._now, token, until))
+            case Stalled(length, ended, fresh):
+                self.roster.stalled(length, ended, fresh=fresh)
+            case Reloaded():
+                return self._reload()
+            case Lead(recovered):
+                self._lead(recovered)
+            case _Compare(state):
+                return self._compare(state)
+            case _Name(rcs):
+                self._publish([], rcs)
+            case _Listed(answer):
+                return self._on_requests(answer)
+            case _NewClient(number, there):
+                self._take(self.operations.found(self._now, number, there=there))
+                return self.operations.events()
+            case _Resume():
+                self._queue.extendleft(reversed(self.operations.resume()))
+            case _Due():
+                return self._tick()
+            case _Tick():
+                self._reports()
+        return None
+
+    def _take(self, taken: Taken) -> None:
+        """Carry out what follows at once from operations."""
+        out = self._out
+        out.at_once += taken.answers
+        out.notices += taken.notices
+        out.strange += taken.strange
+        for change in taken.changes:
+            self._follow(change)
+
+    def _follow(self, change: Change) -> Sequence[Event]:
+        """The events of what follows for the roster; all else is done, or put before what waits."""
+        out = self._out
+        out.higher += change.higher
+        out.disbelieved += change.disbelieved
+        out.questions += change.questions
+        out.suspicions += change.suspicions
+        out.log += change.remarks
+        out.duplicates += change.duplicates
+        if change.surplus:
+            out.strange.append(
+                (change.surplus, f"{change.surplus} shows more than {MAX_TOKENS} tokens: later ones are ignored")
+            )
+        later: list[_Work] = [*map(_Compare, change.reported)]
+        if change.named:
+            later.append(_Name(change.named))
+        later += map(_Listed, change.listed)
+        later += [_NewClient(number, there) for number, there in change.found]
+        if change.settled:
+            later.append(_Resume())
+        if later:
+            self._queue.extendleft(reversed(later))
+        return change.events
+
+    def _tick(self) -> Sequence[Event]:
+        answers, again = self.operations.tick(self._now)
+        self._out.at_once += answers
+        self._queue.extendleft(reversed([_Tick(), *again]))
+        if self.roster.next is not None and self.roster.next <= self._now:
+            return self._follow(self.roster.tick(self._now))
+        return ()
+
+    def _reports(self) -> None:
+        self._waking = False
+        if self._core_wake is not None and self._core_wake <= self._now:
+            self._decide([Tick()])
+        notices, text = self.registry.tick(self._now)
+        self._out.notices += notices
+        self._out.log += [text] if text else []
+
+    def _reload(self) -> Sequence[Event]:
+        """The rights have changed: who has none any more holds and waits for nothing."""
+        self.core.policy = self._admission.authority.bound(self._fleet.scheduling)
+        known = filter(None, map(self.core.arc, self.core.arcs()))
+        return [Tick(), *removed((arc.request for arc in known), self._admission)]
+
+    def _lead(self, recovered: RecoveredState) -> None:
+        """Begin with what was recovered."""
+        now, registry, places = self._now, self.registry, self._admission.places
+        joined = self.roster.start(now, recovered.rcs.values(), recovered.pending, patient=recovered.patient)
+        for arc in recovered.given_up:
+            registry.give_up(now, arc, Outcome.RELEASED)
+        requests = [hold.request for hold in recovered.holds] + [asked.request for asked in recovered.waiting]
+        for request in requests:
+            registry.enter(request.arc, request.name)
+            self.roster.expect(now, request.client)
+            if request.client not in recovered.answered:
+                self._recover(request)
+        for arc, rcs in recovered.believed.items():
+            registry.believe(arc, rcs)
+        bookings = self._bookings
+        waiting = tuple(replace(asked, request=bookings.dated(asked.request)) for asked in recovered.waiting)
+        certain = 0 if bookings.settled else bookings.settles_at
+        lead = LeadTaken(self.term, tuple(recovered.holds), waiting, recovered.charged, certain)
+        booked = bookings.recovered({request.booking for request in requests if request.booking} | recovered.booked)
+        gone = removed((hold.request for hold in recovered.holds), self._admission)
+        # RCs receive the new term first; full lists end whatever was found to be half a gang.
+        self._decide([*self._follow(joined), *booked, lead, *gone], named=recovered.rcs)
+        self._out.notices += [registry.refuse(now, *refused) for refused in recovered.refused]
+        for arc in self.core.arcs():
+            self._bind(arc)
+            if (expecting := recovered.expected.get(request_id(arc))) is not None:
+                places.admit(arc, expecting)
+
+    def _compare(self, state: messages.RcState) -> Sequence[Event] | None:
+        """Makes an RC and the core agree: what the RC lost has ended, what is too much there is revoked."""
+        rc = state.rc
+        current = state.term == self.term and state.seq >= self._named.get(rc, 0)
+        ended, superfluous = discrepancies(state, self.core.holders(rc), self._now, current=current)
+        if superfluous:
+            self._queue.appendleft(_Name([rc]))
+        return [RcReported(rc, ended)] if ended else None
+
+    def _on_requests(self, answer: messages.ClientRequests) -> Sequence[Event]:
+        """What RCs alone reported, and a client does not ask for, it gave up where no RCM heard of it; else its own
+        word is the one that counts."""
+        known = self._recovered.pop(answer.client, set()) & {*self.core.arcs_of(answer.client)}
+        listed = {asked.id: asked for asked in answer.requests[: self._fleet.limits.max_requests_per_client]}
+        events = list[Event]()
+        for arc in filter(None, map(self.core.arc, sorted(known))):
+            if (request := listed.get(request_id(arc.id))) is None:
+                events.append(Released(arc.id))
+            elif not arc.vouched:
+                try:
+                    own = listed_by(answer.client, request, self._admission, self._bookings.record)
+                    events.append(vouched(arc, own, self._admission))
+                except (Refused, BadName) as error:
+                    self._out.strange.append((answer.client, f"{answer.client} lists what can't be: {error}"))
+                    events.append(Released(arc.id, f"the leader, as it is no valid request: {error}"))
+        return events
+
+    def _recover(self, request: ArcRequest) -> None:
+        """Has a client say whether it still asks for what RCs hold for it."""
+        self._recovered.setdefault(request.client, set()).add(request.arc)
+        self._follow(self.roster.ask_requests(self._now, request.client))
+
+    # Out: one instant
+
+    def _decide(self, events: Sequence[Event], named: Collection[RcName] | None = None) -> None:
+        """RCs that are `named` are published, whatever becomes of them."""
+        for event in events:
+            if isinstance(event, ClientLost):
+                self._recovered.pop(event.client, None)
+        if named is None and all(
+            isinstance(event, ClientLost) and not self.core.arcs_of(event.client) for event in events
+        ):
+            return  # a client that asked for nothing changes nothing
+        now, out, registry, instant = self._now, self._out, self.registry, self.operations.instant
+        over = registry.ended
+        events = [event for event in events if not (isinstance(event, Adopted) and over(event.held.request.arc))]
+        effects = self.core.handle(now, *events)
+        out.events, out.effects = events, effects
+        out.granted, notified = self.operations.granted(now, effects)
+        if not any(isinstance(event, CONTINUED) for event in events):
+            out.grant_notices = registry.grants(now, effects, notified)
+            notified |= {arc_id(notice.client, notice.id) for notice in out.grant_notices}
+        out.reopened, registry.traced = registry.traced, []
+        self._publish(effects, named, instant.left)
+        self._note(events)
+        answered = notified | self.operations.waiting.keys()
+        out.notices += registry.report(now, effects, answered, instant.given_up)
+        answers, notices = self.operations.decided(now, effects)
+        out.answers += answers
+        out.notices += notices
+        for effect in effects:
+            match effect:
+                case Dropped(arc=arc, outcome=outcome) | HoldEnded(arc=arc, outcome=outcome) if not self.core.is_open(
+                    arc
+                ):
+                    self._admission.places.end(arc, now, KEPT.get(outcome, REMEMBERED))
+                case Propose():
+                    out.proposals.append(Proposed(effect.rc, self.proposal(effect)))
+                case WakeAt(at):
+                    self._core_wake = at
+        if line := self.core.strategy.log_line():
+            out.log.append(line)
+        out.over, registry.traced = registry.traced, []
+
+    def _note(self, events: Iterable[Event]) -> None:
+        """What is remembered of an instant."""
+        now = self._now
+        for event in events:
+            match event:
+                case Requested(ArcRequest(client=client)) | HandedOver(to=client):
+                    self.roster.expect(now, client)
+            match event:
+                case Requested(request):
+                    self._bind(request.arc)
+                    asked = f"asked for {', '.join(sorted(request.needs))} at priority {request.priority}"
+                    self.registry.record(now, request.arc, asked)
+                case PlaceShown(arc) | Vouched(ArcRequest(arc=arc)):
+                    self._bind(arc)
+                case HandedOver(renamed=arc):
+                    self._bind(arc)
+                    if (moved := self.core.arc(arc)) is not None and not moved.vouched:
+                        self._recover(moved.request)
+                case Adopted(RecoveredHold(ArcRequest(client=client) as request)) if self.core.arc(request.arc):
+                    self._bind(request.arc)
+                    self.registry.enter(request.arc, request.name)
+                    if client not in self.roster.clients:
+                        # As the links to its RCs came back just now, so may its own.
+                        self._follow(self.roster.heard(now, client))
+                        self.roster.expect(now, client)
+                    self._recover(request)
+
+    def _bind(self, arc: ArcId) -> None:
+        if (place := self.core.place_of(arc)) is not None:
+            self._admission.places.bind(place, arc, self._now)
+
+    # Out: grants and proposals
+
+    def _publish(
+        self, effects: Iterable[Effect], rcs: Collection[RcName] | None = None, left: Collection[ArcId] = ()
+    ) -> None:
+        """Publishes all holders of the RCs that were granted or revoked, if any were and as far as they have joined;
+        with `rcs` in any case, and those of `rcs` as well. `left`: ARCs whose programs are gone by their own client's
+        word."""
+        changed = [effect for effect in effects if isinstance(effect, (Granted, HoldEnded))]
+        if not changed and rcs is None:
+            return
+        now = self._now
+        revoked = [
+            _revocation(effect, self.registry.name(effect.arc), now, left)
+            for effect in changed
+            if isinstance(effect, HoldEnded)
+        ]
+        number = self.core.seq if self.core.seq > self.seq else self.core.number()
+        # One that has not joined holds what is not known here: to name it would end that.
+        concerned = filter(self.roster.has_joined, {rc for effect in changed for rc in effect.rcs})
+        names = sorted({*(rcs or ()), *concerned})
+        self._named |= dict.fromkeys(names, number)
+        holders = {name: holders_of(self.core.holders(name), name, now) for name in names}
+        instances = {rc: instance for rc, (instance, _) in self.roster.named(names).items()}
+        begun = [
+            (effect.grant.seq, effect.waited / SECOND)
+            for effect in changed
+            if isinstance(effect, Granted) and effect.waited is not None
+        ]
+        self._out.publication = self._grants(number, holders, revoked, instances, begun)
+
+    def heartbeat(self, now: Ns) -> messages.Grants:
+        """Repeats the last number."""
+        self._now = now
+        return self._grants(self.seq, {}, [], {}, [])
+
+    def _grants(
+        self,
+        number: int,
+        rcs: dict[str, list[messages.Holder]],
+        revoked: list[messages.Revocation],
+        instances: dict[str, str],
+        begun: list[tuple[int, float]],
+    ) -> messages.Grants:
+        now, charged = self._now, dict[str, float]()
+        if now >= self._charged + CHARGED_EVERY:
+            self._charged, charged = now, self.core.charged()
+        every, time, age = self._fleet.timing.heartbeat / SECOND, self._bookings.time, self._bookings.age
+        before, self.seq, self.published = self.seq, number, now
+        return messages.Grants(self.term, number, before, every, rcs, revoked, instances, begun, time, age, charged)
+
+    def proposal(self, effect: Propose) -> messages.Proposal:
+        arcs = ((name, self.core.arc(name), params) for name, params in effect.holders.items())
+        holders = [
+            messages.ProposedHolder(request_id(arc.id), arc.name, arc.request.client, messages.decimals(params))
+            if arc is not None
+            else self._bookings.proposed(name, params)
+            for name, arc, params in arcs
+        ]
+        return messages.Proposal(proposal=effect.proposal, term=self.term, holders=holders)
+
+
+def _revocation(effect: HoldEnded, name: str, now: Ns, left: Collection[ArcId]) -> messages.Revocation:
+    return messages.Revocation(
+        id=request_id(effect.arc),
+        arc=name,
+        client=effect.client,
+        grant=effect.grant,
+        rcs=list(effect.rcs),
+        outcome=effect.outcome,
+        reason=str(effect.reason),
+        by=effect.by,
+        why=reason_info(effect.reason, now),
+        own=effect.outcome in (Outcome.RELEASED, Outcome.CANCELLED) and effect.arc in left,
+    )

@@ -1,0 +1,528 @@
+"""Operations of clients: they become events of the core, and are answered once the core has decided. Pure.
+
+What one step takes in is one instant: one pass decides it and one publication has it. Operations on one ARC stay in
+their order: the second one waits for the next step."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from typing import Any, Final, NamedTuple, Protocol
+
+from msgspec.structs import replace
+
+from zscout.config.fleet import Fleet
+from zscout.keyexpr import BadName, Sender, check_name, client_of
+from zscout.messages import (
+    Ask,
+    BookingRecord,
+    Cancel,
+    Foresee,
+    Foresight,
+    HandOver,
+    Notice,
+    Problem,
+    ProposedHolder,
+    Refused,
+    Release,
+)
+from zscout.rcm.admission import Admission
+from zscout.rcm.authority import Authority
+from zscout.rcm.deadlines import Deadlines
+from zscout.rcm.door import Door
+from zscout.rcm.places import arc_id, request_id
+from zscout.rcm.recovery import Listed, vouched
+from zscout.rcm.request_log import RequestLog, party_info, reason_info
+from zscout.rcm.roster import NOTHING, Change, Roster
+from zscout.rcm.step import Asked, Reply, Ticket
+from zscout.rcm.terms import Source, Word
+from zscout.scheduling.core import Core
+from zscout.scheduling.forecast import forecast
+from zscout.scheduling.model import (
+    ArcRequest,
+    Cancelled,
+    Dropped,
+    Effect,
+    Event,
+    Granted,
+    HandedOver,
+    Outcome,
+    PlaceShown,
+    Queued,
+    Reachable,
+    Released,
+    Requested,
+    Unconfirmed,
+)
+from zscout.scheduling.reason import Party, person
+from zscout.scheduling.runtimes import RuntimeEstimator
+from zscout.types import SECOND, ArcId, ClientId, Ns, Params, Place
+
+REPLY_SLACK: Final[Ns] = SECOND // 10
+"""After an overdue vote the first answer is given all the same."""
+MAX_BATCH = 64
+"""Operations that are decided together at most."""
+
+
+class Booked(Protocol):
+    """The bookings of the term."""
+
+    @property
+    def settled(self) -> bool: ...
+    @property
+    def settles_at(self) -> Ns: ...
+    @property
+    def time(self) -> float | None: ...
+    @property
+    def age(self) -> float: ...
+    def take_up(self, ask: Ask, sender: Sender) -> str: ...
+    def dated(self, request: ArcRequest) -> ArcRequest: ...
+    def record(self, booking: str) -> BookingRecord | None: ...
+    def recovered(self, taken: Collection[str]) -> list[Event]: ...
+    def proposed(self, name: ArcId, params: Params) -> ProposedHolder: ...
+
+
+class _Due(Enum):
+    FIRST_ANSWER = auto()
+    RESUME = auto()
+
+
+class _Standing(NamedTuple):
+    """An ask whose answer is how its ARC stands after the instant, votes or not."""
+
+    ticket: Ticket
+    arc: ArcId
+    ask: Ask
+
+
+@dataclass(slots=True)
+class Taken:
+    """What follows at once from operations: the rest once the instant is decided."""
+
+    answers: list[Reply] = field(default_factory=list)
+    notices: list[Notice] = field(default_factory=list)
+    changes: list[Change] = field(default_factory=list)
+    strange: list[tuple[str, str]] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class _Instant:
+    """Operations that are gathered for one instant."""
+
+    touched: set[ArcId] = field(default_factory=set)
+    ended: list[Cancelled | Released] = field(default_factory=list)
+    shown: list[Event] = field(default_factory=list)
+    asked: list[Requested] = field(default_factory=list)
+    standing: list[_Standing] = field(default_factory=list)
+    moved: tuple[Ticket, list[ArcId]] | None = None
+    """A hand-over: it is alone."""
+    given_up: set[ArcId] = field(default_factory=set)
+    """ARCs that end by their own client's will."""
+    left: set[ArcId] = field(default_factory=set)
+    """Those whose programs are gone: a client that started anew gives up what its former life may use yet."""
+
+
+class Operations:
+    """Checks operations, gathers those of an instant, and keeps the tickets that wait for their answer."""
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        core: Core,
+        registry: RequestLog,
+        roster: Roster,
+        admission: Admission,
+        door: Door,
+        bookings: Booked,
+        runtimes: RuntimeEstimator | None,
+    ) -> None:
+        self.core, self._registry, self._roster, self._door = core, registry, roster, door
+        self._admission, self._bookings, self._runtimes = admission, bookings, runtimes
+        self._first_answer: Ns = fleet.timing.vote_timeout + REPLY_SLACK
+        self._lease: Ns = round(fleet.mesh.lease * SECOND)
+        self._now: Ns = 0
+        self._taken = Taken()
+        self.instant = _Instant()
+        self.waiting: dict[ArcId, list[Ticket]] = {}
+        """Operations that are not answered yet, by ARC."""
+        self._deferred: list[Asked] = []
+        """Asked by clients that believe to hold, or handed over by them, while their RCs have not said so."""
+        self._moving: dict[int, tuple[Ticket, HandOver, ClientId, ClientId]] = {}
+        """Hand-overs that wait until it is known whether their new client is there, by number."""
+        self._moved = 0
+        self._deadlines: Deadlines[tuple[_Due, Any]] = Deadlines()
+
+    # In
+
+    def joins(self, asked: Asked) -> bool:
+        """Return True if an operation can be part of the instant that is gathered."""
+        instant, operation = self.instant, asked.operation
+        if not instant.touched:
+            return True
+        if len(instant.touched) >= MAX_BATCH:
+            return False
+        match operation:
+            case Ask(id=name, was=was):
+                client = str(asked.sender)
+                return arc_id(client, name) not in instant.touched and (
+                    was is None or arc_id(client, was) not in instant.touched
+                )
+            case Cancel() | Release():
+                return arc_id(operation.client or str(asked.sender), operation.id) not in instant.touched
+        return False
+
+    def take(self, now: Ns, asked: Asked) -> Taken:
+        """Take an operation in."""
+        self._now = now
+        ticket, sender, operation = asked
+        client = str(sender)
+        try:
+            if (heard := self._roster.heard(now, client)) is not NOTHING:
+                self._taken.changes.append(heard)
+            check_name(operation.id, "id")
+            match operation:
+                case Ask():
+                    self._ask(asked, operation, sender, client)
+                case Cancel() | Release():
+                    self._end(ticket, operation, sender)
+                case HandOver():
+                    self._find_new_client(asked, operation, client)
+                case Foresee():
+                    self._forecast(ticket, operation, sender)
+        except Refused as refused:
+            self._taken.answers.append((ticket, refused.problem))
+        except BadName as error:
+            self._taken.answers.append((ticket, Problem("bad_request", str(error))))
+        taken, self._taken = self._taken, Taken()
+        return taken
+
+    def events(self) -> list[Event]:
+        """The events of the instant: first ends, then what is asked."""
+        return [*self.instant.ended, *self.instant.shown, *self.instant.asked]
+
+    def resume(self) -> list[Asked]:
+        """The operations of clients that believe to hold, to be looked at again."""
+        deferred, self._deferred = self._deferred, []
+        return deferred
+
+    def found(self, now: Ns, number: int, *, there: bool) -> Taken:
+        """It is known whether the new client of a hand-over has a token."""
+        self._now = now
+        ticket, operation, sender, to = self._moving.pop(number)
+        try:
+            if not there:
+                raise Refused("unknown_client", f"{to} is not on the mesh")
+            self._hand_over(ticket, operation, sender, to)
+        except Refused as refused:
+            self._taken.answers.append((ticket, refused.problem))
+        taken, self._taken = self._taken, Taken()
+        return taken
+
+    @property
+    def next(self) -> Ns | None:
+        return self._deadlines.next
+
+    def tick(self, now: Ns) -> tuple[list[Reply], list[Asked]]:
+        """First answers that are due, and operations to be looked at again."""
+        answers, again = list[Reply](), list[Asked]()
+        while (due := self._deadlines.pop_due(now)) is not None:
+            match due:
+                case _Due.FIRST_ANSWER, arcs:
+                    answers += self._answers(now, arcs)
+                case _Due.RESUME, _:
+                    again += self.resume()
+        return answers, again
+
+    # Out: the instant is decided
+
+    def granted(self, now: Ns, effects: Iterable[Effect]) -> tuple[list[Reply], set[ArcId]]:
+        """The answers to those whose ARCs an instant has granted, before anybody else learns of it; and those ARCs."""
+        arcs = {
+            effect.arc: None
+            for effect in effects
+            if isinstance(effect, Granted) and effect.arc in self.waiting and self.core.is_running(effect.arc)
+        }
+        return self._answers(now, arcs), {*arcs}
+
+    def decided(self, now: Ns, effects: Iterable[Effect]) -> tuple[list[Reply], list[Notice]]:
+        """The other answers that an instant has decided, and what new clients of ARCs are to know."""
+        answers, notices = list[Reply](), list[Notice]()
+        for effect in effects:
+            match effect:
+                case Granted(arc=arc) | Dropped(arc=arc):
+                    answers += self._answers(now, [arc])
+                case Queued(arc=arc, settled=True) if self.core.is_queued(arc):
+                    answers += self._answers(now, [arc])
+        done, self.instant = self.instant, _Instant()
+        answers += self._answers(now, [event.arc for event in done.ended])
+        answers += [(ticket, self._standing(now, arc, ask)) for ticket, arc, ask in done.standing]
+        if done.moved is not None:
+            ticket, moved = done.moved
+            notices = self._registry.present(now, filter(self.core.is_queued, moved))
+            answers.append((ticket, self._registry.notice(now, moved[0])))
+        undecided = [event.request.arc for event in done.asked if event.request.arc in self.waiting]
+        if undecided:
+            # Votes are out: they decide the first answer, if they come.
+            self._deadlines.set(now + self._first_answer, (_Due.FIRST_ANSWER, undecided))
+        return answers, notices
+
+    def _answers(self, now: Ns, arcs: Iterable[ArcId]) -> list[Reply]:
+        answers = list[Reply]()
+        for arc in arcs:
+            if tickets := self.waiting.pop(arc, None):
+                notice = self._registry.notice(now, arc)
+                answers += [(ticket, notice) for ticket in tickets]
+        return answers
+
+    # Asking
+
+    def _ask(self, asked: Asked, ask: Ask, sender: Sender, client: ClientId) -> None:
+        self._check_term(ask, sender, client)
+        arc, now, answers = arc_id(client, ask.id), self._now, self._taken.answers
+        undecided = self._may_hold(arc, ask) and self._roster.awaits(now, arc, ask.rcs)
+        undecided = undecided or bool(ask.booking and not self._bookings.settled)
+        if undecided and len(self._deferred) < MAX_BATCH:
+            self._defer(asked)
+        elif arc in self.waiting:
+            self.waiting[arc].append(asked.ticket)
+        elif self.core.is_open(arc):
+            self._ask_again(asked.ticket, ask, sender, client, arc)
+        elif self._registry.ended(arc) and not self._registry.reopens(arc, ask.grant if ask.unserved else None):
+            answers.append((asked.ticket, self._registry.notice(now, arc)))
+        elif self._goes_on_elsewhere(ask):
+            answers.append((asked.ticket, self._registry.handed_over(arc, ask.arc)))
+        else:
+            self._enter(asked.ticket, ask, sender, client, arc)
+
+    def _check_term(self, ask: Ask, sender: Sender, client: ClientId) -> None:
+        """Raises Refused for one from a later term: this leader steps down, if that counts."""
+        place = ask.place
+        if (
+            place is not None
+            and self._roster.closed
+            and place.term > self.core.term
+            and self._admission.places.proves(place, client, ask.was or ask.id, ask.seal)
+        ):
+            self._taken.changes.append(Change(higher=[(Word(place.term, Source.SEAL, client, sender.host), None)]))
+            raise Refused("old_term", "a leader of a later term gave this place; try again", place.term)
+        if ask.term is not None and ask.term > self.core.term:
+            self._taken.changes.append(Change(higher=[(self._roster.client_word(client, ask.term), None)]))
+            raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
+
+    def _ask_again(self, ticket: Ticket, ask: Ask, sender: Sender, client: ClientId, arc: ArcId) -> None:
+        """The ARC is open: the answer is how it stands, once what its client shows is known."""
+        instant = self.instant
+        self._registry.enter(arc, ask.arc, estimate=ask.estimate)
+        place, known, shown = self._own_place(ask, client), self.core.arc(arc), list[Event]()
+        if known is not None and not known.vouched:
+            shown.append(vouched(known, Listed(self._admission.form(ask, sender), place), self._admission))
+        elif place is not None:
+            shown.append(PlaceShown(arc, place))
+        if ask.grant is not None and ask.unconfirmed:
+            shown.append(Unconfirmed(arc, ask.grant, tuple(sorted(ask.unconfirmed))))
+        if ask.reachable:
+            shown.append(Reachable(arc))
+        if shown:
+            instant.touched.add(arc)
+            instant.shown += shown
+            instant.standing.append(_Standing(ticket, arc, ask))
+        else:
+            self._taken.answers.append((ticket, self._standing(self._now, arc, ask)))
+
+    def _enter(self, ticket: Ticket, ask: Ask, sender: Sender, client: ClientId, arc: ArcId) -> None:
+        """Takes a new request. This is the way of every grant: nothing is done here that can be done once it is
+        answered."""
+        instant, request = self.instant, self._admission.admit(ask, sender, self)
+        if ask.booking:
+            request = self._bookings.dated(replace(request, booking=self._bookings.take_up(ask, sender)))
+        place, since = None, None
+        if ask.place is not None and (place := self._own_place(ask, client)) is not None:
+            since = self._now - round(ask.waited * SECOND)
+        elif ask.check and ask.place is None and ask.grant is None:
+            self._door.check(self._now, ask.needs, waits=ask.wait_for_device)
+        self._registry.enter(arc, ask.arc, estimate=ask.estimate)
+        instant.touched.add(arc)
+        instant.asked.append(Requested(request, place, since))
+        if self._may_hold(arc, ask):
+            # It ends what it began under that grant before anybody is asked for a vote.
+            instant.standing.append(_Standing(ticket, arc, ask))
+            return
+        if place is not None and ask.was is not None and ask.was != ask.id:
+            before = arc_id(client, ask.was)
+            if self.core.is_open(before):
+                instant.touched.add(before)
+                instant.ended.append(Released(before, f"its client, which asks for it as {ask.id}"))
+        self.waiting.setdefault(arc, []).append(ticket)
+
+    def _own_place(self, ask: Ask, client: ClientId) -> Place | None:
+        """The place that a request shows, if it is its client's. Raises Refused for one that can't be."""
+        if ask.place is None:
+            return None
+        places = self._admission.places
+        self._admission.check_place(ask.place, self.core.could_have_issued)
+        seen = client in self._roster.clients
+        if places.may_claim(ask.place, client, ask.was or ask.id, ask.seal, seen=seen):
+            if places.takes_the_word_for(ask.place):
+                text = f"{client} shows a place of term {ask.place.term.counter} that is not known here: it has it"
+                self._taken.strange.append((client, text))
+            return ask.place
+        self._taken.strange.append((client, f"{client} shows a place that is not its own: it has none for that"))
+        return None
+
+    def _may_hold(self, arc: ArcId, ask: Ask) -> bool:
+        """Whether its client believes in a grant of an earlier RCM of which this one does not know."""
+        if ask.grant is None or ask.grant.term >= self.core.term or ask.unconfirmed or ask.unserved:
+            return False
+        known = self.core.arc(arc)
+        return (known is None or known.hold is None) and not self._registry.ended(arc)
+
+    def _standing(self, now: Ns, arc: ArcId, ask: Ask) -> Notice:
+        """How an open ARC stands, for a client that may not have heard how its last hold ended."""
+        if ask.grant is not None and not ask.unconfirmed and not ask.unserved and self.core.is_queued(arc):
+            return self._registry.interrupted(now, arc, ask.grant)
+        return self._registry.notice(now, arc)
+
+    def _goes_on_elsewhere(self, ask: Ask) -> bool:
+        """Whether another client has this ARC: what one RCM handed over, the next knows by its place only."""
+        return ask.place is not None and any(request_id(arc) == ask.id for arc in self.core.at_place(ask.place))
+
+    def _defer(self, asked: Asked) -> None:
+        self._deferred.append(asked)
+        self._deadlines.set(self._now + self._lease, (_Due.RESUME, None))
+
+    # Ending
+
+    def _end(self, ticket: Ticket, operation: Cancel | Release, sender: Sender) -> None:
+        owner, authority = client_of(operation.client) if operation.client is not None else sender, self._authority
+        if owner.host != sender.host:
+            authority.check_operator(sender, f"end what is {owner}'s")
+        arc, instant = arc_id(str(owner), operation.id), self.instant
+        if owner == sender:
+            instant.given_up.add(arc)
+            if operation.left:
+                instant.left.add(arc)
+            if not self.core.is_open(arc):
+                outcome = Outcome.CANCELLED if isinstance(operation, Cancel) else Outcome.RELEASED
+                self._registry.give_up(self._now, arc, outcome)
+        event = Cancelled if isinstance(operation, Cancel) else Released
+        by = "" if owner == sender else person(authority.known_as(sender, operation.who), str(sender))
+        instant.touched.add(arc)
+        instant.ended.append(event(arc, by))
+        self.waiting.setdefault(arc, []).append(ticket)
+
+    @property
+    def _authority(self) -> Authority:
+        return self._admission.authority
+
+    # Open requests, as limits and quotas count them: those of this instant included
+
+    @property
+    def waiting_now(self) -> int:
+        return self.core.waiting + len(self.instant.asked)
+
+    def of_client(self, client: ClientId) -> int:
+        return self.core.count_of(client) + sum(event.request.client == client for event in self.instant.asked)
+
+    def of_owners(self, names: Collection[str], *but: ArcId) -> int:
+        owned = sum(map(self.core.count_of_owner, names))
+        owned += sum(event.request.client.partition("/")[0] in names for event in self.instant.asked)
+        return owned - sum(self.core.is_open(arc) and arc.partition("/")[0] in names for arc in but)
+
+    def held_by(self, names: Collection[str], *but: ArcId) -> int:
+        """The number of RCs held by these owners."""
+        arcs = filter(None, map(self.core.arc, {*self.core.arcs_of_owners(names)} - {*but}))
+        return sum(len(arc.needs) for arc in arcs if arc.hold is not None)
+
+    # Trying dry
+
+    def _forecast(self, ticket: Ticket, asked: Foresee, sender: Sender) -> None:
+        arc, now = arc_id(str(sender), asked.id), self._now
+        if self.core.arc(arc) is not None:
+            raise Refused("bad_request", f"{asked.id} is already a request; ask how it stands")
+        request = self._admission.admit(asked, sender, self)
+        if asked.check:
+            self._door.check(now, asked.needs, waits=asked.wait_for_device)
+        expected = forecast(self.core, now, request, self._runtimes)
+        start = expected.starts.get(arc)
+        victims = [known.request for known in map(self.core.arc, expected.preempts) if known is not None]
+        answer = Foresight(
+            id=asked.id,
+            arc=asked.arc,
+            starts_in=None if start is None else (start - now) / SECOND,
+            preempts=[self._registry.name(victim) for victim in expected.preempts],
+            reason=str(expected.reason or ""),
+            victims=[party_info(Party(one.arc, one.name, one.priority, one.who), now) for one in victims],
+            why=reason_info(expected.reason, now),
+        )
+        self._taken.answers.append((ticket, answer))
+
+    # Handing over
+
+    def _find_new_client(self, asked: Asked, operation: HandOver, sender: ClientId) -> None:
+        to = str(client_of(operation.to))
+        for other in operation.others:
+            check_name(other, "id")
+        arcs = [arc_id(sender, name) for name in (operation.id, *operation.others)]
+        if any(self._registry.may_be_held(self._now, arc) for arc in arcs) and len(self._deferred) < MAX_BATCH:
+            self._defer(asked)
+            return
+        own, goal = self.core.arc(arc_id(sender, operation.id)), self.core.arc(arc_id(to, operation.id))
+        if sender == to or own is None:
+            self._answer_handed_over(asked.ticket, operation, sender, to)
+        elif goal is not None and goal.place == own.place:
+            # An RCM before this one has carried it out: by the word of RCs the new client holds it, wherever that is.
+            self._hand_over(asked.ticket, operation, sender, to)
+        elif len(self._moving) >= MAX_BATCH:
+            raise Refused("busy", f"{MAX_BATCH} hand-overs already wait here; try again")
+        else:
+            self._moved += 1
+            self._moving[self._moved] = asked.ticket, operation, sender, to
+            self._taken.changes.append(self._roster.seek(self._now, to, self._moved))
+
+    def _hand_over(self, ticket: Ticket, operation: HandOver, sender: ClientId, to: ClientId) -> None:
+        """All in one instant, and so in one publication: nobody gets in between."""
+        moves = self._moves(operation, sender, to)
+        if not moves or moves[0].arc != arc_id(sender, operation.id):
+            self._answer_handed_over(ticket, operation, sender, to)
+            return
+        arcs = [arc for move in moves if (arc := self.core.arc(move.arc)) is not None]
+        # An ARC that is open at its new client already is replaced by the one that comes.
+        replaced = [move.renamed for move in moves if self.core.is_open(move.renamed)]
+        self._admission.check_hand_over(client_of(sender), client_of(to), arcs, replaced, self)
+        for move in moves:
+            self._registry.rename(move.arc, move.renamed)
+        places = {move.renamed: place for move in moves if (place := self.core.place_of(move.arc)) is not None}
+        shown = [
+            PlaceShown(arc, place) for arc, place in places.items() if self.core.place_of(arc) not in (None, place)
+        ]
+        instant = self.instant
+        instant.shown += [*shown, *moves]
+        instant.moved = ticket, [move.renamed for move in moves]
+        instant.touched |= {move.arc for move in moves}
+
+    def _moves(self, operation: HandOver, sender: ClientId, to: ClientId) -> list[HandedOver]:
+        """What a hand-over comes to: of the ARCs that it names, those that are open at the sender."""
+        moves = []
+        for name in dict.fromkeys((operation.id, *operation.others)):
+            arc = self.core.arc(arc_id(sender, name))
+            if arc is None:
+                continue
+            renamed = arc_id(to, name)
+            taken = self.core.arc(renamed)
+            if taken is not None and (taken.request.needs != arc.request.needs or taken.place < arc.place):
+                # Else it is the same: its new client has asked for it, and could not prove that it has its place.
+                raise Refused("bad_request", f"{to} already has a request {name}; use random ids")
+            moves.append(HandedOver(arc.id, to, renamed))
+        return moves
+
+    def _answer_handed_over(self, ticket: Ticket, operation: HandOver, sender: ClientId, to: ClientId) -> None:
+        """Answers a hand-over that was done before. Raises Refused if it was not."""
+        goal = arc_id(to, operation.id)
+        over = self._registry.ended(goal) and self._registry.ended(arc_id(sender, operation.id))
+        if self.core.arc(goal) is None and not over:
+            raise Refused("not_running", f"{operation.id} is not open at {sender}")
+        # The new client may have missed it, where the RCM changed just then.
+        arcs = [arc_id(to, name) for name in (operation.id, *operation.others)]
+        self._taken.notices += self._registry.present(self._now, arcs)
+        self._taken.answers.append((ticket, self._registry.notice(self._now, goal)))

@@ -1,0 +1,141 @@
+"""Answers about the state of a leader: holds, queue, devices. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Final
+
+from msgspec.structs import replace
+
+from zscout import messages
+from zscout.rcm.devices import ExpectedDevices
+from zscout.rcm.places import request_id
+from zscout.rcm.request_log import RequestLog, reason_info
+from zscout.rcm.roster import Roster
+from zscout.scheduling.core import Core
+from zscout.scheduling.model import ArcStatus, Hold, Status
+from zscout.scheduling.runtimes import RuntimeEstimator
+from zscout.types import SECOND, VERSION, HostName, Ns
+
+MAX_LISTED: Final = 1_000
+"""Queued ARCs in one answer."""
+MAX_REASON: Final = 500
+"""Characters of a veto's reason, and of a device's."""
+
+
+class StateView:
+    """Reads, and changes nothing."""
+
+    def __init__(
+        self,
+        me: HostName,
+        core: Core,
+        roster: Roster,
+        registry: RequestLog,
+        devices: ExpectedDevices,
+        runtimes: RuntimeEstimator | None,
+    ) -> None:
+        self._me, self._core, self._roster, self._registry = me, core, roster, registry
+        self._devices_known, self._runtimes = devices, runtimes
+
+    def state(self, asked: messages.StateAsk, seq: int, now: Ns) -> messages.RcmState:
+        term = self._roster.term
+        if asked.devices_only:
+            rcs = self._devices(self._core.status(0), now)
+            return messages.RcmState(term, seq, self._me, rcs=rcs, version=VERSION)
+        status = self._core.status(0 if asked.holds_only else MAX_LISTED)
+        holds = [_hold_view(arc, arc.hold, now, self._runtimes) for arc in status.running if arc.hold is not None]
+        instances = self._roster.named(sorted({rc for hold in holds for rc in hold.needs}))
+        state = messages.RcmState(term, seq, self._me, holds, instances=instances, version=VERSION)
+        if not asked.holds_only:
+            starts = self._registry.starts(now) if asked.forecast else {}
+            state = replace(
+                state,
+                queue=[_wait_view(arc, now, starts.get(arc.id)) for arc in status.queued],
+                rcs=self._devices(status, now),
+                more=status.waiting - len(status.queued),
+                charged=self._core.charged(),
+            )
+        return state
+
+    def _devices(self, status: Status, now: Ns) -> list[messages.RcView]:
+        """All RCs that are there or expected. What somebody asks for and nobody ever offered is not among them."""
+        known = {rc.name: rc for rc in status.rcs}
+        devices = self._devices_known
+        devices.forget_old(now)
+        named = self._roster.named(known)
+        there = {rc.name for rc in status.rcs if rc.present}
+        views = []
+        for name in sorted(there | devices.names):
+            rc, state = known.get(name), self._roster.reported(name)
+            view = messages.RcView(name, present=False, sharable=False)
+            if rc is not None:
+                view = messages.RcView(name, rc.present, rc.sharable, [*map(request_id, rc.holders)])
+            if state is not None:
+                reason = "" if state.health == "ok" else state.health[:MAX_REASON]
+                view = replace(view, sharable=state.sharable, reason=reason, parameters=state.parameters)
+            views.append(devices.view(view, now, named[name][1] if name in named else None))
+        return views
+
+
+# The core's values as messages
+
+
+def _of(arc: ArcStatus) -> dict[str, Any]:
+    """What all messages have of an ARC."""
+    return {
+        "id": request_id(arc.id),
+        "arc": arc.name,
+        "client": arc.request.client,
+        "priority": arc.request.priority,
+        "place": arc.place,
+        "min_runtime": messages.decimal_seconds(arc.request.min_runtime),
+        "who": arc.request.who,
+        "booking": arc.request.booking,
+    }
+
+
+def holders_of(arcs: Iterable[ArcStatus], rc: str, now: Ns) -> list[messages.Holder]:
+    return [
+        messages.Holder(
+            **_of(arc),
+            grant=arc.hold.grant,
+            rcs=sorted(arc.needs),
+            remaining=(arc.hold.end - now) / SECOND,
+            keep=arc.request.keep,
+            params=messages.decimals(arc.needs[rc]),
+            bound=dict(arc.bound),
+            direct=arc.request.direct,
+            continues=arc.request.continues,
+        )
+        for arc in arcs
+        if arc.hold is not None
+    ]
+
+
+def _hold_view(arc: ArcStatus, hold: Hold, now: Ns, runtimes: RuntimeEstimator | None) -> messages.HoldView:
+    end = None if runtimes is None else runtimes.end(arc.request, hold, now)
+    return messages.HoldView(
+        **_of(arc),
+        grant=hold.grant,
+        needs={rc: messages.decimals(params) for rc, params in sorted(arc.needs.items())},
+        held=(now - hold.start) / SECOND,
+        remaining=(hold.end - now) / SECOND,
+        keep=arc.request.keep,
+        bound=dict(arc.bound),
+        direct=arc.request.direct,
+        continues=arc.request.continues,
+        ends_in=None if end is None else (end - now) / SECOND,
+    )
+
+
+def _wait_view(arc: ArcStatus, now: Ns, start: Ns | None) -> messages.WaitView:
+    return messages.WaitView(
+        **_of(arc),
+        needs={need: messages.decimals(params) for need, params in sorted(arc.request.needs.items())},
+        waited=(now - arc.since) / SECOND,
+        reason=str(arc.reason or ""),
+        preemptions=arc.preemptions,
+        starts_in=None if start is None else (start - now) / SECOND,
+        why=reason_info(arc.reason, now),
+    )

@@ -1,0 +1,138 @@
+"""What goes into a step of the leader, and what comes out. Pure values.
+
+Stimuli that the mesh, timers and bookings bring are queued; a step takes as many as make one instant of the core."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, TypeAlias
+
+from msgspec import Struct
+
+from zscout import messages
+from zscout.keyexpr import Sender, Token
+from zscout.messages import Grants, Notice, Problem
+from zscout.rcm.recovery import RecoveredState
+from zscout.rcm.roster import Question
+from zscout.rcm.terms import Word
+from zscout.scheduling.model import Effect, Event
+from zscout.types import ArcId, HostName, Ns, RcName, Term
+
+Ticket: TypeAlias = int
+"""The number of a query that waits for its answer."""
+
+
+class Asked(NamedTuple):
+    """An operation on requests."""
+
+    ticket: Ticket
+    sender: Sender
+    operation: messages.Operation
+
+
+class Lead(NamedTuple):
+    """The first stimulus: what a takeover found."""
+
+    recovered: RecoveredState
+
+
+class Seen(NamedTuple):
+    """A token of a client or an RC came or went."""
+
+    token: Token
+    alive: bool
+
+
+class Reported(NamedTuple):
+    """An RC's state, and its key."""
+
+    key: str
+    state: messages.RcState
+
+
+class Answered(NamedTuple):
+    """The first answer to a question; neither message nor problem: there was none."""
+
+    question: Question
+    message: Any = None
+    problem: Problem | None = None
+
+
+class Found(NamedTuple):
+    """The tokens on a question's key."""
+
+    question: Question
+    tokens: Sequence[Token]
+
+
+class Happened(NamedTuple):
+    """Events of the core, of one instant: ballots, dates."""
+
+    events: Sequence[Event]
+
+
+class Shunned(NamedTuple):
+    """An RC shows a term that is not believed: it counts as absent until then."""
+
+    token: Token
+    until: Ns
+
+
+class Stalled(NamedTuple):
+    """This process stalled. `fresh`: what arrived meanwhile may not be handled yet."""
+
+    length: Ns
+    ended: Ns
+    fresh: bool
+
+
+class Reloaded(NamedTuple):
+    """The fleet file's rights changed."""
+
+
+Stimulus: TypeAlias = Asked | Lead | Seen | Reported | Answered | Found | Happened | Shunned | Stalled | Reloaded
+
+Reply: TypeAlias = tuple[Ticket, Struct]
+
+
+class Proposed(NamedTuple):
+    rc: RcName
+    proposal: messages.Proposal
+
+
+@dataclass(slots=True)
+class Outbox:
+    """What follows from a step, in the order in which it is carried out, nothing awaited in between."""
+
+    at_once: list[Reply] = field(default_factory=list)
+    """Answers that need no instant: refusals, and how requests stood before it."""
+    higher: list[tuple[Word, Token | None]] = field(default_factory=list)
+    """Terms above the own, and for an RC that is seen its token. A leader that steps down does nothing of the rest."""
+    disbelieved: list[tuple[RcName, Term]] = field(default_factory=list)
+    granted: list[Reply] = field(default_factory=list)
+    """Answers to requests that are granted: before anybody else learns of it."""
+    grant_notices: list[Notice] = field(default_factory=list)
+    reopened: list[tuple[str, ArcId]] = field(default_factory=list)
+    """For the trace, before the publication."""
+    publication: Grants | None = None
+    notices: list[Notice] = field(default_factory=list)
+    answers: list[Reply] = field(default_factory=list)
+    proposals: list[Proposed] = field(default_factory=list)
+    questions: list[Question] = field(default_factory=list)
+    suspicions: list[tuple[str, bool]] = field(default_factory=list)
+    """Contradictions of the mesh, and those that are over."""
+    events: Sequence[Event] = ()
+    effects: Sequence[Effect] = ()
+    """Of the instant, for the bookings and those who count holds."""
+    log: list[str] = field(default_factory=list)
+    strange: list[tuple[str, str]] = field(default_factory=list)
+    """Warnings, each with its subject: of one subject not too many are logged."""
+    duplicates: list[tuple[RcName, HostName]] = field(default_factory=list)
+    """RCs that a second host offers."""
+    over: list[tuple[str, ArcId]] = field(default_factory=list)
+    """For the trace."""
+    wake: Ns | None = None
+    """The next step is due then at the latest."""
+    more: bool = False
+    """Another step is due at once: stimuli are left."""
