@@ -97,7 +97,7 @@ def test_root_is_believed_by_everybody(monkeypatch: pytest.MonkeyPatch, tmp_path
         held.bind(name().replace("@", "\0", 1))
         held.listen()
         for uid, believed in ((0, True), (os.geteuid(), True), (4711, False)):
-            monkeypatch.setattr(lock, "_holder", lambda _, uid=uid: lock.Holder(1, uid))
+            monkeypatch.setattr(lock, "_holder", lambda _, uid=uid: lock.LockHolder(1, uid))
             if believed:
                 with pytest.raises(MeshError), only_here(FLEET, "anvil", "robot/a", tmp_path):
                     pass

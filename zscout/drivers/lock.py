@@ -29,7 +29,7 @@ BACKLOG: Final = 4_096
 """Processes that may ask a holder for its user: none is ever answered."""
 
 
-class Holder(NamedTuple):
+class LockHolder(NamedTuple):
     pid: int
     uid: Uid
 
@@ -86,7 +86,7 @@ def _name(name: str, host: str, rc: str) -> Iterator[None]:
         yield
 
 
-def _holder(name: str) -> Holder | None:
+def _holder(name: str) -> LockHolder | None:
     """The process that listens under an abstract name; None if it does not, or does not let itself be asked."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
         asking.setblocking(False)
@@ -95,9 +95,9 @@ def _holder(name: str) -> Holder | None:
         except OSError:
             return None
         pid, uid, _ = _CREDENTIALS.unpack(asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
-        return Holder(pid, uid)
+        return LockHolder(pid, uid)
 
 
-def _served(host: str, rc: str, holder: Holder | None) -> MeshError:
+def _served(host: str, rc: str, holder: LockHolder | None) -> MeshError:
     by = f" ({holder})" if holder is not None else ""
     return MeshError(f"{rc}: another process on {host} serves it already{by}; end that, or rename this")
