@@ -2,6 +2,7 @@
 
 The fleet with certificates (TLS, and access rules of 20 names) and the plain one take turns, on one machine. The
 stranger sends 400 MB in one message, and leads in a term of 10^12 while a fleet begins and a node of it starts anew.
+Members flood a fleet with certificates, as far as their roles allow, while another asks.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from benchmarks.loop import run
 from benchmarks.stats import Row, Samples, of_latency, table
 from tests.live.closed import DAY, ROLES, ClosedLab
 from tests.live.lab import Lab
+from tests.live.test_floods import floods
 from tests.live.test_plain_doors import HUGE, MIB, mad_leader, peak
 from zscout.behaviors.client.arc import hold
 from zscout.behaviors.client.client import Client
@@ -40,11 +42,11 @@ with zenoh.open(zenoh.Config.from_json5(settings)) as session:
 WARM = 5
 
 
-async def entered(client: Client) -> float:
+async def entered(client: Client, rc: str = "radio/a") -> float:
     """Seconds from a request to its body."""
     start = time.perf_counter()
     took = 0.0
-    async with hold(client, "bench", {"radio/a": {}}):
+    async with hold(client, "bench", {rc: {}}):
         took = time.perf_counter() - start
     return took  # noqa: RET504
 
@@ -85,6 +87,24 @@ async def cost(folder: Path, rounds: int) -> list[Row]:
         of_latency("request to body, plain", secured[1], secured[1], against="itself"),
         of_latency("request to body, TLS and 20 names", secured[0], secured[1], aim=1.1, against="plain"),
         of_latency("state query, TLS and 20 names", bare[0], bare[1], against="plain"),
+    ]
+
+
+async def beside_floods(folder: Path, rounds: int) -> list[Row]:
+    """500 questions and asks of three members are outstanding all the time, made on the same machine."""
+    alone, beside = Samples(), Samples()
+    async with ClosedLab(folder) as lab:
+        lab.node("anvil", "robot/a", "robot/b")
+        client = await lab.person("ada")
+        await lab.ready(client, "robot/a", "robot/b")
+        for _ in range(rounds):
+            alone.add(await entered(client, "robot/b"))
+        async with floods(lab):
+            for _ in range(rounds):
+                beside.add(await entered(client, "robot/b"))
+    return [
+        of_latency("request to body beside floods", beside, alone, against="no floods"),
+        Row("the same, at most", max(beside.values), "s", aim=0.5, rounds=rounds),
     ]
 
 
@@ -137,10 +157,15 @@ async def mad_term(folder: Path, rounds: int) -> list[Row]:
 
 async def measure(rounds: int, mad: int) -> list[Row]:
     with tempfile.TemporaryDirectory(prefix="zscout-doors-") as name:
-        folders = [Path(name, part) for part in ("cost", "huge", "mad")]
+        folders = [Path(name, part) for part in ("cost", "floods", "huge", "mad")]
         for folder in folders:
             folder.mkdir()
-        return [*await cost(folders[0], rounds), *await huge_message(folders[1]), *await mad_term(folders[2], mad)]
+        return [
+            *await cost(folders[0], rounds),
+            *await beside_floods(folders[1], rounds),
+            *await huge_message(folders[2]),
+            *await mad_term(folders[3], mad),
+        ]
 
 
 def main() -> None:

@@ -55,6 +55,8 @@ class Promises:
         self._hold_lease, self._half_a_gang = hold_lease, hold_lease + HALF_A_GANG
         self.terms: dict[Term, float] = {}
         """Of every leader that was seen, and when it was seen first."""
+        self.led: dict[str, Term] = {}
+        """By node: the highest term in which it led, as its disk has it."""
         self.unheard = False
         """Whether no publication of any RCM arrives, or no token of a new one: there is one every few seconds."""
         self._begun: list[float] = []
@@ -257,6 +259,14 @@ class Promises:
             self._believed[name] = client.internals.rcm._heard
             if term < before and silence[name] / SECOND < self._hold_lease:
                 self._broken(f"{name} went back from {before} to {term}, and had heard that lately")
+
+    def look_who_leads_again(self, leaders: Mapping[str, Rcm]) -> None:
+        """A node whose disk was not emptied leads in no term below one in which it led."""
+        for name, rcm in leaders.items():
+            before = self.led.get(name, NO_TERM)
+            if rcm.term < before:
+                self._broken(f"{name} leads in {rcm.term}, and led in {before}")
+            self.led[name] = max(rcm.term, before)
 
     def _in_order(self, rcm: Rcm) -> None:
         """Of two that wait, the better-ranked is granted first, if it needs no more than what the other got."""

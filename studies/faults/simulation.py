@@ -414,6 +414,8 @@ class Simulation:
                 for why in filter(None, map(forgers.believed, self._leaders().values())):
                     self.broken(f"a leader believes a forger: {why}")
             self.promises.look_who_went_back(clients, unled)
+            if self.size.liars:
+                self.promises.look_who_leads_again(self._leaders())
             if self.work.over and not any(self.busy.values()):
                 self.idle.set()
 
@@ -647,6 +649,7 @@ class Simulation:
                 if fault.jump:
                     for disk in self.term_disks.values():
                         disk.term = NO_TERM
+                    self.promises.led.clear()
                 end = partial(self._start_all, names)
             case "fail":
                 failing = {key: rc for key, rc in self.rcs.items() if rc.name == fault.whom[0]}

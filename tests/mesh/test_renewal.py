@@ -11,7 +11,9 @@ import pytest
 from tests.mesh.both_meshes import ASK, LONG, NEWS, Ping, Pong, World, token
 from tests.mesh.kit import until
 from zscout.keyexpr import Role, Sender
-from zscout.mesh.renewal import LASTS, LONGEST, PATIENCE, SHORTEST, Suspicions
+from zscout.mesh import MeshError
+from zscout.mesh.renewal import LASTS, LONGEST, PATIENCE, SHORTEST, RenewableTransport, Suspicions
+from zscout.mesh.transport import Transport
 from zscout.testing.memory import MemoryNetwork
 from zscout.types import SECOND
 
@@ -55,6 +57,33 @@ async def test_what_is_declared_goes_on_and_nobody_notices(world: World) -> None
     for one in tokens:
         one.close()
     await until(lambda: all(len(told) == 4 for told in seen.values()))
+
+
+async def test_settings_that_change_during_a_renewal_are_taken_after_it() -> None:
+    """A name that is removed while a session is being reopened does not keep its rights on the new one."""
+    network, settings, opened = MemoryNetwork(), ["old"], list[str]()
+    gate = asyncio.Event()
+
+    async def opening() -> Transport:
+        opened.append(settings[0])
+        await gate.wait()
+        if opened[-1] == "bad":
+            raise MeshError("no port is free")
+        return network._session()
+
+    transport = RenewableTransport(network._session(), [opening])
+    transport.renew()
+    await asyncio.sleep(0)
+    settings[0] = "bad"
+    transport.take_settings()
+    gate.set()
+    await until(lambda: opened == ["old", "bad"] and transport._renewing is None)
+    assert (opened, transport.behind) == (["old", "bad"], True)
+    settings[0] = "new"
+    transport.renew()
+    await until(lambda: opened[-1] == "new" and transport._renewing is None)
+    assert (opened, transport.behind) == (["old", "bad", "new"], False)
+    await transport.close()
 
 
 async def test_what_is_polled_seldom_goes_on_as_well(world: World) -> None:

@@ -65,6 +65,7 @@ def test_a_burst_is_served_alike_every_time() -> None:
     assert len({tuple(played()) for _ in range(4)}) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(len(WAYS)))
 def test_a_case_is_the_same_every_time(seed: int) -> None:
     one, two = play_case(seed), play_case(seed)

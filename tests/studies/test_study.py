@@ -89,6 +89,7 @@ def test_the_list_names_each_study_as_the_page_does(capsys: pytest.CaptureFixtur
 
 
 @pytest.mark.live
+@pytest.mark.slow
 def test_at_a_terminal_a_bar_shows_how_far_it_is() -> None:
     with Terminal("schedule", "--family", "paper", "--seeds", "3", command=STUDIES) as terminal:
         terminal.until(f"/{3 * len(STRATEGIES)}")
@@ -162,6 +163,7 @@ def test_processes_that_can_not_start_are_one_line() -> None:
     assert done.stderr == line
 
 
+@pytest.mark.slow
 def test_the_recording_has_curves_and_bars_of_every_strategy(tmp_path: Path) -> None:
     path = tmp_path / "study.rrd"
     assert study_here("schedule", "--family", "paper", "--seeds", "4-5", "--rrd", path) == 0

@@ -52,6 +52,7 @@ def test_json_tells_what_became_of_crossings(capsys: pytest.CaptureFixture[str])
     assert sum(account["fates"].values()) > 0
 
 
+@pytest.mark.slow
 def test_a_pipe_gets_plain_tables(capsys: pytest.CaptureFixture[str]) -> None:
     assert study_here(*LITTLE, "--baud", "300", "--slot", "45") == 0
     shown = capsys.readouterr()

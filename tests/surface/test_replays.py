@@ -14,9 +14,12 @@ BLOCKS = {
     for number, (family, strategy) in enumerate((one, other) for one in families() for other in NAMES)
 }
 """Each another one."""
+DEAR = ("json", "adaptive")
 
 
-@pytest.mark.parametrize(("family", "strategy"), BLOCKS)
+@pytest.mark.parametrize(
+    ("family", "strategy"), [pytest.param(*of, marks=pytest.mark.slow if of == DEAR else ()) for of in BLOCKS]
+)
 def test_a_block_of_workloads_comes_out_as_before(family: str, strategy: StrategyName) -> None:
     blocks = json.loads(RECORDED.read_text())[family][strategy].split()
     assert len(blocks) == SEEDS // BLOCK

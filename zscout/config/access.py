@@ -8,13 +8,15 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterator, Mapping
 from functools import cached_property
-from typing import Annotated, Final, get_args
+from hashlib import blake2b
+from typing import Annotated, Any, Final, get_args
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, to_builtins
+from msgspec.structs import replace
 
 from zscout.config.strict import Where, check_name, check_names, key, quoted, seconds
 from zscout.keyexpr import PEOPLE, FleetMember, Rank, as_pattern, matcher
-from zscout.types import HostName, Ns, RcName
+from zscout.types import SECOND, HostName, Ns, RcName
 
 MAX_NAMES: Final = 1_000
 """Names of one role or group; groups, patterns and quotas of one file."""
@@ -22,6 +24,8 @@ MAX_PATTERNS: Final = 1_000
 """RCs, or patterns of them, that one host may serve."""
 MAX_TOLD: Final = 4
 """Names that a refusal lists of those who could."""
+CLIENT_RUNTIME: Final[Ns] = 86_400 * SECOND
+"""The longest minimum runtime of a client, by default."""
 _RC: Final = re.compile(r"[A-Za-z0-9_.*-]{1,64}/[A-Za-z0-9_.*-]{1,64}")
 
 Names = Annotated[tuple[str, ...], Meta(max_length=MAX_NAMES)]
@@ -62,7 +66,9 @@ class Ceiling(Struct, frozen=True, forbid_unknown_fields=True):
         Annotated[int, Meta(ge=-1_000_000, le=1_000_000)] | None,
         key("The highest; for clients it is below `operator_priority` in any case."),
     ] = None
-    runtime: Annotated[Ns, seconds("0", "31622400", "The longest minimum runtime, and none may `keep`; 0: any.")] = 0
+    runtime: Annotated[
+        Ns | None, seconds("0", "31622400", "The longest minimum runtime; 0: any. Without it: a day for clients.")
+    ] = None
 
 
 class AccessPolicy(Struct, frozen=True, dict=True):
@@ -83,6 +89,11 @@ class AccessPolicy(Struct, frozen=True, dict=True):
             for name in getattr(self.roles, rank):
                 found.setdefault(name, set()).add(rank)
         return {name: frozenset(ranks) for name, ranks in found.items()}
+
+    @cached_property
+    def digest(self) -> str:
+        """Equal where the rights are, in whatever order the names stand."""
+        return blake2b(_ordered(to_builtins(self)).encode(), digest_size=6).hexdigest()
 
     def ranks_of(self, name: str) -> frozenset[Rank]:
         return self.ranks.get(name, frozenset())
@@ -116,7 +127,8 @@ class AccessPolicy(Struct, frozen=True, dict=True):
         """What an ARC of this name may ask for. Programs on a machine (its components) may what a client may."""
         ranks = self.ranks_of(name)
         rank: Rank = "operator" if "operator" in ranks else "client"
-        return self.ceilings.get(rank, Ceiling())
+        found = self.ceilings.get(rank, Ceiling())
+        return found if found.runtime is not None else replace(found, runtime=CLIENT_RUNTIME if rank == "client" else 0)
 
     def refusal(self, name: str, what: str, needed: Collection[Rank]) -> str:
         """Why this name may not do `what`, which takes one of these ranks: who could. Empty: it may."""
@@ -130,6 +142,16 @@ class AccessPolicy(Struct, frozen=True, dict=True):
         title = f"{name} ({', '.join(sorted(ranks))})" if ranks else f"{name}, which has no role here,"
         more = f" and {len(names) - MAX_TOLD} more" if len(names) > MAX_TOLD else ""
         return f"{title} may not {what}; {', '.join(names[:MAX_TOLD]) + more or 'nobody'} may"
+
+
+def _ordered(value: Any) -> str:
+    match value:
+        case dict():
+            return f"{{{','.join(f'{name!r}:{_ordered(value[name])}' for name in sorted(value))}}}"
+        case list() | tuple():
+            return f"[{','.join(sorted(map(_ordered, value)))}]"
+        case _:
+            return repr(value)
 
 
 def check_access(policy: AccessPolicy, at: Where) -> None:

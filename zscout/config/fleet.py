@@ -25,6 +25,7 @@ from zscout.config.scheduling_policy import (
 from zscout.config.strict import (
     BadInput,
     Where,
+    check_folder_name,
     check_name,
     check_names,
     check_rc_name,
@@ -173,6 +174,8 @@ class Fleet(Struct, frozen=True):
     security: Path | None = None
     """The folder of this host's or this user's certificate; None: a plain mesh, on which `access` is advice."""
     access: AccessPolicy = AccessPolicy()
+    file: Path | None = None
+    """Of a secured fleet: where this was read. Programs look there for changed rights."""
 
     @property
     def operator_priority(self) -> int:
@@ -268,7 +271,8 @@ class FleetFile(Struct, frozen=True, forbid_unknown_fields=True):
 def load_fleet(path: Path, named_by: str = "") -> Fleet:
     """Reads a fleet file; an error says what named it. Raises BadInput."""
     try:
-        return _fleet(read_toml(path, FleetFile), Where(str(path)), path.parent)
+        fleet = _fleet(read_toml(path, FleetFile), Where(str(path)), path.parent)
+        return fleet if fleet.security is None else structs.replace(fleet, file=path.absolute())
     except BadInput as error:
         raise (BadInput(f"{error} (named by {named_by})") if named_by else error) from None
 
@@ -286,7 +290,7 @@ def fleet_from_env() -> Fleet:
 
 def _fleet(file: FleetFile, top: Where, folder: Path = Path()) -> Fleet:
     table, mesh, at = file.fleet, MeshConfig(**structs.asdict(file.mesh)), top / "fleet"
-    check_name(table.name, at / "name")
+    check_folder_name(table.name, at / "name")
     check_names(table.candidates, at / "candidates")
     check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
     check_multicast(mesh.multicast_address, top / "mesh" / "multicast_address")

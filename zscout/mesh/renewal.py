@@ -87,13 +87,21 @@ class RenewableTransport(Transport):
         self._numbers = itertools.count()
         self._renewing: asyncio.Task[None] | None = None
         self._closed = False
+        self.behind = False
+        """The present session has older settings than were to be taken: `renew` was too early, or failed."""
 
     def renew(self) -> None:
         """Renew, unless a renewal runs. A failure is logged, and keeps the present session."""
         if self._renewing is None and not self._closed:
             self._renewing = asyncio.create_task(self._renew())
 
+    def take_settings(self) -> None:
+        """Renew with settings that have changed: again after a renewal that may have begun with older ones."""
+        self.behind = True
+        self.renew()
+
     async def _renew(self) -> None:
+        wanted, self.behind, failed = self.behind, False, True
         try:
             for opening in self._openings:
                 fresh = await opening()
@@ -112,12 +120,17 @@ class RenewableTransport(Transport):
                     await old.close()
                     for declared in self._all():
                         declared.forget_old()
+            failed = False
         except MeshError as error:
             log.warning("%s", error)
         except Exception:
             log.exception("the mesh session could not be reopened")
         finally:
             self._renewing = None
+        if failed:
+            self.behind |= wanted
+        elif self.behind:
+            self.renew()
 
     async def _linked(self, fresh: Transport) -> None:
         # Zenoh reports no links, but listing them costs nothing.

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any, NamedTuple, NoReturn, Self, TypeVar
 
 import zenoh
@@ -21,8 +22,9 @@ from msgspec.structs import replace
 from zenoh.handlers import Callback, RingChannel
 
 from zscout import messages
+from zscout.config.access import AccessPolicy
 from zscout.config.certificates import Certificates, read_certificates
-from zscout.config.fleet import Fleet, MeshConfig
+from zscout.config.fleet import Fleet, MeshConfig, load_fleet
 from zscout.config.strict import BadInput
 from zscout.keyexpr import FleetMember, Keys, Sender, access_control
 from zscout.mesh.exchange import MeshError
@@ -48,7 +50,7 @@ QUALITIES: dict[Quality, dict[str, Any]] = {
 QUERY: Any = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.ConsolidationMode.NONE, **CONTROL}
 MAX_QUERIERS = 256  # per session: Zenoh never frees a key's declaration
 MAX_MESSAGE = 17_000_000  # bytes: a little more than zscout's largest message
-LOOK_AT_CERTIFICATES = 2.0  # seconds between two checks for renewed certificates
+LOOK_AT_FILES = 2.0  # seconds between two checks for renewed certificates and changed rights
 ANY_TLS = "tls/0.0.0.0:0"
 T = TypeVar("T")
 _PORT = re.compile(r":\d+$")
@@ -122,6 +124,32 @@ def _closed(security: Security) -> dict[str, Any]:
     }
 
 
+class RightsFile:
+    """The rights in a fleet file, for a program that follows them."""
+
+    def __init__(self, file: Path, access: AccessPolicy) -> None:
+        self._file, self._access = file, access
+        self._seen: tuple[int, ...] | None = None
+
+    def changed(self) -> AccessPolicy | None:
+        """The rights, if they have changed since the last call. An error is logged once, and changes nothing."""
+        try:
+            stat = self._file.stat()
+            seen = stat.st_mtime_ns, stat.st_size, stat.st_ino
+        except OSError:  # it is being replaced; or this program changed its user
+            return None
+        if seen == self._seen:
+            return None
+        self._seen = seen
+        try:
+            access = load_fleet(self._file).access
+        except BadInput as error:
+            log.warning("%s; the rights of before stay", error)
+            return None
+        before, self._access = self._access, access
+        return None if access == before else access
+
+
 @dataclass(slots=True)
 class _Door:
     security: Security | None
@@ -132,8 +160,9 @@ class ZenohMesh(Mesh):
     _watching: asyncio.Task[NoReturn] | None = None
 
     @classmethod
-    async def open(cls, fleet: Fleet, me: Sender) -> Self:
-        """Join the mesh of `fleet`. Raises MeshError if an address can't be had, BadInput for bad certificates."""
+    async def open(cls, fleet: Fleet, me: Sender, *, follow: bool = True) -> Self:
+        """Join the mesh of `fleet`; `follow`: take changed rights from its file, as a node does at a reload alone.
+        Raises MeshError if an address can't be had, BadInput for bad certificates."""
         config, keys = fleet.mesh, Keys(fleet.name, closed=fleet.security is not None)
         security = None if fleet.security is None else _security(fleet, keys, me)
         door = _Door(security)
@@ -148,7 +177,8 @@ class ZenohMesh(Mesh):
         mesh._door = door
         if security is not None:
             mesh.validity = security.certificates
-            mesh._watching = asyncio.create_task(mesh._watch_certificates(security.certificates))
+            rights = RightsFile(fleet.file, fleet.access) if follow and fleet.file is not None else None
+            mesh._watching = asyncio.create_task(mesh._watch_files(security.certificates, rights))
         return mesh
 
     async def close(self) -> None:
@@ -156,12 +186,19 @@ class ZenohMesh(Mesh):
             self._watching.cancel()
         await super().close()
 
-    async def _watch_certificates(self, known: Certificates) -> NoReturn:
-        """Warn before certificates end, and reopen the session once renewed: it keeps those it was opened with."""
+    async def _watch_files(self, known: Certificates, rights: RightsFile | None) -> NoReturn:
+        """Warn before certificates end, and reopen the session once these or the rights have changed: it keeps those
+        it was opened with."""
         told: str | None = None
         warned = ""
         while True:
-            await asyncio.sleep(LOOK_AT_CERTIFICATES)
+            await asyncio.sleep(LOOK_AT_FILES)
+            if self._transport.behind:
+                self._transport.renew()
+            if rights is not None and (access := await asyncio.wrap_future(in_thread("reads rights", rights.changed))):
+                if not access.ranks_of(self.me.host):
+                    log.warning("%s has no role in the fleet file any more: its requests stay unanswered", self.me.host)
+                self.admit(access.members())
             try:
                 reading = in_thread("reads certificates", functools.partial(read_certificates, known.folder))
                 fresh = await asyncio.wrap_future(reading)
@@ -175,7 +212,7 @@ class ZenohMesh(Mesh):
             if fresh.ends != known.ends:
                 log.info("%s was renewed: reopening the mesh session", fresh.cert)
                 known = self.validity = fresh
-                self._transport.renew()
+                self._transport.take_settings()
             if (soon := fresh.expires_soon(datetime.now(UTC))) and soon != warned:
                 log.warning("%s", warned := soon)
 
@@ -183,7 +220,7 @@ class ZenohMesh(Mesh):
         # The rules of a session can't be changed.
         if self._door.security is not None:
             self._door.security = self._door.security._replace(members=tuple(members))
-            self._transport.renew()
+            self._transport.take_settings()
 
 
 def _security(fleet: Fleet, keys: Keys, me: Sender) -> Security:

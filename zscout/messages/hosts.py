@@ -8,6 +8,7 @@ import msgspec
 
 from zscout.messages.base import (
     MAX_COUNTER,
+    MAX_ERROR,
     MAX_INCARNATION,
     Bytes,
     Elapsed,
@@ -64,6 +65,10 @@ class LoadReport(Message, frozen=True):
     renew: bool = False
     version: VersionText = ""
     """Of the node."""
+    rights: VersionText = ""
+    """Digest of the rights that the node enforces; empty: none."""
+    fault: Annotated[str, msgspec.Meta(max_length=MAX_ERROR)] = ""
+    """Why the node uses older settings than its files have, with file and key; empty: it does not."""
 
 
 class RankAsk(Message, frozen=True):

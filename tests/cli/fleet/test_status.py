@@ -17,6 +17,7 @@ from tests.cli.cli_fleet import in_lab, patient_timing
 from tests.cli.tools import CLOCK, COMMAND, Terminal, mine, ours, zscout_soon_until
 from tests.hang import HANG
 from tests.live.lab import PATIENT, Lab
+from zscout.cli.fleet.status import differing
 
 pytestmark = pytest.mark.live
 
@@ -263,3 +264,17 @@ async def test_without_an_rcm_it_shows_what_is_there_and_says_so(lab: Lab) -> No
     assert "nobody leads" in shown.stdout
     assert shown.stderr.startswith(f"zscout: no leader is on the mesh of fleet {lab.fleet.name}")
     assert len(shown.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("own", "rights", "said"),
+    [
+        ("", {}, []),
+        ("a", {"a": ["anvil", "cart"]}, []),
+        ("a", {"b": ["anvil", "cart"]}, ["all hosts enforce other roles than this fleet file; take theirs, or "]),
+        ("a", {"a": ["anvil"], "b": ["cart"]}, ["cart: enforces other roles than this fleet file; "]),
+    ],
+)
+def test_hosts_whose_roles_differ_are_named(own: str, rights: dict[str, list[str]], said: list[str]) -> None:
+    copy = "copy the fleet file to all hosts, and reload their nodes (SIGHUP)"
+    assert differing(own, rights) == [words + copy for words in said]

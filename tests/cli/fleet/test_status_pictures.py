@@ -174,6 +174,8 @@ class Picture:
             all_hosts=lambda: dict(sorted(self.hosts.items())),
             tokens=lambda role: [token for host in self.hosts.values() for token in host.tokens if token.role == role],
             ending=dict,
+            rights=dict,
+            faults=dict,
             stale=lambda host: False,
         )
         devices = cast("Devices", SimpleNamespace(known=lambda: self.health))

@@ -38,7 +38,7 @@ class Files:
     def __init__(self, folder: Path) -> None:
         self.file, self._fleet = folder / "anvil.toml", folder / "fleet.toml"
         self.write(NODE, FLEET)
-        self.reload = Reload(load_node(self.file), lambda: load_node(self.file))
+        self.reload = Reload(lambda: load_node(self.file))
 
     def write(self, node: str, fleet: str = FLEET) -> None:
         self.file.write_text(node)
@@ -56,7 +56,7 @@ def files(tmp_path: Path) -> Files:
 
 def test_what_somebody_takes_is_given_to_it_once(files: Files) -> None:
     given: list[int] = []
-    files.reload.takes("components", lambda node: given.append(node.components.max))
+    files.reload.takes(lambda node: given.append(node.components.max), "components")
     assert files.again(NODE) == "SIGHUP: the files say what they said"
     new = NODE.replace("max = 3", 'max = 4\nkinds = ["counter"]')
     assert files.again(new) == "SIGHUP: took components.kinds, components.max"
@@ -65,7 +65,7 @@ def test_what_somebody_takes_is_given_to_it_once(files: Files) -> None:
 
 
 def test_what_nobody_takes_waits_for_a_restart_and_is_told(files: Files, caplog: pytest.LogCaptureFixture) -> None:
-    files.reload.takes("components", lambda _node: None)
+    files.reload.takes(lambda _node: None, "components")
     node = NODE.replace("max = 3", "max = 4").replace("robot/a", "robot/b")
     fleet = FLEET.replace("1.5", "2.0") + 'bellows = ["robot/c"]\n[limits]\nmax_runtime = 60\n'
     later = "restart this node to take devices.bellows, limits.max_runtime, mesh.lease, rc.robot/a, rc.robot/b"
@@ -89,14 +89,16 @@ def test_what_nobody_takes_waits_for_a_restart_and_is_told(files: Files, caplog:
 )
 def test_a_bad_file_changes_nothing_and_is_told(files: Files, spoil: Callable[[str], str], said: str) -> None:
     given: list[Node] = []
-    files.reload.takes("components", given.append)
+    files.reload.takes(given.append, "components")
     line = files.again(spoil(NODE.replace("robot/a", "robot/b")))
     assert line.startswith("SIGHUP: ")
     assert said in line
     assert line.endswith("; the settings of before stay")
     assert "\n" not in line
+    assert said in files.reload.in_force.fault
     assert files.again(NODE) == "SIGHUP: the files say what they said"
     assert given == []
+    assert files.reload.in_force.fault == ""
 
 
 def test_one_that_fails_to_take_it_keeps_nobody_else_from_it(files: Files, caplog: pytest.LogCaptureFixture) -> None:
@@ -104,15 +106,90 @@ def test_one_that_fails_to_take_it_keeps_nobody_else_from_it(files: Files, caplo
         raise KeyError("a fault of its own")
 
     given: list[Node] = []
-    files.reload.takes("mesh", fail)
-    files.reload.takes("components", given.append)
+    files.reload.takes(fail, "mesh")
+    files.reload.takes(given.append, "components")
     line = files.again(NODE.replace("max = 3", "max = 4"), FLEET.replace("1.5", "2.0"))
     assert line == "SIGHUP: took components.max; restart this node to take mesh.lease"
     assert len(given) == 1
     assert "the new [mesh] can't be taken" in caplog.messages
+    assert files.reload.in_force.fault == (
+        "mesh.lease: can't be taken: KeyError('a fault of its own'); restart this node"
+    )
 
 
 def test_every_setting_of_both_files_has_the_name_that_it_has_there(files: Files) -> None:
     tables = {key.partition(".")[0] for key in settings(load_node(files.file))}
     ours = {"node", "components", "journal", "rc"}
     assert tables == ours | {"fleet", "mesh", "limits", "timing", "placement", "devices", "roles"}
+
+
+RIGHTS = """
+[security]
+folder = "keys"
+[roles]
+manager = ["anvil"]
+client = ["ada", "bob"]
+[roles.node]
+anvil = ["robot/*"]
+[groups]
+rcs = ["ada", "bob"]
+[quotas.rcs]
+rcs = 4
+"""
+
+
+@pytest.mark.parametrize(
+    ("quota", "said"),
+    [
+        ("[quotas.eve]\nrcs = 1", 'fleet.toml: quotas.eve: "eve" has no role'),
+        ("[quotas.bob]\nrcs = -1", "fleet.toml: quotas.bob.rcs: is -1"),
+        ('[quotas.bob]\nrcs = "many"', "fleet.toml: quotas.bob.rcs: is the text"),
+        ("[quotas.bob]\nrc = 1", "fleet.toml: quotas.bob.rc: "),
+        ("[quotas]\nbob = 1", "fleet.toml: quotas.bob: "),
+    ],
+)
+def test_a_wrong_quota_keeps_the_rights_in_force_and_is_told_until_it_is_mended(
+    files: Files, quota: str, said: str
+) -> None:
+    """A name is removed in the same edit: it is removed once the mistake is mended."""
+    given: list[Node] = []
+    files.reload.takes(given.append, "roles", "quotas")
+    assert "took groups.rcs" not in files.again(NODE, FLEET + RIGHTS)
+    before, removed = files.reload.in_force.rights, RIGHTS.replace('client = ["ada", "bob"]', 'client = ["ada"]')
+    removed = removed.replace('rcs = ["ada", "bob"]', 'rcs = ["ada"]')
+    files.again(NODE, FLEET + RIGHTS.replace("rcs = 4", "rcs = 4\n" + quota))
+    assert said in files.reload.in_force.fault
+    assert files.reload.in_force.rights == before
+    assert [node.fleet.access.ranks_of("bob") for node in given] == [{"client"}]
+    files.again(NODE, FLEET + removed)
+    assert files.reload.in_force.fault == ""
+    assert files.reload.in_force.rights != before
+    assert [node.fleet.access.ranks_of("bob") for node in given] == [{"client"}, set()]
+
+
+def test_rights_are_taken_once_for_all_tables(files: Files) -> None:
+    given: list[Node] = []
+    files.reload.takes(given.append, "roles", "groups", "quotas")
+    line = files.again(NODE, FLEET + RIGHTS)
+    assert line.startswith("SIGHUP: took groups.rcs, quotas.rcs.rcs, roles.client, roles.manager, roles.node.anvil; ")
+    assert len(given) == 1
+
+
+def test_the_digest_is_that_of_the_rights_in_whatever_order(files: Files) -> None:
+    def digest(fleet: str) -> str:
+        files.write(NODE, FLEET + fleet)
+        return Reload(lambda: load_node(files.file)).in_force.rights
+
+    assert digest("") == ""
+    assert digest(RIGHTS) == digest(RIGHTS.replace('"ada", "bob"', '"bob", "ada"'))
+    assert digest(RIGHTS) != digest(RIGHTS.replace("rcs = 4", "rcs = 3"))
+    assert digest(RIGHTS) != digest(RIGHTS.replace('client = ["ada", "bob"]', 'operator = ["ada", "bob"]'))
+
+
+async def test_a_fault_of_zscout_ends_no_reload(files: Files, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever goes wrong, the next SIGHUP is heard."""
+    monkeypatch.setattr("zscout.services.node.reload.settings", lambda _node: [][0])
+    line = await files.reload.now()
+    assert "the files can't be used: IndexError" in line
+    monkeypatch.undo()
+    assert await files.reload.now() == "SIGHUP: the files say what they said"

@@ -236,6 +236,11 @@ async def fleet_of(*rcs: str) -> tuple[FakeFleet, list[FakeRc]]:
     return fleet, found
 
 
+def there(candidate: Candidate) -> set[str]:
+    """The RCs that this leader counts as there; none where it does not lead."""
+    return {rc.name for rc in candidate.rcm.core.status().rcs if rc.present} if candidate.rcm is not None else set()
+
+
 async def sees(mesh: MemoryMesh, rc: str, **wanted: Any) -> RcView:
     """Waits until the leader that is seen from here says so of the RC."""
     view: RcView | None = None

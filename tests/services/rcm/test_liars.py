@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.mesh.kit import until
-from tests.services.rcm.kit import FakeClient, FakeFleet, FakeRc, Refusal
+from tests.services.rcm.kit import FakeClient, FakeFleet, FakeRc, Refusal, there
 from zscout.mesh import IncomingQuery
 from zscout.messages import ClientRequests, OpenRequest, RcAsk
 from zscout.rcm.places import Places
@@ -21,11 +21,6 @@ from zscout.types import NO_TERM, SECOND, Place, Term
 KEY = bytes(range(32))
 FAR = Term(2**40, "eve")
 SERVED = 0.5
-
-
-def there(candidate: Candidate) -> set[str]:
-    """The RCs that this leader counts as there; none where it does not lead."""
-    return {rc.name for rc in candidate.rcm.core.status().rcs if rc.present} if candidate.rcm is not None else set()
 
 
 async def led(fleet: FakeFleet, **how: Any) -> Candidate:

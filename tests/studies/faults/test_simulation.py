@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import pytest
 
 from studies.faults.guards import GUARDS, without
+from studies.faults.plan import Fault
 from studies.faults.runs import shrink
 from studies.faults.simulation import Simulation, Size, simulate
 from tests.hang import HANG
@@ -97,6 +98,21 @@ COSTLY = ("doubted", "sealed terms", "back", "snapshots", "caught up", "one stan
 def test_without_a_guard_a_promise_breaks(guard: str) -> None:
     with without(guard):
         assert any(simulate(seed).broken for seed in (MISSED[guard], *SEEDS[:60])), GUARDS[guard].what
+
+
+def test_without_terms_on_disk_a_fleet_that_starts_anew_leads_in_lower_ones() -> None:
+    # Without clients there are no sealed places, which would show the term as well.
+    size = Size(liars=True, clients=0, components=1, span=18.0)
+    faults = [
+        Fault(3.0, 1.0, "part", ("h0",)),
+        Fault(7.0, 1.0, "kill", ("h0/node",)),
+        Fault(9.0, 1.0, "kill", ("h1/node",)),
+        Fault(12.0, 2.0, "nodes", ()),
+    ]
+    assert simulate(6, size, faults).broken == []
+    with without("kept"):
+        [broken] = simulate(6, size, faults).broken
+    assert "h0/node leads in" in broken
 
 
 @pytest.mark.slow

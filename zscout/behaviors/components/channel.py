@@ -123,6 +123,6 @@ _TOO_LONG: Final = f"a frame of more than {MAX_FRAME} bytes comes"
 
 def _unpack(body: bytes, kind: Any) -> Any:
     try:
-        return msgspec.json.decode(body, type=kind)
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        return msgspec.json.decode(body, type=kind, dec_hook=lambda path, value: path(value))
+    except (msgspec.MsgspecError, ValueError, TypeError, RecursionError) as error:
         raise BadFrame(f"can't read a frame: {str(error)[:200]}") from None

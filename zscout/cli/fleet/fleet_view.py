@@ -117,6 +117,18 @@ class FleetView:
         told = {name: host.load for name, host in self.hosts.items() if host.load is not None and host.load.renew}
         return {name: load.certificate_ends_in or 0.0 for name, load in sorted(told.items())} | found
 
+    def rights(self) -> dict[str, list[str]]:
+        """The hosts by the digest of the rights that they enforce."""
+        told = sorted(
+            (host.load.rights, name) for name, host in self.hosts.items() if host.load and host.has(Role.LOAD)
+        )
+        return {rights: [name for its, name in told if its == rights] for rights, _ in told if rights}
+
+    def faults(self) -> dict[str, str]:
+        """By host: why its node uses older settings than its files have."""
+        loads = {name: host.load for name, host in sorted(self.hosts.items()) if host.has(Role.LOAD)}
+        return {name: load.fault for name, load in loads.items() if load is not None and load.fault}
+
     async def quiet(self) -> None:
         """Returns when no host has come into sight for a while: links are made one after another."""
         deadline = self.mesh.now() + round(FIND_LOADS * SECOND)

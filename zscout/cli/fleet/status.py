@@ -47,12 +47,13 @@ async def status(names: Sequence[str], watch: bool, every: bool, as_json: bool) 
     HELD BY shows requests by the names that `zscout why`, `cancel` and `release` take, and their persons; `zscout why`
     also shows their commands. A narrow terminal leaves out less important columns; a pipe gets all of them.
 
-    Warnings come first: certificates that end within 14 days, roles without [security], clocks that differ by more than
-    2 s, different versions. The queue is in rank order, and so are the groups where shares are fair. Candidates of the
-    fleet file are shown even if they are down; other hosts that went down only with --watch. The health of a device is
-    shown if something is wrong with it, if it is gone (for a day, or always if the fleet file expects it), or if
-    several hosts offer it. --watch refreshes once a second; in a pipe it prints a new block if more has changed than
-    loads, times and figures. Exit code 3: no leader.
+    Warnings come first: certificates that end within 14 days, roles without [security], hosts whose roles differ or
+    whose files have an error, clocks that differ by more than 2 s, different versions. The queue is in rank order,
+    and so are the groups where shares are fair. Candidates of the fleet file are shown even if they are down; other
+    hosts that went down only with --watch. The health of a device is shown if something is wrong with it, if it is
+    gone (for a day, or always if the fleet file expects it), or if several hosts offer it. --watch refreshes once a
+    second; in a pipe it prints a new block if more has changed than loads, times and figures. Exit code 3: no
+    leader.
 
     \b
     Examples:
@@ -130,6 +131,10 @@ class Standing:
         fleet = self.fleet_view.client.fleet
         return fleet.security is None and fleet.access != AccessPolicy()
 
+    def _own_rights(self) -> str:
+        fleet = self.fleet_view.client.fleet
+        return fleet.access.digest if fleet.security is not None else ""
+
     def _warnings(self) -> Table:
         rows = [
             ("certificate", f"{ending(name, left)}; renew it (zscout cert renew)")
@@ -137,6 +142,8 @@ class Standing:
         ]
         if self._advisory():
             rows.append(("roles", "they are only advisory: set [security], so that names are proved"))
+        rows += [("roles", words) for words in differing(self._own_rights(), self.fleet_view.rights())]
+        rows += [("files", f"{host} uses older settings: {fault}") for host, fault in self.fleet_view.faults().items()]
         clocks = sorted(self._clocks().items())
         rows += [("clock", f"{booked.clock_words(host, differs)}; set it") for host, differs in clocks]
         if (versions := mixture(self._versions())) is not None:
@@ -220,8 +227,9 @@ class Standing:
 
     def as_object(self) -> dict[str, Any]:
         """The output of `--json`, spans in seconds and memory in bytes; `rcm` is null if no node leads. `advisory`:
-        rights are listed and not enforced; `ending`: certificates that end soon; `clocks`: how far hosts' clocks
-        differ from fleet time; `booked_soon`: dates of bookings within 24 h."""
+        rights are listed and not enforced; `rights`: hosts by the digest of those they enforce, `own_rights`: that of
+        this fleet file; `faults`: why a host uses older settings than its files have; `ending`: certificates that end
+        soon; `clocks`: how far hosts' clocks differ from fleet time; `booked_soon`: dates of bookings within 24 h."""
         chosen, versions = self.selection(), self._versions()
         state, homes, now = chosen.state, self._homes(), self.fleet_view.mesh.now()
         holds, views, queue = (state.holds, state.rcs, state.queue) if state is not None else ([], [], [])
@@ -246,6 +254,9 @@ class Standing:
             "versions": [{"version": told or None, "hosts": hosts} for told, hosts in by_version(versions).items()],
             "links": self.fleet_view.mesh.links(),
             "advisory": self._advisory(),
+            "rights": [{"digest": digest, "hosts": hosts} for digest, hosts in self.fleet_view.rights().items()],
+            "own_rights": self._own_rights(),
+            "faults": self.fleet_view.faults(),
             "ending": [{"name": name, "ends_in": left} for name, left in self.fleet_view.ending().items()],
             "clocks": self._clocks(),
             "booked_soon": booked.soon(self.booked),
@@ -313,6 +324,15 @@ def mixture(versions: Mapping[str, str]) -> str | None:
         return None
     parts = [f"{version_words(told)} on {_some(hosts)}" for told, hosts in by_version(versions).items()]
     return f"they differ: {'; '.join(parts)}; this zscout is {VERSION}"
+
+
+def differing(own: str, rights: Mapping[str, list[str]]) -> list[str]:
+    """Warnings about hosts that enforce other rights than the own fleet file has."""
+    copy = "copy the fleet file to all hosts, and reload their nodes (SIGHUP)"
+    if own and len(rights) == 1 and own not in rights:
+        return [f"all hosts enforce other roles than this fleet file; take theirs, or {copy}"]
+    others = {digest: hosts for digest, hosts in rights.items() if digest != own}
+    return [f"{_some(hosts)}: enforces other roles than this fleet file; {copy}" for hosts in others.values()]
 
 
 def _some(hosts: Sequence[str]) -> str:

@@ -13,9 +13,10 @@ from msgspec.structs import replace
 
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Mesh, Supervisor
-from zscout.messages import LoadReport
+from zscout.messages import MAX_ERROR, LoadReport
 from zscout.services.node import host_figures
 from zscout.services.node.process_use import Running, TreeMeter, TreeUse, UseMeter, faded
+from zscout.services.node.reload import FilesInForce
 from zscout.types import VERSION
 
 log = logging.getLogger("zscout.load")
@@ -39,8 +40,16 @@ class LoadReporter:
 
     A failure is logged, withdraws the liveliness token, and restarts after RESTARTS seconds: the node continues."""
 
-    def __init__(self, mesh: Mesh, labels: Iterable[str] = (), running: Running = tuple, *, tree: bool = False) -> None:
-        self.mesh = mesh
+    def __init__(
+        self,
+        mesh: Mesh,
+        labels: Iterable[str] = (),
+        running: Running = tuple,
+        files: FilesInForce | None = None,
+        *,
+        tree: bool = False,
+    ) -> None:
+        self.mesh, self._files = mesh, files
         self._tree = tree
         self._labels, self._running = tuple(labels), running
         self._pause = RESTARTS[0]
@@ -69,7 +78,10 @@ class LoadReporter:
         self._token.close()
         self._publisher.close()
 
-    def _with_certificate(self, report: LoadReport) -> LoadReport:
+    def _with_files(self, report: LoadReport) -> LoadReport:
+        """With what the node says of its certificate and of its files."""
+        if (files := self._files) is not None:
+            report = replace(report, rights=files.rights, fault=files.fault[:MAX_ERROR])
         own, now = self.mesh.validity, datetime.now(UTC)
         if own is None:
             return report
@@ -95,7 +107,7 @@ class LoadReporter:
                 failed = True
             else:
                 failed = False
-                self._publisher.put(self._with_certificate(report))
+                self._publisher.put(self._with_files(report))
                 self._pause = RESTARTS[0]
 
 

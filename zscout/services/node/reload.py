@@ -1,23 +1,22 @@
-"""SIGHUP: a node reads its files again, and applies changes that need no restart.
+"""One path by which a node's files are read, checked and applied: at its start, by `--check`, and at SIGHUP.
 
-Services register a table and a function (`Reload.takes`). A bad file changes nothing."""
+Services register tables and a function (`Reload.takes`). A bad file changes nothing."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields
 from typing import Any, Final
 
 from msgspec import Struct, structs
 
-from zscout.config.access import AccessPolicy
-from zscout.config.fleet import RcmLimits
 from zscout.config.node import Node
-from zscout.config.scheduling_policy import SchedulingPolicy
 from zscout.config.strict import BadInput
 from zscout.drivers.registry import driver_for
+from zscout.rcm.authority import Authority
 from zscout.services.node.service_manager import ServiceManager
 
 log = logging.getLogger("zscout.node")
@@ -25,18 +24,28 @@ log = logging.getLogger("zscout.node")
 MAX_NAMED: Final = 12  # keys named in one line
 
 
-class Reload:
-    """The settings in force, and the functions that apply new ones. `read` raises BadInput."""
+@dataclass(slots=True)
+class FilesInForce:
+    """What a node publishes about its files: the digest of the rights in force, and the fault that keeps newer files
+    from being used (empty: none)."""
 
-    def __init__(self, node: Node, read: Callable[[], Node]) -> None:
-        self._taken = settings(node)
+    rights: str
+    fault: str = ""
+
+
+class Reload:
+    """The settings in force, and the functions that apply new ones. `read` raises BadInput, and so does this."""
+
+    def __init__(self, read: Callable[[], Node]) -> None:
         self._read = read
-        self._takers: dict[str, Callable[[Node], object]] = {}
+        self.node, self._taken = self._checked()
+        self.in_force = FilesInForce(rights_of(self.node))
+        self._takers: list[tuple[frozenset[str], Callable[[Node], object]]] = []
         self._asked = asyncio.Event()
 
-    def takes(self, table: str, take: Callable[[Node], object]) -> None:
-        """Call `take` in the event loop with settings changed in this table; its errors are logged, old ones stay."""
-        self._takers[table] = take
+    def takes(self, take: Callable[[Node], object], *tables: str) -> None:
+        """Call `take` in the event loop with settings changed in these tables; its errors are logged, old ones stay."""
+        self._takers.append((frozenset(tables), take))
 
     def on_hangup(self) -> None:
         """Reload at SIGHUP. For the main thread; asyncio would remove its own handler before the process ends."""
@@ -60,23 +69,29 @@ class Reload:
         """Read the files; return the line that is logged."""
         try:
             # They may be on another host.
-            node = await asyncio.to_thread(self._read_again)
+            node, said = await asyncio.to_thread(self._checked)
         except BadInput as error:
+            self.in_force.fault = str(error)
             line = f"SIGHUP: {error}; the settings of before stay"
             log.warning("%s", line)
             return line
-        except Exception as error:
-            log.exception("the files can't be read again")
-            return f"SIGHUP: the files can't be read: {error!r}; the settings of before stay"
-        said = settings(node)
         changed = {key for key in self._taken.keys() | said.keys() if self._taken.get(key) != said.get(key)}
-        took = set[str]()
-        for table, take in self._takers.items():
-            keys = {key for key in changed if _table(key) == table}
-            if keys and self._is_taken(table, take, node):
-                took |= keys
-                self._taken = {key: value for key, value in self._taken.items() if _table(key) != table}
-                self._taken |= {key: value for key, value in said.items() if _table(key) == table}
+        took, faults = set[str](), list[str]()
+        for tables, take in self._takers:
+            keys = {key for key in changed if _table(key) in tables}
+            try:
+                if keys:
+                    take(node)
+            except Exception as error:
+                log.exception("the new [%s] can't be taken", "], [".join(sorted(set(map(_table, keys)))))
+                faults.append(f"{_listed(keys)}: can't be taken: {error!r}; restart this node")
+                continue
+            took |= keys
+        self._taken = {key: value for key, value in self._taken.items() if key not in took}
+        self._taken |= {key: said[key] for key in took & said.keys()}
+        self.in_force.fault = "; ".join(faults)
+        if not faults:
+            self.in_force.rights = rights_of(node)
         words = [f"took {_listed(took)}"] if took else []
         if later := changed - took:
             words.append(f"restart this node to take {_listed(later)}")
@@ -84,50 +99,60 @@ class Reload:
         log.log(logging.WARNING if later else logging.INFO, "%s", line)
         return line
 
-    def _read_again(self) -> Node:
-        node = self._read()
-        for rc in node.rcs:
-            driver_for(rc)  # raises the errors of the next start
-        return node
-
-    def _is_taken(self, table: str, take: Callable[[Node], object], node: Node) -> bool:
+    def _checked(self) -> tuple[Node, dict[str, object]]:
+        """What the files say, as a node and by key, if a node could start with it. Raises BadInput."""
         try:
-            take(node)
-        except Exception:
-            log.exception("the new [%s] can't be taken", table)
-            return False
-        return True
+            node = self._read()
+            for rc in node.rcs:
+                driver_for(rc)
+            Authority(node.fleet).bound(node.fleet.scheduling)
+            return node, settings(node)
+        except BadInput:
+            raise
+        except Exception as error:
+            log.exception("the files can't be used")
+            raise BadInput(f"the files can't be used: {error!r}; report it with the log") from error
+
+
+def rights_of(node: Node) -> str:
+    """The digest of the rights that certificates prove; empty on a plain mesh."""
+    return node.fleet.access.digest if node.fleet.security is not None else ""
 
 
 def settings(node: Node) -> dict[str, object]:
     """The settings of both files, by key; RCs by name."""
-    found: dict[str, object] = {}
-
-    def enter(table: str, values: Mapping[str, Any]) -> None:
-        for name, value in values.items():
-            below = name if table in ("node", "fleet") else f"{table}.{name}"
-            match value:
-                case SchedulingPolicy():
-                    # Some keys are under [limits].
-                    enter("fleet", {key: getattr(value, key) for key in value.__slots__ if key not in _LIMITS})
-                case AccessPolicy():
-                    enter("fleet", structs.asdict(value))  # its tables are top-level ones in the file
-                case Struct():
-                    enter(below, structs.asdict(value))
-                case Mapping():
-                    enter(below, value)
-                case _ if name == "rcs":
-                    found.update({f"rc.{rc.name}": rc for rc in value})
-                case None:
-                    pass
-                case _:
-                    found[f"{table}.{name}"] = value
-
-    enter("node", structs.asdict(node))
-    return found
+    own, fleet = structs.asdict(node), structs.asdict(node.fleet)
+    policy, access = node.fleet.scheduling, node.fleet.access
+    for name in ("fleet", "rcs"):
+        del own[name]
+    for name in ("scheduling", "access", "file"):
+        del fleet[name]
+    of_policy = {field.name: getattr(policy, field.name) for field in fields(policy)}
+    found = {f"rc.{rc.name}": rc for rc in node.rcs} | {"fair_shares": of_policy.pop("fair_shares")}
+    # Some keys of the policy are those of [limits].
+    fleet |= {name: value for name, value in of_policy.items() if not hasattr(node.fleet.limits, name)}
+    found |= _by_key("node", own) | _by_key("fleet", fleet | structs.asdict(access))
+    return {key: value for key, value in found.items() if value is not None}
 
 
-_LIMITS: Final = frozenset(field.name for field in structs.fields(RcmLimits))
+def _by_key(table: str, values: Mapping[str, Any]) -> dict[str, object]:
+    """The fields by key: tables among them have their own name, the others stand in `table`."""
+    return {
+        key: inner
+        for name, value in values.items()
+        for key, inner in _flat(name if isinstance(value, Struct | Mapping) else f"{table}.{name}", value)
+    }
+
+
+def _flat(key: str, value: object) -> Iterator[tuple[str, object]]:
+    match value:
+        case Struct():
+            yield from _flat(key, structs.asdict(value))
+        case Mapping():
+            for name, inner in value.items():
+                yield from _flat(f"{key}.{name}", inner)
+        case _:
+            yield key, value
 
 
 def _table(key: str) -> str:

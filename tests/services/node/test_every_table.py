@@ -1,0 +1,95 @@
+"""Every key of both files, on a plain and a secured fleet: what `--check` takes a node starts with and takes at SIGHUP,
+and what a node takes its components and its recorder can read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.config.test_keys import FLEET, LEAST, NODE, Key
+from zscout.behaviors.components import channel
+from zscout.behaviors.components.channel import ComponentJob
+from zscout.config import notify
+from zscout.config.node import Node, RecorderConfig, load_node
+from zscout.messages import ComponentSpec, StartComponent
+from zscout.services.node.reload import Reload
+from zscout.services.recorder.process import RecorderJob, decode_job, encode_job
+
+SECURED = """
+[security]
+folder = "keys"
+[roles]
+manager = ["anvil"]
+client = ["bob"]
+"""
+UNSECURED = {("mesh", "listen"), ("mesh", "connect"), ("roles", "client"), ("roles", "manager")}
+"""Keys whose samples belong to a plain fleet."""
+HOST = "anvil"
+
+
+def samples(tables: dict[str, dict[str, Key]]) -> Iterator[tuple[str, str, str]]:
+    for table, keys in tables.items():
+        for key, (_, good, _) in keys.items():
+            for value in good[:1]:
+                yield table, key, value
+
+
+CASES = [
+    (of, table, key, value, secured)
+    for of, tables in (("fleet", FLEET), ("node", NODE))
+    for table, key, value in samples(tables)  # type: ignore[arg-type]
+    for secured in (False, True)
+    if not (secured and (table, key) in UNSECURED) and key not in ("fleet", "host")
+]
+
+
+def merged(*texts: str) -> str:
+    """TOML whose tables stand in several texts."""
+    tables: dict[str, list[str]] = {}
+    for line in "\n".join(texts).splitlines():
+        if line.startswith("["):
+            head = line
+            tables.setdefault(head, [])
+        elif line:
+            name = line.partition(" = ")[0]
+            tables[head] = [*(one for one in tables[head] if not one.startswith(f"{name} = ")), line]
+    return "\n".join("\n".join((head, *lines)) for head, lines in tables.items())
+
+
+@pytest.mark.parametrize(
+    ("of", "table", "key", "value", "secured"),
+    CASES,
+    ids=[f"{of}-{table}.{key}-{'secured' if secured else 'plain'}" for of, table, key, _, secured in CASES],
+)
+async def test_a_key_is_taken_at_the_start_and_at_sighup_alike(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, of: str, table: str, key: str, value: str, *, secured: bool
+) -> None:
+    monkeypatch.setattr(notify, "usable", lambda urls: [True for _ in urls])
+    node, fleet = tmp_path / "node.toml", tmp_path / "fleet.toml"
+    files = {
+        node: f'[node]\nhost = "{HOST}"\nfleet = "fleet.toml"',
+        fleet: merged('[fleet]\nname = "lab"', SECURED if secured else ""),
+    }
+    for file, text in files.items():
+        file.write_text(text)
+    running = Reload(lambda: load_node(node))
+    changed = node if of == "node" else fleet
+    least = LEAST.get(table, f"[{table}]")
+    changed.write_text(merged(files[changed], f"{least}\n{key} = {value}"))
+    line = await running.now()
+    assert running.in_force.fault == ""
+    assert "restart this node to take" in line
+    assert table in line
+    started = Reload(lambda: load_node(node))
+    assert await started.now() == "SIGHUP: the files say what they said"
+    assert_readable(started.node)
+
+
+def assert_readable(node: Node) -> None:
+    """By the processes that a node starts."""
+    job = ComponentJob(StartComponent("c", 1, ComponentSpec("counter")), "a:b", node.host, node.fleet, "tag")
+    assert channel._unpack(channel.pack(job).rstrip(b"\n"), ComponentJob) == job
+    recorder = RecorderJob(node.recorder or RecorderConfig(Path("runs"), "127.0.0.1", 1), node.fleet, node.host)
+    assert decode_job(encode_job(recorder)) == recorder
