@@ -71,6 +71,9 @@ class Bookings:
         self._another: Ns | None = None
         self._told: dict[str, str] = {}
         """Dangers that were reported, by date."""
+        self._once(_Due.NEWS, 0)
+        if settles_at:
+            self._deadlines.set(settles_at + SLACK, (_Due.NEWS, None))
 
     def at(self, now: Ns) -> Self:
         """The present time is `now`."""
@@ -109,9 +112,6 @@ class Bookings:
 
     def recovered(self, taken: Collection[str]) -> Sequence[Event]:
         """The events by which the core knows of all dates; `taken`: those that ARCs have taken up."""
-        self._once(_Due.NEWS, 0)
-        if not self.settled:
-            self._deadlines.set(self.settles_at + SLACK, (_Due.NEWS, None))
         return [self.dates.recovered(taken)]
 
     def proposed(self, name: ArcId, params: Params) -> ProposedHolder:
