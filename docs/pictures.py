@@ -33,6 +33,8 @@ from rerun.experimental import ViewerClient
 from rich.console import Console
 from rich.text import Text
 
+from zscout.cli.fleet.viewer_page import silent
+
 ROOT: Final = Path(__file__).parents[1]
 FOLDER: Final = ROOT / "docs" / "pictures"
 MADE: Final = FOLDER / "made.json"
@@ -235,7 +237,7 @@ def timeline(path: Path) -> None:
         viewer = Path(rerun.__file__).parents[1] / "rerun_cli" / "rerun"
         command = [str(viewer), "--headless", "--window-size", "1600x1000", "--bind", "127.0.0.1", "--port", "9899"]
         with subprocess.Popen(
-            [*command, str(recording)], env=os.environ | {"HOME": name, "RUST_LOG": "error"}
+            [*command, str(recording)], env=os.environ | {"HOME": name, "RUST_LOG": "error"} | dict(silent(Path(name)))
         ) as process:
             try:
                 client = _ready(process)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -21,6 +23,7 @@ from zscout.drivers.generic import ExclusiveDriver
 from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import MeshError
 from zscout.node import NodeFailed, run_services
+from zscout.services.metrics.server import MetricsServer
 from zscout.services.node.component_host import ComponentHost
 from zscout.testing.memory import MemoryNetwork
 
@@ -211,3 +214,23 @@ def test_a_node_ends_though_a_thread_of_a_driver_hangs_in_its_device(tmp_path: P
     rest = process.communicate(timeout=HANG)[1]
     assert process.returncode == 1
     assert "a thread of a driver hangs: this process ends without it" in rest
+
+
+@pytest.mark.real_time
+@pytest.mark.parametrize(("holder", "starts"), [(0, False), (os.geteuid(), False), (4711, True)])
+def test_a_port_that_another_user_took_first_is_done_without(
+    holder: int, starts: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(node_module, "listeners", lambda _address, _port: [holder])
+
+    async def serve(port: int) -> bool:
+        return await node_module._serve("metrics", MetricsServer(dict, "127.0.0.1", port))
+
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        if not starts:
+            with pytest.raises(NodeFailed, match=rf"\[metrics\] can't be served at 127.0.0.1:{port}: "):
+                asyncio.run(serve(port))
+            return
+        assert not asyncio.run(serve(port))
+        assert "user 4711 has the port: going on without" in caplog.text

@@ -7,6 +7,7 @@ runs the recorder as a process of its own.
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
 import os
 import signal
@@ -14,6 +15,7 @@ import sys
 import threading
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
+from ipaddress import ip_address
 from pathlib import Path
 
 import click
@@ -23,6 +25,7 @@ from zscout import __version__
 from zscout.config.certificates import PLACES_KEY, read_places_key
 from zscout.config.devices import RobotRc
 from zscout.config.fleet import Fleet
+from zscout.config.local_users import is_stranger, listeners, user_name
 from zscout.config.node import CalendarConfig, MetricsConfig, Node, default_node, load_node
 from zscout.config.notify import NotifyConfig
 from zscout.config.state_folder import state_folder
@@ -33,6 +36,7 @@ from zscout.drivers.lock import only_here
 from zscout.drivers.registry import driver_for, driver_name
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
+from zscout.logs import log_to_stderr
 from zscout.mesh import Mesh, MeshError, ZenohMesh
 from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.messages import LoadReport
@@ -50,7 +54,7 @@ from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.digest import HoldListener
 from zscout.services.rcm.term_file import TermFile
 from zscout.services.recorder.process import RecorderProcess
-from zscout.types import SECOND
+from zscout.types import SECOND, clean
 
 log = logging.getLogger("zscout.node")
 
@@ -104,7 +108,7 @@ async def run_services(
         rcs: list[ResourceController] = []
         # Robots end first: their last word goes through a radio, which may be one of this node.
         for spec in sorted(node.rcs, key=lambda spec: isinstance(spec, RobotRc)):
-            stack.enter_context(only_here(node.fleet.name, me.host, spec.name))
+            stack.enter_context(only_here(node.fleet.name, me.host, spec.name, kept))
             driver = drivers[spec.name]
             rc = ResourceController(
                 mesh,
@@ -212,8 +216,8 @@ async def _serve_figures(metrics: MetricsConfig, figures: NodeFigures) -> Callab
     from zscout.services.metrics.server import MetricsServer
 
     server = MetricsServer(figures.samples, metrics.bind, metrics.port)
-    await _serve("metrics", server)
-    log.info("serves its figures at http://%s:%d/metrics", metrics.bind, server.port)
+    if await _serve("metrics", server):
+        log.info("serves its figures at http://%s:%d/metrics", metrics.bind, server.port)
     return server.stop
 
 
@@ -222,17 +226,25 @@ async def _serve_calendars(calendar: CalendarConfig, mesh: Mesh, fleet: str) -> 
     from zscout.services.bookings.calendar_server import CalendarServer
 
     server = CalendarServer(mesh, fleet, calendar.bind, calendar.port)
-    await _serve("calendar", server)
-    log.info("serves calendars at http://%s:%d/fleet.ics", calendar.bind, server.port)
+    if await _serve("calendar", server):
+        log.info("serves calendars at http://%s:%d/fleet.ics", calendar.bind, server.port)
     return server.stop
 
 
-async def _serve(table: str, server: PlainHttpServer) -> None:
-    """Raises NodeFailed."""
+async def _serve(table: str, server: PlainHttpServer) -> bool:
+    """Return False if another user of this machine has the port: a node does without. Raises NodeFailed."""
     try:
         await server.start()
     except OSError as error:
-        raise NodeFailed(f"[{table}] can't be served at {server.bind}:{server.port}: {error.strerror}") from error
+        words = f"[{table}] can't be served at {server.bind}:{server.port}: {error.strerror}"
+        holders = {*listeners(ip_address(server.bind), server.port)}
+        if error.errno != errno.EADDRINUSE or not holders or not all(map(is_stranger, holders)):
+            raise NodeFailed(words) from error
+        log.error(  # noqa: TRY400 - one clear line
+            "%s; user %s has the port: going on without", words, ", ".join(map(user_name, holders))
+        )
+        return False
+    return True
 
 
 def _notifier(config: NotifyConfig, fleet: str, candidate: Candidate) -> Notifier:
@@ -299,7 +311,7 @@ def main(file: Path | None, check: bool, log_level: str) -> None:
       zscout-node lab.toml
       zscout-node --check lab.toml
     """
-    logging.basicConfig(level=log_level.upper(), format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
+    log_to_stderr(log_level.upper())
     manager = ServiceManager.from_env()
     try:
         reload = Reload(lambda: load_node(file) if file is not None else default_node())
@@ -310,7 +322,7 @@ def main(file: Path | None, check: bool, log_level: str) -> None:
         uvloop.run(_main(reload, manager))
     except (BadInput, MeshError, NodeFailed) as error:
         manager.stopping(str(error))
-        click.echo(f"zscout-node: {error}", err=True)
+        click.echo(f"zscout-node: {clean(str(error))}", err=True)
         sys.exit(2 if isinstance(error, BadInput) else 1)
 
 

@@ -48,14 +48,22 @@ _JSON: Final = msgspec.json.Encoder(decimal_format="number")
 
 
 def print_json(value: Any, stream: IO[str] | None = None) -> None:
-    """One JSON value (structs and Decimals included) on one line, at once."""
-    print_line(_JSON.encode(value).decode(), stream)
+    """One JSON value (structs and Decimals included) on one line, at once; all in it that could draw is escaped."""
+    text = _JSON.encode(value).decode()
+    print_line(text if text.isprintable() else "".join(map(_escaped, text)), stream)
+
+
+def _escaped(char: str) -> str:
+    if char.isprintable():
+        return char
+    code = char.encode("utf-16-be").hex()
+    return "".join(f"\\u{code[at : at + 4]}" for at in range(0, len(code), 4))
 
 
 def print_line(text: str, stream: IO[str] | None = None) -> None:
-    """One plain line, at once, so that a reader of the pipe sees it."""
+    """One plain line, at once, so that a reader of the pipe sees it; unable to draw, whatever is in it."""
     stream = stream or sys.stdout
-    stream.write(text + "\n")
+    stream.write(clean(text) + "\n")
     stream.flush()
 
 

@@ -106,7 +106,7 @@ FLEET: Final[Mapping[str, Mapping[str, Key]]] = {
     },
     "ceilings.client": {
         "priority": Key(None, ("5",), ("1_000_001", '"5"')),
-        "runtime": _number("0.0", "1", "31_622_400", "-1", "31_622_401"),
+        "runtime": Key(None, ("0", "31_622_400"), ("-1", "31_622_401", "true")),
     },
     "fair_shares": {
         "half_life": _number("86_400.0", "60", "31_622_400", "59", "31_622_401"),

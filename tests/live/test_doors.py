@@ -12,7 +12,8 @@ from tests.hang import HANG
 from tests.live.closed import ClosedLab
 from tests.live.lab import awaited
 from zscout.behaviors.client.arc import Revoked, hold
-from zscout.messages import LoadReport
+from zscout.behaviors.client.client import RequestRefused
+from zscout.messages import ComponentSpec, ComponentView, LoadReport, StartComponent, StopComponent
 
 pytestmark = pytest.mark.live
 
@@ -32,6 +33,39 @@ async def test_a_component_starts_and_holds_on_a_secured_fleet(lab: ClosedLab) -
     await lab.state(ada, lambda state: any(hold.client.startswith("anvil/counter.") for hold in state.holds))
     done = await lab.zscout("component", "list", env=env_of(lab, "wall"))
     assert "running" in done.stdout
+
+
+@pytest.mark.slow
+async def test_a_component_is_its_starters_and_moves_by_an_operators_word(lab: ClosedLab) -> None:
+    """It counts against its starter's quota on either host; nobody but the placer has a node start anything."""
+    lab.fleet_file.write_text(lab.fleet_file.read_text() + "[quotas.bob]\narcs = 1\n")
+    lab.node("anvil", "robot/a", "robot/b")
+    lab.node("cart")
+    ada, bob = await lab.person("ada"), await lab.person("bob")
+    await lab.ready(bob, "robot/a", "robot/b")
+    start = "component", "start", "counter", "--set", "rc=robot/a", "--host", "anvil", "--host", "cart"
+    assert (await lab.zscout(*start, env=env_of(lab, "bob"))).returncode == 0
+
+    async def held_from() -> set[str]:
+        state = await ada.state()
+        return set() if state is None else {hold.client.partition("/")[0] for hold in state.holds}
+
+    (there,) = await awaited(held_from, bool)
+    other = {"anvil": "cart", "cart": "anvil"}[there]
+    for host in (there, other):
+        await awaited(held_from, lambda hosts, host=host: hosts == {host})  # type: ignore[misc]
+        with pytest.raises(RequestRefused, match="bob has 1 open requests, its quota"):
+            await bob.request("survey", {"robot/b": {}})
+        if host == there:
+            assert (
+                await lab.zscout("component", "migrate", "counter", "--to", other, "--yes", env=env_of(lab, "ada"))
+            ).returncode == 0
+    for order in (StartComponent("c", 1, ComponentSpec("counter")), StopComponent("counter")):
+        key = bob.mesh.keys.component("anvil", bob.mesh.me)
+        reply = await awaited(lambda: bob.mesh.ask_one(key, order, ComponentView, timeout=HANG), bool)  # noqa: B023
+        assert reply is not None
+        assert reply.problem is not None
+        assert "bob (client) may not order a node to" in reply.problem.message
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,19 @@ from zscout.config.fleet import load_fleet
 from zscout.config.scheduling_policy import DEFAULT, FairShares, SchedulingPolicy
 from zscout.keyexpr import Sender
 from zscout.mesh import Refused
+from zscout.messages import (
+    ActivateComponent,
+    CheckpointComponent,
+    ComponentOperation,
+    ComponentSpec,
+    ListComponents,
+    MoveComponent,
+    Placement,
+    ReadOutput,
+    RestoreComponent,
+    StartComponent,
+    StopComponent,
+)
 from zscout.rcm.authority import Authority
 from zscout.scheduling.model import ArcRequest, ArcStatus, Hold
 from zscout.types import NO_TERM, SECOND, Grant, Place
@@ -82,7 +96,7 @@ def test_who_is_in_several_groups_counts_in_the_first(tmp_path: Path) -> None:
         ("bob", ask("robot/arm1"), "bob (client) may not hold robot/arm1; ada, eve may"),
         ("eve", ask("robot/arm1"), ""),
         ("bob", ask("robot/*"), ""),
-        ("bob", ask("robot/scout1", keep=True), "bob (client) may not keep a hold; ada may"),
+        ("bob", ask("robot/scout1", keep=True), ""),
         ("bob", ask("robot/scout1", min_runtime=61), "bob (client) may not request 61 s; at most 60; ada may"),
         ("eve", ask("a/1", "a/2", "a/3", "a/4"), TOO_MANY_RCS),
     ],
@@ -117,7 +131,7 @@ def given(*needs: str, priority: int = 1, keep: bool = False, runs: bool = False
         ),
         ("bob", [given("robot/arm1")], "bob (client) may not hold robot/arm1; ada, eve may"),
         ("bob", [given("robot/s1", priority=10)], "bob (client) may not request priority 10; at most 9; ada may"),
-        ("bob", [given("robot/s1", keep=True)], "bob (client) may not keep a hold; ada may"),
+        ("bob", [given("robot/s1", keep=True)], ""),
         ("wall", [given("robot/s1")], "wall (viewer) may not take over a request" + OTHERS_MAY),
         # Of one group: it has no more than before.
         ("eve", [given("a/1", "a/2", runs=True)], ""),
@@ -163,3 +177,74 @@ def test_without_certificates_nothing_is_refused(tmp_path: Path) -> None:
     told.check_operator(Sender("mallory", "c1"), "drain hosts")
     assert told.bound(DEFAULT) == DEFAULT
     assert not told.is_removed("mallory/c1")
+
+
+DAY = 86_400
+
+
+@pytest.mark.parametrize(
+    ("ceiling", "name", "longest"),
+    [
+        ("", "bob", DAY),
+        ("", "anvil", DAY),
+        ("", "ada", 0),
+        ("[ceilings.client]\npriority = 3", "bob", DAY),
+        ("[ceilings.operator]\npriority = 30", "ada", 0),
+        ('[ceilings.client]\nruntime = "7d"', "bob", 7 * DAY),
+        ("[ceilings.client]\nruntime = 0", "bob", 0),
+    ],
+)
+def test_a_client_is_protected_for_a_day_at_most_unless_the_file_says_more(
+    tmp_path: Path, ceiling: str, name: str, longest: int
+) -> None:
+    text = FILE.replace("[ceilings.client]\nruntime = 60", ceiling)
+    assert authority(tmp_path, text).longest(name) == longest * SECOND
+    assert authority(tmp_path, text.replace('[security]\nfolder = "keys"', "")).longest(name) == 0
+
+
+def test_a_component_counts_against_the_quotas_of_its_starter(tmp_path: Path) -> None:
+    """Where the placer has put it: a node can't charge to others what they did not place there."""
+    told = authority(tmp_path)
+    spec = ComponentSpec("counter", owner="bob")
+    told.placed = {"c": Placement("c", spec, "running", 7, "anvil", to="bellows")}
+    assert [told.starter(f"{host}/c.8") for host in ("anvil", "bellows", "ada")] == ["bob", "bob", ""]
+    assert told.starter("anvil/other.1") == ""
+    told.placed = {"c": Placement("c", ComponentSpec("counter", owner="mallory"), "running", 7, "anvil")}
+    assert told.starter("anvil/c.8") == ""
+    its = ArcRequest("anvil/c.8/q", "anvil/c.8", {"robot/s1": {}}, 1, SECOND, charged_to="bob")
+    assert its.owner == "bob"
+    with pytest.raises(Refused, match="bob has 2 open requests, its quota; cancel one"):
+        told.check_ask("anvil", its, lambda names: 2 if "bob" in names else 0)
+
+
+COMPONENT: dict[str, ComponentOperation] = {
+    "start": StartComponent("c", 8, ComponentSpec("counter")),
+    "stop": StopComponent("c", 8),
+    "stop any": StopComponent("c"),
+    "checkpoint": CheckpointComponent("c"),
+    "move": MoveComponent("c", 7, "bellows", 8),
+    "restore": RestoreComponent("c", 8, b"", []),
+    "activate": ActivateComponent("c", 8),
+    "list": ListComponents(),
+    "output": ReadOutput("c"),
+}
+
+
+@pytest.mark.parametrize(
+    ("sender", "may"),
+    [
+        (Sender("wall", "x"), {"list", "output"}),
+        (Sender("bob", "c.7"), {"list", "output"}),
+        (Sender("ada", "x"), {"list", "output", "stop", "stop any"}),
+        (Sender("bellows", "x"), {"list", "output"}),
+        (Sender("bellows", "c.7"), {"list", "output", "stop", "restore", "activate"}),
+        (Sender("bellows", "c.8"), {"list", "output"}),
+        (Sender("bellows", "d.7"), {"list", "output"}),
+        (Sender("anvil", "rcm"), set(COMPONENT)),
+    ],
+)
+def test_what_a_name_may_order_a_node_to_do(tmp_path: Path, sender: Sender, may: set[str]) -> None:
+    told = authority(tmp_path)
+    assert {
+        name for name, order in COMPONENT.items() if not refusal(partial(told.check_component, sender, order))
+    } == may

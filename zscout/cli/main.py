@@ -304,10 +304,9 @@ def main(ctx: click.Context, fleet: Path | None, verbose: bool) -> None:
         if fleet is not None:
             raise click.UsageError('--fleet is for other commands; write fleet = "FILE" under [node] in the node file')
         return
-    import logging
+    from zscout.logs import log_to_stderr
 
-    level = logging.INFO if verbose else logging.ERROR
-    logging.basicConfig(level=level, format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr)
+    log_to_stderr("INFO" if verbose else "ERROR")
 
 
 if __name__ == "__main__":

@@ -12,10 +12,11 @@ from hashlib import blake2b
 from typing import Annotated, Any, Final, get_args
 
 from msgspec import Meta, Struct, to_builtins
+from msgspec.structs import replace
 
 from zscout.config.strict import Where, check_name, check_names, key, quoted, seconds
 from zscout.keyexpr import PEOPLE, FleetMember, Rank, as_pattern, matcher
-from zscout.types import HostName, Ns, RcName
+from zscout.types import SECOND, HostName, Ns, RcName
 
 MAX_NAMES: Final = 1_000
 """Names of one role or group; groups, patterns and quotas of one file."""
@@ -23,6 +24,8 @@ MAX_PATTERNS: Final = 1_000
 """RCs, or patterns of them, that one host may serve."""
 MAX_TOLD: Final = 4
 """Names that a refusal lists of those who could."""
+CLIENT_RUNTIME: Final[Ns] = 86_400 * SECOND
+"""The longest minimum runtime of a client, by default."""
 _RC: Final = re.compile(r"[A-Za-z0-9_.*-]{1,64}/[A-Za-z0-9_.*-]{1,64}")
 
 Names = Annotated[tuple[str, ...], Meta(max_length=MAX_NAMES)]
@@ -63,7 +66,9 @@ class Ceiling(Struct, frozen=True, forbid_unknown_fields=True):
         Annotated[int, Meta(ge=-1_000_000, le=1_000_000)] | None,
         key("The highest; for clients it is below `operator_priority` in any case."),
     ] = None
-    runtime: Annotated[Ns, seconds("0", "31622400", "The longest minimum runtime, and none may `keep`; 0: any.")] = 0
+    runtime: Annotated[
+        Ns | None, seconds("0", "31622400", "The longest minimum runtime; 0: any. Without it: a day for clients.")
+    ] = None
 
 
 class AccessPolicy(Struct, frozen=True, dict=True):
@@ -122,7 +127,8 @@ class AccessPolicy(Struct, frozen=True, dict=True):
         """What an ARC of this name may ask for. Programs on a machine (its components) may what a client may."""
         ranks = self.ranks_of(name)
         rank: Rank = "operator" if "operator" in ranks else "client"
-        return self.ceilings.get(rank, Ceiling())
+        found = self.ceilings.get(rank, Ceiling())
+        return found if found.runtime is not None else replace(found, runtime=CLIENT_RUNTIME if rank == "client" else 0)
 
     def refusal(self, name: str, what: str, needed: Collection[Rank]) -> str:
         """Why this name may not do `what`, which takes one of these ranks: who could. Empty: it may."""

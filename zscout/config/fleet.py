@@ -25,6 +25,7 @@ from zscout.config.scheduling_policy import (
 from zscout.config.strict import (
     BadInput,
     Where,
+    check_folder_name,
     check_name,
     check_names,
     check_rc_name,
@@ -289,7 +290,7 @@ def fleet_from_env() -> Fleet:
 
 def _fleet(file: FleetFile, top: Where, folder: Path = Path()) -> Fleet:
     table, mesh, at = file.fleet, MeshConfig(**structs.asdict(file.mesh)), top / "fleet"
-    check_name(table.name, at / "name")
+    check_folder_name(table.name, at / "name")
     check_names(table.candidates, at / "candidates")
     check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
     check_multicast(mesh.multicast_address, top / "mesh" / "multicast_address")

@@ -26,7 +26,17 @@ from zscout.config.fleet import (
 )
 from zscout.config.notify import NotifyConfig, NotifyTable, read_notify
 from zscout.config.packages import check_installed
-from zscout.config.strict import Where, check_name, check_names, check_unique, key, quoted, read_toml, seconds
+from zscout.config.strict import (
+    Where,
+    check_folder_name,
+    check_name,
+    check_names,
+    check_unique,
+    key,
+    quoted,
+    read_toml,
+    seconds,
+)
 from zscout.keyexpr import MACHINES, valid_name
 from zscout.messages import MAX_LABELS
 from zscout.types import SECOND, Ns
@@ -219,7 +229,7 @@ def default_node() -> Node:
 
 def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
     host = file.node.host if file.node.host is not None else valid_name(socket.gethostname())
-    check_name(host, top / "node" / "host")
+    check_folder_name(host, top / "node" / "host")
     own = {name: value for name, value in structs.asdict(file.mesh).items() if value is not None}
     if file.mesh.relay and file.mesh.site is None:
         own["site"] = None  # that of the fleet file is the site of those who do not relay

@@ -180,6 +180,13 @@ def check_name(value: str, where: Where) -> None:
         raise where.bad(f"{quoted(value)} is not a name", f"write {_NAME_RULE}")
 
 
+def check_folder_name(value: str, where: Where) -> None:
+    """The same for a name that is a folder's as well: of dots alone it is the folder itself or the one above."""
+    check_name(value, where)
+    if not value.strip("."):
+        raise where.bad(f"{quoted(value)} can't be a folder's name", "use a letter or a digit")
+
+
 def check_rc_name(value: str, where: Where, of: str = "") -> None:
     """Refuses what is not `kind/name`, both names by themselves, and of kind `of` if given. Raises BadInput."""
     kind, _, name = value.partition("/")

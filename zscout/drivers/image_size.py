@@ -12,11 +12,14 @@ _FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """JPEG's markers of a frame (ITU-T T.81, table B.1): those with the picture's size."""
 _ALONE: Final = frozenset({0x01, *range(0xD0, 0xD8)})
 """Markers without a length."""
+_SCAN: Final = b"\xff\xda"
+MAX_SCANS: Final = 64
+"""Passes over a progressive picture: cameras make up to a dozen, and each costs a reader all pixels anew."""
 
 
 def jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in pixels; None if this does not begin as a JPEG picture does."""
-    if data[:2] != b"\xff\xd8":
+    """Width and height in pixels; None if this does not begin as a JPEG picture does, or has more than MAX_SCANS."""
+    if data[:2] != b"\xff\xd8" or data.count(_SCAN) > MAX_SCANS:
         return None
     at = 2
     while at + 4 <= len(data) and data[at] == 0xFF:

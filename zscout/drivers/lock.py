@@ -1,32 +1,103 @@
-"""Keeps two processes of one host from offering the same RC: both would hold its device."""
+"""Keeps two processes of one host from offering the same RC: both would hold its device.
+
+Two locks, both gone with their process. A file in the state folder, where other users can't write, keeps processes
+with the same folder apart. A name of Linux's abstract sockets keeps apart those of other folders and of root; but any
+user of the machine may take it first, so only root and this user are believed."""
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
+import logging
+import os
 import socket
+import struct
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Final, NamedTuple
 
+from zscout.config.local_users import Uid, is_stranger, user_name
 from zscout.mesh import MeshError
+
+log = logging.getLogger(__name__)
+
+_CREDENTIALS: Final = struct.Struct("3i")
+BACKLOG: Final = 4_096
+"""Processes that may ask a holder for its user: none is ever answered."""
+
+
+class LockHolder(NamedTuple):
+    pid: int
+    uid: Uid
+
+    def __str__(self) -> str:
+        return f"process {self.pid} of user {user_name(self.uid)}"
 
 
 @contextmanager
-def only_here(fleet: str, host: str, rc: str) -> Iterator[None]:
-    """Raises MeshError where another process of this machine offers `rc` of `fleet` for `host` already.
+def only_here(fleet: str, host: str, rc: str, folder: Path | None = None) -> Iterator[None]:
+    """Raises MeshError if another process of this machine, of this user or root, offers `rc` of `fleet` for `host`
+    already. `folder`: the state folder."""
+    with ExitStack() as stack:
+        if folder is not None:
+            stack.enter_context(_file(folder / "served" / rc, host, rc))
+        if sys.platform == "linux":
+            name = hashlib.sha256(f"{fleet} {host} {rc}".encode()).hexdigest()
+            stack.enter_context(_name(f"\0zscout-rc-{name}", host, rc))
+        yield
 
-    A name of Linux's abstract sockets is the lock: unlike a file it goes with its process, however that ends, and
-    nothing is left. Elsewhere only the tokens on the mesh keep two apart."""
-    if sys.platform != "linux":
+
+@contextmanager
+def _file(path: Path, host: str, rc: str) -> Iterator[None]:
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        opened = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+    except OSError as error:
+        log.warning("%s can't be opened (%s): no lock in the state folder", path, error.strerror)
         yield
         return
-    name = hashlib.sha256(f"{fleet} {host} {rc}".encode()).hexdigest()
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as lock:
+    try:
         try:
-            lock.bind(f"\0zscout-rc-{name}")
+            fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise _served(host, rc, None) from None
+        yield
+    finally:
+        os.close(opened)
+
+
+@contextmanager
+def _name(name: str, host: str, rc: str) -> Iterator[None]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as lock:
+        try:
+            lock.bind(name)
+            lock.listen(BACKLOG)
         except OSError as error:
             if error.errno != errno.EADDRINUSE:
                 raise
-            raise MeshError(f"{rc}: another process on {host} serves it already; end that, or rename this") from None
+            holder = _holder(name)
+            if holder is not None and not is_stranger(holder.uid):
+                raise _served(host, rc, holder) from None
+            other = holder or "an unknown process"
+            log.warning("%s: %s has its lock on this machine, and can't be believed; serving it", rc, other)
         yield
+
+
+def _holder(name: str) -> LockHolder | None:
+    """The process that listens under an abstract name; None if it does not, or does not let itself be asked."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
+        asking.setblocking(False)
+        try:
+            asking.connect(name)
+        except OSError:
+            return None
+        pid, uid, _ = _CREDENTIALS.unpack(asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
+        return LockHolder(pid, uid)
+
+
+def _served(host: str, rc: str, holder: LockHolder | None) -> MeshError:
+    by = f" ({holder})" if holder is not None else ""
+    return MeshError(f"{rc}: another process on {host} serves it already{by}; end that, or rename this")

@@ -64,7 +64,7 @@ class LetIn:
     def add(self, request: ArcRequest, *, waits: bool) -> None:
         self.waiting_now += waits
         self._clients[request.client] += 1
-        self._owners[request.client.partition("/")[0]] += 1
+        self._owners[request.owner] += 1
 
     def of_client(self, client: ClientId) -> int:
         return self._clients[client]
@@ -94,7 +94,7 @@ class Admission:
         """Raises Refused for a request that its client may not make now."""
         host = request.client.partition("/")[0]
         self.authority.check_ask(host, request, lambda names: present.of_owners(names, request.arc))
-        self._check_room(host, request.client, present)
+        self._check_room(request.owner, request.client, present)
 
     def form(self, asked: Wanted, sender: Sender) -> ArcRequest:
         """The request, if its names and numbers are valid. Raises Refused."""
@@ -117,6 +117,7 @@ class Admission:
                 direct=more is not None and more.direct,
                 continues="" if more is None else more.continues,
                 who=None if more is None else self.authority.known_as(sender, more.who),
+                charged_to=self.authority.starter(client),
             )
         except (BadName, ValueError) as error:
             raise Refused("bad_request", str(error)) from None
@@ -227,8 +228,8 @@ class Admission:
         most, longest = self.authority.highest(host), self.authority.longest(host)
         most = MAX_PRIORITY if most is None else most
         priority = max(-MAX_PRIORITY, min(request.priority, most))
-        if longest and (request.keep or request.min_runtime > longest):
-            request = replace(request, keep=False, min_runtime=min(request.min_runtime, longest))
+        if longest and request.min_runtime > longest:
+            request = replace(request, min_runtime=longest)
         return request if priority == request.priority else replace(request, priority=priority)
 
 

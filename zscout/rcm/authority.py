@@ -5,7 +5,7 @@ plain mesh nothing proves a name, and nothing is refused here."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from typing import Final
 
@@ -14,9 +14,19 @@ from msgspec import structs
 from zscout.config.fleet import Fleet
 from zscout.config.scheduling_policy import RcQuota, SchedulingPolicy
 from zscout.keyexpr import NODES, USERS, Rank, Sender, as_pattern, is_pattern
-from zscout.messages import Refused, Who
+from zscout.messages import (
+    ActivateComponent,
+    ComponentOperation,
+    ListComponents,
+    Placement,
+    ReadOutput,
+    Refused,
+    RestoreComponent,
+    StopComponent,
+    Who,
+)
 from zscout.scheduling.model import ArcRequest, ArcStatus
-from zscout.types import SECOND, ClientId, HostName, Ns, RcName
+from zscout.types import SECOND, ClientId, ComponentId, HostName, Ns, RcName
 
 OPERATORS: Final[frozenset[Rank]] = frozenset({"operator"})
 
@@ -27,6 +37,8 @@ class Authority:
     def __init__(self, fleet: Fleet) -> None:
         self._policy, self.enforced = fleet.access, fleet.security is not None
         self._operator_priority = fleet.operator_priority
+        self.placed: Mapping[ComponentId, Placement] = {}
+        """The components as the placer published them."""
 
     def reload(self, fleet: Fleet) -> None:
         """Takes the rights of a fleet file that was read anew."""
@@ -65,14 +77,12 @@ class Authority:
         most, longest = self.highest(name), self.longest(name)
         if most is not None and asked.priority > most:
             raise self._refused(name, f"request priority {asked.priority}; at most {most}")
-        if longest and asked.keep:
-            raise self._refused(name, "keep a hold")
         if longest and asked.min_runtime > longest:
             raise self._refused(name, f"request {asked.min_runtime / SECOND:g} s; at most {longest / SECOND:g}")
         for need in asked.needs:
             if not is_pattern(need) and not self.may_hold(name, need):
                 raise self._not_its(name, need)
-        for owner, members, quota in self._policy.quotas_of(name):
+        for owner, members, quota in self._policy.quotas_of(asked.charged_to or name):
             if quota.rcs is not None and len(asked.needs) > quota.rcs:
                 raise Refused(
                     "not_allowed",
@@ -92,8 +102,17 @@ class Authority:
         return below if most is None else min(below, most)
 
     def longest(self, name: str) -> Ns:
-        """The longest minimum runtime that this name may ask for; 0: any, and it may keep."""
-        return self._policy.ceiling(name).runtime if self.enforced else 0
+        """The longest minimum runtime that this name may ask for; 0: any."""
+        return (self._policy.ceiling(name).runtime or 0) if self.enforced else 0
+
+    def starter(self, client: ClientId) -> str:
+        """Whose quotas a component's requests count against, which is on its starter's behalf where the placer has put
+        it; empty: its own."""
+        host, _, name = client.partition("/")
+        placement = self.placed.get(name.rpartition(".")[0]) if self.enforced else None
+        if placement is None or host not in (placement.host, placement.to):
+            return ""
+        return placement.spec.owner if self._policy.ranks_of(placement.spec.owner) & USERS else ""
 
     def may_lead(self, host: HostName) -> bool:
         return not self.enforced or "manager" in self._policy.ranks_of(host)
@@ -119,8 +138,8 @@ class Authority:
             wanted = arc.request if arc.hold is None else structs.replace(arc.request, needs=arc.needs)
             self.check_ask(to.host, wanted, lambda _: 0)
         running = sum(len(arc.needs) for arc in arcs if arc.hold is not None)
-        for owner, members, quota in self._policy.quotas_of(to.host):
-            if sender.host in members:
+        for owner, members, quota in self._policy.quotas_of(self.starter(str(to)) or to.host):
+            if (self.starter(str(sender)) or sender.host) in members:
                 continue  # it has no more than before
             if quota.arcs is not None and open_by(members) + len(arcs) > quota.arcs:
                 words = f"{owner} may have {quota.arcs} open requests, and would have more; cancel some first"
@@ -139,10 +158,22 @@ class Authority:
         if self.enforced:
             self._check_rank(sender.host, what, USERS)
 
-    def check_machine(self, sender: Sender, what: str) -> None:
-        """Raises Refused for all but the placer, and components that move."""
-        if self.enforced:
-            self._check_rank(sender.host, what, NODES)
+    def check_component(self, sender: Sender, operation: ComponentOperation) -> None:
+        """Raises Refused for who may not have a node do this: start and move are the placer's, stop is an operator's
+        as well, and a component that moves may give its next incarnation what it has."""
+        if not self.enforced or isinstance(operation, ListComponents | ReadOutput):
+            return
+        name, _, number = sender.client.rpartition(".")
+        what = f"order a node to {operation.__struct_config__.tag} {operation.component}"
+        match operation:
+            case RestoreComponent() | ActivateComponent() | StopComponent(incarnation=int()) if (
+                operation.component == name and number.isdecimal() and int(number) < (operation.incarnation or 0)
+            ):
+                self._check_rank(sender.host, what, NODES)
+            case StopComponent():
+                self._check_rank(sender.host, what, {"manager", "operator"})
+            case _:
+                self._check_rank(sender.host, what, {"manager"})
 
     def may_hold(self, name: str, rc: RcName) -> bool:
         holders = self._policy.holders(rc) if self.enforced else None

@@ -426,8 +426,9 @@ class Operations:
 
     def of_owners(self, names: Collection[str], *but: ArcId) -> int:
         owned = sum(map(self.core.count_of_owner, names))
-        owned += sum(event.request.client.partition("/")[0] in names for event in self.instant.asked)
-        return owned - sum(self.core.is_open(arc) and arc.partition("/")[0] in names for arc in but)
+        owned += sum(event.request.owner in names for event in self.instant.asked)
+        its = filter(None, map(self.core.arc, filter(self.core.is_open, but)))
+        return owned - sum(arc.request.owner in names for arc in its)
 
     def held_by(self, names: Collection[str], *but: ArcId) -> int:
         """The number of RCs held by these owners."""

@@ -67,6 +67,12 @@ class ArcRequest(Struct, frozen=True):
     """The date to wait for while its booking is absent or impossible."""
     who: Who | None = None
     """The requester, for people; unused by the core."""
+    charged_to: str = ""
+    """The name whose quotas count, if not its client's host: that of a component's starter."""
+
+    @property
+    def owner(self) -> str:
+        return self.charged_to or self.client.partition("/")[0]
 
     def __post_init__(self) -> None:
         check_request(f"ARC {self.arc}", self.needs, self.min_runtime)
@@ -151,7 +157,7 @@ class Arc:
     position: int = 0  # the position of its group (`fair_shares.py`); while it runs, as of its start
     vouched: bool = True  # by its client; False: only RCs have reported it, and it is not charged
     late: Ns = 0  # delay that its group's share adds to its waiting time (`reservations.py`)
-    owner: str = field(init=False)  # its client's host, for quotas
+    owner: str = field(init=False)  # for quotas
     id: ArcId = field(init=False)
     priority: int = field(init=False)
     rank: Rank = field(init=False)  # after a takeover two clients may claim one place: the id keeps the order total
@@ -165,7 +171,7 @@ class Arc:
     def take(self, request: ArcRequest) -> None:
         """Replace its request, by itself or another client's with the same needs."""
         self.request, self.id, self.priority = request, request.arc, request.priority
-        self.owner = request.client.partition("/")[0]
+        self.owner = request.owner
         self.party = Party(self.id, request.label or self.id, self.priority, request.who)
         self.put_at(self.position)
 

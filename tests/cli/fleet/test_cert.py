@@ -185,3 +185,14 @@ def test_without_its_package_what_needs_it_says_so_and_show_works(
     assert zscout_here("cert", "issue", "ada") == 1
     assert "zscout: this command needs cryptography, which is not installed here; " in capsys.readouterr().err
     assert zscout_here("cert", "show", "anvil") == 0
+
+
+@pytest.mark.parametrize("name", ["..", ".", "..."])
+def test_a_certificate_is_written_into_a_folder_of_its_own(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("inner").mkdir()
+    assert zscout_here("cert", "ca") == 0
+    for options in ((name,), ("ada", "--manager", name)):
+        assert zscout_here("cert", "issue", *options, "--to", "inner") == 2
+        assert "can't be a folder's name" in capsys.readouterr().err
+    assert {path.name for path in Path().iterdir()} == {"inner", "zscout-ca"}
+    assert not [*Path("inner").iterdir()]

@@ -284,7 +284,7 @@ def test_only_a_file_that_a_recorder_writes_is_believed(
             case "another user's":
                 file.write_bytes(MAGIC)
                 stack.enter_context(writing(file))
-                monkeypatch.setattr(local_recording, "_listeners", lambda _address, _port: [4711])
+                monkeypatch.setattr(local_recording, "listeners", lambda _address, _port: [4711])
         answer = Recorded(str(file), file.stat().st_ino, "127.0.0.1", server.getsockname()[1])
         assert asyncio.run(module._reached(answer, "127.0.0.1")) is None
 

@@ -63,7 +63,7 @@ async def test_each_metric_is_written_as_its_family_says() -> None:
         assert (written.type, written.documentation) == (family.kind, family.help)
         for sample in written.samples:
             assert {*sample.labels} - {"le"} == {*family.labels}
-            assert all(sample.labels[label] == f'a "{label}"\n' for label in family.labels)
+            assert all(sample.labels[label] == f'a "{label}" ' for label in family.labels)
     buckets = [(one.labels["le"], one.value) for one in found["zscout_forecast_error_seconds"].samples]
     assert buckets == [("-1.0", 0), ("0.0", 0), ("2.5", 1), ("+Inf", 1)]
 

@@ -186,7 +186,7 @@ async def test_quotas_and_ceilings_count_for_what_waits_and_end_nothing_that_run
         "runs",
         grant_of(runs),
         4,
-        False,
+        True,
         Decimal(60),
     )
     assert [item.arc for item in state.queue] == ["w4"]

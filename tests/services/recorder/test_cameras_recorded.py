@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from tests.services.recorder.paper_run import events, rows
 from tests.services.recorder.robot_run import CAMERA, GRANT, NET, captions, head, jpeg, png, say
-from zscout.drivers.image_size import jpeg_size, png_size
+from zscout.behaviors.perception.lens import grey_picture
+from zscout.drivers.image_size import MAX_SCANS, jpeg_size, png_size
 from zscout.services.recorder import robots
 from zscout.services.recorder.drawing import HolderRow
 from zscout.services.recorder.timeline import Timeline
@@ -109,3 +110,15 @@ def test_the_head_of_a_picture_tells_its_size(width: int, height: int, quality: 
     spoiled = as_jpeg[:cut] + data.draw(st.binary(max_size=8)) + as_jpeg[cut + 1 :]
     for size in (jpeg_size(as_jpeg[:cut]), jpeg_size(spoiled), png_size(as_png[: len(as_png) * cut // len(as_jpeg)])):
         assert size is None or min(size) > 0
+
+
+def test_a_picture_of_many_scans_is_left_out() -> None:
+    picture = np.random.default_rng(1).integers(0, 255, (16, 16, 3), np.uint8)
+    options = [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]
+    progressive = bytes(cv2.imencode(".jpg", picture, options)[1])
+    assert 1 < progressive.count(b"\xff\xda") <= MAX_SCANS
+    assert jpeg_size(progressive) == (16, 16)
+    scan = progressive[progressive.rindex(b"\xff\xda") : -2]
+    bomb = progressive[:-2] + scan * 5_000 + progressive[-2:]
+    assert jpeg_size(bomb) is None
+    assert grey_picture(bomb) is None

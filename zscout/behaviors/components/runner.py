@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import ctypes
-import logging
 import os
 import signal
 import socket
@@ -26,6 +25,7 @@ from zscout.behaviors.components.channel import BadFrame, ComponentJob, Componen
 from zscout.behaviors.components.component import BAD_PARAMS
 from zscout.behaviors.components.lifecycle import ComponentLifecycle
 from zscout.behaviors.components.processes import kill_family
+from zscout.logs import log_to_stderr
 from zscout.mesh.supervision import done_within
 
 _PR_SET_PDEATHSIG: Final = 1
@@ -37,7 +37,7 @@ def main() -> None:
     """Exit codes: 0 where the component ended well, 1 where it failed, BAD_PARAMS where its parameters are no good."""
     if len(sys.argv) != 2 or not sys.argv[1].isdecimal() or os.getpgrp() != os.getpid():
         sys.exit("zscout: this program is started by a node; `zscout component start` starts a component")
-    logging.basicConfig(level="WARNING", format="%(levelname)s %(message)s", stream=sys.stderr)
+    log_to_stderr("WARNING", "%(levelname)s %(message)s")
     # A process that stands still sees no end of file: the end of its parent wakes it.
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGCONT, 0, 0, 0)
     connection = socket.socket(fileno=int(sys.argv[1]))

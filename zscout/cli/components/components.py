@@ -55,7 +55,7 @@ async def components(name: str | None, only_kinds: bool, watch: bool, as_json: b
         await listing.find()
         await show(listing, placer.changed, listing.refresh, watch=watch, as_json=as_json)
         if name is not None and not (watch or as_json) and (tail := tail_of(placer.placements[name])):
-            for line in ("\nThe end of its output:", *tail):
+            for line in ("", "The end of its output:", *tail):
                 terminal.print_line(line)
 
 

@@ -124,6 +124,8 @@ def issue(name: tuple[str, ...], ca: Path, to: Path, lasts: timedelta, managers:
     authority = _authority(ca)
     if not name and not managers:
         raise BadInput("name at least one machine or person")
+    if dots := next((one for one in (*managers, *name) if not one.strip(".")), None):
+        raise BadInput(f"{quoted(dots)} can't be a folder's name; use a letter or a digit")
     for one in (*managers, *name):
         _check_free(to / one, (CA, CERT, KEY), force)
     for one in (*managers, *name):

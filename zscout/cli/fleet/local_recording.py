@@ -1,4 +1,4 @@
-"""Checks of what a recorder answers on the mesh, before `zscout view` shows it: only a recorder of this host counts.
+"""Checks of a recorder's answer, before `zscout view` shows its recording: only a recorder of this host counts.
 
 Any sender may name a file and an address. Both must exist here, and belong to one local user or to root."""
 
@@ -8,20 +8,15 @@ import fcntl
 import ipaddress
 import os
 import stat
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import Final
 
+from zscout.config.local_users import ROOT, listeners
 from zscout.messages import Recorded
 
 MAGIC: Final = b"RRF"
 """The first bytes of every recording."""
-LISTEN: Final = "0A"
-TABLES: Final = (Path("/proc/net/tcp"), Path("/proc/net/tcp6"))
-ROOT: Final = 0
-
-Address: TypeAlias = ipaddress.IPv4Address | ipaddress.IPv6Address
 
 
 def local_address(recorded: Recorded, bind: str) -> str | None:
@@ -31,7 +26,7 @@ def local_address(recorded: Recorded, bind: str) -> str | None:
         if not (served.is_unspecified or str(served) == bind or ipaddress.ip_address(bind).is_loopback):
             return None
         owner = _owner(recorded)
-        if owner is None or not {owner, ROOT} & {*_listeners(served, recorded.port)}:
+        if owner is None or not {owner, ROOT} & {*listeners(served, recorded.port)}:
             return None
     except (OSError, ValueError):
         return None
@@ -56,20 +51,3 @@ def _owner(recorded: Recorded) -> int | None:
         return found.st_uid
     finally:
         os.close(opened)
-
-
-def _listeners(address: Address, port: int) -> Iterator[int]:
-    """The user ids of the sockets of this host that listen there."""
-    for table in TABLES:
-        with suppress(FileNotFoundError):
-            for line in table.read_text().splitlines()[1:]:
-                fields = line.split()
-                host, _, number = fields[1].partition(":")
-                if fields[3] == LISTEN and int(number, 16) == port and _address(host) == address:
-                    yield int(fields[7])
-
-
-def _address(text: str) -> Address:
-    """From the kernel's notation: words of 32 bits in the byte order of this host."""
-    words = (bytes.fromhex(text[at : at + 8])[::-1] for at in range(0, len(text), 8))
-    return ipaddress.ip_address(b"".join(words))

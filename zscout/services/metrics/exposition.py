@@ -10,6 +10,7 @@ from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamil
 from prometheus_client.utils import floatToGoString
 
 from zscout.services.metrics.figures import FAMILIES, Distribution, Samples
+from zscout.types import clean
 
 CONTENT_TYPE = CONTENT_TYPE_PLAIN_0_0_4
 
@@ -29,8 +30,10 @@ class Exposition:
 
     def collect(self) -> Iterator[Metric]:
         """For the registry."""
-        for name, values in self._samples.items():
+        for name, samples in self._samples.items():
             family = FAMILIES[name]
+            # Two texts that are the same once cleaned would make the whole page invalid: the last stands.
+            values = {tuple(map(clean, labels)): value for labels, value in samples.items()}
             if family.kind == "histogram":
                 histogram = HistogramMetricFamily(name, family.help, labels=family.labels)
                 for labels, value in values.items():

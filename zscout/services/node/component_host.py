@@ -85,8 +85,8 @@ class ComponentHost:
     def _on_request(self, request: IncomingQuery[messages.ComponentOperation]) -> None:
         if self._underway >= MAX_UNDERWAY:
             raise Refused("busy", "too many operations are running here; try again")
-        if self.mesh.keys.closed and not isinstance(request.message, messages.ListComponents | messages.ReadOutput):
-            self._authority.check_machine(self.mesh.keys.sender_of(request.key), "order a node to do this")
+        if self.mesh.keys.closed:
+            self._authority.check_component(self.mesh.keys.sender_of(request.key), request.message)
         self._underway += 1
         self.supervisor.spawn(self._answer(request))
 

@@ -12,6 +12,8 @@ import time
 from collections.abc import MutableMapping
 from typing import Final, Self
 
+from zscout.types import clean
+
 log = logging.getLogger(__name__)
 
 BEATS: Final = 3  # messages per watchdog interval
@@ -59,7 +61,7 @@ class ServiceManager:
     def _tell(self, word: str, status: str = "") -> None:
         if not self._address:
             return
-        lines = f"{word}\nSTATUS={' '.join(status.split())}" if status else word
+        lines = f"{word}\nSTATUS={' '.join(clean(status).split())}" if status else word
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as speaking:
                 speaking.settimeout(LONGEST)

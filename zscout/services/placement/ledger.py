@@ -25,7 +25,7 @@ class PlacementLedger:
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
         self.term: Term = NO_TERM
-        self._placements: dict[ComponentId, Placement] = {}
+        self.placements: dict[ComponentId, Placement] = {}
         self._current: set[ComponentId] = set()  # published or listed since `start`
         self._cordoned: frozenset[HostName] = frozenset()
         self._declarations = ExitStack()
@@ -45,7 +45,7 @@ class PlacementLedger:
 
     def inherited(self) -> Inherited:
         """All placements known, for a new placer."""
-        return Inherited(tuple(self._placements.values()), self._cordoned)
+        return Inherited(tuple(self.placements.values()), self._cordoned)
 
     def _on_placements(self, _key: str, published: Placements) -> None:
         if published.term < self.term or absurd(published.term, self.term):
@@ -54,11 +54,11 @@ class PlacementLedger:
         self._cordoned = frozenset(published.cordoned)
         for placement in published.components:
             component = check_name(placement.component, "component")
-            if len(self._placements) < 2 * MAX_PLACED or component in self._placements:
-                self._placements[component] = placement
+            if len(self.placements) < 2 * MAX_PLACED or component in self.placements:
+                self.placements[component] = placement
                 self._current.add(component)
         for component in published.forgotten:
-            self._placements.pop(component, None)
+            self.placements.pop(component, None)
             self._current.discard(component)
 
     def _on_leader(self, token: Token, alive: bool) -> None:

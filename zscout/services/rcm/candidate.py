@@ -111,6 +111,7 @@ class Candidate:
         self._charged_at: Ns = 0
         """and when."""
         self.ledger = PlacementLedger(mesh)
+        self._authority.placed = self.ledger.placements
         self.inventory = Inventory(mesh, fleet, folder)
         self._timeout = fleet.timing.rebuild / SECOND
         self._leading = ExitStack()

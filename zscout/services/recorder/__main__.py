@@ -20,6 +20,7 @@ from zscout.config.node import RecorderConfig
 from zscout.config.packages import how_to_get
 from zscout.config.strict import BadInput
 from zscout.keyexpr import Sender
+from zscout.logs import log_to_stderr
 from zscout.mesh import MeshError, ZenohMesh
 from zscout.messages import Recorded
 from zscout.services.recorder.process import (
@@ -59,7 +60,7 @@ CHECK_EVERY: Final = 30.0
 
 def main() -> None:
     """Exit codes: 0 when it was ended, 1 when it failed, BAD_SETTINGS where trying again would not help."""
-    logging.basicConfig(level="INFO", format="%(asctime)s recorder %(levelname)s %(message)s", stream=sys.stderr)
+    log_to_stderr("INFO", "%(asctime)s recorder %(levelname)s %(message)s")
     try:
         # Libraries write to standard output as they like: what this program writes there goes round them.
         with os.fdopen(os.dup(1), "wb") as out:

@@ -337,6 +337,5 @@ def with_detail(word: str, detail: str) -> str:
 
 def clean_text(text: str, limit: int = MAX_STATE) -> str:
     """One line of at most `limit` characters, of letters that the viewer has: one that it lacks ends it."""
-    line = " ".join(text[: 2 * limit].split())
-    line = _UNKNOWN.sub("?", "".join(filter(str.isprintable, line)))
+    line = _UNKNOWN.sub("?", " ".join(clean(text[: 2 * limit]).split()))
     return line if len(line) <= limit else line[: limit - 1] + "…"
