@@ -192,8 +192,7 @@ async def test_who_took_up_a_date_that_its_leader_does_not_know_yet_waits_for_it
         told = await client.ask("mine", "robot/a", seconds=100, place=place, booking="late@1800000500")
         assert (told.state, told.reason) == ("queued", "the time of its booking is still to come")
     leader._keeper.records.take([replace(known, id="late", name="late", needs={"robot/a": {}})])
-    leader._keeper.shared += 1
-    leader._keeper.news.set()
+    leader._keeper.shared.set()
     await asyncio.sleep(1)
     assert states((await fleet.bookings())["late"]) == ["taken"]
     await asyncio.sleep(NOON + 501 - fleet.time())

@@ -72,7 +72,7 @@ class BookingSharing:
         """Whether some host may not have all that is known here."""
         self._not_kept: dict[str, str] = {}
         """By booking: why it is not kept, as it was told last."""
-        self._seen = keeper.shared
+        self._news = asyncio.Event()
         self._sharing = asyncio.Lock()
         self.clocks: dict[HostName, float] = {}
         """By how many seconds the clocks of other hosts differ from fleet time, where it is too much."""
@@ -87,8 +87,9 @@ class BookingSharing:
             ),
             *(mesh.watch(keys.alive_any(role), guard(self._on_token)) for role in (Role.CANDIDATE, Role.NODE)),
         ]
-        self._seen = self._keeper.shared
+        self._keeper.shared.clear()
         self._supervisor.spawn(self._keep_sharing())
+        self._supervisor.spawn(self._watch_others())
 
     def close(self) -> None:
         for declared in self._declared:
@@ -111,12 +112,12 @@ class BookingSharing:
         """These are not as they were: shared soon."""
         if changed := {record.id: record for record in records}:
             self._unshared |= changed
-            self._keeper.news.set()
+            self._news.set()
 
     def catch_up(self) -> None:
         """A host has come that may know less, or more."""
         self._behind = True
-        self._keeper.news.set()
+        self._news.set()
 
     async def keep(self, record: BookingRecord) -> str:
         """Returns once this is kept: empty, or why it is not."""
@@ -126,15 +127,19 @@ class BookingSharing:
                 await self._share()
             return self._not_kept.get(record.id, "")
 
+    async def _watch_others(self) -> None:
+        """One that led elsewhere shares its bookings before it steps down."""
+        while True:
+            await self._keeper.shared.wait()
+            self._keeper.shared.clear()
+            self.catch_up()
+            self._give(steps.Shared(news=True))
+
     async def _keep_sharing(self) -> None:
         while True:
-            if await done_within(AGAIN if self._behind else SHARE_EVERY, self._keeper.news.wait()):
+            if await done_within(AGAIN if self._behind else SHARE_EVERY, self._news.wait()):
                 await asyncio.sleep(SOON)
-            self._keeper.news.clear()
-            if self._seen != self._keeper.shared:
-                # One that led elsewhere has told of its bookings before it stepped down.
-                self._seen, self._behind = self._keeper.shared, True
-                self._give(steps.Shared(news=True))
+            self._news.clear()
             async with self._sharing:
                 why = await self._share()
             self._give(steps.Shared(news=False))
@@ -186,7 +191,7 @@ class BookingSharing:
         )
         if changed:
             self._give(steps.Shared(news=True))
-            self._keeper.news.set()
+            self._news.set()
         walls = {one.host: one.wall for one in answers} | {self._mesh.me.host: self._keeper.wall()}
         found, age = oldest(answers), (now - self._clock.since) / SECOND
         if found is not None and found[0] > age + SAME and abs(found[1] - self._clock.at(now)) > DIFFERS * SECOND:
