@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, Protocol, Self, TypeAlias
+from typing import Any, Final, NamedTuple, Protocol, Self, TypeAlias
 
 from msgspec import Struct
 
@@ -60,6 +60,10 @@ class BookingWork:
     strange: list[tuple[str, str]] = field(default_factory=list)
     again: list[Again] = field(default_factory=list)
     """Each in an instant of its own, after this."""
+
+
+NO_WORK: Final = BookingWork()
+"""Nothing follows."""
 
 
 class Booked(Protocol):

@@ -18,7 +18,7 @@ from zscout.keyexpr import BadName, Role
 from zscout.messages import Refused
 from zscout.rcm import steps
 from zscout.rcm.admission import Admission
-from zscout.rcm.booked import Again, Booked, BookingWork
+from zscout.rcm.booked import NO_WORK, Again, Booked, BookingWork
 from zscout.rcm.door import Door
 from zscout.rcm.operations import Operations, Taken
 from zscout.rcm.places import arc_id, request_id
@@ -142,7 +142,7 @@ class Leader:
             self._queue.append(_Due())
         if (events := self._next()) is not None:
             self._decide(events)
-        times = (self._core_wake, *(part.next for part in self._parts))
+        times = [self._core_wake, *[part.next for part in self._parts]]
         self._out.wake = self._wake = min([at for at in times if at is not None], default=None)
         self._out.more = bool(self._queue)
         return self._out
@@ -388,7 +388,8 @@ class Leader:
                     out.proposals.append(steps.Proposed(effect.rc, self._proposal(effect)))
                 case model.WakeAt(at):
                     self._core_wake = at
-        self._booked(self._bookings.note(events, effects))
+        if (work := self._bookings.note(events, effects)) is not NO_WORK:
+            self._booked(work)
         if line := self.core.strategy.log_line():
             out.log.append(line)
         out.over, registry.traced = registry.traced, []

@@ -12,7 +12,7 @@ from zscout.config.fleet import Fleet
 from zscout.keyexpr import BadName, Sender
 from zscout.messages import Ask, BookingRecord, BookingsKept, Operation, Problem, ProposedHolder, Refused, decimals
 from zscout.rcm.admission import Admission
-from zscout.rcm.booked import Again, BookedDanger, BookingWork, Keep, Ticket
+from zscout.rcm.booked import NO_WORK, Again, BookedDanger, BookingWork, Keep, Ticket
 from zscout.rcm.deadlines import Deadlines
 from zscout.rcm.door import Door
 from zscout.scheduling.booking import BookingConflict, BookingThreatened, Dates
@@ -166,7 +166,7 @@ class Bookings:
             self._once(_Due.LOOK, GATHERS)
         if self.handler.undecided and any(isinstance(event, (Vote, VoteOverdue)) for event in events):
             self._once(_Due.TRY, BALLOTS)
-        return self._work()
+        return self._work() if self.dates.changed or self.dates.strange else NO_WORK
 
     def tick(self) -> BookingWork:
         """Carries out what is due."""
