@@ -132,7 +132,7 @@ async def shown(mesh: Mesh, _parameter: str) -> Iterable[str]:
 async def _fleet_kinds(mesh: Mesh, _parameter: str) -> Iterable[str]:
     from zscout.messages import ComponentList, ListComponents
 
-    replies = await mesh.ask(mesh.keys.component_any(mesh.me), ListComponents(), ComponentList, timeout=LOOK)
+    replies = await common.ask_nodes(mesh, ListComponents(), ComponentList, LOOK)
     return {kind for reply in replies if reply.message is not None for kind in reply.message.kinds or ()}
 
 
