@@ -44,6 +44,7 @@ STUDIES: Final[dict[str, Study]] = {
     "frames": Study("frames:main", "How long from a robot's picture to the motor command that follows?", "3 min"),
     "hosts": Study("hosts:main", "How many hosts can one load balancer rank?", "5 min"),
     "journal": Study("journal:main", "What does a journal of 100,000 holds cost?", "1 min"),
+    "leader": Study("leader:main", "How large is the leader, what does a grant cost it, what stops it?", "3 min"),
     "metrics": Study("metrics:main", "What do Prometheus figures cost a node?", "1 min"),
     "publication": Study("publication:main", "What does a publication cost its leader, by listeners?", "2 min"),
     "viewer": Study("viewer:main", "How soon does a browser show a whole recording?", "5 min"),

@@ -120,7 +120,7 @@ class Program(HolderProcess):
         """What it has said, since it was asked last, that it would not say if it had been left alone."""
         await self.order("beats")
         assert self.process.stdout is not None
-        found: list[dict[str, Any]] = []
+        found, self.disturbed = self.disturbed, []
         async with asyncio.timeout(HANG):
             while line := await self.process.stdout.readline():
                 event = json.loads(line)
@@ -157,6 +157,7 @@ class Program(HolderProcess):
         """Asks, enters, and commands these RCs from now on."""
         await self.asks(arc, *rcs)
         await self.enters()
+        self.disturbed = []
         await self.order("work", rcs=rcs)
 
     async def gives_back(self) -> None:

@@ -132,7 +132,9 @@ class BookingPromises:
         self._running: dict[Term, set[tuple[Place, Ns]]] = {}
         """By term: places and beginnings of holds; who hands one over gives both away."""
         self._present: dict[Term, dict[str, float]] = {}
-        """By term and RC that is present: since when."""
+        """By term and RC that is present: since when,"""
+        self._named: dict[Term, Mapping[str, object]] = {}
+        """and in which instance."""
         self._records: dict[str, set[str]] = {}
         """By host: the bookings that it knew as it was looked at last."""
         self._news: dict[str, set[str]] = {}
@@ -324,9 +326,13 @@ class BookingPromises:
     def _look_at_grants(self, host: str, rcm: Rcm) -> None:
         """Nobody starts what would not be over by the date of a booking of its rank that its leader knew of."""
         status, local = rcm.core.status(), self._inside(host, rcm.mesh.now)
-        present = self._present.get(rcm.term, {})
-        there = {rc.name for rc in status.rcs if rc.present and rc.name in present}
-        self._present[rcm.term] = {rc.name: present.get(rc.name, self.now()) for rc in status.rcs if rc.present}
+        now_present = [rc.name for rc in status.rcs if rc.present]
+        named, meant = rcm.roster.named(now_present), self._named.get(rcm.term, {})
+        # Another instance has come: it was away for an instant.
+        present = {rc: at for rc, at in self._present.get(rcm.term, {}).items() if meant.get(rc) == named.get(rc)}
+        there = present.keys() & set(now_present)
+        self._present[rcm.term] = {rc: present.get(rc, self.now()) for rc in now_present}
+        self._named[rcm.term] = named
         for arc in (*status.running, *status.queued):
             if self._claims[rcm.term].get(arc.request.booking, (None, arc.id))[1] is None:
                 self._broken(f"{arc.name} would take up {arc.request.booking}, which is open, and has not")

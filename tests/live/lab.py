@@ -284,6 +284,8 @@ class HolderProcess:
 
     def __init__(self, name: str, process: asyncio.subprocess.Process) -> None:
         self.name, self.process = name, process
+        self.disturbed: list[dict[str, Any]] = []
+        """What it has said, once, when its work ended: it counts also where another event was awaited."""
 
     async def order(self, order: str, **details: Any) -> None:
         assert self.process.stdin is not None
@@ -301,6 +303,7 @@ class HolderProcess:
                     if event["event"] in names:
                         return event
                     skipped.append(event)
+                    self.disturbed += [event] if event["event"] == "disturbed" else []
         except TimeoutError:
             pass
         raise AssertionError(f"{self.name} did not say {names}; it said {skipped}")

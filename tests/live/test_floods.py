@@ -4,7 +4,7 @@ for a share of each host's alone: `tests/services/rcm/test_floods.py`; how long:
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Coroutine
 from contextlib import asynccontextmanager
 from decimal import Decimal
 from pathlib import Path
@@ -32,6 +32,7 @@ from zscout.messages import (
 pytestmark = pytest.mark.live
 
 OUTSTANDING = 100
+NEEDS: dict[str, dict[str, Decimal]] = {"robot/a": {}}
 
 
 async def flood(client: Client, key: str, message: Any, kind: Any) -> None:
@@ -46,26 +47,33 @@ async def flood(client: Client, key: str, message: Any, kind: Any) -> None:
             group.create_task(again())
 
 
+async def crowd(client: Client) -> None:
+    """Requests that wait for robot/a, but for the first."""
+    for number in range(OUTSTANDING):
+        ask = Ask(f"q{number}", f"q{number}", NEEDS, 0, Decimal(60))
+        await client.mesh.ask_one(client.mesh.keys.schedule(client.mesh.me), ask, Notice, timeout=HANG)
+
+
+def each(wall: Client, bob: Client, eve: Client) -> dict[str, Coroutine[Any, Any, None]]:
+    """Floods by a viewer and two clients, the second with a crowd."""
+    keys = wall.mesh.keys
+    dry_run, again = Foresee("dry", "dry", NEEDS, 0, Decimal(60)), Ask("q1", "q1", NEEDS, 0, Decimal(60))
+    return {
+        "rcm/state": flood(wall, keys.ask_state(wall.mesh.me), StateAsk(arc="q1", forecast=True), RcmState),
+        "rcm/bookings": flood(wall, keys.ask_bookings(wall.mesh.me), BookingsAsk(), BookingsTold),
+        "balancer/rank": flood(wall, keys.ask_rank(wall.mesh.me), RankAsk(reports=True), HostRanking),
+        "dry runs": flood(bob, keys.schedule(bob.mesh.me), dry_run, Foresight),
+        "requests asked again": flood(eve, keys.schedule(eve.mesh.me), again, Notice),
+    }
+
+
 @asynccontextmanager
 async def floods(lab: ClosedLab) -> AsyncIterator[None]:
     """Of questions, dry runs and asks, by three people, about robot/a."""
     wall, bob, eve = [await lab.person(name) for name in ("wall", "bob", "eve")]
     await lab.ready(eve, "robot/a")
-    keys, needs = wall.mesh.keys, {"robot/a": dict[str, Decimal]()}
-    for number in range(OUTSTANDING):
-        ask = Ask(f"q{number}", f"q{number}", needs, 0, Decimal(60))
-        await eve.mesh.ask_one(keys.schedule(eve.mesh.me), ask, Notice, timeout=HANG)
-    dry_run = Foresee("dry", "dry", needs, 0, Decimal(60))
-    tasks = [
-        asyncio.create_task(task)
-        for task in (
-            flood(wall, keys.ask_state(wall.mesh.me), StateAsk(arc="q1", forecast=True), RcmState),
-            flood(wall, keys.ask_bookings(wall.mesh.me), BookingsAsk(), BookingsTold),
-            flood(wall, keys.ask_rank(wall.mesh.me), RankAsk(reports=True), HostRanking),
-            flood(bob, keys.schedule(bob.mesh.me), dry_run, Foresight),
-            flood(eve, keys.schedule(eve.mesh.me), Ask("q1", "q1", needs, 0, Decimal(60)), Notice),
-        )
-    ]
+    await crowd(eve)
+    tasks = [asyncio.create_task(task) for task in each(wall, bob, eve).values()]
     try:
         yield
         assert not any(task.done() for task in tasks)

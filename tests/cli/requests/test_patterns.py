@@ -150,7 +150,7 @@ def test_why_tells_of_all_that_match(fleet: CliFleet) -> None:
 def test_a_dry_run_and_a_take_by_pattern(fleet: CliFleet) -> None:
     at_once = fleet.zscout("request", ANY, ANY, "--dry-run")
     assert (at_once.returncode, at_once.stdout) == (0, "request would start at once\n")
-    never = fleet.zscout("request", ANY, ANY, ANY, "--dry-run", "--json")
+    never = fleet.zscout("request", ANY, ANY, ANY, "--wait-for-device", "--dry-run", "--json")
     assert never.returncode == 1
     assert "no device on the mesh is left for framegrabber/*" in json.loads(never.stdout)["reason"]
 

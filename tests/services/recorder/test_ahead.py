@@ -131,7 +131,7 @@ def test_no_outline_covers_another_or_leaves_the_chart(found: list[tuple[str, in
 def test_hostile_names_are_tamed() -> None:
     layers = chart([bar("robot/\x1b[31m" + "x" * 99, 1, 20, "one\ntwo \u65e5" + "y" * 200)], NOW, TODAY)
     ((row,), (text,), (told,)) = (texts(layers, layer) for layer in ("names", "labels", "dates"))
-    assert row == f"robot/[31m{'x' * 19}…"
+    assert row == f"robot/ [31m{'x' * 18}…"
     assert (told[:10], len(told)) == ("one two ?y", 120)
     assert text.startswith("one two ?y")
     assert text.endswith("…")

@@ -1,4 +1,4 @@
-"""Checks of what a recorder answers on the mesh, before `zscout view` shows it: only a recorder of this host counts.
+"""Checks of a recorder's answer, before `zscout view` shows its recording: only a recorder of this host counts.
 
 Any sender may name a file and an address. Both must exist here, and belong to one local user or to root."""
 
