@@ -20,7 +20,6 @@ from zscout.behaviors.client.client import CommandRefused
 from zscout.messages import RcmState
 
 pytestmark = pytest.mark.live
-ON_BOTH_FLEETS = True
 
 ANY, MORE = "framegrabber/*", "framegrabber/*#2"
 BOTH = ["framegrabber/f1", "framegrabber/f2"]

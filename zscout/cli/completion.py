@@ -130,6 +130,7 @@ async def shown(mesh: Mesh, _parameter: str) -> Iterable[str]:
 
 @_on_mesh
 async def _fleet_kinds(mesh: Mesh, _parameter: str) -> Iterable[str]:
+    from zscout.cli import common
     from zscout.messages import ComponentList, ListComponents
 
     replies = await common.ask_nodes(mesh, ListComponents(), ComponentList, LOOK)
