@@ -407,7 +407,7 @@ class BookingPromises:
         them. Returns what there was of what."""
         ((host, rcm),) = leaders.items()
         time = self._inside(host, lambda: rcm.bookings.dates.time)
-        views = {view.id: view for view in self._inside(host, rcm.bookings.handler.views)}
+        views = {view.id: view for view in self._inside(host, lambda: rcm.bookings.handler.views())}
         records = self._keepers[host].records
         for fact in self.facts.values():
             life = self.lives[fact.booking]

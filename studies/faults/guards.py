@@ -46,6 +46,7 @@ from zscout.services.rcm.booking_sharing import BookingSharing
 from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.election import Election
+from zscout.services.rcm.rcm import Rcm
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
 
 ABSENT: Final = object()
@@ -316,14 +317,14 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "merged": Guard("what a host has is one source among all", {(records, "merged"): _believed}),
         "copied": Guard("a booking is acknowledged when another host has it", {(BookingSharing, "keep"): _keep_later}),
         "caught up": Guard(
-            "who comes later is told all", {(Bookings, "_on_token"): _nothing, (BookingSharing, "_behind"): NEVER}
+            "who comes later is told all", {(BookingSharing, "_on_token"): _nothing, (BookingSharing, "_behind"): NEVER}
         ),
         "late": Guard("a late publication turns no clock back", {(BookingKeeper, "hear"): _hear_any}),
         "fleet time": Guard("a leader goes on in the time of the fleet", {(bookings, "_time"): _own_wall}),
         "slewed": Guard("fleet time does not jump in a reign", {(FleetClock, "_slewed"): _jumps}),
         "dates first": Guard(
             "a leader knows of all dates before it grants",
-            {(Bookings, "recovered"): _none_recovered, (Bookings, "enter"): _do_nothing},
+            {(Bookings, "recovered"): _none_recovered, (Rcm, "enter"): _do_nothing},
         ),
         "one stands": Guard("of two bookings that can't both be one stands", {(Calendar, "_obstacle"): _no_obstacle}),
         "awaited": Guard("who has taken up a date does not begin before it", {(BookedDates, "dated"): _undated}),

@@ -23,7 +23,7 @@ from tests.live.lab import Lab
 from zscout.behaviors.client.request import CommandRefused, OpenArc
 from zscout.config.node import load_node
 from zscout.node import run_node
-from zscout.rcm.step import Reply
+from zscout.rcm.booked import Answer
 from zscout.services.rcm.rcm import Rcm
 from zscout.types import Grant
 
@@ -41,7 +41,7 @@ async def node(file: Path) -> None:
     flag = file.with_suffix(".dies")
     answer_grants = Rcm._answer_grants
 
-    def then_dies(self: Rcm, granted: Sequence[Reply]) -> None:
+    def then_dies(self: Rcm, granted: Sequence[Answer]) -> None:
         answer_grants(self, granted)
         if granted and flag.exists():
             flag.unlink()

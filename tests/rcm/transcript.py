@@ -46,9 +46,10 @@ from zscout.messages import (
     RcState,
     Release,
 )
-from zscout.rcm import step
+from zscout.rcm import steps
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
+from zscout.rcm.booked import BookingWork
 from zscout.rcm.devices import ExpectedDevices
 from zscout.rcm.door import Door
 from zscout.rcm.leader import Leader
@@ -66,7 +67,15 @@ OPTIONS = ("priority", "runtime", "remaining", "place", "grant", "rcs")
 
 
 class NoBookings:
-    settled, settles_at, time, age = True, 0, None, 0.0
+    settled, settles_at, time, age, next = True, 0, None, 0.0, None
+
+    def at(self, _now: Ns) -> NoBookings:
+        return self
+
+    def note(self, *_: Any, **__: Any) -> BookingWork:
+        return BookingWork()
+
+    operation = again = kept = shared = tick = note
 
     def take_up(self, ask: Ask, _sender: Any) -> str:
         return ask.booking
@@ -120,7 +129,7 @@ class LeaderPlayer:
         self.keys, self.leader = keys, Leader(fleet, core, self.admission, roster, door, NoBookings(), None)
 
     def batch(self, line: str) -> list[str]:
-        stimuli = list[step.Stimulus]()
+        stimuli = list[steps.Stimulus]()
         for command in line.split(";"):
             words = command.split()
             while words and words[0] == "at":
@@ -140,7 +149,7 @@ class LeaderPlayer:
 
     # In
 
-    def _stimuli(self, name: str, *words: str) -> list[step.Stimulus]:
+    def _stimuli(self, name: str, *words: str) -> list[steps.Stimulus]:
         what, rest = list(words), list(words[1:])
         match name:
             case "secured":
@@ -150,17 +159,17 @@ class LeaderPlayer:
             case "lists":
                 self.lists.append(self._requests(*what))
             case "lead":
-                return [step.Lead(take_over(self.states, self.lists, self.now, self.admission))]
+                return [steps.Lead(take_over(self.states, self.lists, self.now, self.admission))]
             case "come" | "gone":
-                return [step.Seen(self._token(*what), name == "come")]
+                return [steps.Seen(self._token(*what), name == "come")]
             case "promise":
                 state = structs.replace(self._state(*what), term=OWN)
-                return [step.Answered(self.open.pop((Why.PROMISE, what[0])), state)]
+                return [steps.Answered(self.open.pop((Why.PROMISE, what[0])), state)]
             case "requests":
-                return [step.Answered(self.open.pop((Why.REQUESTS, what[0])), self._requests(*what))]
+                return [steps.Answered(self.open.pop((Why.REQUESTS, what[0])), self._requests(*what))]
             case "state":
                 state = structs.replace(self._state(*what), term=OWN, seq=self.leader.seq)
-                return [step.Reported(self.keys.rc_state(what[0]), state)]
+                return [steps.Reported(self.keys.rc_state(what[0]), state)]
             case "ask":
                 return [self._asked(what[0], self._ask(*rest))]
             case "release":
@@ -168,12 +177,12 @@ class LeaderPlayer:
             case "handover":
                 return [self._asked(what[0], HandOver(what[1], what[2]))]
             case "vote":
-                return [step.Happened([Vote(int(what[0]), what[1] == "yes")])]
+                return [steps.Happened([Vote(int(what[0]), what[1] == "yes")])]
             case "dates":
-                return [step.Happened([Dates(tuple(map(self._date, what)))])]
+                return [steps.Happened([Dates(tuple(map(self._date, what)))])]
             case "reload":
                 self.authority.reload(structs.replace(self.fleet, access=_access(what)))
-                return [step.Reloaded()]
+                return [steps.Reloaded()]
             case "wait":
                 pass
             case _:
@@ -213,9 +222,9 @@ class LeaderPlayer:
         wanted = {need: dict[str, Decimal]() for need in needs.split(",")}
         return kind(id=id_, arc=id_, needs=wanted, min_runtime=Decimal(more.get("runtime", "60")), **known)
 
-    def _asked(self, client: str, operation: Any) -> step.Asked:
+    def _asked(self, client: str, operation: Any) -> steps.Asked:
         self.tickets.append(f"{client} {type(operation).__name__.lower()} {operation.id}")
-        return step.Asked(len(self.tickets), client_of(client), operation)
+        return steps.Asked(len(self.tickets), client_of(client), operation)
 
     def _date(self, text: str) -> Booking:
         id_, need, start, runtime, priority = text.split(":")
@@ -223,7 +232,7 @@ class LeaderPlayer:
 
     # Out
 
-    def _told(self, out: step.Outbox) -> Iterator[str]:
+    def _told(self, out: steps.Outbox) -> Iterator[str]:
         for ticket, message in out.at_once:
             yield f"at once {self.tickets[ticket - 1]}: {_answer(message)}"
         for word, _ in out.higher:

@@ -16,63 +16,32 @@ from zscout import messages
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import BadName, Role
 from zscout.messages import Refused
+from zscout.rcm import steps
 from zscout.rcm.admission import Admission
+from zscout.rcm.booked import NO_WORK, Again, Booked, BookingWork
 from zscout.rcm.door import Door
-from zscout.rcm.operations import Booked, Operations, Taken
+from zscout.rcm.operations import Operations, Taken
 from zscout.rcm.places import arc_id, request_id
 from zscout.rcm.recovery import RecoveredState, listed_by, removed, vouched
 from zscout.rcm.request_log import REMEMBERED, RequestLog, reason_info
 from zscout.rcm.roster import MAX_TOKENS, Change, Roster, discrepancies
 from zscout.rcm.state_view import holders_of
-from zscout.rcm.step import (
-    Answered,
-    Asked,
-    Found,
-    Happened,
-    Lead,
-    Outbox,
-    Proposed,
-    Reloaded,
-    Reported,
-    Seen,
-    Shunned,
-    Stalled,
-    Stimulus,
-)
+from zscout.scheduling import model
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import (
-    Adopted,
-    ArcRequest,
-    ClientLost,
-    Dropped,
-    Effect,
-    Event,
-    Granted,
-    HandedOver,
-    HoldEnded,
-    LeadTaken,
-    Outcome,
-    PlaceShown,
-    Propose,
-    RcReported,
-    RecoveredHold,
-    Released,
-    Requested,
-    Tick,
-    Vouched,
-    WakeAt,
-)
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.types import SECOND, ArcId, ClientId, Ns, RcName
 
 CHARGED_EVERY: Final[Ns] = 10 * SECOND
 """From one publication of what groups had to the next: what is lost with a leader."""
-KEPT: Final[Mapping[Outcome, Ns]] = MappingProxyType(
-    {Outcome.RELEASED: 0, Outcome.CANCELLED: 0, Outcome.CLIENT_LOST: 86_400 * SECOND}
+KEPT: Final[Mapping[model.Outcome, Ns]] = MappingProxyType(
+    {model.Outcome.RELEASED: 0, model.Outcome.CANCELLED: 0, model.Outcome.CLIENT_LOST: 86_400 * SECOND}
 )
 """For how long a client may ask again for the place of what ended so; else it is for as long as that is known."""
-CONTINUED: Final = (LeadTaken, Adopted, Vouched, HandedOver)
+CONTINUED: Final = (model.LeadTaken, model.Adopted, model.Vouched, model.HandedOver)
 """Events by which holds that stand go on: the RCs hear of that before anybody else."""
+
+
+BOOKINGS: Final = (messages.Book, messages.Unbook, messages.FindSlots)
 
 
 class _Compare(NamedTuple):
@@ -102,6 +71,16 @@ class _Resume(NamedTuple):
     """RCs are no longer pending."""
 
 
+class _Booking(NamedTuple):
+    """An operation on bookings, once the core is at the present time."""
+
+    asked: steps.Asked
+
+
+class _BookingsDue(NamedTuple):
+    """The bookings' deadlines are over."""
+
+
 class _Due(NamedTuple):
     """Deadlines are over."""
 
@@ -110,7 +89,9 @@ class _Tick(NamedTuple):
     """The core's time is over; reasons and lines of the log may be due."""
 
 
-_Work: TypeAlias = Stimulus | _Compare | _Name | _Listed | _NewClient | _Resume | _Due | _Tick
+_Work: TypeAlias = (
+    steps.Stimulus | _Compare | _Name | _Listed | _NewClient | _Resume | _Booking | Again | _BookingsDue | _Due | _Tick
+)
 
 
 class Leader:
@@ -130,6 +111,8 @@ class Leader:
         self._bookings, self.term = bookings, admission.places.term
         self.registry = RequestLog(core, roster, admission.places, runtimes)
         self.operations = Operations(fleet, core, self.registry, roster, admission, door, bookings, runtimes)
+        self._parts = roster, self.registry, self.operations, bookings
+        """All that has deadlines."""
         self.seq = 0
         """The last number that was published."""
         self.published: Ns = 0
@@ -147,18 +130,19 @@ class Leader:
         """What is due waits among the stimuli."""
         self._core_wake: Ns | None = None
         self._now: Ns = 0
-        self._out = Outbox()
+        self._out = steps.Outbox()
 
-    def step(self, now: Ns, stimuli: Iterable[Stimulus] = ()) -> Outbox:
+    def step(self, now: Ns, stimuli: Iterable[steps.Stimulus] = ()) -> steps.Outbox:
         """One instant: of what waits, as much as is decided together."""
-        self._now, self._out = now, Outbox()
+        self._now, self._out = now, steps.Outbox()
+        self._bookings.at(now)
         self._queue.extend(stimuli)
         if self._wake is not None and self._wake <= now and not self._waking:
             self._waking = True
             self._queue.append(_Due())
         if (events := self._next()) is not None:
             self._decide(events)
-        times = (self._core_wake, self.roster.next, self.registry.next, self.operations.next)
+        times = [self._core_wake, *[part.next for part in self._parts]]
         self._out.wake = self._wake = min([at for at in times if at is not None], default=None)
         self._out.more = bool(self._queue)
         return self._out
@@ -169,11 +153,15 @@ class Leader:
 
     # In: the events of the next instant
 
-    def _next(self) -> Sequence[Event] | None:
+    def _next(self) -> Sequence[model.Event] | None:
         """The events of the next instant; None: there is none to decide."""
         operations, queue = self.operations, self._queue
-        while queue and isinstance(asked := queue[0], Asked) and operations.joins(asked):
+        while queue and isinstance(asked := queue[0], steps.Asked) and operations.joins(asked):
             queue.popleft()
+            if isinstance(asked.operation, BOOKINGS):
+                self._follow(self.roster.heard(self._now, str(asked.sender)))
+                queue.appendleft(_Booking(asked))
+                return [model.Tick()]
             self._take(operations.take(self._now, asked))
             if isinstance(asked.operation, (messages.HandOver, messages.Foresee)):
                 break
@@ -182,26 +170,37 @@ class Leader:
                 return self._events(queue.popleft())
         return operations.events() or None
 
-    def _events(self, work: _Work) -> Sequence[Event] | None:
+    def _events(self, work: _Work) -> Sequence[model.Event] | None:
         match work:
-            case Seen(token, alive):
+            case steps.Seen(token, alive):
                 token_moved = self.roster.client_token if token.role == Role.CLIENT else self.roster.rc_token
                 return self._follow(token_moved(self._now, token, alive=alive))
-            case Reported(key, state):
+            case steps.Reported(key, state):
                 return self._follow(self.roster.rc_state(self._now, key, state))
-            case Answered(question, message, problem):
+            case steps.Answered(question, message, problem):
                 return self._follow(self.roster.answered(self._now, question, message, problem))
-            case Found(question, tokens):
+            case steps.Found(question, tokens):
                 return self._follow(self.roster.seen(self._now, question, tokens))
-            case Happened(events):
+            case steps.Happened(events):
                 return events
-            case Shunned(token, until):
+            case steps.Shunned(token, until):
                 return self._follow(self.roster.shun(self._now, token, until))
-            case Stalled(length, ended, fresh):
+            case steps.Stalled(length, ended, fresh):
                 self.roster.stalled(length, ended, fresh=fresh)
-            case Reloaded():
+            case _Booking(asked):
+                return self._booked(self._bookings.operation(*asked))
+            case Again():
+                return self._booked(self._bookings.again(work))
+            case steps.Kept(keep, why):
+                return self._booked(self._bookings.kept(keep, why))
+            case steps.Shared(news):
+                return self._booked(self._bookings.shared(news=news))
+            case _BookingsDue():
+                self._waking = False
+                return self._booked(self._bookings.tick())
+            case steps.Reloaded():
                 return self._reload()
-            case Lead(recovered):
+            case steps.Lead(recovered):
                 self._lead(recovered)
             case _Compare(state):
                 return self._compare(state)
@@ -229,7 +228,7 @@ class Leader:
         for change in taken.changes:
             self._follow(change)
 
-    def _follow(self, change: Change) -> Sequence[Event]:
+    def _follow(self, change: Change) -> Sequence[model.Event]:
         """The events of what follows for the roster; all else is done, or put before what waits."""
         out = self._out
         out.higher += change.higher
@@ -253,7 +252,20 @@ class Leader:
             self._queue.extendleft(reversed(later))
         return change.events
 
-    def _tick(self) -> Sequence[Event]:
+    def _booked(self, work: BookingWork) -> Sequence[model.Event]:
+        """The events of what follows for bookings; all else is done, or put before what waits."""
+        out = self._out
+        out.answers += work.answers
+        out.proposals += [steps.Proposed(asked.rc, self._proposal(asked)) for asked in work.proposals]
+        out.keep += work.keep
+        out.changed += work.changed
+        out.dangers += work.dangers
+        out.log += work.log
+        out.strange += work.strange
+        self._queue.extendleft(reversed(work.again))
+        return work.events
+
+    def _tick(self) -> Sequence[model.Event]:
         answers, again = self.operations.tick(self._now)
         self._out.at_once += answers
         self._queue.extendleft(reversed([_Tick(), *again]))
@@ -262,25 +274,28 @@ class Leader:
         return ()
 
     def _reports(self) -> None:
-        self._waking = False
+        due = self._bookings.next
+        self._waking = due is not None and due <= self._now
+        if self._waking:
+            self._queue.appendleft(_BookingsDue())
         if self._core_wake is not None and self._core_wake <= self._now:
-            self._decide([Tick()])
+            self._decide([model.Tick()])
         notices, text = self.registry.tick(self._now)
         self._out.notices += notices
         self._out.log += [text] if text else []
 
-    def _reload(self) -> Sequence[Event]:
+    def _reload(self) -> Sequence[model.Event]:
         """The rights have changed: who has none any more holds and waits for nothing."""
         self.core.policy = self._admission.authority.bound(self._fleet.scheduling)
         known = filter(None, map(self.core.arc, self.core.arcs()))
-        return [Tick(), *removed((arc.request for arc in known), self._admission)]
+        return [model.Tick(), *removed((arc.request for arc in known), self._admission)]
 
     def _lead(self, recovered: RecoveredState) -> None:
         """Begin with what was recovered."""
         now, registry, places = self._now, self.registry, self._admission.places
         joined = self.roster.start(now, recovered.rcs.values(), recovered.pending, patient=recovered.patient)
         for arc in recovered.given_up:
-            registry.give_up(now, arc, Outcome.RELEASED)
+            registry.give_up(now, arc, model.Outcome.RELEASED)
         requests = [hold.request for hold in recovered.holds] + [asked.request for asked in recovered.waiting]
         for request in requests:
             registry.enter(request.arc, request.name)
@@ -292,7 +307,7 @@ class Leader:
         bookings = self._bookings
         waiting = tuple(replace(asked, request=bookings.dated(asked.request)) for asked in recovered.waiting)
         certain = 0 if bookings.settled else bookings.settles_at
-        lead = LeadTaken(self.term, tuple(recovered.holds), waiting, recovered.charged, certain)
+        lead = model.LeadTaken(self.term, tuple(recovered.holds), waiting, recovered.charged, certain)
         booked = bookings.recovered({request.booking for request in requests if request.booking} | recovered.booked)
         gone = removed((hold.request for hold in recovered.holds), self._admission)
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
@@ -303,52 +318,52 @@ class Leader:
             if (expecting := recovered.expected.get(request_id(arc))) is not None:
                 places.admit(arc, expecting)
 
-    def _compare(self, state: messages.RcState) -> Sequence[Event] | None:
+    def _compare(self, state: messages.RcState) -> Sequence[model.Event] | None:
         """Makes an RC and the core agree: what the RC lost has ended, what is too much there is revoked."""
         rc = state.rc
         current = state.term == self.term and state.seq >= self._named.get(rc, 0)
         ended, superfluous = discrepancies(state, self.core.holders(rc), self._now, current=current)
         if superfluous:
             self._queue.appendleft(_Name([rc]))
-        return [RcReported(rc, ended)] if ended else None
+        return [model.RcReported(rc, ended)] if ended else None
 
-    def _on_requests(self, answer: messages.ClientRequests) -> Sequence[Event]:
+    def _on_requests(self, answer: messages.ClientRequests) -> Sequence[model.Event]:
         """What RCs alone reported, and a client does not ask for, it gave up where no RCM heard of it; else its own
         word is the one that counts."""
         known = self._recovered.pop(answer.client, set()) & {*self.core.arcs_of(answer.client)}
         listed = {asked.id: asked for asked in answer.requests[: self._fleet.limits.max_requests_per_client]}
-        events = list[Event]()
+        events = list[model.Event]()
         for arc in filter(None, map(self.core.arc, sorted(known))):
             if (request := listed.get(request_id(arc.id))) is None:
-                events.append(Released(arc.id))
+                events.append(model.Released(arc.id))
             elif not arc.vouched:
                 try:
                     own = listed_by(answer.client, request, self._admission, self._bookings.record)
                     events.append(vouched(arc, own, self._admission))
                 except (Refused, BadName) as error:
                     self._out.strange.append((answer.client, f"{answer.client} lists what can't be: {error}"))
-                    events.append(Released(arc.id, f"the leader, as it is no valid request: {error}"))
+                    events.append(model.Released(arc.id, f"the leader, as it is no valid request: {error}"))
         return events
 
-    def _recover(self, request: ArcRequest) -> None:
+    def _recover(self, request: model.ArcRequest) -> None:
         """Has a client say whether it still asks for what RCs hold for it."""
         self._recovered.setdefault(request.client, set()).add(request.arc)
         self._follow(self.roster.ask_requests(self._now, request.client))
 
     # Out: one instant
 
-    def _decide(self, events: Sequence[Event], named: Collection[RcName] | None = None) -> None:
+    def _decide(self, events: Sequence[model.Event], named: Collection[RcName] | None = None) -> None:
         """RCs that are `named` are published, whatever becomes of them."""
         for event in events:
-            if isinstance(event, ClientLost):
+            if isinstance(event, model.ClientLost):
                 self._recovered.pop(event.client, None)
         if named is None and all(
-            isinstance(event, ClientLost) and not self.core.arcs_of(event.client) for event in events
+            isinstance(event, model.ClientLost) and not self.core.arcs_of(event.client) for event in events
         ):
             return  # a client that asked for nothing changes nothing
         now, out, registry, instant = self._now, self._out, self.registry, self.operations.instant
         over = registry.ended
-        events = [event for event in events if not (isinstance(event, Adopted) and over(event.held.request.arc))]
+        events = [event for event in events if not (isinstance(event, model.Adopted) and over(event.held.request.arc))]
         effects = self.core.handle(now, *events)
         out.events, out.effects = events, effects
         out.granted, notified = self.operations.granted(now, effects)
@@ -365,37 +380,41 @@ class Leader:
         out.notices += notices
         for effect in effects:
             match effect:
-                case Dropped(arc=arc, outcome=outcome) | HoldEnded(arc=arc, outcome=outcome) if not self.core.is_open(
-                    arc
+                case model.Dropped(arc=arc, outcome=outcome) | model.HoldEnded(arc=arc, outcome=outcome) if (
+                    not self.core.is_open(arc)
                 ):
                     self._admission.places.end(arc, now, KEPT.get(outcome, REMEMBERED))
-                case Propose():
-                    out.proposals.append(Proposed(effect.rc, self.proposal(effect)))
-                case WakeAt(at):
+                case model.Propose():
+                    out.proposals.append(steps.Proposed(effect.rc, self._proposal(effect)))
+                case model.WakeAt(at):
                     self._core_wake = at
+        if (work := self._bookings.note(events, effects)) is not NO_WORK:
+            self._booked(work)
         if line := self.core.strategy.log_line():
             out.log.append(line)
         out.over, registry.traced = registry.traced, []
 
-    def _note(self, events: Iterable[Event]) -> None:
+    def _note(self, events: Iterable[model.Event]) -> None:
         """What is remembered of an instant."""
         now = self._now
         for event in events:
             match event:
-                case Requested(ArcRequest(client=client)) | HandedOver(to=client):
+                case model.Requested(model.ArcRequest(client=client)) | model.HandedOver(to=client):
                     self.roster.expect(now, client)
             match event:
-                case Requested(request):
+                case model.Requested(request):
                     self._bind(request.arc)
                     asked = f"asked for {', '.join(sorted(request.needs))} at priority {request.priority}"
                     self.registry.record(now, request.arc, asked)
-                case PlaceShown(arc) | Vouched(ArcRequest(arc=arc)):
+                case model.PlaceShown(arc) | model.Vouched(model.ArcRequest(arc=arc)):
                     self._bind(arc)
-                case HandedOver(renamed=arc):
+                case model.HandedOver(renamed=arc):
                     self._bind(arc)
                     if (moved := self.core.arc(arc)) is not None and not moved.vouched:
                         self._recover(moved.request)
-                case Adopted(RecoveredHold(ArcRequest(client=client) as request)) if self.core.arc(request.arc):
+                case model.Adopted(model.RecoveredHold(model.ArcRequest(client=client) as request)) if self.core.arc(
+                    request.arc
+                ):
                     self._bind(request.arc)
                     self.registry.enter(request.arc, request.name)
                     if client not in self.roster.clients:
@@ -411,19 +430,19 @@ class Leader:
     # Out: grants and proposals
 
     def _publish(
-        self, effects: Iterable[Effect], rcs: Collection[RcName] | None = None, left: Collection[ArcId] = ()
+        self, effects: Iterable[model.Effect], rcs: Collection[RcName] | None = None, left: Collection[ArcId] = ()
     ) -> None:
         """Publishes all holders of the RCs that were granted or revoked, if any were and as far as they have joined;
         with `rcs` in any case, and those of `rcs` as well. `left`: ARCs whose programs are gone by their own client's
         word."""
-        changed = [effect for effect in effects if isinstance(effect, (Granted, HoldEnded))]
+        changed = [effect for effect in effects if isinstance(effect, (model.Granted, model.HoldEnded))]
         if not changed and rcs is None:
             return
         now = self._now
         revoked = [
             _revocation(effect, self.registry.name(effect.arc), now, left)
             for effect in changed
-            if isinstance(effect, HoldEnded)
+            if isinstance(effect, model.HoldEnded)
         ]
         number = self.core.seq if self.core.seq > self.seq else self.core.number()
         # One that has not joined holds what is not known here: to name it would end that.
@@ -435,13 +454,14 @@ class Leader:
         begun = [
             (effect.grant.seq, effect.waited / SECOND)
             for effect in changed
-            if isinstance(effect, Granted) and effect.waited is not None
+            if isinstance(effect, model.Granted) and effect.waited is not None
         ]
         self._out.publication = self._grants(number, holders, revoked, instances, begun)
 
     def heartbeat(self, now: Ns) -> messages.Grants:
         """Repeats the last number."""
         self._now = now
+        self._bookings.at(now)
         return self._grants(self.seq, {}, [], {}, [])
 
     def _grants(
@@ -459,7 +479,7 @@ class Leader:
         before, self.seq, self.published = self.seq, number, now
         return messages.Grants(self.term, number, before, every, rcs, revoked, instances, begun, time, age, charged)
 
-    def proposal(self, effect: Propose) -> messages.Proposal:
+    def _proposal(self, effect: model.Propose) -> messages.Proposal:
         arcs = ((name, self.core.arc(name), params) for name, params in effect.holders.items())
         holders = [
             messages.ProposedHolder(request_id(arc.id), arc.name, arc.request.client, messages.decimals(params))
@@ -470,7 +490,7 @@ class Leader:
         return messages.Proposal(proposal=effect.proposal, term=self.term, holders=holders)
 
 
-def _revocation(effect: HoldEnded, name: str, now: Ns, left: Collection[ArcId]) -> messages.Revocation:
+def _revocation(effect: model.HoldEnded, name: str, now: Ns, left: Collection[ArcId]) -> messages.Revocation:
     return messages.Revocation(
         id=request_id(effect.arc),
         arc=name,
@@ -481,5 +501,5 @@ def _revocation(effect: HoldEnded, name: str, now: Ns, left: Collection[ArcId]) 
         reason=str(effect.reason),
         by=effect.by,
         why=reason_info(effect.reason, now),
-        own=effect.outcome in (Outcome.RELEASED, Outcome.CANCELLED) and effect.arc in left,
+        own=effect.outcome in (model.Outcome.RELEASED, model.Outcome.CANCELLED) and effect.arc in left,
     )

@@ -8,79 +8,35 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 from msgspec.structs import replace
 
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import BadName, Sender, check_name, client_of
-from zscout.messages import (
-    Ask,
-    BookingRecord,
-    Cancel,
-    Foresee,
-    Foresight,
-    HandOver,
-    Notice,
-    Problem,
-    ProposedHolder,
-    Refused,
-    Release,
-)
+from zscout.messages import Ask, Cancel, Foresee, Foresight, HandOver, Notice, Problem, Refused, Release
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
+from zscout.rcm.booked import Answer, Booked, Ticket
 from zscout.rcm.deadlines import Deadlines
 from zscout.rcm.door import Door
 from zscout.rcm.places import arc_id, request_id
 from zscout.rcm.recovery import Listed, vouched
 from zscout.rcm.request_log import RequestLog, party_info, reason_info
 from zscout.rcm.roster import NOTHING, Change, Roster
-from zscout.rcm.step import Asked, Reply, Ticket
+from zscout.rcm.steps import Asked
 from zscout.rcm.terms import Source, Word
+from zscout.scheduling import model
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
-from zscout.scheduling.model import (
-    ArcRequest,
-    Cancelled,
-    Dropped,
-    Effect,
-    Event,
-    Granted,
-    HandedOver,
-    Outcome,
-    PlaceShown,
-    Queued,
-    Reachable,
-    Released,
-    Requested,
-    Unconfirmed,
-)
 from zscout.scheduling.reason import Party, person
 from zscout.scheduling.runtimes import RuntimeEstimator
-from zscout.types import SECOND, ArcId, ClientId, Ns, Params, Place
+from zscout.types import SECOND, ArcId, ClientId, Ns, Place
 
 REPLY_SLACK: Final[Ns] = SECOND // 10
 """After an overdue vote the first answer is given all the same."""
 MAX_BATCH = 64
 """Operations that are decided together at most."""
-
-
-class Booked(Protocol):
-    """The bookings of the term."""
-
-    @property
-    def settled(self) -> bool: ...
-    @property
-    def settles_at(self) -> Ns: ...
-    @property
-    def time(self) -> float | None: ...
-    @property
-    def age(self) -> float: ...
-    def take_up(self, ask: Ask, sender: Sender) -> str: ...
-    def dated(self, request: ArcRequest) -> ArcRequest: ...
-    def record(self, booking: str) -> BookingRecord | None: ...
-    def recovered(self, taken: Collection[str]) -> list[Event]: ...
-    def proposed(self, name: ArcId, params: Params) -> ProposedHolder: ...
 
 
 class _Due(Enum):
@@ -100,7 +56,7 @@ class _Standing(NamedTuple):
 class Taken:
     """What follows at once from operations: the rest once the instant is decided."""
 
-    answers: list[Reply] = field(default_factory=list)
+    answers: list[Answer] = field(default_factory=list)
     notices: list[Notice] = field(default_factory=list)
     changes: list[Change] = field(default_factory=list)
     strange: list[tuple[str, str]] = field(default_factory=list)
@@ -111,9 +67,9 @@ class _Instant:
     """Operations that are gathered for one instant."""
 
     touched: set[ArcId] = field(default_factory=set)
-    ended: list[Cancelled | Released] = field(default_factory=list)
-    shown: list[Event] = field(default_factory=list)
-    asked: list[Requested] = field(default_factory=list)
+    ended: list[model.Cancelled | model.Released] = field(default_factory=list)
+    shown: list[model.Event] = field(default_factory=list)
+    asked: list[model.Requested] = field(default_factory=list)
     standing: list[_Standing] = field(default_factory=list)
     moved: tuple[Ticket, list[ArcId]] | None = None
     """A hand-over: it is alone."""
@@ -197,7 +153,7 @@ class Operations:
         taken, self._taken = self._taken, Taken()
         return taken
 
-    def events(self) -> list[Event]:
+    def events(self) -> list[model.Event]:
         """The events of the instant: first ends, then what is asked."""
         return [*self.instant.ended, *self.instant.shown, *self.instant.asked]
 
@@ -223,9 +179,9 @@ class Operations:
     def next(self) -> Ns | None:
         return self._deadlines.next
 
-    def tick(self, now: Ns) -> tuple[list[Reply], list[Asked]]:
+    def tick(self, now: Ns) -> tuple[list[Answer], list[Asked]]:
         """First answers that are due, and operations to be looked at again."""
-        answers, again = list[Reply](), list[Asked]()
+        answers, again = list[Answer](), list[Asked]()
         while (due := self._deadlines.pop_due(now)) is not None:
             match due:
                 case _Due.FIRST_ANSWER, arcs:
@@ -236,23 +192,23 @@ class Operations:
 
     # Out: the instant is decided
 
-    def granted(self, now: Ns, effects: Iterable[Effect]) -> tuple[list[Reply], set[ArcId]]:
+    def granted(self, now: Ns, effects: Iterable[model.Effect]) -> tuple[list[Answer], set[ArcId]]:
         """The answers to those whose ARCs an instant has granted, before anybody else learns of it; and those ARCs."""
         arcs = {
             effect.arc: None
             for effect in effects
-            if isinstance(effect, Granted) and effect.arc in self.waiting and self.core.is_running(effect.arc)
+            if isinstance(effect, model.Granted) and effect.arc in self.waiting and self.core.is_running(effect.arc)
         }
         return self._answers(now, arcs), {*arcs}
 
-    def decided(self, now: Ns, effects: Iterable[Effect]) -> tuple[list[Reply], list[Notice]]:
+    def decided(self, now: Ns, effects: Iterable[model.Effect]) -> tuple[list[Answer], list[Notice]]:
         """The other answers that an instant has decided, and what new clients of ARCs are to know."""
-        answers, notices = list[Reply](), list[Notice]()
+        answers, notices = list[Answer](), list[Notice]()
         for effect in effects:
             match effect:
-                case Granted(arc=arc) | Dropped(arc=arc):
+                case model.Granted(arc=arc) | model.Dropped(arc=arc):
                     answers += self._answers(now, [arc])
-                case Queued(arc=arc, settled=True) if self.core.is_queued(arc):
+                case model.Queued(arc=arc, settled=True) if self.core.is_queued(arc):
                     answers += self._answers(now, [arc])
         done, self.instant = self.instant, _Instant()
         answers += self._answers(now, [event.arc for event in done.ended])
@@ -267,8 +223,8 @@ class Operations:
             self._deadlines.set(now + self._first_answer, (_Due.FIRST_ANSWER, undecided))
         return answers, notices
 
-    def _answers(self, now: Ns, arcs: Iterable[ArcId]) -> list[Reply]:
-        answers = list[Reply]()
+    def _answers(self, now: Ns, arcs: Iterable[ArcId]) -> list[Answer]:
+        answers = list[Answer]()
         for arc in arcs:
             if tickets := self.waiting.pop(arc, None):
                 notice = self._registry.notice(now, arc)
@@ -314,15 +270,15 @@ class Operations:
         """The ARC is open: the answer is how it stands, once what its client shows is known."""
         instant = self.instant
         self._registry.enter(arc, ask.arc, estimate=ask.estimate)
-        place, known, shown = self._own_place(ask, client), self.core.arc(arc), list[Event]()
+        place, known, shown = self._own_place(ask, client), self.core.arc(arc), list[model.Event]()
         if known is not None and not known.vouched:
             shown.append(vouched(known, Listed(self._admission.form(ask, sender), place), self._admission))
         elif place is not None:
-            shown.append(PlaceShown(arc, place))
+            shown.append(model.PlaceShown(arc, place))
         if ask.grant is not None and ask.unconfirmed:
-            shown.append(Unconfirmed(arc, ask.grant, tuple(sorted(ask.unconfirmed))))
+            shown.append(model.Unconfirmed(arc, ask.grant, tuple(sorted(ask.unconfirmed))))
         if ask.reachable:
-            shown.append(Reachable(arc))
+            shown.append(model.Reachable(arc))
         if shown:
             instant.touched.add(arc)
             instant.shown += shown
@@ -343,7 +299,7 @@ class Operations:
             self._door.check(self._now, ask.needs, waits=ask.wait_for_device)
         self._registry.enter(arc, ask.arc, estimate=ask.estimate)
         instant.touched.add(arc)
-        instant.asked.append(Requested(request, place, since))
+        instant.asked.append(model.Requested(request, place, since))
         if self._may_hold(arc, ask):
             # It ends what it began under that grant before anybody is asked for a vote.
             instant.standing.append(_Standing(ticket, arc, ask))
@@ -352,7 +308,7 @@ class Operations:
             before = arc_id(client, ask.was)
             if self.core.is_open(before):
                 instant.touched.add(before)
-                instant.ended.append(Released(before, f"its client, which asks for it as {ask.id}"))
+                instant.ended.append(model.Released(before, f"its client, which asks for it as {ask.id}"))
         self.waiting.setdefault(arc, []).append(ticket)
 
     def _own_place(self, ask: Ask, client: ClientId) -> Place | None:
@@ -403,9 +359,9 @@ class Operations:
             if operation.left:
                 instant.left.add(arc)
             if not self.core.is_open(arc):
-                outcome = Outcome.CANCELLED if isinstance(operation, Cancel) else Outcome.RELEASED
+                outcome = model.Outcome.CANCELLED if isinstance(operation, Cancel) else model.Outcome.RELEASED
                 self._registry.give_up(self._now, arc, outcome)
-        event = Cancelled if isinstance(operation, Cancel) else Released
+        event = model.Cancelled if isinstance(operation, Cancel) else model.Released
         by = "" if owner == sender else person(authority.known_as(sender, operation.who), str(sender))
         instant.touched.add(arc)
         instant.ended.append(event(arc, by))
@@ -495,14 +451,16 @@ class Operations:
             self._registry.rename(move.arc, move.renamed)
         places = {move.renamed: place for move in moves if (place := self.core.place_of(move.arc)) is not None}
         shown = [
-            PlaceShown(arc, place) for arc, place in places.items() if self.core.place_of(arc) not in (None, place)
+            model.PlaceShown(arc, place)
+            for arc, place in places.items()
+            if self.core.place_of(arc) not in (None, place)
         ]
         instant = self.instant
         instant.shown += [*shown, *moves]
         instant.moved = ticket, [move.renamed for move in moves]
         instant.touched |= {move.arc for move in moves}
 
-    def _moves(self, operation: HandOver, sender: ClientId, to: ClientId) -> list[HandedOver]:
+    def _moves(self, operation: HandOver, sender: ClientId, to: ClientId) -> list[model.HandedOver]:
         """What a hand-over comes to: of the ARCs that it names, those that are open at the sender."""
         moves = []
         for name in dict.fromkeys((operation.id, *operation.others)):
@@ -514,7 +472,7 @@ class Operations:
             if taken is not None and (taken.request.needs != arc.request.needs or taken.place < arc.place):
                 # Else it is the same: its new client has asked for it, and could not prove that it has its place.
                 raise Refused("bad_request", f"{to} already has a request {name}; use random ids")
-            moves.append(HandedOver(arc.id, to, renamed))
+            moves.append(model.HandedOver(arc.id, to, renamed))
         return moves
 
     def _answer_handed_over(self, ticket: Ticket, operation: HandOver, sender: ClientId, to: ClientId) -> None:

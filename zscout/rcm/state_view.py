@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from msgspec.structs import replace
 
@@ -23,6 +23,22 @@ MAX_REASON: Final = 500
 """Characters of a veto's reason, and of a device's."""
 
 
+STATE_AGE: Final[Ns] = SECOND // 20
+"""An answer may be this old (rule 20): building it costs as much as many grants."""
+MAX_BUILT: Final = 4
+"""Answers of one kind that are built within STATE_AGE, where the state changes."""
+
+
+class _Built(NamedTuple):
+    """An answer, and after which batch of events it was built."""
+
+    state: messages.RcmState
+    encoded: bytes
+    batches: int
+    built: int
+    """How many were built within STATE_AGE."""
+
+
 class StateView:
     """Reads, and changes nothing."""
 
@@ -37,6 +53,25 @@ class StateView:
     ) -> None:
         self._me, self._core, self._roster, self._registry = me, core, roster, registry
         self._devices_known, self._runtimes = devices, runtimes
+        self._states: dict[messages.StateAsk, _Built] = {}
+        self._since: Ns = 0
+
+    def answer(self, asked: messages.StateAsk, seq: int, now: Ns) -> tuple[messages.RcmState, bytes | None]:
+        """The answer, and the same encoded where it is known."""
+        if asked.holds_only:
+            return self.state(asked, seq, now), None  # RCs reckon ends by it: never of an earlier instant
+        alike, batches = replace(asked, arc=None), self._core.batches
+        if now - self._since > STATE_AGE:
+            self._since = now
+            self._states.clear()
+        known = self._states.get(alike)
+        if known is None or (known.built < MAX_BUILT and known.batches != batches):
+            state = self.state(alike, seq, now)
+            built = 1 if known is None else known.built + 1
+            known = self._states[alike] = _Built(state, messages.encode(state), batches, built)
+        if asked.arc is None:
+            return known.state, known.encoded
+        return replace(known.state, story=self._registry.story(now, asked.arc)), None
 
     def state(self, asked: messages.StateAsk, seq: int, now: Ns) -> messages.RcmState:
         term = self._roster.term

@@ -350,7 +350,7 @@ async def test_records_and_fleet_time_are_taken_from_managers_only() -> None:
     await asyncio.sleep(2)
     assert {item.id for item in keeper.records} == {"forged", "his"}
     assert heir.rcm is not None
-    assert heir.rcm.bookings._sharing._behind is False
+    assert heir.rcm.sharing._behind is False
     token.close()
 
 

@@ -12,8 +12,7 @@ from tests.mesh.kit import until
 from tests.services.rcm.booked_fleet import NOON, BookedFleet, book, booked, dangers_at, do, led, states
 from tests.services.rcm.kit import Refusal, request
 from zscout.messages import BookingView, FindSlots, Release, SlotsTold, Unbook
-from zscout.scheduling.core import Core
-from zscout.services.rcm.bookings import Bookings
+from zscout.services.rcm.rcm import Rcm
 from zscout.types import Place, Term
 
 
@@ -193,7 +192,7 @@ async def test_who_took_up_a_date_that_its_leader_does_not_know_yet_waits_for_it
         told = await client.ask("mine", "robot/a", seconds=100, place=place, booking="late@1800000500")
         assert (told.state, told.reason) == ("queued", "the time of its booking is still to come")
     leader._keeper.records.take([replace(known, id="late", name="late", needs={"robot/a": {}})])
-    leader._keeper.on_shared()
+    leader._keeper.shared.set()
     await asyncio.sleep(1)
     assert states((await fleet.bookings())["late"]) == ["taken"]
     await asyncio.sleep(NOON + 501 - fleet.time())
@@ -234,13 +233,13 @@ async def test_what_is_no_booking_is_refused_in_one_line() -> None:
 async def test_a_candidate_that_sees_a_higher_term_while_dates_enter_leads_above_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    fleet, enter = BookedFleet("x"), Bookings.enter
+    fleet, enter = BookedFleet("x"), Rcm.enter
 
-    async def interrupted(bookings: Bookings, core: Core) -> None:
-        await enter(bookings, core)
+    async def interrupted(rcm: Rcm) -> None:
+        await enter(rcm)
         candidate._learn(Term(7, "other"))
 
-    monkeypatch.setattr(Bookings, "enter", interrupted)
+    monkeypatch.setattr(Rcm, "enter", interrupted)
     candidate = fleet.candidate("x")
     await asyncio.sleep(3)
     monkeypatch.undo()

@@ -56,16 +56,16 @@ async def test_fleet_time_does_not_jump_in_a_reign() -> None:
     await until(lambda: x.rcm)
     assert x.rcm is not None
     await until(lambda: x.rcm and x.rcm.bookings.settled)
-    dates = x.rcm.bookings.dates
-    assert dates.time == pytest.approx(fleet.time(), abs=0.1)
+    rcm = x.rcm
+    assert rcm.bookings.dates.time == pytest.approx(fleet.time(), abs=0.1)
     fleet.candidate("y"), fleet.candidate("z")
-    last, at = dates.time, fleet.time()
+    last, at = rcm.bookings.dates.time, fleet.time()
     for _ in range(1_500):
         await asyncio.sleep(1)
-        gone = dates.time - last
+        gone = rcm.bookings.dates.time - last
         assert 0.989 < gone / (fleet.time() - at) < 1.011
-        last, at = dates.time, fleet.time()
-    assert dates.time == pytest.approx(fleet.time() + 10, abs=0.1)
+        last, at = rcm.bookings.dates.time, fleet.time()
+    assert rcm.bookings.dates.time == pytest.approx(fleet.time() + 10, abs=0.1)
 
 
 async def test_what_changes_after_a_restart_of_all_counts_though_terms_begin_anew() -> None:

@@ -13,9 +13,8 @@ from tests.mesh.kit import until
 from tests.services.rcm.kit import FakeClient, FakeFleet, Refusal, fleet_of, grant_of
 from zscout.config.access import AccessPolicy, Quota, Roles
 from zscout.messages import Cancel, EndedHold, HandOver, Release
-from zscout.rcm.state_view import StateView
+from zscout.rcm.state_view import MAX_BUILT, StateView
 from zscout.scheduling.model import Adopted, ArcRequest, RcJoined, RecoveredHold
-from zscout.services.rcm.state_answers import MAX_BUILT
 from zscout.types import SECOND, Grant, Place, Term
 
 

@@ -107,7 +107,7 @@ class BookingKeeper:
         self._saving = asyncio.Lock()
         self._waiting = 0
         self._declared: list[Declaration] = []
-        self.on_shared: Callable[[], None] = lambda: None  # called when another leader shared new records
+        self.shared = asyncio.Event()  # set when another leader shared new records
         if disk is not None:
             self.records.take(disk.read())
             self._saved = self.records.digest()
@@ -199,7 +199,7 @@ class BookingKeeper:
         if query.message.time is not None:
             self.records.forget_old(query.message.time)
         if self.records.take(query.message.records):
-            self.on_shared()
+            self.shared.set()
         if self._disk is None or self.records.digest() == self._saved:
             query.answer(self.told(query.message.digest, durable=self._disk is not None))
             return

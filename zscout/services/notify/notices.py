@@ -9,10 +9,10 @@ from typing import Final, NamedTuple
 
 from zscout.config.notify import NotifyEvent
 from zscout.messages import LoadReport
+from zscout.rcm.booked import BookedDanger
 from zscout.scheduling.model import ArcRequest, Outcome
 from zscout.scheduling.reason import named
 from zscout.services.bookings.dates import zone_of
-from zscout.services.rcm.bookings import BookedDanger
 from zscout.services.rcm.digest import Began, Over
 from zscout.types import SECOND, HostName, Ns, RcName, clean, span
 

@@ -3,9 +3,8 @@ stands, then what was made earlier. The core judges them; records and views say 
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from functools import partial
 from operator import attrgetter
@@ -14,7 +13,6 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from zscout.keyexpr import check_need
-from zscout.mesh.sparse_log import SparseLog
 from zscout.messages import (
     MAX_AHEAD,
     WINDOW,
@@ -36,15 +34,12 @@ from zscout.scheduling.booking import (
     Dates,
 )
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import ArcRequest, Effect, Propose, Rc
+from zscout.scheduling.model import ArcRequest, Effect
 from zscout.scheduling.reason import Reason
-from zscout.scheduling.votes import HolderSet
 from zscout.services.bookings.dates import DAY, Repetition, told
 from zscout.services.bookings.fleet_clock import FleetClock
 from zscout.services.bookings.records import Records
 from zscout.types import SECOND, ArcId, Grant, Need, Ns, RcName
-
-log = logging.getLogger(__name__)
 
 MAX_CLAIMS = 4_000
 """Dates of all bookings that a leader keeps free: of what is repeated those of the next 60 days."""
@@ -86,22 +81,15 @@ class _Expanded(NamedTuple):
 
 
 class BookedDates:
-    """`emit` takes events of one instant, `vote` sends proposals, `changed` is told of records that are not as they
-    were."""
+    """`now`, on the host's clock, is set by the caller."""
 
-    def __init__(
-        self,
-        core: Core,
-        records: Records,
-        clock: FleetClock,
-        now: Callable[[], Ns],
-        emit: Callable[..., None],
-        vote: Callable[[Iterable[Propose]], None],
-        changed: Callable[[Iterable[BookingRecord]], None],
-    ) -> None:
-        self._core, self._records, self.clock, self._now = core, records, clock, now
-        self._emit, self._vote, self._changed = emit, vote, changed
-        self._strange = SparseLog(log, now)
+    def __init__(self, core: Core, records: Records, clock: FleetClock) -> None:
+        self._core, self._records, self.clock = core, records, clock
+        self.now: Ns = 0
+        self.changed: list[BookingRecord] = []
+        """Records that are not as they were, until the caller takes them."""
+        self.strange: list[tuple[str, str]] = []
+        """Warnings, each with its subject, until the caller takes them."""
         self._conflicts: dict[str, str] = {}
         """Dates that are not kept, with the one that stands; nothing where no RC of a pattern is free."""
         self._repetitions: dict[str, tuple[BookingRecord, Repetition]] = {}
@@ -110,14 +98,14 @@ class BookedDates:
         """Dates that the core knows of."""
         self._danger: dict[str, str] = {}
         """Why dates may not be kept, in words."""
-        self._dated_by: Ns = clock.at(now()) - now()
+        self._dated_by: Ns = clock.at(0)
         """By how much fleet time is ahead of the host's clock for all dates in the core, so that what follows upon
         another does so there as well."""
 
     @property
     def time(self) -> float:
         """Fleet time, in seconds since 1970 (UTC)."""
-        return self.clock.at(self._now()) / SECOND
+        return self.clock.at(self.now) / SECOND
 
     def local(self, instant: Instant) -> Ns:
         """When that is, on the core's clock."""
@@ -170,7 +158,7 @@ class BookedDates:
         try:
             return self._repetition(record).between(time - float(record.runtime), time + _ahead(record))
         except (ValueError, OverflowError) as error:
-            self._strange.warning(record.id, "booking %s is not kept: %s", record.id, error)
+            self.strange.append((record.id, f"booking {record.id} is not kept: {error}"))
             return None
 
     def _repetition(self, record: BookingRecord) -> Repetition:
@@ -186,7 +174,7 @@ class BookedDates:
     def _lapsed(self, date: Date) -> bool:
         """Whether nobody took it up in time: that follows from the time alone, and is not kept."""
         waits = date.record.runtime if date.record.maintenance else min(date.record.patience, date.record.runtime)
-        if self.local(date.start) + round(waits * SECOND) > self._now():
+        if self.local(date.start) + round(waits * SECOND) > self.now:
             return False
         kept = self._core.booking(date.id)
         return kept is None or kept.arc is None
@@ -228,7 +216,7 @@ class BookedDates:
         self._expanded = {known.record.id: known for known in expanded}
         found = [booking for known in expanded for booking in known.bookings]
         if len(found) > MAX_CLAIMS:
-            self._strange.warning("", "more than %d dates are booked: the last are not kept", MAX_CLAIMS)
+            self.strange.append(("", f"more than {MAX_CLAIMS} dates are booked: the last are not kept"))
         return found[:MAX_CLAIMS]
 
     def _expand(self, record: BookingRecord, taken: Collection[str]) -> _Expanded:
@@ -246,7 +234,7 @@ class BookedDates:
                 ]
                 bookings = [replace(one, patience=one.runtime) if one.id in taken else one for one in bookings]
         except ValueError as error:
-            self._strange.warning(record.id, "booking %s is not kept: %s", record.id, error)
+            self.strange.append((record.id, f"booking {record.id} is not kept: {error}"))
         coming, ahead = math.inf, _ahead(record)
         if not record.unbooked and (bookings or not dates):
             with suppress(ValueError, OverflowError):  # logged by `_starts`
@@ -256,38 +244,33 @@ class BookedDates:
         rank = -record.priority, record.made, record.id
         return _Expanded(record, rank, self._dated_by, until, coming if record.every else math.inf, bookings)
 
-    def reconcile(self) -> None:
-        """Brings the core's claims to what the records say."""
+    def reconcile(self) -> Dates:
+        """The event that brings the core's claims to what the records say."""
         ranked = tuple(self._ranked())
         before, self._sent = self._sent, frozenset(booking.id for booking in ranked)
         # What is only forgotten here, as it could be kept nowhere, another host may have.
         gone = before - self._sent
-        self._emit(Dates(ranked, frozenset(name for name in gone if not self._has(name))))
+        event = Dates(ranked, frozenset(name for name in gone if not self._has(name)))
         for name in gone:
             self._conflicts.pop(name, None)
             self._danger.pop(name, None)
         if len(self._repetitions) > 2 * len(self._records) + 64:
             self._repetitions = {name: known for name, known in self._repetitions.items() if self._records.get(name)}
+        return event
 
     def _has(self, name: str) -> bool:
         """Whether there is a record of the booking whose date this is."""
         return self._records.get(name.partition("@")[0]) is not None
 
-    def ask(self, unknown: Iterable[tuple[Rc, HolderSet]], wanted: Booking | None = None) -> None:
-        """Has RCs vote; `wanted` is not among the claims yet."""
-        self._vote(self._core.ask_votes(unknown, wanted))
-
-    def redate(self) -> bool:
-        """Puts right the dates that fleet time, which was slewed, has moved; whether another time goes on, by which
+    def redate(self) -> tuple[list[Dates], bool]:
+        """Puts right the dates that fleet time, which was slewed, has moved; and whether another time goes on, by which
         others may be to come."""
-        now = self._now()
-        ahead = self.clock.at(now) - now
+        ahead = self.clock.at(self.now) - self.now
         moved = self._dated_by - ahead
         if abs(moved) < REDATED:
-            return False
+            return [], False
         self._dated_by = ahead
-        self.reconcile()
-        return abs(moved) > STEPPED
+        return [self.reconcile()], abs(moved) > STEPPED
 
     def number(self) -> Grant:
         """(term, seq) of what is made or changed now: above all that is known. Where all hosts were started anew terms
@@ -301,7 +284,7 @@ class BookedDates:
         changed = self.number()
         new = replace(record, changed=changed, **to)
         self._records.take([new])
-        self._changed([new])
+        self.changed.append(new)
         return self._records.get(record.id) or new
 
     def note(self, effects: Iterable[Effect], *, settled: bool) -> bool:

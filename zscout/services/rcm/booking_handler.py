@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from decimal import Decimal
-from typing import Final, TypeAlias
+from typing import Final
 
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import BadName, Sender, check_name, is_pattern, matcher
-from zscout.mesh import IncomingQuery, Refused
-from zscout.mesh.supervision import Supervisor
 from zscout.messages import (
     MAX_AHEAD,
     MAX_BOOKINGS,
     MAX_KEPT,
     WINDOW,
-    Amounts,
     Ask,
     Book,
     BookingRecord,
-    BookingsAsk,
-    BookingsTold,
     BookingView,
     FindSlots,
     Operation,
+    Refused,
     SlotsTold,
     SlotView,
     Unbook,
@@ -33,24 +28,20 @@ from zscout.messages import (
     exact_amounts,
 )
 from zscout.rcm.admission import Admission
+from zscout.rcm.booked import BookingWork, Keep, Ticket
+from zscout.rcm.door import Door
 from zscout.scheduling.booking import Booking
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import Tick
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.services.bookings.dates import DAY, dates, told, zone_of
-from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.bookings.records import Records
 from zscout.services.rcm.booked_dates import MAX_CLAIMS, BookedDates, Date, start_of
-from zscout.services.rcm.booking_sharing import BookingSharing
 from zscout.types import SECOND, Ns
-
-log = logging.getLogger(__name__)
-
-Query: TypeAlias = IncomingQuery[Operation]
 
 MAX_UNDECIDED: Final = 64
 """Operations that wait for votes, or for a keeper, at one time."""
-DECIDE_WITHIN: Final = 1.5
-"""Seconds: an RC that does not vote is asked again meanwhile."""
+DECIDE_WITHIN: Final[Ns] = 3 * SECOND // 2
+"""An RC that does not vote is asked again meanwhile."""
 NAMED: Final = 3
 """Of what is in the way, so many are named."""
 
@@ -59,70 +50,57 @@ NAMED: Final = 3
 class _Undecided:
     """An operation whose votes are not all known yet."""
 
-    query: Query
+    ticket: Ticket
     decide: Callable[[], bool]
     """Tries; whether it is decided."""
     until: Ns = 0
 
 
 class BookingHandler:
-    """`check_door` raises Refused for what can never start; `settled` says whether the dates of the fleet are known."""
+    """Each operation leads to `work`, until the caller takes that."""
 
     def __init__(
         self,
         fleet: Fleet,
         core: Core,
-        keeper: BookingKeeper,
+        records: Records,
         dates_: BookedDates,
-        sharing: BookingSharing,
         admission: Admission,
-        supervisor: Supervisor,
-        emit: Callable[..., None],
-        check_door: Callable[[Mapping[str, Amounts]], None],
-        settled: Callable[[], bool],
+        door: Door,
         runtimes: RuntimeEstimator | None,
     ) -> None:
-        self._fleet, self._core, self._keeper, self._dates, self._sharing = fleet, core, keeper, dates_, sharing
-        self._admission, self._supervisor, self._emit, self._check_door = admission, supervisor, emit, check_door
-        self._settled = settled
-        self._now, self._keys = keeper.mesh.now, keeper.mesh.keys
+        self._fleet, self._core, self._records, self._dates = fleet, core, records, dates_
+        self._admission, self._door = admission, door
         self._runtimes = runtimes
         """What is known of how long holds last, for hints."""
-        self._undecided: list[_Undecided] = []
+        self.undecided: list[_Undecided] = []
         self._keeping = 0
+        self.work = BookingWork()
 
-    def close(self) -> None:
-        for one in self._undecided:
-            one.query.refuse(Refused("not_leading", "this manager stopped leading; try again").problem)
-
-    def on_operation(self, query: Query) -> None:
-        if self._fleet.strategy != "adaptive":
-            words = f'strategy "{self._fleet.strategy}" has no bookings; set strategy = "adaptive" under [fleet]'
-            raise Refused("wrong_strategy", words)
-        if not self._settled():
-            raise Refused("busy", "the whole fleet restarted and its bookings are not known yet; try again")
-        sender = self._keys.sender_of(query.key)
-        match query.message:
+    def operation(self, ticket: Ticket, sender: Sender, operation: Operation) -> None:
+        """Takes one in; the core is at the present time. Raises Refused."""
+        check_name(operation.id, "id")
+        match operation:
             case Book():
-                self._book(query, query.message, sender)
+                self._book(ticket, operation, sender)
             case Unbook():
-                self._unbook(query, query.message, sender)
+                self._unbook(ticket, operation, sender)
             case FindSlots():
-                self._find_slots(query, query.message, sender)
+                self._find_slots(ticket, operation, sender)
 
     # Booking
 
-    def _book(self, query: Query, wanted: Book, sender: Sender) -> None:
-        known = self._keeper.records.get(wanted.id)
+    def _book(self, ticket: Ticket, wanted: Book, sender: Sender) -> None:
+        known = self._records.get(wanted.id)
         if known is not None:
             self._admission.check_owner(sender, known, "ask for it")
-            self._answer_kept(query, known)
+            self._answer_kept(ticket, known)
             return
         self._admission.check_booking(wanted, sender)
         record = self._record(wanted, sender)
         self._check_room(record)
-        self._check_door(wanted.needs)
-        self._try(_Undecided(query, lambda: self._decide(query, record)))
+        self._door.check(self._now, wanted.needs, may_wait=False)
+        self._try(_Undecided(ticket, lambda: self._decide(ticket, record)))
 
     def _record(self, wanted: Book, sender: Sender) -> BookingRecord:
         """Raises Refused for what is no booking."""
@@ -161,7 +139,7 @@ class BookingHandler:
             raise Refused("bad_date", "a booking can't be longer than a year; ask for less")
 
     def _check_room(self, record: BookingRecord) -> None:
-        records, owner = self._keeper.records, record.owner
+        records, owner = self._records, record.owner
         most = self._fleet.limits.max_bookings_per_host
         if sum(one.owner == owner and not one.unbooked for one in records) >= most:
             raise Refused("too_many", f"{owner} has {most} bookings, the most allowed; cancel one")
@@ -170,10 +148,9 @@ class BookingHandler:
         if len(self._core.bookings()) + len(self._dates.open_dates(record)) > MAX_CLAIMS:
             raise Refused("too_many", f"{MAX_CLAIMS} dates are booked, the most allowed; repeat it less often")
 
-    def _decide(self, query: Query, record: BookingRecord) -> bool:
+    def _decide(self, ticket: Ticket, record: BookingRecord) -> bool:
         """Whether it is decided: all its dates that are kept free from now on are free, or one is not."""
         unknown, bound = [], dict[int, dict[str, str]]()
-        self._emit(Tick())
         # Maintenance goes before what is booked: who is in its way is told.
         for date in [] if record.maintenance else self._dates.open_dates(record):
             claim = self._dates.claim(date)
@@ -181,19 +158,19 @@ class BookingHandler:
             if found.unknown:
                 unknown.append((claim, found.unknown))
             elif not found.found:
-                query.refuse(Refused("not_free", self._in_the_way(date, claim)).problem)
+                self._refuse(ticket, Refused("not_free", self._in_the_way(date, claim)))
                 return True
             elif found.found[0].bound:
                 bound[date.start] = dict(found.found[0].bound)
         if unknown:
             for claim, votes in unknown:
-                self._dates.ask(votes, claim)
+                self.work.proposals += self._core.ask_votes(votes, claim)
             return False
         self._dates.change(record, kept=bound)
-        self._dates.reconcile()
+        self.work.events.append(self._dates.reconcile())
         when = told(record.start, record.zone)
-        log.info("%s books %s: %s at %s", record.owner, record.name, ", ".join(record.needs), when)
-        self._answer_kept(query, record, withdraw=True)
+        self.work.log.append(f"{record.owner} books {record.name}: {', '.join(record.needs)} at {when}")
+        self._answer_kept(ticket, record, withdraw=True)
         return True
 
     def _in_the_way(self, date: Date, claim: Booking) -> str:
@@ -208,33 +185,31 @@ class BookingHandler:
         why = f"booked then: {'; '.join(names)}{more}" if names else "held, in maintenance or promised to who waits"
         return f"not all of {', '.join(date.record.needs)} are free at {told(date.start, date.record.zone)}: {why}"
 
-    def _answer_kept(self, query: Query, record: BookingRecord, *, withdraw: bool = False) -> None:
+    def _answer_kept(self, ticket: Ticket, record: BookingRecord, *, withdraw: bool = False) -> None:
         """Answers once it is kept; `withdraw`: forgets it where it can't be."""
         if self._keeping >= MAX_UNDECIDED:
             raise Refused("busy", f"{MAX_UNDECIDED} bookings are already being stored; try again")
         self._keeping += 1
-        self._supervisor.spawn(self._keep(query, record.id, withdraw=withdraw))
+        self.work.keep.append(Keep(ticket, record.id, withdraw))
 
-    async def _keep(self, query: Query, booking: str, *, withdraw: bool) -> None:
-        try:
-            record = self._keeper.records.get(booking)
-            why = await self._sharing.keep(record) if record is not None else "it is over"
-        finally:
-            self._keeping -= 1
-        record = self._keeper.records.get(booking)
+    def kept(self, keep: Keep, why: str) -> None:
+        """A record is kept, or not: `why`."""
+        self._keeping -= 1
+        record = self._records.get(keep.booking)
         if record is None or why:
-            if record is not None and withdraw:
+            if record is not None and keep.withdraw:
                 # Not given up, which is final: another leader may have made it as well, or may have heard of it.
-                self._keeper.records.remove(booking)
-                self._dates.reconcile()
-            query.refuse(Refused("not_kept", f"no other host stored this booking: {why}").problem)
-            return
-        query.answer(self._dates.view(record))
+                self._records.remove(keep.booking)
+                self.work.events.append(self._dates.reconcile())
+            refused = Refused("not_kept", f"no other host stored this booking: {why or 'it is over'}")
+            self._refuse(keep.ticket, refused)
+        else:
+            self.work.answers.append((keep.ticket, self._dates.view(record)))
 
     # Giving up
 
-    def _unbook(self, query: Query, operation: Unbook, sender: Sender) -> None:
-        record = self._keeper.records.get(operation.id)
+    def _unbook(self, ticket: Ticket, operation: Unbook, sender: Sender) -> None:
+        record = self._records.get(operation.id)
         if record is None:
             raise Refused("unknown_booking", f"there is no booking {operation.id}; see zscout booking list")
         self._admission.check_owner(sender, record, "unbook it")
@@ -247,30 +222,29 @@ class BookingHandler:
         else:
             date = told(operation.start, record.zone)
             raise Refused("bad_date", f"{date} is not a date of {record.name}; see zscout booking list")
-        self._dates.reconcile()
-        self._answer_kept(query, new)
+        self.work.events.append(self._dates.reconcile())
+        self._answer_kept(ticket, new)
 
     # Looking for a time
 
-    def _find_slots(self, query: Query, asked: FindSlots, sender: Sender) -> None:
+    def _find_slots(self, ticket: Ticket, asked: FindSlots, sender: Sender) -> None:
         self._admission.check_booking(asked, sender)
         needs = {need: exact_amounts(params) for need, params in asked.needs.items()}
         runtime = duration(asked.runtime, "runtime")
         self._check_length(asked.runtime)
-        self._check_door(asked.needs)
-        now = self._now()
+        now = self._now
+        self._door.check(now, asked.needs, may_wait=False)
         start = self._dates.local(max(asked.start or 0, -(-self._dates.to_fleet(now) // SECOND)))
         within = min(asked.within, MAX_AHEAD - (start - now) / SECOND)
         if within < 0:
             raise Refused("bad_date", "a booking can't be more than a year ahead; ask for earlier times")
         wanted = Booking(asked.id, needs, asked.priority, start, runtime, runtime, now, owner=sender.host)
-        self._try(_Undecided(query, lambda: self._answer_slots(query, asked, wanted, start + round(within * SECOND))))
+        self._try(_Undecided(ticket, lambda: self._answer_slots(ticket, asked, wanted, start + round(within * SECOND))))
 
-    def _answer_slots(self, query: Query, asked: FindSlots, wanted: Booking, until: Ns) -> bool:
-        self._emit(Tick())
+    def _answer_slots(self, ticket: Ticket, asked: FindSlots, wanted: Booking, until: Ns) -> bool:
         found = self._core.slots(wanted, until, asked.limit)
         if found.unknown:
-            self._dates.ask(found.unknown, wanted)
+            self.work.proposals += self._core.ask_votes(found.unknown, wanted)
             return False
         slots = []
         for one in found.found:
@@ -280,37 +254,39 @@ class BookingHandler:
         likely = None if guess is None else -(-self._dates.to_fleet(guess) // SECOND)
         if likely is not None and slots and likely >= slots[0].start:
             likely = None
-        query.answer(SlotsTold(asked.id, self._dates.time, slots, found.complete, likely))
+        self.work.answers.append((ticket, SlotsTold(asked.id, self._dates.time, slots, found.complete, likely)))
         return True
 
     # Votes
 
     def _try(self, undecided: _Undecided) -> None:
-        if len(self._undecided) >= MAX_UNDECIDED:
+        if len(self.undecided) >= MAX_UNDECIDED:
             raise Refused("busy", f"{MAX_UNDECIDED} bookings already wait for votes; try again")
         if not undecided.decide():
-            undecided.until = self._now() + round(DECIDE_WITHIN * SECOND)
-            self._undecided.append(undecided)
-            self._supervisor.call_later(DECIDE_WITHIN + 0.01, self.try_again)
+            undecided.until = self._now + DECIDE_WITHIN
+            self.undecided.append(undecided)
 
-    def try_again(self) -> None:
+    def again(self, undecided: _Undecided) -> None:
         """Votes have come, or are overdue."""
-        undecided, self._undecided = self._undecided, []
-        for one in undecided:
-            try:
-                if one.decide():
-                    continue
-            except Refused as refused:
-                one.query.refuse(refused.problem)
-                continue
-            if self._now() >= one.until:
-                one.query.refuse(Refused("busy", "a shared device did not answer what it can carry; try again").problem)
-            else:
-                self._undecided.append(one)
+        try:
+            if undecided.decide():
+                return
+        except Refused as refused:
+            self._refuse(undecided.ticket, refused)
+            return
+        if self._now >= undecided.until:
+            self._refuse(
+                undecided.ticket, Refused("busy", "a shared device did not answer what it can carry; try again")
+            )
+        else:
+            self.undecided.append(undecided)
+
+    def _refuse(self, ticket: Ticket, refused: Refused) -> None:
+        self.work.answers.append((ticket, refused.problem))
 
     @property
-    def waits_for_votes(self) -> bool:
-        return bool(self._undecided)
+    def _now(self) -> Ns:
+        return self._dates.now
 
     # Taking up
 
@@ -318,7 +294,7 @@ class BookingHandler:
         """The date that an ARC takes up, as the core calls it; empty where one that goes on finds it over. To that one
         it may be that it is not known here yet. Raises Refused."""
         booking, _, start = ask.booking.partition("@")
-        record = self._keeper.records.get(booking)
+        record = self._records.get(booking)
         goes_on = ask.place is not None or ask.grant is not None
         if record is None or record.unbooked:
             if goes_on:
@@ -336,13 +312,9 @@ class BookingHandler:
 
     # Telling
 
-    def answer_bookings(self, query: IncomingQuery[BookingsAsk]) -> None:
-        asked = query.message
-        query.answer(BookingsTold(self._dates.time, self.views(asked.owner, asked.rc), dict(self._sharing.clocks)))
-
     def views(self, owner: str | None = None, rc: str | None = None) -> list[BookingView]:
         views = []
-        for record in self._keeper.records:
+        for record in self._records:
             if record.unbooked or (owner is not None and record.owner != owner):
                 continue
             if rc is not None and not any(

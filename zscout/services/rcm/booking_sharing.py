@@ -11,14 +11,16 @@ from typing import Final
 
 from msgspec.structs import replace
 
-from zscout.keyexpr import Keys, Role
-from zscout.mesh import Mesh, Reply
+from zscout.keyexpr import Keys, Role, Token
+from zscout.mesh import Declaration, IncomingQuery, Lane, Mesh, Reply
 from zscout.mesh.supervision import Supervisor, done_within
-from zscout.messages import BookingRecord, BookingsKept, ShareBookings
+from zscout.messages import BookingRecord, BookingsAsk, BookingsKept, BookingsTold, ShareBookings
+from zscout.rcm import steps
 from zscout.rcm.authority import Authority
-from zscout.services.bookings.fleet_clock import DIFFERS, SAME, FleetClock, agreed, wall_ns
+from zscout.services.bookings.fleet_clock import DIFFERS, SAME, agreed, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.bookings.records import merged
+from zscout.services.rcm.bookings import Bookings, oldest
 from zscout.types import SECOND, HostName, Ns, Term
 
 log = logging.getLogger(__name__)
@@ -47,33 +49,23 @@ def _aged(one: BookingsKept, seconds: float) -> BookingsKept:
     return replace(one, wall=one.wall + seconds, time=one.time + seconds, time_age=one.time_age + seconds)
 
 
-def oldest(answers: Iterable[BookingsKept]) -> tuple[float, Ns] | None:
-    """Of the fleet times that hosts have heard the one that has gone on for longest: for how many seconds, and it."""
-    told = [(one.time_age, wall_ns(one.time)) for one in answers if one.time is not None]
-    age = max((age for age, _ in told), default=None)
-    return None if age is None else (age, agreed(time for other, time in told if other > age - SAME))
-
-
 class BookingSharing:
-    """Of one term."""
+    """Of one term. What comes of it is given to `take`. Before the bookings are settled fleet time is what most clocks
+    say, and nothing is forgotten by it."""
 
     def __init__(
         self,
         mesh: Mesh,
         term: Term,
         keeper: BookingKeeper,
-        clock: FleetClock,
+        bookings: Bookings,
         authority: Authority,
         supervisor: Supervisor,
-        on_news: Callable[[], None],
-        on_shared: Callable[[], None],
-        settled: Callable[[], bool],
+        take: Callable[[steps.Stimulus], None],
     ) -> None:
-        """`on_news` is called when others told of what was not known here, `on_shared` each time all were
-        asked. Before it is `settled` fleet time is what most clocks say, and nothing is forgotten by it."""
-        self._mesh, self._term, self._keeper, self._clock, self._authority = mesh, term, keeper, clock, authority
-        self._supervisor, self._on_news, self._on_shared = supervisor, on_news, on_shared
-        self._settled = settled
+        self._mesh, self._term, self._keeper, self._authority = mesh, term, keeper, authority
+        self._bookings, self._clock, self._supervisor, self._give = bookings, bookings.clock, supervisor, take
+        self._declared: list[Declaration] = []
         self._begun = mesh.now()
         self._unshared: dict[str, BookingRecord] = {}
         self._behind = True
@@ -86,12 +78,41 @@ class BookingSharing:
         """By how many seconds the clocks of other hosts differ from fleet time, where it is too much."""
 
     def start(self) -> None:
+        """From now on it answers, and shares what it knows."""
+        keys, mesh, guard = self._mesh.keys, self._mesh, self._supervisor.guard
+        self._declared = [
+            *(
+                mesh.serve(key, BookingsAsk, guard(self._answer), lane=Lane.QUESTION)
+                for key in (keys.rcm_bookings, keys.rcm_bookings_any)
+            ),
+            *(mesh.watch(keys.alive_any(role), guard(self._on_token)) for role in (Role.CANDIDATE, Role.NODE)),
+        ]
+        self._keeper.shared.clear()
         self._supervisor.spawn(self._keep_sharing())
+        self._supervisor.spawn(self._watch_others())
+
+    def close(self) -> None:
+        for declared in self._declared:
+            declared.close()
+
+    @property
+    def _settled(self) -> bool:
+        return self._bookings.at(self._mesh.now()).settled
+
+    def _answer(self, query: IncomingQuery[BookingsAsk]) -> None:
+        asked, bookings = query.message, self._bookings.at(self._mesh.now())
+        views = bookings.handler.views(asked.owner, asked.rc)
+        query.answer(BookingsTold(bookings.dates.time, views, dict(self.clocks)))
+
+    def _on_token(self, token: Token, alive: bool) -> None:
+        if alive and token.host != self._mesh.me.host:
+            self.catch_up()
 
     def tell(self, records: Iterable[BookingRecord]) -> None:
         """These are not as they were: shared soon."""
-        self._unshared |= {record.id: record for record in records}
-        self._news.set()
+        if changed := {record.id: record for record in records}:
+            self._unshared |= changed
+            self._news.set()
 
     def catch_up(self) -> None:
         """A host has come that may know less, or more."""
@@ -106,6 +127,14 @@ class BookingSharing:
                 await self._share()
             return self._not_kept.get(record.id, "")
 
+    async def _watch_others(self) -> None:
+        """One that led elsewhere shares its bookings before it steps down."""
+        while True:
+            await self._keeper.shared.wait()
+            self._keeper.shared.clear()
+            self.catch_up()
+            self._give(steps.Shared(news=True))
+
     async def _keep_sharing(self) -> None:
         while True:
             if await done_within(AGAIN if self._behind else SHARE_EVERY, self._news.wait()):
@@ -113,7 +142,7 @@ class BookingSharing:
             self._news.clear()
             async with self._sharing:
                 why = await self._share()
-            self._on_shared()
+            self._give(steps.Shared(news=False))
             if why:
                 log.warning("bookings are kept by this host alone: %s", why)
 
@@ -121,7 +150,7 @@ class BookingSharing:
         """Tells all keepers, and hears what they know. Returns why what was told is not kept; empty: it is."""
         keeper, mesh = self._keeper, self._mesh
         sent, self._unshared = self._unshared, {}
-        time = self._clock.at(mesh.now()) / SECOND if self._settled() else None
+        time = self._clock.at(mesh.now()) / SECOND if self._settled else None
         if time is not None:
             # All forget by the time of one question: else what one has forgotten came back from another.
             keeper.records.forget_old(time)
@@ -161,7 +190,7 @@ class BookingSharing:
             for reply in replies
         )
         if changed:
-            self._on_news()
+            self._give(steps.Shared(news=True))
             self._news.set()
         walls = {one.host: one.wall for one in answers} | {self._mesh.me.host: self._keeper.wall()}
         found, age = oldest(answers), (now - self._clock.since) / SECOND
@@ -169,7 +198,7 @@ class BookingSharing:
             # This reign began where nobody knew the time of the others.
             self._clock.since = now - round(found[0] * SECOND)
             self._clock.step(found[1], now)
-        elif self._settled() or age > (now - self._begun) / SECOND + SAME:
+        elif self._settled or age > (now - self._begun) / SECOND + SAME:
             self._clock.aim(agreed(map(wall_ns, walls.values()), self._clock.at(now)), now)
         else:
             self._clock.step(agreed(map(wall_ns, walls.values())), now)

@@ -1,125 +1,89 @@
-"""Bookings in one term: fleet time, the dates in the core, who keeps them, and who asks."""
+"""Bookings in one term: fleet time, the dates in the core, dangers, and operations. Values in and out; the present time
+is passed in (`at`). Who keeps them, and whom that is asked, is `booking_sharing.py`."""
 
 from __future__ import annotations
 
-import asyncio
-import logging
 import math
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from typing import Final, NamedTuple
+from collections.abc import Collection, Iterable, Sequence
+from enum import Enum, auto
+from typing import Any, Final, Self
 
 from zscout.config.fleet import Fleet
-from zscout.keyexpr import Role, Sender, Token
-from zscout.mesh import Declaration, Lane, Mesh
-from zscout.mesh.supervision import Supervisor
-from zscout.messages import Amounts, Ask, BookingRecord, BookingsAsk, BookingsKept, Instant, ProposedHolder, decimals
+from zscout.keyexpr import BadName, Sender
+from zscout.messages import Ask, BookingRecord, BookingsKept, Operation, Problem, ProposedHolder, Refused, decimals
 from zscout.rcm.admission import Admission
+from zscout.rcm.booked import NO_WORK, Again, BookedDanger, BookingWork, Keep, Ticket
+from zscout.rcm.deadlines import Deadlines
+from zscout.rcm.door import Door
 from zscout.scheduling.booking import BookingConflict, BookingThreatened, Dates
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import ArcRequest, Effect, Event, Propose, Vote, VoteOverdue
+from zscout.scheduling.model import ArcRequest, Effect, Event, Tick, Vote, VoteOverdue
 from zscout.scheduling.runtimes import RuntimeEstimator
-from zscout.services.bookings.fleet_clock import FleetClock, agreed, wall_ns
+from zscout.services.bookings.fleet_clock import SAME, FleetClock, agreed, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.bookings.records import Records
 from zscout.services.rcm.booked_dates import BookedDates, Date
 from zscout.services.rcm.booking_handler import BookingHandler
-from zscout.services.rcm.booking_sharing import BookingSharing, oldest
-from zscout.types import SECOND, ArcId, Ns, Params, Term
+from zscout.types import SECOND, ArcId, Ns, Params
 
-log = logging.getLogger(__name__)
-
-SLACK: Final = 0.01
-"""Seconds: timers may be a little early."""
-BALLOTS: Final = 0.002
-"""Seconds for which ballots on a booking are gathered: one for each of its dates."""
-GATHERS: Final = 1.0
-"""Seconds for which bookings are gathered before it is found out when there is one more date of them to keep."""
-LASTS: Final = 3.0
-"""Seconds that a danger is waited for to pass: after a change of leader RCs come one after the other."""
+SLACK: Final[Ns] = SECOND // 100
+"""Timers may be a little early."""
+BALLOTS: Final[Ns] = SECOND // 500
+"""Ballots on a booking are gathered for so long: one for each of its dates."""
+GATHERS: Final[Ns] = SECOND
+"""Bookings are gathered for so long before it is found out when there is one more date of them to keep."""
+LASTS: Final[Ns] = 3 * SECOND
+"""A danger may pass within this time: after a change of leader RCs come one after the other."""
 
 
-class BookedDanger(NamedTuple):
-    """That a date of a booking may not be kept, and why; empty: it is safe again."""
-
-    record: BookingRecord
-    start: Instant
-    why: str
-    later: int = 0
-    """Dates after that of which the same is to be told."""
+class _Due(Enum):
+    NEWS = auto()
+    ANOTHER = auto()
+    """What is repeated may have one more date within 60 days."""
+    LOOK = auto()
+    """It is found out when that is."""
+    TRY = auto()
+    TELL = auto()
 
 
 class Bookings:
-    """`kept`: what keepers answered as the lead was taken. `emit` takes events of one instant, `propose` sends a
-    proposal, `check_door` raises Refused for needs that can never be met."""
+    """Before `settles_at` not all dates of the fleet are known: after a restart of all its hosts, each knows its own
+    only."""
 
     def __init__(
         self,
-        mesh: Mesh,
         fleet: Fleet,
-        term: Term,
         core: Core,
-        keeper: BookingKeeper,
-        kept: Sequence[BookingsKept],
         admission: Admission,
-        supervisor: Supervisor,
-        emit: Callable[..., None],
-        propose: Callable[[Propose], None],
-        check_door: Callable[[Mapping[str, Amounts]], None],
+        door: Door,
+        records: Records,
+        clock: FleetClock,
         runtimes: RuntimeEstimator | None,
-        on_danger: Callable[[BookedDanger], object],
+        settles_at: Ns,
     ) -> None:
-        """`on_danger` is called with dangers that last."""
-        self._mesh, self._supervisor, self._keeper = mesh, supervisor, keeper
-        now, self._known = mesh.now(), _is_known(keeper, kept, fleet)
-        self.settles_at: Ns = now + round(fleet.mesh.lease * SECOND)
-        """When the dates of the fleet count as known though nobody has told more of them."""
-        time, age = _time(keeper, kept)
-        self.clock = FleetClock(time, now, now - round(age * SECOND))
-        keeper.records.take(record for one in kept for record in one.records)
-
-        def vote(proposals: Iterable[Propose]) -> None:
-            for proposal in proposals:
-                propose(proposal)
-
-        self._sharing = BookingSharing(
-            mesh,
-            term,
-            keeper,
-            self.clock,
-            admission.authority,
-            supervisor,
-            self._on_news,
-            self._redate,
-            lambda: self.settled,
-        )
-        self.dates = BookedDates(core, keeper.records, self.clock, mesh.now, emit, vote, self._sharing.tell)
-        self.handler = BookingHandler(
-            fleet,
-            core,
-            keeper,
-            self.dates,
-            self._sharing,
-            admission,
-            supervisor,
-            emit,
-            check_door,
-            lambda: self.settled,
-            runtimes,
-        )
-        self._reconciling = self._trying = False
-        self._another: asyncio.TimerHandle | None = None
-        """What is repeated has one more date within 60 days then."""
-        self._booked = False
-        """Since that was found."""
+        self._adaptive = fleet.strategy == "adaptive"
+        self._strategy, self._records, self.clock, self.settles_at = fleet.strategy, records, clock, settles_at
+        self.dates = BookedDates(core, records, clock)
+        self.handler = BookingHandler(fleet, core, records, self.dates, admission, door, runtimes)
+        self._deadlines: Deadlines[tuple[_Due, Any]] = Deadlines()
+        self._set: set[_Due] = set()
+        """Those of which there is one at a time."""
+        self._another: Ns | None = None
         self._told: dict[str, str] = {}
-        """Dangers that were told, by date."""
-        self._telling = False
-        self._on_danger = on_danger
-        self._declared: list[Declaration] = []
+        """Dangers that were reported, by date."""
+        self._once(_Due.NEWS, 0)
+        if settles_at:
+            self._deadlines.set(settles_at + SLACK, (_Due.NEWS, None))
+
+    def at(self, now: Ns) -> Self:
+        """The present time is `now`."""
+        self.dates.now = now
+        return self
 
     @property
     def settled(self) -> bool:
-        """Whether the dates of the fleet are known: after a restart of all its hosts, each knows its own only."""
-        return self._known or self._mesh.now() >= self.settles_at
+        """Whether the dates of the fleet are known."""
+        return self.dates.now >= self.settles_at
 
     @property
     def time(self) -> float | None:
@@ -129,7 +93,13 @@ class Bookings:
     @property
     def age(self) -> float:
         """For how many seconds that time has gone on."""
-        return (self._mesh.now() - self.clock.since) / SECOND
+        return (self.dates.now - self.clock.since) / SECOND
+
+    @property
+    def next(self) -> Ns | None:
+        return self._deadlines.next
+
+    # What is known
 
     def take_up(self, ask: Ask, sender: Sender) -> str:
         return self.handler.take_up(ask, sender)
@@ -138,101 +108,116 @@ class Bookings:
         return self.dates.dated(request)
 
     def record(self, booking: str) -> BookingRecord | None:
-        return self._keeper.records.get(booking)
+        return self._records.get(booking)
 
-    def recovered(self, taken: Collection[str]) -> list[Event]:
+    def recovered(self, taken: Collection[str]) -> Sequence[Event]:
         """The events by which the core knows of all dates; `taken`: those that ARCs have taken up."""
         return [self.dates.recovered(taken)]
 
-    async def enter(self, core: Core) -> None:
-        """Has the core know of dates, in parts between which others run, before it begins to lead."""
-        for part in self.dates.parts():
-            core.handle(self._mesh.now(), part)
-            await asyncio.sleep(0)
-
-    def start(self) -> None:
-        """From now on it answers, and shares what it knows."""
-        keys, mesh, guard = self._mesh.keys, self._mesh, self._supervisor.guard
-        self._declared = [
-            *(
-                mesh.serve(key, BookingsAsk, guard(self.handler.answer_bookings), lane=Lane.QUESTION)
-                for key in (keys.rcm_bookings, keys.rcm_bookings_any)
-            ),
-            *(mesh.watch(keys.alive_any(role), guard(self._on_token)) for role in (Role.CANDIDATE, Role.NODE)),
-        ]
-        self._keeper.on_shared = self._on_shared
-        self._sharing.start()
-        self._on_news()
-        if not self.settled:
-            self._supervisor.call_later((self.settles_at - mesh.now()) / SECOND + SLACK, self._on_news)
-
-    def close(self) -> None:
-        self._keeper.on_shared = lambda: None
-        for declared in self._declared:
-            declared.close()
-        self.handler.close()
-
-    def note(self, events: Collection[Event], effects: Collection[Effect]) -> None:
-        """What has happened in an instant: what follows of it follows in another one."""
-        if self.dates.note(effects, settled=self.settled):
-            self._on_news()
-        if any(isinstance(effect, (BookingThreatened, BookingConflict)) for effect in effects):
-            self._tell_soon()
-        if not self._booked and any(isinstance(event, Dates) for event in events):
-            self._booked = True
-            self._supervisor.call_later(GATHERS, self._await_another)
-        voted = any(isinstance(event, (Vote, VoteOverdue)) for event in events)
-        if voted and self.handler.waits_for_votes and not self._trying:
-            self._trying = True
-            self._supervisor.call_later(BALLOTS, self._try_again)
-
-    def _try_again(self) -> None:
-        self._trying = False
-        self.handler.try_again()
-
     def proposed(self, name: ArcId, params: Params) -> ProposedHolder:
         """A booking as an RC is asked about it."""
-        record = self._keeper.records.get(name.partition("@")[0])
+        record = self._records.get(name.partition("@")[0])
         label, owner = (name, "") if record is None else (record.name, record.owner)
         return ProposedHolder(name, label, f"{owner or 'nobody'}/booking", decimals(params))
 
-    def _on_news(self) -> None:
-        if not self._reconciling:
-            self._reconciling = True
-            self._supervisor.call_later(0, self._reconcile)
+    # What happens
 
-    def _on_shared(self) -> None:
-        """One that led elsewhere has told of its bookings before it stepped down."""
-        self._sharing.catch_up()
-        self._on_news()
+    def operation(self, ticket: Ticket, sender: Sender, operation: Operation) -> BookingWork:
+        try:
+            if not self._adaptive:
+                words = f'strategy "{self._strategy}" has no bookings; set strategy = "adaptive" under [fleet]'
+                raise Refused("wrong_strategy", words)
+            if not self.settled:
+                raise Refused("busy", "the whole fleet restarted and its bookings are not known yet; try again")
+            before = len(self.handler.undecided)
+            self.handler.operation(ticket, sender, operation)
+            if len(self.handler.undecided) > before:
+                self._deadlines.set(self.handler.undecided[-1].until + SLACK, (_Due.TRY, None))
+        except Refused as refused:
+            self.handler.work.answers.append((ticket, refused.problem))
+        except BadName as error:
+            self.handler.work.answers.append((ticket, Problem("bad_request", str(error))))
+        return self._work()
 
-    def _redate(self) -> None:
-        if self.dates.redate():
-            self._on_news()
+    def again(self, again: Again) -> BookingWork:
+        self.handler.again(again.undecided)
+        return self._work()
+
+    def kept(self, keep: Keep, why: str) -> BookingWork:
+        self.handler.kept(keep, why)
+        return self._work()
+
+    def shared(self, *, news: bool) -> BookingWork:
+        """All keepers were asked; or there is news: others know what was not known here."""
+        if not news:
+            events, news = self.dates.redate()
+            self.handler.work.events += events
+        if news:
+            self._once(_Due.NEWS, 0)
+        return self._work()
+
+    def note(self, events: Collection[Event], effects: Iterable[Effect]) -> BookingWork:
+        """What has happened in an instant: what follows of it follows in another one."""
+        if self.dates.note(effects, settled=self.settled):
+            self._once(_Due.NEWS, 0)
+        if any(isinstance(effect, (BookingThreatened, BookingConflict)) for effect in effects):
+            self._tell_soon()
+        if any(isinstance(event, Dates) for event in events):
+            self._once(_Due.LOOK, GATHERS)
+        if self.handler.undecided and any(isinstance(event, (Vote, VoteOverdue)) for event in events):
+            self._once(_Due.TRY, BALLOTS)
+        return self._work() if self.dates.changed or self.dates.strange else NO_WORK
+
+    def tick(self) -> BookingWork:
+        """Carries out what is due."""
+        while (due := self._deadlines.pop_due(self.dates.now)) is not None:
+            self._set.discard(due[0])
+            match due:
+                case (_Due.NEWS, _):
+                    self._reconcile()
+                case (_Due.ANOTHER, at) if at == self._another:
+                    self._another = None
+                    self._once(_Due.NEWS, 0)
+                case (_Due.LOOK, _):
+                    self._await_another()
+                case (_Due.TRY, _):
+                    again, self.handler.undecided = self.handler.undecided, []
+                    self.handler.work.again += map(Again, again)
+                    self.handler.work.events += [Tick()] if again else []
+                case (_Due.TELL, _):
+                    self._tell()
+        return self._work()
+
+    def _once(self, due: _Due, delay: Ns) -> None:
+        if due not in self._set:
+            self._set.add(due)
+            self._deadlines.set(self.dates.now + delay, (due, None))
+
+    def _work(self) -> BookingWork:
+        work, self.handler.work = self.handler.work, BookingWork()
+        work.changed, self.dates.changed = self.dates.changed, []
+        work.strange, self.dates.strange = self.dates.strange, []
+        return work
 
     def _reconcile(self) -> None:
-        self._reconciling = False
-        self.dates.reconcile()
+        self.handler.work.events.append(self.dates.reconcile())
         self._tell_soon()
         self._await_another()
 
     def _await_another(self) -> None:
         """What is repeated is to have its dates in time."""
-        if self._another is not None:
-            self._another.cancel()
-        until, self._booked = self.dates.until_another(), False
-        delay = max(0.0, until) + SLACK
-        self._another = self._supervisor.call_later(delay, self._on_news) if math.isfinite(until) else None
+        until, self._another = self.dates.until_another(), None
+        if math.isfinite(until):
+            self._another = self.dates.now + round(max(0.0, until) * SECOND) + SLACK
+            self._deadlines.set(self._another, (_Due.ANOTHER, self._another))
 
     def _tell_soon(self) -> None:
-        if not self._telling and self.dates.dangers() != self._told:
-            self._telling = True
-            self._supervisor.call_later(LASTS, self._tell)
+        if self.dates.dangers() != self._told:
+            self._once(_Due.TELL, LASTS)
 
     def _tell(self) -> None:
-        """Tells what is not as it was told last, and has been so for a while: the next dates first, as there are bounds
-        to what people are told, and once of all dates of a booking."""
-        self._telling = False
+        """Reports what is not as it was reported last, and has been so for a while: the next dates first, as there are
+        bounds to what people get, and once for all dates of a booking."""
         before, self._told = self._told, self.dates.dangers()
         news = dict[tuple[str, str], list[Date]]()
         for name in before.keys() | self._told.keys():
@@ -243,14 +228,31 @@ class Bookings:
             BookedDanger(*min(dates, key=lambda date: date.start), why, len(dates) - 1)
             for (_, why), dates in news.items()
         ]
-        for danger in sorted(found, key=lambda one: (one.start, one.record.id, one.why)):
-            words = f"is in danger: {danger.why}" if danger.why else "is safe again"
-            log.warning("booking %s of %s %s", danger.record.name, danger.record.owner, words)
-            self._on_danger(danger)
+        self.handler.work.dangers += sorted(found, key=lambda danger: (danger.start, danger.record.id, danger.why))
 
-    def _on_token(self, token: Token, alive: bool) -> None:
-        if alive and token.host != self._mesh.me.host:
-            self._sharing.catch_up()
+
+def bookings_of(
+    fleet: Fleet,
+    core: Core,
+    admission: Admission,
+    door: Door,
+    keeper: BookingKeeper,
+    kept: Sequence[BookingsKept],
+    runtimes: RuntimeEstimator | None,
+) -> Bookings:
+    """Those of a new term. `kept`: what keepers answered as the lead was taken."""
+    now, known = keeper.mesh.now(), _is_known(keeper, kept, fleet)
+    time, age = _time(keeper, kept)
+    keeper.records.take(record for told in kept for record in told.records)
+    clock, settles_at = FleetClock(time, now, now - round(age * SECOND)), now + round(fleet.mesh.lease * SECOND)
+    return Bookings(fleet, core, admission, door, keeper.records, clock, runtimes, 0 if known else settles_at)
+
+
+def oldest(answers: Iterable[BookingsKept]) -> tuple[float, Ns] | None:
+    """Of the fleet times that hosts have heard the one that has gone on for longest: for how many seconds, and it."""
+    told = [(one.time_age, wall_ns(one.time)) for one in answers if one.time is not None]
+    age = max((age for age, _ in told), default=None)
+    return None if age is None else (age, agreed(time for other, time in told if other > age - SAME))
 
 
 def _time(keeper: BookingKeeper, kept: Sequence[BookingsKept]) -> tuple[Ns, float]:

@@ -31,6 +31,7 @@ from zscout.messages import (
 )
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
+from zscout.rcm.booked import BookedDanger
 from zscout.rcm.places import Places
 from zscout.rcm.recovery import aged, take_over
 from zscout.rcm.terms import Source, Terms, Verdict, Word
@@ -41,7 +42,6 @@ from zscout.services.placement.component_placer import ComponentPlacer
 from zscout.services.placement.ledger import PlacementLedger
 from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.rcm.booking_sharing import credible
-from zscout.services.rcm.bookings import BookedDanger
 from zscout.services.rcm.digest import HoldListener
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.inventory import Inventory
@@ -432,7 +432,7 @@ class Candidate:
             ),
         )
         self._leading.callback(rcm.stop)
-        await rcm.bookings.enter(rcm.core)
+        await rcm.enter()
         if self.known > term:
             self._leading.close()
             self.election.rivalled(self.mesh.now())

@@ -20,9 +20,10 @@ from zscout.keyexpr import Role, Token, client_of
 from zscout.mesh import Declaration, IncomingQuery, Lane, Mesh, MeshError, Refused, Reply, Tally
 from zscout.mesh.sparse_log import SparseLog
 from zscout.mesh.supervision import StallWatch, Supervisor
-from zscout.rcm import step
+from zscout.rcm import steps
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
+from zscout.rcm.booked import Answer, BookedDanger, Keep, Ticket
 from zscout.rcm.door import Door
 from zscout.rcm.leader import Leader
 from zscout.rcm.places import Places
@@ -35,10 +36,10 @@ from zscout.scheduling.model import Event, Vote, VoteOverdue
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.bookings.keeper import BookingKeeper
-from zscout.services.rcm.bookings import BookedDanger, Bookings
+from zscout.services.rcm.booking_sharing import BookingSharing
+from zscout.services.rcm.bookings import Bookings, bookings_of
 from zscout.services.rcm.digest import HoldDigest, HoldListener
 from zscout.services.rcm.inventory import Inventory
-from zscout.services.rcm.state_answers import StateAnswers
 from zscout.types import SECOND, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
@@ -113,33 +114,22 @@ class Rcm:
         devices, me, now = self.inventory.devices, mesh.me.host, mesh.now()
         roster = Roster(mesh.keys, me, fleet, term, devices, admission, core.arc, now)
         door = Door(devices, roster, now + fleet.timing.hold_lease)
-        self.bookings = Bookings(
-            mesh,
-            fleet,
-            term,
-            core,
-            parts.keeper or BookingKeeper(mesh),
-            parts.kept,
-            admission,
-            self.supervisor,
-            self._receive,
-            lambda effect: self._propose(step.Proposed(effect.rc, self.leader.proposal(effect))),
-            lambda needs: door.check(mesh.now(), needs, may_wait=False),
-            parts.runtimes,
-            parts.on_danger,
+        self._keeper = parts.keeper or BookingKeeper(mesh)
+        self._bookings = bookings_of(fleet, core, admission, door, self._keeper, parts.kept, parts.runtimes)
+        self.sharing = BookingSharing(
+            mesh, term, self._keeper, self._bookings, self.authority, self.supervisor, self._take
         )
-        self.leader = Leader(fleet, core, admission, roster, door, self.bookings, parts.runtimes)
-        view = StateView(me, core, roster, self.leader.registry, devices, parts.runtimes)
-        self._states = StateAnswers(mesh, self.leader, view)
+        self.leader = Leader(fleet, core, admission, roster, door, self._bookings, parts.runtimes)
+        self._view = StateView(me, core, roster, self.leader.registry, devices, parts.runtimes)
         self._digest = HoldDigest(core, parts.listeners) if parts.listeners else None
         self._grants = mesh.publisher(mesh.keys.grants, messages.Grants)
         self._strange = SparseLog(log, mesh.now)
         self._stall = StallWatch(mesh.now)
-        self._stalled = step.Stalled(0, 0, fresh=False)
-        self._coming: list[step.Stimulus] = []
+        self._stalled = steps.Stalled(0, 0, fresh=False)
+        self._coming: list[steps.Stimulus] = []
         """Of the present burst."""
         self._running = False
-        self._open: dict[step.Ticket, IncomingQuery[messages.Operation]] = {}
+        self._open: dict[Ticket, IncomingQuery[messages.Operation]] = {}
         """Operations that are not answered yet."""
         self._tickets = count(1)
         self._declared: list[Declaration] = []
@@ -162,7 +152,17 @@ class Rcm:
         """The last number that was published."""
         return self.leader.seq
 
+    @property
+    def bookings(self) -> Bookings:
+        return self._bookings.at(self.mesh.now())
+
     # Beginning and end
+
+    async def enter(self) -> None:
+        """Has the core know of dates, in parts between which others run, before it begins to lead."""
+        for part in self.bookings.dates.parts():
+            self.core.handle(self.mesh.now(), part)
+            await asyncio.sleep(0)
 
     def start(self, recovered: RecoveredState) -> None:
         """Begins to lead. Everything that is declared here is declared by the leader only."""
@@ -170,7 +170,7 @@ class Rcm:
         if self._parts.inventory is None:
             self.inventory.start(self.supervisor)
         self._stall.start()
-        self._now_take(step.Lead(recovered))
+        self._now_take(steps.Lead(recovered))
         self._declared = [
             mesh.serve(
                 keys.schedule_any,
@@ -181,7 +181,7 @@ class Rcm:
                 concerns=self._concerns,
             ),
             *(
-                mesh.serve(key, messages.StateAsk, guard(self._states.answer), lane=Lane.QUESTION)
+                mesh.serve(key, messages.StateAsk, guard(self._on_state_asked), lane=Lane.QUESTION)
                 for key in (keys.rcm_state, keys.rcm_state_any)
             ),
             mesh.subscribe(keys.rc_state_any, messages.RcState, guard(self._on_rc_state)),
@@ -189,7 +189,7 @@ class Rcm:
             mesh.watch(keys.alive_any(Role.RC), guard(self._on_token)),
             mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, self.term.rcm)),
         ]
-        self.bookings.start()
+        self.sharing.start()
         self.supervisor.spawn(self._send_heartbeats())
 
     def stop(self) -> None:
@@ -204,40 +204,40 @@ class Rcm:
             self.inventory.stop()
         if text := self.leader.close(self.mesh.now()):
             log.info("%s", text)
-        self.bookings.close()
+        self.sharing.close()
         queries, self._open = self._open, {}
         for query in queries.values():
             query.refuse(Refused("not_leading", "this manager stopped leading; try again").problem)
         self._grants.close()
 
     def on_reload(self) -> None:
-        self._now_take(step.Reloaded())
+        self._now_take(steps.Reloaded())
 
     # In
 
     def _look(self) -> None:
         """Before the leader judges by tokens and answers, it is to know of a stall of this process."""
-        stalled = step.Stalled(self._stall.length, self._stall.ended, self._stall.fresh())
+        stalled = steps.Stalled(self._stall.length, self._stall.ended, self._stall.fresh())
         if stalled != self._stalled:
             self._stalled = stalled
             self._coming.append(stalled)
 
-    def _take(self, stimulus: step.Stimulus) -> None:
+    def _take(self, stimulus: steps.Stimulus) -> None:
         """Those of one burst are taken together."""
         first = not self._coming
-        if not isinstance(stimulus, step.Asked):
+        if not isinstance(stimulus, steps.Asked):
             self._look()
         self._coming.append(stimulus)
         if first:
             self.mesh.after_burst(self._run)
 
-    def _now_take(self, stimulus: step.Stimulus) -> None:
+    def _now_take(self, stimulus: steps.Stimulus) -> None:
         self._coming.append(stimulus)
         self._run()
 
     def _receive(self, *events: Event) -> None:
         """Events of one instant, decided at once."""
-        self._now_take(step.Happened(events))
+        self._now_take(steps.Happened(events))
 
     def _concerns(self, query: IncomingQuery[messages.Operation]) -> tuple[Lane, str]:
         """Dry runs and slots are questions; an operation on another host's request waits behind that host's surplus."""
@@ -248,18 +248,18 @@ class Rcm:
         return Lane.ASK, host if owner is None else client_of(owner).host
 
     def _on_operation(self, query: IncomingQuery[messages.Operation]) -> None:
-        if isinstance(query.message, (messages.Book, messages.Unbook, messages.FindSlots)):
-            self.bookings.handler.on_operation(query)
-            return
         ticket = next(self._tickets)
         self._open[ticket] = query
-        self._take(step.Asked(ticket, self.mesh.keys.sender_of(query.key), query.message))
+        self._take(steps.Asked(ticket, self.mesh.keys.sender_of(query.key), query.message))
+
+    def _on_state_asked(self, query: IncomingQuery[messages.StateAsk]) -> None:
+        query.answer(*self._view.answer(query.message, self.seq, self.mesh.now()))
 
     def _on_rc_state(self, key: str, state: messages.RcState) -> None:
-        self._take(step.Reported(key, state))
+        self._take(steps.Reported(key, state))
 
     def _on_token(self, token: Token, alive: bool) -> None:
-        self._take(step.Seen(token, alive))
+        self._take(steps.Seen(token, alive))
 
     def _on_alarm(self) -> None:
         self._look()
@@ -283,14 +283,14 @@ class Rcm:
         finally:
             self._running = False
 
-    def _carry_out(self, out: step.Outbox) -> bool:
+    def _carry_out(self, out: steps.Outbox) -> bool:
         """In the order of the fields. Return False if this leader stepped down."""
         mesh, supervisor = self.mesh, self.supervisor
         self._answer(out.at_once)
         for word, token in out.higher:
             verdict = self._on_newer(word)
             if token is not None and verdict.absent_until:
-                self._take(step.Shunned(token, verdict.absent_until))
+                self._take(steps.Shunned(token, verdict.absent_until))
         for rc, term in out.disbelieved:
             self._parts.on_disbelieved(rc, term)
         if not supervisor.active:
@@ -308,8 +308,13 @@ class Rcm:
             supervisor.spawn(self._ask(question))
         for sign, so in out.suspicions:
             mesh.suspicions.suspect(sign, so=so)
-        if out.effects or out.events:
-            self.bookings.note(out.events, out.effects)
+        self.sharing.tell(out.changed)
+        for keep in out.keep:
+            supervisor.spawn(self._keep(keep))
+        for danger in out.dangers:
+            words = f"is in danger: {danger.why}" if danger.why else "is safe again"
+            log.warning("booking %s of %s %s", danger.record.name, danger.record.owner, words)
+            self._parts.on_danger(danger)
         for text in out.log:
             log.info("%s", text)
         for subject, text in out.strange:
@@ -323,10 +328,10 @@ class Rcm:
         self._alarm.set(out.wake)
         return True
 
-    def _answer_grants(self, granted: Sequence[step.Reply]) -> None:
+    def _answer_grants(self, granted: Sequence[Answer]) -> None:
         self._answer(granted)
 
-    def _answer(self, answers: Iterable[tuple[step.Ticket, Struct]]) -> None:
+    def _answer(self, answers: Iterable[tuple[Ticket, Struct]]) -> None:
         for ticket, message in answers:
             if (query := self._open.pop(ticket, None)) is not None:
                 query.end(message)
@@ -353,11 +358,16 @@ class Rcm:
 
     async def _ask(self, asked: Question) -> None:
         if asked.kind is None:
-            self._take(step.Found(asked, await self.mesh.living(asked.key, timeout=asked.timeout)))
+            self._take(steps.Found(asked, await self.mesh.living(asked.key, timeout=asked.timeout)))
             return
         reply = await self.mesh.ask_one(asked.key, asked.message, asked.kind, timeout=asked.timeout)
         message, problem = (None, None) if reply is None else (reply.message, reply.problem)
-        self._take(step.Answered(asked, message, problem))
+        self._take(steps.Answered(asked, message, problem))
+
+    async def _keep(self, keep: Keep) -> None:
+        record = self._keeper.records.get(keep.booking)
+        why = await self.sharing.keep(record) if record is not None else ""
+        self._take(steps.Kept(keep, why))
 
     async def _send_heartbeats(self) -> None:
         """Repeats the last number whenever nothing was published for a while."""
@@ -370,7 +380,7 @@ class Rcm:
 
     # Proposals, and ballots
 
-    def _propose(self, proposed: step.Proposed) -> None:
+    def _propose(self, proposed: steps.Proposed) -> None:
         rc, proposal = proposed
         vote_timeout = self.fleet.timing.vote_timeout / SECOND
         # Overdue once; an answer that comes before the query ends still counts.
@@ -389,8 +399,8 @@ class Rcm:
         self.mesh.suspicions.suspect(f"{rc} is seen and does not vote", so=reply is None)
         ballot = reply.message if reply is not None else None
         if ballot is not None and ballot.proposal == proposal:
-            self._take(step.Happened([Vote(proposal, ballot.accept, ballot.reason[:MAX_REASON])]))
+            self._take(steps.Happened([Vote(proposal, ballot.accept, ballot.reason[:MAX_REASON])]))
             return
         if reply is not None and reply.problem is not None:
             log.warning("%s did not vote: %s", rc, reply.problem.message)
-        self._take(step.Happened([VoteOverdue(proposal)]))
+        self._take(steps.Happened([VoteOverdue(proposal)]))

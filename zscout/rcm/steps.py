@@ -8,19 +8,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
 
-from msgspec import Struct
-
 from zscout import messages
 from zscout.keyexpr import Sender, Token
-from zscout.messages import Grants, Notice, Problem
+from zscout.messages import BookingRecord, Grants, Notice, Problem
+from zscout.rcm.booked import Answer, BookedDanger, Keep, Ticket
 from zscout.rcm.recovery import RecoveredState
 from zscout.rcm.roster import Question
 from zscout.rcm.terms import Word
 from zscout.scheduling.model import Effect, Event
 from zscout.types import ArcId, HostName, Ns, RcName, Term
-
-Ticket: TypeAlias = int
-"""The number of a query that waits for its answer."""
 
 
 class Asked(NamedTuple):
@@ -87,13 +83,26 @@ class Stalled(NamedTuple):
     fresh: bool
 
 
+class Shared(NamedTuple):
+    """All keepers of bookings were asked; or there is `news`: records that were not known here."""
+
+    news: bool
+
+
+class Kept(NamedTuple):
+    """A record is kept, or not: `why`."""
+
+    keep: Keep
+    why: str
+
+
 class Reloaded(NamedTuple):
     """The fleet file's rights changed."""
 
 
-Stimulus: TypeAlias = Asked | Lead | Seen | Reported | Answered | Found | Happened | Shunned | Stalled | Reloaded
-
-Reply: TypeAlias = tuple[Ticket, Struct]
+Stimulus: TypeAlias = (
+    Asked | Lead | Seen | Reported | Answered | Found | Happened | Shunned | Stalled | Shared | Kept | Reloaded
+)
 
 
 class Proposed(NamedTuple):
@@ -105,26 +114,31 @@ class Proposed(NamedTuple):
 class Outbox:
     """What follows from a step, in the order in which it is carried out, nothing awaited in between."""
 
-    at_once: list[Reply] = field(default_factory=list)
+    at_once: list[Answer] = field(default_factory=list)
     """Answers that need no instant: refusals, and how requests stood before it."""
     higher: list[tuple[Word, Token | None]] = field(default_factory=list)
     """Terms above the own, and for an RC that is seen its token. A leader that steps down does nothing of the rest."""
     disbelieved: list[tuple[RcName, Term]] = field(default_factory=list)
-    granted: list[Reply] = field(default_factory=list)
+    granted: list[Answer] = field(default_factory=list)
     """Answers to requests that are granted: before anybody else learns of it."""
     grant_notices: list[Notice] = field(default_factory=list)
     reopened: list[tuple[str, ArcId]] = field(default_factory=list)
     """For the trace, before the publication."""
     publication: Grants | None = None
     notices: list[Notice] = field(default_factory=list)
-    answers: list[Reply] = field(default_factory=list)
+    answers: list[Answer] = field(default_factory=list)
     proposals: list[Proposed] = field(default_factory=list)
     questions: list[Question] = field(default_factory=list)
     suspicions: list[tuple[str, bool]] = field(default_factory=list)
     """Contradictions of the mesh, and those that are over."""
     events: Sequence[Event] = ()
     effects: Sequence[Effect] = ()
-    """Of the instant, for the bookings and those who count holds."""
+    """Of the instant, for those who count holds."""
+    changed: list[BookingRecord] = field(default_factory=list)
+    """Records to be shared with all keepers soon."""
+    keep: list[Keep] = field(default_factory=list)
+    """Those that are kept before they are answered."""
+    dangers: list[BookedDanger] = field(default_factory=list)
     log: list[str] = field(default_factory=list)
     strange: list[tuple[str, str]] = field(default_factory=list)
     """Warnings, each with its subject: of one subject not too many are logged."""
