@@ -21,11 +21,12 @@ from msgspec.structs import replace
 
 from zscout.config.fleet import FLEET_VARIABLE, Fleet, fleet_from_env, load_fleet
 from zscout.config.strict import BadInput, quoted
-from zscout.keyexpr import check_name, new_instance
-from zscout.messages import RcmState, Who
+from zscout.keyexpr import Role, check_name, new_instance
+from zscout.messages import Message, RcmState, Who
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.client import Client
+    from zscout.mesh import Mesh, Reply
 
 LOOK_FOR_RCM: Final = 2.0
 """Seconds in which a mesh that has an RCM shows it."""
@@ -156,6 +157,17 @@ async def state_of(client: Client, arc: str | None = None, *, forecast: bool = F
         if state is not None:
             return state
     raise NobodyThere(f"the leader of fleet {client.fleet.name} did not answer; try again, or see its log")
+
+
+async def ask_nodes(mesh: Mesh, message: Message, kind: type[T], timeout: float) -> list[Reply[T]]:
+    """The answers of all nodes to a question about components. On a secured fleet each is asked by itself: nobody may
+    answer with the key of a question to all."""
+    keys = mesh.keys
+    if not keys.closed:
+        return await mesh.ask(keys.component_any(mesh.me), message, kind, timeout=timeout)
+    hosts = {token.host for token in await mesh.living(keys.alive_any(Role.NODE), timeout=timeout)}
+    asked = (mesh.ask(keys.component(host, mesh.me), message, kind, timeout=timeout) for host in sorted(hosts))
+    return [reply for replies in await asyncio.gather(*asked) for reply in replies]
 
 
 async def until(true: Callable[[], bool], changed: asyncio.Event, seconds: float) -> bool:

@@ -130,9 +130,10 @@ async def shown(mesh: Mesh, _parameter: str) -> Iterable[str]:
 
 @_on_mesh
 async def _fleet_kinds(mesh: Mesh, _parameter: str) -> Iterable[str]:
+    from zscout.cli import common
     from zscout.messages import ComponentList, ListComponents
 
-    replies = await mesh.ask(mesh.keys.component_any(mesh.me), ListComponents(), ComponentList, timeout=LOOK)
+    replies = await common.ask_nodes(mesh, ListComponents(), ComponentList, LOOK)
     return {kind for reply in replies if reply.message is not None for kind in reply.message.kinds or ()}
 
 

@@ -30,7 +30,7 @@ from zscout.behaviors.client.request import (
 )
 from zscout.config.certificates import read_certificates
 from zscout.config.fleet import FLEET_VARIABLE, Fleet, beside, fleet_from_env
-from zscout.keyexpr import Role, Sender, Token, check_name, new_instance, valid_name
+from zscout.keyexpr import USERS, Role, Sender, Token, check_name, new_instance, valid_name
 from zscout.mesh import Mesh, ZenohMesh
 from zscout.mesh.exchange import naming_versions
 from zscout.mesh.supervision import done_within
@@ -278,6 +278,8 @@ class Client:
     ) -> Foresight | None:
         """Return what a request would lead to, without making it. None if no leader answered. Takes what `request`
         takes. Raises RequestRefused."""
+        if self.mesh.keys.closed and (why := self.fleet.access.refusal(self.mesh.me.host, "request devices", USERS)):
+            raise RequestRefused(Problem("not_allowed", why))
         seconds = self._protected(min_runtime)
         waits, wanted = self._waits(wait_for_device), amounts(needs)
         asked = messages.Foresee(

@@ -140,7 +140,7 @@ class Reader:
             return None
         mesh = self._client.mesh
         asked = ReadOutput(self._name)
-        replies = await mesh.ask(mesh.keys.component_any(mesh.me), asked, Output, timeout=READ_TIMEOUT)
+        replies = await common.ask_nodes(mesh, asked, Output, READ_TIMEOUT)
         found = [(one.message.incarnation, mesh.keys.host_of(one.key)) for one in replies if one.message]
         self._host = max(found)[1] if found else self._host
         return await self._read() if found else None

@@ -132,7 +132,7 @@ async def absent(mesh: Mesh, hosts: Collection[str]) -> list[str]:
 
 
 async def ask_nodes(mesh: Mesh, asked: ListComponents) -> list[ComponentList]:
-    replies = await mesh.ask(mesh.keys.component_any(mesh.me), asked, ComponentList, timeout=LOOK_FOR_HOSTS)
+    replies = await common.ask_nodes(mesh, asked, ComponentList, LOOK_FOR_HOSTS)
     lists = (reply.message for reply in replies if reply.message is not None)
     return sorted(lists, key=lambda answer: answer.host)
 

@@ -246,9 +246,10 @@ async def stop(names: Sequence[str], timeout: float | None, yes: bool, as_json: 
     stays = f"{', '.join(names)} will be stopped all the same; zscout component list tells how that goes"
     async with placing.connected("stop", names, as_json=as_json) as (client, shown, placer):
         await placing.ask_for_others(client, placer, names, "stop", yes=yes)
+        refused = set[str]()
 
         def lasting() -> str:
-            records = (placer.placements.get(name) for name in names)
+            records = (placer.placements.get(name) for name in names if name not in refused)
             running = (one for one in records if one and one.state not in placing.OVER)
             return "; ".join(f"{one.component} {placing.standing(one)}" for one in running)
 
@@ -257,6 +258,7 @@ async def stop(names: Sequence[str], timeout: float | None, yes: bool, as_json: 
 
         async with shown.within(timeout, late, stays):
             ends = await asyncio.gather(*(_end(placer, name) for name in names), return_exceptions=True)
+            refused |= {name for name, end in zip(names, ends, strict=True) if isinstance(end, BaseException)}
             while words := lasting():
                 shown.update(words)
                 await placer.wait_changed()

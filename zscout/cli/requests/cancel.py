@@ -12,7 +12,7 @@ from zscout.cli import common
 from zscout.cli.ownership import User, ask_for_others, whose, yes_option
 from zscout.cli.requests.options import arc_argument
 from zscout.config.strict import quoted
-from zscout.keyexpr import check_name, client_of
+from zscout.keyexpr import USERS, check_name, client_of
 from zscout.messages import Cancel, Notice, RcmState, Release, Who
 
 MAX_LISTED: Final = 20
@@ -137,6 +137,9 @@ def _instead(state: RcmState, named: str) -> str:
 
 async def _operate(client: Client, target: Target, word: str) -> Notice:
     """Has the RCM end one ARC; asking twice does no harm. Raises Failed, NobodyThere."""
+    own = client.mesh.me.host
+    if client.mesh.keys.closed and (why := client.fleet.access.refusal(own, "end requests", USERS)):
+        raise common.Failed(f"{target.full_name} was not ended: {why}")
     operation = (Cancel if word == "cancel" else Release)(id=target.id, client=target.client, who=client.who)
     key = client.mesh.keys.schedule(client.mesh.me)
     for _ in range(TRIES):
