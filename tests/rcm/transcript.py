@@ -161,12 +161,12 @@ class LeaderPlayer:
             case "lead":
                 return [steps.Lead(take_over(self.states, self.lists, self.now, self.admission))]
             case "come" | "gone":
-                return [steps.Seen(self._token(*what), name == "come")]
+                return [steps.TokenSeen(self._token(*what), name == "come")]
             case "promise":
                 state = structs.replace(self._state(*what), term=OWN)
-                return [steps.Answered(self.open.pop((Why.PROMISE, what[0])), state)]
+                return [steps.QuestionAnswered(self.open.pop((Why.PROMISE, what[0])), state)]
             case "requests":
-                return [steps.Answered(self.open.pop((Why.REQUESTS, what[0])), self._requests(*what))]
+                return [steps.QuestionAnswered(self.open.pop((Why.REQUESTS, what[0])), self._requests(*what))]
             case "state":
                 state = structs.replace(self._state(*what), term=OWN, seq=self.leader.seq)
                 return [steps.Reported(self.keys.rc_state(what[0]), state)]
@@ -222,9 +222,9 @@ class LeaderPlayer:
         wanted = {need: dict[str, Decimal]() for need in needs.split(",")}
         return kind(id=id_, arc=id_, needs=wanted, min_runtime=Decimal(more.get("runtime", "60")), **known)
 
-    def _asked(self, client: str, operation: Any) -> steps.Asked:
+    def _asked(self, client: str, operation: Any) -> steps.OperationAsked:
         self.tickets.append(f"{client} {type(operation).__name__.lower()} {operation.id}")
-        return steps.Asked(len(self.tickets), client_of(client), operation)
+        return steps.OperationAsked(len(self.tickets), client_of(client), operation)
 
     def _date(self, text: str) -> Booking:
         id_, need, start, runtime, priority = text.split(":")

@@ -66,7 +66,7 @@ NO_WORK: Final = BookingWork()
 """Nothing follows."""
 
 
-class Booked(Protocol):
+class FleetBookings(Protocol):
     """The bookings of one term."""
 
     @property

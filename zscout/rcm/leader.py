@@ -18,7 +18,7 @@ from zscout.keyexpr import BadName, Role
 from zscout.messages import Refused
 from zscout.rcm import steps
 from zscout.rcm.admission import Admission
-from zscout.rcm.booked import NO_WORK, Again, Booked, BookingWork
+from zscout.rcm.booked import NO_WORK, Again, BookingWork, FleetBookings
 from zscout.rcm.door import Door
 from zscout.rcm.operations import Operations, Taken
 from zscout.rcm.places import arc_id, request_id
@@ -74,7 +74,7 @@ class _Resume(NamedTuple):
 class _Booking(NamedTuple):
     """An operation on bookings, once the core is at the present time."""
 
-    asked: steps.Asked
+    asked: steps.OperationAsked
 
 
 class _BookingsDue(NamedTuple):
@@ -104,7 +104,7 @@ class Leader:
         admission: Admission,
         roster: Roster,
         door: Door,
-        bookings: Booked,
+        bookings: FleetBookings,
         runtimes: RuntimeEstimator | None,
     ) -> None:
         self._fleet, self.core, self._admission, self.roster = fleet, core, admission, roster
@@ -156,7 +156,7 @@ class Leader:
     def _next(self) -> Sequence[model.Event] | None:
         """The events of the next instant; None: there is none to decide."""
         operations, queue = self.operations, self._queue
-        while queue and isinstance(asked := queue[0], steps.Asked) and operations.joins(asked):
+        while queue and isinstance(asked := queue[0], steps.OperationAsked) and operations.joins(asked):
             queue.popleft()
             if isinstance(asked.operation, BOOKINGS):
                 self._follow(self.roster.heard(self._now, str(asked.sender)))
@@ -172,14 +172,14 @@ class Leader:
 
     def _events(self, work: _Work) -> Sequence[model.Event] | None:
         match work:
-            case steps.Seen(token, alive):
+            case steps.TokenSeen(token, alive):
                 token_moved = self.roster.client_token if token.role == Role.CLIENT else self.roster.rc_token
                 return self._follow(token_moved(self._now, token, alive=alive))
             case steps.Reported(key, state):
                 return self._follow(self.roster.rc_state(self._now, key, state))
-            case steps.Answered(question, message, problem):
+            case steps.QuestionAnswered(question, message, problem):
                 return self._follow(self.roster.answered(self._now, question, message, problem))
-            case steps.Found(question, tokens):
+            case steps.TokensFound(question, tokens):
                 return self._follow(self.roster.seen(self._now, question, tokens))
             case steps.Happened(events):
                 return events

@@ -17,14 +17,14 @@ from zscout.keyexpr import BadName, Sender, check_name, client_of
 from zscout.messages import Ask, Cancel, Foresee, Foresight, HandOver, Notice, Problem, Refused, Release
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
-from zscout.rcm.booked import Answer, Booked, Ticket
+from zscout.rcm.booked import Answer, FleetBookings, Ticket
 from zscout.rcm.deadlines import Deadlines
 from zscout.rcm.door import Door
 from zscout.rcm.places import arc_id, request_id
 from zscout.rcm.recovery import Listed, vouched
 from zscout.rcm.request_log import RequestLog, party_info, reason_info
 from zscout.rcm.roster import NOTHING, Change, Roster
-from zscout.rcm.steps import Asked
+from zscout.rcm.steps import OperationAsked
 from zscout.rcm.terms import Source, Word
 from zscout.scheduling import model
 from zscout.scheduling.core import Core
@@ -90,7 +90,7 @@ class Operations:
         roster: Roster,
         admission: Admission,
         door: Door,
-        bookings: Booked,
+        bookings: FleetBookings,
         runtimes: RuntimeEstimator | None,
     ) -> None:
         self.core, self._registry, self._roster, self._door = core, registry, roster, door
@@ -102,7 +102,7 @@ class Operations:
         self.instant = _Instant()
         self.waiting: dict[ArcId, list[Ticket]] = {}
         """Operations that are not answered yet, by ARC."""
-        self._deferred: list[Asked] = []
+        self._deferred: list[OperationAsked] = []
         """Asked by clients that believe to hold, or handed over by them, while their RCs have not said so."""
         self._moving: dict[int, tuple[Ticket, HandOver, ClientId, ClientId]] = {}
         """Hand-overs that wait until it is known whether their new client is there, by number."""
@@ -111,7 +111,7 @@ class Operations:
 
     # In
 
-    def joins(self, asked: Asked) -> bool:
+    def joins(self, asked: OperationAsked) -> bool:
         """Return True if an operation can be part of the instant that is gathered."""
         instant, operation = self.instant, asked.operation
         if not instant.touched:
@@ -128,7 +128,7 @@ class Operations:
                 return arc_id(operation.client or str(asked.sender), operation.id) not in instant.touched
         return False
 
-    def take(self, now: Ns, asked: Asked) -> Taken:
+    def take(self, now: Ns, asked: OperationAsked) -> Taken:
         """Take an operation in."""
         self._now = now
         ticket, sender, operation = asked
@@ -157,7 +157,7 @@ class Operations:
         """The events of the instant: first ends, then what is asked."""
         return [*self.instant.ended, *self.instant.shown, *self.instant.asked]
 
-    def resume(self) -> list[Asked]:
+    def resume(self) -> list[OperationAsked]:
         """The operations of clients that believe to hold, to be looked at again."""
         deferred, self._deferred = self._deferred, []
         return deferred
@@ -179,9 +179,9 @@ class Operations:
     def next(self) -> Ns | None:
         return self._deadlines.next
 
-    def tick(self, now: Ns) -> tuple[list[Answer], list[Asked]]:
+    def tick(self, now: Ns) -> tuple[list[Answer], list[OperationAsked]]:
         """First answers that are due, and operations to be looked at again."""
-        answers, again = list[Answer](), list[Asked]()
+        answers, again = list[Answer](), list[OperationAsked]()
         while (due := self._deadlines.pop_due(now)) is not None:
             match due:
                 case _Due.FIRST_ANSWER, arcs:
@@ -233,7 +233,7 @@ class Operations:
 
     # Asking
 
-    def _ask(self, asked: Asked, ask: Ask, sender: Sender, client: ClientId) -> None:
+    def _ask(self, asked: OperationAsked, ask: Ask, sender: Sender, client: ClientId) -> None:
         self._check_term(ask, sender, client)
         arc, now, answers = arc_id(client, ask.id), self._now, self._taken.answers
         undecided = self._may_hold(arc, ask) and self._roster.awaits(now, arc, ask.rcs)
@@ -343,7 +343,7 @@ class Operations:
         """Whether another client has this ARC: what one RCM handed over, the next knows by its place only."""
         return ask.place is not None and any(request_id(arc) == ask.id for arc in self.core.at_place(ask.place))
 
-    def _defer(self, asked: Asked) -> None:
+    def _defer(self, asked: OperationAsked) -> None:
         self._deferred.append(asked)
         self._deadlines.set(self._now + self._lease, (_Due.RESUME, None))
 
@@ -416,7 +416,7 @@ class Operations:
 
     # Handing over
 
-    def _find_new_client(self, asked: Asked, operation: HandOver, sender: ClientId) -> None:
+    def _find_new_client(self, asked: OperationAsked, operation: HandOver, sender: ClientId) -> None:
         to = str(client_of(operation.to))
         for other in operation.others:
             check_name(other, "id")

@@ -19,7 +19,7 @@ from zscout.scheduling.model import Effect, Event
 from zscout.types import ArcId, HostName, Ns, RcName, Term
 
 
-class Asked(NamedTuple):
+class OperationAsked(NamedTuple):
     """An operation on requests."""
 
     ticket: Ticket
@@ -33,7 +33,7 @@ class Lead(NamedTuple):
     recovered: RecoveredState
 
 
-class Seen(NamedTuple):
+class TokenSeen(NamedTuple):
     """A token of a client or an RC came or went."""
 
     token: Token
@@ -47,7 +47,7 @@ class Reported(NamedTuple):
     state: messages.RcState
 
 
-class Answered(NamedTuple):
+class QuestionAnswered(NamedTuple):
     """The first answer to a question; neither message nor problem: there was none."""
 
     question: Question
@@ -55,7 +55,7 @@ class Answered(NamedTuple):
     problem: Problem | None = None
 
 
-class Found(NamedTuple):
+class TokensFound(NamedTuple):
     """The tokens on a question's key."""
 
     question: Question
@@ -101,7 +101,18 @@ class Reloaded(NamedTuple):
 
 
 Stimulus: TypeAlias = (
-    Asked | Lead | Seen | Reported | Answered | Found | Happened | Shunned | Stalled | Shared | Kept | Reloaded
+    OperationAsked
+    | Lead
+    | TokenSeen
+    | Reported
+    | QuestionAnswered
+    | TokensFound
+    | Happened
+    | Shunned
+    | Stalled
+    | Shared
+    | Kept
+    | Reloaded
 )
 
 

@@ -225,7 +225,7 @@ class Rcm:
     def _take(self, stimulus: steps.Stimulus) -> None:
         """Those of one burst are taken together."""
         first = not self._coming
-        if not isinstance(stimulus, steps.Asked):
+        if not isinstance(stimulus, steps.OperationAsked):
             self._look()
         self._coming.append(stimulus)
         if first:
@@ -250,7 +250,7 @@ class Rcm:
     def _on_operation(self, query: IncomingQuery[messages.Operation]) -> None:
         ticket = next(self._tickets)
         self._open[ticket] = query
-        self._take(steps.Asked(ticket, self.mesh.keys.sender_of(query.key), query.message))
+        self._take(steps.OperationAsked(ticket, self.mesh.keys.sender_of(query.key), query.message))
 
     def _on_state_asked(self, query: IncomingQuery[messages.StateAsk]) -> None:
         query.answer(*self._view.answer(query.message, self.seq, self.mesh.now()))
@@ -259,7 +259,7 @@ class Rcm:
         self._take(steps.Reported(key, state))
 
     def _on_token(self, token: Token, alive: bool) -> None:
-        self._take(steps.Seen(token, alive))
+        self._take(steps.TokenSeen(token, alive))
 
     def _on_alarm(self) -> None:
         self._look()
@@ -358,11 +358,11 @@ class Rcm:
 
     async def _ask(self, asked: Question) -> None:
         if asked.kind is None:
-            self._take(steps.Found(asked, await self.mesh.living(asked.key, timeout=asked.timeout)))
+            self._take(steps.TokensFound(asked, await self.mesh.living(asked.key, timeout=asked.timeout)))
             return
         reply = await self.mesh.ask_one(asked.key, asked.message, asked.kind, timeout=asked.timeout)
         message, problem = (None, None) if reply is None else (reply.message, reply.problem)
-        self._take(steps.Answered(asked, message, problem))
+        self._take(steps.QuestionAnswered(asked, message, problem))
 
     async def _keep(self, keep: Keep) -> None:
         record = self._keeper.records.get(keep.booking)
