@@ -120,3 +120,18 @@ async def test_a_leader_that_is_asked_by_whom_it_does_not_see_joins_the_mesh_ane
         await asyncio.sleep(10)
         assert arc.state == "running"
         assert "client_lost" not in outcomes
+
+
+async def test_commands_go_on_while_the_process_of_an_rc_joins_the_mesh_anew() -> None:
+    """Until others know its new session, what they send arrives on the old one, which serves no more."""
+    async with small_fleet("one") as (fleet, (one,)):
+        _, grant = await held(one, "first")
+        fleet.network.delay = 0.1  # of links that are made from now on
+        renewable = fleet.devices._transport
+        renewable.renew()
+        done = 0
+        while renewable._renewing is not None:
+            assert (await one.command(RC, grant, ECHO)).result == ECHO["value"]
+            done += 1
+            await asyncio.sleep(0.01)
+        assert done > 1

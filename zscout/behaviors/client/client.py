@@ -46,6 +46,9 @@ LOOK_FOR_RCM: Final = 3.0
 LOOK_FOR_TAKEOVER: Final = 5.0
 """The same where a candidate is seen."""
 MAX_NAMED: Final = 5
+REJOINS: Final = 0.5
+"""Seconds for which a command is sent again that ended without an answer: others know a new session by then."""
+AGAIN: Final = 0.05
 TOLD_WITHIN = 1.0
 """Seconds within which a notice says so too; else the RC is believed."""
 
@@ -315,9 +318,13 @@ class Client:
         key = self.mesh.keys.command(rc, self.mesh.me)
         id_ = f"{self.internals.instance}-{next(self._commanded)}"
         command = messages.Command(grant=grant, do=dict(do), ttl=ttl, id=id_)
-        reply = await self.mesh.ask_one(key, command, Done, timeout=timeout)
-        if reply is None:
-            raise CommandRefused(rc, Problem("unknown", "no answer; it may or may not have been done"))
+        began, left = self.mesh.now(), timeout
+        while (reply := await self.mesh.ask_one(key, command, Done, timeout=left)) is None:
+            if (self.mesh.now() - began) / SECOND >= min(timeout, REJOINS):
+                raise CommandRefused(rc, Problem("unknown", "no answer; it may or may not have been done"))
+            # It ended early: its RC's process may be joining the mesh anew. Under one id it is done once.
+            await asyncio.sleep(AGAIN)
+            left = max(AGAIN, timeout - (self.mesh.now() - began) / SECOND)
         if reply.message is None:
             refused = CommandRefused(rc, reply.problem or Problem("unknown", "no reason given"))
             arc = next((arc for arc in self._store.open if arc.grant == grant), None)
