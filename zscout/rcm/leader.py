@@ -167,7 +167,14 @@ class Leader:
                 break
         else:
             if queue and not operations.instant.touched and not self._out.at_once:
-                return self._events(queue.popleft())
+                stimulus = queue.popleft()
+                try:
+                    return self._events(stimulus)
+                except BadName as error:
+                    if isinstance(stimulus, steps.Lead):
+                        raise
+                    self._out.strange.append((str(error), f"ignored what came under a bad name: {error}"))
+                    return None
         return operations.events() or None
 
     def _events(self, work: _Work) -> Sequence[model.Event] | None:

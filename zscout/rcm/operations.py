@@ -149,7 +149,7 @@ class Operations:
         except Refused as refused:
             self._taken.answers.append((ticket, refused.problem))
         except BadName as error:
-            self._taken.answers.append((ticket, Problem("bad_request", str(error))))
+            self._taken.answers.append((ticket, Problem("bad_name", str(error))))
         taken, self._taken = self._taken, Taken()
         return taken
 

@@ -164,7 +164,15 @@ async def open_viewer(
         allowed = source.removeprefix("rerun+").removesuffix("/proxy")
         served = ViewerPage((here, files), allowed, bind, page)
         try:
-            await served.start()
+            try:
+                await served.start()
+            except OSError:
+                if port is not None:
+                    raise
+                # Another program took it since it was found free: any other does as well.
+                page = free_port(bind, 0)
+                served = ViewerPage((here, files), allowed, bind, page)
+                await served.start()
         except OSError as error:
             raise BadInput(f"can't serve on {bind}, port {page} ({error.strerror}); choose another --port") from None
         try:
