@@ -208,6 +208,10 @@ async def _handshake(at: tuple[str, int], context: ssl.SSLContext) -> _Shaken | 
         pass
     finally:
         writer.transport.abort()
+        # The error by which it ended is logged as one that nobody looked at, else.
+        with suppress(OSError):
+            async with asyncio.timeout(OBJECTION):
+                await writer.wait_closed()
     return _Shaken(told, encoded, objection)
 
 

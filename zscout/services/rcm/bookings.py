@@ -136,7 +136,7 @@ class Bookings:
         except Refused as refused:
             self.handler.work.answers.append((ticket, refused.problem))
         except BadName as error:
-            self.handler.work.answers.append((ticket, Problem("bad_request", str(error))))
+            self.handler.work.answers.append((ticket, Problem("bad_name", str(error))))
         return self._work()
 
     def again(self, again: Again) -> BookingWork:
