@@ -200,8 +200,9 @@ def _reported(state: Any) -> set[str]:
 
 
 def _measured(out: str) -> bool:
-    """Whether the first load report with what the component uses has come."""
-    return out.startswith("{") and all(one["cpu"] is not None for one in json.loads(out)["components"])
+    """Whether its host has reported that it can be moved, and in a load report what it uses."""
+    shown = json.loads(out)["components"] if out.startswith("{") else []
+    return bool(shown) and all(one["cpu"] is not None and one["movable"] for one in shown)
 
 
 def _whole(keys: str) -> bool:
