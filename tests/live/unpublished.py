@@ -13,7 +13,6 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,8 +21,8 @@ from tests.live.bench import answer
 from tests.live.lab import Lab
 from zscout.behaviors.client.request import CommandRefused, OpenArc
 from zscout.config.node import load_node
+from zscout.messages import Grants
 from zscout.node import run_node
-from zscout.rcm.booked import Answer
 from zscout.services.rcm.rcm import Rcm
 from zscout.types import Grant
 
@@ -39,16 +38,16 @@ async def node(file: Path) -> None:
     """Runs a node that kills itself so."""
     settings = load_node(file)
     flag = file.with_suffix(".dies")
-    answer_grants = Rcm._answer_grants
+    publish = Rcm._publish
 
-    def then_dies(self: Rcm, granted: Sequence[Answer]) -> None:
-        answer_grants(self, granted)
-        if granted and flag.exists():
+    def dies_first(self: Rcm, grants: Grants) -> None:
+        if flag.exists() and any(grants.rcs.values()):
             flag.unlink()
             time.sleep(OUT)
             os.kill(os.getpid(), signal.SIGKILL)
+        publish(self, grants)
 
-    Rcm._answer_grants = then_dies  # type: ignore[method-assign]
+    Rcm._publish = dies_first  # type: ignore[method-assign]
     await run_node(settings, asyncio.Event())
 
 

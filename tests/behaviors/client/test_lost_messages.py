@@ -11,6 +11,7 @@ from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, held, small_flee
 from tests.mesh.kit import until
 from zscout.behaviors.client.confirmation import CONFIRM_TIMEOUT
 from zscout.behaviors.client.request import CommandRefused
+from zscout.messages import Command
 from zscout.scheduling.model import HOLD_BACK
 from zscout.testing.link import Disturbance
 from zscout.types import SECOND
@@ -135,3 +136,21 @@ async def test_commands_go_on_while_the_process_of_an_rc_joins_the_mesh_anew() -
             done += 1
             await asyncio.sleep(0.01)
         assert done > 1
+
+
+async def test_a_command_that_is_sent_again_has_what_is_left_of_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A drive command is not carried out for longer, or later, than it was meant."""
+    async with small_fleet("one") as (_, (one,)):
+        _, grant = await held(one, "first")
+        sent = []
+
+        async def ends_early(_key: str, command: Command, *_: object, **__: object) -> None:
+            sent.append((one.mesh.now(), command))
+
+        monkeypatch.setattr(one.mesh, "ask_one", ends_early)
+        with pytest.raises(CommandRefused, match="no answer"):
+            await one.command(RC, grant, ECHO, ttl=0.2)
+        assert len(sent) > 1
+        assert len({command.id for _, command in sent}) == 1
+        ends = [at / SECOND + command.ttl for at, command in sent]
+        assert ends == pytest.approx(ends[:1] * len(ends))

@@ -318,13 +318,15 @@ class Client:
         key = self.mesh.keys.command(rc, self.mesh.me)
         id_ = f"{self.internals.instance}-{next(self._commanded)}"
         command = messages.Command(grant=grant, do=dict(do), ttl=ttl, id=id_)
-        began, left = self.mesh.now(), timeout
-        while (reply := await self.mesh.ask_one(key, command, Done, timeout=left)) is None:
-            if (self.mesh.now() - began) / SECOND >= min(timeout, REJOINS):
+        began, gone = self.mesh.now(), 0.0
+        while (
+            reply := await self.mesh.ask_one(key, replace(command, ttl=ttl - gone), Done, timeout=timeout - gone)
+        ) is None:
+            gone = (self.mesh.now() - began) / SECOND + AGAIN
+            if gone >= min(timeout, ttl, REJOINS):
                 raise CommandRefused(rc, Problem("unknown", "no answer; it may or may not have been done"))
             # It ended early: its RC's process may be joining the mesh anew. Under one id it is done once.
             await asyncio.sleep(AGAIN)
-            left = max(AGAIN, timeout - (self.mesh.now() - began) / SECOND)
         if reply.message is None:
             refused = CommandRefused(rc, reply.problem or Problem("unknown", "no reason given"))
             arc = next((arc for arc in self._store.open if arc.grant == grant), None)

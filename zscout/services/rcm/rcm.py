@@ -23,7 +23,7 @@ from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.rcm import steps
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
-from zscout.rcm.booked import Answer, BookedDanger, Keep, Ticket
+from zscout.rcm.booked import BookedDanger, Keep, Ticket
 from zscout.rcm.door import Door
 from zscout.rcm.leader import Leader
 from zscout.rcm.places import Places
@@ -295,7 +295,7 @@ class Rcm:
             self._parts.on_disbelieved(rc, term)
         if not supervisor.active:
             return False
-        self._answer_grants(out.granted)
+        self._answer(out.granted)
         self._notify(out.grant_notices)
         self._trace(out.reopened)
         if out.publication is not None:
@@ -327,9 +327,6 @@ class Rcm:
         self._trace(out.over)
         self._alarm.set(out.wake)
         return True
-
-    def _answer_grants(self, granted: Sequence[Answer]) -> None:
-        self._answer(granted)
 
     def _answer(self, answers: Iterable[tuple[Ticket, Struct]]) -> None:
         for ticket, message in answers:
