@@ -40,7 +40,7 @@ a host that was alone went on, which had differed by 2 s; and at 519734 a candid
 RC. At 1466 a hold that a forger had made up was vouched for by its second report."""
 MISSED = {
     "order": 15, "grant": 2, "safe first": 1, "snapshots": 8, "step down": 1, "reopen": 2, "places": 2,
-    "withdrawn": 119, "believed": 147, "settling": 8, "deadline": 8, "once": 10, "sealed": 10, "copied": 3,
+    "withdrawn": 65, "believed": 147, "settling": 8, "deadline": 8, "once": 10, "sealed": 10, "copied": 3,
     "dates": 343, "merged": 3, "caught up": 4, "one stands": 33, "awaited": 3003, "had again": 13, "dates first": 113,
     "fleet time": 4, "late": 173, "slewed": 3, "door": 5, "clamped": 25, "certified": 5, "managers": 5,
     "words": 6, "doubted": 46, "sealed terms": 26, "back": 36,
