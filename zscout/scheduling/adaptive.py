@@ -25,10 +25,11 @@ from typing import Final, Literal
 
 from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling import priority
-from zscout.scheduling.conflict_groups import ConflictGroup, conflict_groups
+from zscout.scheduling.conflict_groups import ConflictGroup, conflict_groups, take_all
 from zscout.scheduling.local_search import LocalSearch
 from zscout.scheduling.model import Rc
 from zscout.scheduling.packing import PackingItem, PackingProblem, numbers, pack
+from zscout.scheduling.plan import dry_run
 from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.reservations import Reservations, reservations
 from zscout.scheduling.state import Actions, SchedulerState, Strategy
@@ -79,7 +80,10 @@ class _Search:
 
     def fits(self, group: ConflictGroup) -> bool:
         return (
-            self.items == group.items and self.arcs == [arc.id for arc in group.arcs] and self.nogoods == group.nogoods
+            self.items == group.items
+            and self.arcs == [arc.id for arc in group.arcs]
+            and self.nogoods == group.nogoods
+            and group.planned in {None, self.heuristic}
         )
 
     @property
@@ -115,12 +119,17 @@ class Adaptive(Strategy):
             actions.run_again()
             return
         before, self._searches, self._unfinished = self._searches, {}, []
-        held = 0
+        held, taken = 0, list[tuple[ConflictGroup, int]]()
         reserved = self._reserve(state)
-        for group in conflict_groups(state, reserved, MAX_STARTABLE):
-            if not self._decide(group, before, actions):
-                held |= group.mask
-        priority.run_pass(state, actions, off_limits=held, reserved=reserved)
+        plan = dry_run(state, reserved)
+        for group in conflict_groups(state, reserved, MAX_STARTABLE, plan):
+            match self._decide(group, before, actions):
+                case "open":
+                    held |= group.off_limits
+                case int(chosen):
+                    taken.append((group, chosen))
+        plan = take_all(state, reserved, plan, taken, actions)
+        priority.run_pass(state, actions, off_limits=held, reserved=reserved, plan=plan)
         self._seen = _situation(state)
 
     def _reserve(self, state: SchedulerState) -> Reservations | None:
@@ -142,13 +151,15 @@ class Adaptive(Strategy):
         changed = index.freed or index.touched or votes.answered or votes.invalidated or votes.due(state.now)
         return not changed and self._seen == _situation(state)
 
-    def _decide(self, group: ConflictGroup, before: dict[ArcId, _Search], actions: Actions) -> bool:
-        """Take the better set of a group, or leave it to `priority`. False: off limits for now."""
+    def _decide(
+        self, group: ConflictGroup, before: dict[ArcId, _Search], actions: Actions
+    ) -> int | Literal["open", "left"]:
+        """The better set of a group. `left`: to `priority`; `open`: off limits for now."""
         earlier = list({id(known): known for arc in group.arcs if (known := before.get(arc.id))}.values())
         while (search := self._search(group, earlier)) is not None:
             self._searches.update(dict.fromkeys(search.arcs, search))
             if search.exhausted:
-                return True
+                return "left"
             if not search.begun and self._work > 0:
                 self._begin(search)
             asked = self._ask(group, search, search.heuristic, actions) if search.inexact else "yes"
@@ -159,18 +170,17 @@ class Adaptive(Strategy):
                             actions.wait(arc, SEARCHING, settled=False)
                     self._unfinished.append(search)
                     actions.run_again()
-                    return False
+                    return "open"
                 if not search.gains:
-                    return True
+                    return "left"
                 asked = self._ask(group, search, search.best, actions)
             if asked == "yes":
                 self._report_gain(group, search)
-                group.take(search.best, actions)
-                return True
+                return search.best
             if asked == "open":
-                return False
+                return "open"
             earlier = [search]
-        return True
+        return "left"
 
     def _ask(
         self, group: ConflictGroup, search: _Search, chosen: int, actions: Actions
@@ -192,8 +202,8 @@ class Adaptive(Strategy):
         if len(earlier) == 1 and earlier[0].fits(group):
             return earlier[0]
         problem = group.problem()
-        heuristic = problem.complete()
-        if problem.value(heuristic) >= problem.upper_bound_of_all():
+        heuristic = problem.complete() if group.planned is None else group.planned
+        if group.moves or problem.value(heuristic) >= problem.upper_bound_of_all():
             return None
         arcs = [arc.id for arc in group.arcs]
         preferred = problem.complete(_warm_start(earlier, arcs)) if earlier else heuristic

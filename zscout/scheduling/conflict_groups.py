@@ -15,7 +15,8 @@ from operator import attrgetter
 
 from zscout.scheduling.model import Arc, Rank, Rc, union
 from zscout.scheduling.packing import PackingItem, PackingProblem
-from zscout.scheduling.patterns import bind_all
+from zscout.scheduling.patterns import alternatives, bind_all
+from zscout.scheduling.plan import NO_PLAN, Plan, dry_run
 from zscout.scheduling.queue_index import Watched
 from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.state import Actions, SchedulerState
@@ -24,17 +25,18 @@ from zscout.types import ArcId, Ns
 
 
 def undecided_arcs(
-    state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None
+    state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None, plan: Plan = NO_PLAN
 ) -> list[Arc] | None:
-    """The queued ARCs that might start, best-ranked first, then the running ARCs that might end; None: over `limit`."""
+    """The queued ARCs that might start, best-ranked first, then the running ARCs that might end; None: over `limit`.
+    ARCs are bound as planned; the others to what these leave, as far as possible."""
     if state.by_pattern:
-        bind_all(state, reserved)
-    return _Search(state, reserved).run(limit)
+        bind_all(state, reserved, plan.mask)
+    return _Search(state, reserved, plan).run(limit)
 
 
 class _Search:
-    def __init__(self, state: SchedulerState, reserved: Reservations | None) -> None:
-        self.state, self.votes, self.reserved = state, state.votes, reserved
+    def __init__(self, state: SchedulerState, reserved: Reservations | None, plan: Plan) -> None:
+        self.state, self.votes, self.reserved, self.plan = state, state.votes, reserved, plan
         self.preemptible: dict[ArcId, Arc] = {}  # running ARCs that might have to end
         self._heap: list[
             tuple[Rank, int, Arc, Watched | None]
@@ -54,7 +56,7 @@ class _Search:
         while self._heap:
             rank, _, arc, on = heapq.heappop(self._heap)
             if arc.like is not None and rank != last:
-                self.state.bind(arc, arc.like.bound(arc))
+                self.state.bind(arc, self.plan.bound.get(arc.id) or arc.like.bound(arc))
             # An ARC may be queued twice in the heap; duplicates are adjacent because ranks are unique.
             if rank != last and self._might_start(arc):
                 found.append(arc)
@@ -129,17 +131,41 @@ class _Search:
 
 
 def conflict_groups(
-    state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None
+    state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None, plan: Plan = NO_PLAN
 ) -> list[ConflictGroup]:
     """The groups with a choice, best-ranked first; none if more than `limit` ARCs could start.
 
     One ARC, or one queued ARC without sharable RCs in its group, leaves no choice: `priority` starts it."""
     return [
-        ConflictGroup(state, members, reserved)
-        for members in split(undecided_arcs(state, reserved, limit) or ())
+        ConflictGroup(state, members, reserved, plan)
+        for members in split(undecided_arcs(state, reserved, limit, plan) or ())
         if len(members) > 1
         and (sum(arc.hold is None for arc in members) > 1 or any(arc.mask & state.sharable for arc in members))
     ]
+
+
+def take_all(
+    state: SchedulerState,
+    reserved: Reservations | None,
+    plan: Plan,
+    taken: list[tuple[ConflictGroup, int]],
+    actions: Actions,
+) -> Plan:
+    """Take these sets, and return the plan of a pass after that. A group with an ARC that this pass would end again is
+    left to it."""
+    while taken and plan is not NO_PLAN:
+        changes = [group.changes(chosen) for group, chosen in taken]
+        starting = [arc for starting, _ in changes for arc in starting]
+        after = dry_run(state, reserved, starting, [arc for _, ending in changes for arc in ending])
+        if not after.dropped:
+            plan = after
+            break
+        taken = [
+            (group, chosen) for group, chosen in taken if not any(arc.id in after.dropped for arc in group.arcs)
+        ]
+    for group, chosen in taken:
+        group.take(chosen, actions, plan)
+    return plan
 
 
 def split(arcs: Iterable[Arc]) -> list[list[Arc]]:
@@ -198,7 +224,9 @@ def _one_group(arcs: Sequence[Arc]) -> bool:
 
 
 class ConflictGroup:
-    def __init__(self, state: SchedulerState, arcs: list[Arc], reserved: Reservations | None = None) -> None:
+    def __init__(
+        self, state: SchedulerState, arcs: list[Arc], reserved: Reservations | None = None, plan: Plan = NO_PLAN
+    ) -> None:
         self.state, self.votes = state, state.votes
         now = state.now
         first = {arc.id for arc in arcs if reserved is not None and reserved.goes_first(arc)}
@@ -219,6 +247,14 @@ class ConflictGroup:
             )
             for arc, key in zip(self.arcs, keys, strict=True)
         ]
+        self.planned: int | None = None
+        """The set of the plan as bits of item numbers. None: as by name, the plan is not needed."""
+        self.moves = False
+        """`priority` would end an ARC and start it on other RCs, which no set of these items can express."""
+        if plan is not NO_PLAN:
+            stay = (arc.id in plan.started if arc.hold is None else arc.id not in plan.ended for arc in self.arcs)
+            self.planned = sum(1 << number for number, stays in enumerate(stay) if stays)
+            self.moves = any(arc.id in plan.started and arc.id in plan.ended for arc in self.arcs)
         self._number = {arc.id: number for number, arc in enumerate(self.arcs)}
         self.sharables = list(state.rcs_in(self.mask & state.sharable))
         vetoes = {rc.name: set(self._vetoes(rc)) for rc in self.sharables}
@@ -248,11 +284,25 @@ class ConflictGroup:
                 ruled_out = True
         return None if ruled_out else proposals
 
-    def take(self, chosen: int, actions: Actions) -> None:
-        """Preempt the running ARCs outside the set, start the queued ARCs in it."""
+    @property
+    def off_limits(self) -> int:
+        """Bits of the RCs that it may take while its votes are out."""
+        waiting = (arc for arc in self.arcs if arc.patterns and arc.hold is None)
+        return self.mask | union(alternatives(self.state, arc) for arc in waiting)
+
+    def changes(self, chosen: int) -> tuple[list[Arc], list[Arc]]:
+        """The queued ARCs in the set, and the running ARCs outside it."""
         taken = [chosen >> number & 1 for number in range(len(self.arcs))]
         starting = [arc for arc, is_taken in zip(self.arcs, taken, strict=True) if is_taken and arc.hold is None]
         ending = [arc for arc, is_taken in zip(self.arcs, taken, strict=True) if not is_taken and arc.hold is not None]
+        return starting, ending
+
+    def take(self, chosen: int, actions: Actions, plan: Plan) -> None:
+        """Preempt the running ARCs outside the set, start the queued ARCs in it."""
+        starting, ending = self.changes(chosen)
+        for arc in starting:
+            if arc.patterns:
+                self.state.bind(arc, plan.bound[arc.id])
         for victim in ending:
             actions.preempt(victim, by=self._taker(victim, starting))
         for arc in starting:
@@ -261,8 +311,12 @@ class ConflictGroup:
     def _vetoes(self, rc: Rc) -> Iterator[int]:
         """The vetoes of `rc` on these ARCs. Its other holders stay."""
         for holders in self.votes.vetoed(rc.name):
-            if all(arc in self._number or arc in rc.holders for arc in holders) and (nogood := self._bits(holders)):
+            if all(self._may_hold(rc, arc) for arc in holders) and (nogood := self._bits(holders)):
                 yield nogood
+
+    def _may_hold(self, rc: Rc, arc: ArcId) -> bool:
+        number = self._number.get(arc)
+        return arc in rc.holders if number is None else bool(self.arcs[number].mask & rc.bit)
 
     def _probe(self, rc: Rc, holders: HolderSet) -> HolderSet:
         """Propose half of the ARCs not accepted yet: a veto of few ARCs rules out far more sets than a veto of many."""

@@ -17,10 +17,11 @@ from msgspec.structs import replace
 
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy
 from zscout.scheduling import model
+from zscout.scheduling.admission import AdmissionCheck
 from zscout.scheduling.booking import Booked, Booking, BookingStatus, Dates, Redated, Unbooked
 from zscout.scheduling.calendar import Calendar
 from zscout.scheduling.model import Arc, ArcState, ArcStatus, Hold, Outcome, Rc, RcStatus, Status
-from zscout.scheduling.priority import AdmissionCheck, Priority, reason_of_now, reasons_of_now
+from zscout.scheduling.priority import Priority, reason_of_now, reasons_of_now
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.scheduling.slots import SlotsFound, slots

@@ -249,9 +249,17 @@ class Rc:
     sharable: bool = False
     absence: str = ""  # the reason while absent, if known
     holders: dict[ArcId, Arc] = field(default_factory=dict)
-    demand: int = 0  # queued ARCs that name it
+    demand: list[Rank] = field(default_factory=list)  # of the queued ARCs that name it, best first
     watchers: list[Rank] = field(default_factory=list)
     """Ranks of the queued ARCs that watch it (`QueueIndex`), best first."""
+
+    @property
+    def wanted(self) -> tuple[float, ...]:
+        """Sort key: the less wanted the smaller, by the best rank that names it, then by number."""
+        if not self.demand:
+            return (-math.inf,)
+        priority, position, min_runtime, _, _ = self.demand[0]
+        return -priority, -position, -min_runtime, len(self.demand)
 
     def non_preemptible_holders(self, arc: Arc, now: Ns) -> list[Arc]:
         return [holder for holder in self.holders.values() if not holder.preemptible_by(arc, now)]

@@ -18,13 +18,14 @@ from __future__ import annotations
 
 import functools
 import importlib.util
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling import priority
-from zscout.scheduling.conflict_groups import ConflictGroup, conflict_groups
+from zscout.scheduling.conflict_groups import ConflictGroup, conflict_groups, take_all
 from zscout.scheduling.local_search import LocalSearch
 from zscout.scheduling.packing import PackingProblem, numbers, pack
+from zscout.scheduling.plan import dry_run
 from zscout.scheduling.state import Actions, SchedulerState, Strategy
 
 if TYPE_CHECKING:
@@ -148,28 +149,33 @@ class Optimal(Strategy):
     name: StrategyName = "optimal"
 
     def run_pass(self, state: SchedulerState, actions: Actions) -> None:
-        held = 0
-        for group in conflict_groups(state):
-            if not decide(group, actions):
-                held |= group.mask
-        # It starts none, but reports the reasons of waiting ARCs.
-        priority.run_pass(state, actions, off_limits=held)
+        held, taken, plan = 0, list[tuple[ConflictGroup, int]](), dry_run(state, None)
+        for group in conflict_groups(state, plan=plan):
+            match decide(group, actions):
+                case "open":
+                    held |= group.off_limits
+                case int(chosen):
+                    taken.append((group, chosen))
+        plan = take_all(state, None, plan, taken, actions)
+        # It starts none by name, but reports the reasons of waiting ARCs.
+        priority.run_pass(state, actions, off_limits=held, plan=plan)
 
 
-def decide(group: ConflictGroup, actions: Actions) -> bool:
-    """Take the best set of a group, or leave it to `priority`. False: votes are out; nothing changes yet."""
+def decide(group: ConflictGroup, actions: Actions) -> int | Literal["open", "left"]:
+    """The best set of a group. `left`: to `priority`; `open`: votes are out; nothing changes yet."""
     proposals = None
     while proposals is None:
-        if len(group.nogoods) > MAX_VETOES:
-            return True
+        if group.moves or len(group.nogoods) > MAX_VETOES:
+            return "left"
         # None: ruled out by a known veto; each round bars at least one more set.
-        proposals = group.missing_votes(chosen := best(group.problem()))
+        problem = group.problem()
+        proposals = group.missing_votes(chosen := best(problem))
     if proposals:
         for rc, holders in proposals:
             actions.propose(rc, holders)
-        return False
-    group.take(chosen, actions)
-    return True
+        return "open"
+    worse = group.planned is not None and problem.key(chosen) < problem.key(group.planned)
+    return "left" if worse else chosen
 
 
 def best(problem: PackingProblem) -> int:

@@ -6,8 +6,8 @@ keeps its binding to its end.
 
 The worst of an ARC's choices counts (`Fitness`): the binding without the worse kind wins, found by augmenting paths
 (Kuhn's algorithm), so an ARC never waits where some choice of free RCs would let it run. Ties: the RC kept for the
-ARC's booking, then the RC that fewest ARCs wait for by name. Of sharable RCs: the RC of the ARC that it continues, then
-the fewest holders.
+ARC's booking, then the RC that nobody waits for by name, or those of the lowest rank (`Rc.wanted`). Of sharable RCs:
+the RC of the ARC that it continues, then the fewest holders. The bindings of a pass are found together (`plan.py`).
 
 Where holds have to end, the fewest and lowest-ranked do (`_least_ending`). Holders of named exclusive RCs end anyway,
 so their other RCs count as free.
@@ -54,7 +54,7 @@ class _Choice(NamedTuple):
     """An RC for a pattern. The least is the best."""
 
     fitness: Fitness
-    tie: float
+    tie: tuple[float, ...]
     bit: int
     rc: Rc
 
@@ -70,7 +70,7 @@ class Choices:
         there = like.reach & state.present
         free = there & ~(closed | state.busy | state.sharable | (0 if arc.claim is None else arc.claim.kept))
         self._there, self._held = there, there & ~(free | state.sharable | usable(state, arc))
-        self._best_first = [_Choice(Fitness.FREE, rc.demand, rc.bit, rc) for rc in state.rcs_in(free)]
+        self._best_first = [_Choice(Fitness.FREE, rc.wanted, rc.bit, rc) for rc in state.rcs_in(free)]
         self._best_first += [
             _Choice(*_fitness(state, arc, rc, bool(rc.bit & closed), ending), rc.bit, rc)
             for rc in state.rcs_in(there & ~(free | self._held))
@@ -87,6 +87,11 @@ class Choices:
             self._found[key] = self._bind(*key)
         return self._found[key]
 
+    def first(self, mask: int) -> Rc | None:
+        """The best RC in `mask` that may serve the ARC now."""
+        usable = _count(self._best_first, Fitness.PREEMPTIBLE)
+        return next((choice.rc for choice in self._best_first[:usable] if choice.bit & mask), None)
+
     def _bind(self, without: int, claimed: int) -> Mapping[Need, RcName] | None:
         found = self._best_first
         if without:
@@ -94,7 +99,7 @@ class Choices:
         if claimed:
             free = found[: _count(found, Fitness.FREED)]
             taken = [choice for choice in free if choice.bit & claimed and not choice.rc.sharable]
-            taken = [_Choice(Fitness.CLAIMED, choice.rc.demand, choice.bit, choice.rc) for choice in taken]
+            taken = [_Choice(Fitness.CLAIMED, choice.tie, choice.bit, choice.rc) for choice in taken]
             left = [choice for choice in free if not choice.bit & claimed or choice.rc.sharable]
             found = [*left, *sorted(taken), *found[len(free) :]]
         numbers = Counter(self._masks.values())
@@ -103,7 +108,7 @@ class Choices:
         for worst in Fitness:
             if worst is Fitness.HELD:
                 rcs = self._state.rcs_in(self._held & ~without)
-                held = [_Choice(worst, _held_until(rc.holders.values()), rc.bit, rc) for rc in rcs]
+                held = [_Choice(worst, (_held_until(rc.holders.values()),), rc.bit, rc) for rc in rcs]
                 found = sorted([*found, *held])
             more = found[seen : _count(found, worst)]
             seen += len(more)
@@ -179,6 +184,12 @@ def short(state: SchedulerState, arc: Arc) -> bool:
     return class_of(arc).short
 
 
+def alternatives(state: SchedulerState, arc: Arc) -> int:
+    """Bits of the sharable RCs that its patterns may be bound to instead, where one is bound to a sharable RC."""
+    masks = class_of(arc).masks
+    return union(masks[need] & state.sharable for need, rc in arc.bound.items() if state.rc(rc).sharable)
+
+
 def all_present(state: SchedulerState, arc: Arc) -> bool:
     """Return True if enough RCs are present for all patterns."""
     return enough(mask & state.present for mask in class_of(arc).masks.values())
@@ -207,29 +218,29 @@ def enough(masks: Iterable[int]) -> bool:
     return all(place(number, [0]) for number in range(len(wanted)))
 
 
-def _fitness(state: SchedulerState, arc: Arc, rc: Rc, closed: bool, ending: Collection[Arc]) -> tuple[Fitness, float]:
+def _fitness(state: SchedulerState, arc: Arc, rc: Rc, closed: bool, ending: Collection[Arc]) -> tuple[Fitness, tuple[float, ...]]:
     """The fitness of `rc` where the holders `ending` end anyway, and a tie-breaker. `closed`: reserved for another."""
     non_preemptible = rc.non_preemptible_holders(arc, state.now)
     kept = arc.claim is not None and bool(rc.bit & arc.claim.kept)
     if rc.sharable:
         answer = state.votes.known(rc.name, frozenset((*(holder.id for holder in non_preemptible), arc.id)))
         if closed or (answer is None and rc.name in state.votes.unresponsive):
-            return Fitness.RESERVED, rc.demand
+            return Fitness.RESERVED, rc.wanted
         if answer is not None and not answer.accept:
-            return Fitness.HELD, rc.demand
+            return Fitness.HELD, rc.wanted
         # The ARC that it continues ends for it; its device continues only on the same RC.
         asked = arc.request
         continues_here = bool(asked.continues) and any(
             asked.continues_from(holder.request) for holder in rc.holders.values()
         )
-        return Fitness.FREE, -1 if continues_here or kept else len(rc.holders) + (answer is None)
+        return Fitness.FREE, (-1 if continues_here or kept else len(rc.holders) + (answer is None),)
     if non_preemptible:
-        return Fitness.HELD, _held_until(non_preemptible)
+        return Fitness.HELD, (_held_until(non_preemptible),)
     if closed:
-        return Fitness.RESERVED, rc.demand
+        return Fitness.RESERVED, rc.wanted
     if others := [holder for holder in rc.holders.values() if holder not in ending]:
-        return Fitness.PREEMPTIBLE, max(holder.priority for holder in others)
-    return Fitness.FREED if rc.holders else Fitness.FREE, -1 if kept else rc.demand
+        return Fitness.PREEMPTIBLE, (max(holder.priority for holder in others),)
+    return Fitness.FREED if rc.holders else Fitness.FREE, () if kept else rc.wanted
 
 
 def _held_until(holders: Iterable[Arc]) -> Ns:
@@ -303,11 +314,11 @@ def _ranks(arcs: Iterable[Arc]) -> list[Rank]:
     return sorted(arc.rank for arc in arcs)
 
 
-def bind_all(state: SchedulerState, reserved: Reservations | None = None) -> None:
+def bind_all(state: SchedulerState, reserved: Reservations | None = None, claimed: int = 0) -> None:
     """Find bindings of all queued ARCs with patterns (`PatternClass.bound`), best-ranked first, to different RCs as
-    far as possible. Once a class claims no more, its other members have the same, until others claim what it may
+    far as possible, and to others than the `claimed`. Once a class claims no more, its other members have the same, until others claim what it may
     have."""
-    claimed, asleep = 0, dict[PatternClass, int]()  # with the RCs of which it matters whether they are claimed
+    asleep = dict[PatternClass, int]()  # with the RCs of which it matters whether they are claimed
     heap = [(like.members[0], number, like) for number, like in enumerate(state.classes.values())]
     numbers = {like: number for _, number, like in heap}
     heapq.heapify(heap)

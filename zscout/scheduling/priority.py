@@ -40,192 +40,25 @@ them joins, is freed or becomes off limits. Then its members are checked in rank
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
 from operator import attrgetter
-from typing import Final, Literal, TypeAlias
+from typing import Final
 
 from zscout.config.scheduling_policy import RcQuota, StrategyName
-from zscout.scheduling.model import Arc, ArcState, PatternClass, Rank, Rc, absences, union
-from zscout.scheduling.patterns import all_present, bind, choices, class_of, no_match, short
+from zscout.scheduling.admission import Admissible, AdmissionCheck, Verdict, VotesNeeded, judge, judge_bindings
+from zscout.scheduling.model import Arc, ArcState, PatternClass, Rank, Rc, union
+from zscout.scheduling.patterns import all_present, alternatives, bind, class_of, no_match, short
+from zscout.scheduling.plan import NO_PLAN, Plan, dry_run
 from zscout.scheduling.queue_index import Watched
-from zscout.scheduling.reason import SHOWN, SHOWN_CHOICES, Reason, ReasonCode, of_rcs
+from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.reservations import Inadmissible, Reservations
 from zscout.scheduling.state import Actions, SchedulerState, Strategy
-from zscout.scheduling.votes import Answer, HolderSet
-from zscout.types import ArcId, Need, RcName
-
-
-@dataclass(frozen=True, slots=True)
-class VotesNeeded:
-    proposals: list[tuple[Rc, HolderSet]]
-
-
-@dataclass(frozen=True, slots=True)
-class Admissible:
-    victims: list[Arc]
-
-
-class AdmissionCheck:
-    """The obstacles of a queued ARC, its footprint, and the votes on it."""
-
-    def __init__(self, state: SchedulerState, arc: Arc) -> None:
-        self.state, self.arc = state, arc
-        self.votes, self.now = state.votes, state.now
-        self.non_preemptible: list[tuple[Rc, Arc]] = []
-        self.exclusive_victims: dict[ArcId, Arc] = {}  # preemptible holders of its exclusive RCs: they end if it starts
-        self._sharables: list[Rc] = []
-        for rc in arc.rcs:
-            if rc.sharable:
-                self._sharables.append(rc)
-                continue
-            for holder in rc.holders.values():
-                if holder.preemptible_by(arc, self.now):
-                    self.exclusive_victims[holder.id] = holder
-                else:
-                    self.non_preemptible.append((rc, holder))
-
-    def footprint(self) -> int:
-        return union(arc.mask for arc in (self.arc, *self.exclusive_victims.values(), *self._preemptible_sharers()))
-
-    def obstacle(self, off_limits: int) -> Inadmissible | None:
-        """An RC that keeps the ARC out by itself, apart from RCs `off_limits`. Prefers a hold likely to last: that
-        saves checks."""
-        for rc in self.arc.rcs:
-            if not rc.present:
-                absent = [rc for rc in self.arc.rcs if not rc.present]
-                why = rc.absence if len(absent) == 1 else absences(absent)
-                return Inadmissible(rc, of_rcs(ReasonCode.ABSENT, [rc.name for rc in absent], why))
-        lasting: tuple[int, float, int] | None = None
-        for number, (rc, holder) in enumerate(self.non_preemptible):
-            if not off_limits or not rc.bit & off_limits:
-                lasting = max(lasting or (holder.priority, -1.0, 0), (holder.priority, holder.known_end(), number))
-        if lasting is not None:
-            return Inadmissible(self.non_preemptible[lasting[2]][0], self._held())
-        if off_limits:
-            for rc in self._sharables:
-                if not rc.bit & off_limits and (answer := self._answer(rc)) is not None and not answer.accept:
-                    return self._vetoed(rc, answer)
-        return None
-
-    def _held(self) -> Reason:
-        """The holders in its way: of a named RC, or of all choices for a pattern."""
-        arc, number = self.arc, len(self.non_preemptible)
-        if not arc.patterns:
-            shown = self.non_preemptible[:SHOWN]
-            rcs, parties = tuple(rc.name for rc, _ in shown), tuple(holder.blocks(arc) for _, holder in shown)
-            return Reason(ReasonCode.HELD, rcs, parties, self._preferred(), number)
-        bound = {rc: need for need, rc in arc.bound.items()}
-        held = [(rc, holder, "") for rc, holder in self.non_preemptible if rc.name not in bound]
-        known = union(rc.bit for rc, _, _ in held)
-        for rc, _ in self.non_preemptible:
-            if rc.bit & known:  # two patterns may have the same choices
-                continue
-            need = bound[rc.name]
-            for choice in sorted(self.state.matching(need), key=attrgetter("name")):
-                if choice.present and not choice.sharable and not choice.bit & (known | arc.named_mask):
-                    known |= choice.bit
-                    held += [(choice, holder, need) for holder in choice.non_preemptible_holders(arc, self.now)[:1]]
-        first = held[:SHOWN_CHOICES]
-        return Reason(
-            ReasonCode.HELD,
-            tuple(rc.name for rc, _, _ in first),
-            tuple(holder.blocks(arc) for _, holder, _ in first),
-            self._preferred(),
-            len(held),
-            patterns=tuple(need for _, _, need in first),
-        )
-
-    def _preferred(self) -> str:
-        """The group preferred by fair shares, if one of its holders is in the way for that."""
-        shares = self.state.shares
-        return "" if shares is None else shares.preferred(self.arc, (holder for _, holder in self.non_preemptible))
-
-    def masked_obstacles(self) -> int:
-        """Bits of the RCs that keep the ARC out at present, whether off limits or not."""
-        vetoing = (rc.bit for rc in self._sharables if (answer := self._answer(rc)) is not None and not answer.accept)
-        return union(rc.bit for rc, _ in self.non_preemptible) | union(vetoing)
-
-    def decide(self) -> Inadmissible | VotesNeeded | Admissible:
-        """Steps 3b and 3c with the known votes, for a check without an obstacle."""
-        kept = {rc.name: self._with_non_preemptible(rc) for rc in self._sharables}
-        verdict = self._votes_on([(rc, kept[rc.name]) for rc in self._sharables])
-        if verdict is not None:
-            return verdict
-        victims = list(self.exclusive_victims.values())
-        for sharer in self._preemptible_sharers():
-            shared = [rc for rc in self._sharables if sharer.id in rc.holders]
-            beside = [(rc, kept[rc.name] | {sharer.id}) for rc in shared]
-            verdict = self._votes_on(beside)
-            match verdict:
-                case None:
-                    for rc, holders in beside:
-                        kept[rc.name] = holders
-                case Inadmissible():
-                    victims.append(sharer)
-                case VotesNeeded():
-                    return verdict
-        return Admissible(sorted(victims, key=lambda arc: arc.rank))
-
-    def refusal(self) -> Reason | None:
-        """The veto that keeps the ARC out, else that an RC does not answer; None if there is neither."""
-        unresponsive = None
-        for rc in self._sharables:
-            answer = self._answer(rc)
-            if answer is not None and not answer.accept:
-                return self._vetoed(rc, answer).reason
-            if answer is None and not unresponsive and rc.name in self.votes.unresponsive:
-                unresponsive = of_rcs(ReasonCode.SILENT, [rc.name])
-        return unresponsive
-
-    def _vetoed(self, rc: Rc, answer: Answer) -> Inadmissible:
-        beside = rc.non_preemptible_holders(self.arc, self.now)
-        parties = tuple(holder.blocks(self.arc) for holder in beside[:SHOWN])
-        return Inadmissible(rc, Reason(ReasonCode.VETOED, (rc.name,), parties, answer.reason, len(beside)))
-
-    def refusing(self, pattern: Need) -> tuple[RcName, ...]:
-        """The choices for a pattern that are known to refuse the ARC, the bound RC first."""
-        bound = self.arc.bound[pattern]
-        found = [bound]
-        for rc in self.state.matching(pattern):
-            if rc.present and rc.sharable and rc.name != bound and not rc.bit & self.arc.named_mask:
-                answer = self._answer(rc)
-                found += [rc.name] if answer is not None and not answer.accept else []
-        return tuple(found[:SHOWN_CHOICES])
-
-    def _answer(self, rc: Rc) -> Answer | None:
-        return self.votes.known(rc.name, self._with_non_preemptible(rc))
-
-    def _with_non_preemptible(self, rc: Rc) -> HolderSet:
-        return frozenset((*(holder.id for holder in rc.non_preemptible_holders(self.arc, self.now)), self.arc.id))
-
-    def _preemptible_sharers(self) -> list[Arc]:
-        found = {
-            holder.id: holder
-            for rc in self._sharables
-            for holder in rc.holders.values()
-            if holder.id not in self.exclusive_victims and holder.preemptible_by(self.arc, self.now)
-        }
-        return sorted(found.values(), key=lambda arc: arc.rank)
-
-    def _votes_on(self, sets: list[tuple[Rc, HolderSet]]) -> Inadmissible | VotesNeeded | None:
-        """None if all RCs accept these sets. One veto decides, whatever else is unknown."""
-        unknown: list[tuple[Rc, HolderSet]] = []
-        for rc, holders in sets:
-            answer = self.votes.known(rc.name, holders)
-            if answer is None:
-                unknown.append((rc, holders))
-            elif not answer.accept:
-                return self._vetoed(rc, answer)
-        return VotesNeeded(unknown) if unknown else None
-
+from zscout.types import Need
 
 VOTING: Final = Reason(ReasonCode.VOTING)
-MAX_BINDINGS: Final = 16
 MAX_REPORTED: Final = 4
 """Watchers of an RC that learn of a new holder (the others by `Core.arc`): bounds the reports in a long queue."""
 
-_Verdict: TypeAlias = Inadmissible | VotesNeeded | Admissible | RcQuota | Literal["off limits", "over quota"]
 
 
 class Priority(Strategy):
@@ -236,13 +69,19 @@ class Priority(Strategy):
 
 
 def run_pass(
-    state: SchedulerState, actions: Actions, *, off_limits: int = 0, reserved: Reservations | None = None
+    state: SchedulerState,
+    actions: Actions,
+    *,
+    off_limits: int = 0,
+    reserved: Reservations | None = None,
+    plan: Plan | None = None,
 ) -> None:
     """One pass over the ARCs that changes affect.
 
     `off_limits`: bits of RCs that another strategy still decides about. `reserved`: reservations for starving ARCs,
     absent in the paper."""
-    Pass(state, actions, reserved).run(state.index.ready.values(), off_limits)
+    plan = dry_run(state, reserved) if plan is None else plan
+    Pass(state, actions, reserved, plan).run(state.index.ready.values(), off_limits)
 
 
 def reasons_of_now(state: SchedulerState) -> Iterator[tuple[Arc, Reason]]:
@@ -272,8 +111,10 @@ def _pattern_of(arc: Arc, rc: Rc) -> Need | None:
 class Pass:
     """Checks the ready ARCs and the watchers of freed RCs, in rank order."""
 
-    def __init__(self, state: SchedulerState, actions: Actions, reserved: Reservations | None = None) -> None:
-        self.state, self.actions, self.reserved = state, actions, reserved
+    def __init__(
+        self, state: SchedulerState, actions: Actions, reserved: Reservations | None = None, plan: Plan = NO_PLAN
+    ) -> None:
+        self.state, self.actions, self.reserved, self.plan = state, actions, reserved, plan.bound
         self.votes, self.index = state.votes, state.index
         self.off_limits = 0
         self.changed = 0  # bits of the RCs changed since the last pass began
@@ -311,35 +152,19 @@ class Pass:
             self._check_patterns(arc)
         else:
             check = AdmissionCheck(self.state, arc)
-            self._apply(arc, check, self._verdict(arc, check))
+            self._apply(arc, check, judge(check, self.reserved, self.off_limits))
 
     def _check_patterns(self, arc: Arc) -> None:
         """Try bindings, best first, until the ARC starts or asks votes. With too few RCs none can do."""
         if not self.off_limits & class_of(arc).reach and short(self.state, arc):
             self._watch_class(arc)
             return
-        without, found = 0, choices(self.state, arc, self.reserved)
-        best: tuple[Mapping[Need, RcName], _Verdict] | None = None
-        for _ in range(MAX_BINDINGS):
-            bound = found.best(without=without)
-            if bound is None:
-                break
-            self.state.bind(arc, bound)
-            check = AdmissionCheck(self.state, arc)
-            verdict = self._verdict(arc, check)
-            blamed = self._blamed(arc, verdict)
-            best = best or (arc.bound, verdict)
-            if not blamed:
-                best = arc.bound, verdict
-                break
-            without |= blamed
-        if best is None:
-            self.state.bind(arc, {})
+        verdict = judge_bindings(self.state, arc, self.reserved, self.off_limits, self.plan.get(arc.id))
+        if verdict is None:
             self.index.put(arc, ArcState.READY)
             self.actions.wait(arc, no_match(self.state, arc))
             return
-        self.state.bind(arc, best[0])
-        self._apply(arc, AdmissionCheck(self.state, arc), best[1])
+        self._apply(arc, AdmissionCheck(self.state, arc), verdict)
 
     def _watch_class(self, arc: Arc) -> None:
         on: Watched = class_of(arc)
@@ -356,36 +181,7 @@ class Pass:
             self.index.put(arc, ArcState.READY)  # its reason is its booking's danger
         self.actions.wait(arc, reason)
 
-    def _blamed(self, arc: Arc, verdict: _Verdict) -> int:
-        """Bits of the bound RCs that keep the ARC out, where others might not."""
-        match verdict:
-            case Inadmissible(rc, _, proposal) if proposal is None or rc.name in self.votes.unresponsive:
-                bits = rc.bit
-            case "off limits":
-                bits = self.off_limits
-                bits |= union(rc.bit for rc in arc.rcs if any(holder.mask & bits for holder in rc.holders.values()))
-            case VotesNeeded(proposals):
-                bits = sum(rc.bit for rc, _ in proposals if rc.name in self.votes.unresponsive)
-            case _:
-                bits = 0
-        return bits & arc.mask & ~arc.named_mask
-
-    def _verdict(self, arc: Arc, check: AdmissionCheck) -> _Verdict:
-        obstacle = check.obstacle(self.off_limits)
-        if obstacle is not None:
-            return obstacle
-        if self.state.quota_left(arc) == 0:
-            return "over quota"
-        if (quota := self.state.rc_quota(arc)) is not None:
-            return quota
-        conflict = self.reserved.conflict(arc) if self.reserved is not None else None
-        if conflict is not None:
-            return conflict
-        if self.off_limits and check.footprint() & self.off_limits:
-            return "off limits"
-        return check.decide()
-
-    def _apply(self, arc: Arc, check: AdmissionCheck, verdict: _Verdict) -> None:
+    def _apply(self, arc: Arc, check: AdmissionCheck, verdict: Verdict) -> None:
         match verdict:
             case Inadmissible(rc, reason, proposal) if proposal is not None:
                 # A silent RC is asked again at times: no change there would queue the check.
@@ -443,7 +239,8 @@ class Pass:
     def _defer(self, arc: Arc, check: AdmissionCheck, state: ArcState) -> None:
         footprint = check.footprint()
         if arc.patterns:
-            # Always checked again: another RC may serve it.
+            # Always checked again: another RC may serve it, if the one that is asked refuses.
+            footprint |= alternatives(self.state, arc)
             self.index.put(arc, ArcState.READY)
         else:
             self.index.put(arc, state, footprint, check.masked_obstacles())

@@ -216,12 +216,16 @@ class SchedulerState:
             self._declassify(arc)
 
     def _classify(self, arc: Arc) -> None:
-        key = self._class_key(arc)
-        like = arc.like = self.classes.get(key)
-        if like is None:
-            like = arc.like = self.classes[key] = PatternClass()
-            self._find_matches(like, arc)
+        like = arc.like = self.classes.setdefault(self._class_key(arc), self.class_for(arc))
         insort(like.members, arc.rank)
+
+    def class_for(self, arc: Arc) -> PatternClass:
+        """The class of an ARC with patterns, if it were queued."""
+        like = self.classes.get(self._class_key(arc))
+        if like is None:
+            like = PatternClass()
+            self._find_matches(like, arc)
+        return like
 
     def _declassify(self, arc: Arc) -> None:
         like, arc.like = arc.like, None
@@ -414,6 +418,9 @@ class SchedulerState:
         self.index.sort(self.queued, self.rcs_in(self.index.watched))
         for like in self.classes.values():
             like.members = sorted(self.queued[rank[-1]].rank for rank in like.members)
+        for rc in self.rcs.values():
+            rc.demand = sorted(self.queued[rank[-1]].rank for rank in rc.demand)
+        self.demand_version += 1
 
     def _put(self, arc: Arc, shares: Shares | None) -> None:
         arc.put_at(0 if shares is None else shares.position(arc))
@@ -494,7 +501,10 @@ class SchedulerState:
 
     def _count_demand(self, arc: Arc, by: int) -> None:
         for rc in self.rcs_in(arc.named_mask) if arc.patterns else arc.rcs:
-            rc.demand += by
+            if by > 0:
+                insort(rc.demand, arc.rank)
+            else:
+                del rc.demand[bisect_left(rc.demand, arc.rank)]
             self.demand_version += 1
         if self.shares is not None:
             self.shares.count_waiting(arc, by)

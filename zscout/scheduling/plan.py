@@ -1,0 +1,317 @@
+"""A dry run of `priority` by its steps, for the bindings of a pass: unknown votes count as yes, and nothing changes.
+
+ARCs with patterns that start in the run may still be bound otherwise. Where exclusive RCs that these have keep a lower
+rank out, they are bound anew along augmenting paths (Kuhn's algorithm), to RCs that are free or were freed in this run.
+So no ARC waits where some bindings of those that start would let it: in rank order, which of ARCs with one need each
+gives the lexicographically best set (a transversal matroid). Running ARCs never move, and no hold ends for a path but
+those that end for the ARC itself.
+
+The pass itself tries each ARC's planned binding first, by the usual rules: a plan that turns out wrong costs nothing."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Set
+from typing import Final, NamedTuple
+
+from zscout.scheduling.admission import Admissible, AdmissionCheck, judge, judge_bindings
+from zscout.scheduling.model import Arc, Hold, Rank, Rc, union
+from zscout.scheduling.claim_index import bits
+from zscout.scheduling.patterns import choices, class_of, short
+from zscout.scheduling.queue_index import Watched
+from zscout.scheduling.reservations import Reservations
+from zscout.scheduling.state import SchedulerState
+from zscout.types import NO_TERM, ArcId, Grant, Need, RcName
+
+MAX_PATHS: Final = 200
+"""Searches for paths in a run."""
+
+_versions = itertools.count(-2, -1)
+"""Of the states of dry runs: what is cached of these never serves the real ones."""
+
+
+class Plan(NamedTuple):
+    bound: Mapping[ArcId, Mapping[Need, RcName]] = {}  # of the ARCs with patterns that start
+    started: Set[ArcId] = frozenset()
+    ended: Set[ArcId] = frozenset()  # running ARCs; some start on other RCs
+    dropped: Set[ArcId] = frozenset()  # those given to start that others would end
+    mask: int = 0  # bits of the RCs of those that start
+
+
+NO_PLAN: Final = Plan()
+
+
+def dry_run(
+    state: SchedulerState, reserved: Reservations | None, starting: Iterable[Arc] = (), ending: Iterable[Arc] = ()
+) -> Plan:
+    """What a pass of `priority` would do; first these end and start. NO_PLAN where no queued ARC has a pattern."""
+    return _DryRun(state, reserved).play(starting, ending) if state.by_pattern else NO_PLAN
+
+
+class _DryRun:
+    def __init__(self, state: SchedulerState, reserved: Reservations | None) -> None:
+        self.state, self.reserved = state, reserved
+        self._started: dict[ArcId, Arc] = {}
+        self._ended: dict[ArcId, tuple[Arc, Hold, Mapping[Need, RcName]]] = {}
+        self._dropped: set[ArcId] = set()  # those to start that others end
+        self._holders: dict[int, dict[ArcId, Arc]] = {}  # by bit: as before the run
+        self._heap: list[tuple[Rank, int, Arc, Watched | None]] = []
+        self._walked: set[Watched] = set()
+        self._movable = 0  # bits of the exclusive RCs by pattern of those that started
+        self._paths = 0
+
+    def play(self, starting: Iterable[Arc], ending: Iterable[Arc]) -> Plan:
+        state = self.state
+        version, busy = state.version, state.busy
+        owners = state.running_by_owner.copy(), state.held_by_owner.copy()
+        try:
+            for victim in ending:
+                self._end(victim)
+            for arc in starting:
+                self._start(arc)
+            self._run()
+            started = self._started.values()
+            bound = {arc.id: arc.bound for arc in started if arc.patterns}
+            mask = union(arc.mask for arc in started)
+            return Plan(bound, self._started.keys(), self._ended.keys(), frozenset(self._dropped), mask)
+        finally:
+            for arc in self._started.values():
+                arc.hold = None
+            for bit, holders in self._holders.items():
+                state.rc_of(bit).holders = holders
+            for arc, hold, was in self._ended.values():
+                arc.hold, arc.like = hold, None
+                state.bind(arc, was)
+            state.version, state.busy = version, busy
+            state.running_by_owner, state.held_by_owner = owners
+
+    def _run(self) -> None:
+        state, index, heap = self.state, self.state.index, self._heap
+        heap += [(arc.rank, 0, arc, None) for arc in (*index.ready.values(), *index.parked.values())]
+        heapq.heapify(heap)
+        self._call(index.freed | union(state.rc(name).bit for name in state.votes.invalidated), None)
+        last: Rank | None = None
+        while heap:
+            rank, _, arc, on = heapq.heappop(heap)
+            if on is not None and self._is_held(on, arc):
+                self._walked.discard(on)
+                continue
+            # An ARC may be queued twice in the heap; duplicates are adjacent because ranks are unique.
+            if rank != last and arc.hold is None:
+                self._check(arc)
+            last = rank
+            if on is not None:
+                self._call_next(on, rank)
+
+    def _call(self, bits: int, rank: Rank | None) -> None:
+        for on in self.state.watched_at(bits):
+            if on not in self._walked:
+                self._walked.add(on)
+                self._call_next(on, rank)
+
+    def _call_next(self, on: Watched, rank: Rank | None) -> None:
+        following = self.state.next_watcher(on, rank)
+        if following is None:
+            self._walked.discard(on)
+        else:
+            heapq.heappush(self._heap, following)
+
+    def _is_held(self, on: Watched, arc: Arc) -> bool:
+        """Return True if no watcher from `arc` on can start: RC or class are held again, and no path frees them."""
+        if isinstance(on, Rc):
+            held = not on.sharable and bool(on.non_preemptible_holders(arc, self.state.now))
+            return held and not on.bit & self._movable
+        return short(self.state, arc) and not on.reach & self._movable
+
+    def _check(self, arc: Arc) -> None:
+        state = self.state
+        if arc.mask & ~state.present and not arc.patterns:
+            return
+        verdict = None
+        if not arc.patterns:
+            verdict = judge(AdmissionCheck(state, arc, presume=True), self.reserved)
+        elif not short(state, arc):
+            verdict = judge_bindings(state, arc, self.reserved, presume=True)
+        victims = verdict.victims if isinstance(verdict, Admissible) else None
+        if victims != [] and self._movable:
+            bound = arc.bound
+            if self._bind_anew(arc, may_preempt=False) or (victims is None and self._bind_anew(arc, may_preempt=True)):
+                return
+            state.bind(arc, bound)
+        if victims is not None:
+            self._take(arc, victims)
+
+    def _take(self, arc: Arc, victims: Iterable[Arc]) -> None:
+        for victim in victims:
+            self._end(victim)
+        self._start(arc)
+        for victim in victims:
+            self._call(victim.mask, arc.rank)
+
+    def _end(self, arc: Arc) -> None:
+        """End a hold; its ARC may start on other RCs by its patterns."""
+        assert arc.hold is not None  # noqa: S101
+        if arc.patterns and not arc.past_min_runtime(self.state.now) and not self.state.is_barred(arc):
+            arc.like = arc.like or self.state.class_for(arc)
+            heapq.heappush(self._heap, (arc.rank, 0, arc, None))
+        if self._started.pop(arc.id, None) is None:
+            self._ended[arc.id] = arc, arc.hold, arc.bound
+        elif arc.id not in self._ended:
+            self._dropped.add(arc.id)
+        self._leave(arc)
+
+    def _start(self, arc: Arc) -> None:
+        self._started[arc.id] = arc
+        self._enter(arc)
+
+    def _enter(self, arc: Arc) -> None:
+        state = self.state
+        arc.hold = Hold(Grant(NO_TERM, 0), state.now, arc.ends(state.now), state.protected_below(arc))
+        for rc in arc.rcs:
+            self._holders_of(rc)[arc.id] = arc
+        state.busy |= arc.mask & ~state.sharable
+        self._count(arc, 1)
+        if arc.id not in self._ended:
+            self._movable |= union(rc.bit for rc, _ in self._moves(arc))
+
+    def _leave(self, arc: Arc) -> None:
+        arc.hold = None
+        for rc in arc.rcs:
+            del self._holders_of(rc)[arc.id]
+        self.state.busy &= ~arc.mask
+        self._count(arc, -1)
+
+    def _count(self, arc: Arc, by: int) -> None:
+        state = self.state
+        state.version = next(_versions)
+        state.running_by_owner[arc.owner] += by
+        state.held_by_owner[arc.owner] += by * len(arc.rcs)
+
+    def _holders_of(self, rc: Rc) -> dict[ArcId, Arc]:
+        if rc.bit not in self._holders:
+            self._holders[rc.bit], rc.holders = rc.holders, dict(rc.holders)
+        return rc.holders
+
+    def _moves(self, arc: Arc) -> Iterator[tuple[Rc, Need]]:
+        """The exclusive RCs of an ARC that starts by pattern, each with its need."""
+        if arc.like is not None and arc.claim is None and not arc.request.continues:
+            for need, name in arc.bound.items():
+                if not (rc := self.state.rc(name)).sharable:
+                    yield rc, need
+
+    def _bind_anew(self, arc: Arc, *, may_preempt: bool) -> bool:
+        """Start `arc` by binding those that start in this run to other RCs. `may_preempt`: and by ending whom it may."""
+        state = self.state
+        blocking = [
+            rc
+            for rc in state.rcs_in(arc.named_mask & ~state.sharable & state.busy & ~self._movable)
+            if not may_preempt or rc.non_preemptible_holders(arc, state.now)
+        ]
+        if blocking or self._paths >= MAX_PATHS or arc.named_mask & ~state.present:
+            return False
+        self._paths += 1
+        paths = _Paths(state, arc, self.reserved, may_preempt=may_preempt)
+        for other in self._started.values():
+            for rc, need in self._moves(other):
+                paths.own(other, need, rc)
+        if not paths.add():
+            return False
+        moved = [(other, other.bound) for other in paths.moved()]
+        for other, _ in moved:
+            self._leave(other)
+        for other, _ in moved:
+            state.bind(other, paths.bound(other))
+            self._enter(other)
+        if arc.patterns:
+            state.bind(arc, paths.bound(arc))
+        verdict = judge(AdmissionCheck(state, arc, presume=True), self.reserved)
+        if isinstance(verdict, Admissible) and (may_preempt or not verdict.victims):
+            self._take(arc, verdict.victims)
+            return True
+        for other, _ in moved:
+            self._leave(other)
+        for other, was in moved:
+            state.bind(other, was)
+            self._enter(other)
+        return False
+
+
+class _Paths:
+    """A matching of needs and exclusive RCs: of the ARCs that start in a dry run, and of the one to add."""
+
+    def __init__(self, state: SchedulerState, arc: Arc, reserved: Reservations | None, *, may_preempt: bool) -> None:
+        self._state, self._arc, self._reserved = state, arc, reserved
+        self._owner: dict[int, tuple[Arc, Need]] = {}
+        self._bound: dict[ArcId, dict[Need, RcName]] = {}
+        self._free = state.present & ~state.sharable & ~state.busy
+        self._own = 0  # bits of the RCs that only `arc` may take, as it may end their holders
+        if may_preempt:
+            for rc in state.rcs_in(state.busy):
+                for holder in rc.holders.values():
+                    if holder.preemptible_by(arc, state.now):
+                        self._own |= rc.bit
+                        self._free |= holder.mask & ~state.sharable if rc.bit & arc.named_mask else 0
+            self._own &= ~self._free
+        self._seen = 0
+
+    def own(self, arc: Arc, need: Need, rc: Rc) -> None:
+        self._owner[rc.bit] = arc, need
+
+    def add(self) -> bool:
+        """Find separate RCs for all needs of the ARC to add; the others keep theirs, or get others."""
+        state, arc = self._state, self._arc
+        wanted: dict[Need, int] = {rc.name: rc.bit for rc in state.rcs_in(arc.named_mask & ~state.sharable)}
+        for need, mask in class_of(arc).masks.items() if arc.patterns else ():
+            if mask & state.sharable:
+                rc = choices(state, arc, self._reserved).first(mask)
+                if rc is None or not rc.sharable or rc.name in self.bound(arc).values():
+                    return False
+                self._bound.setdefault(arc.id, {})[need] = rc.name
+            else:
+                wanted[need] = mask
+        for need in wanted:
+            self._seen = 0
+            if not self._place(arc, need, wanted):
+                return False
+        return True
+
+    def moved(self) -> list[Arc]:
+        found = {arc.id: arc for arc, _ in self._owner.values()}
+        return [arc for arc in found.values() if arc is not self._arc and arc.id in self._bound]
+
+    def bound(self, arc: Arc) -> Mapping[Need, RcName]:
+        kept = {} if arc is self._arc else arc.bound
+        return {**kept, **{need: rc for need, rc in self._bound.get(arc.id, {}).items() if need in arc.patterns}}
+
+    def _place(self, arc: Arc, need: Need, wanted: Mapping[Need, int]) -> bool:
+        mask = wanted[need] if arc is self._arc else class_of(arc).masks[need] & ~self._own
+        mask &= self._state.present & ~self._seen & ~self._kept_from(arc, mask)
+        if free := mask & self._free:
+            rc = min(self._state.rcs_in(free), key=lambda rc: (rc.wanted, rc.bit))
+            self._free &= ~rc.bit
+            self._give(rc, arc, need)
+            return True
+        for bit in bits(mask & union(self._owner)):
+            if not bit & self._seen:
+                self._seen |= bit
+                if self._place(*self._owner[bit], wanted):
+                    self._give(self._state.rc_of(bit), arc, need)
+                    return True
+        left = mask & self._own & ~union(self._owner)
+        if arc is not self._arc or not left:
+            return False
+        rc = min(self._state.rcs_in(left), key=lambda rc: (max(arc.priority for arc in rc.holders.values()), rc.bit))
+        self._give(rc, arc, need)
+        return True
+
+    def _kept_from(self, arc: Arc, mask: int) -> int:
+        """Bits of the RCs that are reserved for others."""
+        if (reserved := self._reserved) is None:
+            return 0
+        rcs = self._state.rcs_in(mask & reserved.bits)
+        return union(rc.bit for rc in rcs if reserved.reserves(rc, arc))
+
+    def _give(self, rc: Rc, arc: Arc, need: Need) -> None:
+        self._owner[rc.bit] = arc, need
+        self._bound.setdefault(arc.id, {})[need] = rc.name
