@@ -6,18 +6,10 @@ import heapq
 from collections.abc import Mapping
 
 from zscout.scheduling.model import Arc
-from zscout.scheduling.patterns import Choices, no_match
-from zscout.scheduling.priority import (
-    MAX_BINDINGS,
-    VOTING,
-    Admissible,
-    AdmissionCheck,
-    Pass,
-    Priority,
-    VotesNeeded,
-    _pattern_of,
-    _Verdict,
-)
+from zscout.scheduling.admission import MAX_BINDINGS, Admissible, AdmissionCheck, Verdict, VotesNeeded, _blamed, judge
+from zscout.scheduling.patterns import Choices, alternatives, no_match
+from zscout.scheduling.plan import Plan, dry_run
+from zscout.scheduling.priority import VOTING, Priority, _pattern_of
 from zscout.scheduling.reason import ReasonCode, of_rcs
 from zscout.scheduling.reservations import Inadmissible
 from zscout.scheduling.state import Actions, SchedulerState
@@ -30,15 +22,15 @@ class PlainPriority(Priority):
         votes = state.votes
         order = [(arc.rank, arc) for arc in state.queued.values()]
         heapq.heapify(order)
-        one_pass = Pass(state, actions)
+        plan, off_limits = dry_run(state, None), 0
         while order:
             _, arc = heapq.heappop(order)
-            check, verdict = judged(one_pass, arc)
+            check, verdict = judged(state, arc, off_limits, plan)
             match verdict:
                 case None:
                     actions.wait(arc, no_match(state, arc))
                 case "off limits":
-                    one_pass.off_limits |= check.footprint()
+                    off_limits |= check.footprint() | (alternatives(state, arc) if arc.patterns else 0)
                     actions.wait(arc, VOTING, settled=False)
                 case Inadmissible(rc, reason):
                     pattern = _pattern_of(arc, rc)
@@ -52,7 +44,7 @@ class PlainPriority(Priority):
                     for rc, holders in silent:
                         actions.propose(rc, holders)
                 case VotesNeeded(questions):
-                    one_pass.off_limits |= check.footprint()
+                    off_limits |= check.footprint() | (alternatives(state, arc) if arc.patterns else 0)
                     actions.wait(arc, VOTING, settled=False)
                     for rc, holders in questions:
                         actions.propose(rc, holders)
@@ -63,20 +55,22 @@ class PlainPriority(Priority):
                     actions.start(arc)
 
 
-def judged(one_pass: Pass, arc: Arc) -> tuple[AdmissionCheck, _Verdict | None]:
-    """Of its bindings, one after the other, the first that nothing but a vote keeps out, else the best."""
-    state, check = one_pass.state, AdmissionCheck(one_pass.state, arc)
+def judged(state: SchedulerState, arc: Arc, off_limits: int, plan: Plan) -> tuple[AdmissionCheck, Verdict | None]:
+    """Of its bindings, the planned and then one after the other, the first that nothing but a vote keeps out, else the
+    best."""
+    check = AdmissionCheck(state, arc)
     if not arc.patterns:
-        return check, one_pass._verdict(arc, check)
-    best: _Verdict | None = None
+        return check, judge(check, None, off_limits)
+    best: Verdict | None = None
     bound: Mapping[str, str] = {}
-    without, choices = 0, Choices(state, arc, 0)
+    without, choices, planned = 0, Choices(state, arc, 0), plan.bound.get(arc.id)
     for _ in range(MAX_BINDINGS):
-        if (found := choices.best(without=without)) is None:
+        if (found := planned or choices.best(without=without)) is None:
             break
+        planned = None
         state.bind(arc, found)
-        verdict = one_pass._verdict(arc, AdmissionCheck(state, arc))
-        blamed = one_pass._blamed(arc, verdict)
+        verdict = judge(AdmissionCheck(state, arc), None, off_limits)
+        blamed = _blamed(state, arc, verdict, off_limits)
         if best is None or not blamed:
             best, bound = verdict, found
         if not blamed:

@@ -40,7 +40,7 @@ from zscout.scheduling.model import (
     Vote,
     VoteOverdue,
 )
-from zscout.scheduling.priority import AdmissionCheck
+from zscout.scheduling.admission import AdmissionCheck
 from zscout.scheduling.queue_index import QueueIndex
 from zscout.scheduling.state import SchedulerState
 from zscout.scheduling.strategies import STRATEGIES

@@ -6,7 +6,7 @@ from collections import Counter
 
 from zscout.keyexpr import matcher
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import Arc, ArcState
+from zscout.scheduling.model import Arc, ArcState, Rank
 from zscout.scheduling.patterns import short
 from zscout.scheduling.queue_index import QueueIndex
 from zscout.scheduling.state import SchedulerState
@@ -74,9 +74,12 @@ def _check_state(state: SchedulerState) -> None:
     assert busy == state.busy, "the mask of busy RCs is wrong"
     counted = Counter(arc.owner for arc in state.running.values())
     assert counted == state.running_by_owner, "the owners' ARCs are miscounted"
-    demand = Counter(name for arc in state.queued.values() for name in arc.request.needs if name in state.rcs)
+    demand: dict[str, list[Rank]] = {}
+    for arc in state.queued.values():
+        for name in arc.request.needs:
+            demand.setdefault(name, []).append(arc.rank)
     for rc in state.rcs.values():
-        assert rc.demand == demand[rc.name], f"{rc.name} is named by {demand[rc.name]}, not {rc.demand}"
+        assert rc.demand == sorted(demand.get(rc.name, [])), f"{rc.name} is not named by {rc.demand}"
     by_pattern = {arc.id for arc in state.queued.values() if arc.patterns}
     assert by_pattern == state.by_pattern.keys(), "those queued by pattern are not those known"
     known = {arc.id for arcs in state._clients.values() for arc in arcs.values()}
