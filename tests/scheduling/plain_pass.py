@@ -22,7 +22,10 @@ class PlainPriority(Priority):
         votes = state.votes
         order = [(arc.rank, arc) for arc in state.queued.values()]
         heapq.heapify(order)
-        plan, off_limits = dry_run(state, None), 0
+        plan = dry_run(state, None)
+        off_limits = plan.off_limits
+        for rc, holders in plan.unknown:
+            actions.propose(rc, holders)
         while order:
             _, arc = heapq.heappop(order)
             check, verdict = judged(state, arc, off_limits, plan)
@@ -73,7 +76,7 @@ def judged(state: SchedulerState, arc: Arc, off_limits: int, plan: Plan) -> tupl
         blamed = _blamed(state, arc, verdict, off_limits)
         if best is None or not blamed:
             best, bound = verdict, found
-        if not blamed:
+        if not blamed or (found == plan.bound.get(arc.id) and verdict == "off limits"):
             break
         without |= blamed
     state.bind(arc, bound)

@@ -126,6 +126,8 @@ class Adaptive(Strategy):
             match self._decide(group, before, actions):
                 case "open":
                     held |= group.off_limits
+                case "left":
+                    pass
                 case int(chosen):
                     taken.append((group, chosen))
         plan = take_all(state, reserved, plan, taken, actions)
@@ -156,6 +158,8 @@ class Adaptive(Strategy):
     ) -> int | Literal["open", "left"]:
         """The better set of a group. `left`: to `priority`; `open`: off limits for now."""
         earlier = list({id(known): known for arc in group.arcs if (known := before.get(arc.id))}.values())
+        if group.waits:
+            return "left"
         while (search := self._search(group, earlier)) is not None:
             self._searches.update(dict.fromkeys(search.arcs, search))
             if search.exhausted:
@@ -175,6 +179,8 @@ class Adaptive(Strategy):
                     return "left"
                 asked = self._ask(group, search, search.best, actions)
             if asked == "yes":
+                if group.flickers(search.best):
+                    return "left"
                 self._report_gain(group, search)
                 return search.best
             if asked == "open":

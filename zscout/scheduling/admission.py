@@ -27,6 +27,7 @@ class VotesNeeded:
 @dataclass(frozen=True, slots=True)
 class Admissible:
     victims: list[Arc]
+    presumed: list[tuple[Rc, HolderSet]]  # the unknown votes that were counted as yes
 
 
 Verdict: TypeAlias = Inadmissible | VotesNeeded | Admissible | RcQuota | Literal["off limits", "over quota"]
@@ -37,6 +38,7 @@ class AdmissionCheck:
     def __init__(self, state: SchedulerState, arc: Arc, *, presume: bool = False) -> None:
         """`presume` counts the unknown votes of RCs that answer as yes."""
         self.state, self.arc, self.presume = state, arc, presume
+        self._presumed: list[tuple[Rc, HolderSet]] = []
         self.votes, self.now = state.votes, state.now
         self.non_preemptible: list[tuple[Rc, Arc]] = []
         self.exclusive_victims: dict[ArcId, Arc] = {}  # preemptible holders of its exclusive RCs: they end if it starts
@@ -131,7 +133,7 @@ class AdmissionCheck:
                     victims.append(sharer)
                 case VotesNeeded():
                     return verdict
-        return Admissible(sorted(victims, key=lambda arc: arc.rank))
+        return Admissible(sorted(victims, key=lambda arc: arc.rank), self._presumed)
 
     def refusal(self) -> Reason | None:
         """The veto that keeps the ARC out, else that an RC does not answer; None if there is neither."""
@@ -180,8 +182,8 @@ class AdmissionCheck:
         for rc, holders in sets:
             answer = self.votes.known(rc.name, holders)
             if answer is None:
-                if not self.presume or rc.name in self.votes.unresponsive:
-                    unknown.append((rc, holders))
+                presume = self.presume and rc.name not in self.votes.unresponsive
+                (self._presumed if presume else unknown).append((rc, holders))
             elif not answer.accept:
                 return self._vetoed(rc, answer)
         return VotesNeeded(unknown) if unknown else None
@@ -219,6 +221,7 @@ def judge_bindings(
     without, found = 0, choices(state, arc, reserved)
     best: tuple[Mapping[Need, RcName], Verdict] | None = None
     for _ in range(MAX_BINDINGS):
+        is_planned = planned is not None
         bound = planned or found.best(without=without)
         if bound is None:
             break
@@ -228,7 +231,8 @@ def judge_bindings(
         blamed = _blamed(state, arc, verdict, off_limits)
         if best is None or not blamed:
             best = arc.bound, verdict
-        if not blamed:
+        # What is planned waits for the votes of others: elsewhere it might be in the way of a lower rank.
+        if not blamed or (is_planned and verdict == "off limits"):
             break
         without |= blamed
     state.bind(arc, best[0] if best else {})

@@ -251,6 +251,8 @@ class ConflictGroup:
         """The set of the plan as bits of item numbers. None: as by name, the plan is not needed."""
         self.moves = False
         """`priority` would end an ARC and start it on other RCs, which no set of these items can express."""
+        self.waits = bool(self.mask & plan.off_limits)
+        """Votes are out on which its bindings depend."""
         if plan is not NO_PLAN:
             stay = (arc.id in plan.started if arc.hold is None else arc.id not in plan.ended for arc in self.arcs)
             self.planned = sum(1 << number for number, stays in enumerate(stay) if stays)
@@ -289,6 +291,11 @@ class ConflictGroup:
         """Bits of the RCs that it may take while its votes are out."""
         waiting = (arc for arc in self.arcs if arc.patterns and arc.hold is None)
         return self.mask | union(alternatives(self.state, arc) for arc in waiting)
+
+    def flickers(self, chosen: int) -> bool:
+        """Return True if the set would end what was granted at this instant, by another plan."""
+        holds = [arc.hold for arc in self.changes(chosen)[1]]
+        return self.planned is not None and any(hold and hold.start == self.state.now for hold in holds)
 
     def changes(self, chosen: int) -> tuple[list[Arc], list[Arc]]:
         """The queued ARCs in the set, and the running ARCs outside it."""

@@ -154,6 +154,8 @@ class Optimal(Strategy):
             match decide(group, actions):
                 case "open":
                     held |= group.off_limits
+                case "left":
+                    pass
                 case int(chosen):
                     taken.append((group, chosen))
         plan = take_all(state, None, plan, taken, actions)
@@ -165,7 +167,7 @@ def decide(group: ConflictGroup, actions: Actions) -> int | Literal["open", "lef
     """The best set of a group. `left`: to `priority`; `open`: votes are out; nothing changes yet."""
     proposals = None
     while proposals is None:
-        if group.moves or len(group.nogoods) > MAX_VETOES:
+        if group.moves or group.waits or len(group.nogoods) > MAX_VETOES:
             return "left"
         # None: ruled out by a known veto; each round bars at least one more set.
         problem = group.problem()
@@ -174,8 +176,9 @@ def decide(group: ConflictGroup, actions: Actions) -> int | Literal["open", "lef
         for rc, holders in proposals:
             actions.propose(rc, holders)
         return "open"
-    worse = group.planned is not None and problem.key(chosen) < problem.key(group.planned)
-    return "left" if worse else chosen
+    if group.flickers(chosen) or (group.planned is not None and problem.key(chosen) < problem.key(group.planned)):
+        return "left"
+    return chosen
 
 
 def best(problem: PackingProblem) -> int:

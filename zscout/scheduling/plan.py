@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import heapq
 import itertools
-from collections.abc import Iterable, Iterator, Mapping, Set
-from typing import Final, NamedTuple
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
+from typing import Any, Final, NamedTuple
 
 from zscout.scheduling.admission import Admissible, AdmissionCheck, judge, judge_bindings
 from zscout.scheduling.model import Arc, Hold, Rank, Rc, union
@@ -22,6 +22,7 @@ from zscout.scheduling.patterns import choices, class_of, short
 from zscout.scheduling.queue_index import Watched
 from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.state import SchedulerState
+from zscout.scheduling.votes import HolderSet
 from zscout.types import NO_TERM, ArcId, Grant, Need, RcName
 
 MAX_PATHS: Final = 200
@@ -37,6 +38,8 @@ class Plan(NamedTuple):
     ended: Set[ArcId] = frozenset()  # running ARCs; some start on other RCs
     dropped: Set[ArcId] = frozenset()  # those given to start that others would end
     mask: int = 0  # bits of the RCs of those that start
+    unknown: Sequence[tuple[Rc, HolderSet]] = ()  # the votes counted as yes on which bindings may depend
+    off_limits: int = 0  # bits of the RCs that wait for these votes
 
 
 NO_PLAN: Final = Plan()
@@ -45,8 +48,9 @@ NO_PLAN: Final = Plan()
 def dry_run(
     state: SchedulerState, reserved: Reservations | None, starting: Iterable[Arc] = (), ending: Iterable[Arc] = ()
 ) -> Plan:
-    """What a pass of `priority` would do; first these end and start. NO_PLAN where no queued ARC has a pattern."""
-    return _DryRun(state, reserved).play(starting, ending) if state.by_pattern else NO_PLAN
+    """What a pass of `priority` would do; first these end and start. NO_PLAN where no ARC has a pattern."""
+    by_pattern = state.by_pattern or state.running_by_pattern
+    return _DryRun(state, reserved).play(starting, ending) if by_pattern else NO_PLAN
 
 
 class _DryRun:
@@ -60,6 +64,8 @@ class _DryRun:
         self._walked: set[Watched] = set()
         self._movable = 0  # bits of the exclusive RCs by pattern of those that started
         self._paths = 0
+        self._presumed: dict[ArcId, tuple[int, list[tuple[Rc, HolderSet]]]] = {}
+        """By ARC: the votes that were counted as yes when it started, and bits of the RCs that it takes and frees."""
 
     def play(self, starting: Iterable[Arc], ending: Iterable[Arc]) -> Plan:
         state = self.state
@@ -74,7 +80,8 @@ class _DryRun:
             started = self._started.values()
             bound = {arc.id: arc.bound for arc in started if arc.patterns}
             mask = union(arc.mask for arc in started)
-            return Plan(bound, self._started.keys(), self._ended.keys(), frozenset(self._dropped), mask)
+            plan = Plan(bound, self._started.keys(), self._ended.keys(), frozenset(self._dropped), mask)
+            return plan._replace(**self._depends()) if self._presumed else plan
         finally:
             for arc in self._started.values():
                 arc.hold = None
@@ -85,6 +92,20 @@ class _DryRun:
                 state.bind(arc, was)
             state.version, state.busy = version, busy
             state.running_by_owner, state.held_by_owner = owners
+
+    def _depends(self) -> dict[str, Any]:
+        """The presumed votes on which a binding may depend, and bits of all RCs that these may bring to others."""
+        reach = {arc.id: arc.mask | class_of(arc).reach for arc in self._started.values() if arc.patterns}
+        found, off_limits = list[tuple[Rc, HolderSet]](), 0
+        for arc, (mask, votes) in self._presumed.items():
+            if any(mask & other for other in reach.values()):
+                off_limits |= mask | reach.get(arc, 0)
+                found += votes
+        before = 0
+        while found and off_limits != before:
+            before = off_limits
+            off_limits |= union(mask for mask in reach.values() if mask & before)
+        return {"unknown": found, "off_limits": off_limits}
 
     def _run(self) -> None:
         state, index, heap = self.state, self.state.index, self._heap
@@ -133,16 +154,19 @@ class _DryRun:
             verdict = judge(AdmissionCheck(state, arc, presume=True), self.reserved)
         elif not short(state, arc):
             verdict = judge_bindings(state, arc, self.reserved, presume=True)
-        victims = verdict.victims if isinstance(verdict, Admissible) else None
-        if victims != [] and self._movable:
+        found = verdict if isinstance(verdict, Admissible) else None
+        if self._movable and (found is None or found.victims):
             bound = arc.bound
-            if self._bind_anew(arc, may_preempt=False) or (victims is None and self._bind_anew(arc, may_preempt=True)):
+            if self._bind_anew(arc, may_preempt=False) or (found is None and self._bind_anew(arc, may_preempt=True)):
                 return
             state.bind(arc, bound)
-        if victims is not None:
-            self._take(arc, victims)
+        if found is not None:
+            self._take(arc, found)
 
-    def _take(self, arc: Arc, victims: Iterable[Arc]) -> None:
+    def _take(self, arc: Arc, admissible: Admissible) -> None:
+        victims = admissible.victims
+        if admissible.presumed:
+            self._presumed[arc.id] = union(other.mask for other in (arc, *victims)), admissible.presumed
         for victim in victims:
             self._end(victim)
         self._start(arc)
@@ -227,7 +251,7 @@ class _DryRun:
             state.bind(arc, paths.bound(arc))
         verdict = judge(AdmissionCheck(state, arc, presume=True), self.reserved)
         if isinstance(verdict, Admissible) and (may_preempt or not verdict.victims):
-            self._take(arc, verdict.victims)
+            self._take(arc, verdict)
             return True
         for other, _ in moved:
             self._leave(other)

@@ -81,7 +81,9 @@ def run_pass(
     `off_limits`: bits of RCs that another strategy still decides about. `reserved`: reservations for starving ARCs,
     absent in the paper."""
     plan = dry_run(state, reserved) if plan is None else plan
-    Pass(state, actions, reserved, plan).run(state.index.ready.values(), off_limits)
+    for rc, holders in plan.unknown:
+        actions.propose(rc, holders)
+    Pass(state, actions, reserved, plan).run(state.index.ready.values(), off_limits | plan.off_limits)
 
 
 def reasons_of_now(state: SchedulerState) -> Iterator[tuple[Arc, Reason]]:

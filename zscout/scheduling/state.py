@@ -48,6 +48,7 @@ class SchedulerState:
         self.busy = 0  # bits of the held exclusive RCs
         self.index = QueueIndex(self.band)
         self.by_pattern: dict[ArcId, Arc] = {}  # queued ARCs with patterns
+        self.running_by_pattern = 0  # running ARCs with patterns
         self._matching: dict[Need, list[Rc]] = {}
         self._matching_masks: dict[Need, int] = {}
         self.classes: dict[Hashable, PatternClass] = {}
@@ -477,6 +478,7 @@ class SchedulerState:
 
     def _add_running(self, arc: Arc) -> None:
         self.running[arc.id] = arc
+        self.running_by_pattern += bool(arc.patterns)
         self._grow(arc.mask, arc.known_end())
         if arc.claim is not None:
             self.dates.put(arc.claim)
@@ -491,6 +493,7 @@ class SchedulerState:
         if self.shares is not None:
             self.shares.end(arc)
         del self.running[arc.id]
+        self.running_by_pattern -= bool(arc.patterns)
         self._grow(arc.mask, arc.known_end())
         self.running_by_owner[arc.owner] -= 1
         self.held_by_owner[arc.owner] -= len(arc.rcs)
