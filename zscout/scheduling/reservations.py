@@ -29,7 +29,7 @@ from zscout.scheduling.model import Arc, Rc, union
 from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.state import SchedulerState
 from zscout.scheduling.votes import HolderSet
-from zscout.types import Ns
+from zscout.types import ArcId, Ns
 
 MAX_STARVING: Final = 16
 """ARCs with reservations at one time; later starving ARCs follow as these start."""
@@ -80,7 +80,7 @@ def reservations(state: SchedulerState, patience: Ns | None, last: Reservations 
     if patience is not None:
         state.index.mark_starving(state.now - patience // 2, state.queued)
     state.dates.pass_time(state.now, state.present)
-    if last is not None and last.made_of == _versions(state):
+    if last is not None and last.current:
         return last
     return Reservations(state, patience)
 
@@ -103,6 +103,11 @@ class Reservations:
             if state.queued[arc].claim is None:
                 self._reserve(state.queued[arc], (True, priority, since + (patience or 0) // 2, arc))
         self.bits = state.dates.claimed | union(self.starving)
+
+    @property
+    def current(self) -> bool:
+        """Return True if nothing has changed that these depend on."""
+        return self.made_of == _versions(self._state)
 
     def at(self, rc: Rc, start: Ns, end: float) -> list[Reservation]:
         """The bookings of `rc` in this span, and all its reservations for starving ARCs, in their order."""
@@ -176,15 +181,25 @@ class Reservations:
         """When `rc` has room for `arc` at the latest; infinite if unknown."""
         non_preemptible = rc.non_preemptible_holders(arc, self._state.now)
         if rc.sharable:
-            now = self._state.now
-            before = self.before(rc, order, now, arc.ends(now))
-            sharing = (promise.arc.id for promise in before if not promise.excludes)
-            if self._votes.accepts(rc.name, frozenset((*(holder.id for holder in non_preemptible), *sharing, arc.id))):
-                return self._state.now
-            alone = self._votes.known(rc.name, frozenset((arc.id,)))
-            if rc.name in self._votes.unresponsive or (alone is not None and not alone.accept):
-                return math.inf
+            return self._room_from(rc, arc, order, non_preemptible)
         return max((self._free.get(rc.bit, self._state.now), *(holder.known_end(arc) for holder in non_preemptible)))
+
+    def _room_from(self, rc: Rc, arc: Arc, order: Order, holders: list[Arc]) -> float:
+        """When a sharable RC accepts `arc` beside those of its holders and of the earlier promises that are not over."""
+        now, votes = self._state.now, self._votes
+        before = [promise for promise in self.before(rc, order, now, arc.ends(now)) if not promise.excludes]
+        ends = [(holder.known_end(arc), holder.id) for holder in holders]
+        ends += [(float(promise.over()), promise.arc.id) for promise in before]
+        if votes.accepts(rc.name, frozenset((arc.id, *(other for _, other in ends)))):
+            return now
+        alone = votes.known(rc.name, frozenset((arc.id,)))
+        if rc.name in votes.unresponsive or (alone is not None and not alone.accept):
+            return math.inf
+        ends.sort()
+        for number, (time, _) in enumerate(ends, 1):
+            if votes.accepts(rc.name, frozenset((arc.id, *(other for _, other in ends[number:])))):
+                return time
+        return max(now, ends[-1][0]) if ends else now
 
     def due(self, arc: Arc) -> Ns:
         return arc.since + arc.late + (self._patience or 0)
@@ -245,23 +260,31 @@ class Reservations:
         return Reservation(arc, claim.booking.start, order_of(self._state, claim.booking), claim.booking.end)
 
     def _together(self, rc: Rc, arc: Arc, before: list[Reservation]) -> list[HolderSet]:
-        """The holder sets beside `arc`, from now on: at each arrival, without the holders that yield to it."""
-        if all(promise.booked is None for promise in before):
-            return [frozenset((*rc.holders, arc.id, *(promise.arc.id for promise in before)))]
-        now = self._state.now
+        """The holder sets beside `arc`, from now until it ends: at each arrival, without the holders that yield to it.
+        A starving ARC may start before its reserved time, but not before those reserved for earlier: where one arrives,
+        those count too, until they are over."""
+        now, end = self._state.now, arc.ends(self._state.now)
         sets = []
-        for time in sorted({now, *(promise.start for promise in before if promise.start > now)}):
-            there = [
-                promise
-                for promise in before
-                if promise.start <= time and (promise.booked is None or promise.booked > time)
-            ]
-            coming = [arc] if time == now else [promise.arc for promise in there if promise.start == time]
+        for time in sorted({now, *(promise.start for promise in before if now < promise.start < end)}):
+            arriving = [promise for promise in before if promise.start == time > now]
+            there = [promise for promise in before if self._is_there(promise, time, arriving)]
+            coming = [promise.arc for promise in arriving] or [arc]
             staying = [
                 holder.id for holder in rc.holders.values() if not any(yields(holder, other, time) for other in coming)
             ]
             sets.append(frozenset((*staying, arc.id, *(promise.arc.id for promise in there))))
-        return sets
+        if any(promise.booked is not None for promise in before):
+            return sets
+        # One question for all; only if that is refused, one for each time.
+        whole = frozenset[ArcId]().union(*sets)
+        answer = self._votes.known(rc.name, whole)
+        return sets if answer is not None and not answer.accept else [whole]
+
+    def _is_there(self, promise: Reservation, time: Ns, arriving: list[Reservation]) -> bool:
+        if promise.booked is not None:
+            return promise.start <= time < promise.booked
+        begun = promise.start <= time or any(promise.order < other.order for other in arriving)
+        return begun and promise.arc.ends(max(promise.start, self._state.now)) > time
 
     def reserves(self, rc: Rc, arc: Arc) -> bool:
         """Return True if `rc` is reserved exclusively for another ARC that precedes `arc`."""
