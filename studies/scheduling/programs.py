@@ -6,7 +6,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from zscout.config.scheduling_policy import SchedulingPolicy
 from zscout.scheduling import model
@@ -14,9 +14,6 @@ from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import play_instant
 from zscout.types import SECOND, ArcId, Ns, Params, RcName
-
-TICK: Final[Ns] = 30 * SECOND
-"""From one pass to the next while somebody waits; the RCM's is a second, and nothing here takes so little time."""
 
 
 class ProgramJob(NamedTuple):
@@ -124,7 +121,7 @@ def play(
             for effect in effects:
                 run.note(effect, now)
         at = run.coming[0][0] if run.coming else until
-        now = min(at, until, now + TICK if run.core.waiting else until)
+        now = min(at, until, run.core.next_change() or until, run.core.next_order() or until)
         if now >= until:
             break
         events = []

@@ -270,6 +270,8 @@ def play(workload: Workload, *, one_by_one: bool = False, fair: FairShares | Non
         # A kept hold's minimum runtime is an event too: from then on equal priority may displace it.
         times = [one.end() for one in running if not one.past_min_runtime(now)]
         times += [arrival.at for arrival in arrivals[:1]]
+        if times and oracle.shares is not None and oracle.groups:
+            times.append(oracle.next_look if oracle.next_look > now else now + QUANTUM)
         if times:
             now = min(times)
         else:

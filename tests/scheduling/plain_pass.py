@@ -5,8 +5,8 @@ from __future__ import annotations
 import heapq
 from collections.abc import Mapping
 
-from zscout.scheduling.model import Arc
 from zscout.scheduling.admission import MAX_BINDINGS, Admissible, AdmissionCheck, Verdict, VotesNeeded, _blamed, judge
+from zscout.scheduling.model import Arc
 from zscout.scheduling.patterns import Choices, alternatives, no_match
 from zscout.scheduling.plan import Plan, dry_run
 from zscout.scheduling.priority import VOTING, Priority, _pattern_of

@@ -153,14 +153,14 @@ TAGS = "abcd"
 def one_place_each(seed: int) -> Situation:
     """ARCs that want one device each, by name or by tags, beside others that run."""
     draw = random.Random(seed)  # noqa: S311
-    found = Situation([f"dev/{number}{''.join(draw.sample(TAGS, draw.randint(1, 3)))}" for number in range(draw.randint(2, 7))])
+    found = Situation(
+        [f"dev/{number}{''.join(draw.sample(TAGS, draw.randint(1, 3)))}" for number in range(draw.randint(2, 7))]
+    )
     for number, rc in enumerate(draw.sample(found.exclusive, draw.randint(0, 2))):
         found.running.append((request(f"runs{number}", rc, priority=3, seconds=99), {}, 40))
     for number in range(draw.randint(2, 9)):
         need = draw.choice([*found.exclusive, *(f"dev/$*{tag}$*" for tag in TAGS * 2), "dev/*"])
-        found.asked.append(
-            request(f"asks{number}", need, priority=draw.randint(0, 2), seconds=draw.randint(1, 9))
-        )
+        found.asked.append(request(f"asks{number}", need, priority=draw.randint(0, 2), seconds=draw.randint(1, 9)))
     return found
 
 

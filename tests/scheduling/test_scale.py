@@ -14,6 +14,7 @@ from tests.scheduling.validate import validate
 from tests.thorough import times
 from zscout.config.scheduling_policy import DEFAULT, FairShares, SchedulingPolicy, StrategyName
 from zscout.scheduling import fair_shares, patterns, priority
+from zscout.scheduling.admission import AdmissionCheck
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import (
@@ -40,7 +41,6 @@ from zscout.scheduling.model import (
     Vote,
     VoteOverdue,
 )
-from zscout.scheduling.admission import AdmissionCheck
 from zscout.scheduling.queue_index import QueueIndex
 from zscout.scheduling.state import SchedulerState
 from zscout.scheduling.strategies import STRATEGIES

@@ -132,7 +132,7 @@ class Adaptive(Strategy):
                     taken.append((group, chosen))
         plan = take_all(state, reserved, plan, taken, actions)
         priority.run_pass(state, actions, off_limits=held, reserved=reserved, plan=plan)
-        if reserved is not None and reserved.bits and not reserved.current:
+        if state.queued and reserved is not None and reserved.starving and not reserved.current:
             actions.run_again()  # what this pass has changed may let others start that reservations held back
         self._seen = _situation(state)
 

@@ -32,6 +32,7 @@ class Admissible:
 
 Verdict: TypeAlias = Inadmissible | VotesNeeded | Admissible | RcQuota | Literal["off limits", "over quota"]
 
+
 class AdmissionCheck:
     """The obstacles of a queued ARC, its footprint, and the votes on it."""
 

@@ -160,9 +160,7 @@ def take_all(
         if not after.dropped:
             plan = after
             break
-        taken = [
-            (group, chosen) for group, chosen in taken if not any(arc.id in after.dropped for arc in group.arcs)
-        ]
+        taken = [(group, chosen) for group, chosen in taken if not any(arc.id in after.dropped for arc in group.arcs)]
     for group, chosen in taken:
         group.take(chosen, actions, plan)
     return plan

@@ -574,19 +574,24 @@ class Core:
         by = reason.by[0].arc if reason.by and reason.code is not ReasonCode.MAINTENANCE else None
         return model.HoldEnded(arc.id, arc.request.client, hold.grant, rcs, outcome, reason, requeued, by)
 
+    def next_change(self) -> Ns | None:
+        """When the passing of time next changes something; before, only events do, and the order of fair shares."""
+        calendar, held_back = self._calendar, self._state.held_back.values()
+        dates = (self._state.next_end(), self._state.dates.next_change(), calendar.next_start, calendar.next_question)
+        ends = [end for end in dates if end is not None]
+        return min(ends + [arc.held_back[0] for arc in held_back if arc.held_back], default=None)
+
+    def next_order(self) -> Ns | None:
+        """When the groups that wait are next put in order (`fair_shares.py`)."""
+        shares = self._state.shares
+        return None if shares is None or not self._state.queued else shares.next_order()
+
     def _set_wake(self) -> None:
-        at = min((arc.held_back[0] for arc in self._state.held_back.values() if arc.held_back), default=None)
-        calendar = self._calendar
-        for end in (
-            self._state.next_end(),
-            self._state.dates.next_change(),
-            calendar.next_start,
-            calendar.next_question,
-        ):
-            if end is not None:
-                at = end if at is None else min(at, end)
+        at = self.next_change()
         if self._state.queued:
-            at = min(self._state.now + model.QUANTUM, at) if at is not None else self._state.now + model.QUANTUM
+            soon = self._state.now + model.QUANTUM
+            soon = min(soon, self.next_order() or soon)
+            at = soon if at is None else min(soon, at)
         if self._run_again:
             at = self._state.now
         if at != self._wake or self._run_again:

@@ -132,6 +132,9 @@ class Shares:
         if bits := self._charged.pop(arc.id, 0):
             self._settle(self._account(self.group(arc)), self._state.now).rate -= bits.bit_count()
 
+    def next_order(self) -> Ns:
+        return self._next if self._next > self._state.now else self._state.now + QUANTUM
+
     def order(self) -> bool:
         """Order the waiting groups, once a quantum at most. True: a position has changed."""
         now = self._state.now

@@ -106,7 +106,8 @@ def forecast(
         checks += copy.waiting
         if checks > MAX_CHECKS:
             break
-        now = max(now, min((*ends.values(), *releases.values(), *(date for date, _ in dates[:1]))))
+        changes = [at for at in (copy.next_change(),) if at is not None and at > now]
+        now = max(now, min((*ends.values(), *releases.values(), *(date for date, _ in dates[:1]), *changes)))
         events: list[Event] = [model.Tick(), *(Released(arc) for arc, at in releases.items() if at <= now)]
         while dates and dates[0][0] <= now:
             date, name = dates.pop(0)

@@ -218,7 +218,9 @@ def enough(masks: Iterable[int]) -> bool:
     return all(place(number, [0]) for number in range(len(wanted)))
 
 
-def _fitness(state: SchedulerState, arc: Arc, rc: Rc, closed: bool, ending: Collection[Arc]) -> tuple[Fitness, tuple[float, ...]]:
+def _fitness(
+    state: SchedulerState, arc: Arc, rc: Rc, closed: bool, ending: Collection[Arc]
+) -> tuple[Fitness, tuple[float, ...]]:
     """The fitness of `rc` where the holders `ending` end anyway, and a tie-breaker. `closed`: reserved for another."""
     non_preemptible = rc.non_preemptible_holders(arc, state.now)
     kept = arc.claim is not None and bool(rc.bit & arc.claim.kept)
@@ -316,8 +318,8 @@ def _ranks(arcs: Iterable[Arc]) -> list[Rank]:
 
 def bind_all(state: SchedulerState, reserved: Reservations | None = None, claimed: int = 0) -> None:
     """Find bindings of all queued ARCs with patterns (`PatternClass.bound`), best-ranked first, to different RCs as
-    far as possible, and to others than the `claimed`. Once a class claims no more, its other members have the same, until others claim what it may
-    have."""
+    far as possible, and to others than the `claimed`. Once a class claims no more, its other members have the same,
+    until others claim what it may have."""
     asleep = dict[PatternClass, int]()  # with the RCs of which it matters whether they are claimed
     heap = [(like.members[0], number, like) for number, like in enumerate(state.classes.values())]
     numbers = {like: number for _, number, like in heap}

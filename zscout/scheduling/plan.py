@@ -6,7 +6,8 @@ So no ARC waits where some bindings of those that start would let it: in rank or
 gives the lexicographically best set (a transversal matroid). Running ARCs never move, and no hold ends for a path but
 those that end for the ARC itself.
 
-The pass itself tries each ARC's planned binding first, by the usual rules: a plan that turns out wrong costs nothing."""
+The pass itself tries each ARC's planned binding first, by the usual rules. What was planned on a vote that is not known
+waits for it, where another answer could change a binding."""
 
 from __future__ import annotations
 
@@ -16,8 +17,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from typing import Any, Final, NamedTuple
 
 from zscout.scheduling.admission import Admissible, AdmissionCheck, judge, judge_bindings
-from zscout.scheduling.model import Arc, Hold, Rank, Rc, union
 from zscout.scheduling.claim_index import bits
+from zscout.scheduling.model import Arc, Hold, Rank, Rc, union
 from zscout.scheduling.patterns import choices, class_of, short
 from zscout.scheduling.queue_index import Watched
 from zscout.scheduling.reservations import Reservations
@@ -95,11 +96,12 @@ class _DryRun:
 
     def _depends(self) -> dict[str, Any]:
         """The presumed votes on which a binding may depend, and bits of all RCs that these may bring to others."""
-        reach = {arc.id: arc.mask | class_of(arc).reach for arc in self._started.values() if arc.patterns}
+        exclusive, started = ~self.state.sharable, self._started.values()
+        reach = {arc.id: (arc.mask | class_of(arc).reach) & exclusive for arc in started if arc.patterns}
         found, off_limits = list[tuple[Rc, HolderSet]](), 0
-        for arc, (mask, votes) in self._presumed.items():
-            if any(mask & other for other in reach.values()):
-                off_limits |= mask | reach.get(arc, 0)
+        for arc_id, (mask, votes) in self._presumed.items():
+            if any(mask & exclusive & other for other in reach.values()):
+                off_limits |= mask & exclusive | reach.get(arc_id, 0)
                 found += votes
         before = 0
         while found and off_limits != before:
@@ -225,7 +227,7 @@ class _DryRun:
                     yield rc, need
 
     def _bind_anew(self, arc: Arc, *, may_preempt: bool) -> bool:
-        """Start `arc` by binding those that start in this run to other RCs. `may_preempt`: and by ending whom it may."""
+        """Start `arc` by binding others that start in this run to other RCs; `may_preempt`: ending whom it may."""
         state = self.state
         blocking = [
             rc

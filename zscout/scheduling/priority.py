@@ -46,7 +46,7 @@ from typing import Final
 
 from zscout.config.scheduling_policy import RcQuota, StrategyName
 from zscout.scheduling.admission import Admissible, AdmissionCheck, Verdict, VotesNeeded, judge, judge_bindings
-from zscout.scheduling.model import Arc, ArcState, PatternClass, Rank, Rc, union
+from zscout.scheduling.model import Arc, ArcState, PatternClass, Rank, Rc
 from zscout.scheduling.patterns import all_present, alternatives, bind, class_of, no_match, short
 from zscout.scheduling.plan import NO_PLAN, Plan, dry_run
 from zscout.scheduling.queue_index import Watched
@@ -58,7 +58,6 @@ from zscout.types import Need
 VOTING: Final = Reason(ReasonCode.VOTING)
 MAX_REPORTED: Final = 4
 """Watchers of an RC that learn of a new holder (the others by `Core.arc`): bounds the reports in a long queue."""
-
 
 
 class Priority(Strategy):

@@ -185,7 +185,7 @@ class Reservations:
         return max((self._free.get(rc.bit, self._state.now), *(holder.known_end(arc) for holder in non_preemptible)))
 
     def _room_from(self, rc: Rc, arc: Arc, order: Order, holders: list[Arc]) -> float:
-        """When a sharable RC accepts `arc` beside those of its holders and of the earlier promises that are not over."""
+        """When a sharable RC accepts `arc` beside its holders and earlier promises that are not over by then."""
         now, votes = self._state.now, self._votes
         before = [promise for promise in self.before(rc, order, now, arc.ends(now)) if not promise.excludes]
         ends = [(holder.known_end(arc), holder.id) for holder in holders]

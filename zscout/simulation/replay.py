@@ -83,16 +83,16 @@ def replay(
     now: Ns = 0
     step(now, [model.RcJoined(rc.name, rc.sharable) for rc in workload.rcs])
     while arrivals or running:
-        # The quantum's ticks change nothing; only arrivals and ends of minimum runtimes do (kept holds may be
-        # displaced from then on).
-        ends = [hold.start + early.get(arc, runtime[arc]) for arc, hold in running.items()]
-        coming = [end for end in ends if end > now]
+        # The instants at which the leader's passes may change something: its other ticks change nothing.
+        coming = [end for arc, hold in running.items() if arc in early and (end := hold.start + early[arc]) > now]
+        if (change := core.next_change()) is not None and change > now:
+            coming.append(change)
         if arrivals:
             coming.append(arrivals[0].at)
         if not coming:
             step(now, [model.Released(arc) for arc in sorted(running)])
             continue
-        now = min(coming)
+        now = min(*coming, core.next_order() or coming[0])
         released = sorted(arc for arc, hold in running.items() if arc in early and hold.start + early[arc] <= now)
         events: list[model.Event] = [*map(model.Released, released)]
         while arrivals and arrivals[0].at == now:
