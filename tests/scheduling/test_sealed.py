@@ -14,7 +14,18 @@ SURFACE = {
     "tell_reasons", "slots", "likely_slot", "ask_votes", "booking", "bookings", "charged",
     "charged_in_all",
 }  # fmt: skip
-SURFACE |= {"as_events", "expects_yes", "next_change", "next_order", "number", "batches", "term", "seq", "strategy", "policy"}
+SURFACE |= {
+    "as_events",
+    "expects_yes",
+    "next_change",
+    "next_order",
+    "number",
+    "batches",
+    "term",
+    "seq",
+    "strategy",
+    "policy",
+}
 ACTIONS = {"start", "preempt", "wait", "propose", "run_again"}
 
 

@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 
 from zscout.scheduling.admission import Admissible, AdmissionCheck, judge, judge_bindings
 from zscout.scheduling.claim_index import bits
-from zscout.scheduling.model import Arc, Hold, Rank, Rc, union
+from zscout.scheduling.model import Arc, Hold, PatternClass, Rank, Rc, union
 from zscout.scheduling.patterns import choices, class_of, short
 from zscout.scheduling.queue_index import Watched
 from zscout.scheduling.reservations import Reservations
@@ -65,6 +65,8 @@ class _DryRun:
         self._walked: set[Watched] = set()
         self._movable = 0  # bits of the exclusive RCs by pattern of those that started
         self._paths = 0
+        self._failed: dict[PatternClass, int] = {}  # by class: the version in which a member found no path
+        self._may_end: dict[int, bool] = {}  # by priority: whether some hold may end for it
         self._presumed: dict[ArcId, tuple[int, list[tuple[Rc, HolderSet]]]] = {}
         """By ARC: the votes that were counted as yes when it started, and bits of the RCs that it takes and frees."""
 
@@ -143,9 +145,23 @@ class _DryRun:
     def _is_held(self, on: Watched, arc: Arc) -> bool:
         """Return True if no watcher from `arc` on can start: RC or class are held again, and no path frees them."""
         if isinstance(on, Rc):
-            held = not on.sharable and bool(on.non_preemptible_holders(arc, self.state.now))
-            return held and not on.bit & self._movable
-        return short(self.state, arc) and not on.reach & self._movable
+            held, reach = not on.sharable and bool(on.non_preemptible_holders(arc, self.state.now)), on.bit
+        else:
+            held, reach = short(self.state, arc), on.reach
+        return held and not (reach & self._movable and self._has_paths(arc))
+
+    def _has_paths(self, arc: Arc) -> bool:
+        """Return False if a path for `arc` has nowhere to end: no RC is free, and no hold may end for it; or if there
+        was none for another of its class."""
+        state = self.state
+        if arc.like is not None and self._failed.get(arc.like) == state.version:
+            return False
+        if state.present & ~state.sharable & ~state.busy:
+            return True
+        if arc.priority not in self._may_end:
+            holders = (other for other in state.running.values() if other.id not in self._ended)
+            self._may_end[arc.priority] = any(other.preemptible_by(arc, state.now) for other in holders)
+        return self._may_end[arc.priority]
 
     def _check(self, arc: Arc) -> None:
         state = self.state
@@ -157,11 +173,13 @@ class _DryRun:
         elif not short(state, arc):
             verdict = judge_bindings(state, arc, self.reserved, presume=True)
         found = verdict if isinstance(verdict, Admissible) else None
-        if self._movable and (found is None or found.victims):
+        if self._movable and (found is None or found.victims) and self._has_paths(arc):
             bound = arc.bound
             if self._bind_anew(arc, may_preempt=False) or (found is None and self._bind_anew(arc, may_preempt=True)):
                 return
             state.bind(arc, bound)
+            if arc.like is not None and not (arc.like.reach | arc.named_mask) & state.sharable:
+                self._failed[arc.like] = state.version
         if found is not None:
             self._take(arc, found)
 
