@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from tests.mesh.kit import until
-from tests.services.rcm.booked_fleet import NOON, BookedFleet, book, booked, dangers_at, do, led, states
+from tests.services.rcm.booked_fleet import NOON, BookedFleet, book, booked, do, led, states
 from tests.services.rcm.kit import Refusal, request
 from zscout.messages import BookingView, FindSlots, Release, SlotsTold, Unbook
 from zscout.services.rcm.rcm import Rcm
@@ -292,8 +292,8 @@ async def test_maintenance_goes_before_what_is_booked_and_both_are_told() -> Non
 
 
 async def test_the_danger_of_maintenance_that_is_given_up_is_over() -> None:
-    fleet, (leader, *_) = await booked("x", "y")
-    dangers = dangers_at(leader)
+    fleet, _ = await booked("x", "y")
+    dangers = fleet.dangers["x"]
     client = fleet.client("one", "desk")
     await do(client, book("b", "robot/a", at=500, priority=1), BookingView)
     await do(client, book("m", "robot/a", at=400, seconds=300, maintenance=True), BookingView)
@@ -317,8 +317,8 @@ async def test_what_is_repeated_is_kept_from_the_instant_that_a_date_is_within_6
 
 
 async def test_a_booking_is_in_danger_while_what_it_needs_is_away() -> None:
-    fleet, (leader,) = await booked("x")
-    dangers = dangers_at(leader)
+    fleet, _ = await booked("x")
+    dangers = fleet.dangers["x"]
     far = fleet.rc("robot/far")
     await fleet.joined(far)
     client = fleet.client("one")
@@ -339,8 +339,8 @@ async def test_a_booking_is_in_danger_while_what_it_needs_is_away() -> None:
 
 
 async def test_of_all_dates_of_a_booking_a_danger_is_told_once_and_the_next_dates_first() -> None:
-    fleet, (leader,) = await booked("x")
-    dangers = dangers_at(leader)
+    fleet, _ = await booked("x")
+    dangers = fleet.dangers["x"]
     far = fleet.rc("robot/far")
     await fleet.joined(far)
     client = fleet.client("one")
