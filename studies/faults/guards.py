@@ -25,7 +25,7 @@ from zscout.drivers.repeated import CommandMemory
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
 from zscout.mesh.renewal import Suspicions
-from zscout.messages import BookingRecord, Problem, Who
+from zscout.messages import BookingRecord, OpenRequest, Problem, Who
 from zscout.rcm import recovery, roster, terms
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
@@ -154,8 +154,8 @@ async def _none_async(*_: object) -> set[str]:
     return set()
 
 
-def _without_place(self: OpenArc, now: Ns, grant: Grant | None) -> dict[str, Any]:
-    return _as_asked(self, now, grant) | {"place": None}
+def _without_place(self: OpenArc, now: Ns, grant: Grant | None) -> OpenRequest:
+    return replace(_as_asked(self, now, grant), place=None)
 
 
 def _take_any(self: OpenArc, *args: Any) -> bool:

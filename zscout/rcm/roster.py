@@ -58,6 +58,7 @@ class _Due(Enum):
     AGAIN = "a question is asked again"
     WAITED = "a pending RC has waited so long (ns)"
     FREE = "a departed RC serves nobody any longer"
+    UNLED = "somebody else would lead by now in the term that an RC shows"
     DROP_UNSEEN = "RCs and tokens had a lease to show themselves"
     SHUNNED = "an RC no longer counts as absent for the term that it shows"
     JOIN_ALL = "RCs away from home may join"
@@ -212,18 +213,13 @@ class Roster:
         return self._taken()
 
     def shun(self, now: Ns, token: Token, until: Ns) -> Outbox:
-        """An RC shows a term that is not believed: it counts as absent until then."""
+        """An RC shows a term that is not believed: it counts as absent until then, unless somebody soon leads in it. It
+        may have promised that to another candidate."""
         self._now = now
-        rc = self._rc(token.name)
-        if until <= now or token.instance in self.shunned:
-            return self._taken()
-        self.shunned.add(token.instance)
-        self._set(until - now, _Due.SHUNNED, token)
-        if rc.pending is not None and rc.pending.state.instance == token.instance:
-            rc.pending = None
-            self._settle()
-        if rc.joined is not None and rc.joined.instance == token.instance:
-            self._drop(token.name, SHUNNED)
+        if until > now and token.instance not in self.shunned:
+            self.shunned.add(token.instance)
+            self._set(until - now, _Due.SHUNNED, token)
+            self._set(2 * self._timeout, _Due.UNLED, token)
         return self._taken()
 
     def expect(self, now: Ns, client: ClientId) -> None:
@@ -322,6 +318,8 @@ class Roster:
                 case _Due.SHUNNED, token:
                     self.shunned.discard(token.instance)
                     self._ask_promise(token)
+                case _Due.UNLED, token if token.instance in self.shunned:
+                    self._leave_out(token)
                 case _Due.DROP_UNSEEN, _:
                     self._drop_unseen()
                 case _Due.JOIN_ALL, _:
@@ -723,6 +721,15 @@ class Roster:
     def _taken(self) -> Outbox:
         out, self._out = self._out, Outbox()
         return out
+
+    def _leave_out(self, token: Token) -> None:
+        """Nobody leads in the term that a shunned RC shows."""
+        rc = self._rc(token.name)
+        if rc.pending is not None and rc.pending.state.instance == token.instance:
+            rc.pending = None
+            self._settle()
+        if rc.joined is not None and rc.joined.instance == token.instance:
+            self._drop(token.name, SHUNNED)
 
     def _set(self, delay: Ns, due: _Due, subject: Any = None) -> None:
         self._deadlines.set(self._now + delay, (due, subject))

@@ -166,7 +166,9 @@ def test_what_was_refused_before_any_hold_is_told_as_well() -> None:
     assert (revoked.outcome, str(revoked)) == ("cancelled", "cancelled by an operator")
 
 
-EXPECTED = OpenRequest("id", "survey", {"robot/x": {}}, 3, Decimal(5), True, Place(TERM, 1), 2.0, FIRST)
+EXPECTED = OpenRequest(
+    "id", "survey", {"robot/x": {}}, 3, Decimal(5), True, place=Place(TERM, 1), waited=2.0, grant=FIRST
+)
 
 
 def test_what_is_expected_is_nobodys_until_there_is_word_of_it() -> None:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Self
 import msgspec
 
 from zscout.keyexpr import BadName, check_name, check_need, check_rc, is_pattern, matcher, new_instance
-from zscout.messages import Amounts, Ask, Cancel, Notice, OpenRequest, Problem, ReasonInfo, Release, Who
+from zscout.messages import Amounts, Ask, Cancel, Notice, OpenRequest, Problem, ReasonInfo, Release, Who, carried
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Place, Term
 
 Needs = Mapping[str, Mapping[str, Any]]
@@ -282,42 +282,41 @@ class OpenArc:
     def _ask(self, now: Ns, *, reachable: bool = False) -> Ask:
         """`reachable`: the RCs that did not confirm its last grant have shown themselves anew."""
         grant, unconfirmed = self._unconfirmed or (self.grant or self._unserved, [])
-        asked = self._as_asked(now, grant)
-        unserved = self._unserved is not None and grant == self._unserved
-        return Ask(
-            **asked,
+        return carried(
+            self._as_asked(now, grant),
+            Ask,
             estimate=self.estimate,
             unconfirmed=unconfirmed,
             reachable=reachable,
-            unserved=unserved,
+            unserved=self._unserved is not None and grant == self._unserved,
             check=self._check and self._place is None,
             wait_for_device=self._wait_for_device and self._place is None,
         )
 
     def _open_request(self, now: Ns) -> OpenRequest:
         """As it is reported to an RCM that takes the lead."""
-        return OpenRequest(**self._as_asked(now, self.grant))
+        return self._as_asked(now, self.grant)
 
-    def _as_asked(self, now: Ns, grant: Grant | None) -> dict[str, Any]:
+    def _as_asked(self, now: Ns, grant: Grant | None) -> OpenRequest:
         since = now if self._waits_since is None or self.grant is not None else self._waits_since
-        return {
-            "id": self.id,
-            "arc": self.name,
-            "needs": self.needs,
-            "priority": self.priority,
-            "min_runtime": self.min_runtime,
-            "keep": self.keep,
-            "place": self._place,
-            "seal": self._seal,
-            "was": self._was,
-            "waited": max(0, now - since) / SECOND,
-            "grant": grant,
-            "rcs": self.rcs if grant is not None else [],
-            "direct": self.direct,
-            "continues": self.continues,
-            "who": self.who,
-            "booking": self.booking,
-        }
+        return OpenRequest(
+            id=self.id,
+            arc=self.name,
+            needs=self.needs,
+            priority=self.priority,
+            min_runtime=self.min_runtime,
+            keep=self.keep,
+            place=self._place,
+            seal=self._seal,
+            was=self._was,
+            waited=max(0, now - since) / SECOND,
+            grant=grant,
+            rcs=self.rcs if grant is not None else [],
+            direct=self.direct,
+            continues=self.continues,
+            who=self.who,
+            booking=self.booking,
+        )
 
 
 def amounts(needs: Needs) -> dict[str, Amounts]:
