@@ -96,16 +96,20 @@ class BookingHandler:
     # Booking
 
     def _book(self, ticket: Ticket, wanted: Book, sender: Sender) -> None:
-        known = self._records.get(wanted.id)
-        if known is not None:
-            self._admission.check_owner(sender, known, "ask for it")
-            self._answer_kept(ticket, known)
+        if self._is_made(ticket, wanted.id, sender):
             return
         self._admission.check_booking(wanted, sender)
         record = self._record(wanted, sender)
-        self._check_room(record)
         self._door.check(self._now, wanted.needs, may_wait=False)
-        self._try(_Undecided(ticket, lambda: self._decide(ticket, record)))
+        self._try(_Undecided(ticket, lambda: self._is_made(ticket, record.id, sender) or self._decide(ticket, record)))
+
+    def _is_made(self, ticket: Ticket, booking: str, sender: Sender) -> bool:
+        """Answers what is asked for again. Raises Refused."""
+        if (known := self._records.get(booking)) is None:
+            return False
+        self._admission.check_owner(sender, known, "ask for it")
+        self._answer_kept(ticket, known)
+        return True
 
     def _record(self, wanted: Book, sender: Sender) -> BookingRecord:
         """Raises Refused for what is no booking."""
@@ -154,7 +158,9 @@ class BookingHandler:
             raise Refused("too_many", f"{MAX_CLAIMS} dates are booked, the most allowed; repeat it less often")
 
     def _decide(self, ticket: Ticket, record: BookingRecord) -> bool:
-        """Whether it is decided: all its dates that are kept free from now on are free, or one is not."""
+        """Whether it is decided: all its dates that are kept free from now on are free, or one is not. Raises Refused
+        where there is no room any more."""
+        self._check_room(record)
         unknown, bound = [], dict[int, dict[str, str]]()
         # Maintenance goes before what is booked: who is in its way is told.
         for date in [] if record.maintenance else self._dates.open_dates(record):

@@ -11,7 +11,7 @@ import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import RANDOM, BadName, Role, Sender, Token, client_of, new_instance
@@ -65,42 +65,43 @@ BACKOFF_RESET_AFTER: Ns = 60 * SECOND
 """After a candidacy at least this long the next failure begins with BACKOFF anew."""
 
 
+class CandidateParts(NamedTuple):
+    """What a node gives its candidate."""
+
+    folder: Path | None = None
+    """Where it keeps what it must know after a restart."""
+    authority: Authority | None = None
+    places_key: bytes | None = None
+    """By which the managers of a fleet seal places."""
+    listeners: Sequence[HoldListener] = ()
+    """Get to know of holds while it leads."""
+    journal: Journal | None = None
+    """Gets to know of publications."""
+    runtimes: RuntimeObserver | None = None
+    keeper: BookingKeeper | None = None
+    """Keeps bookings; without one they are kept in memory."""
+    disk: TermDisk | None = None
+    """Keeps the highest term of a fleet with `[security]`."""
+    on_danger: Callable[[BookedDanger], object] = lambda _: None
+    """Called while it leads with bookings that may not be kept."""
+
+
 class Candidate:
     """Stands by, leads when it must, steps down when a higher term is seen or when anything fails."""
 
-    def __init__(
-        self,
-        mesh: Mesh,
-        fleet: Fleet,
-        folder: Path | None = None,
-        authority: Authority | None = None,
-        places_key: bytes | None = None,
-        listeners: Sequence[HoldListener] = (),
-        journal: Journal | None = None,
-        keeper: BookingKeeper | None = None,
-        disk: TermDisk | None = None,
-    ) -> None:
-        """`folder`: where it keeps what it must know after a restart; None: it does not. `places_key`: that by which
-        the managers of a fleet seal places. `listeners` are told of holds while it leads, `journal` of publications.
-        `keeper` keeps bookings; without one it keeps them in memory, for itself. `disk` keeps the highest term of a
-        fleet with `[security]`."""
-        self._keeper = keeper or BookingKeeper(mesh)
-        self._journal, self._runtimes = journal, RuntimeObserver()
-        if journal is not None:
-            journal.on_opened = self._runtimes.recall
-        self._places_key = places_key
-        self._authority = authority or Authority(fleet)
+    def __init__(self, mesh: Mesh, fleet: Fleet, parts: CandidateParts | None = None) -> None:
+        self._parts = parts = parts or CandidateParts()
+        self._keeper = parts.keeper or BookingKeeper(mesh)
+        self._runtimes = parts.runtimes or RuntimeObserver()
+        self._authority = parts.authority or Authority(fleet)
         self.mesh, self.fleet = mesh, fleet
-        self._disk = disk if mesh.keys.closed else None
+        self._disk = parts.disk if mesh.keys.closed else None
         self._saved = self._disk.read() if self._disk is not None else NO_TERM
         self._saving = asyncio.Lock()
         self.terms = Terms(secured=mesh.keys.closed, highest=self._saved)
         self.rcm: Rcm | None = None
         self.balancer: LoadBalancer | None = None
         """Beside the RCM, while this node leads."""
-        self.listeners = listeners
-        self.on_danger: Callable[[BookedDanger], object] = lambda _: None
-        """Called while it leads with bookings that may not be kept."""
         self.terms_led = 0
         self.tally = Tally()
         """How operations ended that its RCMs were asked for."""
@@ -112,7 +113,7 @@ class Candidate:
         """and when."""
         self.ledger = PlacementLedger(mesh)
         self._authority.placed = self.ledger.placements
-        self.inventory = Inventory(mesh, fleet, folder)
+        self.inventory = Inventory(mesh, fleet, parts.folder)
         self._timeout = fleet.timing.rebuild / SECOND
         self._leading = ExitStack()
         """Ends the RCM, and the load balancer and the placer beside it, while this node leads."""
@@ -198,8 +199,8 @@ class Candidate:
             self._runtimes.hear(self.mesh.now(), grants)
             if grants.charged:
                 self._charged, self._charged_at = grants.charged, self.mesh.now()
-            if self._journal is not None:
-                self._journal.hear(grants)
+            if self._parts.journal is not None:
+                self._parts.journal.hear(grants)
 
     def _on_leader(self, token: Token, alive: bool) -> None:
         if self.rcm is None or token.instance != self.rcm.term.rcm:
@@ -376,7 +377,7 @@ class Candidate:
 
     def _hear_seals(self, answers: Iterable[ClientRequests]) -> None:
         """Take the terms of places that clients list with a right seal."""
-        places = Places(self.fleet.name, self._places_key, NO_TERM)
+        places = Places(self.fleet.name, self._parts.places_key, NO_TERM)
         for answer in answers if self.terms.secured else ():
             for request in answer.requests:
                 place = request.place
@@ -400,7 +401,7 @@ class Candidate:
     async def _lead(
         self, term: Term, states: list[RcState], open_requests: list[ClientRequests], kept: list[BookingsKept]
     ) -> bool:
-        places = Places(self.fleet.name, self._places_key, term)
+        places = Places(self.fleet.name, self._parts.places_key, term)
         self._keeper.records.take(record for one in kept for record in one.records)
         admission = Admission(self.fleet.limits, self._authority, places)
         home_of, record_of = self.inventory.devices.home_of, self._keeper.records.get
@@ -422,13 +423,13 @@ class Candidate:
                 self.inventory,
                 self._authority,
                 places,
-                self.listeners,
+                self._parts.listeners,
                 self.tally,
                 self._keeper,
                 kept,
                 self._runtimes.estimator,
                 self._disbelieved,
-                lambda danger: self.on_danger(danger),
+                self._parts.on_danger,
             ),
         )
         self._leading.callback(rcm.stop)
