@@ -33,6 +33,7 @@ from zscout.rcm.leader import Leader
 from zscout.rcm.places import Places
 from zscout.rcm.request_log import RequestLog
 from zscout.rcm.roster import Roster
+from zscout.rcm.steps import Outbox
 from zscout.rcm.terms import BELIEVED, Terms, Verdict
 from zscout.scheduling.calendar import Calendar
 from zscout.scheduling.model import ArcRequest
@@ -64,8 +65,8 @@ def _nothing(*_: object, **__: object) -> None:
     return None
 
 
-def _no_change(*_: object) -> roster.Change:
-    return roster.Change()
+def _no_change(*_: object) -> Outbox:
+    return Outbox()
 
 
 def _no(*_: object, **__: object) -> bool:

@@ -12,7 +12,7 @@ from tests.services.kit import answer
 from tests.services.rcm.kit import FakeClient, FakeFleet, request
 from zscout.mesh import IncomingQuery
 from zscout.messages import Book, BookingRecord, BookingsAsk, BookingsTold, BookingView, Operation, ShareBookings
-from zscout.rcm.booked import BookedDanger
+from zscout.rcm.steps import BookedDanger
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.rcm.candidate import Candidate, CandidateParts
 from zscout.testing.memory import MemoryMesh

@@ -103,6 +103,18 @@ async def test_votes_decide_about_a_sharable_rc() -> None:
         await do(client, book("e", "radio/rf0:1", at=55, seconds=10), BookingView)
 
 
+async def test_of_bookings_that_wait_for_votes_no_more_are_made_than_are_allowed_and_each_once() -> None:
+    fleet = BookedFleet("x")
+    fleet.fleet = replace(fleet.fleet, limits=replace(fleet.fleet.limits, max_bookings_per_host=2))
+    await led(fleet, "x")
+    await fleet.joined(fleet.rc("radio/rf0", accept=True))
+    client = fleet.client("one")
+    wanted = [book(name, "radio/rf0:5", at=50) for name in "bbcd"]
+    told = await asyncio.gather(*(do(client, one, BookingView) for one in wanted), return_exceptions=True)
+    assert [one.id if isinstance(one, BookingView) else str(one)[:8] for one in told] == ["b", "b", "c", "too_many"]
+    assert {*await fleet.bookings()} == {"b", "c"}
+
+
 async def test_a_booking_outlives_its_leader_and_its_taker_goes_on() -> None:
     fleet, (leader, heir) = await booked("x", "y")
     client = fleet.client("one")

@@ -31,9 +31,9 @@ from zscout.messages import (
 )
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
-from zscout.rcm.booked import BookedDanger
 from zscout.rcm.places import Places
 from zscout.rcm.recovery import aged, take_over
+from zscout.rcm.steps import BookedDanger
 from zscout.rcm.terms import Source, Terms, Verdict, Word
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.journal.journal import Journal
