@@ -59,19 +59,6 @@ async def test_what_is_declared_goes_on_and_nobody_notices(world: World) -> None
     await until(lambda: all(len(told) == 4 for told in seen.values()))
 
 
-async def test_who_does_not_know_the_new_session_yet_is_answered_on_the_old_one() -> None:
-    network = MemoryNetwork()
-    a, b = (network.open("test", Sender(name, "test")) for name in "ab")
-    a.serve(ASK, Ping, lambda query: query.answer(Pong(query.message.number)))
-    network.delay = 0.1  # of links that are made from now on
-    a._transport.renew()
-    answered = set[bool]()
-    while a._transport._renewing is not None:
-        answered.add(await b.ask_one(ASK, Ping(), Pong, timeout=LONG) is not None)
-        await asyncio.sleep(0.01)
-    assert answered == {True}
-
-
 async def test_settings_that_change_during_a_renewal_are_taken_after_it() -> None:
     """A name that is removed while a session is being reopened does not keep its rights on the new one."""
     network, settings, opened = MemoryNetwork(), ["old"], list[str]()

@@ -82,7 +82,6 @@ class RenewableTransport(Transport):
 
     def __init__(self, transport: Transport, openings: Sequence[Opening]) -> None:
         self.current, self._openings = transport, openings
-        self._answering = transport  # of two sessions the one whose queries are answered
         self._declared: dict[int, _Declared] = {}
         self._tokens: WeakValueDictionary[int, _Token] = WeakValueDictionary()  # die with their undeclare function
         self._numbers = itertools.count()
@@ -116,12 +115,8 @@ class RenewableTransport(Transport):
                     # Declare first, so that no token of this process disappears in between.
                     for declared in self._all():
                         declared.declare(fresh)
-                    # Until others know the new one they ask the old one.
-                    await asyncio.sleep(OVERLAP / 2)
-                    self._answering = fresh
-                    await asyncio.sleep(OVERLAP / 2)
+                    await asyncio.sleep(OVERLAP)
                 finally:
-                    self._answering = fresh
                     await old.close()
                     for declared in self._all():
                         declared.forget_old()
@@ -198,7 +193,7 @@ class RenewableTransport(Transport):
         def declare(transport: Transport) -> Undeclare:
             def once(query: TransportQuery) -> None:
                 # While there are two sessions a query may arrive on both.
-                if transport is self._answering:
+                if transport is self.current:
                     on_query(query)
                 else:
                     query.drop()
