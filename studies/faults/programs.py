@@ -17,13 +17,12 @@ from zscout.behaviors.client.client import Client, CommandRefused, RequestRefuse
 from zscout.behaviors.client.direct import DirectHold
 from zscout.keyexpr import RANDOM, Role, Token, new_instance
 from zscout.mesh import Mesh
-from zscout.messages import Ask, ClientRequests, Notice, OpenRequest, RcAsk, RcmState, StateAsk
+from zscout.messages import Ask, ClientRequests, Notice, OpenRequest, RcAsk, RcmState, StateAsk, carried
 from zscout.testing.virtual_time import PROCESS
 from zscout.types import SECOND, Place
 
 LONG: Final = 4
 STEALS_EVERY: Final = 0.5
-ASKED: Final = ("id", "arc", "needs", "priority", "min_runtime", "seal", "was")
 CLEARS_UP: Final = (0.0, 0.0, 0.2, 1.0, 60.0)
 """Seconds that a program takes to end when it is told to; the last is killed before."""
 
@@ -76,7 +75,7 @@ async def steal_places(mesh: Mesh, over: Callable[[], bool]) -> None:
             id_ = rng.choice((new_instance(), one.id))
             stolen = OpenRequest(id_, "stolen", one.needs, one.priority, one.min_runtime, seal=seals.get(one.place))
             listed[:] = [replace(stolen, place=one.place, was=rng.choice((None, one.id)))]
-            ask = Ask(place=one.place, **{name: getattr(listed[0], name) for name in ASKED})
+            ask = carried(listed[0], Ask)
             await mesh.ask_one(mesh.keys.schedule(mesh.me), ask, Notice, timeout=STEALS_EVERY)
     for left in declared:
         left.close()

@@ -99,7 +99,9 @@ class Promises:
         self._running: dict[Term, set[Grant]] = {}
         self._queued: dict[Term, dict[ArcId, Rank]] = {}
         self._believed: dict[str, Term] = {}
-        """By client: the highest term that it heard of a leader."""
+        """By client: the highest term that it heard of a leader,"""
+        self._silent: dict[str, Ns] = {}
+        """and for how long it had heard none at the last look: as it goes back, it hears one."""
         self._seen: dict[Term, int] = {}
         """By term: how many instants its RCM had decided about as it was looked at."""
 
@@ -153,6 +155,7 @@ class Promises:
     def forget_client(self, name: str) -> None:
         """It died: what it was promised was to that life."""
         self._believed.pop(name, None)
+        self._silent.pop(name, None)
         self._places = {key: place for key, place in self._places.items() if key[0] != name}
 
     def told(self, name: str, arc: OpenArc, term: Term, *, touched: bool) -> None:
@@ -257,7 +260,8 @@ class Promises:
         for name, client in clients.items():
             term, before = client.internals.term, self._believed.get(name, NO_TERM)
             self._believed[name] = client.internals.rcm._heard
-            if term < before and silence[name] / SECOND < self._hold_lease:
+            silent, self._silent[name] = self._silent.get(name, 0), silence[name]
+            if term < before and silent / SECOND < self._hold_lease - JUST_NOW:
                 self._broken(f"{name} went back from {before} to {term}, and had heard that lately")
 
     def look_who_leads_again(self, leaders: Mapping[str, Rcm]) -> None:

@@ -21,11 +21,11 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from msgspec import structs
 
-from zscout.messages import EndedHold, Grants, Holder, Problem, RcmState, absurd
+from zscout.messages import EndedHold, Grants, Holder, Problem, RcmState, absurd, carried
 from zscout.scheduling.reason import ended, named
 from zscout.types import NO_TERM, SECOND, Grant, HostName, Ns, Place, Term
 
@@ -208,9 +208,7 @@ class HoldTable:
         for view in state.holds:
             if self.rc not in view.needs or view.grant in self.held or view.grant in self._ended:
                 continue
-            own: dict[str, Any] = {"rcs": sorted(view.needs), "params": view.needs[self.rc]}
-            shared = {name: getattr(view, name) for name in Holder.__struct_fields__ if name not in own}
-            holder = Holder(**shared, **own)
+            holder = carried(view, Holder, rcs=sorted(view.needs), params=view.needs[self.rc])
             # An ARC has one hold: its older one is over.
             older = [grant for grant, held in self.held.items() if _arc(held.holder) == _arc(holder)]
             others = [held.holder for grant, held in self.held.items() if grant not in older]

@@ -96,6 +96,7 @@ class Refused(Exception):
 
 
 T = TypeVar("T")
+M = TypeVar("M", bound=Message)
 _ENCODER = msgspec.json.Encoder(decimal_format="number")
 _decoder: Callable[[Any], msgspec.json.Decoder[Any]] = cache(msgspec.json.Decoder)
 NAMES_ONCE: set[Any] = set()
@@ -207,6 +208,12 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 _ONCE = json.JSONDecoder(object_pairs_hook=_unique, parse_int=str, parse_float=str)
+
+
+def carried(message: Message, kind: type[M], **own: Any) -> M:
+    """A message of `kind` with the fields that `message` has as well, and its `own`."""
+    shared = message.__struct_fields__
+    return kind(**{name: getattr(message, name) for name in kind.__struct_fields__ if name in shared} | own)
 
 
 def schema(kind: type) -> str:

@@ -81,9 +81,8 @@ class _Asked(_Wanted, frozen=True):
     """With `check`: a need that nobody knows is waited for."""
 
 
-class Ask(_Asked, frozen=True, tag_field="op", tag="request"):
-    """Asks for an ARC. `id` is the client's own and stays the same however often it asks; `place` is what an earlier
-    RCM gave, and `waited` the seconds since it was last queued there."""
+class _Request(_Asked, frozen=True):
+    """All that a client says of a request."""
 
     place: Place | None = None
     waited: Elapsed = 0.0
@@ -114,6 +113,16 @@ class Ask(_Asked, frozen=True, tag_field="op", tag="request"):
     """The id under which its client had that place, where it is another one now. What is open under it ends."""
     booking: BookingRef = ""
     """The booking that it takes up, whose needs it has: its id, or as a notice has it."""
+
+
+class OpenRequest(_Request, frozen=True):
+    """A request as its client knows it, for an RCM that takes the lead, or another client that goes on with it. `place`
+    is absent where no RCM has answered. What only an Ask has to say is left out."""
+
+
+class Ask(_Request, frozen=True, tag_field="op", tag="request"):
+    """Asks for an ARC. `id` is the client's own and stays the same however often it asks; `place` is what an earlier
+    RCM gave, and `waited` the seconds since it was last queued there."""
 
 
 class Cancel(Message, frozen=True, tag_field="op", tag="cancel"):
@@ -243,11 +252,23 @@ class Notice(_ArcParty, frozen=True):
     """Why it ended, where an RCM that took the lead refuses what its client listed."""
 
 
-class Holder(_ArcParty, frozen=True):
+class _Hold(_ArcParty, frozen=True, kw_only=True):
+    """What its request gave a hold: `bound` is the RC that meets each of its patterns. On the wire these come last."""
+
+    bound: dict[str, str] = {}
+    direct: bool = False
+    """As asked: its RCs settle when it ends."""
+    continues: ContinuedArc = ""
+    """As asked: what the same client held by that name goes on in it."""
+    who: Who | None = None
+    booking: BookingRef = ""
+
+
+class Holder(_Hold, frozen=True):
     """One holder of one RC, so complete that a new RCM can recover its ARC from the RCs' states alone.
 
-    `rcs` names the whole gang, `bound` the RC that meets each of its patterns. `remaining` seconds of its
-    minimum runtime are left, negative where it is over; with `keep` the hold does not end then."""
+    `rcs` names the whole gang. `remaining` seconds of its minimum runtime are left, negative where it is over; with
+    `keep` the hold does not end then."""
 
     grant: Grant
     place: Place
@@ -257,13 +278,6 @@ class Holder(_ArcParty, frozen=True):
     priority: int = 0
     keep: bool = False
     params: Amounts = {}
-    bound: dict[str, str] = {}
-    direct: bool = False
-    """As asked: its RCs settle when it ends."""
-    continues: ContinuedArc = ""
-    """As asked: what the same client held by that name goes on in it."""
-    who: Who | None = None
-    booking: BookingRef = ""
 
 
 class Revocation(_ArcParty, frozen=True):
@@ -319,11 +333,7 @@ class StateAsk(Message, frozen=True):
     """Whether only `rcs` is wanted."""
 
 
-class HoldView(_ArcParty, frozen=True):
-    """A hold in force. `held` is how long it has stood, in seconds; `needs` are by RC, `bound` the RC that
-    meets each of its patterns. In `ends_in` seconds it is likely to be given back, as such holds usually were, before
-    it is over."""
-
+class _HoldView(_Hold, frozen=True):
     priority: int
     grant: Grant
     place: Place
@@ -332,11 +342,12 @@ class HoldView(_ArcParty, frozen=True):
     held: Seconds
     remaining: Seconds
     keep: bool = False
-    bound: dict[str, str] = {}
-    direct: bool = False
-    continues: ContinuedArc = ""
-    who: Who | None = None
-    booking: BookingRef = ""
+
+
+class HoldView(_HoldView, frozen=True, kw_only=True):
+    """A hold in force. `held` is how long it has stood, in seconds; `needs` are by RC. In `ends_in` seconds it is
+    likely to be given back, as such holds usually were, before it is over."""
+
     ends_in: Seconds | None = None
 
 
@@ -416,22 +427,6 @@ class RcmState(Message, frozen=True):
     version: VersionText = ""
     charged: Charged = {}
     """As in Grants."""
-
-
-class OpenRequest(_Wanted, frozen=True):
-    """A request as its client knows it, for an RCM that takes the lead. `waited` as in Ask."""
-
-    place: Place | None = None
-    waited: Elapsed = 0.0
-    grant: Grant | None = None
-    rcs: Annotated[list[str], msgspec.Meta(max_length=MAX_OTHERS)] = []
-    """The RCs of `grant`."""
-    direct: bool = False
-    continues: ContinuedArc = ""
-    who: Who | None = None
-    seal: Seal | None = None
-    was: RequestId | None = None
-    booking: BookingRef = ""
 
 
 class ClientRequests(Message, frozen=True):

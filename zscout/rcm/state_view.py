@@ -130,19 +130,22 @@ def _of(arc: ArcStatus) -> dict[str, Any]:
     }
 
 
+def _held(arc: ArcStatus, hold: Hold, now: Ns) -> dict[str, Any]:
+    """What all messages have of a hold."""
+    return {
+        **_of(arc),
+        "grant": hold.grant,
+        "remaining": (hold.end - now) / SECOND,
+        "keep": arc.request.keep,
+        "bound": dict(arc.bound),
+        "direct": arc.request.direct,
+        "continues": arc.request.continues,
+    }
+
+
 def holders_of(arcs: Iterable[ArcStatus], rc: str, now: Ns) -> list[messages.Holder]:
     return [
-        messages.Holder(
-            **_of(arc),
-            grant=arc.hold.grant,
-            rcs=sorted(arc.needs),
-            remaining=(arc.hold.end - now) / SECOND,
-            keep=arc.request.keep,
-            params=messages.decimals(arc.needs[rc]),
-            bound=dict(arc.bound),
-            direct=arc.request.direct,
-            continues=arc.request.continues,
-        )
+        messages.Holder(**_held(arc, arc.hold, now), rcs=sorted(arc.needs), params=messages.decimals(arc.needs[rc]))
         for arc in arcs
         if arc.hold is not None
     ]
@@ -151,15 +154,9 @@ def holders_of(arcs: Iterable[ArcStatus], rc: str, now: Ns) -> list[messages.Hol
 def _hold_view(arc: ArcStatus, hold: Hold, now: Ns, runtimes: RuntimeEstimator | None) -> messages.HoldView:
     end = None if runtimes is None else runtimes.end(arc.request, hold, now)
     return messages.HoldView(
-        **_of(arc),
-        grant=hold.grant,
+        **_held(arc, hold, now),
         needs={rc: messages.decimals(params) for rc, params in sorted(arc.needs.items())},
         held=(now - hold.start) / SECOND,
-        remaining=(hold.end - now) / SECOND,
-        keep=arc.request.keep,
-        bound=dict(arc.bound),
-        direct=arc.request.direct,
-        continues=arc.request.continues,
         ends_in=None if end is None else (end - now) / SECOND,
     )
 

@@ -166,7 +166,9 @@ def test_what_was_refused_before_any_hold_is_told_as_well() -> None:
     assert (revoked.outcome, str(revoked)) == ("cancelled", "cancelled by an operator")
 
 
-EXPECTED = OpenRequest("id", "survey", {"robot/x": {}}, 3, Decimal(5), True, Place(TERM, 1), 2.0, FIRST)
+EXPECTED = OpenRequest(
+    "id", "survey", {"robot/x": {}}, 3, Decimal(5), True, place=Place(TERM, 1), waited=2.0, grant=FIRST
+)
 
 
 def test_what_is_expected_is_nobodys_until_there_is_word_of_it() -> None:
@@ -212,7 +214,7 @@ def test_what_moved_and_is_taken_back_keeps_its_place_and_its_wait(held: bool) -
 
 
 async def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_later() -> None:
-    store, known = RequestStore(lambda: NOW), arc()
+    store, known = RequestStore(lambda: NOW, lambda _: None), arc()
     store.add(known)
     store.take(known, RUNS)
     store.resumed.clear()

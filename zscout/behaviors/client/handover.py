@@ -40,11 +40,10 @@ class MovableClient:
 
     def __init__(self, mesh: Mesh, fleet: Fleet, supervisor: Supervisor) -> None:
         self.mesh, self.fleet, self._supervisor = mesh, fleet, supervisor
-        self._store = RequestStore(mesh.now)
+        self._store = RequestStore(mesh.now, self._ask_soon)
         self._rcm = RcmLink(mesh, fleet, self._store, supervisor)
         self.expected_came = asyncio.Event()
         """Set at the first notice of an ARC that is expected: from then on it is this client's."""
-        self._store.on_awaited = lambda arc: supervisor.spawn(self._await_again(arc))
         self._unclaimed: dict[str, OpenArc] = {}
         """What is expected, come or not, and was not asked for yet."""
         self._may_end = asyncio.Event()
@@ -115,6 +114,9 @@ class MovableClient:
         except TimeoutError:
             log.warning("%s was handed over to here, but not granted for %g s; requesting it", arc.name, EXPECT_TIMEOUT)
             self._store.adopt(arc)
+
+    def _ask_soon(self, arc: OpenArc) -> None:
+        self._supervisor.spawn(self._await_again(arc) if arc.state == "awaited" else self.ask_again(arc))
 
     async def _await_again(self, arc: OpenArc) -> None:
         await self._come(arc)

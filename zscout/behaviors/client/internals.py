@@ -51,7 +51,6 @@ class ClientInternals(MovableClient):
         keys, mesh = self.mesh.keys, self.mesh
         self._declared = [mesh.subscribe(keys.notice(mesh.me), Notice, self._on_notice), *self.rcm.start()]
         mesh.watch_links()
-        self.store.ask_again = self._on_dropped
         self._renew_token()
         self.supervisor.spawn(self.rcm.keep_asking())
         self.supervisor.spawn(self.rcm.watch_lease())
@@ -65,14 +64,11 @@ class ClientInternals(MovableClient):
             self._token.close()
         self._token, self._shown = token, mesh.now()
 
-    def _on_dropped(self, arc: OpenArc) -> None:
+    def _ask_soon(self, arc: OpenArc) -> None:
         # All that was dropped together is asked for with one token.
         if arc.outcome == "client_lost" and self.mesh.now() - self._shown > RENEW_TOKEN:
             self._renew_token()
-        self._ask_soon(arc)
-
-    def _ask_soon(self, arc: OpenArc) -> None:
-        self.supervisor.spawn(self.ask_again(arc))
+        super()._ask_soon(arc)
 
     async def close(self) -> None:
         """Gives back everything and leaves the mesh."""

@@ -205,9 +205,8 @@ class RcmLink:
             now = self.mesh.now()
             # As at the RCs: an RCM that was replaced, or whose term is absurd, keeps no hold alive.
             published = [one.term for _, one in self._published.each()]
-            believed = [self.accept(term) for term in published]
             await self._follow_lower(published)
-            if any(believed):
+            if [term for term in published if self.accept(term)]:
                 # It may have published right after the last check.
                 self._last_contact = now - lease // CHECKS_PER_LEASE
             seen = self.leader is not None and not self.stood_still

@@ -23,13 +23,13 @@ from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.rcm import steps
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
-from zscout.rcm.booked import BookedDanger, Keep, Ticket
 from zscout.rcm.door import Door
 from zscout.rcm.leader import Leader
 from zscout.rcm.places import Places
 from zscout.rcm.recovery import RecoveredState
-from zscout.rcm.roster import Question, Roster
+from zscout.rcm.roster import Roster
 from zscout.rcm.state_view import MAX_REASON, StateView
+from zscout.rcm.steps import BookedDanger, Keep, Question, Ticket
 from zscout.rcm.terms import Verdict, Word
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Event, Vote, VoteOverdue
