@@ -48,6 +48,7 @@ from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.rcm import Rcm
+from zscout.services.rcm.term_file import KeptTerm
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
 
 ABSENT: Final = object()
@@ -295,7 +296,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
             "a client goes back to the leader that it sees",
             {(RcmLink, "_follow_lower"): _do_nothing, (RcmLink, "_only_promised"): _no},
         ),
-        "kept": Guard("managers keep their highest term on disk", {(Candidate, "_keep"): _do_nothing}),
+        "kept": Guard("managers keep their highest term on disk", {(KeptTerm, "keep"): _do_nothing}),
         "handed": Guard(
             "what was handed over stays the old client's until the new one has heard of it",
             {(MovableClient, "_awaited_by"): _none_async},

@@ -169,7 +169,7 @@ class LeaderPlayer:
                 return [steps.QuestionAnswered(self.open.pop((Why.REQUESTS, what[0])), self._requests(*what))]
             case "state":
                 state = structs.replace(self._state(*what), term=OWN, seq=self.leader.seq)
-                return [steps.Reported(self.keys.rc_state(what[0]), state)]
+                return [steps.Reported(state)]
             case "ask":
                 return [self._asked(what[0], self._ask(*rest))]
             case "release":

@@ -57,7 +57,7 @@ class Leader:
         bookings: FleetBookings,
         runtimes: RuntimeEstimator | None,
     ) -> None:
-        self._fleet, self.core, self._admission, self.roster = fleet, core, admission, roster
+        self._fleet, self.core, self.admission, self.roster = fleet, core, admission, roster
         self._bookings, self.term = bookings, admission.places.term
         self.registry = RequestLog(core, roster, admission.places, runtimes)
         self.operations = Operations(fleet, core, self.registry, roster, admission, door, bookings, runtimes)
@@ -120,14 +120,7 @@ class Leader:
                 break
         else:
             if queue and not operations.instant.touched and not out.at_once:
-                stimulus = queue.popleft()
-                try:
-                    return self._events(stimulus)
-                except BadName as error:
-                    if isinstance(stimulus, steps.Lead):
-                        raise
-                    out.strange.append((str(error), f"ignored what came under a bad name: {error}"))
-                    return []
+                return self._events(queue.popleft())
         return operations.events()
 
     def _events(self, work: steps.Stimulus) -> list[model.Event]:
@@ -136,8 +129,8 @@ class Leader:
             case steps.TokenSeen(token, alive):
                 token_moved = self.roster.client_token if token.role == Role.CLIENT else self.roster.rc_token
                 return merge(token_moved(self._now, token, alive=alive))
-            case steps.Reported(key, state):
-                return merge(self.roster.rc_state(self._now, key, state))
+            case steps.Reported(state):
+                return merge(self.roster.rc_state(self._now, state))
             case steps.QuestionAnswered(question, message, problem):
                 return merge(self.roster.answered(self._now, question, message, problem))
             case steps.TokensFound(question, tokens):
@@ -206,13 +199,13 @@ class Leader:
 
     def _reload(self) -> list[model.Event]:
         """The rights have changed: who has none any more holds and waits for nothing."""
-        self.core.policy = self._admission.authority.bound(self._fleet.scheduling)
+        self.core.policy = self.admission.authority.bound(self._fleet.scheduling)
         known = filter(None, map(self.core.arc, self.core.arcs()))
-        return [model.Tick(), *removed((arc.request for arc in known), self._admission)]
+        return [model.Tick(), *removed((arc.request for arc in known), self.admission)]
 
     def _lead(self, recovered: RecoveredState) -> None:
         """Begin with what was recovered."""
-        now, registry, places = self._now, self.registry, self._admission.places
+        now, registry, places = self._now, self.registry, self.admission.places
         joined = self.roster.start(now, recovered.rcs.values(), recovered.pending, patient=recovered.patient)
         for arc in recovered.given_up:
             registry.give_up(now, arc, model.Outcome.RELEASED)
@@ -229,7 +222,7 @@ class Leader:
         certain = 0 if bookings.settled else bookings.settles_at
         lead = model.LeadTaken(self.term, tuple(recovered.holds), waiting, recovered.charged, certain)
         booked = bookings.recovered({request.booking for request in requests if request.booking} | recovered.booked)
-        gone = removed((hold.request for hold in recovered.holds), self._admission)
+        gone = removed((hold.request for hold in recovered.holds), self.admission)
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
         self._decide([*self._out.merge(joined), *booked, lead, *gone], named=recovered.rcs)
         self._out.notices += [registry.refuse(now, *refused) for refused in recovered.refused]
@@ -258,8 +251,8 @@ class Leader:
                 events.append(model.Released(arc.id))
             elif not arc.vouched:
                 try:
-                    own = listed_by(answer.client, request, self._admission, self._bookings.record)
-                    events.append(vouched(arc, own, self._admission))
+                    own = listed_by(answer.client, request, self.admission, self._bookings.record)
+                    events.append(vouched(arc, own, self.admission))
                 except (Refused, BadName) as error:
                     self._out.strange.append((answer.client, f"{answer.client} lists what can't be: {error}"))
                     events.append(model.Released(arc.id, f"the leader, as it is no valid request: {error}"))
@@ -301,7 +294,7 @@ class Leader:
                 case model.Dropped(arc=arc, outcome=outcome) | model.HoldEnded(arc=arc, outcome=outcome) if (
                     not self.core.is_open(arc)
                 ):
-                    self._admission.places.end(arc, now, KEPT.get(outcome, REMEMBERED))
+                    self.admission.places.end(arc, now, KEPT.get(outcome, REMEMBERED))
                 case model.Propose():
                     out.proposals.append(self._bookings.proposal(effect))
                 case model.WakeAt(at):
@@ -342,7 +335,7 @@ class Leader:
 
     def _bind(self, arc: ArcId) -> None:
         if (place := self.core.place_of(arc)) is not None:
-            self._admission.places.bind(place, arc, self._now)
+            self.admission.places.bind(place, arc, self._now)
 
     # Out: grants and proposals
 

@@ -206,10 +206,9 @@ class Roster:
                 self._judge_soon(token.name, token)
         return self._taken()
 
-    def rc_state(self, now: Ns, key: str, state: RcState) -> Outbox:
+    def rc_state(self, now: Ns, state: RcState) -> Outbox:
         self._now = now
-        if self._keys.rc_of(key) == state.rc:
-            self._report(self._rc(state.rc), state)
+        self._report(self._rc(state.rc), state)
         return self._taken()
 
     def shun(self, now: Ns, token: Token, until: Ns) -> Outbox:
@@ -268,7 +267,7 @@ class Roster:
         match asked.why:
             case Why.PROMISE if asked.token is not None:
                 self._promised(asked.token, message, problem)
-            case Why.RETURN if isinstance(message, RcState):
+            case Why.RETURN if asked.token is not None and _is_of(message, asked.token):
                 self._report(self._rc(message.rc), message)
             case Why.REQUESTS:
                 self._listed(asked.client, message, problem)
@@ -622,8 +621,7 @@ class Roster:
                 self._out.disbelieved.append((token.name, problem.term))
         if not self._is_wanted(rc, token):
             return
-        promised = isinstance(state, RcState) and (state.rc, state.instance) == (token.name, token.instance)
-        if not promised or state.term < self.term:  # a report from before the promise
+        if not _is_of(state, token) or state.term < self.term:  # a report from before the promise
             # An answer without a promise can come at once, again and again: a token may outlive its RC.
             self._set(self._timeout, _Due.AGAIN, Question(Why.PROMISE, "", 0, token=token))
         elif any(holder.grant.term != self.term for holder in state.holders):
@@ -779,6 +777,11 @@ class Roster:
 
 
 _UNKNOWN: Final = _Rc()
+
+
+def _is_of(message: Any, token: Token) -> bool:
+    """Return True for the state of that instance."""
+    return isinstance(message, RcState) and (message.rc, message.instance) == (token.name, token.instance)
 
 
 def _presence(state: RcState) -> RcJoined | RcLost:

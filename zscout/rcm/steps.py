@@ -1,6 +1,7 @@
 """What goes into a step of the leader, and what comes out. Pure values.
 
-Stimuli that the mesh, timers and bookings bring are queued; a step takes as many as make one instant of the core."""
+Stimuli that the mesh, timers and bookings bring are queued; a step takes as many as make one instant of the core. The
+names in them were checked as they came in, those within holds and requests are checked where these enter."""
 
 from __future__ import annotations
 
@@ -98,9 +99,8 @@ class TokenSeen(NamedTuple):
 
 
 class Reported(NamedTuple):
-    """An RC's state, and its key."""
+    """An RC's state, on its own key."""
 
-    key: str
     state: RcState
 
 

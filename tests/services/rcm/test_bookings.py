@@ -197,14 +197,14 @@ async def test_who_took_up_a_date_that_its_leader_does_not_know_yet_waits_for_it
     fleet = BookedFleet("x", "y")
     (leader,) = await led(fleet, "x")
     await do(fleet.client("there", "y"), book("b", "robot/b", at=500), BookingView)
-    (known,) = leader._keeper.records
+    (known,) = leader.learned.keeper.records
     hers, not_hers = (fleet.client("one", host) for host in ("y", "z"))
     for number, client in enumerate((hers, not_hers), 1):
         place = Place(Term(0, "elsewhere"), number)
         told = await client.ask("mine", "robot/a", seconds=100, place=place, booking="late@1800000500")
         assert (told.state, told.reason) == ("queued", "the time of its booking is still to come")
-    leader._keeper.records.take([replace(known, id="late", name="late", needs={"robot/a": {}})])
-    leader._keeper.shared.set()
+    leader.learned.keeper.records.take([replace(known, id="late", name="late", needs={"robot/a": {}})])
+    leader.learned.keeper.shared.set()
     await asyncio.sleep(1)
     assert states((await fleet.bookings())["late"]) == ["taken"]
     await asyncio.sleep(NOON + 501 - fleet.time())
