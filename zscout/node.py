@@ -27,7 +27,6 @@ from zscout.config.devices import RobotRc
 from zscout.config.fleet import Fleet
 from zscout.config.local_users import is_stranger, listeners, user_name
 from zscout.config.node import CalendarConfig, MetricsConfig, Node, default_node, load_node
-from zscout.config.notify import NotifyConfig
 from zscout.config.state_folder import state_folder
 from zscout.config.strict import BadInput
 from zscout.drivers.confirm_server import ConfirmServer
@@ -50,8 +49,9 @@ from zscout.services.node.reload import FilesInForce, Reload, rights_of
 from zscout.services.node.service_manager import ServiceManager
 from zscout.services.notify.notifier import Notifier
 from zscout.services.plain_http import PlainHttpServer
-from zscout.services.rcm.candidate import Candidate
+from zscout.services.rcm.candidate import Candidate, CandidateParts
 from zscout.services.rcm.digest import HoldListener
+from zscout.services.rcm.observed_runtimes import RuntimeObserver
 from zscout.services.rcm.term_file import TermFile
 from zscout.services.recorder.process import RecorderProcess
 from zscout.types import SECOND, clean
@@ -151,31 +151,33 @@ async def run_services(
             recorder = RecorderProcess(node.recorder, node.fleet, node.host)
             await recorder.start()
             stack.push_async_callback(recorder.stop)
-        candidate = None
+        candidate: Candidate | None = None
         figures = NodeFigures(node, mesh, rcs)
         listeners: list[HoldListener] = [figures.holds] if node.metrics is not None else []
         if node.candidate:
-            journal = None
+            journal, runtimes = None, RuntimeObserver()
             if kept is not None and node.fleet.may_lead(me.host) and not node.journal.off:
-                journal = Journal(mesh, kept, node.journal, node.fleet.silence / SECOND)
+                silence = node.fleet.silence / SECOND
+                journal = Journal(mesh, kept, node.journal, silence, on_opened=runtimes.recall)
                 journal.start()
                 stack.push_async_callback(journal.stop)
-            candidate = Candidate(
-                mesh,
-                node.fleet,
+            parts = CandidateParts(
                 kept,
                 authority,
                 _places_key(node.fleet),
                 listeners,
                 journal,
+                runtimes,
                 keeper,
                 TermFile(kept, node.fleet.name) if kept is not None else None,
             )
             if node.notify is not None:
-                notifier = _notifier(node.notify, node.fleet.name, candidate)
-                listeners.append(notifier.holds)
-                candidate.on_danger = notifier.on_danger
+                notifier = Notifier(node.fleet.name, node.notify, lambda: _reports(candidate))
+                notifier.start()
                 stack.callback(notifier.stop)
+                listeners.append(notifier.holds)
+                parts = parts._replace(on_danger=notifier.on_danger)
+            candidate = Candidate(mesh, node.fleet, parts)
             candidate.start()
             stack.push_async_callback(candidate.stop)
         if node.metrics is not None:
@@ -247,14 +249,9 @@ async def _serve(table: str, server: PlainHttpServer) -> bool:
     return True
 
 
-def _notifier(config: NotifyConfig, fleet: str, candidate: Candidate) -> Notifier:
-    def reports() -> list[LoadReport]:
-        balancer = candidate.balancer
-        return [] if balancer is None else [report for _, report in balancer.core.reports.values()]
-
-    notifier = Notifier(fleet, config, reports)
-    notifier.start()
-    return notifier
+def _reports(candidate: Candidate | None) -> list[LoadReport]:
+    balancer = None if candidate is None else candidate.balancer
+    return [] if balancer is None else [report for _, report in balancer.core.reports.values()]
 
 
 def _places_key(fleet: Fleet) -> bytes | None:

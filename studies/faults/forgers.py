@@ -102,7 +102,7 @@ async def forge(mesh: Mesh, devices: Mapping[str, object], over: Callable[[], bo
 
 def believed(rcm: Rcm) -> str:
     """The forgery that a leader believes; empty: none."""
-    status, authority, of_forger = rcm.core.status(), rcm.authority, 0
+    status, authority, of_forger = rcm.core.status(), rcm.leader.admission.authority, 0
     for arc in (*status.running, *status.queued):
         host, request = arc.request.client.partition("/")[0], arc.request
         most = authority.highest(host)

@@ -33,6 +33,7 @@ from zscout.rcm.leader import Leader
 from zscout.rcm.places import Places
 from zscout.rcm.request_log import RequestLog
 from zscout.rcm.roster import Roster
+from zscout.rcm.steps import Outbox
 from zscout.rcm.terms import BELIEVED, Terms, Verdict
 from zscout.scheduling.calendar import Calendar
 from zscout.scheduling.model import ArcRequest
@@ -47,6 +48,7 @@ from zscout.services.rcm.bookings import Bookings
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.election import Election
 from zscout.services.rcm.rcm import Rcm
+from zscout.services.rcm.term_file import KeptTerm
 from zscout.types import NO_TERM, SECOND, Grant, Ns, Term
 
 ABSENT: Final = object()
@@ -63,8 +65,8 @@ def _nothing(*_: object, **__: object) -> None:
     return None
 
 
-def _no_change(*_: object) -> roster.Change:
-    return roster.Change()
+def _no_change(*_: object) -> Outbox:
+    return Outbox()
 
 
 def _no(*_: object, **__: object) -> bool:
@@ -294,7 +296,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
             "a client goes back to the leader that it sees",
             {(RcmLink, "_follow_lower"): _do_nothing, (RcmLink, "_only_promised"): _no},
         ),
-        "kept": Guard("managers keep their highest term on disk", {(Candidate, "_keep"): _do_nothing}),
+        "kept": Guard("managers keep their highest term on disk", {(KeptTerm, "keep"): _do_nothing}),
         "handed": Guard(
             "what was handed over stays the old client's until the new one has heard of it",
             {(MovableClient, "_awaited_by"): _none_async},

@@ -45,7 +45,7 @@ from zscout.messages import MAX_COUNTER, Grants
 from zscout.scheduling.reason import ReasonCode
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.node.component_host import ComponentHost
-from zscout.services.rcm.candidate import Candidate
+from zscout.services.rcm.candidate import Candidate, CandidateParts
 from zscout.services.rcm.rcm import Rcm
 from zscout.testing.memory import MemoryMesh, MemoryNetwork, MemoryTransport
 from zscout.testing.virtual_time import PROCESS, START, Process, VirtualTimeLoop
@@ -497,9 +497,8 @@ class Simulation:
         if leads:
             self.keepers[host] = keeper
             key = PLACES_KEY if self.size.thief or self.size.liars or self.size.forger else None
-            candidate = self.candidates[host] = Candidate(
-                mesh, self.fleet, places_key=key, keeper=keeper, disk=self.term_disks[host]
-            )
+            parts = CandidateParts(places_key=key, keeper=keeper, disk=self.term_disks[host])
+            candidate = self.candidates[host] = Candidate(mesh, self.fleet, parts)
             candidate.start()
         elif self.size.bookers and str(mesh.me) in self.where.values():
             self.keepers[host] = keeper

@@ -36,7 +36,7 @@ from zscout.mesh.transport import Collector, Quality, TransportQuery
 from zscout.messages import ComponentSpec, Problem, Recorded
 from zscout.services.journal.journal import Journal
 from zscout.services.node.component_host import ComponentHost
-from zscout.services.rcm.candidate import Candidate
+from zscout.services.rcm.candidate import Candidate, CandidateParts
 from zscout.services.recorder.recorder import Recorder
 from zscout.services.recorder.timeline import Timeline
 from zscout.testing.memory import MemoryMesh, MemoryNetwork, MemoryTransport
@@ -226,7 +226,7 @@ class Fleet:
             mesh, folder, JournalConfig(), self.fleet.silence / SECOND, lambda: START + mesh.now() / SECOND
         )
         journal.start()
-        candidate = Candidate(mesh, self.fleet, journal=journal)
+        candidate = Candidate(mesh, self.fleet, CandidateParts(journal=journal))
         candidate.start()
         self.candidates.append(candidate)
         components = ComponentHost(

@@ -18,6 +18,7 @@ from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
 from zscout.rcm.places import Places
 from zscout.rcm.recovery import RecoveredState, recover
+from zscout.scheduling import model
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, ArcStatus, LeadTaken, RcJoined
 from zscout.scheduling.strategies import STRATEGIES
@@ -252,3 +253,13 @@ def test_what_goes_on_at_another_client_is_believed_of_no_request_that_waits() -
     found = recover(BOTH, [RUNS, client(asked(grant=Grant(TERM, 5)), name="h/old")], NOW, plain())
     assert summary(found) == (["gang"], [])
     assert found.believed == {}
+
+
+def test_a_reported_hold_is_checked_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An RC may report thousands, and all of one answer are looked at in one step."""
+    checked = list[str]()
+    monkeypatch.setattr(model, "check_request", lambda name, *_: checked.append(name))
+    held = [hold(("radio/b",), seq=number, name=f"n{number}") for number in range(50)]
+    found = recover_plain([rc("radio/b", *held)], [], NOW)
+    assert len(found.holds) == 50
+    assert len(checked) == 50

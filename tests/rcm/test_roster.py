@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from msgspec import structs
+
 from zscout.config.fleet import default_fleet
 from zscout.keyexpr import Keys, Role, Token
+from zscout.messages import RcState
 from zscout.rcm import roster
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
 from zscout.rcm.devices import ExpectedDevices
 from zscout.rcm.places import Places
-from zscout.rcm.roster import MAX_TOKENS, Roster, Why
+from zscout.rcm.roster import MAX_TOKENS, Roster
+from zscout.rcm.steps import Outbox, Why
 from zscout.scheduling.model import ClientLost
 from zscout.types import SECOND, Term
 
@@ -27,7 +31,7 @@ def token(number: int, host: str = "greedy") -> Token:
 def test_tokens_of_one_host_are_bounded_and_the_earliest_stay() -> None:
     members = a_roster()
     changes = [members.client_token(0, token(number), alive=True) for number in range(MAX_TOKENS + 50)]
-    assert [change.surplus for change in changes if change.surplus] == ["greedy"]
+    assert [host for change in changes for host, _ in change.strange] == ["greedy"]
     assert len(members.clients) == MAX_TOKENS
     assert "greedy/c0" in members.clients
     members.client_token(0, token(MAX_TOKENS + 1), alive=False)  # it never counted
@@ -52,3 +56,17 @@ def test_a_host_s_tokens_disappear_in_one_go() -> None:
     lost = members.answered(2 * SECOND, judged.questions[0], object(), None)
     assert len(lost.events) == MAX_TOKENS
     assert all(isinstance(event, ClientLost) for event in lost.events)
+
+
+def test_an_rc_speaks_for_itself_alone() -> None:
+    """An answer under another name, or of another instance, changes nothing: no name enters here unchecked."""
+    members = a_roster()
+    shown = Token("desk", Role.RC, "robot/a", "desk-1")
+    [question] = members.rc_token(0, shown, alive=True).questions
+    state = RcState("robot/a", "desk", "desk-1", sharable=False, term=Term(1, "rcm"))
+    members.answered(0, question, state, None)
+    back = question._replace(why=Why.RETURN)
+    for other in (structs.replace(state, rc="no name"), structs.replace(state, instance="desk-2")):
+        assert members.answered(1, back, structs.replace(other, health="broken"), None) == Outbox()
+        assert not members.is_known("no name")
+    assert members.answered(1, back, structs.replace(state, health="broken"), None).events

@@ -42,23 +42,23 @@ from zscout.messages import (
     Notice,
     OpenRequest,
     Problem,
-    ProposedHolder,
+    Proposal,
     RcState,
     Release,
 )
 from zscout.rcm import steps
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
-from zscout.rcm.booked import BookingWork
 from zscout.rcm.devices import ExpectedDevices
 from zscout.rcm.door import Door
 from zscout.rcm.leader import Leader
 from zscout.rcm.places import Places
 from zscout.rcm.recovery import take_over
-from zscout.rcm.roster import Roster, Why
+from zscout.rcm.roster import Roster
+from zscout.rcm.steps import Why
 from zscout.scheduling.booking import Booking, Dates
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import Effect, HoldEnded, Vote
+from zscout.scheduling.model import Effect, HoldEnded, Propose, Vote
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import Grant, Ns, Place, Term
 
@@ -72,8 +72,8 @@ class NoBookings:
     def at(self, _now: Ns) -> NoBookings:
         return self
 
-    def note(self, *_: Any, **__: Any) -> BookingWork:
-        return BookingWork()
+    def note(self, *_: Any, **__: Any) -> steps.Outbox:
+        return steps.Outbox()
 
     operation = again = kept = shared = tick = note
 
@@ -89,8 +89,8 @@ class NoBookings:
     def recovered(self, _taken: Any) -> list[Any]:
         return []
 
-    def proposed(self, name: str, _params: Any) -> ProposedHolder:
-        return ProposedHolder(name, name, "nobody/booking")
+    def proposal(self, asked: Propose) -> steps.Proposed:
+        return steps.Proposed(asked.rc, Proposal(proposal=asked.proposal, term=OWN, holders=[]))
 
 
 def _access(words: list[str]) -> AccessPolicy:
@@ -169,7 +169,7 @@ class LeaderPlayer:
                 return [steps.QuestionAnswered(self.open.pop((Why.REQUESTS, what[0])), self._requests(*what))]
             case "state":
                 state = structs.replace(self._state(*what), term=OWN, seq=self.leader.seq)
-                return [steps.Reported(self.keys.rc_state(what[0]), state)]
+                return [steps.Reported(state)]
             case "ask":
                 return [self._asked(what[0], self._ask(*rest))]
             case "release":

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from typing import Final
 
 from zscout.keyexpr import BadName, Role, Token, client_of
 from zscout.mesh.exchange import Reply
 from zscout.mesh.session import Mesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import MAX_COUNTER, ClientRequests, RcAsk, RcmState, RcState, StateAsk, of_the_last
+from zscout.messages import LAST_TERMS, MAX_COUNTER, ClientRequests, RcAsk, RcmState, RcState, StateAsk, of_the_last
 from zscout.types import NO_TERM, Term
+
+MOST_OF_RCS: Final = (LAST_TERMS + MAX_COUNTER) // 2
+"""With certificates: terms above come one by one, whatever RCs obey. Two hosts that lie do not end a fleet."""
 
 
 class LastTerms:
@@ -61,7 +65,7 @@ async def promised_elsewhere(mesh: Mesh, *, timeout: float) -> Term:
 
 
 def _second(replies: list[Reply[RcState]], tokens: list[Token]) -> list[Reply[RcState]]:
-    """Of RCs that are seen, those which obey no higher term than RCs of another host do."""
+    """Of RCs that are seen, those which obey no higher term than RCs of another host do, nor one above MOST_OF_RCS."""
     hosts = {(token.name, token.instance): token.host for token in tokens if token.role == Role.RC}
     shown = [
         (reply, reply.message.term, host)
@@ -69,7 +73,9 @@ def _second(replies: list[Reply[RcState]], tokens: list[Token]) -> list[Reply[Rc
         if reply.message is not None and (host := hosts.get((reply.message.rc, reply.message.instance))) is not None
     ]
     return [
-        reply for reply, term, host in shown if any(other != host and another >= term for _, another, other in shown)
+        reply
+        for reply, term, host in shown
+        if term.counter <= MOST_OF_RCS and any(other != host and another >= term for _, another, other in shown)
     ]
 
 

@@ -229,14 +229,13 @@ def exact(value: Decimal, what: str) -> Fraction:
 
 def check_amount(value: Decimal, what: str) -> None:
     """Raises ValueError for what `exact` does not take."""
-    shown = str(value)[:40]
     if not value.is_finite():
-        raise ValueError(f"{what} must be a number, not {shown}")
+        raise ValueError(f"{what} must be a number, not {str(value)[:40]}")
     if value < 0:
-        raise ValueError(f"{what} must not be negative, and is {shown}")
+        raise ValueError(f"{what} must not be negative, and is {str(value)[:40]}")
     # A Fraction of 1e999999 would take all memory: look at the exponent before converting.
     if value and not -MAX_EXPONENT <= value.adjusted() <= MAX_EXPONENT:
-        raise ValueError(f"{what} must lie between 1e-{MAX_EXPONENT} and 1e{MAX_EXPONENT}, and is {shown}")
+        raise ValueError(f"{what} must lie between 1e-{MAX_EXPONENT} and 1e{MAX_EXPONENT}, and is {str(value)[:40]}")
     if len(value.as_tuple().digits) > MAX_DIGITS:
         raise ValueError(f"{what} has more than {MAX_DIGITS} digits")
 

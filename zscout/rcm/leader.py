@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final
 
 from msgspec.structs import replace
 
@@ -18,13 +18,13 @@ from zscout.keyexpr import BadName, Role
 from zscout.messages import Refused
 from zscout.rcm import steps
 from zscout.rcm.admission import Admission
-from zscout.rcm.booked import NO_WORK, Again, BookingWork, FleetBookings
+from zscout.rcm.booked import FleetBookings
 from zscout.rcm.door import Door
-from zscout.rcm.operations import Operations, Taken
+from zscout.rcm.operations import Operations
 from zscout.rcm.places import arc_id, request_id
 from zscout.rcm.recovery import RecoveredState, listed_by, removed, vouched
 from zscout.rcm.request_log import REMEMBERED, RequestLog, reason_info
-from zscout.rcm.roster import MAX_TOKENS, Change, Roster, discrepancies
+from zscout.rcm.roster import Roster, discrepancies
 from zscout.rcm.state_view import holders_of
 from zscout.scheduling import model
 from zscout.scheduling.core import Core
@@ -44,56 +44,6 @@ CONTINUED: Final = (model.LeadTaken, model.Adopted, model.Vouched, model.HandedO
 BOOKINGS: Final = (messages.Book, messages.Unbook, messages.FindSlots)
 
 
-class _Compare(NamedTuple):
-    """An RC that counts as present reports its holds."""
-
-    state: messages.RcState
-
-
-class _Name(NamedTuple):
-    """Publish these RCs."""
-
-    rcs: Collection[RcName]
-
-
-class _Listed(NamedTuple):
-    answer: messages.ClientRequests
-
-
-class _NewClient(NamedTuple):
-    """Whether the new client of a hand-over is there."""
-
-    number: int
-    there: bool
-
-
-class _Resume(NamedTuple):
-    """RCs are no longer pending."""
-
-
-class _Booking(NamedTuple):
-    """An operation on bookings, once the core is at the present time."""
-
-    asked: steps.OperationAsked
-
-
-class _BookingsDue(NamedTuple):
-    """The bookings' deadlines are over."""
-
-
-class _Due(NamedTuple):
-    """Deadlines are over."""
-
-
-class _Tick(NamedTuple):
-    """The core's time is over; reasons and lines of the log may be due."""
-
-
-_Work: TypeAlias = (
-    steps.Stimulus | _Compare | _Name | _Listed | _NewClient | _Resume | _Booking | Again | _BookingsDue | _Due | _Tick
-)
-
-
 class Leader:
     """One term. `bookings`: those of the fleet."""
 
@@ -107,7 +57,7 @@ class Leader:
         bookings: FleetBookings,
         runtimes: RuntimeEstimator | None,
     ) -> None:
-        self._fleet, self.core, self._admission, self.roster = fleet, core, admission, roster
+        self._fleet, self.core, self.admission, self.roster = fleet, core, admission, roster
         self._bookings, self.term = bookings, admission.places.term
         self.registry = RequestLog(core, roster, admission.places, runtimes)
         self.operations = Operations(fleet, core, self.registry, roster, admission, door, bookings, runtimes)
@@ -123,7 +73,7 @@ class Leader:
         """The number of the last publication that named an RC."""
         self._recovered: dict[ClientId, set[ArcId]] = {}
         """By client: the ARCs that only RCs have reported."""
-        self._queue: deque[_Work] = deque()
+        self._queue: deque[steps.Stimulus] = deque()
         self._wake: Ns | None = None
         """When deadlines are over."""
         self._waking = False
@@ -134,18 +84,21 @@ class Leader:
 
     def step(self, now: Ns, stimuli: Iterable[steps.Stimulus] = ()) -> steps.Outbox:
         """One instant: of what waits, as much as is decided together."""
-        self._now, self._out = now, steps.Outbox()
+        self._now, out = now, steps.Outbox()
+        self._out = out
         self._bookings.at(now)
         self._queue.extend(stimuli)
         if self._wake is not None and self._wake <= now and not self._waking:
             self._waking = True
-            self._queue.append(_Due())
-        if (events := self._next()) is not None:
+            self._queue.append(steps.Due.DEADLINES)
+        if events := self._next():
             self._decide(events)
+        self._queue.extendleft(reversed(out.then))
+        out.then = []
         times = [self._core_wake, *[part.next for part in self._parts]]
-        self._out.wake = self._wake = min([at for at in times if at is not None], default=None)
-        self._out.more = bool(self._queue)
-        return self._out
+        out.wake = self._wake = min([at for at in times if at is not None], default=None)
+        out.more = bool(self._queue)
+        return out
 
     def close(self, now: Ns) -> str:
         """What was gathered for the log: nothing is published any more."""
@@ -153,153 +106,106 @@ class Leader:
 
     # In: the events of the next instant
 
-    def _next(self) -> Sequence[model.Event] | None:
-        """The events of the next instant; None: there is none to decide."""
-        operations, queue = self.operations, self._queue
+    def _next(self) -> list[model.Event]:
+        """The events of the next instant."""
+        operations, queue, out = self.operations, self._queue, self._out
         while queue and isinstance(asked := queue[0], steps.OperationAsked) and operations.joins(asked):
             queue.popleft()
             if isinstance(asked.operation, BOOKINGS):
-                self._follow(self.roster.heard(self._now, str(asked.sender)))
-                queue.appendleft(_Booking(asked))
+                out.merge(self.roster.heard(self._now, str(asked.sender)))
+                out.then.append(steps.BookingAsked(asked))
                 return [model.Tick()]
-            self._take(operations.take(self._now, asked))
+            out.merge(operations.take(self._now, asked))
             if isinstance(asked.operation, (messages.HandOver, messages.Foresee)):
                 break
         else:
-            if queue and not operations.instant.touched and not self._out.at_once:
-                stimulus = queue.popleft()
-                try:
-                    return self._events(stimulus)
-                except BadName as error:
-                    if isinstance(stimulus, steps.Lead):
-                        raise
-                    self._out.strange.append((str(error), f"ignored what came under a bad name: {error}"))
-                    return None
-        return operations.events() or None
+            if queue and not operations.instant.touched and not out.at_once:
+                return self._events(queue.popleft())
+        return operations.events()
 
-    def _events(self, work: _Work) -> Sequence[model.Event] | None:
+    def _events(self, work: steps.Stimulus) -> list[model.Event]:
+        merge = self._out.merge
         match work:
             case steps.TokenSeen(token, alive):
                 token_moved = self.roster.client_token if token.role == Role.CLIENT else self.roster.rc_token
-                return self._follow(token_moved(self._now, token, alive=alive))
-            case steps.Reported(key, state):
-                return self._follow(self.roster.rc_state(self._now, key, state))
+                return merge(token_moved(self._now, token, alive=alive))
+            case steps.Reported(state):
+                return merge(self.roster.rc_state(self._now, state))
             case steps.QuestionAnswered(question, message, problem):
-                return self._follow(self.roster.answered(self._now, question, message, problem))
+                return merge(self.roster.answered(self._now, question, message, problem))
             case steps.TokensFound(question, tokens):
-                return self._follow(self.roster.seen(self._now, question, tokens))
+                return merge(self.roster.seen(self._now, question, tokens))
             case steps.Happened(events):
-                return events
+                return [*events]
             case steps.Shunned(token, until):
-                return self._follow(self.roster.shun(self._now, token, until))
+                return merge(self.roster.shun(self._now, token, until))
             case steps.Stalled(length, ended, fresh):
                 self.roster.stalled(length, ended, fresh=fresh)
-            case _Booking(asked):
-                return self._booked(self._bookings.operation(*asked))
-            case Again():
-                return self._booked(self._bookings.again(work))
+            case steps.BookingAsked(asked):
+                return merge(self._bookings.operation(*asked))
+            case steps.Again():
+                return merge(self._bookings.again(work))
             case steps.Kept(keep, why):
-                return self._booked(self._bookings.kept(keep, why))
+                return merge(self._bookings.kept(keep, why))
             case steps.Shared(news):
-                return self._booked(self._bookings.shared(news=news))
-            case _BookingsDue():
+                return merge(self._bookings.shared(news=news))
+            case steps.Due.BOOKINGS:
                 self._waking = False
-                return self._booked(self._bookings.tick())
+                return merge(self._bookings.tick())
             case steps.Reloaded():
                 return self._reload()
             case steps.Lead(recovered):
                 self._lead(recovered)
-            case _Compare(state):
+            case steps.Compare(state):
                 return self._compare(state)
-            case _Name(rcs):
-                self._publish([], rcs)
-            case _Listed(answer):
+            case steps.Name(rc):
+                self._publish([], self._all_named(rc))
+            case steps.ClientListed(answer):
                 return self._on_requests(answer)
-            case _NewClient(number, there):
-                self._take(self.operations.found(self._now, number, there=there))
+            case steps.ClientFound(number, there):
+                merge(self.operations.found(self._now, number, there=there))
                 return self.operations.events()
-            case _Resume():
-                self._queue.extendleft(reversed(self.operations.resume()))
-            case _Due():
+            case steps.Resume():
+                self._out.then += self.operations.resume()
+            case steps.Due.DEADLINES:
                 return self._tick()
-            case _Tick():
+            case steps.Due.TIME:
                 self._reports()
-        return None
+        return []
 
-    def _take(self, taken: Taken) -> None:
-        """Carry out what follows at once from operations."""
-        out = self._out
-        out.at_once += taken.answers
-        out.notices += taken.notices
-        out.strange += taken.strange
-        for change in taken.changes:
-            self._follow(change)
+    def _all_named(self, rc: RcName) -> set[RcName]:
+        """`rc`, and the RCs to be named right after it."""
+        rcs = {rc}
+        while self._queue and isinstance(named := self._queue[0], steps.Name):
+            rcs.add(named.rc)
+            self._queue.popleft()
+        return rcs
 
-    def _follow(self, change: Change) -> Sequence[model.Event]:
-        """The events of what follows for the roster; all else is done, or put before what waits."""
-        out = self._out
-        out.higher += change.higher
-        out.disbelieved += change.disbelieved
-        out.questions += change.questions
-        out.suspicions += change.suspicions
-        out.log += change.remarks
-        out.duplicates += change.duplicates
-        if change.surplus:
-            out.strange.append(
-                (change.surplus, f"{change.surplus} shows more than {MAX_TOKENS} tokens: later ones are ignored")
-            )
-        later: list[_Work] = [*map(_Compare, change.reported)]
-        if change.named:
-            later.append(_Name(change.named))
-        later += map(_Listed, change.listed)
-        later += [_NewClient(number, there) for number, there in change.found]
-        if change.settled:
-            later.append(_Resume())
-        if later:
-            self._queue.extendleft(reversed(later))
-        return change.events
-
-    def _booked(self, work: BookingWork) -> Sequence[model.Event]:
-        """The events of what follows for bookings; all else is done, or put before what waits."""
-        out = self._out
-        out.answers += work.answers
-        out.proposals += [steps.Proposed(asked.rc, self._proposal(asked)) for asked in work.proposals]
-        out.keep += work.keep
-        out.changed += work.changed
-        out.dangers += work.dangers
-        out.log += work.log
-        out.strange += work.strange
-        self._queue.extendleft(reversed(work.again))
-        return work.events
-
-    def _tick(self) -> Sequence[model.Event]:
-        answers, again = self.operations.tick(self._now)
-        self._out.at_once += answers
-        self._queue.extendleft(reversed([_Tick(), *again]))
-        if self.roster.next is not None and self.roster.next <= self._now:
-            return self._follow(self.roster.tick(self._now))
-        return ()
+    def _tick(self) -> list[model.Event]:
+        out, answers = self._out, self.operations.tick(self._now)
+        events = out.merge(self.roster.tick(self._now))
+        out.then.append(steps.Due.TIME)
+        out.merge(answers)
+        return events
 
     def _reports(self) -> None:
         due = self._bookings.next
         self._waking = due is not None and due <= self._now
         if self._waking:
-            self._queue.appendleft(_BookingsDue())
+            self._out.then.append(steps.Due.BOOKINGS)
         if self._core_wake is not None and self._core_wake <= self._now:
             self._decide([model.Tick()])
-        notices, text = self.registry.tick(self._now)
-        self._out.notices += notices
-        self._out.log += [text] if text else []
+        self._out.merge(self.registry.tick(self._now))
 
-    def _reload(self) -> Sequence[model.Event]:
+    def _reload(self) -> list[model.Event]:
         """The rights have changed: who has none any more holds and waits for nothing."""
-        self.core.policy = self._admission.authority.bound(self._fleet.scheduling)
+        self.core.policy = self.admission.authority.bound(self._fleet.scheduling)
         known = filter(None, map(self.core.arc, self.core.arcs()))
-        return [model.Tick(), *removed((arc.request for arc in known), self._admission)]
+        return [model.Tick(), *removed((arc.request for arc in known), self.admission)]
 
     def _lead(self, recovered: RecoveredState) -> None:
         """Begin with what was recovered."""
-        now, registry, places = self._now, self.registry, self._admission.places
+        now, registry, places = self._now, self.registry, self.admission.places
         joined = self.roster.start(now, recovered.rcs.values(), recovered.pending, patient=recovered.patient)
         for arc in recovered.given_up:
             registry.give_up(now, arc, model.Outcome.RELEASED)
@@ -316,25 +222,25 @@ class Leader:
         certain = 0 if bookings.settled else bookings.settles_at
         lead = model.LeadTaken(self.term, tuple(recovered.holds), waiting, recovered.charged, certain)
         booked = bookings.recovered({request.booking for request in requests if request.booking} | recovered.booked)
-        gone = removed((hold.request for hold in recovered.holds), self._admission)
+        gone = removed((hold.request for hold in recovered.holds), self.admission)
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
-        self._decide([*self._follow(joined), *booked, lead, *gone], named=recovered.rcs)
+        self._decide([*self._out.merge(joined), *booked, lead, *gone], named=recovered.rcs)
         self._out.notices += [registry.refuse(now, *refused) for refused in recovered.refused]
         for arc in self.core.arcs():
             self._bind(arc)
             if (expecting := recovered.expected.get(request_id(arc))) is not None:
                 places.admit(arc, expecting)
 
-    def _compare(self, state: messages.RcState) -> Sequence[model.Event] | None:
+    def _compare(self, state: messages.RcState) -> list[model.Event]:
         """Makes an RC and the core agree: what the RC lost has ended, what is too much there is revoked."""
         rc = state.rc
         current = state.term == self.term and state.seq >= self._named.get(rc, 0)
         ended, superfluous = discrepancies(state, self.core.holders(rc), self._now, current=current)
         if superfluous:
-            self._queue.appendleft(_Name([rc]))
-        return [model.RcReported(rc, ended)] if ended else None
+            self._out.then.append(steps.Name(rc))
+        return [model.RcReported(rc, ended)] if ended else []
 
-    def _on_requests(self, answer: messages.ClientRequests) -> Sequence[model.Event]:
+    def _on_requests(self, answer: messages.ClientRequests) -> list[model.Event]:
         """What RCs alone reported, and a client does not ask for, it gave up where no RCM heard of it; else its own
         word is the one that counts."""
         known = self._recovered.pop(answer.client, set()) & {*self.core.arcs_of(answer.client)}
@@ -345,8 +251,8 @@ class Leader:
                 events.append(model.Released(arc.id))
             elif not arc.vouched:
                 try:
-                    own = listed_by(answer.client, request, self._admission, self._bookings.record)
-                    events.append(vouched(arc, own, self._admission))
+                    own = listed_by(answer.client, request, self.admission, self._bookings.record)
+                    events.append(vouched(arc, own, self.admission))
                 except (Refused, BadName) as error:
                     self._out.strange.append((answer.client, f"{answer.client} lists what can't be: {error}"))
                     events.append(model.Released(arc.id, f"the leader, as it is no valid request: {error}"))
@@ -355,7 +261,7 @@ class Leader:
     def _recover(self, request: model.ArcRequest) -> None:
         """Has a client say whether it still asks for what RCs hold for it."""
         self._recovered.setdefault(request.client, set()).add(request.arc)
-        self._follow(self.roster.ask_requests(self._now, request.client))
+        self._out.merge(self.roster.ask_requests(self._now, request.client))
 
     # Out: one instant
 
@@ -382,21 +288,18 @@ class Leader:
         self._note(events)
         answered = notified | self.operations.waiting.keys()
         out.notices += registry.report(now, effects, answered, instant.given_up)
-        answers, notices = self.operations.decided(now, effects)
-        out.answers += answers
-        out.notices += notices
+        out.merge(self.operations.decided(now, effects))
         for effect in effects:
             match effect:
                 case model.Dropped(arc=arc, outcome=outcome) | model.HoldEnded(arc=arc, outcome=outcome) if (
                     not self.core.is_open(arc)
                 ):
-                    self._admission.places.end(arc, now, KEPT.get(outcome, REMEMBERED))
+                    self.admission.places.end(arc, now, KEPT.get(outcome, REMEMBERED))
                 case model.Propose():
-                    out.proposals.append(steps.Proposed(effect.rc, self._proposal(effect)))
+                    out.proposals.append(self._bookings.proposal(effect))
                 case model.WakeAt(at):
                     self._core_wake = at
-        if (work := self._bookings.note(events, effects)) is not NO_WORK:
-            self._booked(work)
+        out.merge(self._bookings.note(events, effects))
         if line := self.core.strategy.log_line():
             out.log.append(line)
         out.over, registry.traced = registry.traced, []
@@ -426,13 +329,13 @@ class Leader:
                     self.registry.enter(request.arc, request.name)
                     if client not in self.roster.clients:
                         # As the links to its RCs came back just now, so may its own.
-                        self._follow(self.roster.heard(now, client))
+                        self._out.merge(self.roster.heard(now, client))
                         self.roster.expect(now, client)
                     self._recover(request)
 
     def _bind(self, arc: ArcId) -> None:
         if (place := self.core.place_of(arc)) is not None:
-            self._admission.places.bind(place, arc, self._now)
+            self.admission.places.bind(place, arc, self._now)
 
     # Out: grants and proposals
 
@@ -485,16 +388,6 @@ class Leader:
         every, time, age = self._fleet.timing.heartbeat / SECOND, self._bookings.time, self._bookings.age
         before, self.seq, self.published = self.seq, number, now
         return messages.Grants(self.term, number, before, every, rcs, revoked, instances, begun, time, age, charged)
-
-    def _proposal(self, effect: model.Propose) -> messages.Proposal:
-        arcs = ((name, self.core.arc(name), params) for name, params in effect.holders.items())
-        holders = [
-            messages.ProposedHolder(request_id(arc.id), arc.name, arc.request.client, messages.decimals(params))
-            if arc is not None
-            else self._bookings.proposed(name, params)
-            for name, arc, params in arcs
-        ]
-        return messages.Proposal(proposal=effect.proposal, term=self.term, holders=holders)
 
 
 def _revocation(effect: model.HoldEnded, name: str, now: Ns, left: Collection[ArcId]) -> messages.Revocation:

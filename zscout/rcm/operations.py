@@ -17,14 +17,14 @@ from zscout.keyexpr import BadName, Sender, check_name, client_of
 from zscout.messages import Ask, Cancel, Foresee, Foresight, HandOver, Notice, Problem, Refused, Release
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
-from zscout.rcm.booked import Answer, FleetBookings, Ticket
+from zscout.rcm.booked import FleetBookings
 from zscout.rcm.deadlines import Deadlines
 from zscout.rcm.door import Door
 from zscout.rcm.places import arc_id, request_id
 from zscout.rcm.recovery import Listed, vouched
 from zscout.rcm.request_log import RequestLog, party_info, reason_info
-from zscout.rcm.roster import NOTHING, Change, Roster
-from zscout.rcm.steps import OperationAsked
+from zscout.rcm.roster import Roster
+from zscout.rcm.steps import Answer, OperationAsked, Outbox, Ticket
 from zscout.rcm.terms import Source, Word
 from zscout.scheduling import model
 from zscout.scheduling.core import Core
@@ -50,16 +50,6 @@ class _Standing(NamedTuple):
     ticket: Ticket
     arc: ArcId
     ask: Ask
-
-
-@dataclass(slots=True)
-class Taken:
-    """What follows at once from operations: the rest once the instant is decided."""
-
-    answers: list[Answer] = field(default_factory=list)
-    notices: list[Notice] = field(default_factory=list)
-    changes: list[Change] = field(default_factory=list)
-    strange: list[tuple[str, str]] = field(default_factory=list)
 
 
 @dataclass(slots=True)
@@ -98,7 +88,7 @@ class Operations:
         self._first_answer: Ns = fleet.timing.vote_timeout + REPLY_SLACK
         self._lease: Ns = round(fleet.mesh.lease * SECOND)
         self._now: Ns = 0
-        self._taken = Taken()
+        self._out = Outbox()
         self.instant = _Instant()
         self.waiting: dict[ArcId, list[Ticket]] = {}
         """Operations that are not answered yet, by ARC."""
@@ -128,14 +118,13 @@ class Operations:
                 return arc_id(operation.client or str(asked.sender), operation.id) not in instant.touched
         return False
 
-    def take(self, now: Ns, asked: OperationAsked) -> Taken:
+    def take(self, now: Ns, asked: OperationAsked) -> Outbox:
         """Take an operation in."""
         self._now = now
         ticket, sender, operation = asked
         client = str(sender)
         try:
-            if (heard := self._roster.heard(now, client)) is not NOTHING:
-                self._taken.changes.append(heard)
+            self._out.merge(self._roster.heard(now, client))
             check_name(operation.id, "id")
             match operation:
                 case Ask():
@@ -147,11 +136,11 @@ class Operations:
                 case Foresee():
                     self._forecast(ticket, operation, sender)
         except Refused as refused:
-            self._taken.answers.append((ticket, refused.problem))
+            self._out.at_once.append((ticket, refused.problem))
         except BadName as error:
-            self._taken.answers.append((ticket, Problem("bad_name", str(error))))
-        taken, self._taken = self._taken, Taken()
-        return taken
+            self._out.at_once.append((ticket, Problem("bad_name", str(error))))
+        out, self._out = self._out, Outbox()
+        return out
 
     def events(self) -> list[model.Event]:
         """The events of the instant: first ends, then what is asked."""
@@ -162,7 +151,7 @@ class Operations:
         deferred, self._deferred = self._deferred, []
         return deferred
 
-    def found(self, now: Ns, number: int, *, there: bool) -> Taken:
+    def found(self, now: Ns, number: int, *, there: bool) -> Outbox:
         """It is known whether the new client of a hand-over has a token."""
         self._now = now
         ticket, operation, sender, to = self._moving.pop(number)
@@ -171,24 +160,24 @@ class Operations:
                 raise Refused("unknown_client", f"{to} is not on the mesh")
             self._hand_over(ticket, operation, sender, to)
         except Refused as refused:
-            self._taken.answers.append((ticket, refused.problem))
-        taken, self._taken = self._taken, Taken()
-        return taken
+            self._out.at_once.append((ticket, refused.problem))
+        out, self._out = self._out, Outbox()
+        return out
 
     @property
     def next(self) -> Ns | None:
         return self._deadlines.next
 
-    def tick(self, now: Ns) -> tuple[list[Answer], list[OperationAsked]]:
+    def tick(self, now: Ns) -> Outbox:
         """First answers that are due, and operations to be looked at again."""
-        answers, again = list[Answer](), list[OperationAsked]()
+        out = Outbox()
         while (due := self._deadlines.pop_due(now)) is not None:
             match due:
                 case _Due.FIRST_ANSWER, arcs:
-                    answers += self._answers(now, arcs)
+                    out.at_once += self._answers(now, arcs)
                 case _Due.RESUME, _:
-                    again += self.resume()
-        return answers, again
+                    out.then += self.resume()
+        return out
 
     # Out: the instant is decided
 
@@ -201,27 +190,27 @@ class Operations:
         }
         return self._answers(now, arcs), {*arcs}
 
-    def decided(self, now: Ns, effects: Iterable[model.Effect]) -> tuple[list[Answer], list[Notice]]:
+    def decided(self, now: Ns, effects: Iterable[model.Effect]) -> Outbox:
         """The other answers that an instant has decided, and what new clients of ARCs are to know."""
-        answers, notices = list[Answer](), list[Notice]()
+        out = Outbox()
         for effect in effects:
             match effect:
                 case model.Granted(arc=arc) | model.Dropped(arc=arc):
-                    answers += self._answers(now, [arc])
+                    out.answers += self._answers(now, [arc])
                 case model.Queued(arc=arc, settled=True) if self.core.is_queued(arc):
-                    answers += self._answers(now, [arc])
+                    out.answers += self._answers(now, [arc])
         done, self.instant = self.instant, _Instant()
-        answers += self._answers(now, [event.arc for event in done.ended])
-        answers += [(ticket, self._standing(now, arc, ask)) for ticket, arc, ask in done.standing]
+        out.answers += self._answers(now, [event.arc for event in done.ended])
+        out.answers += [(ticket, self._standing(now, arc, ask)) for ticket, arc, ask in done.standing]
         if done.moved is not None:
             ticket, moved = done.moved
-            notices = self._registry.present(now, filter(self.core.is_queued, moved))
-            answers.append((ticket, self._registry.notice(now, moved[0])))
+            out.notices = self._registry.present(now, filter(self.core.is_queued, moved))
+            out.answers.append((ticket, self._registry.notice(now, moved[0])))
         undecided = [event.request.arc for event in done.asked if event.request.arc in self.waiting]
         if undecided:
             # Votes are out: they decide the first answer, if they come.
             self._deadlines.set(now + self._first_answer, (_Due.FIRST_ANSWER, undecided))
-        return answers, notices
+        return out
 
     def _answers(self, now: Ns, arcs: Iterable[ArcId]) -> list[Answer]:
         answers = list[Answer]()
@@ -235,7 +224,7 @@ class Operations:
 
     def _ask(self, asked: OperationAsked, ask: Ask, sender: Sender, client: ClientId) -> None:
         self._check_term(ask, sender, client)
-        arc, now, answers = arc_id(client, ask.id), self._now, self._taken.answers
+        arc, now, answers = arc_id(client, ask.id), self._now, self._out.at_once
         undecided = self._may_hold(arc, ask) and self._roster.awaits(now, arc, ask.rcs)
         undecided = undecided or bool(ask.booking and not self._bookings.settled)
         if undecided and len(self._deferred) < MAX_BATCH:
@@ -260,10 +249,10 @@ class Operations:
             and place.term > self.core.term
             and self._admission.places.proves(place, client, ask.was or ask.id, ask.seal)
         ):
-            self._taken.changes.append(Change(higher=[(Word(place.term, Source.SEAL, client, sender.host), None)]))
+            self._out.higher.append((Word(place.term, Source.SEAL, client, sender.host), None))
             raise Refused("old_term", "a leader of a later term gave this place; try again", place.term)
         if ask.term is not None and ask.term > self.core.term:
-            self._taken.changes.append(Change(higher=[(self._roster.client_word(client, ask.term), None)]))
+            self._out.higher.append((self._roster.client_word(client, ask.term), None))
             raise Refused("old_term", f"{sender} has promised a higher term", ask.term)
 
     def _ask_again(self, ticket: Ticket, ask: Ask, sender: Sender, client: ClientId, arc: ArcId) -> None:
@@ -284,7 +273,7 @@ class Operations:
             instant.shown += shown
             instant.standing.append(_Standing(ticket, arc, ask))
         else:
-            self._taken.answers.append((ticket, self._standing(self._now, arc, ask)))
+            self._out.at_once.append((ticket, self._standing(self._now, arc, ask)))
 
     def _enter(self, ticket: Ticket, ask: Ask, sender: Sender, client: ClientId, arc: ArcId) -> None:
         """Takes a new request. This is the way of every grant: nothing is done here that can be done once it is
@@ -321,9 +310,9 @@ class Operations:
         if places.may_claim(ask.place, client, ask.was or ask.id, ask.seal, seen=seen):
             if places.takes_the_word_for(ask.place):
                 text = f"{client} shows a place of term {ask.place.term.counter} that is not known here: it has it"
-                self._taken.strange.append((client, text))
+                self._out.strange.append((client, text))
             return ask.place
-        self._taken.strange.append((client, f"{client} shows a place that is not its own: it has none for that"))
+        self._out.strange.append((client, f"{client} shows a place that is not its own: it has none for that"))
         return None
 
     def _may_hold(self, arc: ArcId, ask: Ask) -> bool:
@@ -412,7 +401,7 @@ class Operations:
             victims=[party_info(Party(one.arc, one.name, one.priority, one.who), now) for one in victims],
             why=reason_info(expected.reason, now),
         )
-        self._taken.answers.append((ticket, answer))
+        self._out.at_once.append((ticket, answer))
 
     # Handing over
 
@@ -435,7 +424,7 @@ class Operations:
         else:
             self._moved += 1
             self._moving[self._moved] = asked.ticket, operation, sender, to
-            self._taken.changes.append(self._roster.seek(self._now, to, self._moved))
+            self._out.merge(self._roster.seek(self._now, to, self._moved))
 
     def _hand_over(self, ticket: Ticket, operation: HandOver, sender: ClientId, to: ClientId) -> None:
         """All in one instant, and so in one publication: nobody gets in between."""
@@ -483,5 +472,5 @@ class Operations:
             raise Refused("not_running", f"{operation.id} is not open at {sender}")
         # The new client may have missed it, where the RCM changed just then.
         arcs = [arc_id(to, name) for name in (operation.id, *operation.others)]
-        self._taken.notices += self._registry.present(self._now, arcs)
-        self._taken.answers.append((ticket, self._registry.notice(self._now, goal)))
+        self._out.notices += self._registry.present(self._now, arcs)
+        self._out.at_once.append((ticket, self._registry.notice(self._now, goal)))

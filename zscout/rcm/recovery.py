@@ -256,7 +256,7 @@ def recover(
         if mine is None and (status := known(arc)) is not None and status.vouched:
             mine = Listed(status.request, status.place)
         try:
-            hold = _hold(arc, grant, held, mine, now, admission)
+            hold = _hold(arc, held, some, mine, now, admission)
         except (BadName, ValueError) as error:
             result.remarks.append(f"the hold of {arc} is not carried on: {str(error)[:MAX_ERROR]}")
             continue
@@ -282,31 +282,30 @@ def _most_telling(held: Mapping[RcName, Holder]) -> Holder:
 
 
 def _hold(
-    arc: ArcId, grant: Grant, held: Mapping[RcName, Holder], mine: Listed | None, now: Ns, admission: Admission
+    arc: ArcId, held: Mapping[RcName, Holder], some: Holder, mine: Listed | None, now: Ns, admission: Admission
 ) -> RecoveredHold | None:
-    """A hold as these RCs report it, with the request of its client if that answered; None: the client asks for
-    something else. Raises BadName, ValueError."""
-    some = _most_telling(held)
+    """A hold as these RCs report it (`some`: the most telling of them), with the request of its client if that
+    answered; None: the client asks for something else. Raises BadName, ValueError."""
     end = now + round(min(holder.remaining for holder in held.values()) * SECOND)
     direct = any(holder.direct for holder in held.values()) or (mine is not None and mine.request.direct)
     bound: Mapping[Need, RcName] = some.bound
     place: Place | None = some.place
     if not admission.closed:
-        request = _told(arc, some, _needs(held, mine, _patterns(some)))
+        request = _told(arc, some, _needs(held, some, mine, _patterns(some)), direct=direct)
     elif mine is None:
         for rc in some.rcs:
             check_rc(rc)
-        request, bound, place = _told(arc, some, _needs(held, None, {})), {}, None
-        request = replace(request, continues="", booking="", who=None)
+        some = replace(some, continues="", booking="", who=None)
+        request, bound, place = _told(arc, some, _needs(held, some, None, {}), direct=direct), {}, None
     else:
         found = binding(mine.request.needs, some.rcs, bound)
         if found is None or not _agree(mine.request.needs, found, held):
             return None
-        request, bound = mine.request, found
+        request, bound = replace(mine.request, direct=direct), found
         place = some.place if mine.expects else mine.place
-    request = admission.clamped(replace(request, direct=direct))
+    request = admission.clamped(request)
     vouched = not admission.closed or mine is not None
-    return RecoveredHold(request, place, grant, end - request.min_runtime, end, bound, vouched)
+    return RecoveredHold(request, place, some.grant, end - request.min_runtime, end, bound, vouched)
 
 
 def _agree(needs: Mapping[Need, Params], bound: Mapping[Need, RcName], held: Mapping[RcName, Holder]) -> bool:
@@ -319,8 +318,10 @@ def _by_rc(needs: Mapping[Need, Params], bound: Mapping[Need, RcName]) -> dict[R
     return {bound.get(need, need): params for need, params in needs.items()}
 
 
-def _needs(held: Mapping[RcName, Holder], mine: Listed | None, patterns: Mapping[RcName, Need]) -> dict[Need, Params]:
-    needs: dict[Need, Params] = {patterns.get(name, name): {} for name in _most_telling(held).rcs}
+def _needs(
+    held: Mapping[RcName, Holder], some: Holder, mine: Listed | None, patterns: Mapping[RcName, Need]
+) -> dict[Need, Params]:
+    needs: dict[Need, Params] = {patterns.get(name, name): {} for name in some.rcs}
     told = {rc: exact_amounts(holder.params) for rc, holder in held.items()}
     # An absent RC's parameters are known to the client only, unless another RC meets a like pattern: those
     # of one kind have all the same.
@@ -344,7 +345,7 @@ def _patterns(holder: Holder) -> dict[RcName, Need]:
     return patterns
 
 
-def _told(arc: ArcId, holder: Holder, needs: Mapping[Need, Params]) -> ArcRequest:
+def _told(arc: ArcId, holder: Holder, needs: Mapping[Need, Params], *, direct: bool) -> ArcRequest:
     """The request in the words of an RC. Raises BadName, ValueError."""
     client_of(holder.client)
     check_name(holder.id, "id")
@@ -359,6 +360,7 @@ def _told(arc: ArcId, holder: Holder, needs: Mapping[Need, Params]) -> ArcReques
         min_runtime=duration(Decimal(holder.min_runtime), "min_runtime"),
         keep=holder.keep,
         label=holder.arc,
+        direct=direct,
         continues=holder.continues,
         booking=holder.booking,
         who=holder.who,

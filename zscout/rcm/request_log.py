@@ -16,6 +16,7 @@ from zscout.keyexpr import is_pattern
 from zscout.messages import Notice, Problem, ReasonInfo, ReasonParty, State, StoryLine
 from zscout.rcm.places import Places, client_id, request_id
 from zscout.rcm.roster import Roster
+from zscout.rcm.steps import Outbox
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
 from zscout.scheduling.model import ArcStatus, Dropped, Effect, Granted, HoldEnded, Outcome, Queued
@@ -268,19 +269,21 @@ class RequestLog:
         """When `tick` is due."""
         return min((at for at in (self._report_at, self._log_at) if at is not None), default=None)
 
-    def tick(self, now: Ns) -> tuple[list[Notice], str]:
+    def tick(self, now: Ns) -> Outbox:
         """The notices of changed reasons, and lines for the log, as far as they are due."""
-        notices = []
+        out = Outbox()
         if self._report_at is not None and self._report_at <= now:
             self._changed |= {effect.arc: None for effect in self._core.tell_reasons() if isinstance(effect, Queued)}
             undecided = [arc for arc in self._changed if self.may_be_held(now, arc)]
             changed = [arc for arc in self._changed if arc not in undecided and self._core.is_queued(arc)]
             self._changed = dict.fromkeys(changed)
             self._record_reasons(now)
-            notices = self.present(now, changed)
+            out.notices = self.present(now, changed)
             self._changed = dict.fromkeys(undecided)
             self._report_at = now + REASONS_DELAY if undecided else None
-        return notices, self._log_text() if self._log_at is not None and self._log_at <= now else ""
+        if self._log_at is not None and self._log_at <= now:
+            out.log.append(self._log_text())
+        return out
 
     def _close(self, now: Ns, effect: HoldEnded | Dropped) -> Notice:
         """Record how a hold, or the wait for one, ended. A request that is not queued again has ended with it."""

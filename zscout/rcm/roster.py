@@ -9,7 +9,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from msgspec import Struct
 
@@ -21,8 +21,9 @@ from zscout.rcm.admission import Admission
 from zscout.rcm.deadlines import Deadlines
 from zscout.rcm.devices import ExpectedDevices
 from zscout.rcm.recovery import adopted, aged, gangs_of
+from zscout.rcm.steps import ClientFound, ClientListed, Compare, Name, Outbox, Question, Resume, Why
 from zscout.rcm.terms import Source, Word
-from zscout.scheduling.model import ArcStatus, ClientLost, Event, RcJoined, RcLost, RcReported
+from zscout.scheduling.model import ArcStatus, ClientLost, RcJoined, RcLost, RcReported
 from zscout.types import SECOND, ArcId, ClientId, Grant, HostName, Ns, RcName, Term
 
 PROBE_PERIOD: Final[Ns] = SECOND
@@ -49,31 +50,6 @@ MAX_WITNESSES: Final = 3
 """Hosts that are asked whether this one is away."""
 
 
-class Question(NamedTuple):
-    """A question to the mesh. The first answer, or none within `timeout` seconds, goes to `Roster.answered`; the tokens
-    on `key`, where `kind` is None, to `Roster.seen`."""
-
-    why: Why
-    key: str
-    timeout: float
-    message: RcAsk = RcAsk()
-    kind: type[Struct] | None = None
-    token: Token | None = None
-    client: ClientId = ""
-    number: int = 0
-    """Of the client's deadline, or the caller's of `seek`."""
-
-
-class Why(Enum):
-    PROMISE = "an RC's promise to obey this term"
-    RETURN = "the state of an RC whose token is back"
-    REQUESTS = "the requests of a client"
-    OVERDUE = "a client without a token may answer all the same"
-    SOUGHT = "the new client of a hand-over"
-    PROBE = "a client or RC whose token disappeared: an answer shows that the mesh contradicts itself"
-    WITNESS = "any other host: an answer shows that this leader is not away"
-
-
 class _Due(Enum):
     """What a deadline is for; it stands beside its subject."""
 
@@ -82,43 +58,10 @@ class _Due(Enum):
     AGAIN = "a question is asked again"
     WAITED = "a pending RC has waited so long (ns)"
     FREE = "a departed RC serves nobody any longer"
+    UNLED = "somebody else would lead by now in the term that an RC shows"
     DROP_UNSEEN = "RCs and tokens had a lease to show themselves"
     SHUNNED = "an RC no longer counts as absent for the term that it shows"
     JOIN_ALL = "RCs away from home may join"
-
-
-@dataclass(slots=True)
-class Change:
-    """What follows from a stimulus, in the order in which it is carried out."""
-
-    higher: list[tuple[Word, Token | None]] = field(default_factory=list)
-    """Terms above the own, and for an RC that is seen its token."""
-    disbelieved: list[tuple[RcName, Term]] = field(default_factory=list)
-    """RCs that obey a term so low that they take the own one for a forgery, while none has joined."""
-    events: list[Event] = field(default_factory=list)
-    """Of the core, of one instant."""
-    reported: list[RcState] = field(default_factory=list)
-    """RCs that count as present report their holds: compare them with the core's."""
-    named: dict[RcName, None] = field(default_factory=dict)
-    """Publish these RCs, so that their instances learn which one is meant."""
-    listed: list[ClientRequests] = field(default_factory=list)
-    found: list[tuple[int, bool]] = field(default_factory=list)
-    """By number of `seek`: whether the client has a token."""
-    settled: bool = False
-    """RCs are no longer pending."""
-    questions: list[Question] = field(default_factory=list)
-    suspicions: list[tuple[str, bool]] = field(default_factory=list)
-    """Contradictions of the mesh, and those that are over."""
-    duplicates: list[tuple[RcName, HostName]] = field(default_factory=list)
-    """RCs that a second host offers, and that host."""
-    remarks: list[str] = field(default_factory=list)
-    """On holds that do not continue, for the log."""
-    surplus: HostName = ""
-    """This host shows more than MAX_TOKENS, since this token."""
-
-
-NOTHING: Final = Change()
-"""Nothing follows."""
 
 
 @dataclass(slots=True, eq=False)
@@ -200,11 +143,11 @@ class Roster:
         self._deadlines: Deadlines[tuple[_Due, Any]] = Deadlines()
         self._numbers = 0
         self._now = now
-        self._change = Change()
+        self._out = Outbox()
 
     # In: each call returns what follows
 
-    def start(self, now: Ns, rcs: Iterable[RcState], pending: Iterable[RcState], *, patient: bool) -> Change:
+    def start(self, now: Ns, rcs: Iterable[RcState], pending: Iterable[RcState], *, patient: bool) -> Outbox:
         """The RCs that promised before the term began, and those that join later. `patient`: the rest of their gangs
         has a lease to answer."""
         self._now = now
@@ -219,14 +162,14 @@ class Roster:
         # An RC that died before its token was watched would never be seen to disappear.
         self._set(self._lease, _Due.DROP_UNSEEN)
         self._set(self._home_until - now, _Due.JOIN_ALL)
-        self._change.events += map(_presence, joined)
+        self._out.events += map(_presence, joined)
         return self._taken()
 
     def stalled(self, length: Ns, ended: Ns, *, fresh: bool) -> None:
         """This process stalled. `fresh`: what arrived meanwhile may not be handled yet."""
         self._stall = length, ended, fresh
 
-    def client_token(self, now: Ns, token: Token, *, alive: bool) -> Change:
+    def client_token(self, now: Ns, token: Token, *, alive: bool) -> Outbox:
         self._now = now
         client = f"{token.host}/{token.name}"
         instances = self.clients.get(client, set())
@@ -243,11 +186,11 @@ class Roster:
                 self._judge_soon(client, token)
         return self._taken()
 
-    def rc_token(self, now: Ns, token: Token, *, alive: bool) -> Change:
+    def rc_token(self, now: Ns, token: Token, *, alive: bool) -> Outbox:
         self._now = now
         rc = self._rc(token.name)
         if rc.tokens.get(token.instance, token if alive else None) != token:
-            return Change()  # a second host shows this instance, or stopped doing so: it belongs to the first
+            return self._taken()  # a second host shows this instance, or stopped doing so: it belongs to the first
         if not self._counts(token, alive=alive, known=token.instance in rc.tokens):
             return self._taken()
         if alive:
@@ -263,25 +206,19 @@ class Roster:
                 self._judge_soon(token.name, token)
         return self._taken()
 
-    def rc_state(self, now: Ns, key: str, state: RcState) -> Change:
+    def rc_state(self, now: Ns, state: RcState) -> Outbox:
         self._now = now
-        if self._keys.rc_of(key) == state.rc:
-            self._report(self._rc(state.rc), state)
+        self._report(self._rc(state.rc), state)
         return self._taken()
 
-    def shun(self, now: Ns, token: Token, until: Ns) -> Change:
-        """An RC shows a term that is not believed: it counts as absent until then."""
+    def shun(self, now: Ns, token: Token, until: Ns) -> Outbox:
+        """An RC shows a term that is not believed: it counts as absent until then, unless somebody soon leads in it. It
+        may have promised that to another candidate."""
         self._now = now
-        rc = self._rc(token.name)
-        if until <= now or token.instance in self.shunned:
-            return self._taken()
-        self.shunned.add(token.instance)
-        self._set(until - now, _Due.SHUNNED, token)
-        if rc.pending is not None and rc.pending.state.instance == token.instance:
-            rc.pending = None
-            self._settle()
-        if rc.joined is not None and rc.joined.instance == token.instance:
-            self._drop(token.name, SHUNNED)
+        if until > now and token.instance not in self.shunned:
+            self.shunned.add(token.instance)
+            self._set(until - now, _Due.SHUNNED, token)
+            self._set(2 * self._timeout, _Due.UNLED, token)
         return self._taken()
 
     def expect(self, now: Ns, client: ClientId) -> None:
@@ -290,10 +227,10 @@ class Roster:
         if client not in self._unshown and client not in self.clients:
             self._expect(now, client)
 
-    def heard(self, now: Ns, client: ClientId) -> Change:
+    def heard(self, now: Ns, client: ClientId) -> Outbox:
         """A client that asks is there, though its token is not seen."""
         if client in self.clients and not self._probed:
-            return NOTHING
+            return Outbox()
         self._now = now
         if client in self._unshown:
             self._expect(now, client)
@@ -302,11 +239,11 @@ class Roster:
             self._suspect(key, so=key in self._probed)
         return self._taken()
 
-    def seek(self, now: Ns, client: ClientId, number: int) -> Change:
+    def seek(self, now: Ns, client: ClientId, number: int) -> Outbox:
         """Find out whether a client has a token: a new leader does not know all tokens yet."""
         self._now = now
         if client in self.clients:
-            self._change.found.append((number, True))
+            self._out.then.append(ClientFound(number, there=True))
         else:
             self._ask(Why.SOUGHT, self._keys.alive_any(Role.CLIENT), client=client, number=number)
         return self._taken()
@@ -315,7 +252,7 @@ class Roster:
         """A client says that it obeys `term`."""
         return Word(term, Source.CLIENT, client, client_of(client).host if client in self.clients else "")
 
-    def ask_requests(self, now: Ns, client: ClientId) -> Change:
+    def ask_requests(self, now: Ns, client: ClientId) -> Outbox:
         """Question a client for its requests, until it answers or is gone."""
         self._now = now
         if client not in self._asked:
@@ -323,14 +260,14 @@ class Roster:
             self._ask_client(client)
         return self._taken()
 
-    def answered(self, now: Ns, asked: Question, message: Any, problem: Problem | None) -> Change:
+    def answered(self, now: Ns, asked: Question, message: Any, problem: Problem | None) -> Outbox:
         """The first answer to a question. Without `message` and `problem` there was none."""
         self._now = now
         silent = message is None and problem is None
         match asked.why:
             case Why.PROMISE if asked.token is not None:
                 self._promised(asked.token, message, problem)
-            case Why.RETURN if isinstance(message, RcState):
+            case Why.RETURN if asked.token is not None and _is_of(message, asked.token):
                 self._report(self._rc(message.rc), message)
             case Why.REQUESTS:
                 self._listed(asked.client, message, problem)
@@ -350,19 +287,19 @@ class Roster:
                 self._present()
         return self._taken()
 
-    def seen(self, now: Ns, asked: Question, tokens: Sequence[Token]) -> Change:
+    def seen(self, now: Ns, asked: Question, tokens: Sequence[Token]) -> Outbox:
         """The tokens of a query of the mesh."""
         self._now = now
         if asked.why is Why.SOUGHT:
             found = any(f"{token.host}/{token.name}" == asked.client for token in tokens)
-            self._change.found.append((asked.number, found))
+            self._out.then.append(ClientFound(asked.number, found))
         elif tokens:
             self._shown_late(asked)
         elif self._unshown.get(asked.client) == asked.number:
             self._lose_client(asked.client)
         return self._taken()
 
-    def tick(self, now: Ns) -> Change:
+    def tick(self, now: Ns) -> Outbox:
         """Carry out the deadlines that are over."""
         self._now = now
         while (due := self._deadlines.pop_due(now)) is not None:
@@ -380,6 +317,8 @@ class Roster:
                 case _Due.SHUNNED, token:
                     self.shunned.discard(token.instance)
                     self._ask_promise(token)
+                case _Due.UNLED, token if token.instance in self.shunned:
+                    self._leave_out(token)
                 case _Due.DROP_UNSEEN, _:
                     self._drop_unseen()
                 case _Due.JOIN_ALL, _:
@@ -464,17 +403,17 @@ class Roster:
             self._see(self.client_word(client, problem.term))
         if isinstance(message, ClientRequests) and message.client == client:
             self._asked.discard(client)
-            self._change.suspicions.append((silent, False))
-            self._change.listed.append(message)
+            self._out.suspicions.append((silent, False))
+            self._out.then.append(ClientListed(message))
             return
         absent = message is None and problem is None
-        self._change.suspicions.append((silent, absent and client in self.clients))
+        self._out.suspicions.append((silent, absent and client in self.clients))
         self._set(self._timeout, _Due.AGAIN, Question(Why.REQUESTS, "", 0, client=client))
 
     def _lose_client(self, client: ClientId) -> None:
         self._unshown.pop(client, None)
         self._probe(self._keys.requests(client_of(client)), ClientRequests, client=client)
-        self._change.events.append(ClientLost(client))
+        self._out.events.append(ClientLost(client))
 
     # Tokens that disappear
 
@@ -525,7 +464,7 @@ class Roster:
             # Of several lost links one is the first.
             self._away_until = now + self._lease
             for key, kind in witnesses:
-                self._change.questions.append(Question(Why.WITNESS, key, PRESENT_WITHIN, kind=kind))
+                self._out.questions.append(Question(Why.WITNESS, key, PRESENT_WITHIN, kind=kind))
         return now < self._away_until
 
     def _present(self) -> None:
@@ -567,7 +506,8 @@ class Roster:
         if alive and self._tokens[token.host] >= MAX_TOKENS:
             if token.host not in self._surplus:
                 self._surplus.add(token.host)
-                self._change.surplus = token.host
+                text = f"{token.host} shows more than {MAX_TOKENS} tokens: later ones are ignored"
+                self._out.strange.append((token.host, text))
             return False
         self._tokens[token.host] += 1 if alive else -1
         return True
@@ -603,14 +543,14 @@ class Roster:
                 rc.unseen = False
                 self._ask_rc(Why.RETURN, token)
         elif rc.joined is not None:
-            self._change.duplicates.append((token.name, token.host))
-            self._change.named[token.name] = None
+            self._out.duplicates.append((token.name, token.host))
+            self._out.then.append(Name(token.name))
 
     def _succeed(self, rc: _Rc, token: Token) -> None:
         """A new instance on the same host: its predecessor is gone."""
         rc.joined, rc.named = None, (token.instance, token.host)
-        self._change.events.append(RcLost(token.name, "it started anew"))
-        self._change.named[token.name] = None
+        self._out.events.append(RcLost(token.name, "it started anew"))
+        self._out.then.append(Name(token.name))
 
     def _drop(self, name: RcName, why: str = "") -> None:
         rc = self._rc(name)
@@ -620,7 +560,7 @@ class Roster:
         rc.departed = gone
         self._set(self._hold_lease + round((gone.settle or 0) * SECOND), _Due.FREE, gone)
         self._probe(self._keys.rc_state(name), RcState, token=Token(gone.host, Role.RC, name, gone.instance))
-        self._change.events.append(RcLost(name, why=why or self._devices.why_gone(name, gone.host)))
+        self._out.events.append(RcLost(name, why=why or self._devices.why_gone(name, gone.host)))
         if gone.leaving:
             self._free(gone)
         self._ask_others(rc)
@@ -634,7 +574,7 @@ class Roster:
         others = sorted(rc.tokens.values())
         if others and rc.joined is None:
             rc.named = others[0].instance, others[0].host
-            self._change.named[gone.rc] = None
+            self._out.then.append(Name(gone.rc))
         self._ask_others(rc)
 
     def _ask_others(self, rc: _Rc) -> None:
@@ -650,7 +590,7 @@ class Roster:
         for name in sorted(self._devices.names - there):
             if name not in self._missed and (home := self._devices.latest_home(name)) is not None:
                 self._missed.add(name)
-                self._change.events.append(RcLost(name, why=self._devices.why_gone(name, home)))
+                self._out.events.append(RcLost(name, why=self._devices.why_gone(name, home)))
 
     def _awaited_since(self, arc: ArcId) -> Ns | None:
         if arc not in self._awaited and len(self._awaited) >= MAX_PROBED:
@@ -678,11 +618,10 @@ class Roster:
             self._see_rc(rc, token.name, token.instance, problem.term)
             alone = not any(rc.joined or rc.pending for rc in self._rcs.values())
             if alone and disbelieved(self.term, problem.term):
-                self._change.disbelieved.append((token.name, problem.term))
+                self._out.disbelieved.append((token.name, problem.term))
         if not self._is_wanted(rc, token):
             return
-        promised = isinstance(state, RcState) and (state.rc, state.instance) == (token.name, token.instance)
-        if not promised or state.term < self.term:  # a report from before the promise
+        if not _is_of(state, token) or state.term < self.term:  # a report from before the promise
             # An answer without a promise can come at once, again and again: a token may outlive its RC.
             self._set(self._timeout, _Due.AGAIN, Question(Why.PROMISE, "", 0, token=token))
         elif any(holder.grant.term != self.term for holder in state.holders):
@@ -727,7 +666,8 @@ class Roster:
                     self._rc(other).pending = None
                 admitted = [pending.pop(other) for other in sorted(gangs & pending.keys())]
                 self._admit([aged(waiting.state, self._now - waiting.since) for waiting in admitted])
-        self._change.settled |= settled
+        if settled:
+            self._out.then.append(Resume())
 
     def _admit(self, states: list[RcState]) -> None:
         """Let RCs join. Holds of which every RC of the gang that has joined reports exactly this grant continue."""
@@ -736,13 +676,13 @@ class Roster:
             rc.joined, rc.named = state, (state.instance, state.host)
         joined = {name for name, rc in self._rcs.items() if rc.joined is not None}
         holds, remarks = adopted(states, joined, self._now, self._admission, self._known)
-        self._change.events += [*map(_presence, states), *holds]
-        self._change.remarks += remarks
-        self._change.reported += states
+        self._out.events += [*map(_presence, states), *holds]
+        self._out.log += remarks
+        self._out.then += map(Compare, states)
         for state in states:
             if state.duplicate_of or len(self._rc(state.rc).tokens) > 1:
-                self._change.named[state.rc] = None
-        self._change.settled = True
+                self._out.then.append(Name(state.rc))
+        self._out.then.append(Resume())
 
     def _report(self, rc: _Rc, state: RcState) -> None:
         if state.instance in self.shunned:
@@ -755,7 +695,7 @@ class Roster:
             self._free(gone)
         elif gone is not None and gone.host != state.host and state.holders:
             # It holds by a leader of another half of the mesh, and is not the one that is meant.
-            self._change.named[state.rc] = None
+            self._out.then.append(Name(state.rc))
         if known is None or known.instance != state.instance:
             return
         rc.joined = state
@@ -763,39 +703,48 @@ class Roster:
             self._drop(state.rc)
         elif state.health != "ok":
             if known.health != state.health:
-                self._change.events.append(_presence(state))
+                self._out.events.append(_presence(state))
         else:
             if known.health != "ok" or known.sharable != state.sharable:
-                self._change.events.append(_presence(state))
+                self._out.events.append(_presence(state))
             if state.rules != known.rules:
-                self._change.events.append(RcReported(state.rc, rules_changed=True))
-            self._change.reported.append(state)
+                self._out.events.append(RcReported(state.rc, rules_changed=True))
+            self._out.then.append(Compare(state))
             if state.duplicate_of:
                 # Whatever made it stand by: it is the one that is meant.
-                self._change.named[state.rc] = None
+                self._out.then.append(Name(state.rc))
 
     # What follows
 
-    def _taken(self) -> Change:
-        change, self._change = self._change, Change()
-        return change
+    def _taken(self) -> Outbox:
+        out, self._out = self._out, Outbox()
+        return out
+
+    def _leave_out(self, token: Token) -> None:
+        """Nobody leads in the term that a shunned RC shows."""
+        rc = self._rc(token.name)
+        if rc.pending is not None and rc.pending.state.instance == token.instance:
+            rc.pending = None
+            self._settle()
+        if rc.joined is not None and rc.joined.instance == token.instance:
+            self._drop(token.name, SHUNNED)
 
     def _set(self, delay: Ns, due: _Due, subject: Any = None) -> None:
         self._deadlines.set(self._now + delay, (due, subject))
 
     def _see(self, word: Word, token: Token | None = None) -> None:
         if word.term > self.term:
-            self._change.higher.append((word, token))
+            self._out.higher.append((word, token))
 
     def _see_rc(self, rc: _Rc, name: RcName, instance: str, term: Term) -> None:
         token = rc.tokens.get(instance)
         self._see(Word(term, Source.RC, name, "" if token is None else token.host), token)
 
     def _suspect(self, key: str, *, so: bool = True) -> None:
-        self._change.suspicions.append((f"{key} answers, and its token is missing", so))
+        self._out.suspicions.append((f"{key} answers, and its token is missing", so))
 
     def _ask(self, why: Why, key: str, **how: Any) -> None:
-        self._change.questions.append(Question(why, key, self._timeout / SECOND, **how))
+        self._out.questions.append(Question(why, key, self._timeout / SECOND, **how))
 
     def _ask_rc(self, why: Why, token: Token) -> None:
         message = RcAsk(promise=self.term, instance=token.instance)
@@ -811,7 +760,7 @@ class Roster:
             self._ask(Why.REQUESTS, key, message=message, kind=ClientRequests, client=client)
         else:
             self._asked.discard(client)
-            self._change.suspicions.append((f"{client} is seen and does not answer", False))
+            self._out.suspicions.append((f"{client} is seen and does not answer", False))
 
     def _ask_again(self, asked: Question) -> None:
         if asked.why is Why.REQUESTS:
@@ -823,11 +772,16 @@ class Roster:
             self._suspect(asked.key, so=False)
         else:
             self._probed[asked.key] -= 1
-            self._change.questions.append(asked)
+            self._out.questions.append(asked)
             self._set(PROBE_PERIOD, _Due.AGAIN, asked)
 
 
 _UNKNOWN: Final = _Rc()
+
+
+def _is_of(message: Any, token: Token) -> bool:
+    """Return True for the state of that instance."""
+    return isinstance(message, RcState) and (message.rc, message.instance) == (token.name, token.instance)
 
 
 def _presence(state: RcState) -> RcJoined | RcLost:

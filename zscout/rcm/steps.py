@@ -1,22 +1,80 @@
 """What goes into a step of the leader, and what comes out. Pure values.
 
-Stimuli that the mesh, timers and bookings bring are queued; a step takes as many as make one instant of the core."""
+Stimuli that the mesh, timers and bookings bring are queued; a step takes as many as make one instant of the core. The
+names in them were checked as they came in, those within holds and requests are checked where these enter."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeAlias
+from enum import Enum, auto
+from typing import Any, Final, NamedTuple, TypeAlias
 
-from zscout import messages
+from msgspec import Struct
+
 from zscout.keyexpr import Sender, Token
-from zscout.messages import BookingRecord, Grants, Notice, Problem
-from zscout.rcm.booked import Answer, BookedDanger, Keep, Ticket
+from zscout.messages import (
+    BookingRecord,
+    ClientRequests,
+    Grants,
+    Instant,
+    Notice,
+    Operation,
+    Problem,
+    Proposal,
+    RcAsk,
+    RcState,
+)
 from zscout.rcm.recovery import RecoveredState
-from zscout.rcm.roster import Question
 from zscout.rcm.terms import Word
 from zscout.scheduling.model import Effect, Event
-from zscout.types import ArcId, HostName, Ns, RcName, Term
+from zscout.types import ArcId, ClientId, HostName, Ns, RcName, Term
+
+Ticket: TypeAlias = int
+"""The number of a query that waits for its answer."""
+Answer: TypeAlias = tuple[Ticket, Struct]
+
+
+class BookedDanger(NamedTuple):
+    """A date of a booking may not be kept, and why; empty: it is safe again."""
+
+    record: BookingRecord
+    start: Instant
+    why: str
+    later: int = 0
+    """Dates after that of which the same is to be reported."""
+
+
+class Keep(NamedTuple):
+    """Answer once a record is kept; `withdraw`: forget it where it can't be."""
+
+    ticket: Ticket
+    booking: str
+    withdraw: bool
+
+
+class Question(NamedTuple):
+    """A question to the mesh. The first answer, or none within `timeout` seconds, becomes a `QuestionAnswered`; the
+    tokens on `key`, where `kind` is None, `TokensFound`."""
+
+    why: Why
+    key: str
+    timeout: float
+    message: RcAsk = RcAsk()
+    kind: type[Struct] | None = None
+    token: Token | None = None
+    client: ClientId = ""
+    number: int = 0
+    """Of the client's deadline, or the caller's of `seek`."""
+
+
+class Why(Enum):
+    PROMISE = "an RC's promise to obey this term"
+    RETURN = "the state of an RC whose token is back"
+    REQUESTS = "the requests of a client"
+    OVERDUE = "a client without a token may answer all the same"
+    SOUGHT = "the new client of a hand-over"
+    PROBE = "a client or RC whose token disappeared: an answer shows that the mesh contradicts itself"
+    WITNESS = "any other host: an answer shows that this leader is not away"
 
 
 class OperationAsked(NamedTuple):
@@ -24,7 +82,7 @@ class OperationAsked(NamedTuple):
 
     ticket: Ticket
     sender: Sender
-    operation: messages.Operation
+    operation: Operation
 
 
 class Lead(NamedTuple):
@@ -41,10 +99,9 @@ class TokenSeen(NamedTuple):
 
 
 class Reported(NamedTuple):
-    """An RC's state, and its key."""
+    """An RC's state, on its own key."""
 
-    key: str
-    state: messages.RcState
+    state: RcState
 
 
 class QuestionAnswered(NamedTuple):
@@ -100,6 +157,52 @@ class Reloaded(NamedTuple):
     """The fleet file's rights changed."""
 
 
+class Compare(NamedTuple):
+    """An RC that counts as present reports its holds: the core is to agree."""
+
+    state: RcState
+
+
+class Name(NamedTuple):
+    """Publish this RC, so that its instances learn which one is meant."""
+
+    rc: RcName
+
+
+class ClientListed(NamedTuple):
+    answer: ClientRequests
+
+
+class ClientFound(NamedTuple):
+    """By number of `Roster.seek`: whether the client has a token."""
+
+    number: int
+    there: bool
+
+
+class Resume(NamedTuple):
+    """RCs are no longer pending."""
+
+
+class Again(NamedTuple):
+    """An operation on bookings whose votes were not all known is tried once more."""
+
+    undecided: Any
+
+
+class BookingAsked(NamedTuple):
+    """An operation on bookings, once the core is at the present time."""
+
+    asked: OperationAsked
+
+
+class Due(Enum):
+    DEADLINES = auto()
+    TIME = auto()
+    """The core's time is over; reasons and lines of the log may be due."""
+    BOOKINGS = auto()
+
+
 Stimulus: TypeAlias = (
     OperationAsked
     | Lead
@@ -113,51 +216,73 @@ Stimulus: TypeAlias = (
     | Shared
     | Kept
     | Reloaded
+    | Compare
+    | Name
+    | ClientListed
+    | ClientFound
+    | Resume
+    | Again
+    | BookingAsked
+    | Due
 )
 
 
 class Proposed(NamedTuple):
     rc: RcName
-    proposal: messages.Proposal
+    proposal: Proposal
 
 
-@dataclass(slots=True)
-class Outbox:
-    """What follows from a step, in the order in which it is carried out, nothing awaited in between."""
+class Outbox(Struct):
+    """What follows from a step, in the order in which it is carried out, nothing awaited in between. Each part of the
+    leader returns its share, with the events that are to be decided, and the stimuli of the next instants."""
 
-    at_once: list[Answer] = field(default_factory=list)
+    at_once: list[Answer] = []
     """Answers that need no instant: refusals, and how requests stood before it."""
-    higher: list[tuple[Word, Token | None]] = field(default_factory=list)
+    higher: list[tuple[Word, Token | None]] = []
     """Terms above the own, and for an RC that is seen its token. A leader that steps down does nothing of the rest."""
-    disbelieved: list[tuple[RcName, Term]] = field(default_factory=list)
-    granted: list[Answer] = field(default_factory=list)
+    disbelieved: list[tuple[RcName, Term]] = []
+    granted: list[Answer] = []
     """Answers to requests that are granted: before anybody else learns of it."""
-    grant_notices: list[Notice] = field(default_factory=list)
-    reopened: list[tuple[str, ArcId]] = field(default_factory=list)
+    grant_notices: list[Notice] = []
+    reopened: list[tuple[str, ArcId]] = []
     """For the trace, before the publication."""
     publication: Grants | None = None
-    notices: list[Notice] = field(default_factory=list)
-    answers: list[Answer] = field(default_factory=list)
-    proposals: list[Proposed] = field(default_factory=list)
-    questions: list[Question] = field(default_factory=list)
-    suspicions: list[tuple[str, bool]] = field(default_factory=list)
+    notices: list[Notice] = []
+    answers: list[Answer] = []
+    proposals: list[Proposed] = []
+    questions: list[Question] = []
+    suspicions: list[tuple[str, bool]] = []
     """Contradictions of the mesh, and those that are over."""
-    events: Sequence[Event] = ()
+    events: list[Event] = []
     effects: Sequence[Effect] = ()
     """Of the instant, for those who count holds."""
-    changed: list[BookingRecord] = field(default_factory=list)
+    changed: list[BookingRecord] = []
     """Records to be shared with all keepers soon."""
-    keep: list[Keep] = field(default_factory=list)
+    keep: list[Keep] = []
     """Those that are kept before they are answered."""
-    dangers: list[BookedDanger] = field(default_factory=list)
-    log: list[str] = field(default_factory=list)
-    strange: list[tuple[str, str]] = field(default_factory=list)
+    dangers: list[BookedDanger] = []
+    log: list[str] = []
+    strange: list[tuple[str, str]] = []
     """Warnings, each with its subject: of one subject not too many are logged."""
-    duplicates: list[tuple[RcName, HostName]] = field(default_factory=list)
+    duplicates: list[tuple[RcName, HostName]] = []
     """RCs that a second host offers."""
-    over: list[tuple[str, ArcId]] = field(default_factory=list)
+    over: list[tuple[str, ArcId]] = []
     """For the trace."""
+    then: list[Stimulus] = []
+    """Each an instant of its own, after this one and before those that wait: the leader takes them itself."""
     wake: Ns | None = None
     """The next step is due then at the latest."""
     more: bool = False
     """Another step is due at once: stimuli are left."""
+
+    def merge(self, part: Outbox) -> list[Event]:
+        """Take over all that a part lists. Its events are returned: they are to be decided."""
+        for name in _LISTS:
+            if more := getattr(part, name):
+                getattr(self, name).extend(more)
+        return part.events
+
+
+_LISTS: Final = tuple(
+    name for name in Outbox.__struct_fields__ if name != "events" and isinstance(getattr(Outbox(), name), list)
+)

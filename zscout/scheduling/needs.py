@@ -14,7 +14,7 @@ def check_request(name: str, needs: Mapping[Need, Params], min_runtime: Ns) -> N
     if min_runtime <= 0:
         raise ValueError(f"{name}: the minimum runtime must be positive")
     for params in needs.values():
-        if params and any(value < 0 for value in params.values()):
+        if params and any(value.numerator < 0 for value in params.values()):
             raise ValueError(f"{name}: bandwidth parameters must not be negative")
     check_patterns(needs)
 

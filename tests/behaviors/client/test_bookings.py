@@ -24,7 +24,7 @@ from zscout.keyexpr import Sender
 from zscout.mesh import IncomingQuery, Refused
 from zscout.messages import Book, BookingView, OpenRequest, Operation, Who
 from zscout.services.bookings.keeper import BookingKeeper
-from zscout.services.rcm.candidate import Candidate
+from zscout.services.rcm.candidate import Candidate, CandidateParts
 from zscout.testing.memory import MemoryNetwork
 from zscout.types import SECOND
 
@@ -136,7 +136,7 @@ class BookedFleet(SmallFleet):
     def candidate(self, host: str) -> Candidate:
         mesh = self.mesh(host, "node")
         keeper = BookingKeeper(mesh, Disk(), wall=lambda: AT.timestamp() + mesh.now() / SECOND)
-        candidate = self.candidates[host] = Candidate(mesh, self.fleet, keeper=keeper)
+        candidate = self.candidates[host] = Candidate(mesh, self.fleet, CandidateParts(keeper=keeper))
         candidate.start()
         return candidate
 

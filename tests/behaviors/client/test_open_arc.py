@@ -214,7 +214,7 @@ def test_what_moved_and_is_taken_back_keeps_its_place_and_its_wait(held: bool) -
 
 
 async def test_while_it_is_paused_a_client_leaves_the_rcm_s_word_on_hand_overs_for_later() -> None:
-    store, known = RequestStore(lambda: NOW), arc()
+    store, known = RequestStore(lambda: NOW, lambda _: None), arc()
     store.add(known)
     store.take(known, RUNS)
     store.resumed.clear()

@@ -25,7 +25,7 @@ from zscout.services.journal.accounts import accounts
 from zscout.services.journal.journal import Journal
 from zscout.services.journal.merging import Span
 from zscout.services.journal.store import FILE
-from zscout.services.rcm.candidate import Candidate
+from zscout.services.rcm.candidate import Candidate, CandidateParts
 from zscout.testing.memory import MemoryMesh
 from zscout.types import SECOND, Grant
 
@@ -50,7 +50,7 @@ class Told:
         silent = self.fleet.fleet.silence / SECOND
         journal = self.journals[host] = Journal(mesh, folder, config, silent, wall=lambda: START + mesh.now() / SECOND)
         journal.start()
-        candidate = self.candidates[host] = Candidate(mesh, self.fleet.fleet, journal=journal)
+        candidate = self.candidates[host] = Candidate(mesh, self.fleet.fleet, CandidateParts(journal=journal))
         candidate.start()
         return mesh
 

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from tests.services.metrics.test_figures import began, over
 from zscout.messages import BookingRecord, LoadReport, Who
-from zscout.rcm.booked import BookedDanger
+from zscout.rcm.steps import BookedDanger
 from zscout.scheduling.model import ArcRequest, Outcome
 from zscout.scheduling.reason import Party, Reason, ReasonCode
 from zscout.services.notify.notices import MAX_BODY, CertificateNotices, HoldNotices, Notification, booking_notice

@@ -12,9 +12,9 @@ from tests.services.kit import answer
 from tests.services.rcm.kit import FakeClient, FakeFleet, request
 from zscout.mesh import IncomingQuery
 from zscout.messages import Book, BookingRecord, BookingsAsk, BookingsTold, BookingView, Operation, ShareBookings
-from zscout.rcm.booked import BookedDanger
+from zscout.rcm.steps import BookedDanger
 from zscout.services.bookings.keeper import BookingKeeper
-from zscout.services.rcm.candidate import Candidate
+from zscout.services.rcm.candidate import Candidate, CandidateParts
 from zscout.testing.memory import MemoryMesh
 
 R = TypeVar("R")
@@ -45,6 +45,8 @@ class BookedFleet(FakeFleet):
         self.meshes: list[MemoryMesh] = []
         super().__init__(*candidates, strategy="adaptive")
         self.disks: dict[str, Disk] = {}
+        self.dangers: dict[str, list[BookedDanger]] = {}
+        """By host, what it told of as it led."""
         self.ahead: dict[str, float] = {}
         """By how many seconds a host's clock is ahead."""
         loop = asyncio.get_running_loop()
@@ -67,7 +69,8 @@ class BookedFleet(FakeFleet):
         mesh = self.mesh(host)
         ahead = self.ahead.get(host, 0.0)
         keeper = BookingKeeper(mesh, disk, wall=lambda: self.time() + ahead)
-        candidate = Candidate(mesh, self.fleet, keeper=keeper, **how)
+        parts = CandidateParts(keeper=keeper, on_danger=self.dangers.setdefault(host, []).append, **how)
+        candidate = Candidate(mesh, self.fleet, parts)
         candidate.start()
         return candidate
 
@@ -108,14 +111,6 @@ async def booked(*hosts: str) -> tuple[BookedFleet, list[Candidate]]:
     """A fleet that all these hosts may lead, and one does."""
     fleet = BookedFleet(*hosts)
     return fleet, await led(fleet, *hosts)
-
-
-def dangers_at(candidate: Candidate) -> list[BookedDanger]:
-    """What this leader tells of dangers from now on."""
-    dangers: list[BookedDanger] = []
-    assert candidate.rcm is not None
-    candidate.on_danger = dangers.append
-    return dangers
 
 
 def states(view: BookingView) -> list[str]:

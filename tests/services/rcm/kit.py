@@ -35,7 +35,7 @@ from zscout.messages import (
 )
 from zscout.rcm.recovery import RecoveredState
 from zscout.rcm.terms import BELIEVED, Verdict, Word
-from zscout.services.rcm.candidate import Candidate
+from zscout.services.rcm.candidate import Candidate, CandidateParts
 from zscout.services.rcm.rcm import Rcm
 from zscout.testing.memory import MemoryMesh
 from zscout.types import NO_TERM, Grant, Place, Term
@@ -202,7 +202,7 @@ class FakeFleet(MemoryFleet):
         return rcm
 
     def candidate(self, host: str, folder: Path | None = None, **how: Any) -> Candidate:
-        candidate = Candidate(self.mesh(host), self.fleet, folder, **how)
+        candidate = Candidate(self.mesh(host), self.fleet, CandidateParts(folder, **how))
         candidate.start()
         return candidate
 

@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from tests.mesh.kit import until
-from tests.services.rcm.booked_fleet import NOON, BookedFleet, book, booked, dangers_at, do, led, states
+from tests.services.rcm.booked_fleet import NOON, BookedFleet, book, booked, do, led, states
 from tests.services.rcm.kit import Refusal, request
 from zscout.messages import BookingView, FindSlots, Release, SlotsTold, Unbook
 from zscout.services.rcm.rcm import Rcm
@@ -103,6 +103,18 @@ async def test_votes_decide_about_a_sharable_rc() -> None:
         await do(client, book("e", "radio/rf0:1", at=55, seconds=10), BookingView)
 
 
+async def test_of_bookings_that_wait_for_votes_no_more_are_made_than_are_allowed_and_each_once() -> None:
+    fleet = BookedFleet("x")
+    fleet.fleet = replace(fleet.fleet, limits=replace(fleet.fleet.limits, max_bookings_per_host=2))
+    await led(fleet, "x")
+    await fleet.joined(fleet.rc("radio/rf0", accept=True))
+    client = fleet.client("one")
+    wanted = [book(name, "radio/rf0:5", at=50) for name in "bbcd"]
+    told = await asyncio.gather(*(do(client, one, BookingView) for one in wanted), return_exceptions=True)
+    assert [one.id if isinstance(one, BookingView) else str(one)[:8] for one in told] == ["b", "b", "c", "too_many"]
+    assert {*await fleet.bookings()} == {"b", "c"}
+
+
 async def test_a_booking_outlives_its_leader_and_its_taker_goes_on() -> None:
     fleet, (leader, heir) = await booked("x", "y")
     client = fleet.client("one")
@@ -185,14 +197,14 @@ async def test_who_took_up_a_date_that_its_leader_does_not_know_yet_waits_for_it
     fleet = BookedFleet("x", "y")
     (leader,) = await led(fleet, "x")
     await do(fleet.client("there", "y"), book("b", "robot/b", at=500), BookingView)
-    (known,) = leader._keeper.records
+    (known,) = leader.learned.keeper.records
     hers, not_hers = (fleet.client("one", host) for host in ("y", "z"))
     for number, client in enumerate((hers, not_hers), 1):
         place = Place(Term(0, "elsewhere"), number)
         told = await client.ask("mine", "robot/a", seconds=100, place=place, booking="late@1800000500")
         assert (told.state, told.reason) == ("queued", "the time of its booking is still to come")
-    leader._keeper.records.take([replace(known, id="late", name="late", needs={"robot/a": {}})])
-    leader._keeper.shared.set()
+    leader.learned.keeper.records.take([replace(known, id="late", name="late", needs={"robot/a": {}})])
+    leader.learned.keeper.shared.set()
     await asyncio.sleep(1)
     assert states((await fleet.bookings())["late"]) == ["taken"]
     await asyncio.sleep(NOON + 501 - fleet.time())
@@ -280,8 +292,8 @@ async def test_maintenance_goes_before_what_is_booked_and_both_are_told() -> Non
 
 
 async def test_the_danger_of_maintenance_that_is_given_up_is_over() -> None:
-    fleet, (leader, *_) = await booked("x", "y")
-    dangers = dangers_at(leader)
+    fleet, _ = await booked("x", "y")
+    dangers = fleet.dangers["x"]
     client = fleet.client("one", "desk")
     await do(client, book("b", "robot/a", at=500, priority=1), BookingView)
     await do(client, book("m", "robot/a", at=400, seconds=300, maintenance=True), BookingView)
@@ -305,8 +317,8 @@ async def test_what_is_repeated_is_kept_from_the_instant_that_a_date_is_within_6
 
 
 async def test_a_booking_is_in_danger_while_what_it_needs_is_away() -> None:
-    fleet, (leader,) = await booked("x")
-    dangers = dangers_at(leader)
+    fleet, _ = await booked("x")
+    dangers = fleet.dangers["x"]
     far = fleet.rc("robot/far")
     await fleet.joined(far)
     client = fleet.client("one")
@@ -327,8 +339,8 @@ async def test_a_booking_is_in_danger_while_what_it_needs_is_away() -> None:
 
 
 async def test_of_all_dates_of_a_booking_a_danger_is_told_once_and_the_next_dates_first() -> None:
-    fleet, (leader,) = await booked("x")
-    dangers = dangers_at(leader)
+    fleet, _ = await booked("x")
+    dangers = fleet.dangers["x"]
     far = fleet.rc("robot/far")
     await fleet.joined(far)
     client = fleet.client("one")

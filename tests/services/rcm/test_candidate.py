@@ -21,8 +21,8 @@ from zscout.keyexpr import Role
 from zscout.mesh.supervision import StallWatch
 from zscout.messages import LAST_TERMS, Grants, Notice, OpenRequest, RcAsk, RcState, Release
 from zscout.services.rcm import candidate as candidate_module
-from zscout.services.rcm.candidate import BACKOFF, MAX_BACKOFF, Candidate
-from zscout.services.rcm.election import SETTLE
+from zscout.services.rcm.candidate import Candidate
+from zscout.services.rcm.election import BACKOFF, MAX_BACKOFF, SETTLE
 from zscout.types import NO_TERM, SECOND, Term
 
 
@@ -102,7 +102,7 @@ async def test_a_candidate_that_has_stood_still_does_not_lead_alone_at_once(
     leader, heir = fleet.candidate("x"), fleet.candidate("y")
     await until(lambda: leader.rcm)
     await asyncio.sleep(5)
-    monkeypatch.setattr(heir._stall, "fresh", lambda: stood_still)
+    monkeypatch.setattr(heir._candidacy.stall, "fresh", lambda: stood_still)
     before = heir.mesh.now()
     fleet.network.kill(leader.mesh)
     await until(lambda: heir.rcm)

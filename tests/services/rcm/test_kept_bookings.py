@@ -62,11 +62,11 @@ async def test_what_is_long_over_is_forgotten_by_all_who_keep_bookings() -> None
 async def test_a_keeper_that_was_busy_is_told_before_long() -> None:
     fleet, (*_, last) = await booked("x", "y", "z")
     client = fleet.client("one")
-    last._keeper._waiting = MAX_SAVING
+    last.learned.keeper._waiting = MAX_SAVING
     await do(client, book("b", "robot/a", at=500), BookingView)
     await asyncio.sleep(1)
     assert not fleet.disks["z"].records
-    last._keeper._waiting = 0
+    last.learned.keeper._waiting = 0
     await asyncio.sleep(6)
     assert [one.id for one in fleet.disks["z"].records] == ["b"]
 
@@ -75,20 +75,20 @@ async def test_a_host_that_has_no_room_for_a_booking_does_not_keep_it() -> None:
     fleet, (_, other) = await booked("x", "y")
     client = fleet.client("one")
     await do(client, book("b", "robot/a", at=500), BookingView)
-    other._keeper.records.size = MAX_BYTES
+    other.learned.keeper.records.size = MAX_BYTES
     with pytest.raises(Refusal, match="not_kept"):
         await do(client, book("c", "robot/b", at=500), BookingView)
     with pytest.raises(Refusal, match="not_kept"):
         await do(client, Unbook("b"), BookingView)
-    other._keeper.records.size = 1_000
+    other.learned.keeper.records.size = 1_000
     assert (await do(client, Unbook("b"), BookingView)).unbooked
 
 
 async def test_what_becomes_of_one_booking_is_not_told_of_another() -> None:
     fleet, (leader, other) = await booked("x", "y")
     await do(fleet.client("one"), book("b", "robot/a", at=500), BookingView)
-    (known,) = other._keeper.records
-    other._keeper.records.size = MAX_BYTES
+    (known,) = other.learned.keeper.records
+    other.learned.keeper.records.size = MAX_BYTES
     assert leader.rcm is not None
     sharing = leader.rcm.sharing
 
@@ -98,7 +98,7 @@ async def test_what_becomes_of_one_booking_is_not_told_of_another() -> None:
         return ""
 
     # The second tells of the fourth as well, and the third of nothing.
-    new = leader._keeper.records.take(replace(known, id=name) for name in "cde")
+    new = leader.learned.keeper.records.take(replace(known, id=name) for name in "cde")
     keeping = [sharing.keep(record) for record in new]
     kept = await asyncio.gather(*keeping[:2], catch_up(), keeping[2])
     assert [*map(bool, kept)] == [True, True, False, True]

@@ -12,7 +12,7 @@ import pytest
 from tests.mesh.kit import until
 from tests.services.rcm.kit import FakeClient, FakeFleet, FakeRc, Refusal, there
 from zscout.mesh import IncomingQuery
-from zscout.messages import ClientRequests, OpenRequest, RcAsk
+from zscout.messages import MAX_COUNTER, ClientRequests, Grants, OpenRequest, RcAsk
 from zscout.rcm.places import Places
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.term_file import FILE, TermFile
@@ -103,6 +103,28 @@ async def test_an_rc_that_claims_terms_costs_one_election_and_then_counts_as_abs
     await until(lambda: there(candidate) == {"robot/a", "gripper/g"}, within=11)
 
 
+async def test_an_rc_beside_a_liar_that_has_promised_another_candidate_is_not_lost_before_that_leads() -> None:
+    """Its host is not believed alone, and the candidate leads within milliseconds (seed 963496)."""
+    fleet = a_fleet()
+    candidate, liar = await led(fleet), FakeRc(fleet.mesh("cart", "liar"), "gripper/g")
+    honest = FakeRc(fleet.mesh("cart"), "robot/b")
+    for rc in (liar, honest):
+        rc.start()
+    await until(lambda: len(there(candidate)) == 3)
+    liar.term = FAR
+    liar.publish()
+    await until(lambda: candidate.known > FAR and len(there(candidate)) == 3)
+    bob = fleet.client("bob")
+    assert (await bob.ask("survey", "robot/b")).state == "running"
+    honest.term = rival = Term(candidate.known.counter + 1, "rival")
+    honest.publish()
+    await asyncio.sleep(fleet.fleet.timing.rebuild / SECOND)
+    assert "robot/b" in there(candidate)
+    fleet.watcher.publisher(fleet.watcher.keys.grants, Grants).put(Grants(rival, 1, 0, 0.5))
+    await until(lambda: candidate.rcm is None)
+    assert [notice.outcome for notice in bob.notices if notice.outcome] == []
+
+
 async def test_rcs_that_claim_to_see_the_leader_of_their_term_delay_one_election_by_a_silence() -> None:
     fleet = a_fleet()
     candidate = await led(fleet)
@@ -118,6 +140,18 @@ async def test_rcs_that_claim_to_see_the_leader_of_their_term_delay_one_election
     await until(lambda: candidate.known > FAR and "robot/a" in there(candidate), within=within)
 
 
+async def test_rcs_of_two_hosts_use_up_no_terms() -> None:
+    """Of the last ones: none above is left, and managers keep what they believe on disk."""
+    fleet = a_fleet()
+    candidate = await led(fleet)
+    for host in ("cart", "desk"):
+        FakeRc(fleet.mesh(host), f"gripper/{host}", term=Term(MAX_COUNTER, "eve")).start()
+    await asyncio.sleep(3)
+    assert candidate.known.counter < MAX_COUNTER // 2
+    async with asyncio.timeout(SERVED):
+        assert (await fleet.client("bob").ask("survey", "robot/a")).state == "running"
+
+
 async def test_managers_that_start_anew_go_on_above_the_term_on_their_disk(tmp_path: Path) -> None:
     fleet = a_fleet()
     disk = TermFile(tmp_path, fleet.fleet.name)
@@ -125,9 +159,7 @@ async def test_managers_that_start_anew_go_on_above_the_term_on_their_disk(tmp_p
     candidate = await led(fleet, disk=disk)
     assert candidate.known.counter == 42
     assert TermFile(tmp_path, fleet.fleet.name).read() == candidate.known
-    fleet.watcher.publisher(fleet.watcher.keys.grants, type(fleet.published[0])).put(
-        type(fleet.published[0])(Term(50, "other"), 1, 0, 0.5)
-    )
+    fleet.watcher.publisher(fleet.watcher.keys.grants, Grants).put(Grants(Term(50, "other"), 1, 0, 0.5))
     await until(lambda: disk.read() >= Term(50, "other"))
 
 

@@ -20,7 +20,7 @@ from zscout.services.journal.follower import Change, HoldOver, HoldSeen
 from zscout.services.journal.journal import Journal
 from zscout.services.journal.store import JournalStore
 from zscout.services.rcm import observed_runtimes
-from zscout.services.rcm.candidate import Candidate
+from zscout.services.rcm.candidate import Candidate, CandidateParts
 from zscout.services.rcm.observed_runtimes import RuntimeObserver
 from zscout.types import SECOND, Ns
 
@@ -78,9 +78,11 @@ async def test_one_who_starts_anew_knows_what_its_journal_knows(tmp_path: Path) 
     for life in range(2):
         mesh = fleet.mesh("x")
         silent = fleet.fleet.silence / SECOND
-        journal = Journal(mesh, tmp_path, JournalConfig(), silent, wall=lambda: 1e9 + fleet.watcher.now() / SECOND)
+        runtimes = RuntimeObserver()
+        wall = lambda: 1e9 + fleet.watcher.now() / SECOND  # noqa: E731
+        journal = Journal(mesh, tmp_path, JournalConfig(), silent, wall, runtimes.recall)
         journal.start()
-        candidate = Candidate(mesh, fleet.fleet, journal=journal)
+        candidate = Candidate(mesh, fleet.fleet, CandidateParts(journal=journal, runtimes=runtimes))
         candidate.start()
         await until(partial(getattr, candidate, "rcm"))
         await until(partial(getattr, journal, "_follower"))

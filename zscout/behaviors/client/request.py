@@ -340,8 +340,10 @@ class RequestStore:
     """All that a client has asked for and that is not over, by request id; who waits for news of it; and
     whether the client is paused."""
 
-    def __init__(self, now: Callable[[], Ns]) -> None:
-        self._now = now
+    def __init__(self, now: Callable[[], Ns], ask_again: Callable[[OpenArc], object]) -> None:
+        """`ask_again` is called with what the RCM dropped because this client seemed gone, or has at a worse place than
+        it had; and with what is `awaited`: it came from another client, and is that one's still by a later RCM."""
+        self._now, self._ask_again = now, ask_again
         self.arcs: dict[str, OpenArc] = {}
         self.moved: dict[str, OpenArc] = {}
         """What was handed over while this client was paused, and may be taken back."""
@@ -356,10 +358,6 @@ class RequestStore:
         self.resumed = asyncio.Event()
         """Not set while the client is paused."""
         self.resumed.set()
-        self.ask_again: Callable[[OpenArc], object] = lambda _: None
-        """Called with what the RCM dropped because this client seemed gone, or has at a worse place than it had."""
-        self.on_awaited: Callable[[OpenArc], object] = lambda _: None
-        """Called with what came from another client, and is that one's still by the word of a later RCM."""
         self.watchers: list[Callable[[OpenArc], None]] = []
         """Each is called with whatever there is news of."""
 
@@ -423,19 +421,19 @@ class RequestStore:
             del self.arcs[arc.id]
             self.expected[arc.id] = arc
             self.notify(arc)
-            self.on_awaited(arc)
+            self._ask_again(arc)
         elif arc._take(notice, self._now()):
             self.reclaimed.discard(arc.id)
             if not arc.open and arc.outcome == "client_lost":
                 arc._reopen(self._now())
-                self.ask_again(arc)
+                self._ask_again(arc)
             elif arc.outcome == "completed" and notice.grant in unserved:
                 arc._not_served(notice.grant, self._now())
-                self.ask_again(arc)
+                self._ask_again(arc)
             elif not granted and arc.outcome == "completed":
                 self._ask_anew(arc)
             elif arc._shows_place(notice):
-                self.ask_again(arc)
+                self._ask_again(arc)
             self.notify(arc)
             if not arc.open:
                 self.forget(arc)
@@ -446,7 +444,7 @@ class RequestStore:
         arc._take_back(new_instance(), "it had its time before this client heard of it", self._now())
         arc.booking = ""  # so had that
         self.arcs[arc.id] = arc
-        self.ask_again(arc)
+        self._ask_again(arc)
 
     def open_requests(self) -> list[OpenRequest]:
         """All, as it is reported to an RCM that takes the lead. What is expected has no place: it is this

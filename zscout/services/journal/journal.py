@@ -41,10 +41,17 @@ class Journal:
     """The journal of one node. `silent`: seconds without publications that mean a lost leader."""
 
     def __init__(
-        self, mesh: Mesh, folder: Path, config: JournalConfig, silent: float, wall: Callable[[], float] = time.time
+        self,
+        mesh: Mesh,
+        folder: Path,
+        config: JournalConfig,
+        silent: float,
+        wall: Callable[[], float] = time.time,
+        on_opened: Callable[[list[PastHold]], object] = lambda _: None,
     ) -> None:
-        """`wall`: seconds since 1970, UTC."""
-        self._mesh, self._silent, self._wall = mesh, silent, wall
+        """`wall`: seconds since 1970, UTC. `on_opened` is called once, in the event loop, with the latest holds of the
+        reopened journal, oldest first."""
+        self._mesh, self._silent, self._wall, self._on_opened = mesh, silent, wall, on_opened
         self._store = JournalStore(folder, config.max_age / SECOND, config.max_size * MEGABYTE)
         self._supervisor = Supervisor("the journal", lambda _: log.error("no journal is kept until this node restarts"))
         self._gathered: list[Heard] = []
@@ -59,8 +66,6 @@ class Journal:
         self._dropped, self._dropped_since = 0, 0.0
         self._follower: Follower | None = None  # none: the file is not open
         self._pending: list[Change] = []  # derived, but not written
-        self.on_opened: Callable[[list[PastHold]], object] = lambda _: None
-        """Called once, in the event loop, with the latest holds of the reopened journal, oldest first."""
         self._told = False
         self._troubled: str | None = None
         self._not_before: Ns = 0
@@ -154,7 +159,7 @@ class Journal:
                 self._follower = Follower(self._silent, stood, left)
                 if not self._told:
                     self._told = True
-                    self.on_opened(latest)
+                    self._on_opened(latest)
             await self._write(self._follower)
         except Unwritable as error:
             self._trouble(error)

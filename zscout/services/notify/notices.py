@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from zscout.config.notify import NotifyEvent
 from zscout.messages import LoadReport
-from zscout.rcm.booked import BookedDanger
+from zscout.rcm.steps import BookedDanger
 from zscout.scheduling.model import ArcRequest, Outcome
 from zscout.scheduling.reason import named
 from zscout.services.bookings.dates import zone_of

@@ -14,7 +14,7 @@ from zscout.config.notify import Address, NotifyConfig
 from zscout.mesh.sparse_log import SparseLog
 from zscout.mesh.supervision import Supervisor, clock
 from zscout.messages import LoadReport
-from zscout.rcm.booked import BookedDanger
+from zscout.rcm.steps import BookedDanger
 from zscout.services.notify.notices import CertificateNotices, HoldNotices, Notification, booking_notice
 from zscout.services.notify.rate_limit import RateLimit
 from zscout.types import SECOND, Ns

@@ -20,18 +20,23 @@ from zscout.messages import (
     BookingView,
     FindSlots,
     Operation,
+    Proposal,
+    ProposedHolder,
     Refused,
     SlotsTold,
     SlotView,
     Unbook,
+    decimals,
     duration,
     exact_amounts,
 )
 from zscout.rcm.admission import Admission
-from zscout.rcm.booked import BookingWork, Keep, Ticket
 from zscout.rcm.door import Door
+from zscout.rcm.places import request_id
+from zscout.rcm.steps import Keep, Outbox, Proposed, Ticket
 from zscout.scheduling.booking import Booking
 from zscout.scheduling.core import Core
+from zscout.scheduling.model import Propose
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.services.bookings.dates import DAY, dates, told, zone_of
 from zscout.services.bookings.records import Records
@@ -57,7 +62,7 @@ class _Undecided:
 
 
 class BookingHandler:
-    """Each operation leads to `work`, until the caller takes that."""
+    """What follows from operations is in `out`, until the caller takes that."""
 
     def __init__(
         self,
@@ -75,7 +80,7 @@ class BookingHandler:
         """What is known of how long holds last, for hints."""
         self.undecided: list[_Undecided] = []
         self._keeping = 0
-        self.work = BookingWork()
+        self.out = Outbox()
 
     def operation(self, ticket: Ticket, sender: Sender, operation: Operation) -> None:
         """Takes one in; the core is at the present time. Raises Refused."""
@@ -91,16 +96,20 @@ class BookingHandler:
     # Booking
 
     def _book(self, ticket: Ticket, wanted: Book, sender: Sender) -> None:
-        known = self._records.get(wanted.id)
-        if known is not None:
-            self._admission.check_owner(sender, known, "ask for it")
-            self._answer_kept(ticket, known)
+        if self._is_made(ticket, wanted.id, sender):
             return
         self._admission.check_booking(wanted, sender)
         record = self._record(wanted, sender)
-        self._check_room(record)
         self._door.check(self._now, wanted.needs, may_wait=False)
-        self._try(_Undecided(ticket, lambda: self._decide(ticket, record)))
+        self._try(_Undecided(ticket, lambda: self._is_made(ticket, record.id, sender) or self._decide(ticket, record)))
+
+    def _is_made(self, ticket: Ticket, booking: str, sender: Sender) -> bool:
+        """Answers what is asked for again. Raises Refused."""
+        if (known := self._records.get(booking)) is None:
+            return False
+        self._admission.check_owner(sender, known, "ask for it")
+        self._answer_kept(ticket, known)
+        return True
 
     def _record(self, wanted: Book, sender: Sender) -> BookingRecord:
         """Raises Refused for what is no booking."""
@@ -149,7 +158,9 @@ class BookingHandler:
             raise Refused("too_many", f"{MAX_CLAIMS} dates are booked, the most allowed; repeat it less often")
 
     def _decide(self, ticket: Ticket, record: BookingRecord) -> bool:
-        """Whether it is decided: all its dates that are kept free from now on are free, or one is not."""
+        """Whether it is decided: all its dates that are kept free from now on are free, or one is not. Raises Refused
+        where there is no room any more."""
+        self._check_room(record)
         unknown, bound = [], dict[int, dict[str, str]]()
         # Maintenance goes before what is booked: who is in its way is told.
         for date in [] if record.maintenance else self._dates.open_dates(record):
@@ -164,12 +175,12 @@ class BookingHandler:
                 bound[date.start] = dict(found.found[0].bound)
         if unknown:
             for claim, votes in unknown:
-                self.work.proposals += self._core.ask_votes(votes, claim)
+                self.out.proposals += map(self.proposal, self._core.ask_votes(votes, claim))
             return False
         self._dates.change(record, kept=bound)
-        self.work.events.append(self._dates.reconcile())
+        self.out.events.append(self._dates.reconcile())
         when = told(record.start, record.zone)
-        self.work.log.append(f"{record.owner} books {record.name}: {', '.join(record.needs)} at {when}")
+        self.out.log.append(f"{record.owner} books {record.name}: {', '.join(record.needs)} at {when}")
         self._answer_kept(ticket, record, withdraw=True)
         return True
 
@@ -190,7 +201,7 @@ class BookingHandler:
         if self._keeping >= MAX_UNDECIDED:
             raise Refused("busy", f"{MAX_UNDECIDED} bookings are already being stored; try again")
         self._keeping += 1
-        self.work.keep.append(Keep(ticket, record.id, withdraw))
+        self.out.keep.append(Keep(ticket, record.id, withdraw))
 
     def kept(self, keep: Keep, why: str) -> None:
         """A record is kept, or not: `why`."""
@@ -200,11 +211,11 @@ class BookingHandler:
             if record is not None and keep.withdraw:
                 # Not given up, which is final: another leader may have made it as well, or may have heard of it.
                 self._records.remove(keep.booking)
-                self.work.events.append(self._dates.reconcile())
+                self.out.events.append(self._dates.reconcile())
             refused = Refused("not_kept", f"no other host stored this booking: {why or 'it is over'}")
             self._refuse(keep.ticket, refused)
         else:
-            self.work.answers.append((keep.ticket, self._dates.view(record)))
+            self.out.answers.append((keep.ticket, self._dates.view(record)))
 
     # Giving up
 
@@ -222,7 +233,7 @@ class BookingHandler:
         else:
             date = told(operation.start, record.zone)
             raise Refused("bad_date", f"{date} is not a date of {record.name}; see zscout booking list")
-        self.work.events.append(self._dates.reconcile())
+        self.out.events.append(self._dates.reconcile())
         self._answer_kept(ticket, new)
 
     # Looking for a time
@@ -244,7 +255,7 @@ class BookingHandler:
     def _answer_slots(self, ticket: Ticket, asked: FindSlots, wanted: Booking, until: Ns) -> bool:
         found = self._core.slots(wanted, until, asked.limit)
         if found.unknown:
-            self.work.proposals += self._core.ask_votes(found.unknown, wanted)
+            self.out.proposals += map(self.proposal, self._core.ask_votes(found.unknown, wanted))
             return False
         slots = []
         for one in found.found:
@@ -254,7 +265,7 @@ class BookingHandler:
         likely = None if guess is None else -(-self._dates.to_fleet(guess) // SECOND)
         if likely is not None and slots and likely >= slots[0].start:
             likely = None
-        self.work.answers.append((ticket, SlotsTold(asked.id, self._dates.time, slots, found.complete, likely)))
+        self.out.answers.append((ticket, SlotsTold(asked.id, self._dates.time, slots, found.complete, likely)))
         return True
 
     # Votes
@@ -281,8 +292,21 @@ class BookingHandler:
         else:
             self.undecided.append(undecided)
 
+    def proposal(self, asked: Propose) -> Proposed:
+        """The question to an RC: some of its holders may be bookings."""
+        holders = []
+        for name, params in asked.holders.items():
+            if (arc := self._core.arc(name)) is not None:
+                known = request_id(name), arc.name, arc.request.client
+            else:
+                record = self._records.get(name.partition("@")[0])
+                label, owner = (name, "nobody") if record is None else (record.name, record.owner or "nobody")
+                known = name, label, f"{owner}/booking"
+            holders.append(ProposedHolder(*known, decimals(params)))
+        return Proposed(asked.rc, Proposal(proposal=asked.proposal, term=self._core.term, holders=holders))
+
     def _refuse(self, ticket: Ticket, refused: Refused) -> None:
-        self.work.answers.append((ticket, refused.problem))
+        self.out.answers.append((ticket, refused.problem))
 
     @property
     def _now(self) -> Ns:

@@ -96,11 +96,16 @@ class BookingSharing:
             declared.close()
 
     @property
+    def bookings(self) -> Bookings:
+        """At the present time."""
+        return self._bookings.at(self._mesh.now())
+
+    @property
     def _settled(self) -> bool:
-        return self._bookings.at(self._mesh.now()).settled
+        return self.bookings.settled
 
     def _answer(self, query: IncomingQuery[BookingsAsk]) -> None:
-        asked, bookings = query.message, self._bookings.at(self._mesh.now())
+        asked, bookings = query.message, self.bookings
         views = bookings.handler.views(asked.owner, asked.rc)
         query.answer(BookingsTold(bookings.dates.time, views, dict(self.clocks)))
 

@@ -10,21 +10,21 @@ from typing import Any, Final, Self
 
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import BadName, Sender
-from zscout.messages import Ask, BookingRecord, BookingsKept, Operation, Problem, ProposedHolder, Refused, decimals
+from zscout.messages import Ask, BookingRecord, BookingsKept, Operation, Problem, Refused
 from zscout.rcm.admission import Admission
-from zscout.rcm.booked import NO_WORK, Again, BookedDanger, BookingWork, Keep, Ticket
 from zscout.rcm.deadlines import Deadlines
 from zscout.rcm.door import Door
+from zscout.rcm.steps import Again, BookedDanger, Keep, Outbox, Proposed, Ticket
 from zscout.scheduling.booking import BookingConflict, BookingThreatened, Dates
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import ArcRequest, Effect, Event, Tick, Vote, VoteOverdue
+from zscout.scheduling.model import ArcRequest, Effect, Event, Propose, Tick, Vote, VoteOverdue
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.services.bookings.fleet_clock import SAME, FleetClock, agreed, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.bookings.records import Records
 from zscout.services.rcm.booked_dates import BookedDates, Date
 from zscout.services.rcm.booking_handler import BookingHandler
-from zscout.types import SECOND, ArcId, Ns, Params
+from zscout.types import SECOND, Ns
 
 SLACK: Final[Ns] = SECOND // 100
 """Timers may be a little early."""
@@ -114,15 +114,12 @@ class Bookings:
         """The events by which the core knows of all dates; `taken`: those that ARCs have taken up."""
         return [self.dates.recovered(taken)]
 
-    def proposed(self, name: ArcId, params: Params) -> ProposedHolder:
-        """A booking as an RC is asked about it."""
-        record = self._records.get(name.partition("@")[0])
-        label, owner = (name, "") if record is None else (record.name, record.owner)
-        return ProposedHolder(name, label, f"{owner or 'nobody'}/booking", decimals(params))
+    def proposal(self, asked: Propose) -> Proposed:
+        return self.handler.proposal(asked)
 
     # What happens
 
-    def operation(self, ticket: Ticket, sender: Sender, operation: Operation) -> BookingWork:
+    def operation(self, ticket: Ticket, sender: Sender, operation: Operation) -> Outbox:
         try:
             if not self._adaptive:
                 words = f'strategy "{self._strategy}" has no bookings; set strategy = "adaptive" under [fleet]'
@@ -134,29 +131,29 @@ class Bookings:
             if len(self.handler.undecided) > before:
                 self._deadlines.set(self.handler.undecided[-1].until + SLACK, (_Due.TRY, None))
         except Refused as refused:
-            self.handler.work.answers.append((ticket, refused.problem))
+            self.handler.out.answers.append((ticket, refused.problem))
         except BadName as error:
-            self.handler.work.answers.append((ticket, Problem("bad_name", str(error))))
-        return self._work()
+            self.handler.out.answers.append((ticket, Problem("bad_name", str(error))))
+        return self._out()
 
-    def again(self, again: Again) -> BookingWork:
+    def again(self, again: Again) -> Outbox:
         self.handler.again(again.undecided)
-        return self._work()
+        return self._out()
 
-    def kept(self, keep: Keep, why: str) -> BookingWork:
+    def kept(self, keep: Keep, why: str) -> Outbox:
         self.handler.kept(keep, why)
-        return self._work()
+        return self._out()
 
-    def shared(self, *, news: bool) -> BookingWork:
+    def shared(self, *, news: bool) -> Outbox:
         """All keepers were asked; or there is news: others know what was not known here."""
         if not news:
             events, news = self.dates.redate()
-            self.handler.work.events += events
+            self.handler.out.events += events
         if news:
             self._once(_Due.NEWS, 0)
-        return self._work()
+        return self._out()
 
-    def note(self, events: Collection[Event], effects: Iterable[Effect]) -> BookingWork:
+    def note(self, events: Collection[Event], effects: Iterable[Effect]) -> Outbox:
         """What has happened in an instant: what follows of it follows in another one."""
         if self.dates.note(effects, settled=self.settled):
             self._once(_Due.NEWS, 0)
@@ -166,9 +163,9 @@ class Bookings:
             self._once(_Due.LOOK, GATHERS)
         if self.handler.undecided and any(isinstance(event, (Vote, VoteOverdue)) for event in events):
             self._once(_Due.TRY, BALLOTS)
-        return self._work() if self.dates.changed or self.dates.strange else NO_WORK
+        return self._out()
 
-    def tick(self) -> BookingWork:
+    def tick(self) -> Outbox:
         """Carries out what is due."""
         while (due := self._deadlines.pop_due(self.dates.now)) is not None:
             self._set.discard(due[0])
@@ -182,25 +179,25 @@ class Bookings:
                     self._await_another()
                 case (_Due.TRY, _):
                     again, self.handler.undecided = self.handler.undecided, []
-                    self.handler.work.again += map(Again, again)
-                    self.handler.work.events += [Tick()] if again else []
+                    self.handler.out.then += map(Again, again)
+                    self.handler.out.events += [Tick()] if again else []
                 case (_Due.TELL, _):
                     self._tell()
-        return self._work()
+        return self._out()
 
     def _once(self, due: _Due, delay: Ns) -> None:
         if due not in self._set:
             self._set.add(due)
             self._deadlines.set(self.dates.now + delay, (due, None))
 
-    def _work(self) -> BookingWork:
-        work, self.handler.work = self.handler.work, BookingWork()
-        work.changed, self.dates.changed = self.dates.changed, []
-        work.strange, self.dates.strange = self.dates.strange, []
-        return work
+    def _out(self) -> Outbox:
+        out, self.handler.out = self.handler.out, Outbox()
+        out.changed, self.dates.changed = self.dates.changed, []
+        out.strange, self.dates.strange = self.dates.strange, []
+        return out
 
     def _reconcile(self) -> None:
-        self.handler.work.events.append(self.dates.reconcile())
+        self.handler.out.events.append(self.dates.reconcile())
         self._tell_soon()
         self._await_another()
 
@@ -228,7 +225,7 @@ class Bookings:
             BookedDanger(*min(dates, key=lambda date: date.start), why, len(dates) - 1)
             for (_, why), dates in news.items()
         ]
-        self.handler.work.dangers += sorted(found, key=lambda danger: (danger.start, danger.record.id, danger.why))
+        self.handler.out.dangers += sorted(found, key=lambda danger: (danger.start, danger.record.id, danger.why))
 
 
 def bookings_of(

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import RANDOM, BadName, Role, Sender, Token, client_of, new_instance
@@ -31,11 +31,10 @@ from zscout.messages import (
 )
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
-from zscout.rcm.booked import BookedDanger
 from zscout.rcm.places import Places
 from zscout.rcm.recovery import aged, take_over
+from zscout.rcm.steps import BookedDanger
 from zscout.rcm.terms import Source, Terms, Verdict, Word
-from zscout.scheduling.fair_shares import decayed
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.journal.journal import Journal
 from zscout.services.placement.component_placer import ComponentPlacer
@@ -43,11 +42,12 @@ from zscout.services.placement.ledger import PlacementLedger
 from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.rcm.booking_sharing import credible
 from zscout.services.rcm.digest import HoldListener
-from zscout.services.rcm.election import Election
+from zscout.services.rcm.election import Election, Setbacks
 from zscout.services.rcm.inventory import Inventory
+from zscout.services.rcm.learned import Learned
 from zscout.services.rcm.observed_runtimes import RuntimeObserver
 from zscout.services.rcm.rcm import Parts, Rcm
-from zscout.services.rcm.term_file import TermDisk
+from zscout.services.rcm.term_file import KeptTerm, TermDisk
 from zscout.types import NO_TERM, SECOND, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
@@ -57,69 +57,64 @@ R = TypeVar("R")
 UNSEEN = "RCs of other hosts see an RCM, and this candidate does not"
 WAITS = 4.0
 """Seconds for which a candidate waits for a leader that only others see: longer than RCs believe in one that went."""
-BACKOFF, MAX_BACKOFF = 1.0, 30.0
-"""Seconds until a candidate that failed becomes one again: doubled each time, at most."""
-KEPT_WITHIN = 1.0
-"""Seconds that a candidate waits for its disk before it leads."""
-BACKOFF_RESET_AFTER: Ns = 60 * SECOND
-"""After a candidacy at least this long the next failure begins with BACKOFF anew."""
+
+
+class CandidateParts(NamedTuple):
+    """What a node gives its candidate."""
+
+    folder: Path | None = None
+    """Where it keeps what it must know after a restart."""
+    authority: Authority | None = None
+    places_key: bytes | None = None
+    """By which the managers of a fleet seal places."""
+    listeners: Sequence[HoldListener] = ()
+    """Get to know of holds while it leads."""
+    journal: Journal | None = None
+    """Gets to know of publications."""
+    runtimes: RuntimeObserver | None = None
+    keeper: BookingKeeper | None = None
+    """Keeps bookings; without one they are kept in memory."""
+    disk: TermDisk | None = None
+    """Keeps the highest term of a fleet with `[security]`."""
+    on_danger: Callable[[BookedDanger], object] = lambda _: None
+    """Called while it leads with bookings that may not be kept."""
+
+
+class _Candidacy(NamedTuple):
+    """From a start to its failure, or the end of the node."""
+
+    supervisor: Supervisor
+    last_terms: LastTerms
+    stall: StallWatch
+    declared: ExitStack
+    """Undeclares what is declared meanwhile."""
 
 
 class Candidate:
     """Stands by, leads when it must, steps down when a higher term is seen or when anything fails."""
 
-    def __init__(
-        self,
-        mesh: Mesh,
-        fleet: Fleet,
-        folder: Path | None = None,
-        authority: Authority | None = None,
-        places_key: bytes | None = None,
-        listeners: Sequence[HoldListener] = (),
-        journal: Journal | None = None,
-        keeper: BookingKeeper | None = None,
-        disk: TermDisk | None = None,
-    ) -> None:
-        """`folder`: where it keeps what it must know after a restart; None: it does not. `places_key`: that by which
-        the managers of a fleet seal places. `listeners` are told of holds while it leads, `journal` of publications.
-        `keeper` keeps bookings; without one it keeps them in memory, for itself. `disk` keeps the highest term of a
-        fleet with `[security]`."""
-        self._keeper = keeper or BookingKeeper(mesh)
-        self._journal, self._runtimes = journal, RuntimeObserver()
-        if journal is not None:
-            journal.on_opened = self._runtimes.recall
-        self._places_key = places_key
-        self._authority = authority or Authority(fleet)
+    def __init__(self, mesh: Mesh, fleet: Fleet, parts: CandidateParts | None = None) -> None:
+        self._parts = parts = parts or CandidateParts()
+        keeper, runtimes = parts.keeper or BookingKeeper(mesh), parts.runtimes or RuntimeObserver()
+        self.learned = Learned(keeper, runtimes, parts.journal)
+        self._authority = parts.authority or Authority(fleet)
         self.mesh, self.fleet = mesh, fleet
-        self._disk = disk if mesh.keys.closed else None
-        self._saved = self._disk.read() if self._disk is not None else NO_TERM
-        self._saving = asyncio.Lock()
-        self.terms = Terms(secured=mesh.keys.closed, highest=self._saved)
+        disk = parts.disk if mesh.keys.closed else None
+        self.terms = Terms(secured=mesh.keys.closed, highest=NO_TERM if disk is None else disk.read())
+        self._kept = KeptTerm(disk, self.terms)
         self.rcm: Rcm | None = None
         self.balancer: LoadBalancer | None = None
         """Beside the RCM, while this node leads."""
-        self.listeners = listeners
-        self.on_danger: Callable[[BookedDanger], object] = lambda _: None
-        """Called while it leads with bookings that may not be kept."""
         self.terms_led = 0
         self.tally = Tally()
         """How operations ended that its RCMs were asked for."""
-        self._leader: str | None = None
-        """The host of the leader that was seen last."""
-        self._charged: Mapping[str, float] = {}
-        """By group: what it had, as a leader told last (`fair_shares.py`),"""
-        self._charged_at: Ns = 0
-        """and when."""
         self.ledger = PlacementLedger(mesh)
         self._authority.placed = self.ledger.placements
-        self.inventory = Inventory(mesh, fleet, folder)
-        self._timeout = fleet.timing.rebuild / SECOND
+        self.inventory = Inventory(mesh, fleet, parts.folder)
         self._leading = ExitStack()
         """Ends the RCM, and the load balancer and the placer beside it, while this node leads."""
-        self._candidacy = ExitStack()
-        """Undeclares what is declared while it is a candidate."""
         self._changed = asyncio.Event()
-        self._failures = 0
+        self._setbacks = Setbacks()
         self._again: asyncio.TimerHandle | None = None
 
     @property
@@ -127,40 +122,42 @@ class Candidate:
         """The highest term that it believes."""
         return self.terms.highest
 
+    @property
+    def _timeout(self) -> float:
+        return self.fleet.timing.rebuild / SECOND
+
     async def stop(self) -> None:
         if self._again is not None:
             self._again.cancel()
         self._withdraw()
-        await self._supervisor.close()
+        await self._candidacy.supervisor.close()
 
     def start(self) -> None:
         """Becomes a candidate, the first time or again: others see its token from now on."""
         keys, mesh = self.mesh.keys, self.mesh
-        self._again, self._since = None, mesh.now()
-        silence = self.fleet.silence
-        self.election = Election(mesh.me.host, self.fleet.candidates, silence=silence, now=self._since)
-        self._supervisor = Supervisor("the candidate", self._failed)
-        self._last_terms = LastTerms(mesh, self._supervisor, self._learn, timeout=self._timeout)
-        guard = self._supervisor.guard
+        self._again, now, silence = None, mesh.now(), self.fleet.silence
+        self._setbacks.began(now)
+        self.election = Election(mesh.me.host, self.fleet.candidates, silence=silence, now=now)
+        supervisor, stall, declarations = Supervisor("the candidate", self._failed), StallWatch(mesh.now), ExitStack()
+        last_terms = LastTerms(mesh, supervisor, self._learn, timeout=self._timeout)
+        self._candidacy = _Candidacy(supervisor, last_terms, stall, declarations)
+        guard = supervisor.guard
         try:
-            self._stall = StallWatch(mesh.now).start()
-            self._candidacy.callback(self._stall.stop)
-            self._candidacy.callback(self.ledger.stop)
-            self.ledger.start(self._supervisor)
-            self._candidacy.callback(self.inventory.stop)
-            self.inventory.start(self._supervisor)
-            self._candidacy.callback(self._keeper.stop)
-            self._keeper.start(self._supervisor)
+            stall.start()
+            declarations.callback(stall.stop)
+            for service in (self.ledger, self.inventory, self.learned.keeper):
+                declarations.callback(service.stop)
+                service.start(supervisor)
             for declared in (
                 mesh.subscribe(keys.grants, Grants, guard(self._on_grants)),
                 mesh.watch(keys.alive_any(Role.RCM), guard(self._on_leader)),
                 mesh.watch(keys.alive_any(Role.CANDIDATE), guard(self._on_candidate)),
                 mesh.alive(Token(mesh.me.host, Role.CANDIDATE, mesh.me.client, new_instance())),
             ):
-                self._candidacy.callback(declared.close)
-            self._supervisor.spawn(self._run())
+                declarations.callback(declared.close)
+            supervisor.spawn(self._run())
         except Exception as error:  # noqa: BLE001 - it is logged there
-            self._supervisor.fail(error)
+            supervisor.fail(error)
 
     def on_reload(self) -> None:
         """The rights have changed."""
@@ -171,17 +168,14 @@ class Candidate:
         """Steps down and withdraws; becomes a new candidate after a while."""
         if self._again is not None:
             return
-        if self.mesh.now() - self._since > BACKOFF_RESET_AFTER:
-            self._failures = 0
-        delay = min(BACKOFF * 2**self._failures, MAX_BACKOFF)
-        self._failures += 1
+        delay = self._setbacks.delay(self.mesh.now())
         log.error("this candidate withdraws, and becomes one again in %g s", delay)
         self._again = asyncio.get_running_loop().call_later(delay, self.start)
         self._withdraw()
 
     def _withdraw(self) -> None:
-        self._supervisor.cancel()
-        with self._candidacy.pop_all():
+        self._candidacy.supervisor.cancel()
+        with self._candidacy.declared.pop_all():
             self._stop_leading()
 
     def _stop_leading(self) -> None:
@@ -194,20 +188,14 @@ class Candidate:
         known = grants.term == self.known and (self.rcm is None or self.rcm.term == self.known)
         if known or self._see(Word(grants.term, Source.LEADER)).believed:
             self.election.published(grants.term, self.mesh.now())
-            self._keeper.hear(grants)
-            self._runtimes.hear(self.mesh.now(), grants)
-            if grants.charged:
-                self._charged, self._charged_at = grants.charged, self.mesh.now()
-            if self._journal is not None:
-                self._journal.hear(grants)
+            self.learned.hear(self.mesh.now(), grants)
 
     def _on_leader(self, token: Token, alive: bool) -> None:
         if self.rcm is None or token.instance != self.rcm.term.rcm:
             log.info("%s %s", token.host, "leads" if alive else "does not lead any more")
         if alive:
-            self._leader = token.host
             self.mesh.suspicions.suspect(UNSEEN, so=False)
-        self.election.leader(token.instance, alive=alive, now=self.mesh.now())
+        self.election.leader(token.instance, token.host, alive=alive, now=self.mesh.now())
         self._changed.set()
 
     def _on_candidate(self, token: Token, alive: bool) -> None:
@@ -220,11 +208,11 @@ class Candidate:
         heard = self.rcm is not None or self.election.heard_within(self.fleet.timing.hold_lease, now)
         verdict = self.terms.hear(word, now, heard=heard)
         if verdict.last:
-            self._last_terms.shown(word.term, before)
+            self._candidacy.last_terms.shown(word.term, before)
         if verdict.why:
             log.warning("%s", verdict.why)
-        if verdict.believed and self.known > before:
-            self._keep_soon()
+        if verdict.believed and self.known > before and self._kept.is_due:
+            self._candidacy.supervisor.spawn(self._kept.keep())
         if verdict.believed and self.rcm is not None and word.term > self.rcm.term:
             led = word.source is Source.LEADER or not self.terms.secured
             self._step_down(f"term {word.term.counter} of another RCM is above {self.rcm.term.counter}", led=led)
@@ -245,24 +233,6 @@ class Candidate:
     def _learn(self, term: Term) -> None:
         self.terms.highest = max(self.known, term)
 
-    def _keep_soon(self) -> None:
-        if self._disk is not None and not self._saving.locked():
-            self._supervisor.spawn(self._keep())
-
-    async def _keep(self, tried: Term = NO_TERM) -> None:
-        """Return once the highest term, `tried` included, is on disk, or can't be."""
-        if self._disk is None:
-            return
-        async with self._saving:
-            while (term := max(self.known, tried)) > self._saved:
-                try:
-                    async with asyncio.timeout(KEPT_WITHIN):
-                        await self._disk.write(term)
-                except (OSError, TimeoutError) as error:
-                    log.warning("term %d can't be kept on disk: %s", term.counter, error)
-                    return
-                self._saved = term
-
     # Leading
 
     async def _run(self) -> None:
@@ -279,7 +249,7 @@ class Candidate:
     async def _leader_elsewhere(self) -> bool:
         """Whether RCs still see a leader: then it is this candidate that is cut off; or have promised a term to a
         candidate that may be about to lead."""
-        if self._stall.fresh():
+        if self._candidacy.stall.fresh():
             self.election.stood_still(self.mesh.now())
         keys, tokens = self.mesh.keys, list[Token]()
         asked = self.mesh.ask(keys.rc_state_any, RcAsk(), RcState, timeout=self._timeout)
@@ -298,7 +268,7 @@ class Candidate:
         host = self.mesh.me.host
         others = [bool(state.leader) for state in states if state.host != host]
         own = [bool(state.leader) for state in states if state.host == host]
-        if self.election.must_wait(others, own, self.mesh.now(), self._leader):
+        if self.election.must_wait(others, own, self.mesh.now()):
             log.info("%d of %d RCs of other hosts still see a leader: waiting", sum(others), len(others))
             if sum(others) * 2 > len(others):
                 self.mesh.suspicions.suspect(UNSEEN, patience=WAITS)
@@ -337,12 +307,12 @@ class Candidate:
         term = Term(self.known.counter + 1, new_instance())
         self.terms.tries(term)
         promise_query = RcAsk(promise=term, above=self.mesh.me.host if self.terms.goes_above else None, ordinary=True)
-        booked = ShareBookings(term, self._keeper.records.digest())
+        booked = ShareBookings(term, self.learned.keeper.records.digest())
         rcs, clients, keepers, _ = await asyncio.gather(
             self.mesh.ask(keys.rc_state_any, promise_query, RcState, timeout=self._timeout),
             self.mesh.ask(keys.requests_any, promise_query, ClientRequests, timeout=self._timeout),
             self.mesh.ask(keys.bookings_any, booked, BookingsKept, timeout=self._timeout),
-            self._keep(term),
+            self._kept.keep(term),
         )
         refusals = [_refusal(reply, term) for reply in rcs]
         await self._hear_refusals(Source.RC, refusals)
@@ -376,7 +346,7 @@ class Candidate:
 
     def _hear_seals(self, answers: Iterable[ClientRequests]) -> None:
         """Take the terms of places that clients list with a right seal."""
-        places = Places(self.fleet.name, self._places_key, NO_TERM)
+        places = Places(self.fleet.name, self._parts.places_key, NO_TERM)
         for answer in answers if self.terms.secured else ():
             for request in answer.requests:
                 place = request.place
@@ -400,17 +370,16 @@ class Candidate:
     async def _lead(
         self, term: Term, states: list[RcState], open_requests: list[ClientRequests], kept: list[BookingsKept]
     ) -> bool:
-        places = Places(self.fleet.name, self._places_key, term)
-        self._keeper.records.take(record for one in kept for record in one.records)
+        places = Places(self.fleet.name, self._parts.places_key, term)
+        self.learned.keeper.records.take(record for one in kept for record in one.records)
         admission = Admission(self.fleet.limits, self._authority, places)
-        home_of, record_of = self.inventory.devices.home_of, self._keeper.records.get
+        home_of, record_of = self.inventory.devices.home_of, self.learned.keeper.records.get
         recovered = take_over(states, open_requests, self.mesh.now(), admission, home_of, record_of)
         for remark in recovered.remarks:
             log.info("%s", remark)
         if (fair := self.fleet.scheduling.fair_shares) is not None:
-            passed = self.mesh.now() - self._charged_at
-            recovered.charged = {group: decayed(had, passed, fair.half_life) for group, had in self._charged.items()}
-        recovered.patient = self.election.links_return(self.mesh.now(), self._leader)
+            recovered.charged = self.learned.charged(self.mesh.now(), fair.half_life)
+        recovered.patient = self.election.links_return(self.mesh.now())
         self.terms.highest = term
         rcm = Rcm(
             self.mesh,
@@ -422,13 +391,13 @@ class Candidate:
                 self.inventory,
                 self._authority,
                 places,
-                self.listeners,
+                self._parts.listeners,
                 self.tally,
-                self._keeper,
+                self.learned.keeper,
                 kept,
-                self._runtimes.estimator,
+                self.learned.runtimes.estimator,
                 self._disbelieved,
-                lambda danger: self.on_danger(danger),
+                self._parts.on_danger,
             ),
         )
         self._leading.callback(rcm.stop)

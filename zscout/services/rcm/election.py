@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from zscout.types import SECOND, Ns, Term
+from zscout.types import SECOND, HostName, Ns, Term
 
 SETTLE = SECOND // 4
 """From joining the mesh, which takes 0.2 s where nobody answers, until a leader that exists has been seen. One that is
@@ -24,6 +24,26 @@ CALM = 10 * SECOND
 ALONE = 2
 """Silences for which a deposed candidate waits at most that sees nobody else: its own RCs wait as well."""
 MAX_DOUBLINGS = 5
+BACKOFF, MAX_BACKOFF = 1.0, 30.0
+"""Seconds until a candidate that failed becomes one again: doubled each time, at most."""
+BACKOFF_RESET_AFTER: Ns = 60 * SECOND
+"""After a candidacy at least this long the next failure begins with BACKOFF anew."""
+
+
+class Setbacks:
+    """Candidacies that failed one after the other."""
+
+    def __init__(self) -> None:
+        self._began: Ns = 0
+        self._failures = 0
+
+    def began(self, now: Ns) -> None:
+        self._began = now
+
+    def delay(self, now: Ns) -> float:
+        """A candidacy failed: the seconds until the next one."""
+        self._failures = 1 if now - self._began > BACKOFF_RESET_AFTER else self._failures + 1
+        return min(BACKOFF * 2.0 ** (self._failures - 1), MAX_BACKOFF)
 
 
 class Election:
@@ -51,6 +71,8 @@ class Election:
         """When one of them came back last."""
         self._stood_still: Ns | None = None
         self._alone_since: Ns | None = None
+        self.led_by: HostName | None = None
+        """The host of the leader that was seen last."""
 
     def candidate(self, host: str, *, alive: bool, now: Ns) -> None:
         """A candidate's token came or went."""
@@ -62,9 +84,10 @@ class Election:
         self._candidates[host] += 1 if alive else -1
         self._candidates = +self._candidates
 
-    def leader(self, instance: str, *, alive: bool, now: Ns) -> None:
+    def leader(self, instance: str, host: HostName, *, alive: bool, now: Ns) -> None:
         """A leader's token came or went."""
         if alive:
+            self.led_by = host
             self._leaders[instance] = self._heard = now
             self._alone_since = None
         elif self._leaders.pop(instance, None) is not None and not self._leaders:
@@ -104,9 +127,8 @@ class Election:
         """This process has just gone on: what it sees go may have missed it, and not the other way round."""
         self._stood_still = now
 
-    def must_wait(self, others: Sequence[bool], own: Sequence[bool], now: Ns, leader: str | None) -> bool:
-        """Whether to wait, by what RCs of other hosts and of this one say of a leader: whether they see one. `leader`
-        is the host of the last one.
+    def must_wait(self, others: Sequence[bool], own: Sequence[bool], now: Ns) -> bool:
+        """Whether to wait, by what RCs of other hosts and of this one say of a leader: whether they see one.
 
         RCs of this host share its view of the mesh: they count only where no other answers. Where it may be this
         host that is cut off, that is once more a silence."""
@@ -121,22 +143,22 @@ class Election:
         ):
             # Who deposed this candidate goes on, though nobody who could say so is seen: the two would take turns.
             return True
-        if sum(own) * 2 <= len(own) and not self._was_away(now, leader) and self._alone_since is None:
+        if sum(own) * 2 <= len(own) and not self._was_away(now) and self._alone_since is None:
             return False
         self._alone_since = now if self._alone_since is None else self._alone_since
         return now - self._alone_since < self.silence
 
-    def _was_away(self, now: Ns, leader: str | None) -> bool:
+    def _was_away(self, now: Ns) -> bool:
         """Whether it may be this host that is cut off, or was until a silence ago."""
-        missed = [at for host, at in self._lost.items() if host not in (leader, self.host)]
+        missed = [at for host, at in self._lost.items() if host not in (self.led_by, self.host)]
         if self._stood_still is not None:
             missed.append(self._stood_still)
         return any(now - at <= self.silence for at in missed)
 
-    def links_return(self, now: Ns, leader: str | None) -> bool:
+    def links_return(self, now: Ns) -> bool:
         """Whether links of this host may be coming back, one after the other."""
         returned = self._returned is not None and now - self._returned <= self.silence
-        return returned or self._was_away(now, leader)
+        return returned or self._was_away(now)
 
     def heard_within(self, span: Ns, now: Ns) -> bool:
         """Whether a leader that counts was seen or heard so lately."""

@@ -23,13 +23,13 @@ from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.rcm import steps
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
-from zscout.rcm.booked import BookedDanger, Keep, Ticket
 from zscout.rcm.door import Door
 from zscout.rcm.leader import Leader
 from zscout.rcm.places import Places
 from zscout.rcm.recovery import RecoveredState
-from zscout.rcm.roster import Question, Roster
+from zscout.rcm.roster import Roster
 from zscout.rcm.state_view import MAX_REASON, StateView
+from zscout.rcm.steps import BookedDanger, Keep, Question, Ticket
 from zscout.rcm.terms import Verdict, Word
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Event, Vote, VoteOverdue
@@ -107,19 +107,17 @@ class Rcm:
         self._parts = parts = parts or Parts()
         self.mesh, self.fleet, self._on_newer = mesh, fleet, on_newer
         self.supervisor = Supervisor(f"the RCM of term {term.counter}", on_failure)
-        self.authority = parts.authority or Authority(fleet)
-        core = Core(STRATEGIES[fleet.strategy](), self.authority.bound(fleet.scheduling))
-        admission = Admission(fleet.limits, self.authority, parts.places or Places(fleet.name, None, term))
+        authority = parts.authority or Authority(fleet)
+        core = Core(STRATEGIES[fleet.strategy](), authority.bound(fleet.scheduling))
+        admission = Admission(fleet.limits, authority, parts.places or Places(fleet.name, None, term))
         self.inventory = parts.inventory or Inventory(mesh, fleet)
         devices, me, now = self.inventory.devices, mesh.me.host, mesh.now()
         roster = Roster(mesh.keys, me, fleet, term, devices, admission, core.arc, now)
         door = Door(devices, roster, now + fleet.timing.hold_lease)
-        self._keeper = parts.keeper or BookingKeeper(mesh)
-        self._bookings = bookings_of(fleet, core, admission, door, self._keeper, parts.kept, parts.runtimes)
-        self.sharing = BookingSharing(
-            mesh, term, self._keeper, self._bookings, self.authority, self.supervisor, self._take
-        )
-        self.leader = Leader(fleet, core, admission, roster, door, self._bookings, parts.runtimes)
+        keeper = parts.keeper or BookingKeeper(mesh)
+        bookings = bookings_of(fleet, core, admission, door, keeper, parts.kept, parts.runtimes)
+        self.sharing = BookingSharing(mesh, term, keeper, bookings, authority, self.supervisor, self._take)
+        self.leader = Leader(fleet, core, admission, roster, door, bookings, parts.runtimes)
         self._view = StateView(me, core, roster, self.leader.registry, devices, parts.runtimes)
         self._digest = HoldDigest(core, parts.listeners) if parts.listeners else None
         self._grants = mesh.publisher(mesh.keys.grants, messages.Grants)
@@ -154,7 +152,7 @@ class Rcm:
 
     @property
     def bookings(self) -> Bookings:
-        return self._bookings.at(self.mesh.now())
+        return self.sharing.bookings
 
     # Beginning and end
 
@@ -256,7 +254,8 @@ class Rcm:
         query.answer(*self._view.answer(query.message, self.seq, self.mesh.now()))
 
     def _on_rc_state(self, key: str, state: messages.RcState) -> None:
-        self._take(steps.Reported(key, state))
+        if self.mesh.keys.rc_of(key) == state.rc:
+            self._take(steps.Reported(state))
 
     def _on_token(self, token: Token, alive: bool) -> None:
         self._take(steps.TokenSeen(token, alive))
@@ -362,7 +361,7 @@ class Rcm:
         self._take(steps.QuestionAnswered(asked, message, problem))
 
     async def _keep(self, keep: Keep) -> None:
-        record = self._keeper.records.get(keep.booking)
+        record = self.bookings.record(keep.booking)
         why = await self.sharing.keep(record) if record is not None else ""
         self._take(steps.Kept(keep, why))
 

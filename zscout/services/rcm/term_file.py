@@ -12,11 +12,14 @@ import msgspec
 from zscout.config.state_folder import write_durably
 from zscout.config.strict import BadInput, read_bytes
 from zscout.messages import MAX_COUNTER, Malformed, decode_told, encode
+from zscout.rcm.terms import Terms
 from zscout.types import NO_TERM, Term
 
 log = logging.getLogger(__name__)
 
 FILE: Final = "term.json"
+KEPT_WITHIN: Final = 1.0
+"""Seconds that a candidate waits for its disk before it leads."""
 MAX_BYTES: Final = 4_096
 
 
@@ -53,3 +56,30 @@ class TermFile:
 
     async def write(self, term: Term) -> None:
         await asyncio.to_thread(write_durably, self._path, encode(_TermFile(self._fleet, term)), 0o600)
+
+
+class KeptTerm:
+    """Keeps the highest of `terms` on `disk`, from which it was read; without a disk it keeps nothing."""
+
+    def __init__(self, disk: TermDisk | None, terms: Terms) -> None:
+        self._disk, self._terms, self._saved = disk, terms, terms.highest
+        self._lock = asyncio.Lock()
+
+    @property
+    def is_due(self) -> bool:
+        """Return True if a higher term is to be kept: one that is being kept is followed by the highest."""
+        return self._disk is not None and not self._lock.locked()
+
+    async def keep(self, tried: Term = NO_TERM) -> None:
+        """Return once the highest term, `tried` included, is on disk, or can't be."""
+        if self._disk is None:
+            return
+        async with self._lock:
+            while (term := max(self._terms.highest, tried)) > self._saved:
+                try:
+                    async with asyncio.timeout(KEPT_WITHIN):
+                        await self._disk.write(term)
+                except (OSError, TimeoutError) as error:
+                    log.warning("term %d can't be kept on disk: %s", term.counter, error)
+                    return
+                self._saved = term

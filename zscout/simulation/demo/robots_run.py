@@ -6,7 +6,7 @@ The demo observes publications only: of the RCM, of behaviors, and the simulated
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -92,9 +92,10 @@ class RobotsDemo(DemoRunner):
         seed: int,
         speed: float,
         show: Callable[[float, str], None],
+        on_live: Callable[[str], Awaitable[None]] | None = None,
     ) -> None:
         """`building` is an argument of `zscout simulate`, `ids` the robots' ids on the air by RC."""
-        super().__init__(folder, show)
+        super().__init__(folder, show, on_live)
         self._ids = ids
         self.robots = list(ids)
         self.seen = RobotsObserved(self.robots)

@@ -44,7 +44,9 @@ async def play(
     screen = DemoScreen("robots", as_json=as_json, decimals=1, live=live)
     screen.begin(f"{_title(building, speed, len(ids))}; {HARDWARE}; starting")
     demo, path = await screen.play(
-        lambda folder: RobotsDemo(folder, building, ids, seed=seed, speed=speed, show=screen.show),
+        lambda folder: RobotsDemo(
+            folder, building, ids, seed=seed, speed=speed, show=screen.show, on_live=screen.on_live
+        ),
         lambda demo: _picture(demo, screen),
         out,
     )

@@ -33,9 +33,12 @@ SHOWN: Final = 600  # characters of a log in a failure's message
 class DemoRunner(ABC):
     """A run of a demo, implemented by `play`. Use as an async context manager, which leaves no process behind.
 
-    `show(at, text)` receives each event in words, `at` in seconds since `zero`."""
+    `show(at, text)` receives each event in words, `at` in seconds since `zero`; `on_live` the address of the live view,
+    before anything is shown."""
 
-    def __init__(self, folder: Path, show: Callable[[float, str], None]) -> None:
+    def __init__(
+        self, folder: Path, show: Callable[[float, str], None], on_live: Callable[[str], Awaitable[None]] | None = None
+    ) -> None:
         self.folder = folder
         self.zero: Ns | None = None  # origin of the shown times
         self._fleet_file = folder / "fleet.toml"
@@ -47,8 +50,7 @@ class DemoRunner(ABC):
         self._ending = False
         self._ends: dict[str, str] = {}  # address of each host's node
         self._live = 0  # port of the recorder's live view
-        self.on_live: Callable[[str], Awaitable[None]] | None = None
-        """Called with the address of the live view before anything is shown."""
+        self._on_live = on_live
 
     @abstractmethod
     async def play(self) -> None:
@@ -109,9 +111,9 @@ class DemoRunner(ABC):
             # The launcher has the kernel end the node with this process, even if that is killed.
             node = [*LAUNCH[1:], str(os.getpid()), sys.executable, "-m", "zscout.node", str(file)]
             await self.start(f"node {host}", node)
-        if self.on_live is not None:
+        if self._on_live is not None:
             await self.within(LIVE, self._served(), "the recorder did not begin")
-            await self.on_live(f"rerun+http://127.0.0.1:{self._live}/proxy")
+            await self._on_live(f"rerun+http://127.0.0.1:{self._live}/proxy")
 
     async def _served(self) -> None:
         """Return once the live view answers."""

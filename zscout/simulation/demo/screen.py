@@ -6,7 +6,7 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol, TypeVar
@@ -70,7 +70,6 @@ class DemoScreen:
         even if the demo fails. `draw` returns the current picture."""
         with _recording(out) as path, tempfile.TemporaryDirectory(prefix="zscout-demo-") as folder:
             demo = make(Path(folder))
-            demo.on_live = self._open if self._live is not None else None
             try:
                 # The picture stays until all processes have ended, some seconds later.
                 with picture(lambda: draw(demo)) if self._drawn else nullcontext():
@@ -82,6 +81,11 @@ class DemoScreen:
                 raise
             keep_recording(Path(folder), path)
         return demo, path
+
+    @property
+    def on_live(self) -> Callable[[str], Awaitable[None]] | None:
+        """What opens the live view at its address, if one is wanted."""
+        return self._open if self._live is not None else None
 
     async def _open(self, url: str) -> None:
         assert self._live is not None  # noqa: S101

@@ -6,7 +6,7 @@ After the first request the watcher only subscribes: its queries to the RCM woul
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -31,8 +31,14 @@ LATE: Final = 5.0  # s that an ARC's end may be late
 class Table1Demo(DemoRunner):
     """A run of a workload; `zero` is the first request."""
 
-    def __init__(self, folder: Path, workload: Workload, show: Callable[[float, str], None]) -> None:
-        super().__init__(folder, show)
+    def __init__(
+        self,
+        folder: Path,
+        workload: Workload,
+        show: Callable[[float, str], None],
+        on_live: Callable[[str], Awaitable[None]] | None = None,
+    ) -> None:
+        super().__init__(folder, show, on_live)
         self.workload = workload
         self.seen = Observed()
         self._behaviors: dict[str, asyncio.subprocess.Process] = {}

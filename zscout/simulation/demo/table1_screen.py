@@ -44,7 +44,7 @@ async def play(out: Path | None, *, as_json: bool, live: LiveView | None = None)
     screen = DemoScreen("table1", as_json=as_json, decimals=2, live=live)
     screen.begin("Table 1 of the paper on three nodes of this machine; starting them")
     demo, path = await screen.play(
-        lambda folder: Table1Demo(folder, expected.workload, screen.show),
+        lambda folder: Table1Demo(folder, expected.workload, screen.show, screen.on_live),
         lambda demo: _picture(demo, expected, screen),
         out,
     )

@@ -1,0 +1,33 @@
+"""What a candidate learns from the publications of leaders, to go on from when it leads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from zscout.messages import Grants
+from zscout.scheduling.fair_shares import decayed
+from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.journal.journal import Journal
+from zscout.services.rcm.observed_runtimes import RuntimeObserver
+from zscout.types import Ns
+
+
+class Learned:
+    def __init__(self, keeper: BookingKeeper, runtimes: RuntimeObserver, journal: Journal | None) -> None:
+        self.keeper, self.runtimes, self._journal = keeper, runtimes, journal
+        self._charged: tuple[Mapping[str, float], Ns] = {}, 0
+        """What groups had, by the last publication of it, and when that came."""
+
+    def hear(self, now: Ns, grants: Grants) -> None:
+        """A publication, of a term that is believed."""
+        self.keeper.hear(grants)
+        self.runtimes.hear(now, grants)
+        if grants.charged:
+            self._charged = grants.charged, now
+        if self._journal is not None:
+            self._journal.hear(grants)
+
+    def charged(self, now: Ns, half_life: Ns) -> dict[str, float]:
+        """What each group still counts as having had (`fair_shares.py`)."""
+        charged, at = self._charged
+        return {group: decayed(had, now - at, half_life) for group, had in charged.items()}
