@@ -256,6 +256,33 @@ def bindings(request: ArcRequest, rcs: Iterable[RcName]) -> Iterator[dict[str, P
             yield dict(zip(chosen, request.needs.values(), strict=True))
 
 
+def best_by_rank(asked: Iterable[ArcRequest], free: Iterable[RcName]) -> list[ArcRequest]:
+    """Those of one instant who start on exclusive RCs: in rank order, everyone with whom all before can have places of
+    their own, by trying all. None of those who run can be made to end."""
+    order = sorted(enumerate(asked), key=lambda item: (-item[1].priority, item[1].min_runtime, item[0]))
+    found: list[ArcRequest] = []
+    for _, request in order:
+        if have_places([need for one in (*found, request) for need in one.needs], list(free)):
+            found.append(request)
+    return found
+
+
+def have_places(needs: list[str], free: list[RcName]) -> bool:
+    """Whether each need can have an RC of its own; named ones first, as nothing else will do for these."""
+    named = [need for need in needs if not is_pattern(need)]
+    if len(set(named)) < len(named) or not set(named) <= set(free):
+        return False
+    left = [rc for rc in free if rc not in named]
+    return _fit([need for need in needs if is_pattern(need)], left)
+
+
+def _fit(patterns: list[str], free: list[RcName]) -> bool:
+    if not patterns:
+        return True
+    fits = matcher(patterns[0])
+    return any(fits(rc) and _fit(patterns[1:], [other for other in free if other != rc]) for rc in free)
+
+
 def play(workload: Workload, *, one_by_one: bool = False, fair: FairShares | None = None) -> Replay:
     """Plays a workload to its end.
 

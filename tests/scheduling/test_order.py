@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
 from fractions import Fraction
 
 import pytest
+from msgspec import structs
 
+from tests.scheduling.oracle import best_by_rank
 from tests.scheduling.situations import Situation, decide, less, random_situation
 from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy, StrategyName
-from zscout.keyexpr import matcher
 from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.simulation.replay import replay
@@ -164,28 +164,31 @@ def one_place_each(seed: int) -> Situation:
     return found
 
 
-def best_by_rank(situation: Situation) -> set[str]:
-    """In rank order, everyone with whom all so far can have places of their own, by trying all."""
-    free = {rc for rc in situation.exclusive if all(rc not in asked.needs for asked, _, _ in situation.running)}
-    order = sorted(enumerate(situation.asked), key=lambda item: (-item[1].priority, item[1].min_runtime, item[0]))
-    found: list[ArcRequest] = []
-    for _, asked in order:
-        if have_places([*found, asked], free):
-            found.append(asked)
-    return {asked.arc for asked in found}
-
-
-def have_places(asked: Sequence[ArcRequest], free: set[RcName]) -> bool:
-    if not asked:
-        return True
-    fits = matcher(next(iter(asked[0].needs)))
-    return any(fits(rc) and have_places(asked[1:], free - {rc}) for rc in free)
-
-
 @pytest.mark.parametrize("seeds", [range(100), pytest.param(range(100, times(2000)), marks=pytest.mark.slow)])
 def test_one_place_each_is_shared_out_to_the_best_ranks(seeds: range) -> None:
     for seed in seeds:
         situation = one_place_each(seed)
-        expected = best_by_rank(situation) | {asked.arc for asked, _, _ in situation.running}
         for strategy in ALL:
-            assert decide(situation, strategy).held.keys() == expected, (seed, strategy)
+            assert decide(situation, strategy).held.keys() == expected(situation), (seed, strategy)
+
+
+def gangs(seed: int) -> Situation:
+    """ARCs that want up to three devices each, by name and by tags."""
+    draw = random.Random(seed)  # noqa: S311
+    found = one_place_each(seed)
+    for number, asked in enumerate(found.asked):
+        others = draw.sample(["dev/*#2", "dev/*#3", "dev/$*a$*#4", *found.exclusive], draw.choice((0, 0, 1, 2)))
+        found.asked[number] = structs.replace(asked, needs={need: {} for need in (*asked.needs, *others)})
+    return found
+
+
+@pytest.mark.parametrize("seeds", [range(100), pytest.param(range(100, times(2000)), marks=pytest.mark.slow)])
+def test_gangs_start_in_rank_order_wherever_all_can_have_places(seeds: range) -> None:
+    for seed in seeds:
+        assert decide(gangs(seed), "priority").held.keys() == expected(gangs(seed)), seed
+
+
+def expected(situation: Situation) -> set[str]:
+    running = [asked for asked, _, _ in situation.running]
+    free = {rc for rc in situation.exclusive if all(rc not in asked.needs for asked in running)}
+    return {asked.arc for asked in (*running, *best_by_rank(situation.asked, free))}
