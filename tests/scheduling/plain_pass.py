@@ -23,11 +23,13 @@ class PlainPriority(Priority):
         order = [(arc.rank, arc) for arc in state.queued.values()]
         heapq.heapify(order)
         plan = dry_run(state, None)
-        off_limits = plan.off_limits
+        off_limits = 0
         for rc, holders in plan.unknown:
             actions.propose(rc, holders)
         while order:
             _, arc = heapq.heappop(order)
+            if plan.since is not None and arc.rank >= plan.since:
+                off_limits |= plan.off_limits
             check, verdict = judged(state, arc, off_limits, plan)
             match verdict:
                 case None:

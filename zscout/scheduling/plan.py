@@ -40,7 +40,8 @@ class Plan(NamedTuple):
     dropped: Set[ArcId] = frozenset()  # those given to start that others would end
     mask: int = 0  # bits of the RCs of those that start
     unknown: Sequence[tuple[Rc, HolderSet]] = ()  # the votes counted as yes on which bindings may depend
-    off_limits: int = 0  # bits of the RCs that wait for these votes
+    off_limits: int = 0  # bits of the RCs that wait for these votes,
+    since: Rank | None = None  # for this rank and those below
 
 
 NO_PLAN: Final = Plan()
@@ -109,7 +110,12 @@ class _DryRun:
         while found and off_limits != before:
             before = off_limits
             off_limits |= union(mask for mask in reach.values() if mask & before)
-        return {"unknown": found, "off_limits": off_limits}
+        # An operator waits for nobody's votes but its own.
+        waiting = (
+            arc for arc in started if reach.get(arc.id, 0) & off_limits and not self.state.operator(arc.priority)
+        )
+        since = min((arc.rank for arc in waiting), default=None)
+        return {"unknown": found, "off_limits": off_limits, "since": since} if since is not None else {}
 
     def _run(self) -> None:
         state, index, heap = self.state, self.state.index, self._heap

@@ -82,7 +82,7 @@ def run_pass(
     plan = dry_run(state, reserved) if plan is None else plan
     for rc, holders in plan.unknown:
         actions.propose(rc, holders)
-    Pass(state, actions, reserved, plan).run(state.index.ready.values(), off_limits | plan.off_limits)
+    Pass(state, actions, reserved, plan).run(state.index.ready.values(), off_limits)
 
 
 def reasons_of_now(state: SchedulerState) -> Iterator[tuple[Arc, Reason]]:
@@ -115,7 +115,7 @@ class Pass:
     def __init__(
         self, state: SchedulerState, actions: Actions, reserved: Reservations | None = None, plan: Plan = NO_PLAN
     ) -> None:
-        self.state, self.actions, self.reserved, self.plan = state, actions, reserved, plan.bound
+        self.state, self.actions, self.reserved, self.plan = state, actions, reserved, plan
         self.votes, self.index = state.votes, state.index
         self.off_limits = 0
         self.changed = 0  # bits of the RCs changed since the last pass began
@@ -140,6 +140,8 @@ class Pass:
                     continue
             # An ARC may be queued twice in the heap; duplicates are adjacent because ranks are unique.
             if arc.rank != last:
+                if self.plan.since is not None and arc.rank >= self.plan.since:
+                    self._put_off_limits(self.plan.off_limits, last)
                 last = arc.rank
                 if arc.footprint is None or not self._still_deferred(arc, arc.footprint):
                     self._check(arc)
@@ -160,7 +162,7 @@ class Pass:
         if not self.off_limits & class_of(arc).reach and short(self.state, arc):
             self._watch_class(arc)
             return
-        verdict = judge_bindings(self.state, arc, self.reserved, self.off_limits, self.plan.get(arc.id))
+        verdict = judge_bindings(self.state, arc, self.reserved, self.off_limits, self.plan.bound.get(arc.id))
         if verdict is None:
             self.index.put(arc, ArcState.READY)
             self.actions.wait(arc, no_match(self.state, arc))
