@@ -52,6 +52,7 @@ request robot/a --min-runtime never | --min-runtime: "never" is not a duration
 request robot/a --min-runtime 0 | --min-runtime must be positive, and is 0; write more than 0, at most 3660 d
 request robot/a --for 1h | there is no option --for; did you mean --min-runtime or --release-after? (see zscout request
 usage --user ada | there is no option --user (see zscout usage --help)
+maintain robot/a --reason stuck | there is no option --reason; did you mean --comment?
 history --device robot/a | there is no option --device; did you mean --rc?
 request robot/a --timeout -1 | --timeout: "-1" is not a duration
 request robot/a --name a/b | --name "a/b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
@@ -96,6 +97,7 @@ maintain robot/* --for 1h --at 9:00 | robot/* is a pattern; name each device for
 maintain robot/a robot/a --for 1h --at 9:00 | zscout: robot/a is named twice; name each device once
 slots robot/a --for 1h --within 500d | --within: 500 d is out of range; write 1.0 s to 366 d
 slots robot/a --for 1h --limit 0 | --limit: 0 is out of range; write 1 to 50
+bookings --date nosuch | --date: "nosuch" is not a date;
 booking cancel x --date someday | --date: "someday" is not a date; write "now", "tue 14:00", "tomorrow 9:00", "14:30"
 history --since soon | --since: "soon" is not a time
 history --since 2999-01-01 | --since: "2999-01-01" is in the future; write an earlier date
