@@ -8,6 +8,9 @@ Takes orders as JSON lines on stdin and tells what happens as JSON lines on stdo
     {"do": "command", "id": ..., "rc": ..., "action": {...}}       {"do": "release" | "cancel", "id": ...}
     {"do": "quit"}
 
+With `KEYS` in its environment, a folder with ca.pem, cert.pem and key.pem, it joins a fleet with `[security]`; HOST is
+the certificate's name.
+
 `rc` is an RC, or a pattern of the request: the command goes to the RC that meets it.
 """
 
@@ -102,6 +105,7 @@ class OpenRequest:
     asked: Json
     state: str = "asking"
     place: Any = None
+    seal: Any = None
     grant: Any = None
     rcs: tuple[str, ...] = ()
     bound: Json = field(default_factory=dict)
@@ -161,6 +165,7 @@ class PlainClient:
             changed = new != (request.state, request.grant)
             request.state = notice["state"]
             request.place = notice.get("place", request.place)
+            request.seal = notice.get("seal", request.seal)
             request.grant = notice.get("grant") if request.state == "running" else None
             if request.state == "running":
                 request.rcs, request.bound = tuple(notice["rcs"]), notice.get("bound", {})
@@ -192,6 +197,7 @@ class PlainClient:
             for request in self.requests.values():
                 told = {field: request.asked[field] for field in fields if field in request.asked}
                 told |= {"place": request.place} if request.place is not None else {}
+                told |= {"seal": request.seal} if request.seal is not None else {}
                 told |= {"grant": request.grant} if request.grant is not None else {}
                 requests.append(told)
             answer = {"client": f"{self.host}/{self.name}", "requests": requests}
@@ -221,6 +227,8 @@ class PlainClient:
             message = {"op": "request"} | request.asked
             if request.place is not None:
                 message["place"] = request.place
+            if request.seal is not None:
+                message["seal"] = request.seal
         for good, answer in self.schedule("Ask", message):
             if not good and answer["code"] not in TRY_AGAIN:
                 with self.lock:
@@ -333,6 +341,17 @@ def tell(what: str, **details: Any) -> None:
         print(json.dumps({"what": what} | details), flush=True)
 
 
+def secured(keys: str | None) -> Json:
+    if keys is None:
+        return {}
+    tls: Json = {"root_ca_certificate": f"{keys}/ca.pem", "enable_mtls": True}
+    for side in ("listen", "connect"):
+        tls |= {f"{side}_certificate": f"{keys}/cert.pem", f"{side}_private_key": f"{keys}/key.pem"}
+    tls |= {"verify_name_on_connect": False, "close_link_on_expiration": False}
+    listen = {"listen/endpoints": ["tls/0.0.0.0:0"], "transport/link/protocols": ["tls"]}
+    return {**listen, "transport/link/tls": tls}
+
+
 def settings(multicast: str, lease: float) -> zenoh.Config:
     config = zenoh.Config()
     for key, value in {
@@ -347,6 +366,7 @@ def settings(multicast: str, lease: float) -> zenoh.Config:
         "scouting/gossip/autoconnect_strategy": GREATER_CONNECTS,
         "transport/link/tx/lease": round(lease * 1000),
         "transport/shared_memory/enabled": False,
+        **secured(os.environ.get("KEYS")),
     }.items():
         config.insert_json5(key, json.dumps(value))
     return config
