@@ -23,7 +23,7 @@ from zscout.scheduling.model import ArcRequest, Event, Granted, HoldEnded, RcJoi
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.simulation.replay import replay
 from zscout.simulation.workload import Arrival, Workload, WorkloadRc
-from zscout.types import SECOND, ArcId, Ns, RcName
+from zscout.types import SECOND, ArcId, Ns, Params, RcName
 
 Span = tuple[ArcId, Ns, Ns, tuple[RcName, ...]]
 
@@ -60,8 +60,10 @@ def test_a_radio_is_not_kept_for_those_who_come_later() -> None:
     """`short` is over before `second` is there, and `first`, which comes meanwhile, leaves it room."""
 
     def asks(at: int, name: str, seconds: int, rate: int | None, *robots: str) -> Arrival:
-        radio = {} if rate is None else {"radio/0": {"rate": Fraction(rate)}}
-        return Arrival(at * SECOND, ArcRequest(name, "h/c", {rc: {} for rc in robots} | radio, 1, seconds * SECOND))
+        needs: dict[RcName, Params] = {rc: {} for rc in robots}
+        if rate is not None:
+            needs["radio/0"] = {"rate": Fraction(rate)}
+        return Arrival(at * SECOND, ArcRequest(name, "h/c", needs, 1, seconds * SECOND))
 
     rcs = (WorkloadRc("dev/0"), WorkloadRc("radio/0", sharable=True, capacity={"rate": Fraction(6)}))
     work = Workload(
