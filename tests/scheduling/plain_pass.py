@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from zscout.scheduling.admission import MAX_BINDINGS, Admissible, AdmissionCheck, Verdict, VotesNeeded, _blamed, judge
 from zscout.scheduling.model import Arc
 from zscout.scheduling.patterns import Choices, alternatives, no_match
-from zscout.scheduling.plan import Plan, dry_run
+from zscout.scheduling.plan import BindingPlan, dry_run
 from zscout.scheduling.priority import VOTING, Priority, _pattern_of
 from zscout.scheduling.reason import ReasonCode, of_rcs
 from zscout.scheduling.reservations import Inadmissible
@@ -60,7 +60,9 @@ class PlainPriority(Priority):
                     actions.start(arc)
 
 
-def judged(state: SchedulerState, arc: Arc, off_limits: int, plan: Plan) -> tuple[AdmissionCheck, Verdict | None]:
+def judged(
+    state: SchedulerState, arc: Arc, off_limits: int, plan: BindingPlan
+) -> tuple[AdmissionCheck, Verdict | None]:
     """Of its bindings, the planned and then one after the other, the first that nothing but a vote keeps out, else the
     best."""
     check = AdmissionCheck(state, arc)

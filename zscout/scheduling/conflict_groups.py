@@ -16,7 +16,7 @@ from operator import attrgetter
 from zscout.scheduling.model import Arc, Rank, Rc, union
 from zscout.scheduling.packing import PackingItem, PackingProblem
 from zscout.scheduling.patterns import alternatives, bind_all
-from zscout.scheduling.plan import NO_PLAN, Plan, dry_run
+from zscout.scheduling.plan import NO_PLAN, BindingPlan, dry_run
 from zscout.scheduling.queue_index import Watched
 from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.state import Actions, SchedulerState
@@ -25,7 +25,7 @@ from zscout.types import ArcId, Ns
 
 
 def undecided_arcs(
-    state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None, plan: Plan = NO_PLAN
+    state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None, plan: BindingPlan = NO_PLAN
 ) -> list[Arc] | None:
     """The queued ARCs that might start, best-ranked first, then the running ARCs that might end; None: over `limit`.
     ARCs are bound as planned; the others to what these leave, as far as possible."""
@@ -35,7 +35,7 @@ def undecided_arcs(
 
 
 class _Search:
-    def __init__(self, state: SchedulerState, reserved: Reservations | None, plan: Plan) -> None:
+    def __init__(self, state: SchedulerState, reserved: Reservations | None, plan: BindingPlan) -> None:
         self.state, self.votes, self.reserved, self.plan = state, state.votes, reserved, plan
         self.preemptible: dict[ArcId, Arc] = {}  # running ARCs that might have to end
         self._heap: list[
@@ -131,7 +131,7 @@ class _Search:
 
 
 def conflict_groups(
-    state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None, plan: Plan = NO_PLAN
+    state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None, plan: BindingPlan = NO_PLAN
 ) -> list[ConflictGroup]:
     """The groups with a choice, best-ranked first; none if more than `limit` ARCs could start.
 
@@ -147,10 +147,10 @@ def conflict_groups(
 def take_all(
     state: SchedulerState,
     reserved: Reservations | None,
-    plan: Plan,
+    plan: BindingPlan,
     taken: list[tuple[ConflictGroup, int]],
     actions: Actions,
-) -> Plan:
+) -> BindingPlan:
     """Take these sets, and return the plan of a pass after that. A group with an ARC that this pass would end again is
     left to it."""
     while taken and plan is not NO_PLAN:
@@ -223,7 +223,7 @@ def _one_group(arcs: Sequence[Arc]) -> bool:
 
 class ConflictGroup:
     def __init__(
-        self, state: SchedulerState, arcs: list[Arc], reserved: Reservations | None = None, plan: Plan = NO_PLAN
+        self, state: SchedulerState, arcs: list[Arc], reserved: Reservations | None = None, plan: BindingPlan = NO_PLAN
     ) -> None:
         self.state, self.votes = state, state.votes
         now = state.now
@@ -302,7 +302,7 @@ class ConflictGroup:
         ending = [arc for arc, is_taken in zip(self.arcs, taken, strict=True) if not is_taken and arc.hold is not None]
         return starting, ending
 
-    def take(self, chosen: int, actions: Actions, plan: Plan) -> None:
+    def take(self, chosen: int, actions: Actions, plan: BindingPlan) -> None:
         """Preempt the running ARCs outside the set, start the queued ARCs in it."""
         starting, ending = self.changes(chosen)
         for arc in starting:

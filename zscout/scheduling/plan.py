@@ -33,7 +33,7 @@ _versions = itertools.count(-2, -1)
 """Of the states of dry runs: what is cached of these never serves the real ones."""
 
 
-class Plan(NamedTuple):
+class BindingPlan(NamedTuple):
     bound: Mapping[ArcId, Mapping[Need, RcName]] = {}  # of the ARCs with patterns that start
     started: Set[ArcId] = frozenset()
     ended: Set[ArcId] = frozenset()  # running ARCs; some start on other RCs
@@ -44,12 +44,12 @@ class Plan(NamedTuple):
     since: Rank | None = None  # for this rank and those below
 
 
-NO_PLAN: Final = Plan()
+NO_PLAN: Final = BindingPlan()
 
 
 def dry_run(
     state: SchedulerState, reserved: Reservations | None, starting: Iterable[Arc] = (), ending: Iterable[Arc] = ()
-) -> Plan:
+) -> BindingPlan:
     """What a pass of `priority` would do; first these end and start. NO_PLAN where no ARC has a pattern."""
     by_pattern = state.by_pattern or state.running_by_pattern
     return _DryRun(state, reserved).play(starting, ending) if by_pattern else NO_PLAN
@@ -71,7 +71,7 @@ class _DryRun:
         self._presumed: dict[ArcId, tuple[int, list[tuple[Rc, HolderSet]]]] = {}
         """By ARC: the votes that were counted as yes when it started, and bits of the RCs that it takes and frees."""
 
-    def play(self, starting: Iterable[Arc], ending: Iterable[Arc]) -> Plan:
+    def play(self, starting: Iterable[Arc], ending: Iterable[Arc]) -> BindingPlan:
         state = self.state
         version, busy = state.version, state.busy
         owners = state.running_by_owner.copy(), state.held_by_owner.copy()
@@ -84,7 +84,7 @@ class _DryRun:
             started = self._started.values()
             bound = {arc.id: arc.bound for arc in started if arc.patterns}
             mask = union(arc.mask for arc in started)
-            plan = Plan(bound, self._started.keys(), self._ended.keys(), frozenset(self._dropped), mask)
+            plan = BindingPlan(bound, self._started.keys(), self._ended.keys(), frozenset(self._dropped), mask)
             return plan._replace(**self._depends()) if self._presumed else plan
         finally:
             for arc in self._started.values():

@@ -48,7 +48,7 @@ from zscout.config.scheduling_policy import RcQuota, StrategyName
 from zscout.scheduling.admission import Admissible, AdmissionCheck, Verdict, VotesNeeded, judge, judge_bindings
 from zscout.scheduling.model import Arc, ArcState, PatternClass, Rank, Rc
 from zscout.scheduling.patterns import all_present, alternatives, bind, class_of, no_match, short
-from zscout.scheduling.plan import NO_PLAN, Plan, dry_run
+from zscout.scheduling.plan import NO_PLAN, BindingPlan, dry_run
 from zscout.scheduling.queue_index import Watched
 from zscout.scheduling.reason import Reason, ReasonCode, of_rcs
 from zscout.scheduling.reservations import Inadmissible, Reservations
@@ -73,7 +73,7 @@ def run_pass(
     *,
     off_limits: int = 0,
     reserved: Reservations | None = None,
-    plan: Plan | None = None,
+    plan: BindingPlan | None = None,
 ) -> None:
     """One pass over the ARCs that changes affect.
 
@@ -113,7 +113,7 @@ class Pass:
     """Checks the ready ARCs and the watchers of freed RCs, in rank order."""
 
     def __init__(
-        self, state: SchedulerState, actions: Actions, reserved: Reservations | None = None, plan: Plan = NO_PLAN
+        self, state: SchedulerState, actions: Actions, reserved: Reservations | None = None, plan: BindingPlan = NO_PLAN
     ) -> None:
         self.state, self.actions, self.reserved, self.plan = state, actions, reserved, plan
         self.votes, self.index = state.votes, state.index
