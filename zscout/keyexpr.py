@@ -217,6 +217,7 @@ class Keys:
     vote = _rc_key("vote")
     command_any = _rc_key("command/*/*")
     rc_state = _rc_key("state")
+    asked_state_any = _rc_key("state/*/*")
     frame = _rc_key("frame")
     load = _host_key("load")
     confirm_any = _host_key("confirm/*/*")
@@ -265,6 +266,10 @@ class Keys:
     def ask_state(self, sender: Sender) -> str:
         """Where the leader is asked for the state. RCs, candidates and others of a node ask on `rcm_state`."""
         return self._asked("rcm/state", sender)
+
+    def ask_rc_state(self, rc: str, sender: Sender) -> str:
+        """Where people ask an RC for its state; leaders ask on `rc_state`, also for a promise."""
+        return f"{self.rc_state(rc)}/{_sender(sender)}" if self.closed else self.rc_state(rc)
 
     def ask_bookings(self, sender: Sender) -> str:
         return self._asked("rcm/bookings", sender)
@@ -403,6 +408,7 @@ ACCESS: Final = (
     Access("rc/{rc}/command/{by}/*", ask=USERS, serve=NODES),
     # Who asks may ask for a promise: a leader's right.
     Access("rc/{rc}/state", ask=_MANAGERS, serve=NODES, publish=NODES, subscribe=_ALL),
+    Access("rc/{rc}/state/{by}/*", ask=_ALL, serve=NODES),
     Access("rc/{rc}/frame", publish=NODES, subscribe=_ALL),
     Access("host/{at}/load", publish=NODES, subscribe=_ALL),
     Access("host/{at}/component/{by}/*", ask=_ALL, serve=NODES),

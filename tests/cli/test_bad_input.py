@@ -52,6 +52,7 @@ request robot/a --min-runtime never | --min-runtime: "never" is not a duration
 request robot/a --min-runtime 0 | --min-runtime must be positive, and is 0; write more than 0, at most 3660 d
 request robot/a --for 1h | there is no option --for; did you mean --min-runtime or --release-after? (see zscout request
 usage --user ada | there is no option --user (see zscout usage --help)
+maintain robot/a --reason stuck | there is no option --reason; did you mean --comment?
 history --device robot/a | there is no option --device; did you mean --rc?
 request robot/a --timeout -1 | --timeout: "-1" is not a duration
 request robot/a --name a/b | --name "a/b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -

@@ -112,6 +112,8 @@ def test_an_old_spelling_names_the_new_at_a_terminal_alone(
         ("ps", "; use zscout status"),
         ("lock", "; use zscout request"),
         ("KILL", "; use zscout cancel"),
+        ("disable", "; use zscout maintain"),
+        ("when", "; use zscout slots"),
         ("xyzzy", ""),
     ],
 )
@@ -262,7 +264,7 @@ def test_bash_completes_at_tab(tmp_path: Path) -> None:
         assert terminal.code() == 0
 
 
-@pytest.mark.parametrize("text", ["", "5x", "-1", "1e3", "nan", "1_0", "٣", "5 s", "mm", "0", "1ss", "99999999h"])
+@pytest.mark.parametrize("text", ["", "5x", "-1", "1e3", "nan", "1_0", "٣", "5  s", "mm", "0", "1ss", "99999999h"])
 def test_what_is_no_duration_is_refused(text: str) -> None:
     with pytest.raises(BadInput, match="--timeout"):
         parse_duration(text, "--timeout")

@@ -74,6 +74,7 @@ def test_seconds_out_of_range(seconds: str) -> None:
     [
         ("5", "5"), ("1.5", "1.5"), (".5", "0.5"), ("90s", "90"), ("300ms", "0.3"), ("5m", "300"), ("2h", "7200"),
         ("1d12h", "129600"), ("1d", "86400"), ("2h30m", "9000"), ("1.5h", "5400"), ("1m3s", "63"), ("5m3ms", "300.003"),
+        ("5min", "300"), ("5 m", "300"), ("1 d 2 h", "93600"), ("29 min 45 s", "1785"), ("2 ms", "0.002"),
     ],
 )  # fmt: skip
 def test_a_duration(text: str, seconds: str) -> None:
@@ -81,7 +82,27 @@ def test_a_duration(text: str, seconds: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "s", "soon", "5 m", "5min", "1m1h", "1h1h", "1d12", "-1", "+1", "1e3", "inf", "m5", "٣s", "5m\n"]
+    "text",
+    [
+        "",
+        "s",
+        "soon",
+        "5  m",
+        "5minutes",
+        "5 mi n",
+        "5 ",
+        " 5m",
+        "1m1h",
+        "1h1h",
+        "1d12",
+        "-1",
+        "+1",
+        "1e3",
+        "inf",
+        "m5",
+        "٣s",
+        "5m\n",
+    ],
 )
 def test_no_duration(text: str) -> None:
     assert strict.parse_duration(text) is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import signal
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from tests.live.closed import ClosedLab
 from tests.live.lab import awaited
 from zscout.behaviors.client.arc import Revoked, hold
 from zscout.behaviors.client.client import RequestRefused
-from zscout.messages import ComponentSpec, ComponentView, LoadReport, StartComponent, StopComponent
+from zscout.messages import ComponentSpec, ComponentView, LoadReport, RcAsk, RcState, StartComponent, StopComponent
+from zscout.types import Term
 
 pytestmark = pytest.mark.live
 
@@ -33,6 +35,25 @@ async def test_a_component_starts_and_holds_on_a_secured_fleet(lab: ClosedLab) -
     await lab.state(ada, lambda state: any(hold.client.startswith("anvil/counter.") for hold in state.holds))
     done = await lab.zscout("component", "list", env=env_of(lab, "wall"))
     assert "running" in done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["wall", "bob"])
+async def test_health_and_capacity_of_devices_are_shown_to_everybody(lab: ClosedLab, name: str) -> None:
+    """RCs answer a state's question of all, who may not ask them for a promise."""
+    lab.node("anvil", "robot/a:rate=10")
+    person = await lab.person(name)
+    await lab.ready(person, "robot/a")
+    done = await lab.zscout("status", "--json", env=env_of(lab, name))
+    (device,) = json.loads(done.stdout)["rcs"]
+    assert (device["health"], device["capacity"]) == ("ok", {"rate": 10.0})
+    forged = RcAsk(promise=Term(9, "forger"))
+    reply = await person.mesh.ask_one(
+        person.mesh.keys.ask_rc_state("robot/a", person.mesh.me), forged, RcState, timeout=HANG
+    )
+    assert reply is not None
+    assert reply.message is not None
+    assert reply.message.term.counter < 9
 
 
 @pytest.mark.slow

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 import threading
 import time
 from typing import Any
 
 import pytest
 import zenoh
+from msgspec.structs import replace
 
 from tests.hang import HANG
 from tests.mesh.both_meshes import ASK, LONG, NEWS, Ping, Pong, World, token
-from zscout.config.fleet import default_fleet
+from zscout.config.fleet import MeshConfig, default_fleet
 from zscout.keyexpr import Role, Sender
-from zscout.mesh import ZenohMesh, zenoh_mesh
+from zscout.mesh import MeshError, ZenohMesh, zenoh_mesh
 
 
 class StuckSession:
@@ -113,3 +115,16 @@ async def test_nothing_is_handled_after_the_mesh_is_closed(world: World) -> None
     assert (await b.ask(ASK, Ping(), Pong, timeout=LONG), handled) == ([], [])
     a.put(NEWS, Ping())
     late.close()
+
+
+def test_a_port_in_use_is_named_without_the_places_in_zenohs_source() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        mesh = MeshConfig(listen=(f"tcp/127.0.0.1:{port}",), multicast=False)
+        opening = ZenohMesh.open(replace(default_fleet(), mesh=mesh), Sender("anvil", "script"))
+        with pytest.raises(MeshError) as refused:
+            asyncio.run(opening)
+    words = str(refused.value)
+    assert f"127.0.0.1:{port}: Address already in use" in words
+    assert ".rs" not in words
+    assert words.endswith("]; check listen and connect under [mesh]")

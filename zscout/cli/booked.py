@@ -94,6 +94,18 @@ def in_maintenance(told: BookingsTold | None) -> dict[str, str]:
     }
 
 
+def coming(told: BookingsTold | None) -> dict[str, str]:
+    """The next booking of each RC within 24 h, and when it begins: `calib (ada@desk) from 14:30`."""
+    found = [
+        (date.start, rc, clean(f"{booking.name} ({whose(booking)}) from {clock(date.start - told.time)}"))
+        for booking in (told.bookings if told is not None else ())
+        for date in booking.dates
+        if told is not None and date.state == "open" and 0 < date.start - told.time < SOON
+        for rc in (date.bound.get(need, need) for need in booking.needs)
+    ]
+    return {rc: words for _, rc, words in sorted(found, reverse=True)}
+
+
 def explained(refused: RequestRefused) -> Exception:
     """What to raise instead: bad input has its own exit code."""
     return BadInput(str(refused)) if refused.code in BAD else refused

@@ -213,6 +213,12 @@ def unknown(what: str, name: str, known: Iterable[str], nothing: str, listed: st
     return Failed(f"unknown {what} {quoted(name)}{hint_at(name, known, nothing, listed, more)}")
 
 
+def device_named(state: RcmState, name: str) -> str | None:
+    """The device of this name, or the only device that may be meant by it: `robot/arm1` by `arm1`."""
+    alike = [view.rc for view in state.rcs if name in (view.rc, view.rc.partition("/")[2])]
+    return name if name in alike else alike[0] if len(alike) == 1 else None
+
+
 def hint_at(name: str, known: Iterable[str], nothing: str, listed: str, more: int = 0) -> str:
     """The end of a line that says that nobody knows `name`: what was meant, perhaps."""
     names = sorted(set(known))

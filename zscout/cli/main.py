@@ -80,9 +80,11 @@ request DEVICE -- COMMAND = run exec srun sbatch; book = reserve schedule; take 
 release = unlock free return give drop yield; cancel = kill scancel abort end rm delete remove
 component logs = log output tail; component migrate = move mv; component kinds = kinds types
 why = explain reason; view = timeline viewer gui ui rerun; view --web = web dashboard
-history = sacct events journal past; booking export = export ics; booking import = import; maintain = maintenance
-drain = cordon; uncordon = undrain resume; doctor = check diagnose debug ping; node = daemon serve up agent server
-cert = certs certificate login; simulate = sim simulator; motion = detect camera; --version = version; --help = help
+history = sacct events journal past; booking export = export ics; booking import = import
+maintain = maintenance disable offline; booking cancel = enable; booking list = reservations; slots = when next
+drain = cordon; uncordon = undrain resume; doctor = check diagnose debug ping health
+node = daemon serve up agent server; cert = certs certificate login; simulate = sim simulator
+motion = detect camera; --version = version; --help = help
 """
 """What to write, and names that people try for it and that never were commands."""
 INSTEAD: Final = {
@@ -221,6 +223,7 @@ OTHER_OPTIONS: Final = {
     "--device": ("--rc",),
     "--request": ("--arc",),
     "--from": ("--since",),
+    "--reason": ("--comment",),
 }
 """Options that other commands or other programs have, and those that may be meant."""
 

@@ -43,7 +43,8 @@ _DEEP_KEY: Final = re.compile(rf"""(?<![\w"'\\-]){_PART}(?:[ \t]*+\.[ \t]*+{_PAR
 """A dotted key that is longer than any here. tomllib takes hours over one that fills the file."""
 _NUMBER: Final = r"([0-9]{1,19}(?:\.[0-9]{1,18})?|\.[0-9]{1,18})"
 _DURATION: Final = re.compile(
-    f"{_NUMBER}|(?:{_NUMBER}d)?(?:{_NUMBER}h)?(?:{_NUMBER}m(?!s))?(?:{_NUMBER}s)?(?:{_NUMBER}ms)?"
+    f"{_NUMBER}|(?:{_NUMBER} ?d ?)?(?:{_NUMBER} ?h ?)?(?:{_NUMBER} ?m(?:in|(?!s)) ?)?(?:{_NUMBER} ?s ?)?"
+    f"(?:{_NUMBER} ?ms)?"
 )
 _UNITS: Final = tuple(map(Decimal, ("1", "86400", "3600", "60", "1", "0.001")))
 DURATIONS: Final = "a number of seconds, or with units: 1.5, 300ms, 90s, 5m, 2h, 1d12h"
@@ -246,7 +247,7 @@ def secret(wanted: str) -> Meta:
 
 
 def parse_duration(text: str) -> Decimal | None:
-    """Seconds from `5`, `1.5`, `90s`, `300ms`, `5m`, `2h` or `1d12h`; None for what is no duration."""
+    """Seconds from `5`, `1.5`, `90s`, `300ms`, `5m`, `2h`, `1d12h` or as messages write it, `1 min 30 s`; else None."""
     found = _DURATION.fullmatch(text)
     if found is None or not any(found.groups()):
         return None

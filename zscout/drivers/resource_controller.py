@@ -161,6 +161,8 @@ class ResourceController:
         self._served = []
         if state is not InstanceState.STANDS_BY:
             self._served.append(mesh.serve(keys.rc_state(self.name), messages.RcAsk, self._on_state_query))
+            if keys.closed:
+                self._served.append(mesh.serve(keys.asked_state_any(self.name), messages.RcAsk, self._on_question))
         if state is InstanceState.SERVES:
             if self.driver.sharable:
                 self._served.append(mesh.serve(keys.vote(self.name), messages.Proposal, self._on_proposal))
@@ -268,6 +270,10 @@ class ResourceController:
             self._promise(query, above=False)
         else:
             self.supervisor.spawn(self._promise_above(query, query.message.above))
+
+    def _on_question(self, query: IncomingQuery[messages.RcAsk]) -> None:
+        """Of somebody who may not ask for a promise."""
+        query.answer(self._rc_state([]))
 
     async def _promise_above(self, query: IncomingQuery[messages.RcAsk], host: str) -> None:
         seen = await self.mesh.living(self.mesh.keys.alive_any(Role.CANDIDATE), timeout=REREAD_TIMEOUT)

@@ -250,7 +250,9 @@ async def _open(config: MeshConfig, security: Security | None) -> Transport:
         )
         raise
     except zenoh.ZError as error:
-        raise MeshError(f"the mesh can't be joined: {error}; check listen and connect under [mesh]") from None
+        # Without the places in Zenoh's source.
+        why = re.sub(r" at \S+\.rs:[0-9]+\.?", "", str(error))
+        raise MeshError(f"the mesh can't be joined: {why}; check listen and connect under [mesh]") from None
     try:
         # A relay leaves relinking to its sites, which know its address.
         relinks = config.multicast and not config.relay

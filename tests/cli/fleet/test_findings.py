@@ -118,13 +118,14 @@ def test_who_has_no_role_is_told_so() -> None:
         (MeshConfig(multicast=False), {}, "it is off, and `connect` names nobody: no host finds another"),
         (MeshConfig(), {"interfaces": {"eth0": "Network is unreachable"}}, "(eth0: Network is unreachable)"),
         (MeshConfig(), {"interfaces": {}}, "(no interface is up for it)"),
+        (MeshConfig(), {"interfaces": {}}, '; for this host alone, write interface = "lo" in each file'),
         (MeshConfig(), {"heard": []}, "nobody is heard at 224.0.0.224:7446 on eth0"),
     ],
 )
 def test_without_multicast_nobody_is_found(mesh: MeshConfig, more: dict[str, object], says: str) -> None:
     alone = seen(replace(PLAIN, mesh=mesh), **more, links=0, hosts={}, state=None)
     (found,) = [one for one in findings(alone) if one.about == "multicast"]
-    assert (found.state, says in found.says) == ("mend", True)
+    assert (found.state, says in str(found)) == ("mend", True)
     # Links by `connect` do without.
     linked = seen(replace(PLAIN, mesh=replace(mesh, connect=("tcp/anvil:7447",))), **more)
     assert [one.state for one in findings(linked) if one.about == "multicast"] == ["note"]

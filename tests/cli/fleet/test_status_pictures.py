@@ -114,8 +114,9 @@ class Picture:
         self.hosts[at].tokens.add(Token(at, Role.RC, name, "i"))
         health, rate = options.get("health", "ok"), float(options.get("rate", 0))
         self.health[name] = RcState(name, at, "i", shared, health=health, figures={"rate": rate} if rate else {})
-        if options.get("kept") == "maintenance":
-            date = BookedDate(round(NOW.timestamp()) - 60, round(NOW.timestamp()) + 60, "open")
+        if (kept := options.get("kept")) is not None:
+            start = round(NOW.timestamp()) + {"maintenance": -60, "booked": 3600}[kept]
+            date = BookedDate(start, start + 120, "open")
             view_of = BookingView(
                 id="b1",
                 owner="anvil",
@@ -125,7 +126,7 @@ class Picture:
                 priority=0,
                 runtime=Decimal(120),
                 patience=Decimal(0),
-                maintenance=True,
+                maintenance=kept == "maintenance",
                 dates=[date],
             )
             self.booked.bookings.append(view_of)

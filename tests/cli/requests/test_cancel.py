@@ -60,7 +60,7 @@ def test_a_name_of_several_is_refused_with_the_list(fleet: CliFleet) -> None:
     holds = fleet.state(lambda state: len(state.holds) == 2).holds
     names = [f"{hold.client}/{hold.id}" for hold in holds]
     assert refused.stderr.startswith('zscout: 2 requests are called "twin": ')
-    assert all(name in refused.stderr for name in names)
+    assert all(f"{name} (running)" in refused.stderr for name in names)
     assert fleet.zscout("cancel", names[0]).returncode == 0
     (left,) = fleet.state(lambda state: len(state.holds) == 1).holds
     assert f"{left.client}/{left.id}" == names[1]
@@ -77,8 +77,8 @@ def test_an_unknown_arc_is_one_line(fleet: CliFleet) -> None:
         done.stderr
         == 'zscout: no request "nobody" holds or waits; see zscout status, or zscout booking list for bookings\n'
     )
-    device = fleet.zscout("release", "robot/a").stderr
-    assert device.endswith("it is a device: zscout status robot/a shows which request holds it\n")
+    device = fleet.zscout("release", "a").stderr
+    assert device.endswith("; robot/a is a device: zscout status robot/a shows which requests hold it or wait\n")
 
 
 def test_anothers_request_is_asked_about(fleet: CliFleet) -> None:

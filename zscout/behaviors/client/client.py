@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 import logging
 import os
 import socket
@@ -15,7 +14,7 @@ from typing import Any, Final, Generic, Self, TypeVar
 from msgspec.structs import replace
 
 from zscout import messages
-from zscout.behaviors.client.confirmation import NOT_DONE, NOT_HELD
+from zscout.behaviors.client.confirmation import NOT_DONE
 from zscout.behaviors.client.identity import checked_comment, this_program
 from zscout.behaviors.client.internals import ClientInternals
 from zscout.behaviors.client.rcm_link import QUERY_TIMEOUT, TRY_AGAIN
@@ -34,7 +33,7 @@ from zscout.keyexpr import USERS, Role, Sender, Token, check_name, new_instance,
 from zscout.mesh import Mesh, ZenohMesh
 from zscout.mesh.exchange import naming_versions
 from zscout.mesh.supervision import done_within
-from zscout.messages import Done, Foresight, Notice, Problem, RcmState, Who
+from zscout.messages import Done, Foresight, Problem, RcmState, Who
 from zscout.types import SECOND, Grant
 
 __all__ = ["QUERY_TIMEOUT", "TRY_AGAIN", "Client", "CommandRefused", "NoRcm", "RequestRefused"]
@@ -46,11 +45,6 @@ LOOK_FOR_RCM: Final = 3.0
 LOOK_FOR_TAKEOVER: Final = 5.0
 """The same where a candidate is seen."""
 MAX_NAMED: Final = 5
-REJOINS: Final = 0.5
-"""Seconds for which a command is sent again that ended without an answer: others know a new session by then."""
-AGAIN: Final = 0.05
-TOLD_WITHIN = 1.0
-"""Seconds within which a notice says so too; else the RC is believed."""
 
 
 class Client:
@@ -60,16 +54,13 @@ class Client:
     def __init__(self, mesh: Mesh, fleet: Fleet) -> None:
         self.mesh, self.fleet = mesh, fleet
         # For zscout's own modules; may change without notice.
-        self.internals = own = ClientInternals(mesh, fleet, self._command, self._on_notice)
+        self.internals = own = ClientInternals(mesh, fleet)
         self._store, self._rcm, self._supervisor = own.store, own.rcm, own.supervisor
         self._confirmations = own.confirmations
         self.who: Who | None = None
         """User, host and command, shown to other people. `connect` sets it."""
         self.waits_for_devices = False
         """Default of the argument `wait_for_device`."""
-        self._commanded = itertools.count(1)
-        self._denied: set[Grant] = set()
-        """Grants that an RC says are over, and no notice yet."""
 
     @classmethod
     def connect(
@@ -302,7 +293,7 @@ class Client:
         `timeout` seconds for the answer. Raises CommandRefused."""
         began = self.mesh.now()
         try:
-            return await self._command(rc, grant, do, ttl=ttl, timeout=timeout)
+            return await self.internals.command(rc, grant, do, ttl=ttl, timeout=timeout)
         except CommandRefused as refused:
             confirmation = self._confirmations.pending(grant)
             if confirmation is None or refused.code not in NOT_DONE:
@@ -310,51 +301,7 @@ class Client:
             left = ttl - (self.mesh.now() - began) / SECOND
             if not await done_within(max(0.0, left), confirmation.over()) or not confirmation.all:
                 raise
-        return await self._command(rc, grant, do, ttl=ttl, timeout=timeout)
-
-    async def _command(
-        self, rc: str, grant: Grant, do: Mapping[str, Any], *, ttl: float = 1.0, timeout: float = 2.0
-    ) -> Done:
-        key = self.mesh.keys.command(rc, self.mesh.me)
-        id_ = f"{self.internals.instance}-{next(self._commanded)}"
-        command = messages.Command(grant=grant, do=dict(do), ttl=ttl, id=id_)
-        began, gone = self.mesh.now(), 0.0
-        while (
-            reply := await self.mesh.ask_one(key, replace(command, ttl=ttl - gone), Done, timeout=timeout - gone)
-        ) is None:
-            gone = (self.mesh.now() - began) / SECOND + AGAIN
-            if gone >= min(timeout, ttl, REJOINS):
-                raise CommandRefused(rc, Problem("unknown", "no answer; it may or may not have been done"))
-            # It ended early: its RC's process may be joining the mesh anew. Under one id it is done once.
-            await asyncio.sleep(AGAIN)
-        if reply.message is None:
-            refused = CommandRefused(rc, reply.problem or Problem("unknown", "no reason given"))
-            arc = next((arc for arc in self._store.open if arc.grant == grant), None)
-            if refused.code in NOT_HELD and arc is not None and grant not in self._denied:
-                self._denied.add(grant)
-                self._supervisor.call_later(TOLD_WITHIN, self._lose, arc, grant, str(refused))
-            raise refused
-        return reply.message
-
-    def _lose(self, arc: OpenArc, grant: Grant, reason: str) -> None:
-        """An RC of this grant does not know it any more, and no notice has said so."""
-        self._denied.discard(grant)
-        if arc.grant == grant and arc.id in self._store.arcs and self._store.resumed.is_set():
-            arc._lose(reason, self.mesh.now())
-            self._store.notify(arc)
-            self._supervisor.spawn(self.internals.ask_again(arc))
-
-    def _on_notice(self, _key: str, notice: Notice) -> None:
-        if not self._rcm.accept(notice.term):
-            return
-        if (arc := self._store.arcs.get(notice.id)) is not None:
-            self._store.take(arc, notice)
-        elif not self.internals.take_moving(notice) and notice.id not in self._store.withdrawn:
-            # What nobody here asked for, or what was over here before an RCM that took the lead heard of it.
-            if notice.state == "running":
-                self._supervisor.spawn(self._rcm.give_back(messages.Release(id=notice.id)))
-            elif notice.state == "queued":
-                self._supervisor.spawn(self._rcm.give_back(messages.Cancel(id=notice.id)))
+        return await self.internals.command(rc, grant, do, ttl=ttl, timeout=timeout)
 
 
 C = TypeVar("C", bound=Client)

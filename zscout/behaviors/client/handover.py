@@ -39,9 +39,9 @@ class MovableClient:
     """What a client hands over, and what it expects to be handed over to it."""
 
     def __init__(self, mesh: Mesh, fleet: Fleet, supervisor: Supervisor) -> None:
-        self.mesh, self.fleet, self._supervisor = mesh, fleet, supervisor
-        self._store = RequestStore(mesh.now, self._ask_soon)
-        self._rcm = RcmLink(mesh, fleet, self._store, supervisor)
+        self.mesh, self.fleet, self.supervisor = mesh, fleet, supervisor
+        self.store = RequestStore(mesh.now, self._ask_soon)
+        self.rcm = RcmLink(mesh, fleet, self.store, supervisor)
         self.expected_came = asyncio.Event()
         """Set at the first notice of an ARC that is expected: from then on it is this client's."""
         self._unclaimed: dict[str, OpenArc] = {}
@@ -62,31 +62,31 @@ class MovableClient:
             raise ValueError(f"{len(requests)} requests are too many to take over; at most {MAX_OTHERS + 1} are")
         now = self.mesh.now()
         arcs = {request.id: OpenArc._expected(request, now) for request in requests}
-        if here := arcs.keys() & self._store.arcs.keys():
+        if here := arcs.keys() & self.store.arcs.keys():
             raise ValueError(f"request {min(here)} is already open here; no other client can hand it over")
-        for arc in list(self._store.expected.values()):
+        for arc in list(self.store.expected.values()):
             self._unclaimed.pop(arc.id, None)
-            self._store.forget(arc)
+            self.store.forget(arc)
         for arc in arcs.values():
-            self._store.expect(arc)
+            self.store.expect(arc)
         self._unclaimed |= arcs
         self.expected_came.clear()
 
     def take_moving(self, notice: Notice) -> bool:
         """Applies a notice of what is expected, or was handed over. False if it is of neither."""
-        if (arc := self._store.expected.get(notice.id)) is not None:
+        if (arc := self.store.expected.get(notice.id)) is not None:
             if arc._take_first(notice, self.mesh.now()):
-                self._store.adopt(arc)
-                self._store.notify(arc)
+                self.store.adopt(arc)
+                self.store.notify(arc)
                 self.expected_came.set()
-                self._supervisor.spawn(self._give_back_unwanted(arc))
+                self.supervisor.spawn(self._give_back_unwanted(arc))
             return True
-        arc = self._store.moved.get(notice.id)
+        arc = self.store.moved.get(notice.id)
         if arc is not None and notice.state == "ended" and notice.outcome != "handed_over":
             # It was over before it could be handed over: there is nothing to take back.
             arc._finish(notice.outcome or "lost", notice.reason, self.mesh.now())
-            self._store.notify(arc)
-            self._store.forget(arc)
+            self.store.notify(arc)
+            self.store.forget(arc)
             return True
         return False
 
@@ -100,8 +100,8 @@ class MovableClient:
         try:
             await self._come(arc)
         finally:
-            if arc.id in self._store.expected:
-                self._store.forget(arc)
+            if arc.id in self.store.expected:
+                self.store.forget(arc)
         return arc if arc.open else None
 
     async def _come(self, arc: OpenArc) -> None:
@@ -109,14 +109,14 @@ class MovableClient:
         under its id, at its place."""
         try:
             async with asyncio.timeout(EXPECT_TIMEOUT):
-                while arc.id in self._store.expected:
-                    await self._store.changed(arc)
+                while arc.id in self.store.expected:
+                    await self.store.changed(arc)
         except TimeoutError:
             log.warning("%s was handed over to here, but not granted for %g s; requesting it", arc.name, EXPECT_TIMEOUT)
-            self._store.adopt(arc)
+            self.store.adopt(arc)
 
     def _ask_soon(self, arc: OpenArc) -> None:
-        self._supervisor.spawn(self._await_again(arc) if arc.state == "awaited" else self.ask_again(arc))
+        self.supervisor.spawn(self._await_again(arc) if arc.state == "awaited" else self.ask_again(arc))
 
     async def _await_again(self, arc: OpenArc) -> None:
         await self._come(arc)
@@ -129,7 +129,7 @@ class MovableClient:
             del self._unclaimed[arc.id]
             if arc.open:
                 log.warning("%s was handed over and nobody asked for it: it is given back", arc.name)
-                await self._rcm.end(arc)
+                await self.rcm.end(arc)
 
     # The old client
 
@@ -137,44 +137,44 @@ class MovableClient:
         """From now on nothing is asked again or ended and no body is entered or interrupted, until `resume`,
         `take_back`, `close` or `leave`. Notices are taken as before."""
         self._may_end.clear()
-        self._store.resumed.clear()
-        self._store.undecided.clear()
-        self._store.reclaimed.clear()
-        for arc in [arc for arc in self._store.expected.values() if arc.open]:
+        self.store.resumed.clear()
+        self.store.undecided.clear()
+        self.store.reclaimed.clear()
+        for arc in [arc for arc in self.store.expected.values() if arc.open]:
             # It may have to be handed on before it has come once more.
-            self._store.adopt(arc)
-            self._store.notify(arc)
+            self.store.adopt(arc)
+            self.store.notify(arc)
 
     @property
     def paused(self) -> bool:
-        return not self._store.resumed.is_set()
+        return not self.store.resumed.is_set()
 
     async def resumed(self) -> None:
         """Waits while the client is paused; without end where it leaves like that."""
-        await self._store.resumed.wait()
+        await self.store.resumed.wait()
 
     def resume(self) -> None:
         """Goes on. All that is open is asked again, and what was withheld happens now."""
         self._may_end.set()
-        self._store.resumed.set()
-        for arc in self._store.open:
-            self._supervisor.spawn(self.ask_again(arc))
+        self.store.resumed.set()
+        for arc in self.store.open:
+            self.supervisor.spawn(self.ask_again(arc))
 
     async def ask_again(self, arc: OpenArc) -> None:
         """An acknowledged request is asked once; what was lost or taken back until there is an answer."""
         try:
             if arc.state != "asking":
-                await self._rcm.ask(arc)
-            await self._rcm.submit(arc)
+                await self.rcm.ask(arc)
+            await self.rcm.submit(arc)
         except RequestRefused as refused:
             log.warning("%s is not taken back: %s", arc.name, refused)
-            self._store.notify(arc)
-            self._store.forget(arc)
+            self.store.notify(arc)
+            self.store.forget(arc)
 
     def open_requests(self) -> list[OpenRequest]:
         """What an RCM has answered and is not over: what `hand_over_all` would hand over now."""
         now = self.mesh.now()
-        return [arc._open_request(now) for arc in self._store.acknowledged]
+        return [arc._open_request(now) for arc in self.store.acknowledged]
 
     async def hand_over_all(self, to: Sender) -> None:
         """Hands all `open_requests` of this paused client to another one, which expects them, in one step. On
@@ -185,7 +185,7 @@ class MovableClient:
         `take_back`."""
         if not self.paused:
             raise RuntimeError("pause() the client before it hands over everything: it would ask for it again")
-        arcs = sorted(self._store.acknowledged, key=lambda arc: arc.grant is None)
+        arcs = sorted(self.store.acknowledged, key=lambda arc: arc.grant is None)
         if len(arcs) > MAX_OTHERS + 1:
             words = f"{len(arcs)} requests can't be handed over at once; {MAX_OTHERS + 1} can"
             raise RequestRefused(Problem("too_many", words))
@@ -193,7 +193,7 @@ class MovableClient:
             async with asyncio.timeout(HAND_OVER):
                 await self._hand_over(arcs, to)
         except (TimeoutError, RequestRefused) as error:
-            self._store.undecided = {arc.id for arc in arcs if arc.open}
+            self.store.undecided = {arc.id for arc in arcs if arc.open}
             if isinstance(error, RequestRefused):
                 raise
             unknown = f"no leader reported within {HAND_OVER:g} s whether {to} took over; try again"
@@ -201,37 +201,37 @@ class MovableClient:
 
     async def _hand_over(self, arcs: list[OpenArc], to: Sender) -> None:
         """Asks until all of `arcs` have moved or are over. Raises RequestRefused."""
-        term = self._rcm.term
+        term = self.rcm.term
         pause, longest = FIRST_PAUSE, BACKOFF[1]
         known_by = self.mesh.now() + round(TOKEN_GRACE * SECOND)
         while arcs := [arc for arc in arcs if arc.open]:
             first, *others = arcs
             operation = HandOver(id=first.id, to=str(to), others=[arc.id for arc in others])
-            self._rcm.leader_came.clear()
-            reply = await self._rcm.query(operation)
+            self.rcm.leader_came.clear()
+            reply = await self.rcm.query(operation)
             notice, problem = (reply.message, reply.problem) if reply is not None else (None, None)
             awaited = await self._awaited_by(to) if notice is not None else set()
             # Who was promised to meanwhile has been told that they are here.
-            if notice is not None and self._rcm.accept(notice.term):
+            if notice is not None and self.rcm.accept(notice.term):
                 # An RCM that came in between answers for the first alone: it may not know of the others.
                 told = arcs if notice.term == term else [first]
                 if notice.state == "ended":
                     awaited.discard(first.id)
                 moved = [arc for arc in told if arc.open and arc.id not in awaited]
                 for arc in moved:
-                    self._store.move(arc, notice)
+                    self.store.move(arc, notice)
                 if moved:
                     continue
             elif notice is not None or (problem is not None and problem.code == "not_running"):
                 # It is over, or an RCM that has just taken the lead does not know it: this settles which. And one of a
                 # lower term than was promised hears of that.
-                await self._rcm.ask(first)
+                await self.rcm.ask(first)
             elif problem is not None and problem.code == "unknown_client" and self.mesh.now() < known_by:
                 # It sees the RCM; the RCM may not have seen its token yet.
                 pause = BACKOFF[0]
             elif problem is not None and problem.code not in TRY_AGAIN:
                 raise RequestRefused(problem)
-            pause = FIRST_PAUSE if await self._rcm.leader_within(pause) else min(longest, pause * 2)
+            pause = FIRST_PAUSE if await self.rcm.leader_within(pause) else min(longest, pause * 2)
 
     async def _awaited_by(self, to: Sender) -> set[str]:
         """Ids of what `to` expects and has had no notice of. Where it does not answer, the RCM's word has to do."""
@@ -244,7 +244,7 @@ class MovableClient:
 
         Bodies are interrupted as by any other lost hold. What was not handed over after all, where that was
         unknown, simply stays."""
-        for arc in list(self._store.moved.values()):
-            self._store.reclaim(arc)
-        self._store.reclaimed, self._store.undecided = self._store.undecided, set()
+        for arc in list(self.store.moved.values()):
+            self.store.reclaim(arc)
+        self.store.reclaimed, self.store.undecided = self.store.undecided, set()
         self.resume()

@@ -6,36 +6,42 @@ Its time on the mesh, from its token on; how it moves (`handover.py`); and what 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
-from typing import Final
+import itertools
+from collections.abc import Callable, Mapping
+from typing import Any, Final
 
-from zscout.behaviors.client.confirmation import Confirmations
-from zscout.behaviors.client.direct import CommandSender, DirectHold
+from msgspec.structs import replace
+
+from zscout.behaviors.client.confirmation import NOT_HELD, Confirmations
+from zscout.behaviors.client.direct import DirectHold
 from zscout.behaviors.client.handover import MovableClient
-from zscout.behaviors.client.request import OpenArc
+from zscout.behaviors.client.request import CommandRefused, OpenArc
 from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, Mesh
 from zscout.mesh.supervision import Supervisor
-from zscout.messages import Notice
+from zscout.messages import Cancel, Command, Done, Notice, Problem, Release
 from zscout.types import SECOND, Grant, Ns, Term
 
 LAST_WORD: Final = 0.5
 """Seconds at most for which a client that closes tells RCs that its programs are gone."""
+REJOINS: Final = 0.5
+"""Seconds for which a command is sent again that ended without an answer: others know a new session by then."""
+AGAIN: Final = 0.05
+TOLD_WITHIN: Final = 1.0
+"""Seconds within which a notice says so too; else the RC is believed."""
 RENEW_TOKEN: Final[Ns] = SECOND // 2
 """A client that is dropped again after its token was renewed renews it no sooner."""
 
 
 class ClientInternals(MovableClient):
-    """Of one client. `command` sends a command once; `on_notice` is given each notice of the RCM."""
+    """Of one client."""
 
-    def __init__(
-        self, mesh: Mesh, fleet: Fleet, command: CommandSender, on_notice: Callable[[str, Notice], None]
-    ) -> None:
-        self.supervisor = Supervisor(f"client {mesh.me}", self._failed)
-        super().__init__(mesh, fleet, self.supervisor)
-        self.store, self.rcm, self._on_notice = self._store, self._rcm, on_notice
-        self.confirmations = Confirmations(mesh, fleet, self.store, self.rcm, self.supervisor, command, self._ask_soon)
+    def __init__(self, mesh: Mesh, fleet: Fleet) -> None:
+        super().__init__(mesh, fleet, Supervisor(f"client {mesh.me}", self._failed))
+        self.confirmations = Confirmations(
+            mesh, fleet, self.store, self.rcm, self.supervisor, self.command, self._ask_soon
+        )
         self.leaving: asyncio.Task[None] | None = None
         self.instance = ""
         """Of its token."""
@@ -43,6 +49,9 @@ class ClientInternals(MovableClient):
         self._token: Declaration | None = None
         self._shown: Ns = 0
         """When the present token was declared."""
+        self._commanded = itertools.count(1)
+        self._denied: set[Grant] = set()
+        """Grants that an RC says are over, and no notice yet."""
 
     # On the mesh
 
@@ -155,3 +164,50 @@ class ClientInternals(MovableClient):
         arc._finish("completed", "its minimum runtime is over", self.mesh.now())
         self.store.notify(arc)
         self.store.forget(arc)
+
+    # Commands, and notices
+
+    async def command(
+        self, rc: str, grant: Grant, do: Mapping[str, Any], *, ttl: float = 1.0, timeout: float = 2.0
+    ) -> Done:
+        """Have an RC carry out a command once. Raises CommandRefused."""
+        key = self.mesh.keys.command(rc, self.mesh.me)
+        id_ = f"{self.instance}-{next(self._commanded)}"
+        command = Command(grant=grant, do=dict(do), ttl=ttl, id=id_)
+        began, gone = self.mesh.now(), 0.0
+        while (
+            reply := await self.mesh.ask_one(key, replace(command, ttl=ttl - gone), Done, timeout=timeout - gone)
+        ) is None:
+            gone = (self.mesh.now() - began) / SECOND + AGAIN
+            if gone >= min(timeout, ttl, REJOINS):
+                raise CommandRefused(rc, Problem("unknown", "no answer; it may or may not have been done"))
+            # It ended early: its RC's process may be joining the mesh anew. Under one id it is done once.
+            await asyncio.sleep(AGAIN)
+        if reply.message is None:
+            refused = CommandRefused(rc, reply.problem or Problem("unknown", "no reason given"))
+            arc = next((arc for arc in self.store.open if arc.grant == grant), None)
+            if refused.code in NOT_HELD and arc is not None and grant not in self._denied:
+                self._denied.add(grant)
+                self.supervisor.call_later(TOLD_WITHIN, self._lose, arc, grant, str(refused))
+            raise refused
+        return reply.message
+
+    def _lose(self, arc: OpenArc, grant: Grant, reason: str) -> None:
+        """An RC of this grant does not know it any more, and no notice has said so."""
+        self._denied.discard(grant)
+        if arc.grant == grant and arc.id in self.store.arcs and self.store.resumed.is_set():
+            arc._lose(reason, self.mesh.now())
+            self.store.notify(arc)
+            self.supervisor.spawn(self.ask_again(arc))
+
+    def _on_notice(self, _key: str, notice: Notice) -> None:
+        if not self.rcm.accept(notice.term):
+            return
+        if (arc := self.store.arcs.get(notice.id)) is not None:
+            self.store.take(arc, notice)
+        elif not self.take_moving(notice) and notice.id not in self.store.withdrawn:
+            # What nobody here asked for, or what was over here before an RCM that took the lead heard of it.
+            if notice.state == "running":
+                self.supervisor.spawn(self.rcm.give_back(Release(id=notice.id)))
+            elif notice.state == "queued":
+                self.supervisor.spawn(self.rcm.give_back(Cancel(id=notice.id)))

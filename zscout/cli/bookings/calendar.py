@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import sys
+import time
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from decimal import Decimal
+from itertools import groupby, islice
 from pathlib import Path
 from typing import Any, Final
 from zoneinfo import ZoneInfo
@@ -35,6 +38,10 @@ from zscout.services.bookings.calendar_text import CalendarSelection, calendar_t
 from zscout.terminal import Table, clean, many
 
 MAX_WORDS: Final = 200
+AT_ONCE: Final = 8
+"""Bookings that are asked for at once: hosts write those that come together to their disks in one go."""
+QUIET: Final = 1.0
+"""Seconds before a terminal shows how far it is."""
 LOOK: Final = 1.0
 """Seconds in which RCs are seen."""
 _NEXT_NEED: Final = re.compile(r",(?=[^,=]*/)")
@@ -154,9 +161,26 @@ class _Import:
     rows: list[Row] = field(default_factory=list)
     makes_room: bool = False
     """Whether something is given up, or would be, before the rest is booked."""
+    line: terminal.LiveLine = field(default_factory=lambda: terminal.LiveLine(sys.stderr))
+    done: int = 0
+    """Events of which it is known what became of them."""
 
     async def run(self, plan: ImportPlan, *, sync: bool) -> None:
-        """Raises NobodyThere."""
+        """Tells at a terminal how far it is, and at Ctrl-C what stays. Raises NobodyThere."""
+        with self.line:
+            try:
+                await self._run(plan, sync=sync)
+            except asyncio.CancelledError:
+                self.line.hide()
+                if not self.dry_run:
+                    terminal.print_line(
+                        f"{self.done} of {many(len(plan.wanted), 'event')} imported, which stay booked; "
+                        "import the file again for the rest: nothing is booked twice",
+                        sys.stderr,
+                    )
+                raise
+
+    async def _run(self, plan: ImportPlan, *, sync: bool) -> None:
         gone = [one for one in self.known if one.id.endswith(self.options.suffix) and one.id not in plan.ids]
         for view in gone:
             if not view.unbooked and view.owner == self.client.mesh.me.host:
@@ -168,12 +192,26 @@ class _Import:
                 else:
                     self.rows.append(Row(words, "kept", "it is no longer in the calendar; --sync gives it up", view))
         by_id = {one.id: one for one in self.known if not one.unbooked}
-        for wanted in plan.wanted:
-            await self._want(wanted, next((by_id[one] for one in wanted.ids if one in by_id), None))
+        wants = [(wanted, next((by_id[one] for one in wanted.ids if one in by_id), None)) for wanted in plan.wanted]
+        began = time.monotonic()
+        # What gives up dates makes room for what comes behind it. A dry run keeps nothing that could be waited for.
+        for alone, some in groupby(wants, lambda item: self.dry_run or bool(item[0].dropped)):
+            while part := list(islice(some, 1 if alone else AT_ONCE)):
+                if time.monotonic() - began > QUIET:
+                    self.line.draw(f"{self.done} of {len(wants)} events")
+                try:
+                    async with asyncio.TaskGroup() as group:
+                        for item in part:
+                            group.create_task(self._want(*item))
+                except* NobodyThere as errors:
+                    raise errors.exceptions[0] from None
 
     async def _want(self, wanted: Wanted, known: BookingView | None) -> None:
-        if known is None and wanted.book is None:
-            return
+        if known is not None or wanted.book is not None:
+            await self._take(wanted, known)
+        self.done += 1
+
+    async def _take(self, wanted: Wanted, known: BookingView | None) -> None:
         row = Row(wanted.title, "already there", book=known or wanted.book)
         self.rows.append(row)
         if known is None and wanted.book is not None:

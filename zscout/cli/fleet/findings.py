@@ -153,6 +153,7 @@ def _multicast(seen: Evidence) -> Iterator[Finding]:
             "; ".join(f"{name}: {problem}" for name, problem in seen.interfaces.items()) or "no interface is up for it"
         )
         remedy = "mend `interface` under [mesh] or the network, or name hosts under connect"
+        remedy += '; for this host alone, write interface = "lo" in each file' * (not seen.interfaces)
         yield Finding("multicast", "note" if linked else "mend", f"it is not possible here ({why})", remedy)
     elif not seen.heard:
         remedy = (

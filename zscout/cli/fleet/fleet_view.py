@@ -217,14 +217,27 @@ class Devices:
         """Asks the RCs of which no state is known yet; waits ASK_RCS for their answers at most."""
         self._states = self.known()
 
+        def unknown() -> set[str]:
+            return {token.name for token in self._fleet_view.tokens(Role.RC)} - self.known().keys()
+
         def all_known(reply: Reply[RcState] | None = None) -> bool:
             if reply is not None and reply.message is not None:
                 self._on_state(reply.key, reply.message)
-            return {token.name for token in self._fleet_view.tokens(Role.RC)} <= self.known().keys()
+            return not unknown()
 
-        if not all_known():
-            key = self._mesh.keys.rc_state_any
-            await self._mesh.ask(key, RcAsk(), RcState, timeout=ASK_RCS, enough=all_known)
+        mesh, keys = self._mesh, self._mesh.keys
+        if keys.closed:
+            # Nobody may answer there with the key of a question to all.
+            asked = (self._ask(rc) for rc in unknown())
+            await asyncio.gather(*asked)
+        elif unknown():
+            await mesh.ask(keys.rc_state_any, RcAsk(), RcState, timeout=ASK_RCS, enough=all_known)
+
+    async def _ask(self, rc: str) -> None:
+        key = self._mesh.keys.ask_rc_state(rc, self._mesh.me)
+        reply = await self._mesh.ask_one(key, RcAsk(), RcState, timeout=ASK_RCS)
+        if reply is not None and reply.message is not None and reply.message.rc == rc:
+            self._on_state(self._mesh.keys.rc_state(rc), reply.message)
 
     def known(self) -> dict[str, RcState]:
         """What each RC reported last, in order of names, unless it is gone or was replaced by another."""

@@ -45,7 +45,8 @@ async def status(names: Sequence[str], watch: bool, every: bool, as_json: bool) 
     devices and their holders, a host with its devices and programs. Exit code 1: nothing has one of these names.
 
     HELD BY shows requests by the names that `zscout why`, `cancel` and `release` take, and their persons; `zscout why`
-    also shows their commands. A narrow terminal leaves out less important columns; a pipe gets all of them.
+    also shows their commands. For a free device it shows the next booking within 24 h. A narrow terminal leaves out
+    less important columns; a pipe gets all of them.
 
     Warnings come first: certificates that end within 14 days, roles without [security], hosts whose roles differ or
     whose files have an error, clocks that differ by more than 2 s, different versions. The queue is in rank order,
@@ -165,7 +166,7 @@ class Standing:
     def _rcs(self, state: RcmState) -> Table:
         homes = self._homes()
         lost = {device.rc for device in self.devices.known().values() if device.health != "ok"}
-        maintained = booked.in_maintenance(self.booked)
+        maintained, coming = booked.in_maintenance(self.booked), booked.coming(self.booked)
         rows, styles = [], []
         for view in state.rcs:
             holders = [hold for hold in state.holds if view.rc in hold.needs]
@@ -173,7 +174,7 @@ class Standing:
             words = there if view.present else "lost" if view.rc in lost else "absent"
             kind = "shared" if view.sharable else "exclusive"
             holds = ",\n".join(request_words(hold.arc, hold.who, hold.client, hold.needs[view.rc]) for hold in holders)
-            held_by = maintained[view.rc] if words == "maintenance" else holds
+            held_by = {"maintenance": maintained, "free": coming}.get(words, {}).get(view.rc, holds)
             rows.append((view.rc, kind, words, homes.get(view.rc, "-"), held_by))
             styles.append(
                 {"absent": "red", "lost": "red", "held": "yellow", "maintenance": "yellow", "free": "green"}[words]

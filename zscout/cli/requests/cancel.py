@@ -123,15 +123,15 @@ def _choose(state: RcmState, named: str, word: str, *, every: bool) -> list[Targ
         more = f"; {state.more} more wait: name them <host>/<client>/<id>" if state.more else ""
         raise common.Failed(f"no request {quoted(named)} holds or waits{more}; {_instead(state, named)}")
     if len(found) > 1 and not every:
-        listed = ", ".join(target.full_name for target in found[:MAX_LISTED])
+        listed = ", ".join(f"{target.full_name} ({target.was})" for target in found[:MAX_LISTED])
         rest = f" and {len(found) - MAX_LISTED} more" if len(found) > MAX_LISTED else ""
         raise common.Failed(f"{len(found)} requests are called {quoted(named)}: {listed}{rest}; name one, or add --all")
     return found
 
 
 def _instead(state: RcmState, named: str) -> str:
-    if any(view.rc == named for view in state.rcs):
-        return f"it is a device: zscout status {named} shows which request holds it"
+    if rc := common.device_named(state, named):
+        return f"{rc} is a device: zscout status {rc} shows which requests hold it or wait"
     return "see zscout status, or zscout booking list for bookings"
 
 

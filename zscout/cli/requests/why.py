@@ -54,8 +54,8 @@ async def why(arc: str, as_json: bool) -> None:
         views: list[View] = [*state.holds, *state.queue]
         same = [view for view in views if arc in (view.arc, view.id, _full(view))]
         unknown = common.unknown("request", arc, [view.arc for view in views], "and none is open", "open", state.more)
-        if any(view.rc == arc for view in state.rcs):
-            unknown = common.Failed(f"{arc} is a device: zscout status {arc} shows which requests hold it or wait")
+        if rc := common.device_named(state, arc):
+            unknown = common.Failed(f"{rc} is a device: zscout status {rc} shows which requests hold it or wait")
         past = [] if same or state.story else await _past_holds(client, arc, unknown)
         found = [await _described(client, view, state) for view in same[:MAX_DESCRIBED]]
         if not same:
