@@ -97,6 +97,7 @@ maintain robot/* --for 1h --at 9:00 | robot/* is a pattern; name each device for
 maintain robot/a robot/a --for 1h --at 9:00 | zscout: robot/a is named twice; name each device once
 slots robot/a --for 1h --within 500d | --within: 500 d is out of range; write 1.0 s to 366 d
 slots robot/a --for 1h --limit 0 | --limit: 0 is out of range; write 1 to 50
+bookings --date nosuch | --date: "nosuch" is not a date;
 booking cancel x --date someday | --date: "someday" is not a date; write "now", "tue 14:00", "tomorrow 9:00", "14:30"
 history --since soon | --since: "soon" is not a time
 history --since 2999-01-01 | --since: "2999-01-01" is in the future; write an earlier date

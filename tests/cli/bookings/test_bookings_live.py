@@ -148,6 +148,10 @@ def test_what_is_repeated_is_given_up_date_by_date(fleet: CliFleet) -> None:
     days = re.findall(r"every day until ([-\d]+)", "".join(listed))
     assert len(days) == 2
     assert len(set(days)) == 1
+    [there] = told(fleet, "bookings", "--date", "tomorrow")["bookings"]
+    assert len(there["dates"]) == 1
+    assert len(said(fleet, "bookings", "--date", "tomorrow").splitlines()) == 2
+    assert said(fleet, "bookings", "--date", "2030-01-01") == "nothing is booked on Tue 2030-01-01\n"
     again = said(fleet, "book", "robot/b", "--for", "1h", "--at", "in 2d", "--name", "robot-c")
     assert again.splitlines()[-1].startswith("you have another booking called robot-c: name it by its id")
     assert '2 bookings are called "robot-c": ' in said(fleet, "unbook", "robot-c", code=1)

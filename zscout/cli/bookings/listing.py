@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Any
 from zoneinfo import ZoneInfo
 
 import click
+from msgspec.structs import replace
 
 from zscout import terminal
 from zscout.behaviors.client.bookings import BookingsClient
@@ -48,10 +50,11 @@ from zscout.terminal import Table, clean
     shell_complete=completion.needs,
     help="Only bookings that may have this device, or a device of a pattern: robot/*.",
 )
+@click.option("--date", "at", type=DATE, help="Only the dates of this day, of the next 60: tue, tomorrow, 2026-12-01.")
 @zone_option
 @common.json_option("Print one JSON object.")
 @common.runs
-async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: bool) -> None:
+async def bookings(mine: bool, rc: str | None, at: WrittenDate | None, zone: ZoneInfo | None, as_json: bool) -> None:
     """List bookings, the next date first: owner, devices, times, and what endangers them.
 
     A repeated booking shows its next date, and those of the next 60 days that are in danger; --json has all of them.
@@ -61,6 +64,7 @@ async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: b
     \b
     Examples:
       zscout booking list --mine
+      zscout booking list --date tuesday
       zscout booking list --rc robot/arm1 --zone UTC
       zscout booking list --json | jq -r '.bookings[] | .name + " " + .dates[0].start'
     """
@@ -73,6 +77,9 @@ async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: b
         found = [one for one in told.bookings if not mine or is_own(one, me)]
         if rc is not None and is_pattern(rc):
             found = [one for one in found if _may_have(one, matcher(rc), rc)]
+        day = None if at is None else _day(at, told.time, zone)
+        if day is not None:
+            found = [booking for one in found if (booking := _on_day(one, day, zone)).dates]
         if as_json:
             terminal.print_json(
                 {
@@ -86,9 +93,9 @@ async def bookings(mine: bool, rc: str | None, zone: ZoneInfo | None, as_json: b
         for host, differs in sorted(told.clocks.items()):
             click.secho(clean(clock_words(host, differs)), fg="yellow", err=True)
         if not found:
-            terminal.print_line("nothing is booked")
+            terminal.print_line("nothing is booked" + (f" on {day:%a %Y-%m-%d}" if day is not None else ""))
         else:
-            _table(found, me, zone).print()
+            _table(found, me, zone, every_date=day is not None).print()
 
 
 @click.command()
@@ -120,17 +127,38 @@ async def show(booking: str, zone: ZoneInfo | None, as_json: bool) -> None:
         terminal.print_line(clean(f"  first on {date_words(found.start, zone)}"))
 
 
+def _day(at: WrittenDate, now: float, zone: ZoneInfo | None) -> datetime.date:
+    """Raises BadInput."""
+    if (day := at.whole_day(now, zone or host_zone())) is None:
+        raise BadInput("--date: write a day without a time, as in tue, tomorrow or 2026-12-01")
+    return day
+
+
+def _on_day(booking: BookingView, day: datetime.date, zone: ZoneInfo | None) -> BookingView:
+    """The booking with those of its dates that have a part of the day."""
+    return replace(
+        booking,
+        dates=[
+            part
+            for part in booking.dates
+            if in_zone(part.start, zone).date() <= day <= in_zone(part.end - 1, zone).date()
+        ],
+    )
+
+
 def _may_have(booking: BookingView, matches: Callable[[str], bool], pattern: str) -> bool:
     """Whether it is of an RC that matches, or by that pattern."""
     bound = {rc for date in booking.dates for rc in date.bound.values()}
     return any(matches(need) or need.partition("#")[0] == pattern for need in (*booking.needs, *bound))
 
 
-def _table(found: Sequence[BookingView], me: User, zone: ZoneInfo | None) -> Table:
+def _table(found: Sequence[BookingView], me: User, zone: ZoneInfo | None, *, every_date: bool) -> Table:
     lines: list[tuple[float, Sequence[str], str]] = []
     for one in found:
         shown = [
-            date for number, date in enumerate(one.dates) if number == 0 or date.danger or date.state == "conflict"
+            date
+            for number, date in enumerate(one.dates)
+            if every_date or number == 0 or date.danger or date.state == "conflict"
         ]
         lines += [(date.start, _row(one, date, zone), _style(one, date, me)) for date in shown]
         if not shown:
