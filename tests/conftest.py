@@ -10,7 +10,7 @@ import tempfile
 import pytest
 from hypothesis import settings
 
-pytest_plugins = ["tests.async_tests", "tests.tiers"]
+pytest_plugins = ["tests.async_tests", "tests.fleets", "tests.tiers"]
 
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import zscout
+from tests.fleets import PLAIN_ONLY, QUICK, SECURED, TESTS
 
 ROOT = Path(__file__).parents[1]
 MODULES = {path.relative_to(ROOT): ast.parse(path.read_text()) for path in sorted((ROOT / "zscout").rglob("*.py"))}
@@ -18,6 +19,7 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 SOURCES = {path.name for tree in ("zscout", "tests", "studies", "benchmarks") for path in (ROOT / tree).rglob("*.py")}
 WROTE = re.compile(r"`([\w./]+)`")
 TREES = {"zscout", "tests", "studies", "benchmarks", "examples"} | {path.parts[1] for path in MODULES}
+LIVE = re.compile(r"pytest\.mark\.live\b")
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
 
 
@@ -83,3 +85,14 @@ def test_the_page_on_the_architecture_names_every_room() -> None:
         if path.name not in ("__init__.py", "__pycache__", "py.typed")
     }
     assert {room for room in rooms if f"`{room}`" not in page} == set()
+
+
+def test_every_live_module_is_on_both_fleets_secured_or_says_why_not() -> None:
+    live = {path.relative_to(TESTS).as_posix() for path in TESTS.rglob("test_*.py") if LIVE.search(path.read_text())}
+    assert not SECURED & PLAIN_ONLY.keys()
+    assert {*SECURED, *PLAIN_ONLY, *QUICK} - live == set()
+    page = (ROOT / "docs" / "suite.md").read_text()
+    assert {reason for reason in PLAIN_ONLY.values() if reason not in page} == set()
+    secured, plain = len(SECURED), len(PLAIN_ONLY)
+    counts = f"{len(live) - secured - plain} run on both, {secured} are about rights, {plain} on a plain fleet alone"
+    assert counts in page

@@ -138,7 +138,7 @@ class CliFleet:
             async with asyncio.timeout(HANG):
                 while not ranked.issuperset(hosts):
                     asked = RankAsk(at_most=MAX_RANKED, reports=True)
-                    reply = await mesh.ask_one(mesh.keys.rank, asked, HostRanking, timeout=1)
+                    reply = await mesh.ask_one(mesh.keys.ask_rank(mesh.me), asked, HostRanking, timeout=1)
                     told = reply.message.reports if reply is not None and reply.message is not None else None
                     ranked = {one.report.host for one in told or ()}
 

@@ -36,6 +36,12 @@ def files() -> dict[str, str]:
     return found
 
 
+def with_certificate(lab: Lab) -> None:
+    """What the page says of a node file needs on a secured fleet."""
+    file = Path("node.toml")
+    file.write_text(file.read_text() + lab.security_of("anvil"))
+
+
 def commands() -> list[str]:
     return [line for block in blocks("") for line in block.splitlines()]
 
@@ -80,6 +86,7 @@ def test_a_device_of_ones_own_is_held_commanded_and_on_the_timeline(
 
     async def story() -> None:
         async with Lab(tmp_path) as lab:
+            with_certificate(lab)
             lab.env |= {"PYTHONPATH": ":".join([str(tmp_path / "site"), *sys.path])}
             lab.nodes["anvil"] = lab.spawn([sys.executable, "-m", "zscout.node", "node.toml"], log="anvil.log")
             client = await lab.client("crew")

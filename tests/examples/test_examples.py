@@ -19,7 +19,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
+def fleet(tmp_path_factory: pytest.TempPathFactory, fleet_kind: str) -> Iterator[CliFleet]:
     with fleet_of(tmp_path_factory.mktemp("fleet"), "robot/scout33", "radio/rf0:command_rate=10") as fleet:
         yield fleet
 

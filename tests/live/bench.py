@@ -65,7 +65,7 @@ class Stand:
         self.rcs: list[ResourceController] = []
 
     async def __aenter__(self) -> Stand:
-        fleet = self.lab.fleet
+        fleet = self.lab.fleet_of("bench")
         self.stall = StallWatch(clock.now).start()
         self.mesh = await ZenohMesh.open(fleet, Sender("bench", "node"))
         self.lab.sessions += 1

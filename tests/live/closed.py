@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
 
 import zenoh
 from msgspec.structs import replace
@@ -50,7 +49,9 @@ def make_keys(folder: Path, *names: str, managers: Sequence[str] = MANAGERS) -> 
 
 
 class ClosedLab(Lab):
-    """Nodes and people of one fleet with certificates."""
+    """Nodes and people of one fleet with certificates, and the roles that the test says."""
+
+    own_rights = True
 
     def __init__(self, folder: Path, *, roles: str = ROLES, lease: float | None = None) -> None:
         super().__init__(folder, extra=roles, lease=lease)
@@ -71,7 +72,6 @@ class ClosedLab(Lab):
         self.nodes.clear()
 
     def fleet_of(self, name: str) -> Fleet:
-        """The fleet as this person or machine joins it."""
         return replace(self.fleet, security=self.folder / "keys" / name)
 
     async def person(self, name: str, client: str | None = None) -> PatientClient:
@@ -79,35 +79,6 @@ class ClosedLab(Lab):
         made = await PatientClient.connect(client, fleet=self.fleet_of(name))
         self.clients.append(made)
         return made
-
-
-class SecuredLab(Lab):
-    """A `Lab` with certificates, roles, a group, access and quotas, for tests that know nothing of them: all that it
-    starts or opens besides nodes is an operator's."""
-
-    HOSTS = ("a", "anvil", "b", "bellows", "bench", "boss", "c", "cart", "d", "heir", "lead", "n", "v", "ws1", "ws2")
-    PERSON = "test"
-
-    def __init__(self, folder: Path, **how: Any) -> None:
-        extra = how.pop("extra", "")
-        super().__init__(folder, extra=f"{extra}\n{self._rights()}", **how)
-        self._authority = make_keys(folder / "keys", self.PERSON)
-
-    def _rights(self) -> str:
-        hosts = ", ".join(f'"{host}"' for host in self.HOSTS)
-        return (
-            f'[security]\nfolder = "keys/{self.PERSON}"\n[roles]\nmanager = [{hosts}]\n'
-            f'operator = ["{self.PERSON}"]\n[roles.node]\n'
-            + "".join(f'{host} = ["*/*"]\n' for host in self.HOSTS)
-            + f'[groups]\npeople = ["{self.PERSON}"]\n[access]\n"*/*" = ["people", {hosts}]\n'
-            "[quotas.people]\nrcs = 1000\narcs = 10000\n"
-        )
-
-    def node(self, host: str, *rcs: str, extra: str = "") -> subprocess.Popen[bytes]:
-        keys = self.folder / "keys" / host
-        if not keys.exists():
-            self._authority.issue(host, keys, DAY, datetime.now(UTC), manager=True)
-        return super().node(host, *rcs, extra=f'{extra}\n[security]\nfolder = "keys/{host}"\n')
 
 
 @contextmanager

@@ -11,19 +11,22 @@ import subprocess
 import sys
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import psutil
+from msgspec.structs import replace
 
 from tests.cli.tools import zscout_soon
 from tests.hang import HANG
 from tests.live.holder import linked
+from tests.live.rights import EYE, PERSON, Certificates, Present
 from zscout.behaviors.client import confirmation
 from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.identity import this_program
 from zscout.config.fleet import Fleet, load_fleet
 from zscout.config.scheduling_policy import StrategyName
-from zscout.keyexpr import Role, Token, new_instance
-from zscout.mesh import Reply, clock
+from zscout.keyexpr import Role, Sender, Token, new_instance
+from zscout.mesh import Mesh, Reply, ZenohMesh, clock
 from zscout.messages import Done, RcAsk, RcmState, RcState
 from zscout.types import Grant, Ns
 
@@ -78,6 +81,9 @@ class Lab:
     Use as an async context manager; everything that was started is gone afterwards.
     """
 
+    own_rights: ClassVar[bool] = False
+    """Whether the test itself says who has which role; others are on the kind of fleet that `tests/fleets.py` says."""
+
     def __init__(
         self,
         folder: Path,
@@ -108,6 +114,10 @@ class Lab:
         lines = "".join(f"{name} = {seconds}\n" for name, seconds in timing.items() if f"{name} = " not in extra)
         before, _, after = extra.partition("[timing]\n")
         extra = f"{before}\n[timing]\n{lines}{after}"
+        secured = Present.secured and not self.own_rights
+        self._certificates = Certificates(folder / "keys", candidates) if secured else None
+        if self._certificates:
+            extra = self._certificates.secured(extra)
         self.fleet_file.write_text(
             f'[fleet]\nname = "test-{new_instance()}"\ncandidates = [{names}]\nstrategy = "{strategy}"\n'
             f'[mesh]\nmulticast_address = "224.0.0.224:{port}"\n'
@@ -120,10 +130,20 @@ class Lab:
         self.cwd: Path | None = None
         """Of what is started. `python -m` looks there first."""
         self._confirm_timeout = confirmation.CONFIRM_TIMEOUT
+        self._eye: ZenohMesh | None = None
+
+    def fleet_of(self, name: str) -> Fleet:
+        """The fleet as this person or machine joins it."""
+        return replace(self.fleet, security=self._certificates.of(name)) if self._certificates else self.fleet
+
+    def security_of(self, host: str) -> str:
+        """The table of its node file."""
+        return f'[security]\nfolder = "{self._certificates.of(host)}"\n' if self._certificates else ""
 
     def node(self, host: str, *rcs: str, extra: str = "") -> subprocess.Popen[bytes]:
         """Starts a node. `rcs` are names, or `name:param=bound` for a sharable one with a capacity."""
         text = f'[node]\nhost = "{host}"\nfleet = "fleet.toml"\n{extra}\n'
+        text += self.security_of(host)
         for rc in rcs:
             name, _, bounds = rc.partition(":")
             self._rcs.add(name)
@@ -155,7 +175,8 @@ class Lab:
         return (self.folder / f"{host}.log").read_text()
 
     async def client(self, name: str | None = None) -> Client:
-        client = await PatientClient.connect(name, fleet=self.fleet, host="test")
+        client = await PatientClient.connect(name, fleet=self.fleet, host=PERSON)
+        client.who = this_program(PERSON)  # not of this machine, whose name each machine has its own
         self.clients.append(client)
         return client
 
@@ -210,7 +231,7 @@ class Lab:
                 "-m",
                 "tests.live.holder",
                 name,
-                "test",
+                PERSON,
                 env=self.env,
                 cwd=self.cwd,
                 stdin=asyncio.subprocess.PIPE,
@@ -222,10 +243,19 @@ class Lab:
         await holder.event("up")
         return holder
 
+    async def manager(self, client: Client) -> Mesh:
+        """A session that may ask and publish what a leader does, but is none: on a plain fleet this client's."""
+        if not self._certificates:
+            return client.mesh
+        if self._eye is None:
+            self._eye = await ZenohMesh.open(self.fleet_of(EYE), Sender(EYE, "watcher"))
+            self.sessions += 1
+        return self._eye
+
     async def rc(self, client: Client, name: str) -> RcState:
         """An RC's own word about itself."""
-        key = client.mesh.keys.rc_state(name)
-        return await answered(lambda: client.mesh.ask_one(key, RcAsk(), RcState, timeout=PATIENT))
+        mesh = await self.manager(client)
+        return await answered(lambda: mesh.ask_one(mesh.keys.rc_state(name), RcAsk(), RcState, timeout=PATIENT))
 
     async def held_by(self, client: Client, name: str, *arcs: str) -> None:
         """Waits until an RC names exactly these ARCs as its holders: it may hear of them after the client."""
@@ -261,6 +291,8 @@ class Lab:
             holder.kill()
         await asyncio.gather(*(holder.process.wait() for holder in self.holders))
         await asyncio.gather(*(client.close() for client in self.clients), return_exceptions=True)
+        if self._eye is not None:
+            await self._eye.close()
         for process in self.others:
             if process.poll() is None:
                 process.send_signal(signal.SIGCONT)

@@ -95,7 +95,7 @@ class Placing:
         """Waits until the balancer ranks so many hosts."""
         mesh = self.client.mesh
         await awaited(
-            lambda: answered(lambda: mesh.ask_one(mesh.keys.rank, RankAsk(), HostRanking, timeout=1)),
+            lambda: answered(lambda: mesh.ask_one(mesh.keys.ask_rank(mesh.me), RankAsk(), HostRanking, timeout=1)),
             lambda ranking: len(ranking.hosts) == count,
         )
 
@@ -150,7 +150,7 @@ class WitnessRc:
         self.lab, self.name, self.witness = lab, name, Witness()
 
     async def __aenter__(self) -> Self:
-        fleet = self.lab.fleet
+        fleet = self.lab.fleet_of("devices")
         self._stall = StallWatch(clock.now).start()
         self._mesh = await ZenohMesh.open(fleet, Sender("devices", "node"))
         self.lab.sessions += 1

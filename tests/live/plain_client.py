@@ -8,6 +8,9 @@ Takes orders as JSON lines on stdin and tells what happens as JSON lines on stdo
     {"do": "command", "id": ..., "rc": ..., "action": {...}}       {"do": "release" | "cancel", "id": ...}
     {"do": "quit"}
 
+With `KEYS` in its environment, a folder with ca.pem, cert.pem and key.pem, it joins a fleet with `[security]`; HOST is
+the certificate's name.
+
 `rc` is an RC, or a pattern of the request: the command goes to the RC that meets it.
 """
 
@@ -333,6 +336,17 @@ def tell(what: str, **details: Any) -> None:
         print(json.dumps({"what": what} | details), flush=True)
 
 
+def secured(keys: str | None) -> Json:
+    if keys is None:
+        return {}
+    tls: Json = {"root_ca_certificate": f"{keys}/ca.pem", "enable_mtls": True}
+    for side in ("listen", "connect"):
+        tls |= {f"{side}_certificate": f"{keys}/cert.pem", f"{side}_private_key": f"{keys}/key.pem"}
+    tls |= {"verify_name_on_connect": False, "close_link_on_expiration": False}
+    listen = {"listen/endpoints": ["tls/0.0.0.0:0"], "transport/link/protocols": ["tls"]}
+    return {**listen, "transport/link/tls": tls}
+
+
 def settings(multicast: str, lease: float) -> zenoh.Config:
     config = zenoh.Config()
     for key, value in {
@@ -347,6 +361,7 @@ def settings(multicast: str, lease: float) -> zenoh.Config:
         "scouting/gossip/autoconnect_strategy": GREATER_CONNECTS,
         "transport/link/tx/lease": round(lease * 1000),
         "transport/shared_memory/enabled": False,
+        **secured(os.environ.get("KEYS")),
     }.items():
         config.insert_json5(key, json.dumps(value))
     return config

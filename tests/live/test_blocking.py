@@ -31,7 +31,7 @@ def say(*words):
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
+def fleet(tmp_path_factory: pytest.TempPathFactory, fleet_kind: str) -> Iterator[CliFleet]:
     with fleet_of(tmp_path_factory.mktemp("blocking"), "robot/a", "robot/b") as fleet:
         yield fleet
 

@@ -72,7 +72,7 @@ async def test_a_component_without_arcs_moves_there_and_back_and_counts_on(lab: 
     lab.node("a")
     lab.node("b")
     client = await lab.client()
-    hosts = Hosts(client)
+    hosts = Hosts(await lab.manager(client))
     first = await hosts.start("a", "c", "counter", QUICK)
     await lab.ready(client)
     await counts_on(hosts, "a")
@@ -101,7 +101,7 @@ async def test_a_component_takes_its_hold_along_and_a_rival_gets_nothing(lab: Co
     lab.node("b")
     lab.node("r", "robot/x", "robot/y")
     client = await lab.client()
-    hosts = Hosts(client)
+    hosts = Hosts(await lab.manager(client))
     await lab.ready(client, "robot/x", "robot/y")
     params = QUICK | {"rc": "robot/x"}
     await hosts.start("a", "c", "tally", params)
@@ -135,7 +135,7 @@ async def test_what_waits_for_its_arc_moves_with_its_place(lab: ComponentLab) ->
     lab.node("a")
     lab.node("b", "robot/x")
     client = await lab.client()
-    hosts = Hosts(client)
+    hosts = Hosts(await lab.manager(client))
     await lab.ready(client, "robot/x")
     first = await client.request("first", {"robot/x": {}}, min_runtime=600)
     assert await client.granted(first) is not None
@@ -160,7 +160,7 @@ async def test_a_move_that_fails_before_the_commit_changes_nothing(tmp_path: Pat
         lab.node("a", "robot/x")
         lab.node("b")
         client = await lab.client()
-        hosts = Hosts(client)
+        hosts = Hosts(await lab.manager(client))
         await lab.ready(client, "robot/x")
         await hosts.start("a", "c", "tally", QUICK | {"rc": "robot/x"})
         await counts_on(hosts, "a")
@@ -209,7 +209,8 @@ class Target:
         """To which the other had come."""
         mesh = node.mesh
         self.token = mesh.alive(Token("b", Role.NODE, "node", "x"))
-        mesh.serve(mesh.keys.component("b", mesh.me), ComponentOperation, self._asked)
+        for key in mesh.keys.served_component("b"):
+            mesh.serve(key, ComponentOperation, self._asked)
 
     @classmethod
     async def there(cls, fleet: Fleet, incarnation: int, *, component: bool = True) -> Target:
@@ -262,7 +263,7 @@ async def test_who_handed_over_takes_back_what_the_new_one_does_not_take_on(lab:
     register(lab)
     lab.node("a", "robot/x")
     client = await lab.client()
-    hosts = Hosts(client)
+    hosts = Hosts(await lab.manager(client))
     await lab.ready(client, "robot/x")
     await hosts.start("a", "c", "tally", TALLY)
     await counts_on(hosts, "a")
@@ -282,21 +283,21 @@ async def test_who_handed_over_takes_back_what_the_new_one_does_not_take_on(lab:
 
     grants = [(await lab.rc(client, "robot/x")).holders[0].grant]
     # Refused at the commit: nothing has changed.
-    target = await Target.there(lab.fleet, 2, component=False)
+    target = await Target.there(lab.fleet_of("b"), 2, component=False)
     assert "refused the hand-over" in await fails(target)
     assert not target.activated.is_set()
     assert grants[1] == grants[0]
 
-    failed = await Target.there(lab.fleet, 3)
+    failed = await Target.there(lab.fleet_of("b"), 3)
     failed.answer = lambda request: request.answer(failed.view("ended", "failed"))
     failed.at_last = failed.gives_back
     assert "asked anew here" in await fails(failed)
-    unknown = await Target.there(lab.fleet, 4)
+    unknown = await Target.there(lab.fleet_of("b"), 4)
     unknown.answer = lambda request: request.refuse(Problem("unknown_component", "what?"))
     unknown.at_last = unknown.gives_back
     assert "asked anew here" in await fails(unknown)
     # This one dies with all that it holds, and says nothing.
-    silent = await Target.there(lab.fleet, 5)
+    silent = await Target.there(lab.fleet_of("b"), 5)
     silent.answer = lambda _: silent.token.close()
     silent.at_last = silent.leave
     assert "asked anew here" in await fails(silent)
@@ -308,11 +309,11 @@ async def test_who_handed_over_does_nothing_until_it_is_known_that_the_new_one_r
     register(lab)
     lab.node("a", "robot/x")
     client = await lab.client()
-    hosts = Hosts(client)
+    hosts = Hosts(await lab.manager(client))
     await lab.ready(client, "robot/x")
     await hosts.start("a", "c", "tally", TALLY)
     await counts_on(hosts, "a")
-    target = await Target.there(lab.fleet, 2)
+    target = await Target.there(lab.fleet_of("b"), 2)
     answers: list[ComponentView | None] = [target.view("running"), target.view("standby"), None]
     moving = asyncio.create_task(hosts.get("a", MoveComponent("c", 1, "b", 2), Moved))
 

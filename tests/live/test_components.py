@@ -14,7 +14,8 @@ import pytest
 from tests.behaviors.components.kit import ComponentLab, Hosts, gone, lives
 from tests.behaviors.components.odd import TOO_LARGE
 from tests.hang import HANG
-from zscout.keyexpr import Role, Token
+from zscout.keyexpr import Role, Sender, Token
+from zscout.mesh import ZenohMesh
 from zscout.messages import (
     MAX_OUTPUT,
     MAX_PARAMS_SIZE,
@@ -45,7 +46,7 @@ COUNTER = ComponentSpec("counter", {"period": 0.02}, restart="never")
 async def test_a_component_is_started_once_listed_read_checkpointed_and_stopped(lab: ComponentLab) -> None:
     lab.node("a")
     client = await lab.client()
-    hosts = Hosts(client)
+    hosts = Hosts(await lab.manager(client))
     loads: asyncio.Queue[LoadReport] = asyncio.Queue()
     client.mesh.subscribe(client.mesh.keys.load_any, LoadReport, lambda _, load: loads.put_nowait(load))
     # Asked for twice at once, and again: there is one process.
@@ -103,7 +104,7 @@ async def test_what_a_node_does_not_do_it_refuses_with_the_reason(lab: Component
     lab.node("a", extra="[components]\nmax = 2\n")
     lab.node("b", extra='[components]\nkinds = ["counter"]\n')
     lab.node("c", extra="[components]\nallow = false\n")
-    hosts = Hosts(await lab.client())
+    hosts = Hosts(await lab.manager(await lab.client()))
 
     def start(name: str, incarnation: int, kind: str = "still") -> StartComponent:
         return StartComponent(name, incarnation, ComponentSpec(kind, restart="never"))
@@ -144,7 +145,7 @@ async def test_one_that_does_not_get_ready_is_killed(tmp_path: Path) -> None:
     # Alone: what else begins at that moment has the same limit, and may need longer beside other work.
     async with ComponentLab(tmp_path, start_timeout=20) as lab:
         lab.node("a")
-        never = await Hosts(await lab.client()).start("a", "never", "never")
+        never = await Hosts(await lab.manager(await lab.client())).start("a", "never", "never")
         assert (never.ended, quiet(never.tail)) == ("failed", "warming up\n")
         assert never.reason == "it was killed: it did not get ready within 20 s"
 
@@ -152,7 +153,7 @@ async def test_one_that_does_not_get_ready_is_killed(tmp_path: Path) -> None:
 @pytest.mark.slow
 async def test_how_one_ended_is_told_as_it_was(lab: ComponentLab) -> None:
     lab.node("a")
-    hosts = Hosts(await lab.client())
+    hosts = Hosts(await lab.manager(await lab.client()))
 
     ways = ("raise", "exit", "vanish", "abort", "children")
     for way in ways:
@@ -194,7 +195,7 @@ async def test_how_one_ended_is_told_as_it_was(lab: ComponentLab) -> None:
 @pytest.mark.slow
 async def test_limits_hold_for_the_component_alone(lab: ComponentLab) -> None:
     lab.node("a")
-    hosts = Hosts(await lab.client())
+    hosts = Hosts(await lab.manager(await lab.client()))
     calm = await hosts.start("a", "calm", "still", memory_limit=200_000_000)
     spin = await hosts.start("a", "spin", "spin", {"cpu": 1.0}, cpu_limit=0.4)
     assert calm.pid is not None
@@ -230,7 +231,7 @@ def numbers_in(text: str) -> list[int]:
 
 async def test_nothing_outlives_a_node_that_is_killed(lab: ComponentLab) -> None:
     lab.node("a")
-    hosts = Hosts(await lab.client())
+    hosts = Hosts(await lab.manager(await lab.client()))
     kinds = {"free": {}, "busy": {"busy": True}, "frozen": {}}
     pids: list[int] = []
     for name, params in kinds.items():
@@ -250,7 +251,7 @@ async def test_nothing_outlives_a_node_that_is_killed(lab: ComponentLab) -> None
 async def test_a_node_that_stops_ends_its_components_and_what_they_started(lab: ComponentLab) -> None:
     node = lab.node("a", "robot/x")
     client = await lab.client()
-    hosts = Hosts(client)
+    hosts = Hosts(await lab.manager(client))
     await lab.ready(client, "robot/x")
     views = [
         await hosts.start("a", "count", "counter", {"rc": "robot/x", "period": 0.02}),
@@ -271,14 +272,15 @@ async def test_a_node_that_stops_ends_its_components_and_what_they_started(lab: 
 async def test_who_sees_a_higher_incarnation_ends_itself(lab: ComponentLab) -> None:
     lab.node("a")
     client = await lab.client()
-    hosts = Hosts(client)
+    hosts = Hosts(await lab.manager(client))
     await hosts.start("a", "c", "still", incarnation=7)
     await hosts.start("a", "deaf", "deaf", incarnation=7)
     await hosts.start("a", "d", "still", incarnation=7)
-    for name, instance in (("c", "6-x"), ("c", "x"), ("c", "8-x"), ("deaf", "9-x")):
-        client.mesh.alive(Token("b", Role.COMPONENT, name, instance))
-    for name in ("c", "deaf"):
-        await hosts.ended("a", name)
+    async with await ZenohMesh.open(lab.fleet_of("b"), Sender("b", "node")) as mesh:
+        for name, instance in (("c", "6-x"), ("c", "x"), ("c", "8-x"), ("deaf", "9-x")):
+            mesh.alive(Token("b", Role.COMPONENT, name, instance))
+        for name in ("c", "deaf"):
+            await hosts.ended("a", name)
     listed = await hosts.get("a", ListComponents(), ComponentList)
     ends = {view.component: (view.ended, view.reason) for view in listed.components}
     assert ends == {
@@ -293,7 +295,7 @@ async def test_one_that_does_not_reach_a_device_takes_over_no_hold_of_it(lab: Co
     """It would have to give back at once what it was handed over, to whoever waits for it."""
     lab.node("a", "robot/x")
     client = await lab.client()
-    hosts = Hosts(client)
+    hosts = Hosts(await lab.manager(client))
     await hosts.start("a", "c", "counter", {"period": 0.02, "rc": "robot/x"}, standby=True)
 
     def held(rc: str) -> RestoreComponent:
@@ -309,7 +311,7 @@ async def test_one_that_does_not_reach_a_device_takes_over_no_hold_of_it(lab: Co
 async def test_one_that_stands_by_runs_when_it_is_activated(lab: ComponentLab) -> None:
     lab.node("a")
     client = await lab.client()
-    hosts = Hosts(client)
+    hosts = Hosts(await lab.manager(client))
     view = await hosts.start("a", "c", "counter", {"period": 0.02}, standby=True)
     assert view.phase == "standby"
     assert await client.mesh.living(client.mesh.keys.alive_any(Role.COMPONENT), timeout=1) == []

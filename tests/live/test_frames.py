@@ -90,7 +90,7 @@ async def until_there(put: Callable[[], None], there: Callable[[], bool]) -> Non
 async def test_what_is_no_frame_is_passed_over(lab: Lab) -> None:
     async with AsyncExitStack() as stack:
         here, there = [
-            await stack.enter_async_context(await ZenohMesh.open(lab.fleet, Sender(name, "node")))
+            await stack.enter_async_context(await ZenohMesh.open(lab.fleet_of(name), Sender(name, "node")))
             for name in ("here", "there")
         ]
         key = here.keys.frame(GRABBER)
@@ -156,7 +156,7 @@ async def scene(folder: Path, *, rate: float = 60) -> AsyncIterator[Scene]:
         two = stack.enter_context(
             MjpegServer(rate=40, picture=lambda number: jpeg(numbered(BLUE + number, grey=False)))
         )
-        leader = await ZenohMesh.open(lab.fleet, Sender("leader", "node"))
+        leader = await ZenohMesh.open(lab.fleet_of("leader"), Sender("leader", "node"))
         stack.push_async_callback(leader.close)
         rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _: BELIEVED, lambda _: None)
         rcm.start(RecoveredState())
@@ -253,7 +253,9 @@ async def test_frames_are_published_while_somebody_holds_and_somebody_looks(
             await until(lambda: at.driver._holder is None)
             # Nothing was commanded under it: from its first frame to its last it was used.
             keys = at.client.mesh.keys
-            reply = await at.client.mesh.ask_one(keys.rc_state(GRABBER), RcAsk(), RcState, timeout=HANG)
+            reply = await at.client.mesh.ask_one(
+                keys.ask_rc_state(GRABBER, at.client.mesh.me), RcAsk(), RcState, timeout=HANG
+            )
             assert reply is not None
             assert reply.message is not None
             assert {use.grant: use.seconds for use in reply.message.used}[newer] > 0

@@ -174,7 +174,8 @@ async def test_journals_answer_while_nobody_leads(tmp_path: Path) -> None:
         await client.end(await client.request("survey", {"robot/a": {}}, min_runtime=600))
         await told(lab, lambda found: [hold["outcome"] for hold in found["holds"]] == ["released"])
         above = Grants(Term((await lab.state(client, lambda _: True)).term.counter + 1, "stranger"), 1, 0, 0.5)
-        client.mesh.publisher(client.mesh.keys.grants, Grants).put(above)
+        mesh = await lab.manager(client)
+        mesh.publisher(mesh.keys.grants, Grants).put(above)
         await lab.living(client, Role.RCM, lambda hosts: not hosts)
         for command, found in (("history", "holds"), ("usage", "accounts")):
             done = await lab.zscout(command, "--json")

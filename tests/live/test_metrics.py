@@ -20,6 +20,7 @@ import pytest
 from tests.hang import HANG
 from tests.live.bench import comes_to, granted
 from tests.live.lab import Lab, awaited
+from tests.live.rights import Present
 from tests.ports import free_port
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import CommandRefused, RequestRefused
@@ -93,7 +94,7 @@ class PrometheusServer:
 @asynccontextmanager
 async def measured(folder: Path) -> AsyncIterator[tuple[Lab, Client, int]]:
     """A node that leads, has a robot and shows its figures, with a client and what it has done."""
-    groups = '[roles]\nclient = ["test"]\n[groups]\narms = ["test"]\n'
+    groups = "" if Present.secured else '[roles]\nclient = ["test"]\n[groups]\npeople = ["test"]\n'
     async with Lab(folder, extra=groups) as lab:
         port = free_port()
         lab.node("anvil", "robot/a", extra=f"[metrics]\nport = {port}")
@@ -129,11 +130,11 @@ async def test_a_node_shows_what_it_knows(tmp_path: Path) -> None:
         r"zscout_leading 1\.0",
         r"zscout_terms_led_total 1\.0",
         r"zscout_queue_length 0\.0",
-        r'zscout_wait_seconds_count\{group="arms",priority="0"\} 3\.0',
-        r'zscout_wait_seconds_count\{group="arms",priority="5"\} 1\.0',
+        r'zscout_wait_seconds_count\{group="people",priority="0"\} 3\.0',
+        r'zscout_wait_seconds_count\{group="people",priority="5"\} 1\.0',
         # It was foretold to start when the first one's minimum runtime would be over.
         r'zscout_forecast_error_seconds_bucket\{le="-15\.0"\} [1-9]\.0',
-        r'zscout_preemptions_total\{group="arms",priority="0"\} 1\.0',
+        r'zscout_preemptions_total\{group="people",priority="0"\} 1\.0',
         r'zscout_refusals_total\{code="unknown_parameter"\} 1\.0',
         r'zscout_holds\{rc="robot/a"\} 0\.0',
         r'zscout_held_seconds_total\{rc="robot/a"\} [\d.e-]+',
@@ -155,7 +156,7 @@ async def test_prometheus_scrapes_it_and_answers_from_that(tmp_path: Path) -> No
             # It grows while it is held.
             await prometheus.until("sum by (rc) (zscout_held_seconds_total)", rc, 3)
             await prometheus.until("sum by (rc) (rate(zscout_held_seconds_total[1m]))", rc, 0.01)
-            waits = 'zscout_wait_seconds_count{group="arms"}'
+            waits = 'zscout_wait_seconds_count{group="people"}'
             assert await prometheus.until(waits, {"priority": "0"}, 4) == 4
             dashboard = "(zscout_leading == 1) * on(instance) group_left(host, fleet) zscout_info"
             assert await prometheus.until(dashboard, leads, 1) == 1

@@ -167,7 +167,7 @@ async def ranked(client: Client, asked: RankAsk, hosts: set[str]) -> HostRanking
     """The answer, once it names exactly these hosts."""
     mesh = client.mesh
     return await awaited(
-        lambda: answered(lambda: mesh.ask_one(mesh.keys.rank, asked, HostRanking, timeout=HANG)),
+        lambda: answered(lambda: mesh.ask_one(mesh.keys.ask_rank(mesh.me), asked, HostRanking, timeout=HANG)),
         lambda ranking: {one.host for one in ranking.hosts} == hosts,
     )
 
@@ -190,7 +190,9 @@ async def test_the_balancer_ranks_whom_it_hears(tmp_path: Path) -> None:
         assert some.left_out == {"h9": "no report of it"}
         none = await ranked(client, RankAsk(labels=["gpu"]), set())
         assert set(none.left_out.values()) == {"it has no label gpu"}
-        reply = await client.mesh.ask_one(client.mesh.keys.rank, RankAsk(at_most=1), HostRanking, timeout=HANG)
+        reply = await client.mesh.ask_one(
+            client.mesh.keys.ask_rank(client.mesh.me), RankAsk(at_most=1), HostRanking, timeout=HANG
+        )
         assert reply is not None
         assert reply.message is not None
         assert (len(reply.message.hosts), reply.message.more) == (1, 2)

@@ -104,8 +104,13 @@ class PlainProcess:
         program = str(Path(__file__).with_name("plain_client.py"))
         hold_lease = lab.fleet.timing.hold_lease / SECOND
         arguments = [lab.fleet.name, "elsewhere", name, mesh.multicast_address, str(mesh.lease), str(hold_lease)]
+        keys = lab.fleet_of("elsewhere").security
+        env = lab.env if keys is None else lab.env | {"KEYS": str(keys)}
         process = await asyncio.create_subprocess_exec(
-            sys.executable, program, *arguments, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
+            *(sys.executable, program, *arguments),
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            env=env,
         )
         return cls(process)
 

@@ -183,7 +183,8 @@ async def test_a_snapshot_that_was_overtaken_is_read_again(
 ) -> None:
     monkeypatch.setattr(resource_controller, "REREAD_TIMEOUT", HANG)
     client = await lab.client()
-    mesh, keys = client.mesh, client.mesh.keys
+    mesh = await lab.manager(client)
+    keys = mesh.keys
     waiting: list[IncomingQuery[StateAsk]] = []
     seq = 3
 
@@ -192,7 +193,7 @@ async def test_a_snapshot_that_was_overtaken_is_read_again(
             # The first answer is held back until more has been published.
             waiting.append(request)
         else:
-            request.answer(RcmState(TERM, seq, "test", [view(str(mesh.me), 5)]))
+            request.answer(RcmState(TERM, seq, "test", [view(str(client.mesh.me), 5)]))
 
     rc = await stand.rc("robot/x", Bench())
     mesh.serve(keys.rcm_state, StateAsk, on_asked)
@@ -216,7 +217,7 @@ async def test_an_rc_that_died_while_the_lead_was_taken_is_lost_within_a_lease(t
     async with Lab(tmp_path, lease=4) as lab, Stand(lab) as stand:
         rc = await stand.rc("robot/real", Bench())
         client = await lab.client()
-        leader = await ZenohMesh.open(lab.fleet, Sender("leader", "node"))
+        leader = await ZenohMesh.open(lab.fleet_of("leader"), Sender("leader", "node"))
         rcm = Rcm(leader, lab.fleet, Term(1, "test"), lambda _: BELIEVED, lambda _: None)
         try:
             # Both answered when they were asked; then one of them died, and nobody saw its token go.

@@ -309,7 +309,7 @@ async def at_its_end(process: subprocess.Popen[bytes]) -> None:
 async def test_the_program_says_where_it_records_and_ends_in_order(
     tmp_path: Path, lab: Lab, number: signal.Signals | None
 ) -> None:
-    job = RecorderJob(RecorderConfig(tmp_path / "new" / "runs", "127.0.0.1", 0), lab.fleet, "a")
+    job = RecorderJob(RecorderConfig(tmp_path / "new" / "runs", "127.0.0.1", 0), lab.fleet_of("a"), "a")
     process = run_recorder(lab, encode_job(job))
     assert process.stdout is not None
     assert process.stdin is not None
@@ -334,10 +334,10 @@ async def test_bad_settings_are_one_line_and_code_2(tmp_path: Path) -> None:
             port = other.getsockname()[1]
             jobs = {
                 f"can't listen on 127.0.0.1, port {port}": encode_job(
-                    RecorderJob(RecorderConfig(tmp_path / "runs", "127.0.0.1", port), lab.fleet, "a")
+                    RecorderJob(RecorderConfig(tmp_path / "runs", "127.0.0.1", port), lab.fleet_of("a"), "a")
                 ),
                 "recordings can't be written to": encode_job(
-                    RecorderJob(RecorderConfig(tmp_path / "file" / "runs", "127.0.0.1", 0), lab.fleet, "a")
+                    RecorderJob(RecorderConfig(tmp_path / "file" / "runs", "127.0.0.1", 0), lab.fleet_of("a"), "a")
                 ),
                 "no job for a recorder": b'{"recorder": 1}\n',
             }
@@ -361,7 +361,7 @@ async def test_a_recorder_that_comes_late_has_what_a_journal_kept(tmp_path: Path
             pass
         film = await client.request("film", {"robot/a": {}}, min_runtime=60)
         await lab.state(client, lambda state: {held.arc for held in state.holds} == {"film"})
-        job = RecorderJob(RecorderConfig(runs, "127.0.0.1", 0, past=past), lab.fleet, "b")
+        job = RecorderJob(RecorderConfig(runs, "127.0.0.1", 0, past=past), lab.fleet_of("b"), "b")
         process = run_recorder(lab, encode_job(job))
         await recording(lab)
         if past:
@@ -401,7 +401,7 @@ async def test_parts_follow_one_another_and_the_oldest_make_room(tmp_path: Path)
         old = [before(number, 20_000_000) for number in (1, 2, 3)]
         lab.node("a", "robot/a")
         client = await lab.begun("crew")
-        job = RecorderJob(RecorderConfig(runs, "127.0.0.1", 0, limit=50), lab.fleet, "b")
+        job = RecorderJob(RecorderConfig(runs, "127.0.0.1", 0, limit=50), lab.fleet_of("b"), "b")
         process = run_recorder(lab, encode_job(job), "-c", IN_A_HURRY)
         await recording(lab)
         assert [path.exists() for path in old] == [False, True, True]

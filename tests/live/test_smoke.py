@@ -12,7 +12,6 @@ from tests.live.lab import TTL, Lab
 from zscout.behaviors.client.arc import Revoked, hold
 
 pytestmark = pytest.mark.live
-ON_BOTH_FLEETS = True
 
 
 @pytest.mark.essential

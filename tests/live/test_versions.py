@@ -156,7 +156,7 @@ async def test_a_component_moves_between_the_versions_with_its_hold(tmp_path: Pa
         with lab.at(leads):
             lab.node("r", "robot/x", extra="[components]\nallow = false\n")
         client = await lab.client()
-        placing, hosts = Placing(client), Hosts(client)
+        placing, hosts = Placing(client), Hosts(await lab.manager(client))
         await lab.ready(client, "robot/x")
         await placing.hosts(3)
         said: list[Grants] = []

@@ -12,7 +12,7 @@ import psutil
 
 from tests.hang import HANG
 from tests.live.lab import Lab
-from zscout.behaviors.client.client import Client
+from zscout.mesh import Mesh
 from zscout.messages import (
     ComponentList,
     ComponentSpec,
@@ -64,17 +64,17 @@ class ComponentLab(Lab):
 
 
 class Hosts:
-    """Asks nodes about their components."""
+    """Asks nodes about their components, as the placer does: on the mesh of `Lab.manager`."""
 
-    def __init__(self, client: Client) -> None:
-        self.client = client
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
 
     async def ask(self, host: str, operation: msgspec.Struct, kind: type[R]) -> R | Problem:
         """The answer of a host, which must come."""
-        key = self.client.mesh.keys.component(host, self.client.mesh.me)
+        key = self.mesh.keys.component(host, self.mesh.me)
         async with asyncio.timeout(2 * HANG):
             while True:
-                reply = await self.client.mesh.ask_one(key, operation, kind, timeout=HANG)
+                reply = await self.mesh.ask_one(key, operation, kind, timeout=HANG)
                 if reply is not None:
                     answer = reply.message or reply.problem
                     assert answer is not None

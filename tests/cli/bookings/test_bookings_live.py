@@ -24,7 +24,7 @@ RCS = ("robot/a", "robot/b", "robot/c", "framegrabber/f1", "framegrabber/f2", "r
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
+def fleet(tmp_path_factory: pytest.TempPathFactory, fleet_kind: str) -> Iterator[CliFleet]:
     with fleet_of(tmp_path_factory.mktemp("booked"), *RCS, env={"TZ": "Europe/Berlin"}) as fleet:
         yield fleet
 
@@ -208,7 +208,7 @@ def test_what_the_rcm_refuses_is_bad_input(fleet: CliFleet) -> None:
 
 
 def test_anothers_booking_is_asked_about(fleet: CliFleet) -> None:
-    with connect("script", fleet=fleet.lab.fleet, host="test") as lab:
+    with connect("script", fleet=fleet.lab.fleet_of("bob"), host="bob") as lab:
         lab.client.who = Who("bob", "test")
         bookings = BookingsClient(lab.client)
         booking = lab.run(bookings.book({"robot/a": {}}, datetime.now(UTC) + timedelta(days=5), 60, name="1"))

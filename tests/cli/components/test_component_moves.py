@@ -23,7 +23,7 @@ OTHER = {"anvil": "bellows", "bellows": "anvil"}
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
+def fleet(tmp_path_factory: pytest.TempPathFactory, fleet_kind: str) -> Iterator[CliFleet]:
     """Two nodes, which also know the kind that docs/components.md shows how to write."""
     fleet = CliFleet(tmp_path_factory.mktemp("moves"))
     try:

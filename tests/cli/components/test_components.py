@@ -20,7 +20,7 @@ pytestmark = pytest.mark.live
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
+def fleet(tmp_path_factory: pytest.TempPathFactory, fleet_kind: str) -> Iterator[CliFleet]:
     """One node, which also knows kinds that behave badly."""
     fleet = CliFleet(tmp_path_factory.mktemp("components"))
     try:

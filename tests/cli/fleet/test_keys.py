@@ -6,12 +6,14 @@ import asyncio
 import json
 import subprocess
 
+import msgspec
 import pytest
 
 from tests.cli.cli_fleet import in_lab
 from tests.cli.tools import Terminal, zscout_soon, zscout_soon_until
 from tests.hang import HANG
 from tests.live.lab import Lab
+from tests.live.rights import Present
 from zscout.messages import (
     BookingsAsk,
     BookingsTold,
@@ -56,22 +58,28 @@ async def test_what_is_listed_lives_and_answers(lab: Lab) -> None:
     assert alive.keys() == everybody
     rcm = alive["anvil", "rcm", "node"]
     assert rcm["token"] == f"{base}/alive/anvil/rcm/node/{state.term.rcm}"
-    queries = [key["key"] for key in rcm["keys"] if key["how"] == "query"]
-    assert queries[:2] == [f"{base}/rcm/schedule/*/*", f"{base}/rcm/state"]
-    assert await client.mesh.ask_one(queries[1], StateAsk(), RcmState, timeout=HANG) is not None
-    assert queries[2:] == [f"{base}/rcm/bookings", f"{base}/balancer/rank", f"{base}/placer/component/*/*"]
-    placer = queries[4].replace("*/*", str(client.mesh.me))
-    assert await client.mesh.ask_one(queries[2], BookingsAsk(), BookingsTold, timeout=HANG) is not None
-    assert await client.mesh.ask_one(queries[3], RankAsk(), HostRanking, timeout=HANG) is not None
-    assert await client.mesh.ask_one(placer, ListPlacements(), Placements, timeout=HANG) is not None
-    (host,) = [key["key"] for key in alive["anvil", "node", "node"]["keys"]]
-    assert await client.mesh.ask_one(host, ListComponents(), ComponentList, timeout=HANG) is not None
+    queries = [key["key"].removeprefix(f"{base}/") for key in rcm["keys"] if key["how"] == "query"]
+    named = "/*/*" if Present.secured else ""
+    schedule, placer = "rcm/schedule/*/*", "placer/component/*/*"
+    assert queries == [schedule, *(f"{key}{named}" for key in ("rcm/state", "rcm/bookings", "balancer/rank")), placer]
+
+    async def answers(key: str, question: msgspec.Struct, kind: type[msgspec.Struct]) -> bool:
+        asked = key.replace("/*/*", f"/{client.mesh.me}")
+        reply = await client.mesh.ask_one(f"{base}/{asked}", question, kind, timeout=HANG)
+        return reply is not None and reply.message is not None
+
+    assert await answers(queries[1], StateAsk(), RcmState)
+    assert await answers(queries[2], BookingsAsk(), BookingsTold)
+    assert await answers(queries[3], RankAsk(), HostRanking)
+    assert await answers(placer, ListPlacements(), Placements)
+    (host,) = [key["key"].removeprefix(f"{base}/") for key in alive["anvil", "node", "node"]["keys"]]
+    assert await answers(host, ListComponents(), ComponentList)
     for rc in ("robot/a", "radio/rf0"):
         served = {key["key"] for key in alive["anvil", "rc", rc]["keys"] if key["how"] == "query"}
         assert (f"{base}/rc/{rc}/vote" in served) == (rc == "radio/rf0")
-        key = f"{base}/rc/{rc}/state"
-        assert key in served
-        assert await client.mesh.ask_one(key, RcAsk(), RcState, timeout=HANG) is not None
+        key = f"rc/{rc}/state{named}"
+        assert f"{base}/{key}" in served
+        assert await answers(key, RcAsk(), RcState)
 
     def the_same(done: subprocess.CompletedProcess[str]) -> bool:
         lines = [line.split() for line in done.stdout.splitlines()[3:]]

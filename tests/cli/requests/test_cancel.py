@@ -17,7 +17,7 @@ pytestmark = pytest.mark.live
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
+def fleet(tmp_path_factory: pytest.TempPathFactory, fleet_kind: str) -> Iterator[CliFleet]:
     with fleet_of(tmp_path_factory.mktemp("give"), "robot/a", "robot/b") as fleet:
         yield fleet
 
@@ -82,7 +82,7 @@ def test_an_unknown_arc_is_one_line(fleet: CliFleet) -> None:
 
 
 def test_anothers_request_is_asked_about(fleet: CliFleet) -> None:
-    with connect("script", fleet=fleet.lab.fleet, host="test") as lab:
+    with connect("script", fleet=fleet.lab.fleet_of("bob"), host="bob") as lab:
         lab.client.who = Who("bob", "test")
         arc = lab.run(lab.client.request("survey", {"robot/a": {}}, min_runtime=60))
         lab.run(lab.client.granted(arc))
@@ -90,11 +90,10 @@ def test_anothers_request_is_asked_about(fleet: CliFleet) -> None:
             done = fleet.zscout(word, "survey")
             assert done.returncode == 1, done
             assert done.stderr == (
-                f"zscout: survey (test/script/{arc.id}) of bob@test is not yours; "
-                f"to {word} it all the same, add --yes\n"
+                f"zscout: survey (bob/script/{arc.id}) of bob@test is not yours; to {word} it all the same, add --yes\n"
             )
         done = fleet.zscout("cancel", "survey", "--yes", "--json")
         assert json.loads(done.stdout)["arcs"] == [
-            {"arc": "survey", "id": arc.id, "client": "test/script", "was": "running"}
+            {"arc": "survey", "id": arc.id, "client": "bob/script", "was": "running"}
             | {"state": "ended", "outcome": "cancelled"}
         ]

@@ -24,7 +24,7 @@ F1, F2 = "framegrabber/f1", "framegrabber/f2"
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
+def fleet(tmp_path_factory: pytest.TempPathFactory, fleet_kind: str) -> Iterator[CliFleet]:
     rcs = (F1, F2, "robot/a", "radio/rf0:rate=10")
     with fleet_of(tmp_path_factory.mktemp("patterns"), *rcs) as fleet:
         yield fleet

@@ -32,7 +32,7 @@ STUBBORN = "trap '' TERM; sleep 1000 & echo pid $$ $!; wait; wait"
 
 
 @pytest.fixture(scope="module")
-def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[CliFleet]:
+def fleet(tmp_path_factory: pytest.TempPathFactory, fleet_kind: str) -> Iterator[CliFleet]:
     with fleet_of(tmp_path_factory.mktemp("request"), "robot/a", "robot/b", "radio/rf0:rate=10") as fleet:
         yield fleet
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
-import socket
 from collections.abc import Coroutine, Generator, Mapping
 from contextlib import ExitStack, closing
 from decimal import Decimal
@@ -15,7 +13,7 @@ from msgspec.structs import replace
 
 from zscout import messages
 from zscout.behaviors.client.confirmation import NOT_DONE
-from zscout.behaviors.client.identity import checked_comment, this_program
+from zscout.behaviors.client.identity import checked_comment, host_of, this_machine, this_program
 from zscout.behaviors.client.internals import ClientInternals
 from zscout.behaviors.client.rcm_link import QUERY_TIMEOUT, TRY_AGAIN
 from zscout.behaviors.client.request import (
@@ -27,9 +25,8 @@ from zscout.behaviors.client.request import (
     amounts,
     check_seconds,
 )
-from zscout.config.certificates import read_certificates
 from zscout.config.fleet import FLEET_VARIABLE, Fleet, beside, fleet_from_env
-from zscout.keyexpr import USERS, Role, Sender, Token, check_name, new_instance, valid_name
+from zscout.keyexpr import USERS, Role, Sender, Token, check_name, new_instance
 from zscout.mesh import Mesh, ZenohMesh
 from zscout.mesh.exchange import naming_versions
 from zscout.mesh.supervision import done_within
@@ -75,14 +72,10 @@ class Client:
     @classmethod
     async def _connect(cls, name: str | None, fleet: Fleet | None, host: str | None) -> Self:
         fleet = fleet or fleet_from_env()
-        machine = valid_name(socket.gethostname())
-        if fleet.security is not None:
-            # Keys have the certificate's name: of this machine, or of who runs this program.
-            host = host or read_certificates(fleet.security).name
-        host = host or os.environ.get("ZSCOUT_HOST") or machine
+        host = host or host_of(fleet)
         me = Sender(check_name(host, "host"), check_name(name or f"client-{new_instance()}", "client"))
         client = cls.on(await ZenohMesh.open(replace(fleet, mesh=beside(fleet.mesh)), me), fleet)
-        client.who = this_program(host if fleet.security is None else machine)
+        client.who = this_program(host if fleet.security is None else this_machine())
         return client
 
     @classmethod

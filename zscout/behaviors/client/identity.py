@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import getpass
 import os
+import socket
 import sys
 from pathlib import Path
 
+from zscout.config.certificates import read_certificates
+from zscout.config.fleet import Fleet
+from zscout.keyexpr import valid_name
 from zscout.messages import MAX_COMMENT, MAX_WHO, Who
 from zscout.types import clean
 
@@ -16,6 +20,18 @@ _MAIN = ("__main__", "__init__")
 def this_program(host: str) -> Who:
     """Who runs this process on `host`, and its program's name, without arguments: these may hold secrets."""
     return Who(bounded(_user()), bounded(host), bounded(_program()))
+
+
+def host_of(fleet: Fleet) -> str:
+    """The host in the keys of this program: the name in its certificate, a machine's or a person's; on a plain mesh
+    $ZSCOUT_HOST, else this machine's name. Raises BadInput."""
+    if fleet.security is not None:
+        return read_certificates(fleet.security).name
+    return os.environ.get("ZSCOUT_HOST") or this_machine()
+
+
+def this_machine() -> str:
+    return valid_name(socket.gethostname())
 
 
 def bounded(text: str, most: int = MAX_WHO) -> str:

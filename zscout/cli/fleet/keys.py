@@ -51,16 +51,17 @@ async def show_keys(*, as_json: bool) -> None:
 
 def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str, Any]]:
     """The keys behind a token: `how` is query (it answers), put (it publishes) or hear (it subscribes). `sharable`
-    names the RCs that vote; None where nobody knows, so that all may."""
+    names the RCs that vote; None where nobody knows, so that all may. On a secured fleet people ask under their names.
+    """
     match token.role:
         case Role.RCM:
             found = [
                 ("query", own.schedule_any, "request, cancel, release, hand over, book, unbook, slots"),
-                ("query", own.rcm_state, "who holds, who waits and why"),
-                ("query", own.rcm_bookings, "what is booked"),
+                ("query", own.rcm_state_any if own.closed else own.rcm_state, "who holds, who waits and why"),
+                ("query", own.rcm_bookings_any if own.closed else own.rcm_bookings, "what is booked"),
                 ("put", own.grants, "holders of each device touched, revocations, heartbeat"),
                 ("put", own.notice_any, "what becomes of each request, to its client"),
-                ("query", own.rank, "the best hosts for a component"),
+                ("query", own.rank_any if own.closed else own.rank, "the best hosts for a component"),
                 ("query", own.served_placer()[0], "place, stop, migrate, drain, uncordon, list"),
                 ("put", own.placements, "how components stand, at each change"),
             ]
@@ -70,7 +71,7 @@ def served(own: Keys, token: Token, sharable: set[str] | None) -> list[dict[str,
         case Role.RC:
             found = [
                 ("query", own.command_any(token.name), "do this, under a grant"),
-                ("query", own.rc_state(token.name), "holders, term, health"),
+                ("query", (own.asked_state_any if own.closed else own.rc_state)(token.name), "holders, term, health"),
                 ("put", own.rc_state(token.name), "the same, at each change"),
                 ("hear", own.grants, "who holds it from now on"),
             ]

@@ -30,7 +30,7 @@ from zscout.cli.fleet.local_recording import MAGIC, local_address
 from zscout.cli.fleet.viewer_page import ViewerPage, silent
 from zscout.config.node import MAX_PAST, PAST, RecorderConfig
 from zscout.config.strict import DURATIONS, BadInput, parse_duration, quoted
-from zscout.keyexpr import NODES, valid_name
+from zscout.keyexpr import NODES
 from zscout.services.recorder.process import BAD_SETTINGS, QUIET, RecorderJob, Recording, encode_job
 from zscout.types import SECOND, Ns
 
@@ -186,6 +186,8 @@ async def _source(
     file: Path | None, bind: str, port: int | None, out: Path, past: int | None
 ) -> AsyncIterator[tuple[Recording, Child | None]]:
     """What the viewer opens, and the recorder behind it where one was started."""
+    from zscout.behaviors.client.identity import host_of
+
     if file is not None:
         yield Recording(str(file), None), None
         return
@@ -196,7 +198,7 @@ async def _source(
             terminal.print_line("zscout: --past: a node records; its file sets what it shows of before", sys.stderr)
         yield joined, None
         return
-    host = os.environ.get("ZSCOUT_HOST") or valid_name(socket.gethostname())
+    host = host_of(fleet)
     job = RecorderJob(
         RecorderConfig(out, bind, port or 0, past=PAST if past is None else past), fleet, host, joined=False
     )
