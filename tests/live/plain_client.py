@@ -105,6 +105,7 @@ class OpenRequest:
     asked: Json
     state: str = "asking"
     place: Any = None
+    seal: Any = None
     grant: Any = None
     rcs: tuple[str, ...] = ()
     bound: Json = field(default_factory=dict)
@@ -164,6 +165,7 @@ class PlainClient:
             changed = new != (request.state, request.grant)
             request.state = notice["state"]
             request.place = notice.get("place", request.place)
+            request.seal = notice.get("seal", request.seal)
             request.grant = notice.get("grant") if request.state == "running" else None
             if request.state == "running":
                 request.rcs, request.bound = tuple(notice["rcs"]), notice.get("bound", {})
@@ -195,6 +197,7 @@ class PlainClient:
             for request in self.requests.values():
                 told = {field: request.asked[field] for field in fields if field in request.asked}
                 told |= {"place": request.place} if request.place is not None else {}
+                told |= {"seal": request.seal} if request.seal is not None else {}
                 told |= {"grant": request.grant} if request.grant is not None else {}
                 requests.append(told)
             answer = {"client": f"{self.host}/{self.name}", "requests": requests}
@@ -224,6 +227,8 @@ class PlainClient:
             message = {"op": "request"} | request.asked
             if request.place is not None:
                 message["place"] = request.place
+            if request.seal is not None:
+                message["seal"] = request.seal
         for good, answer in self.schedule("Ask", message):
             if not good and answer["code"] not in TRY_AGAIN:
                 with self.lock:
