@@ -83,6 +83,7 @@ PLAIN_ONLY: Final[dict[str, str]] = {
     "services/node/test_tree_load.py": _RIGHTLESS,
     "live/test_moving.py": "two minutes of deaths around a move; test_component_moves has moves with rights",
     "fuzz/test_live.py": _FORGES,
+    "services/recorder/test_robots_heard.py": _FORGES,
     "live/test_bad_input.py": _FORGES,
     "live/test_forgeries.py": _FORGES,
     "live/test_plain_doors.py": _FORGES,

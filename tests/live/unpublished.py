@@ -75,7 +75,7 @@ class Deaths:
 
     def _start(self, host: str) -> None:
         file = self._lab.folder / f"{host}.toml"
-        file.write_text(f'[node]\nhost = "{host}"\nfleet = "fleet.toml"\n')
+        file.write_text(f'[node]\nhost = "{host}"\nfleet = "fleet.toml"\n{self._lab.security_of(host)}')
         command = [sys.executable, "-m", "tests.live.unpublished", "node", str(file)]
         self._lab.nodes[host] = self._lab.spawn(command, log=f"{host}.log")
 

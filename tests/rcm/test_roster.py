@@ -12,7 +12,8 @@ from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
 from zscout.rcm.devices import ExpectedDevices
 from zscout.rcm.places import Places
-from zscout.rcm.roster import MAX_TOKENS, Roster
+from zscout.rcm.roster import Roster
+from zscout.rcm.sight import MAX_TOKENS
 from zscout.rcm.steps import Outbox, Why
 from zscout.scheduling.model import ClientLost
 from zscout.types import SECOND, Term
@@ -31,7 +32,7 @@ def token(number: int, host: str = "greedy") -> Token:
 def test_tokens_of_one_host_are_bounded_and_the_earliest_stay() -> None:
     members = a_roster()
     changes = [members.client_token(0, token(number), alive=True) for number in range(MAX_TOKENS + 50)]
-    assert [host for change in changes for host, _ in change.strange] == ["greedy"]
+    assert {host for change in changes for host, _ in change.strange} == {"greedy"}
     assert len(members.clients) == MAX_TOKENS
     assert "greedy/c0" in members.clients
     members.client_token(0, token(MAX_TOKENS + 1), alive=False)  # it never counted

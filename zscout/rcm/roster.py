@@ -5,7 +5,6 @@ An RC that reports holds of earlier terms is pending until its gangs have answer
 
 from __future__ import annotations
 
-from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -21,6 +20,7 @@ from zscout.rcm.admission import Admission
 from zscout.rcm.deadlines import Deadlines
 from zscout.rcm.devices import ExpectedDevices
 from zscout.rcm.recovery import adopted, aged, gangs_of
+from zscout.rcm.sight import MAX_TOKENS, Sight
 from zscout.rcm.steps import ClientFound, ClientListed, Compare, Name, Outbox, Question, Resume, Why
 from zscout.rcm.terms import Source, Word
 from zscout.scheduling.model import ArcStatus, ClientLost, RcJoined, RcLost, RcReported
@@ -39,11 +39,7 @@ MAX_HEALTH: Final = 500
 """Characters of an RC's health."""
 NEAR_END: Final[Ns] = SECOND // 20
 """A hold with less than this left may have ended at its RC: clocks differ a little."""
-AWAY_PART: Final = 0.25
-"""A leader that stalled for this part of the mesh lease, or lost several hosts within it, was away itself."""
 SHUNNED: Final = "its host alone shows a term in which nobody leads"
-MAX_TOKENS: Final = 2_000
-"""Tokens of one host that count: later ones are ignored."""
 PRESENT_WITHIN: Final = 0.05
 """Seconds within which others answer a leader that is not away: a later answer may follow its return."""
 MAX_WITNESSES: Final = 3
@@ -92,6 +88,8 @@ class _Rc:
     """It disappeared recently: for a hold lease it may still serve its holders, and then settle."""
     unseen: bool = False
     """It counts as present, and its token disappeared while this leader was away."""
+    missed: bool = False
+    """It is expected, this term has not seen it, and has reported so."""
 
 
 class Roster:
@@ -107,19 +105,14 @@ class Roster:
         now: Ns,
     ) -> None:
         """`known`: an ARC of the core."""
-        self._keys, self._me, self.term, self._devices = keys, me, term, devices
+        self._keys, self.term, self._devices, self._timing = keys, term, devices, fleet.timing
         self._admission, self._known = admission, known
-        self._lease: Ns = round(fleet.mesh.lease * SECOND)
-        self._hold_lease: Ns = fleet.timing.hold_lease
-        self._timeout: Ns = fleet.timing.rebuild
+        self._sight = Sight(me, round(fleet.mesh.lease * SECOND))
         self._rcs: dict[RcName, _Rc] = {}
         self.clients: dict[ClientId, set[str]] = {}
         """Living instances of each client that has a token."""
-        self._unshown: dict[ClientId, int] = {}
-        """Clients that must show a token, each with the number of its deadline."""
-        self._tokens: Counter[HostName] = Counter()
-        self._surplus: set[HostName] = set()
-        """Hosts whose surplus was reported."""
+        self._unshown: dict[ClientId, Ns] = {}
+        """Clients that must show a token, each with its deadline."""
         self.shunned: set[str] = set()
         """Instances of RCs that count as absent, for the terms that they show."""
         self._asked: set[ClientId] = set()
@@ -129,19 +122,11 @@ class Roster:
         """ARCs whose clients believe in holds of RCs never seen here: since when that is known."""
         self._probed: dict[str, int] = {}
         """By key: how often it is still probed."""
-        self._missed: set[RcName] = set()
-        """Expected devices that this term has not seen, and has reported so."""
         self._judged: list[tuple[ClientId | RcName, Token]] = []
         """Tokens that disappeared just now."""
         self._home_until = now + fleet.timing.hold_lease + SETTLE
         """Until then an RC that this term has not seen may still be used at the host that the fleet file names."""
-        self._stall: tuple[Ns, Ns, bool] = (0, 0, False)
-        """The last stall of this process: its length, its end, and whether it ended just now."""
-        self._gone_hosts: deque[tuple[Ns, HostName]] = deque()
-        """Hosts whose last tokens disappeared recently, and when."""
-        self._away_until: Ns = 0
         self._deadlines: Deadlines[tuple[_Due, Any]] = Deadlines()
-        self._numbers = 0
         self._now = now
         self._out = Outbox()
 
@@ -152,7 +137,7 @@ class Roster:
         has a lease to answer."""
         self._now = now
         joined, waiting = list(rcs), list(pending)
-        alone = all(state.host == self._me for state in (*joined, *waiting))
+        alone = all(state.host == self._sight.me for state in (*joined, *waiting))
         for state in joined:
             self._rc(state.rc).joined = state
         for state in (*joined, *waiting):
@@ -160,14 +145,13 @@ class Roster:
         for state in waiting:
             self._hold_up(state, patient=patient or alone)
         # An RC that died before its token was watched would never be seen to disappear.
-        self._set(self._lease, _Due.DROP_UNSEEN)
+        self._set(self._sight.lease, _Due.DROP_UNSEEN)
         self._set(self._home_until - now, _Due.JOIN_ALL)
         self._out.events += map(_presence, joined)
         return self._taken()
 
     def stalled(self, length: Ns, ended: Ns, *, fresh: bool) -> None:
-        """This process stalled. `fresh`: what arrived meanwhile may not be handled yet."""
-        self._stall = length, ended, fresh
+        self._sight.stalled(length, ended, fresh=fresh)
 
     def client_token(self, now: Ns, token: Token, *, alive: bool) -> Outbox:
         self._now = now
@@ -218,7 +202,7 @@ class Roster:
         if until > now and token.instance not in self.shunned:
             self.shunned.add(token.instance)
             self._set(until - now, _Due.SHUNNED, token)
-            self._set(2 * self._timeout, _Due.UNLED, token)
+            self._set(2 * self._timing.rebuild, _Due.UNLED, token)
         return self._taken()
 
     def expect(self, now: Ns, client: ClientId) -> None:
@@ -282,8 +266,7 @@ class Roster:
                 self._shown_late(asked)
             case Why.PROBE if not silent and not self._is_seen(asked):
                 self._suspect(asked.key)
-            case Why.WITNESS if not silent and not self._stall[2] and not self._lost_several:
-                self._away_until = 0
+            case Why.WITNESS if not silent and self._sight.clear():
                 self._present()
         return self._taken()
 
@@ -304,8 +287,8 @@ class Roster:
         self._now = now
         while (due := self._deadlines.pop_due(now)) is not None:
             match due:
-                case _Due.SHOWN, (client, number) if self._unshown.get(client) == number:
-                    self._overdue(client, number)
+                case _Due.SHOWN, (client, at) if self._unshown.get(client) == at:
+                    self._overdue(client, at)
                 case _Due.JUDGE, _:
                     self._judge()
                 case _Due.AGAIN, asked:
@@ -373,18 +356,19 @@ class Roster:
             since = rc.seen
             if since is None and rc.named is None:
                 since = self._awaited_since(arc)
-            if rc.joined is None and since is not None and (now - since < self._lease or self._stood_still):
+            if rc.joined is None and since is not None and (now - since < self._sight.lease or self._stood_still):
                 return True
         return False
 
     # Clients
 
     def _expect(self, now: Ns, client: ClientId) -> None:
-        self._numbers += 1
-        self._unshown[client] = self._numbers
-        self._set(self._lease, _Due.SHOWN, (client, self._numbers))
+        at = now + self._sight.lease
+        if self._unshown.get(client) != at:
+            self._unshown[client] = at
+            self._deadlines.set(at, (_Due.SHOWN, (client, at)))
 
-    def _overdue(self, client: ClientId, number: int) -> None:
+    def _overdue(self, client: ClientId, number: Ns) -> None:
         if self._stood_still:
             self._expect(self._now, client)  # it had less than a lease
         else:
@@ -408,7 +392,7 @@ class Roster:
             return
         absent = message is None and problem is None
         self._out.suspicions.append((silent, absent and client in self.clients))
-        self._set(self._timeout, _Due.AGAIN, Question(Why.REQUESTS, "", 0, client=client))
+        self._set(self._timing.rebuild, _Due.AGAIN, Question(Why.REQUESTS, "", 0, client=client))
 
     def _lose_client(self, client: ClientId) -> None:
         self._unshown.pop(client, None)
@@ -445,27 +429,22 @@ class Roster:
             return
         if not rc.joined.leaving and self._was_away(token):
             rc.unseen = True
-            self._set(self._lease, _Due.DROP_UNSEEN)
+            self._set(self._sight.lease, _Due.DROP_UNSEEN)
         else:
             self._drop(token.name)
 
     def _was_away(self, token: Token) -> bool:
         """Return True if `token` may have disappeared because this leader itself was away (rule 9)."""
-        now = self._now
-        if now >= self._away_until:
+        if not self._sight.is_away(self._now):
             self._doubted.clear()
-        if not self._tokens[token.host]:
-            self._gone_hosts.append((now, token.host))
-        while self._gone_hosts and self._gone_hosts[0][0] < now - self._span:
-            self._gone_hosts.popleft()
-        if (self._stall[2] and self._stood_still) or self._lost_several:
-            self._away_until = now + self._lease
-        elif now >= self._away_until and (witnesses := self._witnesses()[:MAX_WITNESSES]):
-            # Of several lost links one is the first.
-            self._away_until = now + self._lease
-            for key, kind in witnesses:
-                self._out.questions.append(Question(Why.WITNESS, key, PRESENT_WITHIN, kind=kind))
-        return now < self._away_until
+        if self._sight.lost(self._now, token.host):
+            return True
+        witnesses = self._witnesses()[:MAX_WITNESSES]
+        if witnesses:
+            self._sight.doubt(self._now)  # of several lost links one is the first
+        for key, kind in witnesses:
+            self._out.questions.append(Question(Why.WITNESS, key, PRESENT_WITHIN, kind=kind))
+        return bool(witnesses)
 
     def _present(self) -> None:
         """This leader was not away: what disappeared is gone."""
@@ -476,18 +455,8 @@ class Roster:
         self._drop_unseen()
 
     @property
-    def _span(self) -> Ns:
-        return round(AWAY_PART * self._lease)
-
-    @property
     def _stood_still(self) -> bool:
-        """True if this leader stalled for long, less than a lease ago."""
-        length, ended, _ = self._stall
-        return length > self._span and self._now - ended < self._lease
-
-    @property
-    def _lost_several(self) -> bool:
-        return len({host for _, host in self._gone_hosts}) > 1
+        return self._sight.stood_still(self._now)
 
     def _witnesses(self) -> list[tuple[str, type[Struct]]]:
         """For each other host that is seen: a key that it answers on."""
@@ -497,20 +466,17 @@ class Roster:
         }
         tokens = (token for rc in self._rcs.values() for token in rc.tokens.values())
         keys |= {token.host: (self._keys.rc_state(token.name), RcState) for token in tokens}
-        return [keys[host] for host in sorted(keys) if host != self._me]
+        return [keys[host] for host in sorted(keys) if host != self._sight.me]
 
     def _counts(self, token: Token, *, alive: bool, known: bool) -> bool:
         """Return True if a token that came or went counts: its host has no more than MAX_TOKENS, or it did before."""
         if alive is known:
             return alive
-        if alive and self._tokens[token.host] >= MAX_TOKENS:
-            if token.host not in self._surplus:
-                self._surplus.add(token.host)
-                text = f"{token.host} shows more than {MAX_TOKENS} tokens: later ones are ignored"
-                self._out.strange.append((token.host, text))
-            return False
-        self._tokens[token.host] += 1 if alive else -1
-        return True
+        if self._sight.count(token.host, alive=alive):
+            return True
+        text = f"{token.host} shows more than {MAX_TOKENS} tokens: later ones are ignored"
+        self._out.strange.append((token.host, text))
+        return False
 
     # Contradictions of the mesh
 
@@ -519,7 +485,7 @@ class Roster:
         if not fresh or len(self._probed) < MAX_PROBED:
             self._probed[key] = MAX_PROBES
             if fresh:
-                asked = Question(Why.PROBE, key, self._timeout / SECOND, kind=kind, client=client, token=token)
+                asked = Question(Why.PROBE, key, self._timing.rebuild / SECOND, kind=kind, client=client, token=token)
                 self._set(PROBE_PERIOD, _Due.AGAIN, asked)
 
     def _is_seen(self, asked: Question) -> bool:
@@ -558,7 +524,7 @@ class Roster:
         if gone is None:
             return
         rc.departed = gone
-        self._set(self._hold_lease + round((gone.settle or 0) * SECOND), _Due.FREE, gone)
+        self._set(self._timing.hold_lease + round((gone.settle or 0) * SECOND), _Due.FREE, gone)
         self._probe(self._keys.rc_state(name), RcState, token=Token(gone.host, Role.RC, name, gone.instance))
         self._out.events.append(RcLost(name, why=why or self._devices.why_gone(name, gone.host)))
         if gone.leaving:
@@ -588,13 +554,13 @@ class Roster:
         # Requests that wait for a device never seen in this term get to know why it is absent.
         there = {name for name, rc in self._rcs.items() if rc.joined or rc.pending or rc.tokens or rc.departed}
         for name in sorted(self._devices.names - there):
-            if name not in self._missed and (home := self._devices.latest_home(name)) is not None:
-                self._missed.add(name)
+            if not self._rc(name).missed and (home := self._devices.latest_home(name)) is not None:
+                self._rc(name).missed = True
                 self._out.events.append(RcLost(name, why=self._devices.why_gone(name, home)))
 
     def _awaited_since(self, arc: ArcId) -> Ns | None:
         if arc not in self._awaited and len(self._awaited) >= MAX_PROBED:
-            self._awaited = {other: at for other, at in self._awaited.items() if self._now - at < self._lease}
+            self._awaited = {other: at for other, at in self._awaited.items() if self._now - at < self._sight.lease}
         if len(self._awaited) < MAX_PROBED:
             self._awaited.setdefault(arc, self._now)
         return self._awaited.get(arc)
@@ -623,7 +589,7 @@ class Roster:
             return
         if not _is_of(state, token) or state.term < self.term:  # a report from before the promise
             # An answer without a promise can come at once, again and again: a token may outlive its RC.
-            self._set(self._timeout, _Due.AGAIN, Question(Why.PROMISE, "", 0, token=token))
+            self._set(self._timing.rebuild, _Due.AGAIN, Question(Why.PROMISE, "", 0, token=token))
         elif any(holder.grant.term != self.term for holder in state.holders):
             # A hold that all RCs of its gang report continues: they join together.
             self._hold_up(state, patient=True)
@@ -634,7 +600,7 @@ class Roster:
 
     def _hold_up(self, state: RcState, *, patient: bool) -> None:
         pending = self._rc(state.rc).pending = _Pending(state, self._now, patient)
-        for wait in (self._timeout, self._lease, MAX_LEASES_PENDING * self._lease):
+        for wait in (self._timing.rebuild, self._sight.lease, MAX_LEASES_PENDING * self._sight.lease):
             self._set(wait, _Due.WAITED, (pending, wait))
 
     def _wait_over(self, pending: _Pending, wait: Ns) -> None:
@@ -660,8 +626,8 @@ class Roster:
             patient = any(waiting.patient for waiting in together) or any(self._rc(other).tokens for other in missing)
             # They join together: the last to answer may be the first whose links came back.
             waited = min(waiting.waited for waiting in together)
-            over = waited >= (self._lease if patient else self._timeout)
-            if not missing or over or pending[name].waited >= MAX_LEASES_PENDING * self._lease:
+            over = waited >= (self._sight.lease if patient else self._timing.rebuild)
+            if not missing or over or pending[name].waited >= MAX_LEASES_PENDING * self._sight.lease:
                 for other in gangs & pending.keys():
                     self._rc(other).pending = None
                 admitted = [pending.pop(other) for other in sorted(gangs & pending.keys())]
@@ -744,7 +710,7 @@ class Roster:
         self._out.suspicions.append((f"{key} answers, and its token is missing", so))
 
     def _ask(self, why: Why, key: str, **how: Any) -> None:
-        self._out.questions.append(Question(why, key, self._timeout / SECOND, **how))
+        self._out.questions.append(Question(why, key, self._timing.rebuild / SECOND, **how))
 
     def _ask_rc(self, why: Why, token: Token) -> None:
         message = RcAsk(promise=self.term, instance=token.instance)

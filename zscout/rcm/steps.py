@@ -64,7 +64,7 @@ class Question(NamedTuple):
     token: Token | None = None
     client: ClientId = ""
     number: int = 0
-    """Of the client's deadline, or the caller's of `seek`."""
+    """The client's deadline, or the caller's number of `seek`."""
 
 
 class Why(Enum):

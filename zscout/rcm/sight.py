@@ -1,0 +1,69 @@
+"""What a leader sees of other hosts: how many tokens, and whether it was away itself when they went (rule 9). Pure."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from typing import Final
+
+from zscout.types import HostName, Ns
+
+AWAY_PART: Final = 0.25
+"""A leader that stalled for this part of the mesh lease, or lost several hosts within it, was away itself."""
+MAX_TOKENS: Final = 2_000
+"""Tokens of one host that count: later ones are ignored."""
+
+
+class Sight:
+    def __init__(self, me: HostName, lease: Ns) -> None:
+        self.me, self.lease, self._span = me, lease, round(AWAY_PART * lease)
+        self._tokens: Counter[HostName] = Counter()
+        self._stall: tuple[Ns, Ns, bool] = (0, 0, False)
+        """The last stall of this process: its length, its end, and whether it ended just now."""
+        self._gone: deque[tuple[Ns, HostName]] = deque()
+        """Hosts whose last tokens disappeared recently, and when."""
+        self._away_until: Ns = 0
+
+    def stalled(self, length: Ns, ended: Ns, *, fresh: bool) -> None:
+        """This process stalled. `fresh`: what arrived meanwhile may not be handled yet."""
+        self._stall = length, ended, fresh
+
+    def count(self, host: HostName, *, alive: bool) -> bool:
+        """Count a token that came or went. Return False if it is one too many."""
+        if alive and self._tokens[host] >= MAX_TOKENS:
+            return False
+        self._tokens[host] += 1 if alive else -1
+        return True
+
+    def stood_still(self, now: Ns) -> bool:
+        """Return True if this process stalled for long, less than a lease ago."""
+        length, ended, _ = self._stall
+        return length > self._span and now - ended < self.lease
+
+    def is_away(self, now: Ns) -> bool:
+        """Return True while what disappears may be there."""
+        return now < self._away_until
+
+    def lost(self, now: Ns, host: HostName) -> bool:
+        """A token of `host` disappeared. Return True if this leader may be away."""
+        if not self._tokens[host]:
+            self._gone.append((now, host))
+        while self._gone and self._gone[0][0] < now - self._span:
+            self._gone.popleft()
+        if (self._stall[2] and self.stood_still(now)) or self._lost_several:
+            self.doubt(now)
+        return self.is_away(now)
+
+    def doubt(self, now: Ns) -> None:
+        """For a lease this leader may be away."""
+        self._away_until = now + self.lease
+
+    def clear(self) -> bool:
+        """Another host answered. Return True if that shows that this leader is there."""
+        if self._stall[2] or self._lost_several:
+            return False
+        self._away_until = 0
+        return True
+
+    @property
+    def _lost_several(self) -> bool:
+        return len({host for _, host in self._gone}) > 1
