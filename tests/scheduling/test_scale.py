@@ -65,7 +65,7 @@ SIZES = {
     "few, crowded": Size(5, 3, 25, 4, 1200, 2, 0.5),
     "few, exclusive": Size(6, 0, 40, 6, 1200, 2, 0.0),
     "many, slow votes": Size(20, 6, 250, 10, 400, 10, 0.6),
-    "few, by pattern": Size(8, 2, 12, 4, 240, 8, 0.5, 0.6),
+    "few, by pattern": Size(8, 2, 12, 4, 320, 8, 0.5, 0.6),
     "large": Size(100, 10, times(700), 50, 40, 20, 0.05),
 }
 

@@ -80,7 +80,7 @@ def test_a_radio_is_not_kept_for_those_who_come_later() -> None:
         assert starts == {"holds": 0, "short": 100, "first": 170, "second": 260}
 
 
-@pytest.mark.parametrize("seeds", in_parts(range(times(300)), quick=15, size=300))
+@pytest.mark.parametrize("seeds", in_parts(range(times(300)), quick=25, size=300))
 def test_replay_gives_the_holds_of_the_live_core(seeds: Sequence[int]) -> None:
     for seed in seeds:
         draw = random.Random(seed)  # noqa: S311

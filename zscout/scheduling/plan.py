@@ -38,7 +38,8 @@ class BindingPlan(NamedTuple):
     started: Set[ArcId] = frozenset()
     ended: Set[ArcId] = frozenset()  # running ARCs; some start on other RCs
     dropped: Set[ArcId] = frozenset()  # those given to start that others would end
-    mask: int = 0  # bits of the RCs of those that start
+    mask: int = 0  # bits of the RCs of those that start,
+    moved: int = 0  # and of those of them that end before, on other RCs
     unknown: Sequence[tuple[Rc, HolderSet]] = ()  # the votes counted as yes on which bindings may depend
     off_limits: int = 0  # bits of the RCs that wait for these votes,
     since: Rank | None = None  # for this rank and those below
@@ -83,8 +84,9 @@ class _DryRun:
             self._run()
             started = self._started.values()
             bound = {arc.id: arc.bound for arc in started if arc.patterns}
-            mask = union(arc.mask for arc in started)
+            mask, moved = union(arc.mask for arc in started), self._started.keys() & self._ended.keys()
             plan = BindingPlan(bound, self._started.keys(), self._ended.keys(), frozenset(self._dropped), mask)
+            plan = plan._replace(moved=union(self._started[arc].mask for arc in moved))
             return plan._replace(**self._depends()) if self._presumed else plan
         finally:
             for arc in self._started.values():
