@@ -248,15 +248,14 @@ class ConflictGroup:
         self.planned: int | None = None
         """The set of the plan as bits of item numbers. None: as by name, the plan is not needed."""
         self.moves = False
-        """`priority` would end an ARC and start it on other RCs, some of these: no set of these items can express that."""
+        """`priority` would end an ARC and start it on other RCs, perhaps of these: no set expresses that."""
         self.waits = bool(self.mask & plan.off_limits)
         """Votes are out on which its bindings depend."""
         if plan is not NO_PLAN:
             stay = (arc.id in plan.started if arc.hold is None else arc.id not in plan.ended for arc in self.arcs)
             self.planned = sum(1 << number for number, stays in enumerate(stay) if stays)
-self.moves = bool(self.mask & plan.moved) or any(
-                arc.id in plan.started and arc.id in plan.ended for arc in self.arcs
-            )
+            moved = plan.started & plan.ended
+            self.moves = bool(self.mask & plan.moved) or any(arc.id in moved for arc in self.arcs)
         self._number = {arc.id: number for number, arc in enumerate(self.arcs)}
         self.sharables = list(state.rcs_in(self.mask & state.sharable))
         vetoes = {rc.name: set(self._vetoes(rc)) for rc in self.sharables}
