@@ -82,7 +82,7 @@ def parse_trace(lines: Iterable[str], source: str) -> list[Job]:
             job = _Line(fields[1], fields[3], max(fields[4], fields[7]), fields[11], fields[12], fields[13])
         except (ValueError, IndexError):
             raise BadInput(f"{source}: line {number} is no job; write 18 numbers") from None
-        if job.runtime >= 0 and job.nodes > 0:
+        if job.runtime > 0 and job.nodes > 0:
             found.append(job)
     machine = machine or max((job.nodes for job in found), default=1)
     return _mapped(sorted(found, key=lambda job: job.submitted), machine)
@@ -92,24 +92,23 @@ def _mapped(lines: list[_Line], machine: int) -> list[Job]:
     if not lines:
         return []
     widths = [min(DEVICES, -(-line.nodes * DEVICES // machine)) for line in lines]
-    runtimes = [max(1, line.runtime) for line in lines]
-    work = sum(width * runtime for width, runtime in zip(widths, runtimes, strict=True))
+    work = sum(width * line.runtime for width, line in zip(widths, lines, strict=True))
     span = lines[-1].submitted - lines[0].submitted
     pace = work / (DEVICES * LOAD * span) if span else 0.0
     jobs = []
-    for line, width, runtime in zip(lines, widths, runtimes, strict=True):
+    for line, width in zip(lines, widths, strict=True):
         digest = hashlib.sha256(f"{line.user}/{line.application}".encode()).digest()
-        chance, place = digest[0] * 256 + digest[1], digest[2] % DEVICES
+        chance, place = int.from_bytes(digest[:2]), int.from_bytes(digest[2:4])
         named = width < DEVICES and chance % 100 < NAMING
-        mask = 0 if width <= MOST_BY_PATTERN and not named else _row(place, width)
+        mask = 0 if width <= MOST_BY_PATTERN and not named else _row(place % (DEVICES - width + 1), width)
         at = round((line.submitted - lines[0].submitted) * pace * 1_000) * (SECOND // 1_000)
         higher = line.group == PERSONNEL
-        jobs.append(Job(at, runtime * SECOND, mask, width, line.user, line.application, higher))
+        jobs.append(Job(at, line.runtime * SECOND, mask, width, line.user, line.application, higher))
     return jobs
 
 
 def _row(place: int, width: int) -> int:
-    return sum(1 << (place + number) % DEVICES for number in range(width))
+    return ((1 << width) - 1) << place
 
 
 def load(jobs: Iterable[Job]) -> float:
