@@ -1,6 +1,6 @@
 """What batch schedulers do, for comparison: EASY and conservative backfill, and shortest first, on distinct devices.
 
-Runtimes are exact and nobody is preempted. Each returns the start of every job, in ns. Jobs come in order of arrival."""
+Runtimes are exact and nobody is preempted. Each returns the start of every job, in ns; jobs are in order of arrival."""
 
 from __future__ import annotations
 

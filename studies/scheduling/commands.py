@@ -237,10 +237,17 @@ def shares(seeds: range, cases: int, processes: int | None, as_json: bool) -> No
     help="One priority for all, or a higher one for system personnel.",
 )
 @click.option("--first", type=click.IntRange(1), help="Only so many jobs. Default: all.")
+@click.option("--places", type=click.IntRange(0), default=0, help="Other places for programs. Default: 0.")
 @jobs_option
 @common.json_option("Print one JSON object instead of a table.")
 def traces(
-    trace: Path, policies: tuple[str, ...], classes: str, first: int | None, processes: int | None, as_json: bool
+    trace: Path,
+    policies: tuple[str, ...],
+    classes: str,
+    first: int | None,
+    places: int,
+    processes: int | None,
+    as_json: bool,
 ) -> None:
     """Plays a job trace (Standard Workload Format, .swf or .swf.gz) on 32 exclusive devices.
 
@@ -259,7 +266,7 @@ def traces(
     chosen = list(dict.fromkeys(policies)) or [*POLICIES, *STRATEGIES]
     forms = {"one": [False], "two": [True], "both": [False, True]}[classes]
     planned = [
-        study.TraceTrial(trace, policy, form, first)
+        study.TraceTrial(trace, policy, form, first, places)
         for form in forms
         for policy in chosen
         if policy in STRATEGIES or form is forms[0]

@@ -53,18 +53,19 @@ class Job:
     is_higher: bool
 
 
-def read_trace(path: Path, first: int | None = None) -> list[Job]:
-    """The jobs of a trace (.swf or .swf.gz) in order of arrival, or the `first` of them. Raises BadInput."""
+def read_trace(path: Path, first: int | None = None, places: int = 0) -> list[Job]:
+    """The jobs of a trace (.swf or .swf.gz) in order of arrival, or the `first` of them; `places`: which of many random
+    places programs have. Raises BadInput."""
     try:
         raw = path.read_bytes()
         text = (gzip.decompress(raw) if path.suffix == ".gz" else raw).decode("latin-1")
     except OSError as error:
         raise BadInput(f"{path}: {error.strerror or error}; give a trace in the Standard Workload Format") from None
-    jobs = parse_trace(text.splitlines(), str(path))
+    jobs = parse_trace(text.splitlines(), str(path), places)
     return jobs if first is None else jobs[:first]
 
 
-def parse_trace(lines: Iterable[str], source: str) -> list[Job]:
+def parse_trace(lines: Iterable[str], source: str, places: int = 0) -> list[Job]:
     """Raises BadInput."""
     found: list[_Line] = []
     machine = 0
@@ -85,10 +86,10 @@ def parse_trace(lines: Iterable[str], source: str) -> list[Job]:
         if job.runtime > 0 and job.nodes > 0:
             found.append(job)
     machine = machine or max((job.nodes for job in found), default=1)
-    return _mapped(sorted(found, key=lambda job: job.submitted), machine)
+    return _mapped(sorted(found, key=lambda job: job.submitted), machine, places)
 
 
-def _mapped(lines: list[_Line], machine: int) -> list[Job]:
+def _mapped(lines: list[_Line], machine: int, places: int) -> list[Job]:
     if not lines:
         return []
     widths = [min(DEVICES, -(-line.nodes * DEVICES // machine)) for line in lines]
@@ -97,9 +98,9 @@ def _mapped(lines: list[_Line], machine: int) -> list[Job]:
     pace = work / (DEVICES * LOAD * span) if span else 0.0
     jobs = []
     for line, width in zip(lines, widths, strict=True):
-        digest = hashlib.sha256(f"{line.user}/{line.application}".encode()).digest()
-        chance, place = int.from_bytes(digest[:2]), int.from_bytes(digest[2:4])
-        named = width < DEVICES and chance % 100 < NAMING
+        name = f"{line.user}-{line.application}{places or ''}"
+        place, chance = divmod(int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "little"), 100)
+        named = width < DEVICES and chance < NAMING
         mask = 0 if width <= MOST_BY_PATTERN and not named else _row(place % (DEVICES - width + 1), width)
         at = round((line.submitted - lines[0].submitted) * pace * 1_000) * (SECOND // 1_000)
         higher = line.group == PERSONNEL

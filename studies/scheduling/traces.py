@@ -28,6 +28,7 @@ class TraceTrial(NamedTuple):
     """A strategy of the product, or one of `POLICIES`."""
     classes: bool
     first: int | None = None
+    places: int = 0
     knobs: SchedulingPolicy = SchedulingPolicy()
 
 
@@ -48,7 +49,7 @@ class TraceReport:
 
 
 def run(trial: TraceTrial) -> TraceReport:
-    jobs = read_trace(trial.path, trial.first)
+    jobs = read_trace(trial.path, trial.first, trial.places)
     if trial.policy in POLICIES:
         starts = POLICIES[trial.policy](jobs)
         return _report(trial, jobs, [start - job.at for start, job in zip(starts, jobs, strict=True)])

@@ -28,9 +28,14 @@ def starts(policy: Callable[[Sequence[Job]], list[int]], *jobs: Job) -> list[flo
 
 
 def test_the_nodes_of_a_trace_become_devices() -> None:
-    lines = ["; MaxNodes: 128", line(1, 0, 100, 128), *(line(n, 10 * n, 60, 4, user=n, group=n % 3) for n in range(2, 60))]
+    lines = [
+        "; MaxNodes: 128",
+        line(1, 0, 100, 128),
+        *(line(n, 10 * n, 60, 4, user=n, group=n % 3) for n in range(2, 60)),
+    ]
     jobs = parse_trace(lines, "trace")
-    assert jobs[0].width == DEVICES and jobs[0].mask == (1 << DEVICES) - 1
+    assert jobs[0].width == DEVICES
+    assert jobs[0].mask == (1 << DEVICES) - 1
     assert {found.width for found in jobs[1:]} == {1}
     assert 0 < sum(not found.mask for found in jobs) < 30, "the most have a place of their own"
     assert load(jobs) == pytest.approx(LOAD, rel=0.01)
@@ -86,4 +91,5 @@ def test_one_table_of_all(tmp_path: Path) -> None:
     found = [run(TraceTrial(path, policy, classes=True)) for policy in (*POLICIES, "adaptive")]
     table = rows(found)
     assert [row[0] for row in table] == [*POLICIES, "adaptive"]
-    assert table[0][2].endswith(" s") and not found[-1].unserved
+    assert table[0][2].endswith(" s")
+    assert not found[-1].unserved
