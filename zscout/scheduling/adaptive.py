@@ -139,11 +139,10 @@ class Adaptive(Strategy):
     def _reserve(self, state: SchedulerState) -> Reservations | None:
         """Reserve for the starving ARCs. Where a reservation has ended or changed, ARCs that it held back are
         checked again."""
-        patience = state.policy.patience
-        if patience is None and not state.claims and self._reserved is None:
+        if state.policy.patience is None and not state.claims and self._reserved is None:
             return None
         before = self._reserved
-        reserved = reservations(state, patience, before)
+        reserved = reservations(state, before)
         self._reserved = reserved if reserved.bits else None
         if before is not None and before is not reserved:
             state.index.freed |= reserved.changed(before)

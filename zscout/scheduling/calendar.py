@@ -600,7 +600,7 @@ class Calendar:
         """Look again at the bookings that changed holders, RCs and reservations may affect, those in danger and overdue
         ones."""
         state, before = self._state, self._reserved
-        self._reserved = reserved = reservations(state, state.policy.patience, before)
+        self._reserved = reserved = reservations(state, before)
         changed, state.changed = state.changed, {}
         if before is not None and before is not reserved:
             for bit, over in reserved.starving_changed(before).items():
@@ -637,10 +637,10 @@ class Calendar:
         return min((start for start in starts if start > self._state.now), default=None)
 
     def _report_danger(self, claim: Claim) -> None:
-        state, reserved = self._state, reservations(self._state, self._state.policy.patience, self._reserved)
+        state, reserved = self._state, reservations(self._state, self._reserved)
         found = danger(state, reserved, claim)
         if isinstance(found, Reason) and self._keep_another(claim):
-            reserved = reservations(state, state.policy.patience, reserved)
+            reserved = reservations(state, reserved)
             found = danger(state, reserved, claim)
         self._reserved = reserved
         if isinstance(found, Undecided):

@@ -116,9 +116,13 @@ class _Search:
 
     def _held(self, rc: Rc) -> Iterable[_Taken]:
         now = self._state.now
-        for holder in rc.non_preemptible_holders(self._arc, now):
-            end = holder.known_end(self._arc)
-            yield _Taken(now, min(end, self._likely.get(holder.id, end)), holder.id)
+        for holder in rc.holders.values():
+            start = now if holder.hold is None else max(now, holder.hold.protected_from)
+            if (
+                first := next((at for at in (now, start) if not holder.preemptible_by(self._arc, at)), None)
+            ) is not None:
+                end = holder.known_end(self._arc)
+                yield _Taken(first, min(end, self._likely.get(holder.id, end)), holder.id)
 
     def _booked(self, rc: Rc) -> Iterable[_Taken]:
         for claim in self._state.dates.of(rc, self._wanted.start, self._end):
@@ -130,7 +134,7 @@ class _Search:
         state = self._state
         if state.policy.patience is None or not state.queued:
             return
-        for bit, reserved in reservations(state, state.policy.patience, None).starving.items():
+        for bit, reserved in reservations(state, None).starving.items():
             for promise in reserved if bit in self._taken else ():
                 if state.band(promise.arc.priority) >= state.band(self._wanted.priority):
                     self._taken[bit].append(_Taken(promise.start, promise.arc.ends(promise.start), promise.arc.id))
