@@ -15,6 +15,7 @@ from zscout.config.access import MAX_NAMES, AccessPolicy, Ceiling, Names, Quota,
 from zscout.config.scheduling_policy import (
     DEFAULT,
     FAIR_PATIENCE,
+    PATIENCE,
     FairShares,
     Preempt,
     Promise,
@@ -359,8 +360,9 @@ def _fair_shares(file: FleetFile, access: AccessPolicy, at: Where) -> FairShares
             raise here.bad(f"{quoted(name)} belongs to the group {groups[0]}", "give the group a weight")
         if access.ranks and name not in access.groups and name not in access.ranks:
             raise here.bad(f"{quoted(name)} is not a group and has no role", "add it under [groups], or correct it")
-    if file.fleet.patience is not None and table.patience < file.fleet.patience:
-        what = f"is {table.patience / SECOND:g} s, less than fleet.patience ({file.fleet.patience / SECOND:g} s)"
+    least = PATIENCE if file.fleet.patience is None else file.fleet.patience
+    if table.patience < least:
+        what = f"is {table.patience / SECOND:g} s, less than fleet.patience ({least / SECOND:g} s)"
         raise (at / "patience").bad(what, "write as much, or more")
     return FairShares(table.half_life, table.weights, patience=table.patience)
 

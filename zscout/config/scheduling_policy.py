@@ -8,6 +8,8 @@ from typing import Final, Literal, TypeAlias
 
 from zscout.types import SECOND, Ns
 
+PATIENCE: Final[Ns] = 142 * SECOND
+"""In ns: the least where it follows the runtimes. Measured: docs/study.md."""
 PREEMPT_BUDGET: Final = 0.25
 """Default. Measured: docs/scheduling.md."""
 FAIR_PATIENCE: Final[Ns] = 3_600 * SECOND

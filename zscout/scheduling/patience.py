@@ -7,11 +7,11 @@ from __future__ import annotations
 
 from typing import Final
 
+from zscout.config.scheduling_policy import PATIENCE
 from zscout.types import SECOND, Ns
 
 RUNTIMES: Final = 28
 """Measured: docs/scheduling.md."""
-LEAST: Final[Ns] = 142 * SECOND
 MOST: Final[Ns] = 12 * 3_600 * SECOND
 LONGEST: Final[Ns] = 86_400 * SECOND
 """A longer minimum runtime counts as this."""
@@ -25,7 +25,7 @@ class RuntimeMean:
     def __init__(self) -> None:
         self._owners: dict[str, tuple[int, float]] = {}  # by owner, least recent first: grants that count, their mean
         self._before: tuple[int, float] = 0, 0.0  # the same of the leader before, fading
-        self._known: Ns = LEAST
+        self._known: Ns = PATIENCE
         self._next: Ns = 0  # when it is reckoned anew
 
     def count(self, owner: str, min_runtime: Ns) -> None:
@@ -55,6 +55,6 @@ class RuntimeMean:
         counted = [*zip(means, (grants for _, grants in found), strict=True), (self._before[1], self._before[0])]
         grants = sum(count for _, count in counted)
         if not grants:
-            return LEAST
+            return PATIENCE
         mean = sum(mean * count for mean, count in counted) / grants
-        return max(LEAST, min(MOST, round(RUNTIMES * mean)))
+        return max(PATIENCE, min(MOST, round(RUNTIMES * mean)))
