@@ -220,7 +220,9 @@ class Leader:
         bookings = self._bookings
         waiting = tuple(replace(asked, request=bookings.dated(asked.request)) for asked in recovered.waiting)
         certain = 0 if bookings.settled else bookings.settles_at
-        lead = model.LeadTaken(self.term, tuple(recovered.holds), waiting, recovered.charged, certain)
+        lead = model.LeadTaken(
+            self.term, tuple(recovered.holds), waiting, recovered.charged, certain, recovered.patience
+        )
         booked = bookings.recovered({request.booking for request in requests if request.booking} | recovered.booked)
         gone = removed((hold.request for hold in recovered.holds), self.admission)
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
@@ -382,12 +384,13 @@ class Leader:
         instances: dict[str, str],
         begun: list[tuple[int, float]],
     ) -> messages.Grants:
-        now, charged = self._now, dict[str, float]()
+        now, charged, patience = self._now, dict[str, float](), None
         if now >= self._charged + CHARGED_EVERY:
-            self._charged, charged = now, self.core.charged()
+            self._charged, charged, patience = now, self.core.charged(), self.core.patience / SECOND or None
         every, time, age = self._fleet.timing.heartbeat / SECOND, self._bookings.time, self._bookings.age
         before, self.seq, self.published = self.seq, number, now
-        return messages.Grants(self.term, number, before, every, rcs, revoked, instances, begun, time, age, charged)
+        known = rcs, revoked, instances, begun, time, age, charged, patience
+        return messages.Grants(self.term, number, before, every, *known)
 
 
 def _revocation(effect: model.HoldEnded, name: str, now: Ns, left: Collection[ArcId]) -> messages.Revocation:

@@ -70,6 +70,8 @@ class RecoveredState:
     """The clients that have said what they ask for."""
     charged: Mapping[str, float] = field(default_factory=dict)
     """By group: what it lately had, as the leader before told (`fair_shares.py`)."""
+    patience: Ns | None = None
+    """As the leader before published it."""
     refused: list[NotLetIn] = field(default_factory=list)
     booked: set[str] = field(default_factory=set)
     """Dates of bookings that only RCs report as taken up: they do not lapse meanwhile."""
@@ -305,7 +307,9 @@ def _hold(
         place = some.place if mine.expects else mine.place
     request = admission.clamped(request)
     vouched = not admission.closed or mine is not None
-    return RecoveredHold(request, place, some.grant, end - request.min_runtime, end, bound, vouched)
+    left = [holder.protected_from for holder in held.values() if holder.protected_from is not None]
+    protected = end - round(min(left) * SECOND) if left else None
+    return RecoveredHold(request, place, some.grant, end - request.min_runtime, end, bound, vouched, protected)
 
 
 def _agree(needs: Mapping[Need, Params], bound: Mapping[Need, RcName], held: Mapping[RcName, Holder]) -> bool:

@@ -39,7 +39,7 @@ class RuntimeMean:
 
     def restore(self, patience: Ns) -> None:
         """Go on from what the leader before published."""
-        self._before, self._known, self._next = (KEPT, patience / RUNTIMES), patience, 0
+        self._before, self._next = (KEPT, min(patience, MOST) / RUNTIMES), 0
 
     def patience(self, now: Ns) -> Ns:
         """Of an ARC that is queued now; it is reckoned once in a while."""
