@@ -18,7 +18,7 @@ from zscout.scheduling.model import ArcRequest, HoldEnded, LeadTaken, Outcome, R
 from zscout.scheduling.patience import KEPT, LONGEST, MOST, RUNTIMES, RuntimeMean
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.simulation.replay import replay
-from zscout.types import SECOND, ArcId, Ns, Term
+from zscout.types import SECOND, ArcId, Need, Ns, Params, Term
 
 SHORT = 30 * SECOND
 POLICY = SchedulingPolicy(patience=SHORT)
@@ -33,7 +33,7 @@ def fleet(policy: SchedulingPolicy = POLICY, strategy: StrategyName = "adaptive"
 def ask(
     name: str, priority: int = 1, seconds: int = 100, rcs: str = "a", *, host: str = "", keep: bool = False
 ) -> Requested:
-    needs = {f"robot/{rc}": {} for rc in rcs}
+    needs: dict[Need, Params] = {f"robot/{rc}": {} for rc in rcs}
     return Requested(ArcRequest(name, f"{host or name}/c", needs, priority, seconds * SECOND, keep))
 
 

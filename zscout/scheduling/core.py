@@ -196,7 +196,7 @@ class Core:
         joined += [Booked(claim.booking) for claim in state.claims.values()]
         queued = (*state.queued.values(), *state.held_back.values()) if limit is None else self._best_ranked(limit)
         waiting = tuple(
-            model.Requested(arc.request, arc.place, arc.since, model.Past(arc.patience, arc.lost, arc.told))
+            model.Requested(arc.request, arc.place, arc.since, model.WaitSoFar(arc.patience, arc.lost, arc.told))
             for arc in queued
         )
         return joined, model.LeadTaken(term, recovered_holds, waiting, self.charged(), patience=self.patience)

@@ -308,7 +308,7 @@ def union(masks: Iterable[int]) -> int:
     return functools.reduce(operator.or_, masks, 0)
 
 
-class Past(NamedTuple):
+class WaitSoFar(NamedTuple):
     """Of an ARC that waits: what counts for its protection (`Arc`)."""
 
     patience: Ns
@@ -323,7 +323,7 @@ class Requested(Struct, frozen=True):
     request: ArcRequest
     place: Place | None = None
     since: Ns | None = None
-    past: Past | None = None
+    past: WaitSoFar | None = None
 
 
 class Cancelled(Struct, frozen=True):
