@@ -205,6 +205,11 @@ def _level_key(arc: Arc, first: set[ArcId], last: int, now: Ns) -> tuple[int, in
     return -arc.priority, 1
 
 
+def densities(arcs: Sequence[Arc]) -> Iterable[int]:
+    """The worth of an RC with each ARC."""
+    return [1] * len(arcs)
+
+
 def _one_group(arcs: Sequence[Arc]) -> bool:
     """Return True if a quick look shows a single group: the usual case."""
     mask, rest = 0, list(arcs)
@@ -242,8 +247,9 @@ class ConflictGroup:
                 level=levels[key],
                 running=arc.hold is not None,
                 past_min_runtime=arc.past_min_runtime(now),
+                density=density,
             )
-            for arc, key in zip(self.arcs, keys, strict=True)
+            for arc, key, density in zip(self.arcs, keys, densities(self.arcs), strict=True)
         ]
         self.planned: int | None = None
         """The set of the plan as bits of item numbers. None: as by name, the plan is not needed."""
