@@ -144,7 +144,7 @@ def check_worth(seed: int) -> None:
     for strategy in SEARCHING:
         found = decide(situation, strategy)
         assert not found.flickered, (seed, strategy)
-        assert not less(found.worth(), least.worth()), (seed, strategy)
+        assert not less(found.worth(strategy), least.worth(strategy)), (seed, strategy)
 
 
 TAGS = "abcd"

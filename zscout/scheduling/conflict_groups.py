@@ -9,9 +9,11 @@ Undecided ARCs that share no RC, even indirectly, are decided separately: a slow
 from __future__ import annotations
 
 import heapq
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from operator import attrgetter
+from typing import Final
 
 from zscout.scheduling.model import Arc, Rank, Rc, union
 from zscout.scheduling.packing import PackingItem, PackingProblem
@@ -22,6 +24,8 @@ from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.state import Actions, SchedulerState
 from zscout.scheduling.votes import HolderSet
 from zscout.types import ArcId, Ns
+
+SCALE: Final = 1 << 32
 
 
 def undecided_arcs(
@@ -205,9 +209,9 @@ def _level_key(arc: Arc, first: set[ArcId], last: int, now: Ns) -> tuple[int, in
     return -arc.priority, 1
 
 
-def densities(arcs: Sequence[Arc]) -> Iterable[int]:
-    """The worth of an RC with each ARC."""
-    return [1] * len(arcs)
+def density(runtime: Ns) -> int:
+    """The worth of an RC in use for so long: the shorter the more, as whoever waits behind it waits less."""
+    return max(1, SCALE // math.isqrt(runtime))
 
 
 def _one_group(arcs: Sequence[Arc]) -> bool:
@@ -247,9 +251,9 @@ class ConflictGroup:
                 level=levels[key],
                 running=arc.hold is not None,
                 past_min_runtime=arc.past_min_runtime(now),
-                density=density,
+                density=density(arc.request.min_runtime) if state.adaptive else 1,
             )
-            for arc, key, density in zip(self.arcs, keys, densities(self.arcs), strict=True)
+            for arc, key in zip(self.arcs, keys, strict=True)
         ]
         self.planned: int | None = None
         """The set of the plan as bits of item numbers. None: as by name, the plan is not needed."""

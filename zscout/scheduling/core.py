@@ -33,7 +33,7 @@ from zscout.types import NO_TERM, ArcId, ClientId, Grant, Ns, Place, RcName, Ter
 class Core:
     def __init__(self, strategy: Strategy | None = None, policy: SchedulingPolicy = DEFAULT) -> None:
         self.strategy = strategy or Priority()
-        self._state = SchedulerState(policy, budgets=self.strategy.name == "adaptive")
+        self._state = SchedulerState(policy, adaptive=self.strategy.name == "adaptive")
         self._votes = self._state.votes
         self.term: Term = NO_TERM
         self.seq = 0
@@ -239,7 +239,7 @@ class Core:
     @property
     def patience(self) -> Ns:
         """Of an ARC that is queued now; 0 where none is ever due."""
-        return self._state.patience if self._state.budgets else 0
+        return self._state.patience if self._state.adaptive else 0
 
     def charged_in_all(self) -> dict[str, float]:
         return {} if self._state.shares is None else self._state.shares.totals()
@@ -575,7 +575,7 @@ class Core:
             arc.preemptions += preempted
             arc.told = arc.told if preempted else 0
             # Waiting counts through preemption.
-            self._state.enqueue(arc, self._state.now - (arc.waited if preempted and self._state.budgets else 0))
+            self._state.enqueue(arc, self._state.now - (arc.waited if preempted and self._state.adaptive else 0))
         else:
             self._forget(arc)
             self._calendar.give_up(arc, outcome, had_it=True)

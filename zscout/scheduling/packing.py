@@ -1,8 +1,9 @@
 """The best set of ARCs that may hold their RCs together: branch and bound over bit masks.
 
-The value of a set is the vector of (ARC, RC) pairs in use by priority level, highest first, compared lexicographically;
-among equals the fewest preemptions win, then the best-ranked item in which they differ. Items are numbered by rank.
-Taking the best rank first finds the best-ranked of equal sets first, so only strictly better sets are searched.
+The value of a set is the vector of (ARC, RC) pairs in use by priority level, highest first, compared lexicographically,
+each pair worth its ARC's density; among equals the fewest preemptions win, then the best-ranked item in which they
+differ. Items are numbered by rank. Taking the best rank first finds the best-ranked of equal sets first, so only
+strictly better sets are searched.
 
 Upper bound: each free exclusive RC counts once, at the highest level that covers it; pairs at sharable RCs are
 added."""
@@ -59,7 +60,8 @@ class PackingProblem:
         self.worth = [item.width * unit for item, unit in zip(items, valued, strict=True)]
         self.extra = [(item.width - item.mask.bit_count()) * unit for item, unit in zip(items, valued, strict=True)]
         self.dense = any(item.density != 1 for item in items)
-        self.plain = self.levels == 1 and not self.dense and not any(self.extra) and not any(item.past_min_runtime for item in items)
+        alike = self.levels == 1 and not self.dense
+        self.plain = alike and not any(self.extra) and not any(item.past_min_runtime for item in items)
         """Each RC in use counts one."""
         self.nogoods: list[list[int]] = [[] for _ in items]
         for nogood in nogoods:

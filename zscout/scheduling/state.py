@@ -29,9 +29,9 @@ from zscout.types import ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName
 class SchedulerState:
     """The RCs, the ARCs and their holds. Every change uses these methods."""
 
-    def __init__(self, policy: SchedulingPolicy = DEFAULT, *, budgets: bool = False) -> None:
-        """`budgets`: preemption has a budget, as under `adaptive`."""
-        self.policy, self.budgets = policy, budgets
+    def __init__(self, policy: SchedulingPolicy = DEFAULT, *, adaptive: bool = False) -> None:
+        """`adaptive`: preemption has a budget, and sets are weighed by runtime."""
+        self.policy, self.adaptive = policy, adaptive
         self.runtimes = RuntimeMean()
         self.now: Ns = 0  # the instant of the latest batch of events
         self.votes = Votes()
@@ -458,7 +458,7 @@ class SchedulerState:
         waited = arc.waited if arc.state is ArcState.RUNNING else start - arc.since
         if policy.preempt != "always" or (policy.promise == "all" and arc.starving):
             protected_from = start
-        elif not self.budgets:
+        elif not self.adaptive:
             below, protected_from = None, 0
         elif protected_from is not None:
             arc.lost = max(0, start + budget - protected_from)
