@@ -16,7 +16,8 @@ slices. A search works on a snapshot: when the group has changed, it restarts fr
 rounds of votes of a group are bounded; then it takes the best set that needs no more votes, or leaves the group to
 `priority`.
 
-Each pass is worth at least as much as one of `priority`, among the ARCs that no reservation holds back."""
+A pair of ARC and RC is worth the more the shorter the ARC's minimum runtime (`conflict_groups.density`). Each pass is
+worth at least as much as one of `priority`, among the ARCs that no reservation holds back."""
 
 from __future__ import annotations
 
