@@ -1,12 +1,12 @@
-"""Bounded waiting: once an ARC has waited for the fleet's patience it is *due*, and no other may pass it.
+"""Bounded waiting: once an ARC has waited for its patience it is *due*, and no other may pass it.
 
 Shortest-first starves, and so do larger sets of ARCs. The remedy is reservation with conservative backfill (Mu'alem and
 Feitelson, IEEE TPDS 12(6), 2001), on distinct RCs instead of equal processors, and from the time at which the ARC is
 due: an ARC that would end before is not held back. Minimum runtimes are exact, so reservations are.
 
-From half its patience on, an ARC is *starving*. By priority, then waiting time, each starving ARC gets the earliest
-time, from when it is due, at which its RCs are free of holders that are not preempted for it and of earlier starving
-ARCs. An ARC of equal or lower priority on these RCs may start only if it ends by then, or if the RC is sharable and
+From half its patience on, an ARC is *starving*. By priority, then by when they began to starve, each starving ARC gets
+the earliest time, from when it is due, at which its RCs are free of holders that do not yield to it then and of earlier
+starving ARCs. An ARC of equal or lower priority on these RCs may start only if it ends by then, or if the RC is sharable and
 accepts it beside all concerned.
 
 A booking reserves its RCs for its own time. Promises to equals are kept in the order in which they were made: starving
