@@ -119,8 +119,9 @@ def test_every_key_of_the_key_space_has_a_row() -> None:
         "component": ("h", sender),
         "confirm": ("h", sender),
         "history": ("h", sender),
+        "ask_rc_state": ("k/n", sender),
         "served_placer": (),
-        **dict.fromkeys(("vote", "command_any", "rc_state", "frame"), ("k/n",)),
+        **dict.fromkeys(("vote", "command_any", "rc_state", "asked_state_any", "frame"), ("k/n",)),
         **dict.fromkeys(("load", "served_component", "confirm_any", "history_any", "bookings"), ("h",)),
     }
     no_keys = {"fleet", "closed", "base", "everything"}
@@ -164,8 +165,10 @@ def test_every_message_of_the_table_is_drawn_and_every_key_heard() -> None:
 
     _, (strange, unheard) = in_fleet(story)
     assert not strange
-    # These are for a recorder, and a building's plan is told by its simulation, which no message can change.
+    # These are for a recorder, and a building's plan is told by its simulation, which no message can change. The first
+    # is served with `[security]` alone.
     assert unheard == [
+        "rc/<kind>/<name>/state/<host>/<client>",
         "rc/<kind>/<name>/frame",
         "client/<host>/<client>/behavior",
         "recorder/<host>/<client>/recorded",

@@ -18,7 +18,8 @@
     wait                                          time has passed
 
 All commands of a line, joined by `;`, are one burst. `--` stands between its steps. A TERM is a counter: the leader's
-own is 9."""
+own is 9. Changes of holders are numbered: a publication has the number of its last one, a grant that of its own. The
+log of requests is written some 0.1 s late, so it appears with the next stimulus."""
 
 from __future__ import annotations
 
@@ -241,12 +242,12 @@ class LeaderPlayer:
             yield f"answer  {self.tickets[ticket - 1]}: {_answer(message)}"
         yield from (f"notice  {_notice(notice)}" for notice in out.grant_notices)
         if out.publication is not None:
+            number = f"{out.publication.term.counter}.{out.publication.seq}"
             for rc, held in out.publication.rcs.items():
                 holders = ", ".join(f"{holder.id} of {holder.client} by {_grant(holder.grant)}" for holder in held)
-                yield f"publish {out.publication.seq}: {rc}: {holders or 'nobody'}"
+                yield f"publish {number}: {rc}: {holders or 'nobody'}"
             for over in out.publication.revoked:
-                ended = f"{over.id} of {over.client} is over: {over.outcome}, {over.reason}"
-                yield f"publish {out.publication.seq}: {ended}"
+                yield f"publish {number}: {over.id} of {over.client} is over ({over.outcome}): {over.reason}"
         yield from (f"notice  {_notice(notice)}" for notice in out.notices)
         for ticket, message in out.answers:
             yield f"answer  {self.tickets[ticket - 1]}: {_answer(message)}"
@@ -255,9 +256,10 @@ class LeaderPlayer:
         for question in out.questions:
             subject = question.token.name if question.token is not None else question.client
             self.open[question.why, subject] = question
-            yield f"ask     {subject or question.key}: {question.why.value}"
+            yield f"question {subject or question.key}: {question.why.value}"
         yield from (f"date    {_effect(effect)}" for effect in out.effects if "Booking" in type(effect).__name__)
-        for text in (*out.log, *(text for _, text in out.strange)):
+        yield from (f"strange {text}" for _, text in out.strange)
+        for text in out.log:
             yield from (f"log     {line.strip()}" for line in text.splitlines())
 
 
@@ -274,9 +276,9 @@ def _notice(notice: Notice) -> str:
 def _state(notice: Notice) -> str:
     if notice.state == "running" and notice.grant is not None:
         return f"running by {_grant(notice.grant)} on {', '.join(notice.rcs)}"
-    place = f" at {notice.place.term.counter}.{notice.place.arrival}" if notice.place is not None else ""
+    place = f" at place {notice.place.term.counter}.{notice.place.arrival}" if notice.place is not None else ""
     why = notice.problem.message if isinstance(notice.problem, Problem) else notice.reason
-    return f"{notice.state}{place}{f', {notice.outcome}' if notice.outcome else ''}{f': {why}' if why else ''}"
+    return f"{notice.state}{place}{f' ({notice.outcome})' if notice.outcome else ''}{f': {why}' if why else ''}"
 
 
 def _grant(grant: Grant) -> str:
