@@ -181,7 +181,7 @@ def test_nobody_loses_more_than_the_budget_to_others(seeds: Sequence[int]) -> No
         replay(work, watch, strategy=STRATEGIES["adaptive"](), policy=SchedulingPolicy(preempt_budget=budget))
         assert all(had <= round(budget * known[arc].min_runtime) for arc, had in lost.items()), seed
         preempted += sum(had > 0 for had in lost.values())
-    assert preempted > len(seeds)
+    assert preempted > len(seeds) // 2
 
 
 def reckoned(*grants: tuple[str, Ns], before: Ns | None = None) -> Ns:

@@ -607,7 +607,7 @@ class Core:
         """When the passing of time next changes something; before, only events do, and the order of fair shares."""
         calendar, held_back = self._calendar, self._state.held_back.values()
         dates = (self._state.next_end(), self._state.dates.next_change(), calendar.next_start, calendar.next_question)
-        ends = [end for end in dates if end is not None]
+        ends = [end for end in (*dates, self._state.next_starving()) if end is not None]
         return min(ends + [arc.held_back[0] for arc in held_back if arc.held_back], default=None)
 
     def next_order(self) -> Ns | None:

@@ -63,6 +63,12 @@ class QueueIndex:
             insort(self.starving, self._starving_key(queued[arc_id]))
         del self._not_starving[:count]
 
+    def next_starving(self, now: Ns) -> Ns | None:
+        """When the next ARC begins to starve, where others do: these may be kept a later place then, and let somebody
+        pass."""
+        coming = bisect_right(self._not_starving, now, key=itemgetter(0))
+        return self._not_starving[coming][0] if self.starving and coming < len(self._not_starving) else None
+
     def _starving_key(self, arc: Arc) -> tuple[int, Ns, ArcId]:
         return -self._band(arc.priority), arc.starves, arc.id
 

@@ -6,8 +6,8 @@ due: an ARC that would end before is not held back. Minimum runtimes are exact, 
 
 From half its patience on, an ARC is *starving*. By priority, then by when they began to starve, each starving ARC gets
 the earliest time, from when it is due, at which its RCs are free of holders that do not yield to it then and of earlier
-starving ARCs. An ARC of equal or lower priority on these RCs may start only if it ends by then, or if the RC is sharable and
-accepts it beside all concerned.
+starving ARCs. An ARC of equal or lower priority on these RCs may start only if it ends by then, or if the RC is
+sharable and accepts it beside all concerned.
 
 A booking reserves its RCs for its own time. Promises to equals are kept in the order in which they were made: starving
 ARCs avoid older bookings and ignore newer ones. Maintenance precedes all promises except to higher priorities, and all

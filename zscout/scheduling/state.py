@@ -380,6 +380,10 @@ class SchedulerState:
             heapq.heappop(self._ends)
         return None
 
+    def next_starving(self) -> Ns | None:
+        is_kept = self.adaptive and self.policy.patience is not None
+        return self.index.next_starving(self.now) if is_kept else None
+
     def min_runtime_over(self, arc: Arc) -> None:
         """From now on equals may preempt a kept hold."""
         self.index.freed |= arc.mask
