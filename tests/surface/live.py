@@ -51,7 +51,7 @@ class Story:
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        self._stack.enter_context(plain(ZSCOUT_HOST="desk"))
+        self._stack.enter_context(plain(ZSCOUT_HOST="desk", LOGNAME="root"))
         self.folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
         address = f'"tcp/127.0.0.1:{free_port()}"'
         name = f"surface-{os.getpid()}"

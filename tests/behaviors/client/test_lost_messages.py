@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from typing import Any
 
 import pytest
 
 from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, held, small_fleet, transport_of
 from tests.mesh.kit import until
 from zscout.behaviors.client.confirmation import CONFIRM_TIMEOUT
+from zscout.behaviors.client.internals import REJOINS
 from zscout.behaviors.client.request import CommandRefused
 from zscout.messages import Command
 from zscout.scheduling.model import HOLD_BACK
@@ -154,3 +156,23 @@ async def test_a_command_that_is_sent_again_has_what_is_left_of_its_time(monkeyp
         assert len({command.id for _, command in sent}) == 1
         ends = [at / SECOND + command.ttl for at, command in sent]
         assert ends == pytest.approx(ends[:1] * len(ends))
+
+
+async def test_a_command_that_was_long_under_way_as_its_session_closed_is_sent_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """This client joined the mesh anew, and the RC was slow to answer."""
+    async with small_fleet("one") as (_, (one,)):
+        _, grant = await held(one, "first")
+        ask_one, asked = one.mesh.ask_one, list[str]()
+
+        async def closes_first(key: str, *args: Any, **kwargs: Any) -> Any:
+            asked.append(key)
+            if len(asked) == 1:
+                await asyncio.sleep(REJOINS + 0.1)
+                return None
+            return await ask_one(key, *args, **kwargs)
+
+        monkeypatch.setattr(one.mesh, "ask_one", closes_first)
+        assert (await one.command(RC, grant, ECHO)).result == ECHO["value"]
+        assert len(asked) == 2

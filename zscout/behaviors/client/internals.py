@@ -175,11 +175,13 @@ class ClientInternals(MovableClient):
         id_ = f"{self.instance}-{next(self._commanded)}"
         command = Command(grant=grant, do=dict(do), ttl=ttl, id=id_)
         began, gone = self.mesh.now(), 0.0
+        lost: float | None = None
         while (
             reply := await self.mesh.ask_one(key, replace(command, ttl=ttl - gone), Done, timeout=timeout - gone)
         ) is None:
             gone = (self.mesh.now() - began) / SECOND + AGAIN
-            if gone >= min(timeout, ttl, REJOINS):
+            lost = gone if lost is None else lost  # a session that closes ends what was under way for long
+            if gone >= min(timeout, ttl, lost + REJOINS):
                 raise CommandRefused(rc, Problem("unknown", "no answer; it may or may not have been done"))
             # It ended early: its RC's process may be joining the mesh anew. Under one id it is done once.
             await asyncio.sleep(AGAIN)
