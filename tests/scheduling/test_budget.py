@@ -197,7 +197,8 @@ def test_patience_follows_the_minimum_runtimes_that_are_granted() -> None:
     hour = 3_600 * SECOND
     assert reckoned() == PATIENCE
     assert reckoned(("a", SECOND)) == PATIENCE
-    assert reckoned(("a", 600 * SECOND), ("b", 1_200 * SECOND)) == RUNTIMES * 900 * SECOND
+    assert reckoned(("a", 600 * SECOND), ("a", 1_200 * SECOND)) == RUNTIMES * 900 * SECOND
+    assert reckoned(("a", 600 * SECOND), ("b", 1_200 * SECOND)) == RUNTIMES * 600 * SECOND, "of two the shorter"
     assert reckoned(("a", 100 * hour)) == MOST
     assert reckoned(("a", 100 * LONGEST), *[("a", SECOND)] * 9) == min(
         MOST, round(RUNTIMES * (LONGEST + 9 * SECOND) / 10)

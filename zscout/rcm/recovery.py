@@ -307,9 +307,13 @@ def _hold(
         place = some.place if mine.expects else mine.place
     request = admission.clamped(request)
     vouched = not admission.closed or mine is not None
+    start, protected = end - request.min_runtime, _protected_from(held, end)
+    return RecoveredHold(request, place, some.grant, start, end, bound, vouched, protected)
+
+
+def _protected_from(held: Mapping[RcName, Holder], end: Ns) -> Ns | None:
     left = [holder.protected_from for holder in held.values() if holder.protected_from is not None]
-    protected = end - round(min(left) * SECOND) if left else None
-    return RecoveredHold(request, place, some.grant, end - request.min_runtime, end, bound, vouched, protected)
+    return end - round(min(left) * SECOND) if left else None
 
 
 def _agree(needs: Mapping[Need, Params], bound: Mapping[Need, RcName], held: Mapping[RcName, Holder]) -> bool:

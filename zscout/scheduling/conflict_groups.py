@@ -13,7 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from operator import attrgetter
-from typing import Final
+from typing import Final, Literal, TypeAlias
 
 from zscout.scheduling.model import Arc, Rank, Rc, union
 from zscout.scheduling.packing import PackingItem, PackingProblem
@@ -148,15 +148,21 @@ def conflict_groups(
     ]
 
 
+Decision: TypeAlias = int | Literal["open", "left"]
+"""The set of a group. `left`: to `priority`; `open`: off limits for now."""
+
+
 def take_all(
     state: SchedulerState,
     reserved: Reservations | None,
     plan: BindingPlan,
-    taken: list[tuple[ConflictGroup, int]],
+    decided: Sequence[tuple[ConflictGroup, Decision]],
     actions: Actions,
-) -> BindingPlan:
-    """Take these sets, and return the plan of a pass after that. A group with an ARC that this pass would end again is
-    left to it."""
+) -> tuple[int, BindingPlan]:
+    """Take these sets; the bits that are off limits to a pass after that, and its plan. A group with an ARC that this
+    pass would end again is left to it."""
+    held = union(group.off_limits for group, chosen in decided if chosen == "open")
+    taken = [(group, chosen) for group, chosen in decided if isinstance(chosen, int)]
     while taken and plan is not NO_PLAN:
         changes = [group.changes(chosen) for group, chosen in taken]
         starting = [arc for starting, _ in changes for arc in starting]
@@ -167,7 +173,7 @@ def take_all(
         taken = [(group, chosen) for group, chosen in taken if not any(arc.id in after.dropped for arc in group.arcs)]
     for group, chosen in taken:
         group.take(chosen, actions, plan)
-    return plan
+    return held, plan
 
 
 def split(arcs: Iterable[Arc]) -> list[list[Arc]]:

@@ -1,7 +1,8 @@
 """The patience of a fleet whose file names none: so many mean minimum runtimes, as they are granted.
 
 The mean is over the last grants of each owner. The owners with the shortest and the longest count as if their means
-were those of the next: so no owner alone moves the patience beyond what others' requests make it."""
+were those of the next, and of two the longer as the shorter: so none makes others wait longer than they make each
+other."""
 
 from __future__ import annotations
 
@@ -50,8 +51,8 @@ class RuntimeMean:
     def _reckoned(self) -> Ns:
         found = sorted((mean, grants) for grants, mean in self._owners.values())
         means = [mean for mean, _ in found]
-        if len(found) > 2:
-            means[0], means[-1] = means[1], means[-2]
+        if len(found) > 1:
+            means[0], means[-1] = means[min(1, len(means) - 2)], means[-2]
         counted = [*zip(means, (grants for _, grants in found), strict=True), (self._before[1], self._before[0])]
         grants = sum(count for _, count in counted)
         if not grants:

@@ -339,7 +339,10 @@ class Rcm:
     def _publish(self, grants: messages.Grants) -> None:
         if (grants.rcs or grants.revoked) and trace.enabled():
             holders = {
-                rc: [(held.grant, f"{held.client}/{held.id}", held.place, held.rcs) for held in holders]
+                rc: [
+                    (held.grant, f"{held.client}/{held.id}", held.place, held.rcs, held.remaining, held.protected_from)
+                    for held in holders
+                ]
                 for rc, holders in grants.rcs.items()
             }
             ends = [(revoked.grant, revoked.outcome) for revoked in grants.revoked]
