@@ -9,7 +9,7 @@ from typing import Final
 
 from studies.faults.plan import Fault
 from zscout.config.fleet import Fleet
-from zscout.rcm.roster import PRESENT_WITHIN
+from zscout.rcm.roster import PRESENT_PART
 from zscout.testing.virtual_time import START
 from zscout.types import SECOND, Term
 
@@ -77,7 +77,8 @@ class Excuses:
         """`beside`: hosts that no partition parts from these, and whose nodes feel no fault of their own."""
         # Of a leader's links the first was lost as the others came back: nobody can tell that from a host that goes.
         lasts, timing = self.now() - START - fault.at, self.fleet.timing
-        just_over = 0 <= lasts - fault.lasts < 2 * PRESENT_WITHIN
+        answered = 2 * PRESENT_PART * self.fleet.mesh.lease
+        just_over = 0 <= lasts - fault.lasts < answered
         match fault.kind:
             case "kill" | "old disk":
                 name, at = self.killed.get(fault, ("", math.inf))
@@ -104,7 +105,7 @@ class Excuses:
                 alone = len(beside & asked) == 1 and lasts > (timing.hold_lease - 2 * timing.heartbeat) / SECOND
                 # Nor can one tell it that begins to lead just then.
                 over = START + fault.at + fault.lasts
-                began = any(abs(at - over) < 2 * PRESENT_WITHIN for at in self.terms.values())
+                began = any(abs(at - over) < answered for at in self.terms.values())
                 return just_over or began or parted or bool(left) or alone or since > fault.at
             case _:
                 return True

@@ -99,7 +99,7 @@ class Holder:
         asked = self.arc
         while asked.open:
             try:
-                grant = await self.client.granted(asked)
+                grant = await self.client.granted(asked, confirmed=True)
             except CommandRefused as refused:
                 say("not_entered", code=refused.code, reason=str(refused))
                 return
@@ -142,7 +142,7 @@ class Holder:
     async def _time(self, rc: str) -> None:
         began = clock.now()
         asked = await self.client.request("timed", {rc: {}}, min_runtime=600)
-        await self.client.granted(asked)
+        await self.client.granted(asked, confirmed=True)
         took = clock.now() - began
         await self.client.end(asked)
         say("timed", took=took)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from msgspec import structs
 
 from zscout.config.fleet import default_fleet
@@ -19,8 +20,9 @@ from zscout.scheduling.model import ClientLost
 from zscout.types import SECOND, Term
 
 
-def a_roster() -> Roster:
+def a_roster(lease: float = 1.0) -> Roster:
     fleet, term = default_fleet(), Term(1, "rcm")
+    fleet = structs.replace(fleet, mesh=structs.replace(fleet.mesh, lease=lease))
     admission = Admission(fleet.limits, Authority(fleet), Places("lab", None, term))
     return Roster(Keys("lab"), "leader", fleet, term, ExpectedDevices({}), admission, lambda _: None, 0)
 
@@ -57,6 +59,16 @@ def test_a_host_s_tokens_disappear_in_one_go() -> None:
     lost = members.answered(2 * SECOND, judged.questions[0], object(), None)
     assert len(lost.events) == MAX_TOKENS
     assert all(isinstance(event, ClientLost) for event in lost.events)
+
+
+@pytest.mark.parametrize(("lease", "within"), [(1.0, 0.05), (10.0, 0.5)])
+def test_how_quickly_others_have_to_answer_follows_the_lease(lease: float, within: float) -> None:
+    """Hosts of a fleet with a long lease may be busy for a moment: the next in the queue does not wait a lease then."""
+    members = a_roster(lease)
+    for number, host in enumerate(("desk", "other")):
+        members.client_token(0, token(number, host), alive=True)
+    members.client_token(SECOND, token(0, "desk"), alive=False)
+    assert [question.timeout for question in members.tick(2 * SECOND).questions] == [within]
 
 
 def test_an_rc_speaks_for_itself_alone() -> None:

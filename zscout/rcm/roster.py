@@ -40,8 +40,8 @@ MAX_HEALTH: Final = 500
 NEAR_END: Final[Ns] = SECOND // 20
 """A hold with less than this left may have ended at its RC: clocks differ a little."""
 SHUNNED: Final = "its host alone shows a term in which nobody leads"
-PRESENT_WITHIN: Final = 0.05
-"""Seconds within which others answer a leader that is not away: a later answer may follow its return."""
+PRESENT_PART: Final = 0.05
+"""Others answer a leader that is not away within this part of the mesh lease: a later answer may follow its return."""
 MAX_WITNESSES: Final = 3
 """Hosts that are asked whether this one is away."""
 
@@ -442,8 +442,9 @@ class Roster:
         witnesses = self._witnesses()[:MAX_WITNESSES]
         if witnesses:
             self._sight.doubt(self._now)  # of several lost links one is the first
+        within = PRESENT_PART * self._sight.lease / SECOND
         for key, kind in witnesses:
-            self._out.questions.append(Question(Why.WITNESS, key, PRESENT_WITHIN, kind=kind))
+            self._out.questions.append(Question(Why.WITNESS, key, within, kind=kind))
         return bool(witnesses)
 
     def _present(self) -> None:
