@@ -21,7 +21,7 @@ from zscout.rcm.admission import Admission
 from zscout.rcm.booked import FleetBookings
 from zscout.rcm.door import Door
 from zscout.rcm.operations import Operations
-from zscout.rcm.places import arc_id, request_id
+from zscout.rcm.places import request_id
 from zscout.rcm.recovery import RecoveredState, listed_by, removed, vouched
 from zscout.rcm.request_log import REMEMBERED, RequestLog, reason_info
 from zscout.rcm.roster import Roster, discrepancies
@@ -37,7 +37,7 @@ KEPT: Final[Mapping[model.Outcome, Ns]] = MappingProxyType(
     {model.Outcome.RELEASED: 0, model.Outcome.CANCELLED: 0, model.Outcome.CLIENT_LOST: 86_400 * SECOND}
 )
 """For how long a client may ask again for the place of what ended so; else it is for as long as that is known."""
-CONTINUED: Final = (model.LeadTaken, model.Adopted, model.Vouched, model.HandedOver)
+CONTINUED: Final = frozenset({model.LeadTaken, model.Adopted, model.Vouched, model.HandedOver})
 """Events by which holds that stand go on: the RCs hear of that before anybody else."""
 
 
@@ -269,28 +269,32 @@ class Leader:
 
     def _decide(self, events: Sequence[model.Event], named: Collection[RcName] | None = None) -> None:
         """RCs that are `named` are published, whatever becomes of them."""
-        for event in events:
-            if isinstance(event, model.ClientLost):
-                self._recovered.pop(event.client, None)
-        if named is None and all(
-            isinstance(event, model.ClientLost) and not self.core.arcs_of(event.client) for event in events
-        ):
-            return  # a client that asked for nothing changes nothing
-        now, out, registry, instant = self._now, self._out, self.registry, self.operations.instant
-        over = registry.ended
-        events = [event for event in events if not (isinstance(event, model.Adopted) and over(event.held.request.arc))]
+        lost = [event.client for event in events if isinstance(event, model.ClientLost)]
+        for client in lost:
+            self._recovered.pop(client, None)
+        if named is None and len(lost) == len(events) and not any(map(self.core.arcs_of, lost)):
+            return  # clients that asked for nothing change nothing
+        now, out, registry, operations = self._now, self._out, self.registry, self.operations
+        ended = registry.ended
+        events = [event for event in events if not (isinstance(event, model.Adopted) and ended(event.held.request.arc))]
         effects = self.core.handle(now, *events)
         out.events, out.effects = events, effects
-        out.granted, notified = self.operations.granted(now, effects)
-        if not any(isinstance(event, CONTINUED) for event in events):
-            out.grant_notices = registry.grants(now, effects, notified)
-            notified |= {arc_id(notice.client, notice.id) for notice in out.grant_notices}
+        granted = [effect.arc for effect in effects if isinstance(effect, model.Granted)]
+        granted = [*filter(self.core.is_running, granted)]
+        notified = operations.waiting.keys() & granted
+        out.granted = operations.answers(now, granted)
+        if CONTINUED.isdisjoint(map(type, events)):
+            # Not of ARCs that had another hold until now.
+            over = {effect.arc for effect in effects if isinstance(effect, (model.HoldEnded, model.Dropped))}
+            first = [arc for arc in granted if arc not in over | notified]
+            out.grant_notices = [registry.notice(now, arc) for arc in first]
+            notified.update(first)
         out.reopened, registry.traced = registry.traced, []
-        self._publish(effects, named, instant.left)
+        self._publish(effects, named, operations.instant.left)
         self._note(events)
-        answered = notified | self.operations.waiting.keys()
-        out.notices += registry.report(now, effects, answered, instant.given_up)
-        out.merge(self.operations.decided(now, effects))
+        answered = notified | operations.waiting.keys()
+        out.notices += registry.report(now, effects, answered, operations.instant.given_up)
+        out.merge(operations.decided(now, effects))
         for effect in effects:
             match effect:
                 case model.Dropped(arc=arc, outcome=outcome) | model.HoldEnded(arc=arc, outcome=outcome) if (
@@ -350,24 +354,20 @@ class Leader:
         changed = [effect for effect in effects if isinstance(effect, (model.Granted, model.HoldEnded))]
         if not changed and rcs is None:
             return
-        now = self._now
-        revoked = [
-            _revocation(effect, self.registry.name(effect.arc), now, left)
-            for effect in changed
-            if isinstance(effect, model.HoldEnded)
-        ]
+        now, concerned = self._now, set[RcName]()
+        revoked, begun = list[messages.Revocation](), list[tuple[int, float]]()
+        for effect in changed:
+            concerned.update(effect.rcs)
+            if isinstance(effect, model.HoldEnded):
+                revoked.append(_revocation(effect, self.registry.name(effect.arc), now, left))
+            elif effect.waited is not None:
+                begun.append((effect.grant.seq, effect.waited / SECOND))
         number = self.core.seq if self.core.seq > self.seq else self.core.number()
         # One that has not joined holds what is not known here: to name it would end that.
-        concerned = filter(self.roster.has_joined, {rc for effect in changed for rc in effect.rcs})
-        names = sorted({*(rcs or ()), *concerned})
+        names = sorted({*(rcs or ()), *filter(self.roster.has_joined, concerned)})
         self._named |= dict.fromkeys(names, number)
         holders = {name: holders_of(self.core.holders(name), name, now) for name in names}
         instances = {rc: instance for rc, (instance, _) in self.roster.named(names).items()}
-        begun = [
-            (effect.grant.seq, effect.waited / SECOND)
-            for effect in changed
-            if isinstance(effect, model.Granted) and effect.waited is not None
-        ]
         self._out.publication = self._grants(number, holders, revoked, instances, begun)
 
     def heartbeat(self, now: Ns) -> messages.Grants:

@@ -174,33 +174,24 @@ class Operations:
         while (due := self._deadlines.pop_due(now)) is not None:
             match due:
                 case _Due.FIRST_ANSWER, arcs:
-                    out.at_once += self._answers(now, arcs)
+                    out.at_once += self.answers(now, arcs)
                 case _Due.RESUME, _:
                     out.then += self.resume()
         return out
 
     # Out: the instant is decided
 
-    def granted(self, now: Ns, effects: Iterable[model.Effect]) -> tuple[list[Answer], set[ArcId]]:
-        """The answers to those whose ARCs an instant has granted, before anybody else learns of it; and those ARCs."""
-        arcs = {
-            effect.arc: None
-            for effect in effects
-            if isinstance(effect, model.Granted) and effect.arc in self.waiting and self.core.is_running(effect.arc)
-        }
-        return self._answers(now, arcs), {*arcs}
-
     def decided(self, now: Ns, effects: Iterable[model.Effect]) -> Outbox:
         """The other answers that an instant has decided, and what new clients of ARCs are to know."""
-        out = Outbox()
+        out, arcs = Outbox(), list[ArcId]()
         for effect in effects:
             match effect:
                 case model.Granted(arc=arc) | model.Dropped(arc=arc):
-                    out.answers += self._answers(now, [arc])
+                    arcs.append(arc)
                 case model.Queued(arc=arc, settled=True) if self.core.is_queued(arc):
-                    out.answers += self._answers(now, [arc])
+                    arcs.append(arc)
         done, self.instant = self.instant, _Instant()
-        out.answers += self._answers(now, [event.arc for event in done.ended])
+        out.answers = self.answers(now, arcs + [event.arc for event in done.ended])
         out.answers += [(ticket, self._standing(now, arc, ask)) for ticket, arc, ask in done.standing]
         if done.moved is not None:
             ticket, moved = done.moved
@@ -212,7 +203,8 @@ class Operations:
             self._deadlines.set(now + self._first_answer, (_Due.FIRST_ANSWER, undecided))
         return out
 
-    def _answers(self, now: Ns, arcs: Iterable[ArcId]) -> list[Answer]:
+    def answers(self, now: Ns, arcs: Iterable[ArcId]) -> list[Answer]:
+        """The answers to the operations on these ARCs that wait for one."""
         answers = list[Answer]()
         for arc in arcs:
             if tickets := self.waiting.pop(arc, None):

@@ -82,8 +82,8 @@ class Places:
             return
         self.end(arc, now)
         self._places[arc] = place
-        owners = self._owners.setdefault(place, {})
-        owners[client_id(arc)] = owners.get(client_id(arc), 0) + 1
+        owners, client = self._owners.setdefault(place, {}), client_id(arc)
+        owners[client] = owners.get(client, 0) + 1
 
     def admit(self, arc: ArcId, clients: Collection[ClientId]) -> None:
         """These expect to be handed an open ARC: their word is believed where no seal can tell."""

@@ -218,17 +218,6 @@ class RequestLog:
         self.record(now, arc, reason)
         return replace(self._notice(arc, "ended", reason=reason, outcome=Outcome.LOST, problem=problem), arc=name)
 
-    def grants(self, now: Ns, effects: Collection[Effect], answered: Collection[ArcId]) -> list[Notice]:
-        """The notices of an instant's grants that precede its publication: not of ARCs that are `answered` so, or had
-        another hold until now."""
-        over = {effect.arc for effect in effects if isinstance(effect, (HoldEnded, Dropped))}
-        granted = [effect.arc for effect in effects if isinstance(effect, Granted)]
-        return [
-            self.notice(now, arc)
-            for arc in granted
-            if arc not in over and arc not in answered and self._core.is_running(arc)
-        ]
-
     def report(
         self, now: Ns, effects: Iterable[Effect], answered: Collection[ArcId], given_up: Collection[ArcId]
     ) -> list[Notice]:

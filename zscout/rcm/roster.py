@@ -338,8 +338,7 @@ class Roster:
 
     def named(self, names: Iterable[RcName]) -> dict[RcName, tuple[str, HostName]]:
         """The instance that is meant of each of these RCs, and its host."""
-        known = ((name, self._rcs.get(name)) for name in names)
-        return {name: rc.named for name, rc in known if rc is not None and rc.named is not None}
+        return {name: known for name in names if (known := self._rcs.get(name, _UNKNOWN).named) is not None}
 
     def hosts_of(self, names: Iterable[RcName]) -> dict[RcName, HostName]:
         return {name: host for name, (_, host) in self.named(names).items()}

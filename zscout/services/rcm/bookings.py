@@ -157,11 +157,12 @@ class Bookings:
         """What has happened in an instant: what follows of it follows in another one."""
         if self.dates.note(effects, settled=self.settled):
             self._once(_Due.NEWS, 0)
-        if any(isinstance(effect, (BookingThreatened, BookingConflict)) for effect in effects):
+        kinds = {*map(type, events), *map(type, effects)}
+        if kinds & {BookingThreatened, BookingConflict}:
             self._tell_soon()
-        if any(isinstance(event, Dates) for event in events):
+        if Dates in kinds:
             self._once(_Due.LOOK, GATHERS)
-        if self.handler.undecided and any(isinstance(event, (Vote, VoteOverdue)) for event in events):
+        if self.handler.undecided and kinds & {Vote, VoteOverdue}:
             self._once(_Due.TRY, BALLOTS)
         return self._out()
 
