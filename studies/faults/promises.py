@@ -40,8 +40,7 @@ LEFT_OVER: Final = 7.0
 """Seconds after the last hold's end in which everything about it is forgotten, but how it ended."""
 
 PROTECTED: Final = 1.0
-"""Seconds by which a leader may believe later than it was first told that only operators preempt a hold: what its RCs
-heard late ends later."""
+"""Seconds for which a leader may not believe yet that only operators preempt a hold, as was told first."""
 
 LOSSES: Final = ("lost", "client_lost")
 
@@ -82,8 +81,11 @@ class Promises:
         """Grants that an RCM has ended, and not for a loss."""
         self._taken_away: set[str] = set()
         """Those of them that their clients were not to keep: neither given back nor handed over."""
-        self._protected: dict[str, float] = {}
-        """By grant: from when only operators preempt it, as it was told first. (None of these programs is one.)"""
+        self._protected: dict[str, tuple[float, float]] = {}
+        """By grant: when it was published first, and from when only operators were to preempt it then. (None of these
+        programs is one.)"""
+        self.delayed = -math.inf
+        """Until when messages were late last: an RC that heard of a hold late has it end later, and says so."""
         self._interrupted: set[str] = set()
         """Grants that have ended at an RC, and no other of the same ARC began there as they did."""
         self._owner: dict[str, str] = {}
@@ -162,12 +164,13 @@ class Promises:
 
     def _look_who_is_preempted(self, published: Mapping[str, Any]) -> None:
         for grant, outcome in published["ends"]:
-            since = self._now() - self._protected.get(str(grant), math.inf)
-            if outcome == "preempted" and since > PROTECTED:
+            told, protected = self._protected.get(str(grant), (self._now(), math.inf))
+            since = self._now() - protected
+            if outcome == "preempted" and since > PROTECTED and told > self.delayed:
                 self._broken(f"{grant} is preempted, though it was protected {since:.1f} s ago")
         for grant, *_, left, protected in chain.from_iterable(published["rcs"].values()):
             if protected is not None:
-                self._protected.setdefault(str(grant), self._now() + left - protected)
+                self._protected.setdefault(str(grant), (self._now(), self._now() + left - protected))
 
     def forget_client(self, name: str) -> None:
         """It died: what it was promised was to that life."""
