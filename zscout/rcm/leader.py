@@ -100,10 +100,6 @@ class Leader:
         out.more = bool(self._queue)
         return out
 
-    def close(self, now: Ns) -> str:
-        """What was gathered for the log: nothing is published any more."""
-        return self.registry.close(now)
-
     # In: the events of the next instant
 
     def _next(self) -> list[model.Event]:
@@ -140,7 +136,7 @@ class Leader:
             case steps.Shunned(token, until):
                 return merge(self.roster.shun(self._now, token, until))
             case steps.Stalled(length, ended, fresh):
-                self.roster.stalled(length, ended, fresh=fresh)
+                self.roster.sight.stalled(length, ended, fresh=fresh)
             case steps.BookingAsked(asked):
                 return merge(self._bookings.operation(*asked))
             case steps.Again():

@@ -326,7 +326,7 @@ class BookingHandler:
             raise Refused("unknown_booking", f"no booking {booking}, or it was cancelled; see zscout booking list")
         self._admission.check_take_up(ask, sender, record)
         dates_ = [date for date in self._dates.standing(record) if not start or str(date.start) == start]
-        free = [date for date in dates_ if self._dates.taken_by(date) is None]
+        free = [date for date in dates_ if (kept := self._core.booking(date.id)) is None or kept.arc is None]
         if free:
             return free[0].id
         if goes_on:

@@ -200,7 +200,7 @@ class Rcm:
         self.supervisor.cancel()
         if self._parts.inventory is None:
             self.inventory.stop()
-        if text := self.leader.close(self.mesh.now()):
+        if text := self.leader.registry.close(self.mesh.now()):
             log.info("%s", text)
         self.sharing.close()
         queries, self._open = self._open, {}
