@@ -24,6 +24,7 @@ from zscout.messages import (
     duration,
     exact_amounts,
 )
+from zscout.rcm.steps import Outbox
 from zscout.scheduling.booking import (
     Booking,
     BookingBound,
@@ -86,10 +87,8 @@ class BookedDates:
     def __init__(self, core: Core, records: Records, clock: FleetClock) -> None:
         self._core, self._records, self.clock = core, records, clock
         self.now: Ns = 0
-        self.changed: list[BookingRecord] = []
-        """Records that are not as they were, until the caller takes them."""
-        self.strange: list[tuple[str, str]] = []
-        """Warnings, each with its subject, until the caller takes them."""
+        self.out = Outbox()
+        """Until the caller takes it."""
         self._conflicts: dict[str, str] = {}
         """Dates that are not kept, with the one that stands; nothing where no RC of a pattern is free."""
         self._repetitions: dict[str, tuple[tuple[object, ...], Repetition]] = {}
@@ -158,7 +157,7 @@ class BookedDates:
         try:
             return self._repetition(record).between(time - float(record.runtime), time + _ahead(record))
         except (ValueError, OverflowError) as error:
-            self.strange.append((record.id, f"booking {record.id} is not kept: {error}"))
+            self.out.strange.append((record.id, f"booking {record.id} is not kept: {error}"))
             return None
 
     def _repetition(self, record: BookingRecord) -> Repetition:
@@ -217,7 +216,7 @@ class BookedDates:
         self._expanded = {known.record.id: known for known in expanded}
         found = [booking for known in expanded for booking in known.bookings]
         if len(found) > MAX_CLAIMS:
-            self.strange.append(("", f"more than {MAX_CLAIMS} dates are booked: the last are not kept"))
+            self.out.strange.append(("", f"more than {MAX_CLAIMS} dates are booked: the last are not kept"))
         return found[:MAX_CLAIMS]
 
     def _expand(self, record: BookingRecord, taken: Collection[str]) -> _Expanded:
@@ -235,7 +234,7 @@ class BookedDates:
                 ]
                 bookings = [replace(one, patience=one.runtime) if one.id in taken else one for one in bookings]
         except ValueError as error:
-            self.strange.append((record.id, f"booking {record.id} is not kept: {error}"))
+            self.out.strange.append((record.id, f"booking {record.id} is not kept: {error}"))
         coming, ahead = math.inf, _ahead(record)
         if not record.unbooked and (bookings or not dates):
             with suppress(ValueError, OverflowError):  # logged by `_starts`
@@ -281,7 +280,7 @@ class BookedDates:
         changed = self.number()
         new = replace(record, changed=changed, **to)
         self._records.take([new])
-        self.changed.append(new)
+        self.out.changed.append(new)
         return self._records.get(record.id) or new
 
     def note(self, effects: Iterable[Effect], *, settled: bool) -> bool:

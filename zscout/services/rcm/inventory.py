@@ -125,7 +125,9 @@ class Inventory:
             if saved is None or saved[0] != version or now - saved[1] > SAVE_EVERY * SECOND:
                 saved = version, now
                 try:
-                    content = encode(_DeviceFile(time.time(), self.devices.homes(now)))
-                    await asyncio.to_thread(write_durably, file, content)
+                    await asyncio.to_thread(write_durably, file, self._contents(now))
                 except OSError as error:
                     log.warning("%s can't be written: %s", file, error)
+
+    def _contents(self, now: Ns) -> bytes:
+        return encode(_DeviceFile(time.time(), self.devices.homes(now)))
