@@ -279,10 +279,11 @@ class Leader:
         out.granted = operations.answers(now, granted)
         if CONTINUED.isdisjoint(map(type, events)):
             # Not of ARCs that had another hold until now.
-            over = {effect.arc for effect in effects if isinstance(effect, (model.HoldEnded, model.Dropped))}
-            first = [arc for arc in granted if arc not in over | notified]
-            out.grant_notices = [registry.notice(now, arc) for arc in first]
-            notified.update(first)
+            over = {effect.arc for effect in effects if isinstance(effect, (model.HoldEnded, model.Dropped))} | notified
+            for arc in granted:
+                if arc not in over:
+                    out.grant_notices.append(registry.notice(now, arc))
+                    notified.add(arc)
         out.reopened, registry.traced = registry.traced, []
         self._publish(effects, named, operations.instant.left)
         self._note(events)
@@ -309,16 +310,15 @@ class Leader:
         now = self._now
         for event in events:
             match event:
-                case model.Requested(model.ArcRequest(client=client)) | model.HandedOver(to=client):
-                    self.roster.expect(now, client)
-            match event:
                 case model.Requested(request):
+                    self.roster.expect(now, request.client)
                     self._bind(request.arc)
                     asked = f"asked for {', '.join(sorted(request.needs))} at priority {request.priority}"
                     self.registry.record(now, request.arc, asked)
                 case model.PlaceShown(arc) | model.Vouched(model.ArcRequest(arc=arc)):
                     self._bind(arc)
-                case model.HandedOver(renamed=arc):
+                case model.HandedOver(to=client, renamed=arc):
+                    self.roster.expect(now, client)
                     self._bind(arc)
                     if (moved := self.core.arc(arc)) is not None and not moved.vouched:
                         self._recover(moved.request)

@@ -337,9 +337,6 @@ class Roster:
         """The instance that is meant of each of these RCs, and its host."""
         return {name: known for name in names if (known := self._rcs.get(name, _UNKNOWN).named) is not None}
 
-    def hosts_of(self, names: Iterable[RcName]) -> dict[RcName, HostName]:
-        return {name: host for name, (_, host) in self.named(names).items()}
-
     def awaits(self, now: Ns, arc: ArcId, names: Iterable[RcName]) -> bool:
         """Return True if `arc` may still turn out to hold one of these RCs: it is pending; or has not answered, and its
         token was first seen less than a lease ago, or this term has never seen one and learned of the ARC less than a
