@@ -37,6 +37,8 @@ class Rc:
     def __init__(self) -> None:
         self.supervisor = Supervisor(self.name, lambda _error: None)
         self.instances = SimpleNamespace(state=InstanceState.SERVES)
+        self.informed = asyncio.Event()
+        self.informed.set()
         self.said: list[str] = []
         self.news = asyncio.Event()
 
@@ -102,11 +104,14 @@ async def play(
     every: float = 0.05,
     parameters: Mapping[str, Decimal] = MappingProxyType({}),
     state: InstanceState = InstanceState.SERVES,
+    informed: bool = True,
     **scripts: str,
 ) -> AsyncIterator[tuple[CommandDriver, Rc]]:
     """A driver whose commands are these shell scripts."""
     rc = Rc()
     rc.instances.state = state
+    if not informed:
+        rc.informed.clear()
     bounds: dict[str, Any] = {"timeout": round(timeout * SECOND), "every": round(every * SECOND)}
     words: dict[str, Any] = {name: ("sh", "-c", script) for name, script in scripts.items()}
     driver = CommandDriver.configured(CommandRc(name=rc.name, parameters=parameters, **bounds, **words))
@@ -292,6 +297,18 @@ async def test_one_that_stands_by_leaves_the_device_alone_until_it_is_used() -> 
     async with play(state=InstanceState.STANDS_BY, safe=TELL, health=TELL) as (driver, rc):
         await rc.until("it was not made safe: it stands by")
         await driver.safe()  # as its node ends
+        assert told() == []
+        rc.instances.state = InstanceState.OFFERED
+        await rc.until("ok")
+        assert told()[:2] == ["safe", "health"]
+
+
+async def test_the_device_is_left_alone_until_it_is_known_who_serves() -> None:
+    async with play(informed=False, safe=TELL, health=TELL) as (_, rc):
+        assert rc.said == ["it was not made safe yet"]
+        rc.instances.state = InstanceState.STANDS_BY
+        rc.informed.set()
+        await rc.until("it was not made safe: it stands by")
         assert told() == []
         rc.instances.state = InstanceState.OFFERED
         await rc.until("ok")

@@ -7,11 +7,13 @@ from decimal import Decimal
 from itertools import product
 from typing import Any
 
+import pytest
+
 from tests.mesh.kit import until
 from tests.services.rcm.kit import FakeClient, FakeFleet, grant_of
 from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.instances import InstanceState
-from zscout.drivers.resource_controller import ResourceController
+from zscout.drivers.resource_controller import INFORMED_WITHIN, ResourceController
 from zscout.mesh.supervision import StallWatch
 from zscout.messages import Command, Done, Grants, Holder, OpenRequest
 from zscout.testing.memory import MemoryMesh
@@ -85,6 +87,26 @@ async def test_who_finds_another_instance_stands_by_and_serves_when_its_holds_ar
     again = grant_of(client.notices[-1])
     assert again > grant_of(answer)
     assert await confirms(client, again) == [None]
+
+
+async def test_a_device_is_first_touched_when_it_is_known_who_serves() -> None:
+    """A node that starts may see its device's radio before it sees the host whose holder has the device."""
+    fleet, first, client = await offered()
+    await client.ask("tally", RC)
+    late = fleet.mesh("h1")
+    fleet.network.isolate(late)
+    second = await offer(fleet, "h1", late)
+    assert not second.informed.is_set()
+    fleet.network.heal()
+    await second.informed.wait()
+    assert [one.instances.state for one in (first, second)] == [InstanceState.SERVES, InstanceState.STANDS_BY]
+
+
+async def test_without_a_leader_a_device_is_touched_after_a_while() -> None:
+    fleet = FakeFleet()
+    began, alone = fleet.watcher.now(), await offer(fleet, "h1")
+    await alone.informed.wait()
+    assert (fleet.watcher.now() - began) / SECOND == pytest.approx(INFORMED_WITHIN, abs=0.5)
 
 
 async def test_who_leaves_in_order_is_followed_at_once() -> None:

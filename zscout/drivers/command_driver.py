@@ -91,7 +91,7 @@ class CommandDriver(Driver):
     async def open(self, rc: RcHandle) -> None:
         self._rc = own(rc)
         rc.supervisor.spawn(self._keep_well())
-        if not await done_within(OPENING, self._looked.wait()):
+        if not self._rc.informed.is_set() or not await done_within(OPENING, self._looked.wait()):
             self._lose(self._unsure or "its health is not known yet")
 
     async def begin(self, holder: Holder) -> None:
@@ -164,6 +164,7 @@ class CommandDriver(Driver):
         """Looks at it every now and then; at one that was lost until it is well, at growing intervals."""
         every = self._told.every / SECOND if self._told.health else None
         tries = 0
+        await self._rc.informed.wait()
         while True:
             await self._look()
             self._looked.set()

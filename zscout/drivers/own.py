@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable
 from typing import Final, Protocol, cast
 
@@ -28,6 +29,10 @@ class OwnRcHandle(RcHandle, Protocol):
     """Whether this one serves, or stands by for another host's."""
     directory: RcDirectory | None
     """Only of a driver that relays."""
+
+    informed: asyncio.Event
+    """Set once this RC has read whether another host's serves, or has heard no leader for a while. Its device is left
+    alone until then."""
 
 
 def own(rc: RcHandle) -> OwnRcHandle:

@@ -55,6 +55,8 @@ NEVER_HELD_BACK: Final = ("stop", "halt")
 COMMAND_QUEUE = 64
 EARLY: Final = 0.25
 """Seconds for which a command under a grant that is not known yet waits for its publication."""
+INFORMED_WITHIN: Final = 1.0
+"""Seconds from its start in which an RC hears of a leader, if there is one."""
 LOOK_PERIOD = 0.5
 """Seconds between two looks at whether leaders that are seen are heard, and ask."""
 FIGURES_PERIOD = 1.0
@@ -123,6 +125,7 @@ class ResourceController:
         self._reading: asyncio.Task[None] | None = None
         self._missed = False
         """Something was missed that has not been read since."""
+        self.informed = asyncio.Event()
         self._published = mesh.now()
         """When it published its state last."""
         self._timer: asyncio.TimerHandle | None = None
@@ -140,6 +143,7 @@ class ResourceController:
             self._set_timer()
         self._declared.append(mesh.subscribe(keys.grants, messages.Grants, guard(self._on_grants)))
         await asyncio.wait({self._read_state()})
+        self.supervisor.call_later(INFORMED_WITHIN, self.informed.set)
         if self.directory is not None:
             self._declared.append(self.directory.watch())
         # Where another instance is there, its holder has the device: a driver that begins leaves it alone.
@@ -605,6 +609,8 @@ class ResourceController:
                 self._trace("read")
                 self._missed = False
             self._apply(change)
+            if not overtaken:
+                self.informed.set()
             if not overtaken:
                 break
         self.queue.resume(lambda query: not self._is_early(query))

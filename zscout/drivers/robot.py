@@ -249,6 +249,7 @@ class RobotDriver(Driver):
     async def _halt_until_sure(self) -> None:
         """Halts the robot whenever its state is unknown, and offers it again once that is done."""
         pause = PAUSES[0]
+        await self._rc.informed.wait()
         while True:
             await self._unsure.wait()
             self._wake.clear()
