@@ -107,8 +107,8 @@ class Leader:
         operations, queue, out = self.operations, self._queue, self._out
         while queue and isinstance(asked := queue[0], steps.OperationAsked) and operations.joins(asked):
             queue.popleft()
+            out.merge(self.roster.heard(self._now, str(asked.sender)))
             if isinstance(asked.operation, BOOKINGS):
-                out.merge(self.roster.heard(self._now, str(asked.sender)))
                 out.then.append(steps.BookingAsked(asked))
                 return [model.Tick()]
             out.merge(operations.take(self._now, asked))

@@ -123,7 +123,6 @@ class Operations:
         ticket, sender, operation = asked
         client = str(sender)
         try:
-            self._out.merge(self._roster.heard(now, client))
             check_name(operation.id, "id")
             match operation:
                 case Ask():

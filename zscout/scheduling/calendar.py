@@ -424,7 +424,7 @@ class Calendar:
             self._spread()
 
     def _judge_claim(self, claim: Claim) -> None:
-        if _is_unbound(claim):
+        if claim.arc.patterns and not claim.booking.bound and claim.arc.hold is None:
             self._bind(claim, "")
             return
         by, unknown = self._obstacle(claim)
@@ -653,10 +653,6 @@ class Calendar:
         else:
             self._endangered[claim] = None
         self._emit(BookingThreatened(claim.booking.id, found))
-
-
-def _is_unbound(claim: Claim) -> bool:
-    return bool(claim.arc.patterns) and not claim.booking.bound and claim.arc.hold is None
 
 
 def _meet(claim: Claim, other: Claim) -> bool:
