@@ -100,10 +100,6 @@ class Leader:
         out.more = bool(self._queue)
         return out
 
-    def close(self, now: Ns) -> str:
-        """What was gathered for the log: nothing is published any more."""
-        return self.registry.close(now)
-
     # In: the events of the next instant
 
     def _next(self) -> list[model.Event]:
@@ -111,8 +107,8 @@ class Leader:
         operations, queue, out = self.operations, self._queue, self._out
         while queue and isinstance(asked := queue[0], steps.OperationAsked) and operations.joins(asked):
             queue.popleft()
+            out.merge(self.roster.heard(self._now, str(asked.sender)))
             if isinstance(asked.operation, BOOKINGS):
-                out.merge(self.roster.heard(self._now, str(asked.sender)))
                 out.then.append(steps.BookingAsked(asked))
                 return [model.Tick()]
             out.merge(operations.take(self._now, asked))
@@ -140,7 +136,7 @@ class Leader:
             case steps.Shunned(token, until):
                 return merge(self.roster.shun(self._now, token, until))
             case steps.Stalled(length, ended, fresh):
-                self.roster.stalled(length, ended, fresh=fresh)
+                self.roster.sight.stalled(length, ended, fresh=fresh)
             case steps.BookingAsked(asked):
                 return merge(self._bookings.operation(*asked))
             case steps.Again():
@@ -285,10 +281,11 @@ class Leader:
         out.granted = operations.answers(now, granted)
         if CONTINUED.isdisjoint(map(type, events)):
             # Not of ARCs that had another hold until now.
-            over = {effect.arc for effect in effects if isinstance(effect, (model.HoldEnded, model.Dropped))}
-            first = [arc for arc in granted if arc not in over | notified]
-            out.grant_notices = [registry.notice(now, arc) for arc in first]
-            notified.update(first)
+            over = {effect.arc for effect in effects if isinstance(effect, (model.HoldEnded, model.Dropped))} | notified
+            for arc in granted:
+                if arc not in over:
+                    out.grant_notices.append(registry.notice(now, arc))
+                    notified.add(arc)
         out.reopened, registry.traced = registry.traced, []
         self._publish(effects, named, operations.instant.left)
         self._note(events)
@@ -315,16 +312,15 @@ class Leader:
         now = self._now
         for event in events:
             match event:
-                case model.Requested(model.ArcRequest(client=client)) | model.HandedOver(to=client):
-                    self.roster.expect(now, client)
-            match event:
                 case model.Requested(request):
+                    self.roster.expect(now, request.client)
                     self._bind(request.arc)
                     asked = f"asked for {', '.join(sorted(request.needs))} at priority {request.priority}"
                     self.registry.record(now, request.arc, asked)
                 case model.PlaceShown(arc) | model.Vouched(model.ArcRequest(arc=arc)):
                     self._bind(arc)
-                case model.HandedOver(renamed=arc):
+                case model.HandedOver(to=client, renamed=arc):
+                    self.roster.expect(now, client)
                     self._bind(arc)
                     if (moved := self.core.arc(arc)) is not None and not moved.vouched:
                         self._recover(moved.request)

@@ -251,7 +251,8 @@ def recover(
             result.remarks.append(f"the hold of {arc} is not carried on: its grant is of no earlier term")
             continue
         seen.add(arc)
-        some, mine = _most_telling(held), listed.get(arc)
+        # An RC from before there were patterns passes on nothing about them.
+        some, mine = max(held.values(), key=lambda holder: len(holder.bound)), listed.get(arc)
         if mine is None and some.client in result.answered:
             result.remarks.append(f"{arc} is given up by its client")
             continue
@@ -276,11 +277,6 @@ def recover(
     _enter(result, listed, places, undecided, now, admission)
     result.waiting.sort(key=lambda one: (one.place is None, one.place))
     return result
-
-
-def _most_telling(held: Mapping[RcName, Holder]) -> Holder:
-    """An RC from before there were patterns passes on nothing about them."""
-    return max(held.values(), key=lambda holder: len(holder.bound))
 
 
 def _hold(
