@@ -52,6 +52,7 @@ PLAIN_ONLY: Final[dict[str, str]] = {
     "drivers/test_lock.py": _NO_FLEET,
     "drivers/test_registry.py": _NO_FLEET,
     "services/bookings/test_khal.py": _NO_FLEET,
+    "test_streams.py": _NO_FLEET,
     "services/node/test_component_process.py": _NO_FLEET,
     "services/node/test_limits.py": _NO_FLEET,
     "services/node/test_load_reporter.py": _NO_FLEET,

@@ -12,9 +12,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from zscout.streams import open_standard_streams
 from zscout.types import VERSION
 
 __version__ = VERSION
+
+# Of every program of ours, before it opens anything.
+open_standard_streams()
 
 if TYPE_CHECKING:
     from zscout.behaviors.client.arc import Held, Revoked, hold, holds

@@ -54,6 +54,7 @@ from zscout.services.rcm.digest import HoldListener
 from zscout.services.rcm.observed_runtimes import RuntimeObserver
 from zscout.services.rcm.term_file import TermFile
 from zscout.services.recorder.process import RecorderProcess
+from zscout.streams import escape_what_cannot_be_written
 from zscout.types import SECOND, clean
 
 log = logging.getLogger("zscout.node")
@@ -308,6 +309,7 @@ def main(file: Path | None, check: bool, log_level: str) -> None:
       zscout-node lab.toml
       zscout-node --check lab.toml
     """
+    escape_what_cannot_be_written()
     log_to_stderr(log_level.upper())
     manager = ServiceManager.from_env()
     try:

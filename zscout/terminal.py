@@ -6,6 +6,7 @@ Rich is imported by the functions that need it: most of a short command's time i
 from __future__ import annotations
 
 import asyncio
+import json
 import os
 import re
 import sys
@@ -13,12 +14,14 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
+from decimal import Decimal
 from itertools import zip_longest
 from operator import gt
 from typing import IO, TYPE_CHECKING, Any, Final, Self
 
 import msgspec
 
+from zscout.streams import escaped, writable
 from zscout.types import clean as clean
 from zscout.types import span as span
 
@@ -49,15 +52,11 @@ _JSON: Final = msgspec.json.Encoder(decimal_format="number")
 
 def print_json(value: Any, stream: IO[str] | None = None) -> None:
     """One JSON value (structs and Decimals included) on one line, at once; all in it that could draw is escaped."""
-    text = _JSON.encode(value).decode()
-    print_line(text if text.isprintable() else "".join(map(_escaped, text)), stream)
-
-
-def _escaped(char: str) -> str:
-    if char.isprintable():
-        return char
-    code = char.encode("utf-16-be").hex()
-    return "".join(f"\\u{code[at : at + 4]}" for at in range(0, len(code), 4))
+    try:
+        text = _JSON.encode(value).decode()
+    except UnicodeEncodeError:  # the name of a file that is no text
+        text = json.dumps(msgspec.to_builtins(value, builtin_types=(Decimal,)), default=float)
+    print_line(text if text.isprintable() else "".join(c if c.isprintable() else escaped(c) for c in text), stream)
 
 
 def print_line(text: str, stream: IO[str] | None = None) -> None:
@@ -124,7 +123,7 @@ class Table:
 
     def lines(self) -> list[str]:
         """Without colours, as wide as the texts are: two spaces between columns."""
-        table = [self.columns, *([clean(cell) for cell in row] for row in self.rows)]
+        table = [self.columns, *([writable(clean(cell)) for cell in row] for row in self.rows)]
         widths = [max(map(len, column)) for column in zip(*table, strict=True)]
         lines = [
             "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in table
@@ -133,7 +132,9 @@ class Table:
 
     def fitted(self, width: int, most: int | None = None) -> list[Line]:
         """For a terminal of this width, no more than `most` rows."""
-        safe = [["\n".join(map(clean, cell.split("\n"))) for cell in row] for row in self.rows[:most]]
+        safe = [
+            ["\n".join(writable(clean(line)) for line in cell.split("\n")) for cell in row] for row in self.rows[:most]
+        ]
         texts = [list(column) for column in zip(self.columns, *safe, strict=True)]
         kept, below, widths = self._layout(texts, width)
         lines = [(self.title, "bold cyan")] if self.title else []
@@ -212,7 +213,8 @@ def _longest(texts: Sequence[str], breaks: str) -> int:
 def shortened(text: str, width: int) -> str:
     from rich.cells import set_cell_size
 
-    return text if _wide(text) <= width else set_cell_size(text, width - 1).rstrip() + "…"
+    more = "…" if writable("…") == "…" else "~"
+    return text if _wide(text) <= width else set_cell_size(text, width - 1).rstrip() + more
 
 
 def wrapped(text: str, width: int, *, fold: bool = False) -> list[str]:

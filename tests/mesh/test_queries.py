@@ -188,6 +188,32 @@ async def test_one_host_fills_half_a_queue_at_most_and_is_refused_undecoded(worl
     assert await answer(a, Ping(7), "test/ask/one/x") == ("test/ask/one/x", Pong(7, "b"))
 
 
+async def test_one_host_has_half_of_what_may_be_unanswered(world: World) -> None:
+    """Who asks much of what takes long leaves room for others."""
+    a, b = await world.open("a", "b")
+    kept: list[IncomingQuery[Ping]] = []
+    b.serve("test/ask/*/*", Ping, kept.append, unanswered=4)
+    await world.declared()
+    outcomes: list[tuple[str, object]] = []
+
+    def ask(key: str) -> None:
+        a.ask_then(f"test/ask/{key}", PING, Pong, lambda reply: outcomes.append((key, reply)), timeout=LONG)
+
+    for number in range(5):
+        ask(f"one/{number}")
+    await until(lambda: len(outcomes) == 3)
+    assert [reply.problem.code for _, reply in outcomes if reply.problem] == ["busy"] * 3  # type: ignore[attr-defined]
+    for key in ("two/1", "two/2", "three/1"):
+        ask(key)
+    await until(lambda: len(outcomes) == 4)
+    assert outcomes[3][0] == "three/1"
+    kept[0].answer(Pong(1))
+    kept[1].drop()
+    await until(lambda: len(outcomes) == 6)
+    ask("one/again")
+    await until(lambda: len(kept) == 5)
+
+
 async def test_ask_ends_with_the_reply_that_is_enough(world: World) -> None:
     a, b, c = await world.open("a", "b", "c")
     kept: list[IncomingQuery[Ping]] = []

@@ -10,7 +10,7 @@ import pytest
 
 from tests.mesh.both_meshes import ASK, LONG, NEWS, Ping, Pong, World, token
 from tests.mesh.kit import until
-from zscout.keyexpr import Role, Sender
+from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import MeshError
 from zscout.mesh.renewal import LASTS, LONGEST, PATIENCE, SHORTEST, RenewableTransport, Suspicions
 from zscout.mesh.transport import Transport
@@ -145,6 +145,21 @@ async def test_a_session_that_its_program_has_left_is_not_missed(shows_another: 
     withdraw()
     await asyncio.sleep(2 * PATIENCE)
     assert (watcher._transport.id() == before) == shows_another
+
+
+async def test_nobody_withdraws_anothers_session() -> None:
+    """Who shows another's session and stops to do so, as any role may, has nobody join anew."""
+    network = MemoryNetwork()
+    watcher, other, liar = (network.open("test", Sender(name, "test")) for name in ("w", "a", "liar"))
+    for mesh in (watcher, other):
+        mesh.watch_links()
+    before = watcher._transport.id(), other._transport.id()
+    shown = [liar.alive(Token("liar", Role.SESSION, f"s{number}", id_)) for number, id_ in enumerate(before)]
+    await asyncio.sleep(1)
+    for token_ in shown:
+        token_.close()
+    await asyncio.sleep(2 * PATIENCE)
+    assert (watcher._transport.id(), other._transport.id()) == before
 
 
 def test_a_contradiction_must_last_and_one_that_stays_is_acted_on_ever_more_seldom() -> None:

@@ -391,6 +391,11 @@ class Guardian:
 
 
 def main() -> None:
+    for fd in range(3):
+        try:
+            os.fstat(fd)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # the lowest number that is free
     channel, tty, grace, command = int(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4:]
     os.set_inheritable(channel, False)
     connection = socket.socket(fileno=channel)

@@ -23,6 +23,7 @@ import click
 
 from zscout import __version__
 from zscout.cli.groups import Headings, LazyGroup, instead
+from zscout.streams import escape_what_cannot_be_written
 
 HEADINGS: Final[Headings] = {
     "Use devices": {
@@ -108,9 +109,7 @@ class OneLineErrors(LazyGroup):
         standalone_mode: bool = True,
         **extra: Any,
     ) -> Any:
-        for name in ("stdout", "stderr"):
-            if getattr(sys, name) is None:  # closed by whoever started it (`>&-`)
-                setattr(sys, name, open(os.devnull, "w"))  # noqa: PTH123, SIM115 - open to the end
+        escape_what_cannot_be_written()
         own = super().main
         code = run_command(lambda: own(args, "zscout", complete_var, standalone_mode=False, **extra))
         if not standalone_mode:

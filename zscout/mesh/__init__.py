@@ -2,15 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
-# Zenoh reads this once, when it is loaded. With few receiving threads one unreachable host stalls every link.
-os.environ.setdefault(
-    "ZENOH_RUNTIME",
-    "(rx:(worker_threads:16),net:(worker_threads:4),acc:(worker_threads:4),tx:(worker_threads:4),"
-    "app:(worker_threads:2))",
-)
-
 from zscout.mesh.exchange import Answered as Answered
 from zscout.mesh.exchange import Declaration as Declaration
 from zscout.mesh.exchange import IncomingQuery as IncomingQuery

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, Generic, TypeVar
@@ -103,6 +104,8 @@ class IncomingQuery(Generic[R]):
     arrived: Ns  # when it left the network, by `Mesh.now`
     outcome: Answered | None = None
     tally: Tally | None = None
+    over: Callable[[], None] | None = None
+    """Called once it is answered or dropped."""
 
     def answer(self, message: msgspec.Struct, encoded: bytes | None = None) -> None:
         """Answer with `message`; `encoded`: the same, if it is known."""
@@ -113,13 +116,11 @@ class IncomingQuery(Generic[R]):
 
     def drop(self) -> None:
         """Leave it unanswered: its sender does not wait for the whole timeout."""
-        query, self._query = self._query, None
-        if query is not None:
+        if (query := self._taken()) is not None:
             query.drop()
 
     def end(self, said: msgspec.Struct, encoded: bytes | None = None) -> None:
-        query, self._query = self._query, None
-        if query is None:
+        if (query := self._taken()) is None:
             return
         if isinstance(said, Problem):
             refuse(query, said)
@@ -132,6 +133,13 @@ class IncomingQuery(Generic[R]):
                 self.tally.refuse(said.code)
             else:
                 self.tally.answered += 1
+
+    def _taken(self) -> TransportQuery | None:
+        """The query, once."""
+        query, self._query = self._query, None
+        if query is not None and self.over is not None:
+            self.over()
+        return query
 
 
 class Publisher:
@@ -152,24 +160,26 @@ class Backlog:
 
 
 class HostShares:
-    """Waiting queries per host, so that no host takes all the room. Counted on any thread."""
+    """Queries per host, so that no host takes all the room; `most` of all hosts. Counted on any thread."""
 
-    def __init__(self, share: int) -> None:
-        self._share, self._lock, self._waiting = share, threading.Lock(), dict[str, int]()
+    def __init__(self, share: int, most: int | None = None) -> None:
+        self._share, self._most, self._lock, self._counts = share, most, threading.Lock(), Counter[str]()
 
     def enter(self, host: str) -> bool:
+        """`host` is empty where none is named."""
         with self._lock:
-            waiting = self._waiting.get(host, 0)
-            if waiting >= self._share:
+            if host and self._counts[host] >= self._share:
                 return False
-            self._waiting[host] = waiting + 1
+            if self._most is not None and self._counts.total() >= self._most:
+                return False
+            self._counts[host] += 1
             return True
 
     def leave(self, host: str) -> None:
         with self._lock:
-            self._waiting[host] -= 1
-            if not self._waiting[host]:
-                del self._waiting[host]
+            self._counts[host] -= 1
+            if not self._counts[host]:
+                del self._counts[host]
 
 
 class Declaration:

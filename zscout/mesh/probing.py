@@ -28,8 +28,9 @@ from zscout.config.certificates import NO_CHECK_TIME, Certificates, Validity, co
 from zscout.config.fleet import MeshConfig, ip_of
 from zscout.config.strict import BadInput, Where
 from zscout.keyexpr import NAME, ROOT, Role
+from zscout.mesh.exchange import MeshError
 from zscout.mesh.relinking import MEETING
-from zscout.mesh.zenoh_mesh import in_thread, zenoh_config
+from zscout.mesh.zenoh_mesh import in_thread, open_session, zenoh_config
 from zscout.types import clean
 
 SCOUT: Final = 1.5  # seconds for all processes to answer
@@ -260,7 +261,7 @@ def plain_fleets(addresses: Sequence[str]) -> dict[str, set[str]]:
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
     found: dict[str, set[str]] = {}
-    with suppress(zenoh.ZError), zenoh.open(config) as session:
+    with suppress(zenoh.ZError, MeshError), open_session(lambda: config) as session:
         until = time.monotonic() + LINK
         while len(list(session.info.peers_zid())) < len(addresses) and time.monotonic() < until:
             time.sleep(POLL)

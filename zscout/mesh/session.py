@@ -343,15 +343,18 @@ class Mesh:
         tally: Tally | None = None,
         lane: Lane = Lane.ASK,
         concerns: Callable[[IncomingQuery[Any]], tuple[Lane, str]] | None = None,
+        unanswered: int | None = None,
     ) -> Declaration:
         """Call `handler` for queries on `key` with a message of `kind`; `tally` counts how they end. `concerns`: the
         lane that a query turns out to belong in, and the host whose surplus it waits behind (see `Inbox`).
 
         Refused undecoded: wildcard keys (answered on `key` if that is concrete), and, as `busy`, queries beyond `depth`
-        waiting, or half of it from one host if the key names its sender. Bad payloads are `malformed`."""
+        waiting, or half of it from one host if the key names its sender; so are those beyond `unanswered` that are not
+        answered yet. Bad payloads are `malformed`."""
         state = Backlog(depth=depth)
         wild, names_sender = "*" in key, key.endswith("/*/*")
         shares = HostShares(depth // 2)
+        open_ = None if unanswered is None else HostShares(unanswered // 2, unanswered)
 
         def turn_away(query: TransportQuery, code: str, message: str) -> None:
             if tally is not None:
@@ -401,6 +404,10 @@ class Mesh:
                     later = functools.partial(carry_out, incoming, host, waited=True)
                     if (lane is Lane.QUESTION or of != host) and self._inbox.behind(lane, of, later):
                         return
+                if open_ is not None:
+                    if not open_.enter(host):
+                        raise Refused("busy", "too many requests are being answered here; ask again")
+                    incoming.over = functools.partial(open_.leave, host)
                 handler(incoming)
             except Refused as refused:
                 incoming.refuse(refused.problem)
@@ -514,11 +521,13 @@ class Mesh:
         unless its program shows another session (Zenoh may not close the old one). For programs that stay."""
         name = functools.partial(Token, self.me.host, Role.SESSION, self.me.client)
         own = self._transport.own_token(lambda session: self.keys.alive(name(session)))
-        shown: dict[str, tuple[Sender, bool]] = {}
+        shown: dict[str, tuple[set[Sender], Sender]] = {}  # by session: who shows it, and whose word came last
 
         def on_token(token: Token, alive: bool) -> None:
-            shown.pop(token.instance, None)
-            shown[token.instance] = Sender(token.host, token.name), alive
+            program = Sender(token.host, token.name)
+            by, _ = shown.pop(token.instance, (set[Sender](), program))
+            (by.add if alive else by.discard)(program)
+            shown[token.instance] = by, program
             if len(shown) > MAX_SESSIONS:
                 del shown[next(iter(shown))]
 
@@ -527,8 +536,8 @@ class Mesh:
                 return
             self._inbox.loop.call_later(LINK_PERIOD, look)
             about = "the token is missing of the linked session "
-            gone = {peer: shown[peer][0] for peer in self._transport.peers() if peer in shown and not shown[peer][1]}
-            there = {program for program, alive in shown.values() if alive} if gone else ()
+            gone = {peer: shown[peer][1] for peer in self._transport.peers() if peer in shown and not shown[peer][0]}
+            there = {program for by, _ in shown.values() for program in by} if gone else ()
             missing = [about + peer for peer, program in gone.items() if program not in there]
             self.suspicions.keep(missing, about)
             for what in missing:

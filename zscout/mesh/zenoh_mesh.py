@@ -6,6 +6,7 @@ import asyncio
 import functools
 import json
 import logging
+import os
 import re
 import secrets
 import threading
@@ -38,6 +39,12 @@ log = logging.getLogger(__name__)
 
 CONTROL_BATCHES = 8  # control messages in flight per peer: with fewer, an answer waits for the message before it
 SCOUTING_DELAY_MS = 200
+THREADS = "ZENOH_RUNTIME"
+# With few receiving threads one unreachable host stalls every link.
+MANY_THREADS = (
+    "(rx:(worker_threads:16),net:(worker_threads:4),acc:(worker_threads:4),tx:(worker_threads:4),"
+    "app:(worker_threads:2))"
+)
 GREATER_CONNECTS = {"peer": {"to_router": "always", "to_peer": "greater-zid"}}
 CLOSE_TIMEOUT = 3.0  # seconds that closing a session may take
 BLOCK, DROP = zenoh.CongestionControl.BLOCK, zenoh.CongestionControl.DROP
@@ -239,8 +246,24 @@ def increasing_id() -> str:
     return f"1{secrets.token_hex(9)}0{time.time_ns().to_bytes(8, 'little').hex()[4:]}"
 
 
+def open_session(settings: Callable[[], zenoh.Config]) -> zenoh.Session:
+    """Blocks. Raises MeshError."""
+    # Zenoh reads this when it opens its first session. It is none of the programs that this one starts.
+    if THREADS not in os.environ:
+        os.putenv(THREADS, MANY_THREADS)
+    try:
+        return zenoh.open(settings())
+    except zenoh.ZError as error:
+        # Without the places in Zenoh's source.
+        why = re.sub(r" at \S+\.rs:[0-9]+\.?", "", str(error))
+        raise MeshError(f"the mesh can't be joined: {why}; check listen and connect under [mesh]") from None
+    finally:
+        if THREADS not in os.environ:
+            os.unsetenv(THREADS)
+
+
 async def _open(config: MeshConfig, security: Security | None) -> Transport:
-    opening = in_thread("joins the mesh", lambda: zenoh.open(zenoh_config(config, security)))
+    opening = in_thread("joins the mesh", lambda: open_session(lambda: zenoh_config(config, security)))
     try:
         session = await asyncio.wrap_future(opening)
     except asyncio.CancelledError:
@@ -249,10 +272,6 @@ async def _open(config: MeshConfig, security: Security | None) -> Transport:
             lambda opened: opened.exception() or in_thread("closes the mesh", opened.result().close)
         )
         raise
-    except zenoh.ZError as error:
-        # Without the places in Zenoh's source.
-        why = re.sub(r" at \S+\.rs:[0-9]+\.?", "", str(error))
-        raise MeshError(f"the mesh can't be joined: {why}; check listen and connect under [mesh]") from None
     try:
         # A relay leaves relinking to its sites, which know its address.
         relinks = config.multicast and not config.relay

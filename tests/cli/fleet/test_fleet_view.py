@@ -11,9 +11,10 @@ import pytest
 from tests.mesh.kit import run, until
 from tests.services.rcm.kit import FakeFleet
 from zscout.behaviors.client.client import Client
-from zscout.cli.fleet.fleet_view import QUIET, FleetView
-from zscout.keyexpr import Role, Token
-from zscout.messages import HostRanking, LoadReport, RankAsk
+from zscout.cli.fleet.fleet_view import QUIET, Devices, FleetView
+from zscout.keyexpr import Keys, Role, Sender, Token
+from zscout.mesh import Reply
+from zscout.messages import HostRanking, LoadReport, RankAsk, RcAsk, RcState
 from zscout.services.placement.load_balancer import READ_EVERY, LoadBalancer
 from zscout.types import SECOND
 
@@ -93,5 +94,40 @@ def test_a_candidate_that_is_not_there_is_not_waited_for_long() -> None:
             await view.settled()
             assert QUIET <= (view.mesh.now() - began) / SECOND < QUIET + SOON
             assert not view.all_hosts()["nowhere"].tokens
+
+    run(story())
+
+
+class SlowNode:
+    """A secured mesh on which one node has many RCs and answers one question after the other."""
+
+    keys, me = Keys("test", closed=True), Sender("here", "status-1")
+
+    def __init__(self, rcs: list[str]) -> None:
+        self.tokens_of = {Role.RC: [Token("anvil", Role.RC, rc, "i1") for rc in rcs]}
+        self.mesh, self._turn = self, asyncio.Lock()
+
+    def tokens(self, role: str) -> list[Token]:
+        return self.tokens_of[role]
+
+    def subscribe(self, *_: object) -> None: ...
+
+    async def ask_one(self, key: str, _: RcAsk, __: type, *, timeout: float) -> Reply[RcState] | None:
+        try:
+            async with asyncio.timeout(timeout), self._turn:
+                await asyncio.sleep(0.002)
+                return Reply(key, RcState(self.keys.rc_of(key), "anvil", "i1", False))
+        except TimeoutError:
+            return None
+
+
+def test_each_of_many_devices_of_a_secured_node_tells_its_state() -> None:
+    """All asked at once, most would be answered too late."""
+
+    async def story() -> None:
+        rcs = [f"robot/r{number}" for number in range(1_000)]
+        devices = Devices(SlowNode(rcs))  # type: ignore[arg-type]
+        await devices.ask()
+        assert devices.known().keys() == set(rcs)
 
     run(story())

@@ -23,7 +23,7 @@ from zscout.messages import (
     UncordonHost,
 )
 from zscout.placement.placer import Placer
-from zscout.services.placement import component_placer, request_handler
+from zscout.services.placement import component_placer
 
 
 async def test_a_component_is_placed_moved_and_stopped_and_each_change_is_published() -> None:
@@ -126,7 +126,7 @@ async def test_a_move_that_the_component_refuses_is_refused_and_it_stays() -> No
 
 
 async def test_too_many_requests_are_refused_as_busy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(request_handler, "MAX_WAITING", 2)
+    monkeypatch.setattr(component_placer, "MAX_WAITING", 2)
     fleet = PlacerFleet("a")
     fleet.nodes["a"].silent = True
     placer = await fleet.lead()

@@ -12,6 +12,7 @@ from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common
 from zscout.keyexpr import BadName, Role, Sender, Token
+from zscout.mesh.supervision import done_within
 from zscout.messages import MAX_RANKED, HostRanking, LoadReport, RankAsk, RcAsk, RcmState, RcState
 from zscout.types import SECOND, Ns
 
@@ -23,6 +24,10 @@ ASK_PLACER: Final = 1.0
 ASK_BALANCER: Final = 1.0
 ASK_RCS: Final = 0.5
 """Seconds that the RCs have for their answers."""
+ASK_EACH: Final = 5.0
+"""Seconds for all answers where each RC is asked by itself: a thousand of one node take it two."""
+AT_ONCE: Final = 32
+"""RCs asked at one time then."""
 FIND_LOADS: Final = 1.2
 """Seconds to wait for hosts that are known to be there, and for load reports that the balancer does not tell: they come
 once a second."""
@@ -228,10 +233,14 @@ class Devices:
         mesh, keys = self._mesh, self._mesh.keys
         if keys.closed:
             # Nobody may answer there with the key of a question to all.
-            asked = (self._ask(rc) for rc in unknown())
-            await asyncio.gather(*asked)
+            left = sorted(unknown())
+            await done_within(ASK_EACH, asyncio.gather(*(self._ask_each(left) for _ in range(AT_ONCE))))
         elif unknown():
             await mesh.ask(keys.rc_state_any, RcAsk(), RcState, timeout=ASK_RCS, enough=all_known)
+
+    async def _ask_each(self, left: list[str]) -> None:
+        while left:
+            await self._ask(left.pop())
 
     async def _ask(self, rc: str) -> None:
         key = self._mesh.keys.ask_rc_state(rc, self._mesh.me)

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from zscout.config.node import JournalConfig
 from zscout.keyexpr import check_need
-from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError, Refused
+from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError
 from zscout.mesh.supervision import Supervisor, done_within
 from zscout.messages import Grants, HistoryAsk, JournalGap, PastHold, Problem, RcmState, RcState, StateAsk
 from zscout.services.journal.follower import Change, Follower, Heard, PublicationHeard, StateRead, UseHeard
@@ -70,7 +70,6 @@ class Journal:
         self._troubled: str | None = None
         self._not_before: Ns = 0
         self._read_at: Ns = 0
-        self._asking = 0
         self._used_last = False  # true with an RC's last report on an ended hold
         self._ending = asyncio.Event()
         self._declared: list[Declaration] = []
@@ -78,7 +77,7 @@ class Journal:
     def start(self) -> None:
         mesh, guard = self._mesh, self._supervisor.guard
         self._declared = [
-            mesh.serve(mesh.keys.history_any(mesh.me.host), HistoryAsk, guard(self._on_asked)),
+            mesh.serve(mesh.keys.history_any(mesh.me.host), HistoryAsk, guard(self._on_asked), unanswered=MAX_ASKING),
             # The candidate subscribes alike: a state is decoded once.
             mesh.subscribe(mesh.keys.rc_state_any, RcState, guard(self._on_rc_state)),
         ]
@@ -215,9 +214,6 @@ class Journal:
     def _on_asked(self, query: IncomingQuery[HistoryAsk]) -> None:
         if query.message.rc is not None:
             check_need(query.message.rc)
-        if self._asking >= MAX_ASKING:
-            raise Refused("busy", "this journal has too many questions to answer; try again")
-        self._asking += 1
         self._supervisor.spawn(self._answer(query))
 
     async def _answer(self, query: IncomingQuery[HistoryAsk]) -> None:
@@ -227,8 +223,6 @@ class Journal:
         except Unwritable as error:
             query.refuse(Problem("no_journal", str(error)))
             return
-        finally:
-            self._asking -= 1
         silent_for = 0.0 if self._at is None else (self._mesh.now() - self._at) / SECOND
         if asked.before is None and silent_for > self._silent:
             answer = replace(answer, gaps=[*answer.gaps, JournalGap(self._heard, None, "silent")])

@@ -52,13 +52,15 @@ class ComponentHost:
         self._ended: OrderedDict[str, ComponentProcess] = OrderedDict()
         self._known: OrderedDict[str, int] = OrderedDict()  # the highest incarnation of each component started here
         self.supervisor = Supervisor("the component host", on_failure)
-        self._underway = 0
+        self._looking: asyncio.Future[dict[str, str]] | None = None
         self._stopping = False
 
     async def start(self) -> None:
         await asyncio.to_thread(self._limits.sweep)
         self._served = [
-            self.mesh.serve(key, messages.ComponentOperation, self._on_request, limit=messages.MAX_MOVE)
+            self.mesh.serve(
+                key, messages.ComponentOperation, self._on_request, limit=messages.MAX_MOVE, unanswered=MAX_UNDERWAY
+            )
             for key in self.mesh.keys.served_component(self.mesh.me.host)
         ]
 
@@ -83,11 +85,8 @@ class ComponentHost:
         ]
 
     def _on_request(self, request: IncomingQuery[messages.ComponentOperation]) -> None:
-        if self._underway >= MAX_UNDERWAY:
-            raise Refused("busy", "too many operations are running here; try again")
         if self.mesh.keys.closed:
             self._authority.check_component(self.mesh.keys.sender_of(request.key), request.message)
-        self._underway += 1
         self.supervisor.spawn(self._answer(request))
 
     async def _answer(self, request: IncomingQuery[messages.ComponentOperation]) -> None:
@@ -100,8 +99,6 @@ class ComponentHost:
         except Exception:
             log.exception("an operation on a component failed")
             request.refuse(messages.Problem("internal", "the request failed here; see this node's log"))
-        finally:
-            self._underway -= 1
 
     async def _do(self, operation: messages.ComponentOperation) -> msgspec.Struct:
         match operation:
@@ -140,7 +137,7 @@ class ComponentHost:
 
     async def _launch(self, start: messages.StartComponent) -> ComponentProcess:
         self._check(start)
-        kinds = await asyncio.to_thread(self._kinds)
+        kinds = await self._installed()
         # A start may have come meanwhile.
         if process := self._same(start):
             return process
@@ -194,10 +191,16 @@ class ComponentHost:
             raise Refused("too_large", f"params are {size} bytes as JSON; write at most {messages.MAX_PARAMS_SIZE}")
 
     async def _list(self, component: str | None) -> messages.ComponentList:
-        kinds = await asyncio.to_thread(self._kinds)
+        kinds = await self._installed()
         found = {**self._ended, **self._living}
         views = [found[name].view() for name in sorted(found) if component in (None, name)]
         return messages.ComponentList(self.mesh.me.host, views, self._startable(kinds)[:MAX_KINDS])
+
+    async def _installed(self) -> dict[str, str]:
+        """Those who ask at one time share one look."""
+        if self._looking is None or self._looking.done():
+            self._looking = asyncio.ensure_future(asyncio.to_thread(self._kinds))
+        return await asyncio.shield(self._looking)
 
     def _startable(self, kinds: dict[str, str]) -> list[str]:
         if not self._rules.allow:

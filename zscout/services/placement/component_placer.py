@@ -21,7 +21,7 @@ from zscout.placement.placer import Placer
 from zscout.rcm.authority import Authority
 from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.placement.node_client import NodeClient
-from zscout.services.placement.request_handler import PlacerRequestHandler
+from zscout.services.placement.request_handler import MAX_WAITING, PlacerRequestHandler
 from zscout.types import SECOND, HostName, Ns, Term
 
 log = logging.getLogger("zscout.placer")
@@ -67,7 +67,10 @@ class ComponentPlacer:
         for declared in (
             mesh.watch(keys.alive_any(Role.NODE), guard(self._on_node)),
             mesh.watch(keys.alive_any(Role.COMPONENT), guard(self._on_component)),
-            *(mesh.serve(key, PlacerOperation, guard(self._requests.receive)) for key in keys.served_placer()),
+            *(
+                mesh.serve(key, PlacerOperation, guard(self._requests.receive), unanswered=MAX_WAITING)
+                for key in keys.served_placer()
+            ),
         ):
             self._declarations.callback(declared.close)
         self._supervisor.call_later(BEGIN, self._requests.open)

@@ -63,8 +63,6 @@ class PlacerRequestHandler:
         if isinstance(operation, messages.ListPlacements):
             query.answer(self.placements(operation.component))
             return
-        if len(self._early) + len(self._waiting) >= MAX_WAITING:
-            raise Refused("busy", "too many operations are waiting here; try again")
         event = _event_of(operation)
         if self._keys.closed:
             event = self._allowed(event, self._keys.sender_of(query.key))
@@ -143,6 +141,8 @@ class PlacerRequestHandler:
         status = self._placer.components.get(waiting.operation.component) if waiting else None
         if status is not None:
             query.answer(status)
+        else:
+            query.drop()
 
     def _pop(self, query: PlacerQuery) -> _Waiting | None:
         waiting = self._waiting.pop(query, None)
