@@ -133,6 +133,20 @@ def test_clocks_differ_a_little_and_the_earliest_end_counts() -> None:
     assert held.end == NOW + 9_500_000_000
 
 
+@pytest.mark.parametrize(
+    ("told", "protected"),
+    [((45, 45), 45), ((45, 44), 44), ((None, 45), 45), ((None, None), None)],
+    ids=["both alike", "the latest counts", "an older RC says nothing", "no such rule"],
+)
+def test_from_when_a_hold_is_protected_is_the_word_of_its_rcs(
+    told: tuple[float | None, ...], protected: float | None
+) -> None:
+    held = {name: hold(remaining=50, protected_from=left) for name, left in zip(GANG, told, strict=True)}
+    states = [rc("robot/a", held["robot/a"]), rc("radio/b", held["radio/b"])]
+    (found,) = recover_plain(states, [], NOW).holds
+    assert found.protected_from == (None if protected is None else NOW + round((50 - protected) * SECOND))
+
+
 def test_the_parameters_at_an_absent_rc_are_what_the_client_says() -> None:
     (held,) = recover_plain(BOTH[:1], [RUNS], NOW).holds
     assert held.request.needs["radio/b"] == {"rate": Fraction(5, 2)}
@@ -269,7 +283,7 @@ def test_a_node_ends_no_hold_of_others_by_claiming_it(lie: Holder, first: bool) 
     """With certificates: an RC's word counts for the gangs that it is in, and the grant that a client lists first."""
     liar, listed = rc("video/lie", lie), client(asked(grant=Grant(TERM, 5), rcs=list(GANG)))
     found = recover([liar, *BOTH] if first else [*BOTH, liar], [listed], NOW, secured())
-    assert [(held.request.needs.keys(), held.end - NOW) for held in found.holds] == [(set(GANG), 10 * SECOND)]
+    assert [({*held.request.needs}, held.end - NOW) for held in found.holds] == [({*GANG}, 10 * SECOND)]
 
 
 def test_what_goes_on_at_another_client_is_believed_of_no_request_that_waits() -> None:

@@ -70,6 +70,8 @@ class RecoveredState:
     """The clients that have said what they ask for."""
     charged: Mapping[str, float] = field(default_factory=dict)
     """By group: what it lately had, as the leader before told (`fair_shares.py`)."""
+    patience: Ns | None = None
+    """As the leader before published it."""
     refused: list[NotLetIn] = field(default_factory=list)
     booked: set[str] = field(default_factory=set)
     """Dates of bookings that only RCs report as taken up: they do not lapse meanwhile."""
@@ -263,7 +265,8 @@ def recover(
             result.remarks.append(f"the hold of {arc} is not carried on: its grant is of no earlier term")
             continue
         seen.add(arc)
-        some, mine = _most_telling(held), listed.get(arc)
+        # An RC from before there were patterns passes on nothing about them.
+        some, mine = max(held.values(), key=lambda holder: len(holder.bound)), listed.get(arc)
         if mine is None and some.client in result.answered:
             result.remarks.append(f"{arc} is given up by its client")
             continue
@@ -290,11 +293,6 @@ def recover(
     return result
 
 
-def _most_telling(held: Mapping[RcName, Holder]) -> Holder:
-    """An RC from before there were patterns passes on nothing about them."""
-    return max(held.values(), key=lambda holder: len(holder.bound))
-
-
 def _hold(
     arc: ArcId, held: Mapping[RcName, Holder], some: Holder, mine: Listed | None, now: Ns, admission: Admission
 ) -> RecoveredHold | None:
@@ -319,7 +317,13 @@ def _hold(
         place = some.place if mine.expects else mine.place
     request = admission.clamped(request)
     vouched = not admission.closed or mine is not None
-    return RecoveredHold(request, place, some.grant, end - request.min_runtime, end, bound, vouched)
+    start, protected = end - request.min_runtime, _protected_from(held, end)
+    return RecoveredHold(request, place, some.grant, start, end, bound, vouched, protected)
+
+
+def _protected_from(held: Mapping[RcName, Holder], end: Ns) -> Ns | None:
+    left = [holder.protected_from for holder in held.values() if holder.protected_from is not None]
+    return end - round(min(left) * SECOND) if left else None
 
 
 def _agree(needs: Mapping[Need, Params], bound: Mapping[Need, RcName], held: Mapping[RcName, Holder]) -> bool:
