@@ -247,14 +247,14 @@ def recover(
         for holder in state.holders:
             # With certificates an RC's word counts for the gang that it names, and is in.
             gang = tuple(sorted({*holder.rcs})) if admission.closed else ()
-            if not gang or state.rc in gang:
+            if not admission.closed or state.rc in gang:
                 parts.setdefault((arc_id(holder.client, holder.id), holder.grant, gang), {})[state.rc] = holder
 
     def believed(reported: _Reported) -> tuple[bool, Grant]:
         """The newest, but first the one that its client lists: any node may claim another."""
         arc, grant, gang = reported
         mine = listed.get(arc)
-        return bool(gang) and mine is not None and (mine.grant, {*mine.rcs}) == (grant, {*gang}), grant
+        return bool(gang) and mine is not None and mine.grant == grant and {*mine.rcs} in ({*gang}, set()), grant
 
     seen, places = set[ArcId](), set[tuple[Place, str]]()
     for reported, held in sorted(parts.items(), key=lambda item: believed(item[0]), reverse=True):
