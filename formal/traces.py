@@ -255,7 +255,7 @@ class Behaviour:
             if rc in self._sharable or rc not in instances or not self._promised(term, instances[rc]):
                 continue
             wanted[instances[rc]] = None
-            for grant, arc, place, gang in holders[:1]:
+            for grant, arc, place, gang, *_ in holders[:1]:
                 given = _grant(grant)
                 wanted[instances[rc]] = given
                 self._arc_of[given] = arc, place

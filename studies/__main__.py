@@ -26,6 +26,10 @@ STUDIES: Final[dict[str, Study]] = {
     "bookings": Study("scheduling.commands:bookings", "What do bookings cost, and what do their owners gain?", "2 min"),
     "forecasts": Study("scheduling.commands:forecasts", "How close are predicted start times?", "2 min"),
     "shares": Study("scheduling.commands:shares", "Are two groups equal, and can one of them cheat?", "3 min"),
+    "traces": Study("scheduling.commands:traces", "How long do the jobs of a real trace wait?", "20 min, a trace"),
+    "clairvoyant": Study(
+        "scheduling.clairvoyant:clairvoyant", "How much longer than the least do requests wait?", "8 min"
+    ),
     "strategies": Study("strategies:main", "How far is each strategy from the best set?", "5 min"),
     "placement": Study("placement.commands:placement", "Which policy places components best?", "15 s"),
     "robots": Study("robots.commands:robots", "How soon are robots hidden, and what do they then see?", "30 min"),

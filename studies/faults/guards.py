@@ -36,7 +36,7 @@ from zscout.rcm.roster import Roster
 from zscout.rcm.steps import Outbox
 from zscout.rcm.terms import BELIEVED, Terms, Verdict
 from zscout.scheduling.calendar import Calendar
-from zscout.scheduling.model import ArcRequest
+from zscout.scheduling.model import Arc, ArcRequest
 from zscout.scheduling.state import SchedulerState
 from zscout.services.bookings import records
 from zscout.services.bookings.fleet_clock import FleetClock, wall_ns
@@ -239,6 +239,10 @@ def _none_recovered(*_: object) -> list[Any]:
     return []
 
 
+def _at_its_end(_held: object, end: Ns) -> Ns:
+    return end
+
+
 GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
     {
         "promise": Guard("an RC that answered a new leader obeys no older one", {(HoldTable, "promise"): _promise}),
@@ -331,6 +335,12 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "one stands": Guard("of two bookings that can't both be one stands", {(Calendar, "_obstacle"): _no_obstacle}),
         "awaited": Guard("who has taken up a date does not begin before it", {(BookedDates, "dated"): _undated}),
         "had again": Guard("who has taken up a date has it again once it can be", {(Calendar, "_offer"): _nothing}),
+        "budget": Guard(
+            "who has spent its budget is preempted by operators only", {(Arc, "protected_below"): _nothing}
+        ),
+        "protected": Guard(
+            "who is protected stays so under the next leader", {(recovery, "_protected_from"): _at_its_end}
+        ),
         "withdrawn": Guard(
             "what nobody asks for is given back",
             {(RcmLink, "give_back"): _do_nothing, (Roster, "ask_requests"): _no_change},

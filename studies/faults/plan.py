@@ -48,6 +48,8 @@ KINDS: Mapping[FaultKind, int] = MappingProxyType(
     }
 )
 """And how often each is drawn."""
+DELAYS: Final = frozenset({"freeze", "stall", "cut", "isolate", "part", "disturb", "forget"})
+"""Those by which messages are late, or heard late."""
 LASTING, SHARES = ((0.5, 1.5), (0.05, 3.0), (3.0, 8.0)), (7, 2, 1)
 """Seconds, and how often: about a lease is the worst there is; longer than the hold lease is seldom."""
 JUMPS = (3, 10_000_000, MAX_COUNTER)

@@ -5,9 +5,10 @@ leaders believe. Some hold only once they had time to come right: their clocks s
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from itertools import product
+from itertools import chain, product
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from zscout.drivers.instances import InstanceState
@@ -37,6 +38,9 @@ JUST_NOW: Final = 0.1
 """Seconds: two looks."""
 LEFT_OVER: Final = 7.0
 """Seconds after the last hold's end in which everything about it is forgotten, but how it ended."""
+
+PROTECTED: Final = 1.0
+"""Seconds for which a leader may not believe yet that only operators preempt a hold, as was told first."""
 
 LOSSES: Final = ("lost", "client_lost")
 
@@ -77,6 +81,11 @@ class Promises:
         """Grants that an RCM has ended, and not for a loss."""
         self._taken_away: set[str] = set()
         """Those of them that their clients were not to keep: neither given back nor handed over."""
+        self._protected: dict[str, tuple[float, float]] = {}
+        """By grant: when it was published first, and from when only operators were to preempt it then. (None of these
+        programs is one.)"""
+        self.delayed = -math.inf
+        """Until when messages were late last: an RC that heard of a hold late has it end later, and says so."""
         self._interrupted: set[str] = set()
         """Grants that have ended at an RC, and no other of the same ARC began there as they did."""
         self._owner: dict[str, str] = {}
@@ -109,6 +118,7 @@ class Promises:
         """A line of `zscout.trace`: at every event, what an RC may not do whatever it hears."""
         if what["do"] == "publish":
             ended = self._ended_by.setdefault(str(what["term"]), set())
+            self._look_who_is_preempted(what)
             self._taken |= {str(grant) for grant, outcome in what["ends"] if outcome not in LOSSES}
             kept = (*LOSSES, "released", "handed_over")
             self._taken_away |= {str(grant) for grant, outcome in what["ends"] if outcome not in kept}
@@ -151,6 +161,16 @@ class Promises:
         self._held[instance] = held
         if what["do"] == "command" and str(what["grant"]) not in held:
             self._broken(f"{rc} obeyed a command under {what['grant']}, which it does not hold")
+
+    def _look_who_is_preempted(self, published: Mapping[str, Any]) -> None:
+        for grant, outcome in published["ends"]:
+            told, protected = self._protected.get(str(grant), (self._now(), math.inf))
+            since = self._now() - protected
+            if outcome == "preempted" and since > PROTECTED and told > self.delayed:
+                self._broken(f"{grant} is preempted, though it was protected {since:.1f} s ago")
+        for grant, *_, left, protected in chain.from_iterable(published["rcs"].values()):
+            if protected is not None:
+                self._protected.setdefault(str(grant), (self._now(), self._now() + left - protected))
 
     def forget_client(self, name: str) -> None:
         """It died: what it was promised was to that life."""

@@ -9,6 +9,7 @@ import asyncio
 import gc
 import hashlib
 import logging
+import math
 import random
 from collections import Counter
 from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
@@ -706,6 +707,10 @@ class Simulation:
     def _look_who_is_heard(self) -> None:
         lost = {fault.message for fault in self.present if fault.kind == "disturb" and fault.how.lost == 1}
         self.promises.unheard = not lost.isdisjoint(("grants", "alive"))
+        if any(fault.kind in plan.DELAYS for fault in self.present):
+            self.promises.delayed = math.inf
+        else:
+            self.promises.delayed = min(self.promises.delayed, self.loop.now)
 
     def _kill(self, name: str, fault: Fault, reached: MemoryTransport | None = None) -> None:
         if fault in self.excuses.killed or self.running[name][0].dead:

@@ -1,4 +1,4 @@
-"""The studies of scheduling as commands: `schedule`, `bookings`, `forecasts`, `shares`."""
+"""The studies of scheduling as commands: `schedule`, `bookings`, `forecasts`, `shares`, `traces`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Final
 import click
 
 from studies.options import MAX_SEEDS, jobs_option, seeds_option, show
+from studies.scheduling.backfill import POLICIES
 from studies.scheduling.bookings import BOOKABLE, DEFAULT_FAMILIES, SHARES
 from studies.scheduling.families import FAMILIES
 from studies.scheduling.trial import STRATEGIES, SchedulingJob, run_timed
@@ -217,3 +218,62 @@ def shares(seeds: range, cases: int, processes: int | None, as_json: bool) -> No
         common.run(run_trials(fair.play_case, range(cases), processes, found.append))
     report = fair.report(weeks, found)
     show(dataclasses.asdict(report), None, partial(print_shares, report), as_json=as_json)
+
+
+@click.command()
+@click.argument("trace", type=click.Path(path_type=Path, exists=True, dir_okay=False))
+@click.option(
+    "--policy",
+    "policies",
+    multiple=True,
+    type=click.Choice([*POLICIES, *STRATEGIES]),
+    help="A strategy or batch scheduler; repeat it for several. Default: all.",
+)
+@click.option(
+    "--classes",
+    type=click.Choice(["one", "two", "both"]),
+    default="both",
+    show_default=True,
+    help="One priority for all, or a higher one for system personnel.",
+)
+@click.option("--first", type=click.IntRange(1), help="Only so many jobs. Default: all.")
+@click.option("--places", type=click.IntRange(0), default=0, help="Other places for programs. Default: 0.")
+@jobs_option
+@common.json_option("Print one JSON object instead of a table.")
+def traces(
+    trace: Path,
+    policies: tuple[str, ...],
+    classes: str,
+    first: int | None,
+    places: int,
+    processes: int | None,
+    as_json: bool,
+) -> None:
+    """Plays a job trace (Standard Workload Format, .swf or .swf.gz) on 32 exclusive devices.
+
+    The strategies beside EASY backfill, conservative backfill and shortest first: waits in ratios to EASY, device time
+    that preemption threw away, processor time per event. Runtimes are what was asked for. docs/scheduling.md says what
+    was found on the NASA iPSC log of the Parallel Workloads Archive.
+
+    \b
+    Examples:
+      python -m studies traces NASA-iPSC-1993-3.1-cln.swf.gz
+      python -m studies traces TRACE --policy EASY --policy adaptive --classes two --first 3000
+    """
+    from studies.process_pool import run_trials
+    from studies.scheduling import traces as study
+
+    chosen = list(dict.fromkeys(policies)) or [*POLICIES, *STRATEGIES]
+    forms = {"one": [False], "two": [True], "both": [False, True]}[classes]
+    planned = [
+        study.TraceTrial(trace, policy, form, first, places)
+        for form in forms
+        for policy in chosen
+        if policy in STRATEGIES or form is forms[0]
+    ]
+    found: list[study.TraceReport] = []
+    common.run(run_trials(study.run, planned, processes, found.append))
+    if as_json:
+        terminal.print_json({"policies": [dataclasses.asdict(report) for report in found]})
+    else:
+        terminal.print_table(study.COLUMNS, study.rows(found), title="Waits in ratios to EASY backfill")

@@ -45,6 +45,10 @@ BAD = {
     radio(port=r'"\u0000"'): (
         'rc[0].port (radio/r): "\\x00" can\'t be opened; name what to open, as in port = "/dev/ttyUSB0"'
     ),
+    radio(port='"socket://mast:7002"', dtr="false"): (
+        "rc[0].dtr (radio/r): has no effect on socket://; remove it, or use rfc2217://"
+    ),
+    radio(rts='"low"'): 'rc[0].rts (radio/r): is the text "low"; write true or false',
     radio(capacity="{ command_rate = 1 }"): (
         'rc[0].capacity (radio/r): driver "radio" does not take it; remove it, or write driver = "capacity"'
     ),

@@ -147,6 +147,7 @@ def test_every_key_of_a_fleet_file() -> None:
         strategy = "adaptive"
         operator_priority = 7
         preempt = "after_min_runtime"
+        preempt_budget = 0.5
         patience = 2.5
         promise = "all"
         min_runtime = "1m30s"
@@ -177,7 +178,7 @@ def test_every_key_of_a_fleet_file() -> None:
         name="lab",
         candidates=("anvil", "bench"),
         strategy="adaptive",
-        scheduling=SchedulingPolicy("after_min_runtime", 7, 5 * SECOND // 2, "all", 5, 129_600 * SECOND),
+        scheduling=SchedulingPolicy("after_min_runtime", 7, 0.5, 5 * SECOND // 2, "all", 5, 129_600 * SECOND),
         mesh=MeshConfig(
             listen=("tcp/0.0.0.0:0", "tls/[::]:7447", "tcp/anvil.lab:7447#iface=eth0"),
             connect=("quic/10.0.0.2:7447", "udp/[fe80::1]:1", "ws/bench:65535"),

@@ -53,7 +53,8 @@ FLEET: Final[Mapping[str, Mapping[str, Key]]] = {
         "operator_priority": _number("10", "0", "1_000_000_000", "-1", "1_000_000_001"),
         "min_runtime": _number("60.0", "0.001", "31_622_400", "0", "31_622_401"),
         "preempt": Key('"always"', ('"after_min_runtime"',), ('"never"', "true")),
-        "patience": _number("142.0", "0", "31_622_400", "-1", "31_622_401"),
+        "preempt_budget": _number("0.25", "0", "1_000_000", "-0.1", "1_000_001"),
+        "patience": Key(None, ("0", "31_622_400", '"2h"'), ("-1", "31_622_401", '"runtimes"', "nan")),
         "promise": Key('"equals"', ('"all"',), ('"none"', "1")),
     },
     "mesh": {

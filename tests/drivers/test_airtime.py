@@ -358,6 +358,17 @@ def test_a_packet_whose_hold_is_over_does_not_go_out() -> None:
     assert (second.packet.robot, queue.dropped, queue.waiting) == (2, 2, 0)
 
 
+def test_what_a_line_could_not_take_in_time_is_dropped_but_for_stops_and_halts() -> None:
+    queue = filled(9600, 2)
+    queue.send_urgent(5, HaltPacket, 0)
+    # In the place of an old one: what is newly asked for is new.
+    queue.offer(place(0), grant(0), drive(0), 2 * SECOND)
+    sent = [queue.next(at * SECOND // 100, lambda _: True) for at in range(200, 240, 4)]
+    told = [(out.packet.robot, out.until) for out in sent if out is not None and not out.repeat]
+    assert told == [(5, None), (0, 3 * SECOND)]
+    assert (queue.waiting, queue.dropped, queue.replaced) == (0, 1, 1)
+
+
 def test_a_robot_is_halted_at_the_end_of_the_hold_under_which_it_was_last_driven() -> None:
     queue = filled(9600, 2)
     queue.offer(place(1), grant(1), RadioCamera(0, 0), 0)  # which leaves the wheels as they are

@@ -18,6 +18,7 @@ from tests.hang import HANG
 from tests.live.bench import until
 from zscout.drivers.packets import DrivePacket, HaltPacket, encode
 from zscout.drivers.serial_line import DEPTH, SerialLine
+from zscout.drivers.serial_port import SerialPort
 
 pytestmark = pytest.mark.real_time
 
@@ -55,7 +56,7 @@ class Ear:
 
 
 def opened(port: str, ear: Ear) -> SerialLine:
-    return SerialLine(port, 9600, up=ear.line_up, down=ear.line_down, wrote=ear.line_wrote)
+    return SerialLine(SerialPort(port, 9600), up=ear.line_up, down=ear.line_down, wrote=ear.line_wrote)
 
 
 @asynccontextmanager
@@ -108,7 +109,7 @@ async def test_a_second_program_is_refused_and_has_its_turn_later(tmp_path: Path
         serial.Serial(str(pty.link), exclusive=True)
     other = opened(str(pty.link), second)
     await second.until(lambda: second.told)
-    assert second.told == [f"{pty.link} is used by another program"]
+    assert second.told == [f"{pty.link} is used by another device of this node"]
     await line.stop()
     await second.until(lambda: second.told[-1] == "up")
     await other.stop()

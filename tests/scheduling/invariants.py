@@ -13,7 +13,7 @@ from tests.scheduling.validate import validate
 from zscout.keyexpr import is_pattern, matcher
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import Arc, ArcRequest, Effect, Granted, HoldEnded, Outcome, Queued
+from zscout.scheduling.model import Arc, ArcRequest, Effect, Granted, Hold, HoldEnded, Outcome, Queued
 from zscout.simulation.workload import WorkloadRc
 from zscout.types import NO_TERM, ArcId, ClientId, Grant, Ns, Params, RcName
 
@@ -136,14 +136,21 @@ def _asked_of(request: ArcRequest, rc: RcName) -> Params:
     return next(params for need, params in request.needs.items() if is_pattern(need) and matcher(need)(rc))
 
 
+def protection(hold: Hold) -> Ns | None:
+    """As the oracle knows it."""
+    return None if hold.protected_below is None else hold.protected_from
+
+
 def check_settled(now: Ns, core: Core, rcs: Iterable[WorkloadRc]) -> None:
     """After a pass with no vote out: by the letter of steps 1 to 3, nobody who waits could start."""
     if core._votes.proposals:
         return
     oracle = Oracle(rcs)
     for arc in (*core._state.running.values(), *core._state.queued.values()):
-        start = arc.hold.start if arc.hold is not None else None
-        oracle.contenders.append(Contender(arc.request, arc.place.arrival, start))
+        start, protected = None, None
+        if arc.hold is not None:
+            start, protected = arc.hold.start, protection(arc.hold)
+        oracle.contenders.append(Contender(arc.request, arc.place.arrival, start, protected_from=protected))
     for one in oracle.contenders:
         if one.start is None:
             assert oracle.victims(one, now) is None, f"{one.request.arc} waits with nothing in its way"

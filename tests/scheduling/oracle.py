@@ -19,6 +19,8 @@ from zscout.simulation.replay import HoldRecord, Replay
 from zscout.simulation.workload import Arrival, Workload, WorkloadRc
 from zscout.types import SECOND, Ns, Params, RcName
 
+OPERATOR = 10
+
 
 @dataclass
 class SlowShares:
@@ -84,6 +86,8 @@ class Contender:
     """Of its group, when it last waited."""
     needs: Mapping[str, Params] = field(default_factory=dict)
     """What it holds; while it waits, what was tried last."""
+    protected_from: Ns | None = None
+    """From then on only operators end it before its minimum runtime is over; None: no such rule."""
 
     def __post_init__(self) -> None:
         self.needs = self.needs or self.request.needs
@@ -222,6 +226,8 @@ class Oracle:
         def may_displace(other: Contender) -> bool:
             if other.past_min_runtime(now):
                 return a.request.priority >= other.request.priority
+            if other.protected_from is not None and other.protected_from <= now and a.request.priority < OPERATOR:
+                return False
             return a.request.priority > other.request.priority
 
         blockers = [one for one in running if exclusive & set(one.needs)]

@@ -9,6 +9,7 @@ from fractions import Fraction
 
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy, StrategyName
 from zscout.scheduling.capacity import excess
+from zscout.scheduling.conflict_groups import density
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import play_instant
 from zscout.scheduling.model import (
@@ -59,15 +60,17 @@ class Decided:
         ended = [effect for effect in self.effects if isinstance(effect, HoldEnded)]
         return {effect.arc for at, effect in enumerate(ended) if effect.grant.term == NEW and effect.arc in granted}
 
-    def worth(self) -> dict[int, int]:
-        """(ARC, RC) pairs by priority; what was protected counts as the highest priority that can't end it."""
+    def worth(self, strategy: StrategyName) -> dict[int, int]:
+        """(ARC, RC) pairs by priority, as the strategy weighs them; what was protected counts as the highest priority
+        that can't end it."""
         pairs: dict[int, int] = {}
         for arc in self.core._state.running.values():
             assert arc.hold is not None
             if not arc.past_min_runtime(NOW):
                 below = arc.protected_below(NOW) if arc.hold.grant.term == OLD else None
                 level = arc.priority if below is None else max(arc.priority, below - 1)
-                pairs[level] = pairs.get(level, 0) + len(arc.needs)
+                each = density(arc.request.min_runtime) if strategy == "adaptive" else 1
+                pairs[level] = pairs.get(level, 0) + each * len(arc.needs)
         return pairs
 
 

@@ -18,6 +18,7 @@ from tests.services.recorder.paper_run import table1
 from tests.thorough import times
 from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling.adaptive import MAX_SLICES, SLICE, Adaptive, steps_for
+from zscout.scheduling.conflict_groups import density
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import play_instant
 from zscout.scheduling.model import (
@@ -85,11 +86,11 @@ def unasked(question: Propose) -> Vote:
 
 
 def in_use(core: Core, now: Ns) -> Counter[int]:
-    """(ARC, RC) pairs by priority, but for those past their minimum runtime."""
+    """(ARC, RC) pairs by priority, the shorter the more, but for those past their minimum runtime."""
     pairs: Counter[int] = Counter()
     for one in core._state.running.values():
         if not one.past_min_runtime(now):
-            pairs[one.request.priority] += one.mask.bit_count()
+            pairs[one.request.priority] += density(one.request.min_runtime) * one.mask.bit_count()
     return pairs
 
 
@@ -161,7 +162,7 @@ def test_a_gain_is_told_in_words() -> None:
     core = Core(strategy)
     core.handle(0, *(RcJoined(rc, False) for rc in "abcd"))
     core.handle(
-        0, Requested(arc("narrow", "bc", 3, 1)), Requested(arc("left", "ab", 3)), Requested(arc("right", "cd", 3))
+        0, Requested(arc("narrow", "bc", 3, 4)), Requested(arc("left", "ab", 3)), Requested(arc("right", "cd", 3))
     )
     assert core._state.running.keys() == {"left", "right"}
     assert strategy.log_line().startswith("adaptive: RC assignments at priority 3: 2 -> 4, in ")
@@ -227,7 +228,7 @@ def test_a_slow_voter_stops_nobody_who_has_nothing_to_do_with_it() -> None:
     # The better set needs the radio's word; `apart` shares nothing with it.
     effects = core.handle(
         0,
-        Requested(arc("narrow", "ab", runtime=1)),
+        Requested(arc("narrow", "ab", runtime=4)),
         Requested(arc("left", "Ra")),
         Requested(arc("right", "Rb")),
         Requested(arc("apart", "d")),
@@ -246,7 +247,7 @@ def test_a_veto_brings_the_next_best() -> None:
     core = Core(Adaptive())
     core.handle(0, *(RcJoined(rc, rc.isupper()) for rc in "Rabc"))
     effects = core.handle(
-        0, Requested(arc("narrow", "ab", runtime=1)), Requested(arc("left", "Ra")), Requested(arc("right", "Rbc"))
+        0, Requested(arc("narrow", "ab", runtime=4)), Requested(arc("left", "Ra")), Requested(arc("right", "Rbc"))
     )
     for _ in range(MANY_PASSES):
         asked = proposed(effects)

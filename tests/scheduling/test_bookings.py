@@ -49,6 +49,7 @@ from zscout.scheduling.model import (
     WakeAt,
 )
 from zscout.scheduling.reason import Reason, ReasonCode
+from zscout.scheduling.reservations import yields
 from zscout.scheduling.slots import Slot
 from zscout.types import Ns, Params, RcName
 
@@ -296,7 +297,7 @@ def exhaustive(fleet: Fleet, wanted: Booking, until: Ns, *, bookings_only: bool 
         there = [
             holder
             for holder in ({} if bookings_only else state.rc(rc).holders).values()
-            if not holder.preemptible_by(arc, state.now) and holder.known_end(arc) > start
+            if not yields(holder, arc, start)
         ]
         for claim in state.claims.values():
             one = claim.booking

@@ -9,7 +9,7 @@ from itertools import chain
 import pytest
 from msgspec import structs
 
-from tests.scheduling.invariants import Ledger
+from tests.scheduling.invariants import Ledger, protection
 from tests.scheduling.oracle import Contender, Oracle, bindings
 from tests.scheduling.validate import validate
 from tests.thorough import times
@@ -281,7 +281,8 @@ def test_the_fewest_and_lowest_ranked_end_of_all_choices(strategy: StrategyName)
         oracle = Oracle([*map(WorkloadRc, rcs), *(WorkloadRc(rc, True, {"rate": Fraction(10)}) for rc in capacity)])
         for arc in core._state.running.values():
             assert arc.hold is not None
-            oracle.contenders.append(Contender(arc.request, arc.place.arrival, arc.hold.start, 0, arc.needs))
+            known = arc.request, arc.place.arrival, arc.hold.start, 0, arc.needs, protection(arc.hold)
+            oracle.contenders.append(Contender(*known))
         best = oracle.choose(Contender(wanted, 1000), now)
         effects = _answered(core, now, capacity, Requested(wanted))
         assert ("last" in core._state.running) is (best is not None), seed

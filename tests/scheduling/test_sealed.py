@@ -25,6 +25,7 @@ SURFACE |= {
     "seq",
     "strategy",
     "policy",
+    "patience",
 }
 ACTIONS = {"start", "preempt", "wait", "propose", "run_again"}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
 
@@ -14,13 +14,14 @@ from tests.scheduling.invariants import Ledger
 from tests.scheduling.seeds import in_parts
 from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy
+from zscout.scheduling import patience
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, LeadTaken, RcJoined, Requested, Tick
 from zscout.scheduling.reservations import MAX_STARVING
 from zscout.simulation.replay import Replay, replay
 from zscout.simulation.workload import Arrival, Workload, WorkloadRc
-from zscout.types import NO_TERM, SECOND, Ns, Params, Place, RcName, Term
+from zscout.types import NO_TERM, SECOND, ArcId, Ns, Params, Place, RcName, Term
 
 SEEDS = range(times(1_000))
 PATIENCE = 6 * SECOND
@@ -54,21 +55,26 @@ def changed(work: Workload, change: Callable[[ArcRequest], ArcRequest]) -> Workl
     return Workload(work.rcs, tuple(replace(one, request=change(one.request)) for one in work.arrivals))
 
 
-def check_bound(workload: Workload, played: Replay, patience: Ns, late: Ns = 0) -> int:
+def check_bound(workload: Workload, played: Replay, patience: Ns | Mapping[ArcId, Ns], late: Ns = 0) -> int:
     """Raises AssertionError for an ARC that waited longer than promised; how many had to be patient. `late`: by how
-    much the patience of a group that had more is longer, with fair shares."""
-    starts = {hold.arc: hold.start for hold in played.holds}
+    much the patience of a group that had more is longer, with fair shares. Nothing is promised to those of whom, or of
+    who is before them, somebody of higher priority needs an RC."""
+    starts = {hold.arc: hold.start for hold in reversed(played.holds)}
+    last = {hold.arc: hold.start for hold in played.holds}
     longest = max(arrival.request.min_runtime for arrival in workload.arrivals)
+    patient = {arc: patience if isinstance(patience, int) else patience[arc] for arc in starts}
     tried = 0
     for arrival in workload.arrivals:
         arc, since = arrival.request, arrival.at
-        waited = starts[arc.arc] - since
-        tried += waited > patience
-        # Who came before it, still waits when it begins to be owed, and is linked to it by RCs.
+        waited, starves = starts[arc.arc] - since, since + patient[arc.arc] // 2
+        # Who begins to starve before it, still waits then, and is linked to it by RCs.
         before = {
             other.request.arc: other.request
             for other in workload.arrivals
-            if other.at <= since + late and starts[other.request.arc] >= since + patience // 2 and other != arrival
+            if other.at + patient[other.request.arc] // 2 <= starves + late
+            and last[other.request.arc] >= starves
+            and other != arrival
+            and other.request.priority == arc.priority
         }
         linked: dict[str, ArcRequest] = {arc.arc: arc}
         while found := [
@@ -77,12 +83,17 @@ def check_bound(workload: Workload, played: Replay, patience: Ns, late: Ns = 0) 
             if one.arc not in linked and any(one.needs.keys() & other.needs.keys() for other in linked.values())
         ]:
             linked |= {one.arc: one for one in found}
+        needed = {rc for one in linked.values() for rc in one.needs}
+        if any(one.request.priority > arc.priority and needed & one.request.needs.keys() for one in workload.arrivals):
+            continue
+        most = max(patient[one] for one in linked)
+        tried += waited > patient[arc.arc]
         ahead = sum(one.min_runtime for one in linked.values() if one is not arc)
         ahead += longest * ((len(linked) - 1) // MAX_STARVING)
         if late:
             # Who asked after it may come before it only once its group has come to be first, and waits for its RCs.
             ahead += longest * sum(other.at > since for other in workload.arrivals if other.request.arc in linked)
-        bound = late + max(patience, patience // 2 + longest) + ahead
+        bound = late + max(most, most // 2 + longest) + ahead
         assert waited <= bound, f"{arc.arc} waited {waited / SECOND} s, promised are {bound / SECOND}"
     return tried
 
@@ -111,6 +122,47 @@ def test_nobody_waits_longer_than_promised_for_what_is_kept(seeds: Sequence[int]
         outstayed += sum(hold.end - hold.start > runtime[hold.arc] for hold in played.holds)
     assert tried > len(seeds), "hardly anybody had to wait for his patience: these runs prove nothing"
     assert outstayed > len(seeds), "hardly anything was kept"
+
+
+def of_classes(seed: int) -> Workload:
+    """Of two priorities, or three."""
+    draw = random.Random(f"classes {seed}")  # noqa: S311
+    highest = draw.randint(2, 3)
+    return changed(
+        workload(seed, kept=(0.0, 0.3)[seed % 2]),
+        lambda one: structs.replace(one, priority=draw.randint(1, highest), client=f"h{draw.randint(1, 4)}/c"),
+    )
+
+
+@pytest.mark.parametrize("seeds", in_parts(SEEDS, quick=70, size=465))
+def test_nobody_waits_longer_than_promised_beside_protected_holds_of_lower_priority(seeds: Sequence[int]) -> None:
+    tried = 0
+    for seed in seeds:
+        work = of_classes(seed)
+        tried += check_bound(work, replay(work, strategy=Adaptive(), policy=POLICY), PATIENCE)
+    assert tried > len(seeds) // 3, "hardly anybody had to wait for his patience: these runs prove nothing"
+
+
+@pytest.mark.parametrize("seeds", in_parts(SEEDS, quick=70, size=465))
+def test_nobody_waits_longer_than_promised_where_patience_follows_the_runtimes(
+    seeds: Sequence[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(patience, "RUNTIMES", 2)
+    monkeypatch.setattr(patience, "PATIENCE", SECOND)
+    monkeypatch.setattr(patience, "EVERY", SECOND)
+    tried, different = 0, 0
+    for seed in seeds:
+        work, known = of_classes(seed), dict[ArcId, Ns]()
+
+        def watch(_now: Ns, core: Core, _effects: object, known: dict[ArcId, Ns] = known) -> None:
+            known |= {arc.id: arc.patience for arc in core._state.all_arcs()}
+
+        played = replay(work, watch, strategy=Adaptive())
+        known |= dict.fromkeys({one.request.arc for one in work.arrivals} - known.keys(), SECOND)
+        tried += check_bound(work, played, known)
+        different += len(set(known.values())) > 1
+    assert tried > len(seeds) // 3, "hardly anybody had to wait for his patience: these runs prove nothing"
+    assert different > len(seeds) // 2
 
 
 def test_a_kept_hold_of_higher_priority_is_waited_for_as_long_as_the_fleet_lets_it_last() -> None:

@@ -123,10 +123,10 @@ def _check_classes(state: SchedulerState, index: QueueIndex) -> None:
 def _check_index(state: SchedulerState, index: QueueIndex) -> None:
     queued = state.queued.values()
     assert index.ranks == sorted(arc.rank for arc in queued), "the ranks are not those of the queue"
-    patient = sorted((arc.since + arc.late, arc.id) for arc in queued if not arc.starving)
+    patient = sorted((arc.starves, arc.id) for arc in queued if not arc.starving)
     assert index._not_starving == patient, "the patient are not those of the queue"
     band = state.band
-    starving = sorted((-band(arc.priority), arc.since + arc.late, arc.id) for arc in queued if arc.starving)
+    starving = sorted((-band(arc.priority), arc.starves, arc.id) for arc in queued if arc.starving)
     assert index.starving == starving, "the starving are not those of the queue"
     for arc in queued:
         places = {ArcState.PARKED: arc.id in index.parked, ArcState.WATCHING: arc.watched is not None}

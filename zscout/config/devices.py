@@ -80,6 +80,10 @@ class RadioRc(RcTable, frozen=True, tag="radio"):
     ]
     baud: Annotated[int, key("Of the line.", 300, 1_000_000, unit="bit/s")] = 9_600
     bound: Annotated[Ns, seconds("0.01", "10", "The longest that a packet may wait.")] = SECOND // 4
+    dtr: Annotated[bool | None, key("How DTR is from the opening on; a board may be reset by it.", example=False)] = (
+        None
+    )
+    rts: Annotated[bool | None, key("How RTS is from the opening on.", example=False)] = None
 
 
 class RobotRc(RcTable, frozen=True, tag="robot"):
@@ -187,6 +191,9 @@ def _check_rc(rc: BuiltInRc, at: Where) -> None:
             amounts(rc.parameters, at / "parameters")
         case RadioRc():
             _check_source(rc.port, at / "port", A_PORT)
+            for name in ("dtr", "rts"):
+                if getattr(rc, name) is not None and rc.port.lower().startswith("socket://"):
+                    raise (at / name).bad("has no effect on socket://", "remove it, or use rfc2217://")
         case RobotRc():
             check_rc_name(rc.radio, at / "radio", "radio")
             channels: dict[int, str] = {}

@@ -207,9 +207,22 @@ class FleetTable(Struct, frozen=True, forbid_unknown_fields=True):
         int, key("ARCs of this priority and above are an operator's: nothing keeps them.", 0, 1_000_000_000)
     ] = DEFAULT.operator_priority
     preempt: Annotated[Preempt, key("When one ARC may take the hold of another of lower priority.")] = DEFAULT.preempt
+    preempt_budget: Annotated[
+        float,
+        key(
+            "`adaptive`: who lost this part of its minimum runtime to others is protected from all but operators.",
+            0,
+            1e6,
+        ),
+    ] = DEFAULT.preempt_budget
     patience: Annotated[
-        Ns, seconds("0", "31622400", "`adaptive`: after this long an ARC that waits is due; 0: never.")
-    ] = PATIENCE
+        Ns | None,
+        seconds(
+            "0",
+            "31622400",
+            "`adaptive`: after this long an ARC that waits is due; 0: never; unset: 28 mean minimum runtimes.",
+        ),
+    ] = None
     promise: Annotated[
         Promise, key("Whom an ARC that is due goes before: equal and lower priority, or all but operators.")
     ] = DEFAULT.promise
@@ -299,7 +312,7 @@ def _fleet(file: FleetFile, top: Where, folder: Path = Path()) -> Fleet:
     _check_devices(file.devices, top / "devices")
     access = AccessPolicy(file.roles, file.groups, file.access, file.quotas, file.ceilings)
     check_access(access, top)
-    if table.promise != "equals" and (table.strategy != "adaptive" or not table.patience):
+    if table.promise != "equals" and (table.strategy != "adaptive" or table.patience == 0):
         raise (at / "promise").bad(
             f'is "{table.promise}", but only "adaptive" with some patience promises anything',
             'write strategy = "adaptive" and a patience above 0, or promise = "equals"',
@@ -307,7 +320,8 @@ def _fleet(file: FleetFile, top: Where, folder: Path = Path()) -> Fleet:
     policy = SchedulingPolicy(
         preempt=table.preempt,
         operator_priority=table.operator_priority,
-        patience=table.patience or None,
+        preempt_budget=table.preempt_budget,
+        patience="runtimes" if table.patience is None else table.patience or None,
         promise=table.promise,
         max_running_per_host=file.limits.max_running_per_host or None,
         max_runtime=file.limits.max_runtime or None,
@@ -346,8 +360,9 @@ def _fair_shares(file: FleetFile, access: AccessPolicy, at: Where) -> FairShares
             raise here.bad(f"{quoted(name)} belongs to the group {groups[0]}", "give the group a weight")
         if access.ranks and name not in access.groups and name not in access.ranks:
             raise here.bad(f"{quoted(name)} is not a group and has no role", "add it under [groups], or correct it")
-    if table.patience < file.fleet.patience:
-        what = f"is {table.patience / SECOND:g} s, less than fleet.patience ({file.fleet.patience / SECOND:g} s)"
+    least = PATIENCE if file.fleet.patience is None else file.fleet.patience
+    if table.patience < least:
+        what = f"is {table.patience / SECOND:g} s, less than fleet.patience ({least / SECOND:g} s)"
         raise (at / "patience").bad(what, "write as much, or more")
     return FairShares(table.half_life, table.weights, patience=table.patience)
 

@@ -9,7 +9,9 @@ from typing import Final, Literal, TypeAlias
 from zscout.types import SECOND, Ns
 
 PATIENCE: Final[Ns] = 142 * SECOND
-"""Default, in ns. Measured: docs/study.md."""
+"""In ns: the least where it follows the runtimes. Measured: docs/study.md."""
+PREEMPT_BUDGET: Final = 0.25
+"""Default. Measured: docs/scheduling.md."""
 FAIR_PATIENCE: Final[Ns] = 3_600 * SECOND
 """Default, in ns."""
 OPERATOR_PRIORITY: Final = 10
@@ -51,8 +53,11 @@ class SchedulingPolicy:
     """`after_min_runtime`: nobody but an operator takes a hold before its minimum runtime is over."""
     operator_priority: int = OPERATOR_PRIORITY
     """ARCs of this priority and above are an operator's: no knob keeps them waiting."""
-    patience: Ns | None = PATIENCE
-    """`adaptive`: time in ns after which an ARC that waits is due (`reservations.py`); None: never."""
+    preempt_budget: float = PREEMPT_BUDGET
+    """`adaptive`: once an ARC has lost this part of its minimum runtime to others, only operators preempt it."""
+    patience: Ns | Literal["runtimes"] | None = "runtimes"
+    """`adaptive`: time in ns after which an ARC that waits is due (`reservations.py`); `runtimes`: it follows the
+    minimum runtimes (`patience.py`); None: never."""
     promise: Promise = "equals"
     """The ARCs that may not pass a due ARC: those of equal and lower priority, or all but operators. With
     `all`, what a due ARC is granted at last is not preempted within its minimum runtime either."""

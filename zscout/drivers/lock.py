@@ -14,7 +14,7 @@ import os
 import socket
 import struct
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -46,7 +46,28 @@ def only_here(fleet: str, host: str, rc: str, folder: Path | None = None) -> Ite
             stack.enter_context(_file(folder / "served" / rc, host, rc))
         if sys.platform == "linux":
             name = hashlib.sha256(f"{fleet} {host} {rc}".encode()).hexdigest()
-            stack.enter_context(_name(f"\0zscout-rc-{name}", host, rc))
+            try:
+                stack.enter_context(_name(f"\0zscout-rc-{name}", rc))
+            except InUse as used:
+                raise _served(host, rc, used.holder) from None
+        yield
+
+
+class InUse(Exception):
+    """Another device has a port already; in words that follow the port's name."""
+
+    def __init__(self, holder: LockHolder) -> None:
+        here = holder.pid == os.getpid()
+        super().__init__(f"is used by {'another device of this node' if here else holder}")
+        self.holder = holder
+
+
+@contextmanager
+def port_lock(names: Iterable[str]) -> Iterator[None]:
+    """Raises InUse if another device of this machine, in a process of this user or root, has one of these ports."""
+    with ExitStack() as stack:
+        for name in sorted(set(names)) if sys.platform == "linux" else ():
+            stack.enter_context(_name(f"\0zscout-port-{hashlib.sha256(name.encode()).hexdigest()}", name))
         yield
 
 
@@ -70,7 +91,8 @@ def _file(path: Path, host: str, rc: str) -> Iterator[None]:
 
 
 @contextmanager
-def _name(name: str, host: str, rc: str) -> Iterator[None]:
+def _name(name: str, what: str) -> Iterator[None]:
+    """Raises InUse if a process that is believed has this abstract name; `what` is locked by it."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as lock:
         try:
             lock.bind(name)
@@ -80,9 +102,9 @@ def _name(name: str, host: str, rc: str) -> Iterator[None]:
                 raise
             holder = _holder(name)
             if holder is not None and not is_stranger(holder.uid):
-                raise _served(host, rc, holder) from None
+                raise InUse(holder) from None
             other = holder or "an unknown process"
-            log.warning("%s: %s has its lock on this machine, and can't be believed; serving it", rc, other)
+            log.warning("%s: %s has its lock on this machine, and can't be believed; serving it", what, other)
         yield
 
 

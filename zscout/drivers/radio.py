@@ -20,6 +20,7 @@ from zscout.drivers.driver import Driver, RcHandle
 from zscout.drivers.own import own
 from zscout.drivers.packets import MAX_PACKET, HaltPacket, StopPacket, encode
 from zscout.drivers.serial_line import CLOSE_TIMEOUT, DEPTH, SerialLine
+from zscout.drivers.serial_port import TIMEOUT, SerialPort
 from zscout.drivers.transmit_queue import TransmitQueue
 from zscout.keyexpr import RANDOM, Sender
 from zscout.mesh import Refused, Supervisor
@@ -41,14 +42,15 @@ class RadioDriver(Driver):
     sharable = True
     relays = True
 
-    def __init__(self, port: str, *, baud: int, bound: float) -> None:
-        """`port` for `serial.serial_for_url`; `bound` in seconds: the delay bound of a packet."""
-        self._port, self._baud = port, baud
+    def __init__(self, port: str, *, baud: int, bound: float, dtr: bool | None = None, rts: bool | None = None) -> None:
+        """`port`, `dtr`, `rts` as in `SerialPort`; `bound` in seconds: the delay bound of a packet."""
+        self._port = SerialPort(port, baud, dtr=dtr, rts=rts)
         self._rate = line_rate(baud)
         self._default = default_rate(self._rate)
         self._bound = Fraction(str(bound))
         # Not 0: the last radio of these robots may have begun there.
-        self._air = TransmitQueue(self._rate, first_number=RANDOM.get().randrange(256))
+        stale = round(max(TIMEOUT, bound) * SECOND)
+        self._air = TransmitQueue(self._rate, first_number=RANDOM.get().randrange(256), stale=stale)
         self._robots: dict[int, str] = {}
         """Which robot RC an id belongs to: the first that commanded it, while it is there."""
         self._down = "its line is not open yet"
@@ -64,13 +66,14 @@ class RadioDriver(Driver):
 
     @classmethod
     def configured(cls, options: Any) -> Self:
-        return cls(options.port, baud=options.baud, bound=options.bound / SECOND)
+        bound = options.bound / SECOND
+        return cls(options.port, baud=options.baud, bound=bound, dtr=options.dtr, rts=options.rts)
 
     async def open(self, rc: RcHandle) -> None:
         self._rc = own(rc)
         # Of its own: halts still go out after the RC has closed that of its other work.
         self._supervisor = Supervisor(f"the line of {rc.name}", rc.supervisor.fail)
-        self._line = SerialLine(self._port, self._baud, up=self._line_up, down=self._line_down, wrote=self._line_wrote)
+        self._line = SerialLine(self._port, up=self._line_up, down=self._line_down, wrote=self._line_wrote)
         if not await done_within(OPENING, self._known.wait()):
             rc.fail(self._down)
 
@@ -188,7 +191,7 @@ class RadioDriver(Driver):
             if outgoing is None:
                 break
             data = encode(outgoing.packet)
-            if self._line.write(data):
+            if self._line.write(data, outgoing.until):
                 self._outstanding += 1
             self._counts.update(packets=1, bytes=len(data), repeats=outgoing.repeat)
             if not outgoing.repeat:

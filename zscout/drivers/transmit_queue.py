@@ -35,13 +35,20 @@ SPACING: Final[Ns] = SECOND // 20
 
 @dataclass(slots=True, eq=False)
 class QueuedPacket:
-    """A holder's packet that has not gone out. `entered`: when its bucket let it into the queue."""
+    """A holder's packet that has not gone out. `arrived`: when a packet was first asked for here, `given`: when this
+    command was; `entered`: when its bucket let it into the queue."""
 
     place: Place
     grant: Grant
     command: RadioDrive | RadioCamera
     arrived: Ns
+    given: Ns
     entered: Fraction = Fraction(0)
+
+    @property
+    def ready(self) -> Fraction:
+        """From when on it could have gone out."""
+        return max(self.entered, Fraction(self.given))
 
     @property
     def size(self) -> int:
@@ -51,12 +58,14 @@ class QueuedPacket:
 @dataclass(frozen=True, slots=True)
 class OutgoingPacket:
     """A packet to be written now. `sent_by`: when the line has carried it; `entered`: when it stood in the
-    queue, its bucket passed; of a repeat, when it was due."""
+    queue, its bucket passed; of a repeat, when it was due. `until`: later it is not to be written; a stop or a halt
+    always is."""
 
     packet: Packet
     entered: Fraction
     sent_by: Fraction
     repeat: bool
+    until: Ns | None
 
 
 @dataclass(slots=True)
@@ -143,10 +152,11 @@ class _HolderQueue:
 
 
 class TransmitQueue:
-    """All that waits for one line of `rate` bytes a second."""
+    """All that waits for one line of `rate` bytes a second. What could have gone out more than `stale` ago and did not,
+    as the line was not there or this process stood still, is dropped: only stops and halts go out however late."""
 
-    def __init__(self, rate: Fraction, *, first_number: int = 0) -> None:
-        self._ns_per_byte = SECOND / rate
+    def __init__(self, rate: Fraction, *, first_number: int = 0, stale: Ns = SECOND) -> None:
+        self._ns_per_byte, self._stale = SECOND / rate, stale
         self._ahead = MAX_PACKET * self._ns_per_byte
         """How much earlier than the line is free the next packet is written: one waits in the kernel."""
         self._free_at = Fraction(0)
@@ -158,7 +168,7 @@ class TransmitQueue:
         self.replaced = 0
         """Drive and camera packets that a newer command made void before they went out."""
         self.dropped = 0
-        """Packets whose hold was over before they went out."""
+        """Packets whose hold was over, or that were stale, before they went out."""
 
     # Holders
 
@@ -190,7 +200,7 @@ class TransmitQueue:
 
         Raises Refused where too much of the holder waits, or its share has no room for such a packet."""
         member = self.members[place]
-        waiting = QueuedPacket(place, grant, command, now)
+        waiting = QueuedPacket(place, grant, command, now, now)
         if member.bucket is None:
             raise Refused("bad_command", "this request has command_rate 0: only stops and halts are sent; request more")
         if waiting.size > member.share.size:
@@ -205,7 +215,7 @@ class TransmitQueue:
         for earlier in chain(self._queue, member.waiting):
             same = earlier.place == place and earlier.command.robot == command.robot
             if same and type(earlier.command) is type(command):
-                earlier.command, earlier.grant = command, grant
+                earlier.command, earlier.grant, earlier.given = command, grant, now
                 self.replaced += 1
                 waiting = earlier
                 break
@@ -260,7 +270,7 @@ class TransmitQueue:
             return self._transmit(robot.repeat(repeat, now), Fraction(at), now, repeat=True)
         while self._queue:
             waiting = self._queue.popleft()
-            if not in_force(waiting.grant):
+            if now - waiting.ready > self._stale or not in_force(waiting.grant):
                 self.dropped += 1
                 continue
             command, number = waiting.command, self._robots[waiting.command.robot].number()
@@ -269,7 +279,8 @@ class TransmitQueue:
                 packet = DrivePacket(command.robot, number, command.left, command.right, command.lasts)
             else:
                 packet = CameraPacket(command.robot, number, command.channel)
-            return self._transmit(packet, waiting.entered, now)
+            outgoing = self._transmit(packet, waiting.entered, now)
+            return replace(outgoing, until=math.ceil(waiting.ready) + self._stale)
         for member in self.members.values():
             # Nothing waits: whoever joined while something did may have its packet now.
             if member.earning and member.bucket is not None:
@@ -315,4 +326,5 @@ class TransmitQueue:
         if not repeat:
             self._robots[packet.robot].sent(packet, now)
         self._free_at = max(self._free_at, Fraction(now)) + packet.size * self._ns_per_byte
-        return OutgoingPacket(packet, entered, self._free_at, repeat)
+        until = None if isinstance(packet, StopPacket | HaltPacket) else math.ceil(entered) + self._stale
+        return OutgoingPacket(packet, entered, self._free_at, repeat, until)

@@ -262,6 +262,8 @@ class _Hold(_ArcParty, frozen=True, kw_only=True):
     """As asked: what the same client held by that name goes on in it."""
     who: Who | None = None
     booking: BookingRef = ""
+    protected_from: Seconds | None = None
+    """From when so many seconds of its minimum runtime remain, only operators preempt it; None: no such rule."""
 
 
 class Holder(_Hold, frozen=True):
@@ -320,6 +322,8 @@ class Grants(Message, frozen=True):
     charged: Charged = {}
     """With fair shares, now and then: by group the RC-seconds that it lately had and others waited for. Nobody obeys
     this: candidates go on from it when they lead."""
+    patience: Elapsed | None = None
+    """Now and then, under `adaptive`: that of an ARC that is queued now. Candidates go on from it."""
 
 
 class StateAsk(Message, frozen=True):
@@ -426,6 +430,8 @@ class RcmState(Message, frozen=True):
     instances: dict[str, tuple[str, str]] = {}
     version: VersionText = ""
     charged: Charged = {}
+    """As in Grants."""
+    patience: Elapsed | None = None
     """As in Grants."""
 
 

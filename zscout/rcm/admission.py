@@ -92,9 +92,14 @@ class Admission:
 
     def check(self, request: ArcRequest, present: Present) -> None:
         """Raises Refused for a request that its client may not make now."""
-        host = request.client.partition("/")[0]
-        self.authority.check_ask(host, request, lambda names: present.of_owners(names, request.arc))
-        self._check_room(request.owner, request.client, present)
+        client, owner, limits = request.client, request.owner, self.limits
+        self.authority.check_ask(client.partition("/")[0], request, lambda names: present.of_owners(names, request.arc))
+        if present.waiting_now >= limits.max_queued:
+            raise Refused("queue_full", f"{limits.max_queued} requests already wait; try again later")
+        if present.of_client(client) >= (most := limits.max_requests_per_client):
+            raise Refused("too_many", f"{client} already has {most} open requests, the most; cancel one")
+        if present.of_owners((owner,)) >= (most := limits.max_requests_per_host):
+            raise Refused("too_many", f"clients of {owner} already have {most} open requests, the most; cancel one")
 
     def form(self, asked: Wanted, sender: Sender) -> ArcRequest:
         """The request, if its names and numbers are valid. Raises Refused."""
@@ -136,16 +141,6 @@ class Admission:
                 raise ValueError(f"{name} has more than {MAX_PARAMS} parameters")
             for parameter in params:
                 check_name(parameter, f"parameter of {name}")
-
-    def _check_room(self, host: str, client: ClientId, present: Present) -> None:
-        if present.waiting_now >= self.limits.max_queued:
-            raise Refused("queue_full", f"{self.limits.max_queued} requests already wait; try again later")
-        most = self.limits.max_requests_per_client
-        if present.of_client(client) >= most:
-            raise Refused("too_many", f"{client} already has {most} open requests, the most; cancel one")
-        most = self.limits.max_requests_per_host
-        if present.of_owners((host,)) >= most:
-            raise Refused("too_many", f"clients of {host} already have {most} open requests, the most; cancel one")
 
     # Places
 

@@ -81,7 +81,7 @@ class Authority:
             raise self._refused(name, f"request {asked.min_runtime / SECOND:g} s; at most {longest / SECOND:g}")
         for need in asked.needs:
             if not is_pattern(need) and not self.may_hold(name, need):
-                raise self._not_its(name, need)
+                raise Refused("not_allowed", self._policy.told(name, f"hold {need}", self._policy.holders(need) or ()))
         for owner, members, quota in self._policy.quotas_of(asked.charged_to or name):
             if quota.rcs is not None and len(asked.needs) > quota.rcs:
                 raise Refused(
@@ -193,9 +193,6 @@ class Authority:
     def _check_rank(self, name: str, what: str, needed: Collection[Rank]) -> None:
         if why := self._policy.refusal(name, what, needed):
             raise Refused("not_allowed", why)
-
-    def _not_its(self, name: str, rc: RcName) -> Refused:
-        return Refused("not_allowed", self._policy.told(name, f"hold {rc}", self._policy.holders(rc) or ()))
 
     def _refused(self, name: str, what: str) -> Refused:
         """Of what operators may."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import difflib
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from decimal import Decimal
 
 from zscout.keyexpr import is_pattern, matcher
@@ -26,43 +26,30 @@ class Door:
         self._devices, self._roster, self._settles = devices, roster, settles
 
     def check(self, now: Ns, needs: Mapping[Need, Amounts], *, waits: bool = False, may_wait: bool = True) -> None:
-        """Raises Refused for what can never start."""
-        waits = waits or now < self._settles
-        check_door(needs, self._devices.names, self._roster.is_known, self._parameters, waits=waits, may_wait=may_wait)
+        """Raises Refused for what is neither expected nor there, and for more RCs of a pattern than match it; with
+        `waits`, they are waited for. `may_wait`: whether the requester may choose that."""
+        waits, expected, is_there = waits or now < self._settles, self._devices.names, self._roster.is_known
+        wanted = Counter(need.partition("#")[0] for need in needs if is_pattern(need))
+        for need, params in needs.items():
+            if not params and (is_there(need) or need in expected):
+                continue
+            if is_pattern(need):
+                matching = sorted(filter(matcher(need), expected))
+            else:
+                matching = [need] if need in expected or is_there(need) else []
+            if not matching and not waits:
+                raise _unknown(need, expected, may_wait=may_wait)
+            left = [rc for rc in matching if rc not in needs]
+            if is_pattern(need) and not waits and len(left) < wanted[need.partition("#")[0]]:
+                raise _too_few(need.partition("#")[0], left, wanted, may_wait=may_wait)
+            refusals = [_objection(rc, params, self._parameters(rc)) for rc in matching]
+            # One that takes it is enough.
+            if refusals and all(refusals):
+                raise next(filter(None, refusals))
 
     def _parameters(self, rc: RcName) -> Parameters | None:
         state = self._roster.reported(rc)
         return state.parameters if state is not None else self._devices.parameters(rc)
-
-
-def check_door(
-    needs: Mapping[Need, Amounts],
-    expected: Collection[RcName],
-    is_there: Callable[[RcName], bool],
-    parameters_of: Callable[[RcName], Parameters | None],
-    *,
-    waits: bool,
-    may_wait: bool = True,
-) -> None:
-    """Raises Refused for what is neither among those that are expected nor there, and for more RCs of a pattern than
-    match it; with `waits`, they are waited for. `may_wait`: whether the requester may choose that."""
-    wanted = Counter(need.partition("#")[0] for need in needs if is_pattern(need))
-    for need, params in needs.items():
-        if not params and (is_there(need) or need in expected):
-            continue
-        if is_pattern(need):
-            matching = sorted(filter(matcher(need), expected))
-        else:
-            matching = [need] if need in expected or is_there(need) else []
-        if not matching and not waits:
-            raise _unknown(need, expected, may_wait=may_wait)
-        left = [rc for rc in matching if rc not in needs]
-        if is_pattern(need) and not waits and len(left) < wanted[need.partition("#")[0]]:
-            raise _too_few(need.partition("#")[0], left, wanted, may_wait=may_wait)
-        refusals = [_objection(rc, params, parameters_of(rc)) for rc in matching]
-        # One that takes it is enough.
-        if refusals and all(refusals):
-            raise next(filter(None, refusals))
 
 
 def _too_few(pattern: str, left: Sequence[RcName], wanted: Mapping[str, int], *, may_wait: bool) -> Refused:

@@ -100,10 +100,6 @@ class Leader:
         out.more = bool(self._queue)
         return out
 
-    def close(self, now: Ns) -> str:
-        """What was gathered for the log: nothing is published any more."""
-        return self.registry.close(now)
-
     # In: the events of the next instant
 
     def _next(self) -> list[model.Event]:
@@ -111,8 +107,8 @@ class Leader:
         operations, queue, out = self.operations, self._queue, self._out
         while queue and isinstance(asked := queue[0], steps.OperationAsked) and operations.joins(asked):
             queue.popleft()
+            out.merge(self.roster.heard(self._now, str(asked.sender)))
             if isinstance(asked.operation, BOOKINGS):
-                out.merge(self.roster.heard(self._now, str(asked.sender)))
                 out.then.append(steps.BookingAsked(asked))
                 return [model.Tick()]
             out.merge(operations.take(self._now, asked))
@@ -140,7 +136,7 @@ class Leader:
             case steps.Shunned(token, until):
                 return merge(self.roster.shun(self._now, token, until))
             case steps.Stalled(length, ended, fresh):
-                self.roster.stalled(length, ended, fresh=fresh)
+                self.roster.sight.stalled(length, ended, fresh=fresh)
             case steps.BookingAsked(asked):
                 return merge(self._bookings.operation(*asked))
             case steps.Again():
@@ -220,7 +216,9 @@ class Leader:
         bookings = self._bookings
         waiting = tuple(replace(asked, request=bookings.dated(asked.request)) for asked in recovered.waiting)
         certain = 0 if bookings.settled else bookings.settles_at
-        lead = model.LeadTaken(self.term, tuple(recovered.holds), waiting, recovered.charged, certain)
+        lead = model.LeadTaken(
+            self.term, tuple(recovered.holds), waiting, recovered.charged, certain, recovered.patience
+        )
         booked = bookings.recovered({request.booking for request in requests if request.booking} | recovered.booked)
         gone = removed((hold.request for hold in recovered.holds), self.admission)
         # RCs receive the new term first; full lists end whatever was found to be half a gang.
@@ -283,10 +281,11 @@ class Leader:
         out.granted = operations.answers(now, granted)
         if CONTINUED.isdisjoint(map(type, events)):
             # Not of ARCs that had another hold until now.
-            over = {effect.arc for effect in effects if isinstance(effect, (model.HoldEnded, model.Dropped))}
-            first = [arc for arc in granted if arc not in over | notified]
-            out.grant_notices = [registry.notice(now, arc) for arc in first]
-            notified.update(first)
+            over = {effect.arc for effect in effects if isinstance(effect, (model.HoldEnded, model.Dropped))} | notified
+            for arc in granted:
+                if arc not in over:
+                    out.grant_notices.append(registry.notice(now, arc))
+                    notified.add(arc)
         out.reopened, registry.traced = registry.traced, []
         self._publish(effects, named, operations.instant.left)
         self._note(events)
@@ -313,16 +312,15 @@ class Leader:
         now = self._now
         for event in events:
             match event:
-                case model.Requested(model.ArcRequest(client=client)) | model.HandedOver(to=client):
-                    self.roster.expect(now, client)
-            match event:
                 case model.Requested(request):
+                    self.roster.expect(now, request.client)
                     self._bind(request.arc)
                     asked = f"asked for {', '.join(sorted(request.needs))} at priority {request.priority}"
                     self.registry.record(now, request.arc, asked)
                 case model.PlaceShown(arc) | model.Vouched(model.ArcRequest(arc=arc)):
                     self._bind(arc)
-                case model.HandedOver(renamed=arc):
+                case model.HandedOver(to=client, renamed=arc):
+                    self.roster.expect(now, client)
                     self._bind(arc)
                     if (moved := self.core.arc(arc)) is not None and not moved.vouched:
                         self._recover(moved.request)
@@ -382,12 +380,13 @@ class Leader:
         instances: dict[str, str],
         begun: list[tuple[int, float]],
     ) -> messages.Grants:
-        now, charged = self._now, dict[str, float]()
+        now, charged, patience = self._now, dict[str, float](), None
         if now >= self._charged + CHARGED_EVERY:
-            self._charged, charged = now, self.core.charged()
+            self._charged, charged, patience = now, self.core.charged(), self.core.patience / SECOND or None
         every, time, age = self._fleet.timing.heartbeat / SECOND, self._bookings.time, self._bookings.age
         before, self.seq, self.published = self.seq, number, now
-        return messages.Grants(self.term, number, before, every, rcs, revoked, instances, begun, time, age, charged)
+        known = rcs, revoked, instances, begun, time, age, charged, patience
+        return messages.Grants(self.term, number, before, every, *known)
 
 
 def _revocation(effect: model.HoldEnded, name: str, now: Ns, left: Collection[ArcId]) -> messages.Revocation:

@@ -16,7 +16,6 @@ from zscout.config.fleet import Fleet
 from zscout.keyexpr import BadName, Sender, check_name, client_of
 from zscout.messages import Ask, Cancel, Foresee, Foresight, HandOver, Notice, Problem, Refused, Release
 from zscout.rcm.admission import Admission
-from zscout.rcm.authority import Authority
 from zscout.rcm.booked import FleetBookings
 from zscout.rcm.deadlines import Deadlines
 from zscout.rcm.door import Door
@@ -124,7 +123,6 @@ class Operations:
         ticket, sender, operation = asked
         client = str(sender)
         try:
-            self._out.merge(self._roster.heard(now, client))
             check_name(operation.id, "id")
             match operation:
                 case Ask():
@@ -227,7 +225,8 @@ class Operations:
             self._ask_again(asked.ticket, ask, sender, client, arc)
         elif self._registry.ended(arc) and not self._registry.reopens(arc, ask.grant if ask.unserved else None):
             answers.append((asked.ticket, self._registry.notice(now, arc)))
-        elif self._goes_on_elsewhere(ask):
+        elif ask.place is not None and any(request_id(arc) == ask.id for arc in self.core.at_place(ask.place)):
+            # Another client has it: what one RCM handed over, the next knows by its place only.
             answers.append((asked.ticket, self._registry.handed_over(arc, ask.arc)))
         else:
             self._enter(asked.ticket, ask, sender, client, arc)
@@ -320,10 +319,6 @@ class Operations:
             return self._registry.interrupted(now, arc, ask.grant)
         return self._registry.notice(now, arc)
 
-    def _goes_on_elsewhere(self, ask: Ask) -> bool:
-        """Whether another client has this ARC: what one RCM handed over, the next knows by its place only."""
-        return ask.place is not None and any(request_id(arc) == ask.id for arc in self.core.at_place(ask.place))
-
     def _defer(self, asked: OperationAsked) -> None:
         self._deferred.append(asked)
         self._deadlines.set(self._now + self._lease, (_Due.RESUME, None))
@@ -331,7 +326,8 @@ class Operations:
     # Ending
 
     def _end(self, ticket: Ticket, operation: Cancel | Release, sender: Sender) -> None:
-        owner, authority = client_of(operation.client) if operation.client is not None else sender, self._authority
+        owner = client_of(operation.client) if operation.client is not None else sender
+        authority = self._admission.authority
         if owner.host != sender.host:
             authority.check_operator(sender, f"end what is {owner}'s")
         arc, instant = arc_id(str(owner), operation.id), self.instant
@@ -348,10 +344,6 @@ class Operations:
         instant.ended.append(event(arc, by))
         self.waiting.setdefault(arc, []).append(ticket)
 
-    @property
-    def _authority(self) -> Authority:
-        return self._admission.authority
-
     # Open requests, as limits and quotas count them: those of this instant included
 
     @property
@@ -364,7 +356,7 @@ class Operations:
     def of_owners(self, names: Collection[str], *but: ArcId) -> int:
         owned = sum(map(self.core.count_of_owner, names))
         owned += sum(event.request.owner in names for event in self.instant.asked)
-        its = filter(None, map(self.core.arc, filter(self.core.is_open, but)))
+        its = filter(None, map(self.core.arc, but))
         return owned - sum(arc.request.owner in names for arc in its)
 
     def held_by(self, names: Collection[str], *but: ArcId) -> int:

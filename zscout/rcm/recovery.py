@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from itertools import islice
 from operator import attrgetter
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 from msgspec.structs import replace
 
@@ -70,6 +70,8 @@ class RecoveredState:
     """The clients that have said what they ask for."""
     charged: Mapping[str, float] = field(default_factory=dict)
     """By group: what it lately had, as the leader before told (`fair_shares.py`)."""
+    patience: Ns | None = None
+    """As the leader before published it."""
     refused: list[NotLetIn] = field(default_factory=list)
     booked: set[str] = field(default_factory=set)
     """Dates of bookings that only RCs report as taken up: they do not lapse meanwhile."""
@@ -223,6 +225,9 @@ def _enter(
 # Reported holds
 
 
+_Reported: TypeAlias = tuple[ArcId, Grant, tuple[RcName, ...]]
+
+
 def recover(
     states: Iterable[RcState],
     clients: Collection[ClientRequests],
@@ -237,19 +242,31 @@ def recover(
     result = RecoveredState(rcs={state.rc: state for state in states})
     result.answered = {one.client for one in clients}
     listed = _listed(result, clients, admission, record_of)
-    parts: dict[tuple[str, Grant], dict[RcName, Holder]] = {}
+    parts: dict[_Reported, dict[RcName, Holder]] = {}
     for state in result.rcs.values():
         for holder in state.holders:
-            parts.setdefault((arc_id(holder.client, holder.id), holder.grant), {})[state.rc] = holder
+            # With certificates an RC's word counts for the gang that it names, and is in.
+            gang = tuple(sorted({*holder.rcs})) if admission.closed else ()
+            if not admission.closed or state.rc in gang:
+                parts.setdefault((arc_id(holder.client, holder.id), holder.grant, gang), {})[state.rc] = holder
+
+    def believed(reported: _Reported) -> tuple[bool, Grant]:
+        """The newest, but first the one that its client lists: any node may claim another."""
+        arc, grant, gang = reported
+        mine = listed.get(arc)
+        return bool(gang) and mine is not None and mine.grant == grant and {*mine.rcs} in ({*gang}, set()), grant
+
     seen, places = set[ArcId](), set[tuple[Place, str]]()
-    for (arc, grant), held in sorted(parts.items(), key=lambda item: item[0][1], reverse=True):
+    for reported, held in sorted(parts.items(), key=lambda item: believed(item[0]), reverse=True):
+        arc, grant, _ = reported
         if arc in seen:
             continue
         if grant.term >= admission.places.term:
             result.remarks.append(f"the hold of {arc} is not carried on: its grant is of no earlier term")
             continue
         seen.add(arc)
-        some, mine = _most_telling(held), listed.get(arc)
+        # An RC from before there were patterns passes on nothing about them.
+        some, mine = max(held.values(), key=lambda holder: len(holder.bound)), listed.get(arc)
         if mine is None and some.client in result.answered:
             result.remarks.append(f"{arc} is given up by its client")
             continue
@@ -276,11 +293,6 @@ def recover(
     return result
 
 
-def _most_telling(held: Mapping[RcName, Holder]) -> Holder:
-    """An RC from before there were patterns passes on nothing about them."""
-    return max(held.values(), key=lambda holder: len(holder.bound))
-
-
 def _hold(
     arc: ArcId, held: Mapping[RcName, Holder], some: Holder, mine: Listed | None, now: Ns, admission: Admission
 ) -> RecoveredHold | None:
@@ -305,7 +317,13 @@ def _hold(
         place = some.place if mine.expects else mine.place
     request = admission.clamped(request)
     vouched = not admission.closed or mine is not None
-    return RecoveredHold(request, place, some.grant, end - request.min_runtime, end, bound, vouched)
+    start, protected = end - request.min_runtime, _protected_from(held, end)
+    return RecoveredHold(request, place, some.grant, start, end, bound, vouched, protected)
+
+
+def _protected_from(held: Mapping[RcName, Holder], end: Ns) -> Ns | None:
+    left = [holder.protected_from for holder in held.values() if holder.protected_from is not None]
+    return end - round(min(left) * SECOND) if left else None
 
 
 def _agree(needs: Mapping[Need, Params], bound: Mapping[Need, RcName], held: Mapping[RcName, Holder]) -> bool:

@@ -170,7 +170,8 @@ class RequestLog:
         }
         if hold is not None:
             remaining = (hold.end - now) / SECOND
-            rcs, hosts, bound = sorted(arc.needs), self._roster.hosts_of(arc.needs), dict(arc.bound)
+            rcs, bound = sorted(arc.needs), dict(arc.bound)
+            hosts = {rc: host for rc, (_, host) in self._roster.named(arc.needs).items()}
             return self._notice(
                 arc_id, "running", grant=hold.grant, rcs=rcs, bound=bound, remaining=remaining, hosts=hosts, **known
             )

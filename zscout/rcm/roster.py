@@ -5,6 +5,7 @@ An RC that reports holds of earlier terms is pending until its gangs have answer
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -107,8 +108,8 @@ class Roster:
         """`known`: an ARC of the core."""
         self._keys, self.term, self._devices, self._timing = keys, term, devices, fleet.timing
         self._admission, self._known = admission, known
-        self._sight = Sight(me, round(fleet.mesh.lease * SECOND))
-        self._rcs: dict[RcName, _Rc] = {}
+        self.sight = Sight(me, round(fleet.mesh.lease * SECOND))
+        self._rcs = defaultdict[RcName, _Rc](_Rc)
         self.clients: dict[ClientId, set[str]] = {}
         """Living instances of each client that has a token."""
         self._unshown: dict[ClientId, Ns] = {}
@@ -137,21 +138,18 @@ class Roster:
         has a lease to answer."""
         self._now = now
         joined, waiting = list(rcs), list(pending)
-        alone = all(state.host == self._sight.me for state in (*joined, *waiting))
+        alone = all(state.host == self.sight.me for state in (*joined, *waiting))
         for state in joined:
-            self._rc(state.rc).joined = state
+            self._rcs[state.rc].joined = state
         for state in (*joined, *waiting):
-            self._rc(state.rc).named = state.instance, state.host
+            self._rcs[state.rc].named = state.instance, state.host
         for state in waiting:
             self._hold_up(state, patient=patient or alone)
         # An RC that died before its token was watched would never be seen to disappear.
-        self._set(self._sight.lease, _Due.DROP_UNSEEN)
+        self._set(self.sight.lease, _Due.DROP_UNSEEN)
         self._set(self._home_until - now, _Due.JOIN_ALL)
         self._out.events += map(_presence, joined)
         return self._taken()
-
-    def stalled(self, length: Ns, ended: Ns, *, fresh: bool) -> None:
-        self._sight.stalled(length, ended, fresh=fresh)
 
     def client_token(self, now: Ns, token: Token, *, alive: bool) -> Outbox:
         self._now = now
@@ -172,7 +170,7 @@ class Roster:
 
     def rc_token(self, now: Ns, token: Token, *, alive: bool) -> Outbox:
         self._now = now
-        rc = self._rc(token.name)
+        rc = self._rcs[token.name]
         if rc.tokens.get(token.instance, token if alive else None) != token:
             return self._taken()  # a second host shows this instance, or stopped doing so: it belongs to the first
         if not self._counts(token, alive=alive, known=token.instance in rc.tokens):
@@ -192,7 +190,7 @@ class Roster:
 
     def rc_state(self, now: Ns, state: RcState) -> Outbox:
         self._now = now
-        self._report(self._rc(state.rc), state)
+        self._report(self._rcs[state.rc], state)
         return self._taken()
 
     def shun(self, now: Ns, token: Token, until: Ns) -> Outbox:
@@ -252,7 +250,7 @@ class Roster:
             case Why.PROMISE if asked.token is not None:
                 self._promised(asked.token, message, problem)
             case Why.RETURN if asked.token is not None and _is_of(message, asked.token):
-                self._report(self._rc(message.rc), message)
+                self._report(self._rcs[message.rc], message)
             case Why.REQUESTS:
                 self._listed(asked.client, message, problem)
             case Why.OVERDUE if silent:
@@ -266,7 +264,7 @@ class Roster:
                 self._shown_late(asked)
             case Why.PROBE if not silent and not self._is_seen(asked):
                 self._suspect(asked.key)
-            case Why.WITNESS if not silent and self._sight.clear():
+            case Why.WITNESS if not silent and self.sight.clear():
                 self._present()
         return self._taken()
 
@@ -323,25 +321,21 @@ class Roster:
 
     def has_joined(self, name: RcName) -> bool:
         """Return True if an RC counts as present, or did so until just now."""
-        rc = self._rcs.get(name)
-        return rc is not None and rc.pending is None and (rc.joined or rc.departed) is not None
+        rc = self._rcs.get(name, _UNKNOWN)
+        return rc.pending is None and (rc.joined or rc.departed) is not None
 
     def reported(self, name: RcName) -> RcState | None:
         """The last report of an RC that counts as present."""
-        rc = self._rcs.get(name)
-        return None if rc is None else rc.joined
+        return self._rcs.get(name, _UNKNOWN).joined
 
     def is_known(self, name: RcName) -> bool:
         """Return True if any host offers this RC."""
-        rc = self._rcs.get(name)
-        return rc is not None and bool(rc.joined or rc.pending or rc.tokens)
+        rc = self._rcs.get(name, _UNKNOWN)
+        return bool(rc.joined or rc.pending or rc.tokens)
 
     def named(self, names: Iterable[RcName]) -> dict[RcName, tuple[str, HostName]]:
         """The instance that is meant of each of these RCs, and its host."""
         return {name: known for name in names if (known := self._rcs.get(name, _UNKNOWN).named) is not None}
-
-    def hosts_of(self, names: Iterable[RcName]) -> dict[RcName, HostName]:
-        return {name: host for name, (_, host) in self.named(names).items()}
 
     def awaits(self, now: Ns, arc: ArcId, names: Iterable[RcName]) -> bool:
         """Return True if `arc` may still turn out to hold one of these RCs: it is pending; or has not answered, and its
@@ -355,14 +349,14 @@ class Roster:
             since = rc.seen
             if since is None and rc.named is None:
                 since = self._awaited_since(arc)
-            if rc.joined is None and since is not None and (now - since < self._sight.lease or self._stood_still):
+            if rc.joined is None and since is not None and (now - since < self.sight.lease or self._stood_still):
                 return True
         return False
 
     # Clients
 
     def _expect(self, now: Ns, client: ClientId) -> None:
-        at = now + self._sight.lease
+        at = now + self.sight.lease
         if self._unshown.get(client) != at:
             self._unshown[client] = at
             self._deadlines.set(at, (_Due.SHOWN, (client, at)))
@@ -411,7 +405,7 @@ class Roster:
             if token.role == Role.CLIENT:
                 self._judge_client(name, token)
             else:
-                self._judge_rc(self._rc(name), token)
+                self._judge_rc(self._rcs[name], token)
 
     def _judge_client(self, client: ClientId, token: Token) -> None:
         if client in self.clients:
@@ -428,20 +422,20 @@ class Roster:
             return
         if not rc.joined.leaving and self._was_away(token):
             rc.unseen = True
-            self._set(self._sight.lease, _Due.DROP_UNSEEN)
+            self._set(self.sight.lease, _Due.DROP_UNSEEN)
         else:
             self._drop(token.name)
 
     def _was_away(self, token: Token) -> bool:
         """Return True if `token` may have disappeared because this leader itself was away (rule 9)."""
-        if not self._sight.is_away(self._now):
+        if not self.sight.is_away(self._now):
             self._doubted.clear()
-        if self._sight.lost(self._now, token.host):
+        if self.sight.lost(self._now, token.host):
             return True
         witnesses = self._witnesses()[:MAX_WITNESSES]
         if witnesses:
-            self._sight.doubt(self._now)  # of several lost links one is the first
-        within = PRESENT_PART * self._sight.lease / SECOND
+            self.sight.doubt(self._now)  # of several lost links one is the first
+        within = PRESENT_PART * self.sight.lease / SECOND
         for key, kind in witnesses:
             self._out.questions.append(Question(Why.WITNESS, key, within, kind=kind))
         return bool(witnesses)
@@ -456,7 +450,7 @@ class Roster:
 
     @property
     def _stood_still(self) -> bool:
-        return self._sight.stood_still(self._now)
+        return self.sight.stood_still(self._now)
 
     def _witnesses(self) -> list[tuple[str, type[Struct]]]:
         """For each other host that is seen: a key that it answers on."""
@@ -466,13 +460,13 @@ class Roster:
         }
         tokens = (token for rc in self._rcs.values() for token in rc.tokens.values())
         keys |= {token.host: (self._keys.rc_state(token.name), RcState) for token in tokens}
-        return [keys[host] for host in sorted(keys) if host != self._sight.me]
+        return [keys[host] for host in sorted(keys) if host != self.sight.me]
 
     def _counts(self, token: Token, *, alive: bool, known: bool) -> bool:
         """Return True if a token that came or went counts: its host has no more than MAX_TOKENS, or it did before."""
         if alive is known:
             return alive
-        if self._sight.count(token.host, alive=alive):
+        if self.sight.count(token.host, alive=alive):
             return True
         text = f"{token.host} shows more than {MAX_TOKENS} tokens: later ones are ignored"
         self._out.strange.append((token.host, text))
@@ -490,12 +484,9 @@ class Roster:
 
     def _is_seen(self, asked: Question) -> bool:
         """Return True if the client or RC that is probed shows a token again."""
-        return asked.client in self.clients if asked.token is None else bool(self._rc(asked.token.name).tokens)
+        return asked.client in self.clients if asked.token is None else bool(self._rcs[asked.token.name].tokens)
 
     # RCs
-
-    def _rc(self, name: RcName) -> _Rc:
-        return self._rcs.setdefault(name, _Rc())
 
     def _token_came(self, rc: _Rc, token: Token) -> None:
         rc.tokens[token.instance] = token
@@ -519,7 +510,7 @@ class Roster:
         self._out.then.append(Name(token.name))
 
     def _drop(self, name: RcName, why: str = "") -> None:
-        rc = self._rc(name)
+        rc = self._rcs[name]
         gone, rc.joined, rc.unseen = rc.joined, None, False
         if gone is None:
             return
@@ -533,7 +524,7 @@ class Roster:
 
     def _free(self, gone: RcState) -> None:
         """An RC that disappeared serves nobody any longer: another host may offer it."""
-        rc = self._rc(gone.rc)
+        rc = self._rcs[gone.rc]
         if rc.departed is not gone:
             return
         rc.departed = None
@@ -554,13 +545,13 @@ class Roster:
         # Requests that wait for a device never seen in this term get to know why it is absent.
         there = {name for name, rc in self._rcs.items() if rc.joined or rc.pending or rc.tokens or rc.departed}
         for name in sorted(self._devices.names - there):
-            if not self._rc(name).missed and (home := self._devices.latest_home(name)) is not None:
-                self._rc(name).missed = True
+            if not self._rcs[name].missed and (home := self._devices.latest_home(name)) is not None:
+                self._rcs[name].missed = True
                 self._out.events.append(RcLost(name, why=self._devices.why_gone(name, home)))
 
     def _awaited_since(self, arc: ArcId) -> Ns | None:
         if arc not in self._awaited and len(self._awaited) >= MAX_PROBED:
-            self._awaited = {other: at for other, at in self._awaited.items() if self._now - at < self._sight.lease}
+            self._awaited = {other: at for other, at in self._awaited.items() if self._now - at < self.sight.lease}
         if len(self._awaited) < MAX_PROBED:
             self._awaited.setdefault(arc, self._now)
         return self._awaited.get(arc)
@@ -579,7 +570,7 @@ class Roster:
 
     def _promised(self, token: Token, state: Any, problem: Problem | None) -> None:
         """The answer of an RC that was asked for its promise; without one it is asked again."""
-        rc = self._rc(token.name)
+        rc = self._rcs[token.name]
         if problem is not None and problem.term is not None:
             self._see_rc(rc, token.name, token.instance, problem.term)
             alone = not any(rc.joined or rc.pending for rc in self._rcs.values())
@@ -599,14 +590,14 @@ class Roster:
             self._settle()
 
     def _hold_up(self, state: RcState, *, patient: bool) -> None:
-        pending = self._rc(state.rc).pending = _Pending(state, self._now, patient)
-        for wait in (self._timing.rebuild, self._sight.lease, MAX_LEASES_PENDING * self._sight.lease):
+        pending = self._rcs[state.rc].pending = _Pending(state, self._now, patient)
+        for wait in (self._timing.rebuild, self.sight.lease, MAX_LEASES_PENDING * self.sight.lease):
             self._set(wait, _Due.WAITED, (pending, wait))
 
     def _wait_over(self, pending: _Pending, wait: Ns) -> None:
         if self._stood_still:
             self._set(wait, _Due.WAITED, (pending, wait))  # answers may not be handled yet
-        elif self._rc(pending.state.rc).pending is pending:
+        elif self._rcs[pending.state.rc].pending is pending:
             pending.waited = wait
             self._settle()
 
@@ -620,16 +611,16 @@ class Roster:
             if name not in pending:
                 continue
             gangs = gangs_of(name, {other: waiting.state for other, waiting in pending.items()})
-            joined = {other for other in gangs if self._rc(other).joined is not None}
+            joined = {other for other in gangs if self._rcs[other].joined is not None}
             missing = gangs - joined - pending.keys()
             together = [pending[other] for other in gangs & pending.keys()]
-            patient = any(waiting.patient for waiting in together) or any(self._rc(other).tokens for other in missing)
+            patient = any(waiting.patient for waiting in together) or any(self._rcs[other].tokens for other in missing)
             # They join together: the last to answer may be the first whose links came back.
             waited = min(waiting.waited for waiting in together)
-            over = waited >= (self._sight.lease if patient else self._timing.rebuild)
-            if not missing or over or pending[name].waited >= MAX_LEASES_PENDING * self._sight.lease:
+            over = waited >= (self.sight.lease if patient else self._timing.rebuild)
+            if not missing or over or pending[name].waited >= MAX_LEASES_PENDING * self.sight.lease:
                 for other in gangs & pending.keys():
-                    self._rc(other).pending = None
+                    self._rcs[other].pending = None
                 admitted = [pending.pop(other) for other in sorted(gangs & pending.keys())]
                 self._admit([aged(waiting.state, self._now - waiting.since) for waiting in admitted])
         if settled:
@@ -638,7 +629,7 @@ class Roster:
     def _admit(self, states: list[RcState]) -> None:
         """Let RCs join. Holds of which every RC of the gang that has joined reports exactly this grant continue."""
         for state in states:
-            rc = self._rc(state.rc)
+            rc = self._rcs[state.rc]
             rc.joined, rc.named = state, (state.instance, state.host)
         joined = {name for name, rc in self._rcs.items() if rc.joined is not None}
         holds, remarks = adopted(states, joined, self._now, self._admission, self._known)
@@ -646,7 +637,7 @@ class Roster:
         self._out.log += remarks
         self._out.then += map(Compare, states)
         for state in states:
-            if state.duplicate_of or len(self._rc(state.rc).tokens) > 1:
+            if state.duplicate_of or len(self._rcs[state.rc].tokens) > 1:
                 self._out.then.append(Name(state.rc))
         self._out.then.append(Resume())
 
@@ -688,7 +679,7 @@ class Roster:
 
     def _leave_out(self, token: Token) -> None:
         """Nobody leads in the term that a shunned RC shows."""
-        rc = self._rc(token.name)
+        rc = self._rcs[token.name]
         if rc.pending is not None and rc.pending.state.instance == token.instance:
             rc.pending = None
             self._settle()
@@ -717,7 +708,7 @@ class Roster:
         self._ask(why, self._keys.rc_state(token.name), message=message, kind=RcState, token=token)
 
     def _ask_promise(self, token: Token) -> None:
-        if self._is_wanted(self._rc(token.name), token):
+        if self._is_wanted(self._rcs[token.name], token):
             self._ask_rc(Why.PROMISE, token)
 
     def _ask_client(self, client: ClientId) -> None:

@@ -90,6 +90,7 @@ class StateView:
                 rcs=self._devices(status, now),
                 more=status.waiting - len(status.queued),
                 charged=self._core.charged(),
+                patience=self._core.patience / SECOND or None,
             )
         return state
 
@@ -140,6 +141,7 @@ def _held(arc: ArcStatus, hold: Hold, now: Ns) -> dict[str, Any]:
         "bound": dict(arc.bound),
         "direct": arc.request.direct,
         "continues": arc.request.continues,
+        "protected_from": _protected_from(hold),
     }
 
 
@@ -149,6 +151,11 @@ def holders_of(arcs: Iterable[ArcStatus], rc: str, now: Ns) -> list[messages.Hol
         for arc in arcs
         if arc.hold is not None
     ]
+
+
+def _protected_from(hold: Hold) -> float | None:
+    is_protected = hold.protected_below is not None and hold.protected_from < hold.end
+    return (hold.end - hold.protected_from) / SECOND if is_protected else None
 
 
 def _hold_view(arc: ArcStatus, hold: Hold, now: Ns, runtimes: RuntimeEstimator | None) -> messages.HoldView:

@@ -107,14 +107,12 @@ class Terms:
 
     def counts(self, word: Word) -> bool:
         """Return True if such evidence can move the term."""
-        return not self.secured or word.source in (Source.LEADER, Source.SEAL) or self._obeys(word)
+        obeys = word.source is Source.RC and word.host != ""
+        return not self.secured or word.source in (Source.LEADER, Source.SEAL) or obeys
 
     def is_news(self, term: Term, source: Source) -> bool:
         """Return True if `hear` could learn something from a refusal for this term."""
         return not self.secured or (source is not Source.CLIENT and term > self._led)
-
-    def _obeys(self, word: Word) -> bool:
-        return word.source is Source.RC and word.host != ""
 
     def _doubted(self, word: Word, now: Ns) -> Ns:
         """Note what an RC shows. Until when its host is not believed; 0: it is, for once, or is not alone."""

@@ -16,7 +16,8 @@ slices. A search works on a snapshot: when the group has changed, it restarts fr
 rounds of votes of a group are bounded; then it takes the best set that needs no more votes, or leaves the group to
 `priority`.
 
-Each pass is worth at least as much as one of `priority`, among the ARCs that no reservation holds back."""
+A pair of ARC and RC is worth the more the shorter the ARC's minimum runtime (`conflict_groups.density`). Each pass is
+worth at least as much as one of `priority`, among the ARCs that no reservation holds back."""
 
 from __future__ import annotations
 
@@ -25,7 +26,7 @@ from typing import Final, Literal
 
 from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling import priority
-from zscout.scheduling.conflict_groups import ConflictGroup, conflict_groups, take_all
+from zscout.scheduling.conflict_groups import ConflictGroup, Decision, conflict_groups, take_all
 from zscout.scheduling.local_search import LocalSearch
 from zscout.scheduling.model import Rc
 from zscout.scheduling.packing import PackingItem, PackingProblem, numbers, pack
@@ -119,18 +120,11 @@ class Adaptive(Strategy):
             actions.run_again()
             return
         before, self._searches, self._unfinished = self._searches, {}, []
-        held, taken = 0, list[tuple[ConflictGroup, int]]()
         reserved = self._reserve(state)
         plan = dry_run(state, reserved)
-        for group in conflict_groups(state, reserved, MAX_STARTABLE, plan):
-            match self._decide(group, before, actions):
-                case "open":
-                    held |= group.off_limits
-                case "left":
-                    pass
-                case int(chosen):
-                    taken.append((group, chosen))
-        plan = take_all(state, reserved, plan, taken, actions)
+        groups = conflict_groups(state, reserved, MAX_STARTABLE, plan)
+        decided = [(group, self._decide(group, before, actions)) for group in groups]
+        held, plan = take_all(state, reserved, plan, decided, actions)
         priority.run_pass(state, actions, off_limits=held, reserved=reserved, plan=plan)
         if state.queued and reserved is not None and reserved.starving and not reserved.current:
             actions.run_again()  # what this pass has changed may let others start that reservations held back
@@ -139,11 +133,10 @@ class Adaptive(Strategy):
     def _reserve(self, state: SchedulerState) -> Reservations | None:
         """Reserve for the starving ARCs. Where a reservation has ended or changed, ARCs that it held back are
         checked again."""
-        patience = state.policy.patience
-        if patience is None and not state.claims and self._reserved is None:
+        if state.policy.patience is None and not state.claims and self._reserved is None:
             return None
         before = self._reserved
-        reserved = reservations(state, patience, before)
+        reserved = reservations(state, before)
         self._reserved = reserved if reserved.bits else None
         if before is not None and before is not reserved:
             state.index.freed |= reserved.changed(before)
@@ -155,10 +148,7 @@ class Adaptive(Strategy):
         changed = index.freed or index.touched or votes.answered or votes.invalidated or votes.due(state.now)
         return not changed and self._seen == _situation(state)
 
-    def _decide(
-        self, group: ConflictGroup, before: dict[ArcId, _Search], actions: Actions
-    ) -> int | Literal["open", "left"]:
-        """The better set of a group. `left`: to `priority`; `open`: off limits for now."""
+    def _decide(self, group: ConflictGroup, before: dict[ArcId, _Search], actions: Actions) -> Decision:
         earlier = list({id(known): known for arc in group.arcs if (known := before.get(arc.id))}.values())
         if group.waits:
             return "left"

@@ -90,7 +90,6 @@ class Calendar:
         self._lost_at: dict[int, DateIndex] = {}  # by bit of each RC that would do
         self._unjudged: set[str] = set()
         self._order: list[tuple[int, str]] = []  # a heap of these, by rank
-        self._entered: list[str] = []
         self._unbound: dict[str, None] = {}  # dates whose patterns wait for votes
         self.is_partial = False  # further dates follow
         self._questions: dict[RcName, _Questions] = {}
@@ -115,7 +114,7 @@ class Calendar:
         if dates.more:
             for booking in dates.ranked:
                 self.book(booking)
-                self._entered.append(booking.id)
+                self._unjudged.add(booking.id)
             return
         state, wanted = self._state, {booking.id: booking for booking in dates.ranked}
         for name in [name for name in state.claims if name not in wanted]:
@@ -126,8 +125,7 @@ class Calendar:
         known = [name for name in wanted if name in before]
         same_order = all(before[name] < before[other] for name, other in pairwise(known))
         unjudged, self._unjudged, self._order = self._unjudged if same_order else {*known}, set(), []
-        self._look_again((*unjudged, *self._entered))
-        self._entered.clear()
+        self._look_again(unjudged)
         known_claims = (state.claims.get(name) or self._lost.get(name) for name in known)
         moves = {wanted[claim.booking.id].start - claim.date for claim in known_claims if claim is not None}
         for name, booking in wanted.items():
@@ -426,7 +424,7 @@ class Calendar:
             self._spread()
 
     def _judge_claim(self, claim: Claim) -> None:
-        if _is_unbound(claim):
+        if claim.arc.patterns and not claim.booking.bound and claim.arc.hold is None:
             self._bind(claim, "")
             return
         by, unknown = self._obstacle(claim)
@@ -600,7 +598,7 @@ class Calendar:
         """Look again at the bookings that changed holders, RCs and reservations may affect, those in danger and overdue
         ones."""
         state, before = self._state, self._reserved
-        self._reserved = reserved = reservations(state, state.policy.patience, before)
+        self._reserved = reserved = reservations(state, before)
         changed, state.changed = state.changed, {}
         if before is not None and before is not reserved:
             for bit, over in reserved.starving_changed(before).items():
@@ -637,10 +635,10 @@ class Calendar:
         return min((start for start in starts if start > self._state.now), default=None)
 
     def _report_danger(self, claim: Claim) -> None:
-        state, reserved = self._state, reservations(self._state, self._state.policy.patience, self._reserved)
+        state, reserved = self._state, reservations(self._state, self._reserved)
         found = danger(state, reserved, claim)
         if isinstance(found, Reason) and self._keep_another(claim):
-            reserved = reservations(state, state.policy.patience, reserved)
+            reserved = reservations(state, reserved)
             found = danger(state, reserved, claim)
         self._reserved = reserved
         if isinstance(found, Undecided):
@@ -655,10 +653,6 @@ class Calendar:
         else:
             self._endangered[claim] = None
         self._emit(BookingThreatened(claim.booking.id, found))
-
-
-def _is_unbound(claim: Claim) -> bool:
-    return bool(claim.arc.patterns) and not claim.booking.bound and claim.arc.hold is None
 
 
 def _meet(claim: Claim, other: Claim) -> bool:

@@ -9,9 +9,11 @@ Undecided ARCs that share no RC, even indirectly, are decided separately: a slow
 from __future__ import annotations
 
 import heapq
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from operator import attrgetter
+from typing import Final, Literal, TypeAlias
 
 from zscout.scheduling.model import Arc, Rank, Rc, union
 from zscout.scheduling.packing import PackingItem, PackingProblem
@@ -22,6 +24,8 @@ from zscout.scheduling.reservations import Reservations
 from zscout.scheduling.state import Actions, SchedulerState
 from zscout.scheduling.votes import HolderSet
 from zscout.types import ArcId, Ns
+
+SCALE: Final = 1 << 32
 
 
 def undecided_arcs(
@@ -144,15 +148,21 @@ def conflict_groups(
     ]
 
 
+Decision: TypeAlias = int | Literal["open", "left"]
+"""The set of a group. `left`: to `priority`; `open`: off limits for now."""
+
+
 def take_all(
     state: SchedulerState,
     reserved: Reservations | None,
     plan: BindingPlan,
-    taken: list[tuple[ConflictGroup, int]],
+    decided: Sequence[tuple[ConflictGroup, Decision]],
     actions: Actions,
-) -> BindingPlan:
-    """Take these sets, and return the plan of a pass after that. A group with an ARC that this pass would end again is
-    left to it."""
+) -> tuple[int, BindingPlan]:
+    """Take these sets; the bits that are off limits to a pass after that, and its plan. A group with an ARC that this
+    pass would end again is left to it."""
+    held = union(group.off_limits for group, chosen in decided if chosen == "open")
+    taken = [(group, chosen) for group, chosen in decided if isinstance(chosen, int)]
     while taken and plan is not NO_PLAN:
         changes = [group.changes(chosen) for group, chosen in taken]
         starting = [arc for starting, _ in changes for arc in starting]
@@ -163,7 +173,7 @@ def take_all(
         taken = [(group, chosen) for group, chosen in taken if not any(arc.id in after.dropped for arc in group.arcs)]
     for group, chosen in taken:
         group.take(chosen, actions, plan)
-    return plan
+    return held, plan
 
 
 def split(arcs: Iterable[Arc]) -> list[list[Arc]]:
@@ -205,6 +215,11 @@ def _level_key(arc: Arc, first: set[ArcId], last: int, now: Ns) -> tuple[int, in
     return -arc.priority, 1
 
 
+def density(runtime: Ns) -> int:
+    """The worth of an RC in use for so long: the shorter the more, as whoever waits behind it waits less."""
+    return max(1, SCALE // math.isqrt(runtime))
+
+
 def _one_group(arcs: Sequence[Arc]) -> bool:
     """Return True if a quick look shows a single group: the usual case."""
     mask, rest = 0, list(arcs)
@@ -242,6 +257,7 @@ class ConflictGroup:
                 level=levels[key],
                 running=arc.hold is not None,
                 past_min_runtime=arc.past_min_runtime(now),
+                density=density(arc.request.min_runtime) if state.adaptive else 1,
             )
             for arc, key in zip(self.arcs, keys, strict=True)
         ]

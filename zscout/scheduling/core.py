@@ -33,7 +33,7 @@ from zscout.types import NO_TERM, ArcId, ClientId, Grant, Ns, Place, RcName, Ter
 class Core:
     def __init__(self, strategy: Strategy | None = None, policy: SchedulingPolicy = DEFAULT) -> None:
         self.strategy = strategy or Priority()
-        self._state = SchedulerState(policy)
+        self._state = SchedulerState(policy, adaptive=self.strategy.name == "adaptive")
         self._votes = self._state.votes
         self.term: Term = NO_TERM
         self.seq = 0
@@ -181,15 +181,25 @@ class Core:
         ]
         recovered_holds = tuple(
             model.RecoveredHold(
-                arc.request, arc.place, arc.hold.grant, arc.hold.start, arc.hold.end, arc.bound, arc.vouched
+                arc.request,
+                arc.place,
+                arc.hold.grant,
+                arc.hold.start,
+                arc.hold.end,
+                arc.bound,
+                arc.vouched,
+                arc.hold.protected_from,
             )
             for arc in state.running.values()
             if arc.hold is not None
         )
         joined += [Booked(claim.booking) for claim in state.claims.values()]
         queued = (*state.queued.values(), *state.held_back.values()) if limit is None else self._best_ranked(limit)
-        waiting = tuple(model.Requested(arc.request, arc.place, arc.since) for arc in queued)
-        return joined, model.LeadTaken(term, recovered_holds, waiting, self.charged())
+        waiting = tuple(
+            model.Requested(arc.request, arc.place, arc.since, model.WaitSoFar(arc.patience, arc.lost, arc.told))
+            for arc in queued
+        )
+        return joined, model.LeadTaken(term, recovered_holds, waiting, self.charged(), patience=self.patience)
 
     def slots(self, wanted: Booking, until: Ns, limit: int, *, bookings_only: bool = False) -> SlotsFound:
         """The first `limit` times between the start of `wanted` and `until` at which it would be kept.
@@ -225,6 +235,11 @@ class Core:
 
     def charged(self) -> dict[str, float]:
         return self._state.charged()
+
+    @property
+    def patience(self) -> Ns:
+        """Of an ARC that is queued now; 0 where none is ever due."""
+        return self._state.patience if self._state.adaptive else 0
 
     def charged_in_all(self) -> dict[str, float]:
         return {} if self._state.shares is None else self._state.shares.totals()
@@ -311,6 +326,9 @@ class Core:
             self.start(arc)
             return
         since = self._state.now if asked.since is None else min(asked.since, self._state.now)
+        arc.told = self._state.now - since
+        if asked.past is not None:
+            arc.patience, arc.lost, arc.told = asked.past
         self._state.enqueue(arc, since)
         self._calendar.take_up(asked.request.booking, arc)
 
@@ -404,6 +422,8 @@ class Core:
         if self._state.shares is not None:
             self._state.shares.restore(lead.charged)
         self._calendar.certain_from = lead.dates_from
+        if lead.patience:
+            self._state.runtimes.restore(lead.patience)
         # The newest grant is the truth where two claim one exclusive RC.
         for held in sorted(lead.recovered_holds, key=lambda held: held.grant, reverse=True):
             if self._state.arc(held.request.arc) is None:
@@ -445,7 +465,9 @@ class Core:
             return
         self._state.stop(arc)
         self._forget(arc)
-        held = model.RecoveredHold(told.request, place, hold.grant, hold.start, hold.end, told.bound)
+        held = model.RecoveredHold(
+            told.request, place, hold.grant, hold.start, hold.end, told.bound, protected_from=hold.protected_from
+        )
         arc = self._take_up(held)
         if arc.hold is not None:
             self._effects.append(self._granted(arc, arc.hold))
@@ -470,7 +492,7 @@ class Core:
         arc.vouched = held.vouched
         if arc.patterns:
             self._state.bind(arc, held.bound)
-        hold = Hold(held.grant, held.start, held.end, self._state.protected_below(arc), self._state.longest(held.start))
+        hold = self._state.hold(arc, held.grant, held.start, held.end, held.protected_from)
         absent = [rc.name for rc in self._state.rcs_in(arc.mask & ~self._state.present)]
         taken = [rc.name for rc in self._state.rcs_in(arc.mask & self._state.busy)]
         other = self._state.at_place(arc.place)
@@ -511,13 +533,17 @@ class Core:
     def start(self, arc: Arc) -> None:
         grant = Grant(self.term, self.number())
         now, state = self._state.now, self._state
-        hold = Hold(grant, now, arc.ends(now), state.protected_below(arc), state.longest(now))
+        hold = state.hold(arc, grant, now, arc.ends(now))
+        if not arc.preemptions:
+            state.runtimes.count(arc.owner, arc.request.min_runtime)
         waited = 0 if arc.state is ArcState.NEW else now - arc.since
         self._state.start(arc, hold)
         self._effects.append(self._granted(arc, hold, waited))
 
     def preempt(self, arc: Arc, by: Arc) -> bool:
         done = arc.past_min_runtime(self._state.now)
+        if arc.hold is not None and arc.owner != by.owner:
+            arc.lost += self._state.now - arc.hold.start
         reason = Reason(ReasonCode.DISPLACED if done else ReasonCode.PREEMPTED, by=(by.party,))
         self._end_hold(arc, Outcome.COMPLETED if done else Outcome.PREEMPTED, reason)
         return arc.id in self._state.queued
@@ -545,8 +571,11 @@ class Core:
         self._effects.append(self._revocation(arc, hold, outcome, reason, requeued=requeue))
         arc.unconfirmed = 0
         if requeue:
-            arc.preemptions += outcome is Outcome.PREEMPTED
-            self._state.enqueue(arc, self._state.now)
+            preempted = outcome is Outcome.PREEMPTED
+            arc.preemptions += preempted
+            arc.told = arc.told if preempted else 0
+            # Waiting counts through preemption.
+            self._state.enqueue(arc, self._state.now - (arc.waited if preempted and self._state.adaptive else 0))
         else:
             self._forget(arc)
             self._calendar.give_up(arc, outcome, had_it=True)
@@ -578,7 +607,7 @@ class Core:
         """When the passing of time next changes something; before, only events do, and the order of fair shares."""
         calendar, held_back = self._calendar, self._state.held_back.values()
         dates = (self._state.next_end(), self._state.dates.next_change(), calendar.next_start, calendar.next_question)
-        ends = [end for end in dates if end is not None]
+        ends = [end for end in (*dates, self._state.next_starving()) if end is not None]
         return min(ends + [arc.held_back[0] for arc in held_back if arc.held_back], default=None)
 
     def next_order(self) -> Ns | None:

@@ -43,8 +43,8 @@ class LocalSearch:
                 for rc in self._needs[number]:
                     self._cover[rc].append(number)
         self._level = [item.level for item in items]
-        self._top = [min((self._level[number] for number in cover), default=-1) for cover in self._cover]
-        """The highest level that could use each RC; -1 for none."""
+        self._top = [max((problem.unit[number] for number in cover), default=0) for cover in self._cover]
+        """The most that each RC could be worth; 0 for nothing."""
         self._may_all = not problem.running and not problem.vetoes
         self._moved = [-TENURE] * len(items)
         self._random = 1
@@ -69,7 +69,7 @@ class LocalSearch:
                 for rc in self._needs[number]:
                     self._owner[rc] = number
         for rc, owner in enumerate(self._owner):
-            if self._top[rc] >= 0 and (owner < 0 or self._level[owner] > self._top[rc]):
+            if self._top[rc] and (owner < 0 or self.problem.unit[owner] < self._top[rc]):
                 self._at[rc] = len(self._pool)
                 self._pool.append(rc)
 
@@ -156,11 +156,11 @@ class LocalSearch:
         self._used |= self.problem.masks[number]
         self._value += self.problem.worth[number]
         self._moved[number] = self.steps
-        owner, pool, place, top, level = self._owner, self._pool, self._at, self._top, self._level[number]
+        owner, pool, place, top, unit = self._owner, self._pool, self._at, self._top, self.problem.unit[number]
         for rc in self._needs[number]:
             owner[rc] = number
             at = place[rc]
-            if at >= 0 and level <= top[rc]:
+            if at >= 0 and unit >= top[rc]:
                 last = pool.pop()
                 if last != rc:
                     pool[at] = last
@@ -174,6 +174,6 @@ class LocalSearch:
         self._moved[number] = self.steps
         for rc in self._needs[number]:
             self._owner[rc] = -1
-            if self._at[rc] < 0 and self._top[rc] >= 0:
+            if self._at[rc] < 0 and self._top[rc]:
                 self._at[rc] = len(self._pool)
                 self._pool.append(rc)

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from operator import itemgetter
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 from msgspec import Struct
 
@@ -92,8 +92,9 @@ class Hold(Struct, frozen=True):
     start: Ns
     end: Ns
     protected_below: int | None = None
-    """Before `end` only this priority or higher preempts it; None: any higher priority."""
+    """From `protected_from` to `end` only this priority or higher preempts it; None: any higher priority."""
     last: Ns | None = None
+    protected_from: Ns = 0
 
 
 class ArcState(StrEnum):
@@ -151,6 +152,10 @@ class Arc:
     held_back: tuple[Ns, tuple[RcName, ...]] | None = None
     """While HELD_BACK: until when, and for which RCs; None where another ARC has its place."""
     starving: bool = False  # waiting for too long (`reservations.py`)
+    patience: Ns = 0  # the fleet's, as it was when the ARC was queued
+    lost: Ns = 0  # runtime lost to other owners' ARCs
+    waited: Ns = 0  # while it runs: how long it waited before
+    told: Ns = 0  # of its wait: what its client tells, which protects from nothing
     bound: Mapping[Need, RcName] = field(default_factory=dict)
     """The RC of each pattern (`patterns.py`), while it runs or is checked. Empty if some pattern has none."""
     claim: Claim | None = None  # the active booking that it has taken up
@@ -178,6 +183,11 @@ class Arc:
     def put_at(self, position: int) -> None:
         self.position = position
         self.rank = (-self.priority, position, self.request.min_runtime, self.place, self.id)
+
+    @property
+    def starves(self) -> Ns:
+        """When it begins to starve, if it waits (`reservations.py`)."""
+        return self.since + self.late + self.patience // 2
 
     def ends(self, start: Ns) -> Ns:
         """The end of its minimum runtime, or of its booking, if it starts then."""
@@ -214,7 +224,8 @@ class Arc:
 
     def protected_below(self, now: Ns) -> int | None:
         """Priorities below this can't preempt its hold now; None: any higher priority can."""
-        return self.hold.protected_below if self.hold is not None and now < self.hold.end else None
+        hold = self.hold
+        return hold.protected_below if hold is not None and hold.protected_from <= now < hold.end else None
 
 
 @dataclass(slots=True, eq=False)
@@ -297,12 +308,22 @@ def union(masks: Iterable[int]) -> int:
     return functools.reduce(operator.or_, masks, 0)
 
 
+class WaitSoFar(NamedTuple):
+    """Of an ARC that waits: what counts for its protection (`Arc`)."""
+
+    patience: Ns
+    lost: Ns
+    told: Ns
+
+
 class Requested(Struct, frozen=True):
-    """`place` is set for an ARC of an earlier RCM, and `since`, if known, is when it was last queued."""
+    """`place` is set for an ARC of an earlier RCM, and `since`, if known, is when it was last queued. `past` is set in
+    a copy of a core: a new RCM forgets it."""
 
     request: ArcRequest
     place: Place | None = None
     since: Ns | None = None
+    past: WaitSoFar | None = None
 
 
 class Cancelled(Struct, frozen=True):
@@ -391,6 +412,8 @@ class RecoveredHold(Struct, frozen=True):
     end: Ns
     bound: Mapping[Need, RcName] = {}
     vouched: bool = True
+    protected_from: Ns | None = None
+    """As its RCs report it; None: they do not."""
 
     def __post_init__(self) -> None:
         patterns = {need for need in self.request.needs if is_pattern(need)}
@@ -412,6 +435,8 @@ class LeadTaken(Struct, frozen=True):
     """By group: contended RC-seconds, decayed as of now (`fair_shares.py`)."""
     dates_from: Ns = 0
     """Dates before this are uncertain: their ARCs do not begin."""
+    patience: Ns | None = None
+    """The last that a leader published."""
 
 
 class Adopted(Struct, frozen=True):

@@ -18,11 +18,11 @@ from __future__ import annotations
 
 import functools
 import importlib.util
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 from zscout.config.scheduling_policy import StrategyName
 from zscout.scheduling import priority
-from zscout.scheduling.conflict_groups import ConflictGroup, conflict_groups, take_all
+from zscout.scheduling.conflict_groups import ConflictGroup, Decision, conflict_groups, take_all
 from zscout.scheduling.local_search import LocalSearch
 from zscout.scheduling.packing import PackingProblem, numbers, pack
 from zscout.scheduling.plan import dry_run
@@ -149,22 +149,15 @@ class Optimal(Strategy):
     name: StrategyName = "optimal"
 
     def run_pass(self, state: SchedulerState, actions: Actions) -> None:
-        held, taken, plan = 0, list[tuple[ConflictGroup, int]](), dry_run(state, None)
-        for group in conflict_groups(state, plan=plan):
-            match decide(group, actions):
-                case "open":
-                    held |= group.off_limits
-                case "left":
-                    pass
-                case int(chosen):
-                    taken.append((group, chosen))
-        plan = take_all(state, None, plan, taken, actions)
+        plan = dry_run(state, None)
+        decided = [(group, decide(group, actions)) for group in conflict_groups(state, plan=plan)]
+        held, plan = take_all(state, None, plan, decided, actions)
         # It starts none by name, but reports the reasons of waiting ARCs.
         priority.run_pass(state, actions, off_limits=held, plan=plan)
 
 
-def decide(group: ConflictGroup, actions: Actions) -> int | Literal["open", "left"]:
-    """The best set of a group. `left`: to `priority`; `open`: votes are out; nothing changes yet."""
+def decide(group: ConflictGroup, actions: Actions) -> Decision:
+    """The best set of a group."""
     proposals = None
     while proposals is None:
         if group.moves or group.waits or len(group.nogoods) > MAX_VETOES:

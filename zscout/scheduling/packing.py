@@ -1,8 +1,9 @@
 """The best set of ARCs that may hold their RCs together: branch and bound over bit masks.
 
-The value of a set is the vector of (ARC, RC) pairs in use by priority level, highest first, compared lexicographically;
-among equals the fewest preemptions win, then the best-ranked item in which they differ. Items are numbered by rank.
-Taking the best rank first finds the best-ranked of equal sets first, so only strictly better sets are searched.
+The value of a set is the vector of (ARC, RC) pairs in use by priority level, highest first, compared lexicographically,
+each pair worth its ARC's density; among equals the fewest preemptions win, then the best-ranked item in which they
+differ. Items are numbered by rank. Taking the best rank first finds the best-ranked of equal sets first, so only
+strictly better sets are searched.
 
 Upper bound: each free exclusive RC counts once, at the highest level that covers it; pairs at sharable RCs are
 added."""
@@ -26,6 +27,8 @@ class PackingItem(NamedTuple):
     level: int
     running: bool = False
     past_min_runtime: bool = False
+    density: int = 1
+    """The worth of each of its RCs among those of its level."""
 
     @property
     def in_min_runtime(self) -> bool:
@@ -49,14 +52,16 @@ class PackingProblem:
     def __init__(self, items: Sequence[PackingItem], nogoods: Iterable[int] = ()) -> None:
         self.items = items
         self.levels = items[-1].level + 1 if items else 1
-        base = sum(item.width for item in items) + 1
-        self.unit = [base ** (self.levels - 1 - item.level) for item in items]
+        base = sum(item.width * item.density for item in items) + 1
+        self.unit = [item.density * base ** (self.levels - 1 - item.level) for item in items]
         """The worth of one RC at an item's level: more than all lower levels together."""
         self.masks = [item.mask for item in items]
         valued = [0 if item.past_min_runtime else unit for item, unit in zip(items, self.unit, strict=True)]
         self.worth = [item.width * unit for item, unit in zip(items, valued, strict=True)]
         self.extra = [(item.width - item.mask.bit_count()) * unit for item, unit in zip(items, valued, strict=True)]
-        self.plain = self.levels == 1 and not any(self.extra) and not any(item.past_min_runtime for item in items)
+        self.dense = any(item.density != 1 for item in items)
+        alike = self.levels == 1 and not self.dense
+        self.plain = alike and not any(self.extra) and not any(item.past_min_runtime for item in items)
         """Each RC in use counts one."""
         self.nogoods: list[list[int]] = [[] for _ in items]
         for nogood in nogoods:
@@ -77,6 +82,8 @@ class PackingProblem:
             for number in open_:
                 layer |= masks[number]
             return layer.bit_count()
+        if self.dense:
+            open_ = sorted(open_, key=units.__getitem__, reverse=True)
         total = seen = layer = unit = extra = 0
         for number in open_:
             if units[number] != unit:

@@ -219,7 +219,7 @@ class _DryRun:
 
     def _enter(self, arc: Arc) -> None:
         state = self.state
-        arc.hold = Hold(Grant(NO_TERM, 0), state.now, arc.ends(state.now), state.protected_below(arc))
+        arc.hold = state.hold(arc, Grant(NO_TERM, 0), state.now, arc.ends(state.now))
         for rc in arc.rcs:
             self._holders_of(rc)[arc.id] = arc
         state.busy |= arc.mask & ~state.sharable

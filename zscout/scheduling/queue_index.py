@@ -34,13 +34,13 @@ class QueueIndex:
         self.unreported = 0  # bits of the RCs with new holders that are not reported to watchers yet
         self.unreported_classes: dict[PatternClass, None] = {}
         self.ranks: list[Rank] = []  # of all queued ARCs, best first
-        self._not_starving: list[tuple[Ns, ArcId]] = []  # queued ARCs, by the start of their wait
-        self.starving: list[tuple[int, Ns, ArcId]] = []  # by band of priorities (negated), then waiting time
+        self._not_starving: list[tuple[Ns, ArcId]] = []  # queued ARCs, by when they begin to starve
+        self.starving: list[tuple[int, Ns, ArcId]] = []  # by band of priorities (negated), then by when they began
         self.starving_version = 0  # grows when an ARC starts or stops starving
 
     def add(self, arc: Arc) -> None:
         insort(self.ranks, arc.rank)
-        insort(self._not_starving, (arc.since + arc.late, arc.id))
+        insort(self._not_starving, (arc.starves, arc.id))
         self.ready[arc.id] = arc
         arc.move_to(ArcState.READY)
 
@@ -51,25 +51,31 @@ class QueueIndex:
             self.starving_version += 1
             del self.starving[bisect_left(self.starving, self._starving_key(arc))]
         else:
-            del self._not_starving[bisect_left(self._not_starving, (arc.since + arc.late, arc.id))]
+            del self._not_starving[bisect_left(self._not_starving, (arc.starves, arc.id))]
         self._leave(arc)
 
-    def mark_starving(self, since: Ns, queued: Mapping[ArcId, Arc]) -> None:
-        """Mark the ARCs that have waited since then or longer as starving (`reservations.py`)."""
-        count = bisect_right(self._not_starving, since, key=itemgetter(0))
+    def mark_starving(self, now: Ns, queued: Mapping[ArcId, Arc]) -> None:
+        """Mark the ARCs that have waited for half their patience as starving (`reservations.py`)."""
+        count = bisect_right(self._not_starving, now, key=itemgetter(0))
         self.starving_version += count
         for _, arc_id in self._not_starving[:count]:
             queued[arc_id].starving = True
             insort(self.starving, self._starving_key(queued[arc_id]))
         del self._not_starving[:count]
 
+    def next_starving(self, now: Ns) -> Ns | None:
+        """When the next ARC begins to starve, where others do: these may be kept a later place then, and let somebody
+        pass."""
+        coming = bisect_right(self._not_starving, now, key=itemgetter(0))
+        return self._not_starving[coming][0] if self.starving and coming < len(self._not_starving) else None
+
     def _starving_key(self, arc: Arc) -> tuple[int, Ns, ArcId]:
-        return -self._band(arc.priority), arc.since + arc.late, arc.id
+        return -self._band(arc.priority), arc.starves, arc.id
 
     def sort(self, queued: Mapping[ArcId, Arc], rcs: Iterable[Rc]) -> None:
         """Rebuild the order after ranks and waiting times have changed; `rcs` are watched. Starving ARCs must be
         marked again."""
-        self._not_starving = sorted((arc.since + arc.late, arc.id) for arc in queued.values())
+        self._not_starving = sorted((arc.starves, arc.id) for arc in queued.values())
         for _, _, arc_id in self.starving:
             queued[arc_id].starving = False
         self.starving.clear()

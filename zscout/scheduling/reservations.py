@@ -1,13 +1,13 @@
-"""Bounded waiting: once an ARC has waited for the fleet's patience it is *due*, and no other may pass it.
+"""Bounded waiting: once an ARC has waited for its patience it is *due*, and no other may pass it.
 
 Shortest-first starves, and so do larger sets of ARCs. The remedy is reservation with conservative backfill (Mu'alem and
 Feitelson, IEEE TPDS 12(6), 2001), on distinct RCs instead of equal processors, and from the time at which the ARC is
 due: an ARC that would end before is not held back. Minimum runtimes are exact, so reservations are.
 
-From half its patience on, an ARC is *starving*. By priority, then waiting time, each starving ARC gets the earliest
-time, from when it is due, at which its RCs are free of holders that are not preempted for it and of earlier starving
-ARCs. An ARC of equal or lower priority on these RCs may start only if it ends by then, or if the RC is sharable and
-accepts it beside all concerned.
+From half its patience on, an ARC is *starving*. By priority, then by when they began to starve, each starving ARC gets
+the earliest time, from when it is due, at which its RCs are free of holders that do not yield to it then and of earlier
+starving ARCs. An ARC of equal or lower priority on these RCs may start only if it ends by then, or if the RC is
+sharable and accepts it beside all concerned.
 
 A booking reserves its RCs for its own time. Promises to equals are kept in the order in which they were made: starving
 ARCs avoid older bookings and ignore newer ones. Maintenance precedes all promises except to higher priorities, and all
@@ -74,15 +74,15 @@ def yields(holder: Arc, other: Arc, time: Ns) -> bool:
     return holder.known_end(other) <= time or holder.preemptible_by(other, time)
 
 
-def reservations(state: SchedulerState, patience: Ns | None, last: Reservations | None) -> Reservations:
+def reservations(state: SchedulerState, last: Reservations | None) -> Reservations:
     """The present reservations: `last` if nothing has changed that it depends on. Passing time alone does not change
     RCs or order; for a due ARC no backfill is possible."""
-    if patience is not None:
-        state.index.mark_starving(state.now - patience // 2, state.queued)
+    if state.policy.patience is not None:
+        state.index.mark_starving(state.now, state.queued)
     state.dates.pass_time(state.now, state.present)
     if last is not None and last.current:
         return last
-    return Reservations(state, patience)
+    return Reservations(state)
 
 
 def _versions(state: SchedulerState) -> tuple[int, ...]:
@@ -92,16 +92,15 @@ def _versions(state: SchedulerState) -> tuple[int, ...]:
 class Reservations:
     """Those of bookings are looked up as they are now: while held too, as this pass may preempt them."""
 
-    def __init__(self, state: SchedulerState, patience: Ns | None) -> None:
-        """Without a patience no ARC starves."""
-        self._state, self._votes, self._patience = state, state.votes, patience
+    def __init__(self, state: SchedulerState) -> None:
+        self._state, self._votes = state, state.votes
         self.made_of = _versions(state)
         self.starving: dict[int, list[Reservation]] = {}  # of starving ARCs, by bit of the RC, in their order
         self._free: dict[int, Ns] = {}  # by bit: the end of earlier reservations
         self.starts: list[Ns] = []  # reserved times of starving ARCs
         for priority, since, arc in state.index.starving[:MAX_STARVING]:
             if state.queued[arc].claim is None:
-                self._reserve(state.queued[arc], (True, priority, since + (patience or 0) // 2, arc))
+                self._reserve(state.queued[arc], (True, priority, since, arc))
         self.bits = state.dates.claimed | union(self.starving)
 
     @property
@@ -144,10 +143,15 @@ class Reservations:
         rcs = self._rcs(arc, order)
         if not all(rc.present for rc in rcs):
             return
-        start = max(self._within_quota(arc), *(self._free_from(rc, arc, order) for rc in rcs))
-        if math.isinf(start):
-            return
-        start = self._beside_bookings(arc, rcs, max(int(start), self.due(arc)), order)
+        start, found = -1.0, float(max(self._state.now, self.due(arc)))
+        while start < found:
+            # Who yields now may be protected by then: later times are tried until nobody is in the way.
+            start = found
+            found = max(start, self._within_quota(arc), *(self._free_from(rc, arc, order, int(start)) for rc in rcs))
+            if math.isinf(found):
+                return
+            found = self._beside_bookings(arc, rcs, int(found), order)
+        start = int(start)
         reservation = Reservation(arc, start, order)
         self.starts.append(start)
         for rc in rcs:
@@ -160,7 +164,8 @@ class Reservations:
         for need in arc.patterns:
             matching = self._state.matching(need)
             left = [rc for rc in matching if rc.present and rc not in rcs and not rc.bit & self._state.barred(arc)]
-            rcs.append(min(left, key=lambda rc: (self._free_from(rc, arc, order), rc.bit), default=Rc(need, 0)))
+            time = max(self._state.now, self.due(arc))
+            rcs.append(min(left, key=lambda rc: (self._free_from(rc, arc, order, time), rc.bit), default=Rc(need, 0)))
         return rcs
 
     def _within_quota(self, arc: Arc) -> float:
@@ -177,9 +182,9 @@ class Reservations:
                 held -= len(other.rcs)
         return max(ends)
 
-    def _free_from(self, rc: Rc, arc: Arc, order: Order) -> float:
-        """When `rc` has room for `arc` at the latest; infinite if unknown."""
-        non_preemptible = rc.non_preemptible_holders(arc, self._state.now)
+    def _free_from(self, rc: Rc, arc: Arc, order: Order, time: Ns) -> float:
+        """When `rc` has room for `arc` at the latest, without those who yield at `time`; infinite if unknown."""
+        non_preemptible = rc.non_preemptible_holders(arc, time)
         if rc.sharable:
             return self._room_from(rc, arc, order, non_preemptible)
         return max((self._free.get(rc.bit, self._state.now), *(holder.known_end(arc) for holder in non_preemptible)))
@@ -202,7 +207,7 @@ class Reservations:
         return max(now, ends[-1][0]) if ends else now
 
     def due(self, arc: Arc) -> Ns:
-        return arc.since + arc.late + (self._patience or 0)
+        return arc.since + arc.late + arc.patience
 
     def goes_first(self, arc: Arc) -> bool:
         """Return True if `arc` precedes its equals. A sharable RC may accept each backfilled ARC alone but not all

@@ -48,6 +48,8 @@ class _Taken(NamedTuple):
     end: float
     arc: ArcId
     excludes: bool = False
+    held: bool = False
+    """By a hold, which yields to what begins before."""
 
 
 def slots(
@@ -116,9 +118,12 @@ class _Search:
 
     def _held(self, rc: Rc) -> Iterable[_Taken]:
         now = self._state.now
-        for holder in rc.non_preemptible_holders(self._arc, now):
-            end = holder.known_end(self._arc)
-            yield _Taken(now, min(end, self._likely.get(holder.id, end)), holder.id)
+        for holder in rc.holders.values():
+            start = now if holder.hold is None else max(now, holder.hold.protected_from)
+            first = next((at for at in (now, start) if not holder.preemptible_by(self._arc, at)), None)
+            if first is not None:
+                end = holder.known_end(self._arc)
+                yield _Taken(first, min(end, self._likely.get(holder.id, end)), holder.id, held=True)
 
     def _booked(self, rc: Rc) -> Iterable[_Taken]:
         for claim in self._state.dates.of(rc, self._wanted.start, self._end):
@@ -130,7 +135,7 @@ class _Search:
         state = self._state
         if state.policy.patience is None or not state.queued:
             return
-        for bit, reserved in reservations(state, state.policy.patience, None).starving.items():
+        for bit, reserved in reservations(state, None).starving.items():
             for promise in reserved if bit in self._taken else ():
                 if state.band(promise.arc.priority) >= state.band(self._wanted.priority):
                     self._taken[bit].append(_Taken(promise.start, promise.arc.ends(promise.start), promise.arc.id))
@@ -172,7 +177,7 @@ class _Search:
             over += 1
         self._over[rc.bit] = over
         last = bisect_left(spans, (end,))
-        taken = [span for span in spans[over:last] if span.end > start]
+        taken = [span for span in spans[over:last] if span.end > start and not (span.held and span.start > start)]
         if not rc.sharable or self._wanted.maintenance or any(span.excludes for span in taken):
             return not taken
         there = frozenset(span.arc for span in taken)
@@ -181,6 +186,6 @@ class _Search:
 
     def latest(self, start: Ns, bound: Iterable[RcName]) -> Ns:
         rcs = (*self._named, *(self._state.rc(name) for name in bound))
-        after = (spans[bisect_left(spans, (start + 1,)) :][:1] for spans in (self._taken[rc.bit] for rc in rcs))
-        coming = (span.start for spans in after for span in spans)
-        return max(start, min(coming, default=start + (1 << 62)) - self._wanted.runtime)
+        after = (spans[bisect_left(spans, (start + 1,)) :] for spans in (self._taken[rc.bit] for rc in rcs))
+        before = (span.start - (1 if span.held else self._wanted.runtime) for spans in after for span in spans)
+        return max(start, min(before, default=start + (1 << 62)))

@@ -19,17 +19,20 @@ from zscout.keyexpr import is_pattern, matcher
 from zscout.scheduling.claim_index import ClaimIndex, bits
 from zscout.scheduling.fair_shares import Shares
 from zscout.scheduling.model import Arc, ArcRequest, ArcState, Hold, PatternClass, Rank, Rc, union
+from zscout.scheduling.patience import RuntimeMean
 from zscout.scheduling.queue_index import QueueIndex, Watched
 from zscout.scheduling.reason import Reason
 from zscout.scheduling.votes import HolderSet, Votes
-from zscout.types import ArcId, ClientId, Need, Ns, Params, Place, RcName
+from zscout.types import ArcId, ClientId, Grant, Need, Ns, Params, Place, RcName
 
 
 class SchedulerState:
     """The RCs, the ARCs and their holds. Every change uses these methods."""
 
-    def __init__(self, policy: SchedulingPolicy = DEFAULT) -> None:
-        self.policy = policy
+    def __init__(self, policy: SchedulingPolicy = DEFAULT, *, adaptive: bool = False) -> None:
+        """`adaptive`: preemption has a budget, and sets are weighed by runtime."""
+        self.policy, self.adaptive = policy, adaptive
+        self.runtimes = RuntimeMean()
         self.now: Ns = 0  # the instant of the latest batch of events
         self.votes = Votes()
         self._ends: list[tuple[Ns, ArcId]] = []
@@ -111,10 +114,16 @@ class SchedulerState:
             request = structs.replace(request, min_runtime=longest)
         patterns = tuple(filter(is_pattern, request.needs))
         named = self.mask(need for need in request.needs if need not in patterns)
-        arc = Arc(request, place, named, patterns, named)
+        arc = Arc(request, place, named, patterns, named, since=self.now, patience=self.patience)
         if patterns:
             self.bind(arc, {})
         return arc
+
+    @property
+    def patience(self) -> Ns:
+        """Of an ARC that is queued now; 0 where none is ever due."""
+        fixed = self.policy.patience
+        return self.runtimes.patience(self.now) if fixed == "runtimes" else fixed or 0
 
     def params(self, arc: Arc, rc: Rc) -> Params:
         if rc.name in arc.needs:
@@ -334,6 +343,7 @@ class SchedulerState:
         if arc.state is not ArcState.NEW:
             self.dequeue(arc)
         arc.move_to(ArcState.RUNNING)
+        arc.waited = self.now - arc.since
         arc.hold, arc.reason, arc.since, arc.entry = hold, None, self.now, self._next_entry()
         self._add_running(arc)
         heapq.heappush(self._ends, (hold.end, arc.id))
@@ -370,6 +380,10 @@ class SchedulerState:
             heapq.heappop(self._ends)
         return None
 
+    def next_starving(self) -> Ns | None:
+        is_kept = self.adaptive and self.policy.patience is not None
+        return self.index.next_starving(self.now) if is_kept else None
+
     def min_runtime_over(self, arc: Arc) -> None:
         """From now on equals may preempt a kept hold."""
         self.index.freed |= arc.mask
@@ -395,13 +409,19 @@ class SchedulerState:
 
     def take_policy(self, policy: SchedulingPolicy) -> None:
         charged, same = self.charged(), policy.fair_shares == self.policy.fair_shares
+        patient = policy.patience == self.policy.patience
         for arc in self.by_pattern.values():  # other RCs may be barred now
             self.index.put(arc, ArcState.READY)
             self._declassify(arc)
         self.policy = policy
         for arc in self.by_pattern.values():
             self._classify(arc)
+        if not patient:
+            for arc in self.all_arcs():
+                arc.patience = self.patience
         if same:
+            if not patient:
+                self._put_all(self.shares)
             return
         self.shares = None if policy.fair_shares is None else Shares(self, policy.fair_shares)
         if self.shares is not None:
@@ -425,8 +445,8 @@ class SchedulerState:
 
     def _put(self, arc: Arc, shares: Shares | None) -> None:
         arc.put_at(0 if shares is None else shares.position(arc))
-        fair, patience = self.policy.fair_shares, self.policy.patience
-        arc.late = max(0, fair.patience - patience) if arc.position and fair is not None and patience is not None else 0
+        fair = self.policy.fair_shares if self.policy.patience is not None else None
+        arc.late = max(0, fair.patience - arc.patience) if arc.position and fair is not None else 0
 
     def charged(self) -> dict[str, float]:
         return {} if self.shares is None else self.shares.charged()
@@ -435,11 +455,21 @@ class SchedulerState:
         limit = self.policy.max_runtime
         return None if limit is None else start + limit
 
-    def protected_below(self, arc: Arc) -> int | None:
-        """The priority needed to take a hold granted to `arc` now, before its minimum runtime is over; None: no such
-        rule."""
-        promised = self.policy.promise == "all" and arc.starving
-        return self.policy.operator_priority if promised or self.policy.preempt != "always" else None
+    def hold(self, arc: Arc, grant: Grant, start: Ns, end: Ns, protected_from: Ns | None = None) -> Hold:
+        """A hold granted to `arc` then. `protected_from`: as reported of one that goes on."""
+        policy, budget = self.policy, round(self.policy.preempt_budget * arc.request.min_runtime)
+        below: int | None = policy.operator_priority
+        waited = arc.waited if arc.state is ArcState.RUNNING else start - arc.since
+        if policy.preempt != "always" or (policy.promise == "all" and arc.starving):
+            protected_from = start
+        elif not self.adaptive:
+            below, protected_from = None, 0
+        elif protected_from is not None:
+            arc.lost = max(0, start + budget - protected_from)
+        else:
+            is_due = 0 < arc.patience <= waited - arc.told
+            protected_from = start if is_due else start + max(0, budget - arc.lost)
+        return Hold(grant, start, end, below, self.longest(start), protected_from)
 
     def quota_left(self, arc: Arc) -> int | None:
         quota = self.policy.max_running_per_host

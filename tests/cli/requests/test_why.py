@@ -71,7 +71,8 @@ async def test_the_story_of_an_arc(lab: Lab) -> None:
     twin = await client.request("take", {"robot/nowhere": {}}, min_runtime=1, wait_for_device=True)
     runs, waits = (await zscout_soon("why", "take", env=lab.env)).stdout.split("\n\n")
     assert re.match(rf"{TAKE}, priority 10, has run since ", runs)
-    assert re.search(rf"\n  until {CLOCK} \(.*\), its minimum runtime of 10 min\nHolds\n", runs)
+    protected = f"only operators preempt it from {CLOCK} on"
+    assert re.search(rf"\n  until {CLOCK} \(.*\), its minimum runtime of 10 min\n  {protected}\nHolds\n", runs)
     assert " asked for robot/a at priority 10\n" in runs
     assert f"  id {twin.id}, client test/program, command {COMMAND}\n" in waits
     assert " asked for robot/nowhere at priority 0\n" in waits

@@ -83,6 +83,25 @@ async def test_a_takeover_goes_on_with_what_groups_had() -> None:
     assert (await fleet.state()).charged["ws1"] == pytest.approx(taken["ws1"] + 50, rel=0.05)
 
 
+async def test_a_takeover_goes_on_with_the_patience_and_with_who_is_protected() -> None:
+    fleet = FakeFleet("x", "y", strategy="adaptive")
+    leader, heir = fleet.candidate("x"), fleet.candidate("y")
+    robot = fleet.rc("robot/a")
+    await until(lambda: leader.rcm)
+    await fleet.joined(robot)
+    client = fleet.client("one", "ws1")
+    held = await client.ask("held", "robot/a", seconds=600)
+    client.open = [open_request(held)]
+    assert [holder.protected_from for holder in robot.holders] == [450]
+    await asyncio.sleep(100)
+    assert (await fleet.state()).patience == 28 * 600
+    fleet.network.kill(leader.mesh)
+    await until(lambda: heir.rcm)
+    state = await fleet.state()
+    assert state.patience == 28 * 600
+    assert [hold.protected_from for hold in state.holds] == [pytest.approx(450, abs=1)]
+
+
 async def test_while_most_rcs_see_a_leader_nobody_takes_over() -> None:
     fleet = FakeFleet()
     robots = [fleet.rc(f"robot/{name}", leader=True) for name in "abc"]

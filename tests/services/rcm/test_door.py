@@ -5,14 +5,17 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Mapping
 from decimal import Decimal
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from tests.services.rcm.booked_fleet import do
 from tests.services.rcm.kit import FakeFleet, Refusal, fleet_of, grant_of, request
 from zscout.mesh import Refused
-from zscout.messages import Amounts, Foresee, Foresight, Parameter, Parameters
-from zscout.rcm.door import check_door
+from zscout.messages import Amounts, Foresee, Foresight, Parameter, Parameters, RcState
+from zscout.rcm.devices import ExpectedDevices
+from zscout.rcm.door import Door
 from zscout.types import SECOND
 
 RADIO = [
@@ -30,9 +33,12 @@ KNOWN: dict[str, Parameters | None] = {
 def refusal(*needs: str, waits: bool = False, may_wait: bool = True, params: Mapping[str, float] | None = None) -> str:
     """The code and the text; empty where it is let in."""
     amounts: Amounts = {name: Decimal(str(value)) for name, value in (params or {}).items()}
-    wanted = dict.fromkeys(needs, amounts)
+    wanted, devices = dict.fromkeys(needs, amounts), ExpectedDevices({"anvil": KNOWN})
+    for rc, parameters in KNOWN.items():
+        devices.said(RcState(rc, "anvil", "1", sharable=False, parameters=parameters))
+    nobody: Any = SimpleNamespace(is_known=lambda _: False, reported=lambda _: None)
     try:
-        check_door(wanted, KNOWN, lambda _: False, KNOWN.get, waits=waits, may_wait=may_wait)
+        Door(devices, nobody, 0).check(0, wanted, waits=waits, may_wait=may_wait)
     except Refused as refused:
         return f"{refused.problem.code}: {refused.problem.message}"
     return ""

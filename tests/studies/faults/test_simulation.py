@@ -41,11 +41,11 @@ RC. At 1466 a hold that a forger had made up was vouched for by its second repor
 a leader lost at once what it got there. At 3656 RCs of two hosts used up all terms; at
 963496 RCs beside a liar were lost that had promised another candidate."""
 MISSED = {
-    "order": 15, "grant": 8, "safe first": 1, "snapshots": 8, "step down": 4, "reopen": 2, "places": 2,
-    "withdrawn": 65, "believed": 147, "settling": 8, "deadline": 8, "once": 10, "sealed": 10, "copied": 3,
-    "dates": 343, "merged": 3, "caught up": 4, "one stands": 33, "awaited": 3003, "had again": 13, "dates first": 113,
-    "fleet time": 4, "late": 173, "slewed": 3, "door": 5, "clamped": 25, "certified": 5, "managers": 5,
-    "words": 6, "doubted": 46, "sealed terms": 56, "back": 76,
+    "order": 1, "grant": 8, "safe first": 1, "snapshots": 8, "step down": 4, "reopen": 8, "places": 5,
+    "believed": 70, "settling": 8, "deadline": 8, "once": 10, "sealed": 10, "copied": 3,
+    "merged": 3, "caught up": 4, "one stands": 33, "awaited": 3003, "had again": 13, "dates first": 113,
+    "fleet time": 4, "late": 173, "slewed": 3, "door": 5, "clamped": 5, "certified": 5, "managers": 5,
+    "words": 6, "doubted": 46, "sealed terms": 56, "back": 76, "budget": 6,
 }  # fmt: skip
 """Guards without which some promise breaks within a few runs, and the seed of docs/promises.md, which is tried first;
 `python -m studies faults --without` tries the others."""

@@ -134,10 +134,13 @@ def _until(hold: Mapping[str, Any], priority: int) -> str:
     if left <= 0:
         return "kept for as long as it wants" if stays else "its minimum runtime is over"
     end = f"until {clock(left, at_latest=True)} ({span(left)})"
+    if hold["priority"] < priority and left <= (hold["protected_from"] or 0):
+        return f"protected from preemption {end}"
     return f"{end} at least, and kept for as long as it wants" if stays else f"{end} at the latest"
 
 
 def hold_json(hold: HoldView) -> dict[str, Any]:
     """A hold for programs."""
-    fields = {name: getattr(hold, name) for name in ("arc", "id", "client", "who", "priority", "keep")}
+    names = ("arc", "id", "client", "who", "priority", "keep", "protected_from")
+    fields = {name: getattr(hold, name) for name in names}
     return fields | {"held": round(hold.held, 3), "remaining": round(hold.remaining, 3)}

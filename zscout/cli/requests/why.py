@@ -162,6 +162,9 @@ def _print_standing(arc: dict[str, Any]) -> None:
             left = f"until {_end(arc['remaining'])}, its minimum runtime of {runtime}"
         after = "; it keeps what it has after that" if arc["keep"] else ""
         _say(f"  {left}{after}")
+        if arc["remaining"] > 0 and (protected := arc["protected_from"]) is not None:
+            since = "" if arc["remaining"] <= protected else f" from {terminal.clock(arc['remaining'] - protected)} on"
+            _say(f"  only operators preempt it{since}")
         if (ends := arc.get("ends_in")) is not None:
             _say(
                 f"  it is likely to be given back at {terminal.clock(ends)} (in {terminal.span(ends)}), as others were"

@@ -24,6 +24,7 @@ from zscout.messages import (
     duration,
     exact_amounts,
 )
+from zscout.rcm.steps import Outbox
 from zscout.scheduling.booking import (
     Booking,
     BookingBound,
@@ -39,7 +40,7 @@ from zscout.scheduling.reason import Reason
 from zscout.services.bookings.dates import DAY, Repetition, told
 from zscout.services.bookings.fleet_clock import FleetClock
 from zscout.services.bookings.records import Records
-from zscout.types import SECOND, ArcId, Grant, Need, Ns, RcName
+from zscout.types import SECOND, Grant, Need, Ns, RcName
 
 MAX_CLAIMS = 4_000
 """Dates of all bookings that a leader keeps free: of what is repeated those of the next 60 days."""
@@ -86,13 +87,11 @@ class BookedDates:
     def __init__(self, core: Core, records: Records, clock: FleetClock) -> None:
         self._core, self._records, self.clock = core, records, clock
         self.now: Ns = 0
-        self.changed: list[BookingRecord] = []
-        """Records that are not as they were, until the caller takes them."""
-        self.strange: list[tuple[str, str]] = []
-        """Warnings, each with its subject, until the caller takes them."""
+        self.out = Outbox()
+        """Until the caller takes it."""
         self._conflicts: dict[str, str] = {}
         """Dates that are not kept, with the one that stands; nothing where no RC of a pattern is free."""
-        self._repetitions: dict[str, tuple[BookingRecord, Repetition]] = {}
+        self._repetitions: dict[str, tuple[tuple[object, ...], Repetition]] = {}
         self._expanded: dict[str, _Expanded] = {}
         self._sent: frozenset[str] = frozenset()
         """Dates that the core knows of."""
@@ -158,13 +157,14 @@ class BookedDates:
         try:
             return self._repetition(record).between(time - float(record.runtime), time + _ahead(record))
         except (ValueError, OverflowError) as error:
-            self.strange.append((record.id, f"booking {record.id} is not kept: {error}"))
+            self.out.strange.append((record.id, f"booking {record.id} is not kept: {error}"))
             return None
 
     def _repetition(self, record: BookingRecord) -> Repetition:
+        rule = record.start, record.every, record.until, record.zone
         known = self._repetitions.get(record.id)
-        if known is None or not _repeats_alike(known[0], record):
-            known = self._repetitions[record.id] = record, Repetition(record)
+        if known is None or known[0] != rule:
+            known = self._repetitions[record.id] = rule, Repetition(record)
         return known[1]
 
     def until_another(self) -> float:
@@ -216,7 +216,7 @@ class BookedDates:
         self._expanded = {known.record.id: known for known in expanded}
         found = [booking for known in expanded for booking in known.bookings]
         if len(found) > MAX_CLAIMS:
-            self.strange.append(("", f"more than {MAX_CLAIMS} dates are booked: the last are not kept"))
+            self.out.strange.append(("", f"more than {MAX_CLAIMS} dates are booked: the last are not kept"))
         return found[:MAX_CLAIMS]
 
     def _expand(self, record: BookingRecord, taken: Collection[str]) -> _Expanded:
@@ -234,7 +234,7 @@ class BookedDates:
                 ]
                 bookings = [replace(one, patience=one.runtime) if one.id in taken else one for one in bookings]
         except ValueError as error:
-            self.strange.append((record.id, f"booking {record.id} is not kept: {error}"))
+            self.out.strange.append((record.id, f"booking {record.id} is not kept: {error}"))
         coming, ahead = math.inf, _ahead(record)
         if not record.unbooked and (bookings or not dates):
             with suppress(ValueError, OverflowError):  # logged by `_starts`
@@ -250,17 +250,13 @@ class BookedDates:
         before, self._sent = self._sent, frozenset(booking.id for booking in ranked)
         # What is only forgotten here, as it could be kept nowhere, another host may have.
         gone = before - self._sent
-        event = Dates(ranked, frozenset(name for name in gone if not self._has(name)))
+        event = Dates(ranked, frozenset(name for name in gone if self.date(name) is None))
         for name in gone:
             self._conflicts.pop(name, None)
             self._danger.pop(name, None)
         if len(self._repetitions) > 2 * len(self._records) + 64:
             self._repetitions = {name: known for name, known in self._repetitions.items() if self._records.get(name)}
         return event
-
-    def _has(self, name: str) -> bool:
-        """Whether there is a record of the booking whose date this is."""
-        return self._records.get(name.partition("@")[0]) is not None
 
     def redate(self) -> tuple[list[Dates], bool]:
         """Puts right the dates that fleet time, which was slewed, has moved; and whether another time goes on, by which
@@ -284,7 +280,7 @@ class BookedDates:
         changed = self.number()
         new = replace(record, changed=changed, **to)
         self._records.take([new])
-        self.changed.append(new)
+        self.out.changed.append(new)
         return self._records.get(record.id) or new
 
     def note(self, effects: Iterable[Effect], *, settled: bool) -> bool:
@@ -331,7 +327,10 @@ class BookedDates:
         return None if record is None else Date(record, int(start))
 
     def _conflict(self, by: str) -> str:
-        return f"{self._name(by)} takes precedence" if by else "no matching device is free then"
+        if not by:
+            return "no matching device is free then"
+        date = self.date(by)
+        return f"{by if date is None else f'{date.record.name} of {date.record.owner}'} takes precedence"
 
     # For people and programs
 
@@ -353,14 +352,6 @@ class BookedDates:
         fields = {name: getattr(record, name) for name in BookingView.__struct_fields__ if name != "dates"}
         return BookingView(**fields, dates=told)
 
-    def _name(self, date: str) -> str:
-        record = self._records.get(date.partition("@")[0])
-        return date if record is None else f"{record.name} of {record.owner}"
-
-    def taken_by(self, date: Date) -> ArcId | None:
-        kept = self._core.booking(date.id)
-        return kept.arc if kept is not None else None
-
 
 def start_of(name: str) -> Instant | None:
     """When the date begins that the core calls so, as others may tell of it; None: it is none."""
@@ -370,7 +361,3 @@ def start_of(name: str) -> Instant | None:
 
 def _ahead(record: BookingRecord) -> float:
     return WINDOW if record.every else MAX_AHEAD + DAY  # the clock that it was booked by may have been ahead
-
-
-def _repeats_alike(one: BookingRecord, other: BookingRecord) -> bool:
-    return (one.start, one.every, one.until, one.zone) == (other.start, other.every, other.until, other.zone)

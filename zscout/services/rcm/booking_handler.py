@@ -33,7 +33,7 @@ from zscout.messages import (
 from zscout.rcm.admission import Admission
 from zscout.rcm.door import Door
 from zscout.rcm.places import request_id
-from zscout.rcm.steps import Keep, Outbox, Proposed, Ticket
+from zscout.rcm.steps import Keep, Proposed, Ticket
 from zscout.scheduling.booking import Booking
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import Propose
@@ -62,7 +62,7 @@ class _Undecided:
 
 
 class BookingHandler:
-    """What follows from operations is in `out`, until the caller takes that."""
+    """What follows from operations is in `out` of the dates, until the caller takes that."""
 
     def __init__(
         self,
@@ -80,7 +80,6 @@ class BookingHandler:
         """What is known of how long holds last, for hints."""
         self.undecided: list[_Undecided] = []
         self._keeping = 0
-        self.out = Outbox()
 
     def operation(self, ticket: Ticket, sender: Sender, operation: Operation) -> None:
         """Takes one in; the core is at the present time. Raises Refused."""
@@ -175,12 +174,12 @@ class BookingHandler:
                 bound[date.start] = dict(found.found[0].bound)
         if unknown:
             for claim, votes in unknown:
-                self.out.proposals += map(self.proposal, self._core.ask_votes(votes, claim))
+                self._dates.out.proposals += map(self.proposal, self._core.ask_votes(votes, claim))
             return False
         self._dates.change(record, kept=bound)
-        self.out.events.append(self._dates.reconcile())
+        self._dates.out.events.append(self._dates.reconcile())
         when = told(record.start, record.zone)
-        self.out.log.append(f"{record.owner} books {record.name}: {', '.join(record.needs)} at {when}")
+        self._dates.out.log.append(f"{record.owner} books {record.name}: {', '.join(record.needs)} at {when}")
         self._answer_kept(ticket, record, withdraw=True)
         return True
 
@@ -201,7 +200,7 @@ class BookingHandler:
         if self._keeping >= MAX_UNDECIDED:
             raise Refused("busy", f"{MAX_UNDECIDED} bookings are already being stored; try again")
         self._keeping += 1
-        self.out.keep.append(Keep(ticket, record.id, withdraw))
+        self._dates.out.keep.append(Keep(ticket, record.id, withdraw))
 
     def kept(self, keep: Keep, why: str) -> None:
         """A record is kept, or not: `why`."""
@@ -211,11 +210,11 @@ class BookingHandler:
             if record is not None and keep.withdraw:
                 # Not given up, which is final: another leader may have made it as well, or may have heard of it.
                 self._records.remove(keep.booking)
-                self.out.events.append(self._dates.reconcile())
+                self._dates.out.events.append(self._dates.reconcile())
             refused = Refused("not_kept", f"no other host stored this booking: {why or 'it is over'}")
             self._refuse(keep.ticket, refused)
         else:
-            self.out.answers.append((keep.ticket, self._dates.view(record)))
+            self._dates.out.answers.append((keep.ticket, self._dates.view(record)))
 
     # Giving up
 
@@ -233,7 +232,7 @@ class BookingHandler:
         else:
             date = told(operation.start, record.zone)
             raise Refused("bad_date", f"{date} is not a date of {record.name}; see zscout booking list")
-        self.out.events.append(self._dates.reconcile())
+        self._dates.out.events.append(self._dates.reconcile())
         self._answer_kept(ticket, new)
 
     # Looking for a time
@@ -255,7 +254,7 @@ class BookingHandler:
     def _answer_slots(self, ticket: Ticket, asked: FindSlots, wanted: Booking, until: Ns) -> bool:
         found = self._core.slots(wanted, until, asked.limit)
         if found.unknown:
-            self.out.proposals += map(self.proposal, self._core.ask_votes(found.unknown, wanted))
+            self._dates.out.proposals += map(self.proposal, self._core.ask_votes(found.unknown, wanted))
             return False
         slots = []
         for one in found.found:
@@ -265,7 +264,7 @@ class BookingHandler:
         likely = None if guess is None else -(-self._dates.to_fleet(guess) // SECOND)
         if likely is not None and slots and likely >= slots[0].start:
             likely = None
-        self.out.answers.append((ticket, SlotsTold(asked.id, self._dates.time, slots, found.complete, likely)))
+        self._dates.out.answers.append((ticket, SlotsTold(asked.id, self._dates.time, slots, found.complete, likely)))
         return True
 
     # Votes
@@ -306,7 +305,7 @@ class BookingHandler:
         return Proposed(asked.rc, Proposal(proposal=asked.proposal, term=self._core.term, holders=holders))
 
     def _refuse(self, ticket: Ticket, refused: Refused) -> None:
-        self.out.answers.append((ticket, refused.problem))
+        self._dates.out.answers.append((ticket, refused.problem))
 
     @property
     def _now(self) -> Ns:
@@ -326,7 +325,7 @@ class BookingHandler:
             raise Refused("unknown_booking", f"no booking {booking}, or it was cancelled; see zscout booking list")
         self._admission.check_take_up(ask, sender, record)
         dates_ = [date for date in self._dates.standing(record) if not start or str(date.start) == start]
-        free = [date for date in dates_ if self._dates.taken_by(date) is None]
+        free = [date for date in dates_ if (kept := self._core.booking(date.id)) is None or kept.arc is None]
         if free:
             return free[0].id
         if goes_on:

@@ -100,10 +100,6 @@ class BookingSharing:
         """At the present time."""
         return self._bookings.at(self._mesh.now())
 
-    @property
-    def _settled(self) -> bool:
-        return self.bookings.settled
-
     def _answer(self, query: IncomingQuery[BookingsAsk]) -> None:
         asked, bookings = query.message, self.bookings
         views = bookings.handler.views(asked.owner, asked.rc)
@@ -155,7 +151,7 @@ class BookingSharing:
         """Tells all keepers, and hears what they know. Returns why what was told is not kept; empty: it is."""
         keeper, mesh = self._keeper, self._mesh
         sent, self._unshared = self._unshared, {}
-        time = self._clock.at(mesh.now()) / SECOND if self._settled else None
+        time = self._clock.at(mesh.now()) / SECOND if self.bookings.settled else None
         if time is not None:
             # All forget by the time of one question: else what one has forgotten came back from another.
             keeper.records.forget_old(time)
@@ -203,7 +199,7 @@ class BookingSharing:
             # This reign began where nobody knew the time of the others.
             self._clock.since = now - round(found[0] * SECOND)
             self._clock.step(found[1], now)
-        elif self._settled or age > (now - self._begun) / SECOND + SAME:
+        elif self.bookings.settled or age > (now - self._begun) / SECOND + SAME:
             self._clock.aim(agreed(map(wall_ns, walls.values()), self._clock.at(now)), now)
         else:
             self._clock.step(agreed(map(wall_ns, walls.values())), now)

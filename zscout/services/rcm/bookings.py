@@ -131,9 +131,9 @@ class Bookings:
             if len(self.handler.undecided) > before:
                 self._deadlines.set(self.handler.undecided[-1].until + SLACK, (_Due.TRY, None))
         except Refused as refused:
-            self.handler.out.answers.append((ticket, refused.problem))
+            self.dates.out.answers.append((ticket, refused.problem))
         except BadName as error:
-            self.handler.out.answers.append((ticket, Problem("bad_name", str(error))))
+            self.dates.out.answers.append((ticket, Problem("bad_name", str(error))))
         return self._out()
 
     def again(self, again: Again) -> Outbox:
@@ -148,7 +148,7 @@ class Bookings:
         """All keepers were asked; or there is news: others know what was not known here."""
         if not news:
             events, news = self.dates.redate()
-            self.handler.out.events += events
+            self.dates.out.events += events
         if news:
             self._once(_Due.NEWS, 0)
         return self._out()
@@ -180,8 +180,8 @@ class Bookings:
                     self._await_another()
                 case (_Due.TRY, _):
                     again, self.handler.undecided = self.handler.undecided, []
-                    self.handler.out.then += map(Again, again)
-                    self.handler.out.events += [Tick()] if again else []
+                    self.dates.out.then += map(Again, again)
+                    self.dates.out.events += [Tick()] if again else []
                 case (_Due.TELL, _):
                     self._tell()
         return self._out()
@@ -192,13 +192,11 @@ class Bookings:
             self._deadlines.set(self.dates.now + delay, (due, None))
 
     def _out(self) -> Outbox:
-        out, self.handler.out = self.handler.out, Outbox()
-        out.changed, self.dates.changed = self.dates.changed, []
-        out.strange, self.dates.strange = self.dates.strange, []
+        out, self.dates.out = self.dates.out, Outbox()
         return out
 
     def _reconcile(self) -> None:
-        self.handler.out.events.append(self.dates.reconcile())
+        self.dates.out.events.append(self.dates.reconcile())
         self._tell_soon()
         self._await_another()
 
@@ -226,7 +224,7 @@ class Bookings:
             BookedDanger(*min(dates, key=lambda date: date.start), why, len(dates) - 1)
             for (_, why), dates in news.items()
         ]
-        self.handler.out.dangers += sorted(found, key=lambda danger: (danger.start, danger.record.id, danger.why))
+        self.dates.out.dangers += sorted(found, key=lambda danger: (danger.start, danger.record.id, danger.why))
 
 
 def bookings_of(

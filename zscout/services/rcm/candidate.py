@@ -379,6 +379,7 @@ class Candidate:
             log.info("%s", remark)
         if (fair := self.fleet.scheduling.fair_shares) is not None:
             recovered.charged = self.learned.charged(self.mesh.now(), fair.half_life)
+        recovered.patience = self.learned.patience
         recovered.patient = self.election.links_return(self.mesh.now())
         self.terms.highest = term
         rcm = Rcm(

@@ -134,7 +134,7 @@ class Election:
         host that is cut off, that is once more a silence."""
         if others:
             self._alone_since = None
-            yields = now < self._yields_until and (self._heard_lately(now) or any(others))
+            yields = now < self._yields_until and (self.heard_within(self.silence, now) or any(others))
             return yields or sum(others) * 2 > len(others)
         if (
             self._led
@@ -163,9 +163,6 @@ class Election:
     def heard_within(self, span: Ns, now: Ns) -> bool:
         """Whether a leader that counts was seen or heard so lately."""
         return self._heard is not None and now - self._heard < span
-
-    def _heard_lately(self, now: Ns) -> bool:
-        return self.heard_within(self.silence, now)
 
     def next_try(self, now: Ns) -> Ns | None:
         """When to try to lead: now or earlier means at once, None not while things stay as they are."""

@@ -9,7 +9,7 @@ from zscout.scheduling.fair_shares import decayed
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.journal.journal import Journal
 from zscout.services.rcm.observed_runtimes import RuntimeObserver
-from zscout.types import Ns
+from zscout.types import SECOND, Ns
 
 
 class Learned:
@@ -17,6 +17,8 @@ class Learned:
         self.keeper, self.runtimes, self._journal = keeper, runtimes, journal
         self._charged: tuple[Mapping[str, float], Ns] = {}, 0
         """What groups had, by the last publication of it, and when that came."""
+        self.patience: Ns | None = None
+        """The last that was published."""
 
     def hear(self, now: Ns, grants: Grants) -> None:
         """A publication, of a term that is believed."""
@@ -24,6 +26,8 @@ class Learned:
         self.runtimes.hear(now, grants)
         if grants.charged:
             self._charged = grants.charged, now
+        if grants.patience is not None:
+            self.patience = round(grants.patience * SECOND)
         if self._journal is not None:
             self._journal.hear(grants)
 

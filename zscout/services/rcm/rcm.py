@@ -32,7 +32,7 @@ from zscout.rcm.state_view import MAX_REASON, StateView
 from zscout.rcm.steps import BookedDanger, Keep, Question, Ticket
 from zscout.rcm.terms import Verdict, Word
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import Event, Vote, VoteOverdue
+from zscout.scheduling.model import Vote, VoteOverdue
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.services.bookings.keeper import BookingKeeper
@@ -200,7 +200,7 @@ class Rcm:
         self.supervisor.cancel()
         if self._parts.inventory is None:
             self.inventory.stop()
-        if text := self.leader.close(self.mesh.now()):
+        if text := self.leader.registry.close(self.mesh.now()):
             log.info("%s", text)
         self.sharing.close()
         queries, self._open = self._open, {}
@@ -232,10 +232,6 @@ class Rcm:
     def _now_take(self, stimulus: steps.Stimulus) -> None:
         self._coming.append(stimulus)
         self._run()
-
-    def _receive(self, *events: Event) -> None:
-        """Events of one instant, decided at once."""
-        self._now_take(steps.Happened(events))
 
     def _concerns(self, query: IncomingQuery[messages.Operation]) -> tuple[Lane, str]:
         """Dry runs and slots are questions; an operation on another host's request waits behind that host's surplus."""
@@ -339,7 +335,10 @@ class Rcm:
     def _publish(self, grants: messages.Grants) -> None:
         if (grants.rcs or grants.revoked) and trace.enabled():
             holders = {
-                rc: [(held.grant, f"{held.client}/{held.id}", held.place, held.rcs) for held in holders]
+                rc: [
+                    (held.grant, f"{held.client}/{held.id}", held.place, held.rcs, held.remaining, held.protected_from)
+                    for held in holders
+                ]
                 for rc, holders in grants.rcs.items()
             }
             ends = [(revoked.grant, revoked.outcome) for revoked in grants.revoked]
@@ -380,7 +379,8 @@ class Rcm:
         rc, proposal = proposed
         vote_timeout = self.fleet.timing.vote_timeout / SECOND
         # Overdue once; an answer that comes before the query ends still counts.
-        overdue = self.supervisor.call_later(vote_timeout, self._receive, VoteOverdue(proposal.proposal))
+        over = steps.Happened([VoteOverdue(proposal.proposal)])
+        overdue = self.supervisor.call_later(vote_timeout, self._now_take, over)
         voted = partial(self.supervisor.guard(self._on_ballot), rc, proposal.proposal, overdue)
         late = max(LATE_VOTE, 2 * vote_timeout)
         try:
