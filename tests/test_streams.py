@@ -149,15 +149,14 @@ def test_variables_that_steer_zenoh_are_not_left_to_other_programs() -> None:
 
 
 @pytest.mark.live
-def test_too_few_descriptors_are_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize("program", ["zscout-node", "zscout"])
+def test_too_few_descriptors_are_one_line(program: str, tmp_path: Path) -> None:
     (tmp_path / "n.toml").write_text('[node]\nhost = "n"\n')
-    limited = ["sh", "-c", 'ulimit -n 20; exec "$@"', "sh"]
-    for module, words in ("zscout.node", [str(tmp_path / "n.toml")]), ("zscout.cli.main", ["status"]):
-        command = [*limited, sys.executable, "-m", module, *words]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=HANG)
-        program = "zscout-node" if words[0] != "status" else "zscout"
-        why = "the mesh can't be joined: Too many open files; raise the limit (ulimit -n, in a unit LimitNOFILE=)"
-        assert (done.returncode, done.stderr) == (1, f"{program}: {why}\n")
+    words = ["zscout.cli.main", "status"] if program == "zscout" else ["zscout.node", str(tmp_path / "n.toml")]
+    command = ["sh", "-c", 'ulimit -n 20; exec "$@"', "sh", sys.executable, "-m", *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=HANG)
+    why = "the mesh can't be joined: Too many open files; raise the limit (ulimit -n, in a unit LimitNOFILE=)"
+    assert (done.returncode, done.stderr) == (1, f"{program}: {why}\n")
 
 
 def test_where_threads_are_too_few_those_that_were_tried_end(monkeypatch: pytest.MonkeyPatch) -> None:
