@@ -8,6 +8,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from decimal import Decimal
 from pathlib import Path
 
@@ -15,6 +16,8 @@ import pytest
 
 from tests.hang import HANG
 from zscout.behaviors.guardian import GUARD
+from zscout.mesh import MeshError
+from zscout.mesh.zenoh_mesh import open_session
 from zscout.streams import escape_what_cannot_be_written
 from zscout.terminal import Table, print_json, print_line
 
@@ -143,3 +146,29 @@ def test_variables_that_steer_zenoh_are_not_left_to_other_programs() -> None:
         assert (done.returncode, done.stderr) == (0, "")
         seen = {line.partition("=")[0] for line in done.stdout.splitlines()}
         assert seen ^ env.keys() <= {"_", "LC_CTYPE"}
+
+
+@pytest.mark.live
+@pytest.mark.parametrize("program", ["zscout-node", "zscout"])
+def test_too_few_descriptors_are_one_line(program: str, tmp_path: Path) -> None:
+    (tmp_path / "n.toml").write_text('[node]\nhost = "n"\n')
+    words = ["zscout.cli.main", "status"] if program == "zscout" else ["zscout.node", str(tmp_path / "n.toml")]
+    command = ["sh", "-c", 'ulimit -n 20; exec "$@"', "sh", sys.executable, "-m", *words]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=HANG)
+    why = "the mesh can't be joined: Too many open files; raise the limit (ulimit -n, in a unit LimitNOFILE=)"
+    assert (done.returncode, done.stderr) == (1, f"{program}: {why}\n")
+
+
+def test_where_threads_are_too_few_those_that_were_tried_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    start, started = threading.Thread.start, list[threading.Thread]()
+
+    def limited(thread: threading.Thread) -> None:
+        if len(started) == 3:
+            raise RuntimeError("can't start new thread")
+        started.append(thread)
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", limited)
+    with pytest.raises(MeshError, match="no more threads can be started; end some processes"):
+        open_session(pytest.fail)
+    assert not any(thread.is_alive() for thread in started)

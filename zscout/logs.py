@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
 import sys
 from types import TracebackType
 from typing import Final
@@ -13,13 +15,46 @@ _Fault = tuple[type[BaseException], BaseException, TracebackType | None] | tuple
 FORM: Final = "%(asctime)s %(levelname)s %(message)s"
 
 
+REMEDIES: Final = {
+    errno.ENOSPC: "free some",
+    errno.EDQUOT: "free some",
+    errno.EFBIG: "raise the limit (ulimit -f)",
+    errno.EROFS: "name a folder that can be written",
+    errno.EMFILE: "raise the limit (ulimit -n, in a unit LimitNOFILE=)",
+    errno.ENFILE: "end some programs of this host",
+    errno.ENOMEM: "free some",
+    errno.EAGAIN: "end some processes, or raise the limit (ulimit -u, in a unit TasksMax=)",
+}
+
+
+def shortage(error: BaseException | None) -> str:
+    """In words, what this host lacks for what has failed, and the remedy; empty for other errors, where the traceback
+    may help."""
+    if isinstance(error, BaseExceptionGroup):
+        return next(filter(None, map(shortage, error.exceptions)), "")
+    if isinstance(error, RuntimeError) and "start new thread" in str(error):
+        error = OSError(errno.EAGAIN, "no more threads can be started")
+    elif isinstance(error, MemoryError):
+        error = OSError(errno.ENOMEM, "there is no memory left")
+    if not isinstance(error, OSError):
+        return ""
+    file = f": {os.fsdecode(error.filename)}" if isinstance(error.filename, str | bytes) else ""
+    remedy = (
+        "mount /proc so that this user can read it" if file.startswith(": /proc/") else REMEDIES.get(error.errno or 0)
+    )
+    return f"{error.strerror}{file}; {remedy}" if remedy else ""
+
+
 class LineFormatter(logging.Formatter):
-    """Control and bidi characters are left out; a traceback follows in indented lines."""
+    """Control and bidi characters are left out; a traceback follows in indented lines, but not of a shortage."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - logging's name
-        return clean(super().formatMessage(record))
+        why = shortage(record.exc_info[1]) if record.exc_info else ""
+        return clean(super().formatMessage(record) + (f": {why}" if why else ""))
 
     def formatException(self, ei: _Fault) -> str:  # noqa: N802 - logging's name
+        if shortage(ei[1]):
+            return ""
         return "\n".join(f"  {clean(line)}" for line in super().formatException(ei).splitlines())
 
 

@@ -35,7 +35,7 @@ from zscout.drivers.lock import only_here
 from zscout.drivers.registry import driver_for, driver_name
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
-from zscout.logs import log_to_stderr
+from zscout.logs import log_to_stderr, shortage
 from zscout.mesh import Mesh, MeshError, ZenohMesh
 from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.messages import LoadReport
@@ -319,9 +319,12 @@ def main(file: Path | None, check: bool, log_level: str) -> None:
             click.echo(f"{node.host} of fleet {node.fleet.name}: {file or 'the defaults'} can be used here")
             return
         uvloop.run(_main(reload, manager))
-    except (BadInput, MeshError, NodeFailed) as error:
-        manager.stopping(str(error))
-        click.echo(f"zscout-node: {clean(str(error))}", err=True)
+    except Exception as error:
+        words = str(error) if isinstance(error, (BadInput, MeshError, NodeFailed)) else shortage(error)
+        if not words:
+            raise
+        manager.stopping(words)
+        click.echo(f"zscout-node: {clean(words)}", err=True)
         sys.exit(2 if isinstance(error, BadInput) else 1)
 
 

@@ -6,7 +6,7 @@ import os
 import signal
 import socket
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import IO
@@ -51,12 +51,14 @@ class Guarded:
 
 
 @contextmanager
-def guarded(*command: str, grace: float = 0.2, until: int | None = None) -> Iterator[Guarded]:
+def guarded(
+    *command: str, grace: float = 0.2, until: int | None = None, before: Sequence[str] = ()
+) -> Iterator[Guarded]:
     ours, theirs = socket.socketpair()
     with closing(theirs):
         if until is not None:
             ours.send(f"until {until}\n".encode())
-        start = [*GUARD, str(theirs.fileno()), "-1", str(round(grace * SECOND)), *command]
+        start = [*before, *GUARD, str(theirs.fileno()), "-1", str(round(grace * SECOND)), *command]
         guardian = subprocess.Popen(
             start, pass_fds=[theirs.fileno()], stdout=subprocess.PIPE, text=True, process_group=0
         )
@@ -233,3 +235,23 @@ def test_what_can_not_be_executed_is_said_with_its_code(tmp_path: Path) -> None:
         assert command.hears_rest()[1:] == ["exited 127", "gone"]
     with guarded(str(tmp_path)) as command:
         assert command.hears_rest()[1:] == ["exited 126", "gone"]
+
+
+HIDDEN = ("unshare", "--mount", "sh", "-c", 'mount -t tmpfs none /proc && exec "$@"', "sh")
+"""Runs the arguments behind it with an empty /proc."""
+
+
+@pytest.mark.live
+@pytest.mark.parametrize("own_session", [False, True])
+def test_where_proc_is_hidden_its_group_is_ended_and_what_left_it_is_named(own_session: bool, tmp_path: Path) -> None:
+    if subprocess.run([*HIDDEN, "true"], check=False, capture_output=True).returncode:
+        pytest.skip("only root may hide /proc")
+    start = f"trap '' TERM; {'setsid ' * own_session}sleep 1000 & echo $! > $0/child"
+    with guarded(*shell(tmp_path, start), before=HIDDEN) as run:
+        assert run.hears().startswith("started ")
+        assert run.hears() == "exited 0"
+        if own_session:
+            assert run.hears() == "stuck 0"
+            os.kill(pid_in(tmp_path / "child"), signal.SIGKILL)
+        assert run.hears_rest() == ["gone"]
+        assert not lives(pid_in(tmp_path / "child"))

@@ -62,6 +62,12 @@ def plain() -> Admission:
     return Admission(fleet.limits, Authority(fleet), Places("test", None, LATER))
 
 
+def secured() -> Admission:
+    access = AccessPolicy(Roles(client=("h",), manager=("m",)))
+    fleet = structs.replace(default_fleet(), security=Path("keys"), access=access)
+    return Admission(fleet.limits, Authority(fleet), Places("test", None, LATER))
+
+
 def recover_plain(states: list[RcState], clients: list[ClientRequests], now: Ns) -> RecoveredState:
     return recover(states, clients, now, plain())
 
@@ -253,13 +259,31 @@ def test_requests_of_two_clients_may_share_an_id() -> None:
 @pytest.mark.parametrize("vouched", [True, False])
 def test_a_hold_known_from_rcs_only_is_not_vouched_for_by_another_report(vouched: bool) -> None:
     """With certificates. A run of the fault simulator (seed 1466) found it."""
-    access = AccessPolicy(Roles(client=("h",), manager=("m",)))
-    fleet = structs.replace(default_fleet(), security=Path("keys"), access=access)
-    admission = Admission(fleet.limits, Authority(fleet), Places("test", None, LATER))
     request = ArcRequest("h/one/gang-id", "h/one", {"robot/a": {}}, 3, 60 * SECOND)
     known = ArcStatus(request, PLACE, None, request.needs, {}, NOW, 0, 0, None, None, vouched)
-    found = recover([rc("robot/a", hold(ALONE))], [], NOW, admission, known=lambda _: known)
+    found = recover([rc("robot/a", hold(ALONE))], [], NOW, secured(), known=lambda _: known)
     assert [(held.vouched, held.place) for held in found.holds] == [(vouched, PLACE if vouched else None)]
+
+
+LIES = {
+    "the same": hold(("video/lie",)),
+    "the same, of a wider gang": hold((*GANG, "video/lie")),
+    "the same, without itself": hold(GANG),
+    "the same, with patterns": hold(("video/lie",), bound={"video/*": "video/lie", "*/lie": "video/lie"}),
+    "newer": hold(("video/lie",), seq=6),
+    "newer, of a wider gang": hold((*GANG, "video/lie"), seq=6),
+    "newer, of a gang that is not there": hold(("video/lie", "robot/z"), seq=6),
+    "shorter": hold((*GANG, "video/lie"), remaining=0),
+}
+
+
+@pytest.mark.parametrize("lie", LIES.values(), ids=LIES.keys())
+@pytest.mark.parametrize("first", [True, False])
+def test_a_node_ends_no_hold_of_others_by_claiming_it(lie: Holder, first: bool) -> None:
+    """With certificates: an RC's word counts for the gangs that it is in, and the grant that a client lists first."""
+    liar, listed = rc("video/lie", lie), client(asked(grant=Grant(TERM, 5), rcs=list(GANG)))
+    found = recover([liar, *BOTH] if first else [*BOTH, liar], [listed], NOW, secured())
+    assert [({*held.request.needs}, held.end - NOW) for held in found.holds] == [({*GANG}, 10 * SECOND)]
 
 
 def test_what_goes_on_at_another_client_is_believed_of_no_request_that_waits() -> None:

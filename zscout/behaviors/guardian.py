@@ -11,7 +11,8 @@ when COMMAND itself has ended. `gone` is said when the last process of the tree 
 Words on CHANNEL are lines. From the client: `until NS` (the deadline, by the clock of `now`; the first stands there
 before the guardian starts), `end NS` (the grace counts from then), `kill` (without grace), `continue`. To it:
 `started PID`, `stopped SIGNAL`, `ending WHY` (`deadline`, `client`, `signal`: sent to the guardian), `exited CODE` (of
-COMMAND alone; negative: by that signal), `stuck PID` (it runs as another user, and can't be ended), `gone`.
+COMMAND alone; negative: by that signal), `stuck PID` (it runs as another user, and can't be ended; 0: /proc shows no
+process, and something lives), `gone`.
 
 Where the client can't, being gone or frozen, the guardian becomes the program that tells the RCs that all is gone. It
 imports nothing of zscout itself, to start quickly.
@@ -116,7 +117,10 @@ class Descendant:
 def descendants(root: int) -> list[Descendant]:
     """All that live, parents before their children."""
     children: dict[int, list[Descendant]] = {}
-    for name in os.listdir("/proc"):  # noqa: PTH208
+    names: list[str] = []
+    with suppress(OSError):  # /proc is hidden: no descendant can be named
+        names = os.listdir("/proc")  # noqa: PTH208
+    for name in names:
         if name.isdigit():
             try:
                 one = Descendant(int(name))
@@ -129,6 +133,11 @@ def descendants(root: int) -> list[Descendant]:
         found += children.get(pid, ())
         pids += [one.pid for one in children.get(pid, ())]
     return [one for one in found if not one.dead]
+
+
+def is_hidden() -> bool:
+    """Whether /proc shows no process, not even this one: those in sessions of their own can't be found and ended."""
+    return not os.path.exists(f"/proc/{os.getpid()}/stat")  # noqa: PTH110
 
 
 def be_subreaper() -> None:
@@ -192,8 +201,8 @@ class Guardian:
         """Why all of it is to end, once it is."""
         self._since, self._told = 0, False
         self._group = ControlGroup()
-        self._leader = 0
-        """The command, until it was waited for; from then on its number may be another's."""
+        self._leader = self._command = 0
+        """The command, until it was waited for; from then on its number may be another's. And its group."""
         self._pause, self._round = ROUND, 0
         """Between two rounds of SIGKILL, and when the next one is."""
         self._stuck: set[int] = set()
@@ -220,7 +229,7 @@ class Guardian:
     def _start(self, tty: int, command: list[str]) -> None:
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGCHLD, *ENDS_US})
         guardian = os.getpid()
-        self._leader = os.fork()
+        self._leader = self._command = os.fork()
         if self._leader == 0:
             try:
                 self._become(guardian, tty, command, mask)
@@ -321,8 +330,8 @@ class Guardian:
         if self._why:
             self._say(f"ending {self._why}")
         # To a group at once: a shell that sees its command die must have been told itself.
-        self._to_group(signal.SIGTERM)
-        rest = [one for one in descendants(os.getpid()) if one.group != self._leader]
+        group = self._command if self._to_group(signal.SIGTERM) else 0
+        rest = [one for one in descendants(os.getpid()) if one.group != group]
         for number in (signal.SIGTERM, signal.SIGCONT):  # a stopped process gets the first only when it goes on
             for one in rest:
                 with suppress(PermissionError):
@@ -331,8 +340,10 @@ class Guardian:
 
     def _kill(self) -> None:
         """SIGKILL to all that there are; whoever was forked meanwhile has it the next time."""
-        self._to_group(signal.SIGKILL)
         self._group.kill()
+        if not self._to_group(signal.SIGKILL) and not self._stuck and is_hidden():
+            self._stuck.add(0)
+            self._say("stuck 0")
         for one in descendants(os.getpid()):
             try:
                 one.signal(signal.SIGKILL)
@@ -341,10 +352,14 @@ class Guardian:
                     self._stuck.add(one.pid)
                     self._say(f"stuck {one.pid}")
 
-    def _to_group(self, number: int) -> None:
-        if self._leader:
-            with suppress(ProcessLookupError, PermissionError):
-                os.killpg(self._leader, number)
+    def _to_group(self, number: int) -> bool:
+        """To the command's group, if that is still its: it is while the command, or another child, is in it."""
+        with suppress(ChildProcessError, ProcessLookupError, PermissionError):
+            if not self._leader:
+                os.waitid(os.P_PGID, self._command, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+            os.killpg(self._command, number)
+            return True
+        return False
 
     def _ask(self, why: str, since: int = 0) -> None:
         """All of it is to end; the first reason counts."""

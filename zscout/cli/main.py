@@ -23,6 +23,7 @@ import click
 
 from zscout import __version__
 from zscout.cli.groups import Headings, LazyGroup, instead
+from zscout.logs import shortage
 from zscout.streams import escape_what_cannot_be_written
 
 HEADINGS: Final[Headings] = {
@@ -140,8 +141,8 @@ def explain(error: BaseException) -> tuple[int, str] | None:
     """The exit code and the line for an error that people can mend; None: a bug, to be shown in full."""
     if isinstance(error, OSError) and _nobody_reads(error):
         return COULD_NOT, ""
-    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-        return COULD_NOT, f"zscout: {error.strerror}{f': {error.filename}' if error.filename else ''}; free some"
+    if why := shortage(error):
+        return COULD_NOT, f"zscout: {why}"
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         return BAD_INPUT, error.format_message()
     if isinstance(error, click.UsageError):

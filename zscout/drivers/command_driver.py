@@ -222,7 +222,10 @@ async def run_bounded(words: Words, env: Mapping[str, str], timeout: float, give
     """Runs a program in a session of its own, for `timeout` seconds at most, and less if something is to go before it.
     With it ends all that is in its process group, also where this is cancelled."""
     began = time.monotonic()
-    reading, writing = os.pipe()
+    try:
+        reading, writing = os.pipe()
+    except OSError as error:
+        return Ended(f"can't be run: {words[0]}: {error.strerror or error}", 0.0)
     reader = asyncio.StreamReader(limit=KEPT_OUTPUT)
     protocol = asyncio.StreamReaderProtocol(reader)
     pipe, _ = await asyncio.get_running_loop().connect_read_pipe(lambda: protocol, os.fdopen(reading, "rb", 0))

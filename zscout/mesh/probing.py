@@ -30,7 +30,7 @@ from zscout.config.strict import BadInput, Where
 from zscout.keyexpr import NAME, ROOT, Role
 from zscout.mesh.exchange import MeshError
 from zscout.mesh.relinking import MEETING
-from zscout.mesh.zenoh_mesh import in_thread, open_session, zenoh_config
+from zscout.mesh.zenoh_mesh import check_room, in_thread, open_session, zenoh_config
 from zscout.types import clean
 
 SCOUT: Final = 1.5  # seconds for all processes to answer
@@ -51,9 +51,11 @@ def multicast_problems(config: MeshConfig) -> dict[str, str]:
     host, _, port = config.multicast_address.rpartition(":")
     group = ip_of(host.strip("[]"))
     assert group is not None  # noqa: S101 - the fleet file was checked
-    found = psutil.net_if_stats()
     if config.interface == "auto":
-        names = [name for name, stats in found.items() if stats.isup and "multicast" in stats.flags.split(",")]
+        names = [name for _, name in socket.if_nameindex()]
+        with suppress(OSError):  # /proc can't be read
+            found = psutil.net_if_stats()
+            names = [name for name, stats in found.items() if stats.isup and "multicast" in stats.flags.split(",")]
     else:
         names = config.interface.split(",")
     return {name: _multicast_problem(name, group, int(port)) for name in names}
@@ -94,6 +96,7 @@ async def heard(config: MeshConfig) -> list[Heard]:
     own = _own_addresses()
     until = time.monotonic() + SCOUT
     try:
+        check_room()
         with zenoh.scout(what="peer|router", config=zenoh_config(config)) as scout:
             while time.monotonic() < until and len(found) < MAX_HEARD:
                 if (hello := scout.try_recv()) is None:
@@ -102,7 +105,7 @@ async def heard(config: MeshConfig) -> list[Heard]:
                     addresses = tuple(address for address in hello.locators if "[fe80:" not in address)
                     hosts = {match[2].strip("[]") for at in addresses if (match := _ADDRESS.match(at))}
                     found[zid] = Heard(zid, addresses, bool(hosts & own), str(hello.whatami) == "router")
-    except zenoh.ZError:  # no interface for it
+    except (zenoh.ZError, OSError, RuntimeError):  # no interface for it, or no room
         pass
     return list(found.values())
 

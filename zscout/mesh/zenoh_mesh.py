@@ -28,6 +28,7 @@ from zscout.config.certificates import Certificates, read_certificates
 from zscout.config.fleet import Fleet, MeshConfig, load_fleet
 from zscout.config.strict import BadInput
 from zscout.keyexpr import FleetMember, Keys, Sender, access_control
+from zscout.logs import shortage
 from zscout.mesh.exchange import MeshError
 from zscout.mesh.relinking import MEETING, Relinking
 from zscout.mesh.renewal import RenewableTransport
@@ -39,6 +40,7 @@ log = logging.getLogger(__name__)
 
 CONTROL_BATCHES = 8  # control messages in flight per peer: with fewer, an answer waits for the message before it
 SCOUTING_DELAY_MS = 200
+SESSION_FILES, SESSION_THREADS = 40, 36  # that a session opens and starts, its links included
 THREADS = "ZENOH_RUNTIME"
 # With few receiving threads one unreachable host stalls every link.
 MANY_THREADS = (
@@ -246,8 +248,30 @@ def increasing_id() -> str:
     return f"1{secrets.token_hex(9)}0{time.time_ns().to_bytes(8, 'little').hex()[4:]}"
 
 
+def check_room(files: int = SESSION_FILES, threads: int = SESSION_THREADS) -> None:
+    """Raises OSError or RuntimeError where this process can't have so many more: Zenoh ends the process then."""
+    opened, started, done = list[int](), list[threading.Thread](), threading.Event()
+    try:
+        while len(opened) < files:
+            opened.append(os.eventfd(0))
+        while len(started) < threads:
+            thread = threading.Thread(target=done.wait, daemon=True)
+            thread.start()
+            started.append(thread)
+    finally:
+        done.set()
+        for thread in started:
+            thread.join()
+        for fd in opened:
+            os.close(fd)
+
+
 def open_session(settings: Callable[[], zenoh.Config]) -> zenoh.Session:
     """Blocks. Raises MeshError."""
+    try:
+        check_room()
+    except (OSError, RuntimeError) as error:
+        raise MeshError(f"the mesh can't be joined: {shortage(error) or error}") from None
     # Zenoh reads this when it opens its first session. It is none of the programs that this one starts.
     if THREADS not in os.environ:
         os.putenv(THREADS, MANY_THREADS)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from itertools import islice
 from operator import attrgetter
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 from msgspec.structs import replace
 
@@ -225,6 +225,9 @@ def _enter(
 # Reported holds
 
 
+_Reported: TypeAlias = tuple[ArcId, Grant, tuple[RcName, ...]]
+
+
 def recover(
     states: Iterable[RcState],
     clients: Collection[ClientRequests],
@@ -239,12 +242,23 @@ def recover(
     result = RecoveredState(rcs={state.rc: state for state in states})
     result.answered = {one.client for one in clients}
     listed = _listed(result, clients, admission, record_of)
-    parts: dict[tuple[str, Grant], dict[RcName, Holder]] = {}
+    parts: dict[_Reported, dict[RcName, Holder]] = {}
     for state in result.rcs.values():
         for holder in state.holders:
-            parts.setdefault((arc_id(holder.client, holder.id), holder.grant), {})[state.rc] = holder
+            # With certificates an RC's word counts for the gang that it names, and is in.
+            gang = tuple(sorted({*holder.rcs})) if admission.closed else ()
+            if not admission.closed or state.rc in gang:
+                parts.setdefault((arc_id(holder.client, holder.id), holder.grant, gang), {})[state.rc] = holder
+
+    def believed(reported: _Reported) -> tuple[bool, Grant]:
+        """The newest, but first the one that its client lists: any node may claim another."""
+        arc, grant, gang = reported
+        mine = listed.get(arc)
+        return bool(gang) and mine is not None and mine.grant == grant and {*mine.rcs} in ({*gang}, set()), grant
+
     seen, places = set[ArcId](), set[tuple[Place, str]]()
-    for (arc, grant), held in sorted(parts.items(), key=lambda item: item[0][1], reverse=True):
+    for reported, held in sorted(parts.items(), key=lambda item: believed(item[0]), reverse=True):
+        arc, grant, _ = reported
         if arc in seen:
             continue
         if grant.term >= admission.places.term:

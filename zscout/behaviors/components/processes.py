@@ -32,7 +32,7 @@ def kill_family(tag: str, *, spare: int = 0) -> int:
     killed: dict[int, int] = {}
     try:
         for _ in range(ROUNDS):
-            pids = [int(name) for name in os.listdir("/proc") if name.isascii() and name.isdigit()]  # noqa: PTH208
+            pids = [int(name) for name in _names("/proc") if name.isascii() and name.isdigit()]
             found = {pid: _kill(pid, wanted) for pid in pids if pid != spare and pid not in killed}
             new = {pid: handle for pid, handle in found.items() if handle is not None}
             if not new:
@@ -43,6 +43,13 @@ def kill_family(tag: str, *, spare: int = 0) -> int:
         for handle in killed.values():
             os.close(handle)
     return len(killed)
+
+
+def _names(folder: str) -> list[str]:
+    """Of what is in it; none where it can't be read."""
+    with suppress(OSError):
+        return os.listdir(folder)  # noqa: PTH208
+    return []
 
 
 def _kill(pid: int, wanted: bytes) -> int | None:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 LOOK_AGAIN: Final = 0.3
 """Seconds between two looks at a terminal, which reports no changes."""
 KILLED: Final = -signal.SIGKILL
+CANT_FIND: Final = "/proc shows no processes, and one that it has started still runs: end it by hand"
 CANT_END: Final = "runs as another user and can't be ended: end it by hand"
 
 
@@ -194,7 +195,8 @@ class RunningCommand:
             case "ending" if not self._exited:
                 self.why_ended = number
             case "stuck":
-                print_line(f"zscout: process {number} of {self._command[0]} {CANT_END}", sys.stderr)
+                process = f"process {number} {CANT_END}" if number != "0" else CANT_FIND
+                print_line(f"zscout: {self._command[0]}: {process}", sys.stderr)
                 self._stuck.set()
             case "gone":
                 self._over()
