@@ -200,5 +200,4 @@ async def test_a_frozen_source_ends_no_hold_and_is_in_frames_and_figures() -> No
 
 
 def test_a_slow_source_has_longer_until_it_is_lost() -> None:
-    driver = FramegrabberDriver({"": "0"}, rate=10, quality=80, picture_within=20.0)
-    assert driver._patience == 40
+    assert [FramegrabberDriver({"": "0"}, rate=10, quality=80, picture_within=s)._slow for s in (1.5, 20.0)] == [0, 40]

@@ -37,8 +37,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LOST_AFTER: Final = 5.0
-"""Seconds without a picture, at least, after which a framegrabber that is held is lost, and a lost one tries the next
-of several sources."""
+"""Seconds without a picture after which a framegrabber that is held is lost; a slow source has longer."""
+TRY_NEXT: Final = 5.0
+"""Seconds that a lost framegrabber tries one of several sources, likewise."""
 PICTURE_WITHIN: Final = 1.5
 OPEN_TIMEOUT: Final = 2.0
 OPENING: Final = 1.0
@@ -85,9 +86,9 @@ class FramegrabberDriver(Driver):
         self._sources = dict(sources)
         self._receives = ", ".join(sorted(sources))
         self._rate, self._quality = rate, quality
-        self._patience = max(LOST_AFTER, 2 * picture_within)
+        self._slow = 2 * picture_within if picture_within > PICTURE_WITHIN else 0.0
         # Before it gives the first, FFmpeg looks at three pictures.
-        opening = max(OPEN_TIMEOUT, 4 * picture_within if picture_within > PICTURE_WITHIN else 0)
+        opening = max(OPEN_TIMEOUT, 2 * self._slow)
         self._capturing = partial(
             Capture, open_timeout=opening, read_timeout=picture_within, still_after=still_after, transport=transport
         )
@@ -142,7 +143,9 @@ class FramegrabberDriver(Driver):
         self._fail()
 
     def _fail(self) -> None:
-        self._rc.fail(f"no picture: {'; '.join(self._faults.values())}")
+        names = [name for name in self._faults if name]
+        about = f" of {names[0]}" if len(names) == 1 else ""
+        self._rc.fail(f"no picture{about}: {'; '.join(self._faults.values())}")
 
     async def close(self) -> None:
         self._lost = False
@@ -291,13 +294,13 @@ class FramegrabberDriver(Driver):
                 if capture.failed and self._faults.get(name) != capture.health:
                     self._faults[name] = capture.health
                     self._fail()
-                if self._silent > self._patience and self._holder is None:
+                if self._silent > max(TRY_NEXT, self._slow) and self._holder is None:
                     self._try_next()
-            elif self._holder is not None and self._silent > self._patience:
+            elif self._holder is not None and self._silent > (patience := max(LOST_AFTER, self._slow)):
                 self._lost = True
                 about = f" of {self._source}" if self._source else ""
                 self._faults = {self._source or "": capture.health}
-                self._rc.fail(f"no picture{about} for {self._patience:g} s: {capture.health}")
+                self._rc.fail(f"no picture{about} for {patience:g} s: {capture.health}")
             await asyncio.sleep(CHECK)
 
     def _try_next(self) -> None:
