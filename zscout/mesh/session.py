@@ -502,7 +502,7 @@ class Mesh:
         return FrameWatch(self._transport, key, self._inbox.deliver, self.now)
 
     def alive(self, token: Token) -> Declaration:
-        """Declare the liveliness token until the declaration is closed or this process ends."""
+        """Declare the liveliness token until the declaration is closed, or is kept by nobody any more."""
         return Declaration(self._transport.token(self.keys.alive(token)))
 
     def watch(self, key: str, handler: Callable[[Token, bool], None]) -> Declaration:
