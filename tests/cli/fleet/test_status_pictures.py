@@ -112,7 +112,9 @@ class Picture:
         assert self.state is not None
         self.state.rcs.append(view)
         self.hosts[at].tokens.add(Token(at, Role.RC, name, "i"))
-        figures = {figure: float(options[figure]) for figure in ("rate", "frozen_seconds") if figure in options}
+        figures: dict[str, float] = {
+            figure: float(options[figure]) for figure in ("rate", "frozen_seconds") if figure in options
+        }
         health = options.get("health", "ok")
         self.health[name] = RcState(name, at, "i", shared, health=health, figures=figures)
         if (kept := options.get("kept")) is not None:
