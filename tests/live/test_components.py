@@ -277,10 +277,13 @@ async def test_who_sees_a_higher_incarnation_ends_itself(lab: ComponentLab) -> N
     await hosts.start("a", "deaf", "deaf", incarnation=7)
     await hosts.start("a", "d", "still", incarnation=7)
     async with await ZenohMesh.open(lab.fleet_of("b"), Sender("b", "node")) as mesh:
-        for name, instance in (("c", "6-x"), ("c", "x"), ("c", "8-x"), ("deaf", "9-x")):
-            mesh.alive(Token("b", Role.COMPONENT, name, instance))
+        shown = (("c", "6-x"), ("c", "x"), ("c", "8-x"), ("deaf", "9-x"))
+        # A token lives as long as its declaration is kept.
+        tokens = [mesh.alive(Token("b", Role.COMPONENT, name, instance)) for name, instance in shown]
         for name in ("c", "deaf"):
             await hosts.ended("a", name)
+        for token in tokens:
+            token.close()
     listed = await hosts.get("a", ListComponents(), ComponentList)
     ends = {view.component: (view.ended, view.reason) for view in listed.components}
     assert ends == {

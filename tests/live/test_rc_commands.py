@@ -198,7 +198,7 @@ async def test_a_snapshot_that_was_overtaken_is_read_again(
     rc = await stand.rc("robot/x", Bench())
     mesh.serve(keys.rcm_state, StateAsk, on_asked)
     publisher = mesh.publisher(keys.grants, Grants)
-    mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, TERM.rcm))
+    leads = mesh.alive(Token(mesh.me.host, Role.RCM, mesh.me.client, TERM.rcm))
     while rc.holds.seq != 3:
         publisher.put(said(3, 0))
         await asyncio.sleep(0.02)
@@ -210,6 +210,7 @@ async def test_a_snapshot_that_was_overtaken_is_read_again(
     waiting[0].answer(RcmState(TERM, 3, "test"))
     await until(lambda: set(rc.holds.held) == {Grant(TERM, 5)})
     assert await answer(client.command("robot/x", Grant(TERM, 5), ECHO)) == "done"
+    leads.close()
 
 
 @pytest.mark.slow

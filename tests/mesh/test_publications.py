@@ -17,7 +17,7 @@ from tests.mesh.both_meshes import FRAMES, LONG, NEWS, Ping, Pong, World, Zenoh
 from tests.mesh.kit import until
 from zscout.keyexpr import BadName
 from zscout.mesh.transport import Quality
-from zscout.messages import MAX_FRAME, FrameHead
+from zscout.messages import MAX_FRAME, FrameHead, base
 
 
 async def test_publications_arrive_in_order(world: World) -> None:
@@ -151,6 +151,29 @@ async def test_publications_beyond_a_full_queue_are_counted_as_missed(world: Wor
     await world.occupied(lambda: subscription.missed == 7)
     await until(lambda: heard)
     assert (heard, subscription.missed) == ([0, 1, 2], 7)
+
+
+async def test_what_is_too_large_waits_nowhere(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(base.LIMITS, Ping, 100)
+    a, b = await world.open("a", "b")
+    polled = a.poll_latest(NEWS, Ping)
+    heard: list[int] = []
+    a.subscribe(NEWS, Ping, lambda _, ping: heard.append(ping.number))
+    await world.declared()
+    large = b'{"number":1,"x":"' + b"x" * 100_000 + b'"}'
+    b._transport.put(NEWS, large, Ping)
+    waiting = list[int]()
+
+    def arrived() -> bool:
+        waiting[:] = [len(arg) for item in a._inbox.items for arg in item.args if isinstance(arg, bytes)]
+        return bool(waiting)
+
+    await world.occupied(arrived)
+    assert waiting == [101]
+    b.put(NEWS, Ping(2))
+    await until(lambda: heard)
+    await until(lambda: list(polled.each()) == [(NEWS, Ping(2))])
+    assert heard == [2]
 
 
 async def test_poll_latest_keeps_the_latest(world: World) -> None:

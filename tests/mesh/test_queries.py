@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from collections.abc import Awaitable
 from typing import Any
 
@@ -13,6 +14,8 @@ from tests.mesh.kit import until
 from zscout import messages
 from zscout.keyexpr import BadName
 from zscout.mesh import IncomingQuery, Mesh, MeshError, Refused, Tally
+from zscout.mesh.session import MAX_OF_ONE_KEY
+from zscout.mesh.transport import Collector
 
 PING = Ping()
 
@@ -212,6 +215,22 @@ async def test_one_host_has_half_of_what_may_be_unanswered(world: World) -> None
     await until(lambda: len(outcomes) == 6)
     ask("one/again")
     await until(lambda: len(kept) == 5)
+
+
+async def test_of_the_answers_of_one_key_the_first_are_read(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever is asked may answer as often as it likes, and reading takes the time of who asks."""
+    (a,), keys = await world.open("a"), ("test/one", "test/two")
+
+    def get(*args: Any) -> None:
+        to: Collector = args[-1]
+        for number in range(20):
+            for key in keys:
+                to.on_reply(key, messages.encode(Pong(number)), True)
+        to.on_final()
+
+    monkeypatch.setattr(a._transport, "get", get)
+    replies = await a.ask("test/*", PING, Pong, timeout=LONG)
+    assert Counter(reply.key for reply in replies) == dict.fromkeys(keys, MAX_OF_ONE_KEY)
 
 
 async def test_ask_ends_with_the_reply_that_is_enough(world: World) -> None:

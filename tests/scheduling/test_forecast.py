@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import chain
+from typing import Any
 
+import pytest
 from hypothesis import given, settings
 
 from tests.scheduling.workloads import voter, workloads
 from tests.thorough import times
+from zscout.scheduling import forecast as forecasts
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.booking import Booked, Booking
 from zscout.scheduling.core import Core
@@ -75,6 +79,26 @@ def test_what_is_foretold_comes(workload: Workload) -> None:
 
 def ends_of(core: Core) -> list[Ns]:
     return [arc.hold.end for arc in core._state.running.values() if arc.hold is not None]
+
+
+def test_many_bookings_bound_how_far_is_looked(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each instant costs more with them: the leader stood still for seconds, and others led."""
+    played = 0
+
+    def counted(core: Core, *args: Any) -> Iterator[Any]:
+        nonlocal played
+        played += 1
+        return play_instant(core, *args)
+
+    monkeypatch.setattr(forecasts, "play_instant", counted)
+    core = Core(Adaptive())
+    core.handle(0, RcJoined("robot/a", sharable=False))
+    core.handle(
+        0, *(Booked(Booking(f"b{n}", {"robot/a": {}}, 0, n * SECOND, SECOND // 2, 0, 0)) for n in range(1, 1000))
+    )
+    never = request("never", "robot/a", "robot/b")
+    assert "never" not in forecast(core, 0, never).starts
+    assert played < 500
 
 
 def test_bookings_and_maintenance_are_played_through() -> None:

@@ -212,11 +212,11 @@ class RenewableTransport(Transport):
         """A token whose key names the session that declares it."""
         return self._keep_token(key_of)
 
-    def ring(self, key: str, depth: int) -> tuple[Callable[[], tuple[str, bytes] | None], Undeclare]:
+    def ring(self, key: str, depth: int, most: int) -> tuple[Callable[[], tuple[str, bytes] | None], Undeclare]:
         taking: list[Callable[[], tuple[str, bytes] | None]] = []
 
         def declare(transport: Transport) -> Undeclare:
-            take, undeclare = transport.ring(key, depth)
+            take, undeclare = transport.ring(key, depth, most)
             taking.append(take)
             return undeclare
 

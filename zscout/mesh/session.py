@@ -46,6 +46,7 @@ BURST = 256  # items handled in a row at most
 BURST_S = 0.02  # seconds after which a burst ends: timers and other services run between bursts
 SHARE = 16  # queries of one host in the common order; its surplus waits until that is empty
 RING_DEPTH = 32
+MAX_OF_ONE_KEY = 8  # answers to one question, as of the processes of one host: further ones are not read
 LINK_PERIOD = 1.0  # seconds between two checks that each linked session shows its declarations
 MAX_SESSIONS = 4_096  # sessions remembered
 FINAL_SLACK = 0.5  # seconds after its timeout at which a query ends without the transport's report
@@ -270,15 +271,20 @@ class Mesh:
 
         Without a reply the query may have been carried out, or not. Raises MeshError if it can't be sent."""
         replies: list[Reply[R]] = []
+        answers = Counter[str]()
 
         def on_reply(of: str, payload: bytes, ok: bool) -> bool:
+            answers[of] += 1
+            if of and answers[of] > MAX_OF_ONE_KEY:
+                return False
             reply = self._read_reply(of or key, payload, ok, kind, limit)
             if reply is None:
                 return False
             replies.append(reply)
             return enough is not None and enough(reply)
 
-        await self._all(lambda to: self._get(key, message, timeout, to), on_reply, timeout)
+        most = messages.largest(kind, limit)
+        await self._all(lambda to: self._get(key, message, timeout, to), on_reply, timeout, most)
         return replies
 
     async def ask_one(self, key: str, message: Struct | None, kind: type[R], *, timeout: float) -> Reply[R] | None:
@@ -297,7 +303,8 @@ class Mesh:
             first = self._read_reply(of or key, payload, ok, kind, messages.MAX_STATE)
             return first is not None
 
-        self._get(key, message, timeout, _Collector(self._inbox, on_reply, lambda: then(first)))
+        most = messages.largest(kind)
+        self._get(key, message, timeout, _Collector(self._inbox, on_reply, lambda: then(first), most))
 
     def _read_reply(self, key: str, payload: bytes, ok: bool, kind: type[R], limit: int) -> Reply[R] | None:
         """`key` is the answer's, or the question's for a problem without a key."""
@@ -316,7 +323,9 @@ class Mesh:
         payload = None if message is None else messages.encode(message)
         self._transport.get(key, payload, None if message is None else type(message), timeout, to)
 
-    async def _all(self, query: Callable[[Collector], None], on_reply: OnReply, timeout: float) -> None:
+    async def _all(
+        self, query: Callable[[Collector], None], on_reply: OnReply, timeout: float, most: int = messages.MAX_STATE
+    ) -> None:
         """Query, and return when the query ends or `on_reply` returns True."""
         loop = self._inbox.loop
         done: asyncio.Future[None] = loop.create_future()  # not an Event: this is the way of every request
@@ -325,7 +334,7 @@ class Mesh:
             if not done.done():
                 done.set_result(None)
 
-        query(_Collector(self._inbox, on_reply, finish))
+        query(_Collector(self._inbox, on_reply, finish, most))
         guard = loop.call_later(timeout + FINAL_SLACK, finish)
         try:
             await done
@@ -454,9 +463,11 @@ class Mesh:
 
     def _subscribe(self, key: str, kind: type[S], depth: int, limit: int) -> _Subscription:
         state, handlers = Backlog(depth=depth), list[Callable[[str, Any], None]]()
+        most = messages.largest(kind, limit)
 
         def on_sample(name: str, payload: bytes, _: bytes | None) -> None:
-            if not self._inbox.offer(state, handle, name, payload):
+            # One that is too large waits cut, to be refused.
+            if not self._inbox.offer(state, handle, name, payload[: most + 1]):
                 state.missed += 1
 
         def handle(name: str, payload: bytes) -> None:
@@ -480,7 +491,7 @@ class Mesh:
 
     def poll_latest(self, key: str, kind: type[S], *, depth: int = RING_DEPTH) -> PolledSubscription[S]:
         """Keep the latest `depth` publications on `key` until they are taken, without waking the event loop."""
-        return PolledSubscription(*self._transport.ring(key, depth), kind, depth)
+        return PolledSubscription(*self._transport.ring(key, depth, messages.largest(kind)), kind, depth)
 
     def frame_publisher(self, key: str) -> FramePublisher:
         """A publisher of JPEG frames, which knows whether there are subscribers."""
@@ -491,7 +502,7 @@ class Mesh:
         return FrameWatch(self._transport, key, self._inbox.deliver, self.now)
 
     def alive(self, token: Token) -> Declaration:
-        """Declare the liveliness token until the declaration is closed or this process ends."""
+        """Declare the liveliness token until the declaration is closed, or is kept by nobody any more."""
         return Declaration(self._transport.token(self.keys.alive(token)))
 
     def watch(self, key: str, handler: Callable[[Token, bool], None]) -> Declaration:
@@ -557,13 +568,13 @@ class Mesh:
 class _Collector(Collector):
     """Pass replies to `each` in the event loop until it returns True; then, or at the end, call `over` once."""
 
-    def __init__(self, inbox: Inbox, each: OnReply, over: Callable[[], None]) -> None:
-        self._inbox, self._each, self._over = inbox, each, over
+    def __init__(self, inbox: Inbox, each: OnReply, over: Callable[[], None], most: int) -> None:
+        self._inbox, self._each, self._over, self._most = inbox, each, over, most
         self._state = Backlog(depth=INBOX_DEPTH)
         self._open = True
 
     def on_reply(self, key: str, payload: bytes, ok: bool) -> None:
-        self._inbox.offer(self._state, self._take, key, payload, ok)
+        self._inbox.offer(self._state, self._take, key, payload[: self._most + 1], ok)
 
     def on_final(self) -> None:
         if self._open:

@@ -68,7 +68,7 @@ class Transport(Protocol):
     def subscriber(self, key: str, on_sample: OnSample) -> Undeclare:
         """Skips deletes, and publications on keys with a wildcard; so does `ring`."""
 
-    def ring(self, key: str, depth: int) -> tuple[Callable[[], tuple[str, bytes] | None], Undeclare]:
+    def ring(self, key: str, depth: int, most: int) -> tuple[Callable[[], tuple[str, bytes] | None], Undeclare]:
         """Keep the latest `depth` publications; the first function returned takes the oldest."""
 
     def token(self, key: str) -> Undeclare: ...

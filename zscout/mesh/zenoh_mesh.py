@@ -11,6 +11,7 @@ import re
 import secrets
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ from typing import Any, NamedTuple, NoReturn, Self, TypeVar
 
 import zenoh
 from msgspec.structs import replace
-from zenoh.handlers import Callback, RingChannel
+from zenoh.handlers import Callback
 
 from zscout import messages
 from zscout.config.access import AccessPolicy
@@ -411,19 +412,15 @@ class ZenohTransport(Transport):
 
         return _undeclare(self._session.declare_subscriber(key, _direct(on_zenoh_sample)))
 
-    def ring(self, key: str, depth: int) -> tuple[Callable[[], tuple[str, bytes] | None], Undeclare]:
-        subscriber = self._session.declare_subscriber(key, RingChannel(depth))
+    def ring(self, key: str, depth: int, most: int) -> tuple[Callable[[], tuple[str, bytes] | None], Undeclare]:
+        kept: deque[tuple[str, bytes]] = deque(maxlen=depth)
 
-        def take() -> tuple[str, bytes] | None:
-            try:
-                while (sample := subscriber.try_recv()) is not None:
-                    if _is_publication(sample):
-                        return str(sample.key_expr), sample.payload.to_bytes()
-            except zenoh.ZError:  # its session is closed
-                pass
-            return None
+        def keep(sample: zenoh.Sample) -> None:
+            if _is_publication(sample) and len(sample.payload) <= most:
+                kept.append((str(sample.key_expr), sample.payload.to_bytes()))
 
-        return take, _undeclare(subscriber)
+        subscriber = self._session.declare_subscriber(key, _direct(keep))
+        return (lambda: kept.popleft() if kept else None), _undeclare(subscriber)
 
     def token(self, key: str) -> Undeclare:
         return _undeclare(self._session.liveliness().declare_token(key))

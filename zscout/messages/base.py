@@ -153,10 +153,15 @@ def decode(payload: bytes, kind: type[T] | Any, limit: int = MAX_PAYLOAD) -> T:
     return message
 
 
+def largest(kind: Any, limit: int = MAX_STATE) -> int:
+    """Bytes of one message of that kind at most."""
+    return min(limit, LIMITS.get(kind, limit))
+
+
 def decode_told(payload: bytes, kind: type[T] | Any, limit: int = MAX_STATE) -> T:
     """The same of what is published or answered, and may be passed on: it holds no decimal that is no number, or of
     implausible size, which others could not read again. (An operation is refused for one in words of its own.)"""
-    message: T = decode(payload, kind, min(limit, LIMITS.get(kind, limit)))
+    message: T = decode(payload, kind, largest(kind, limit))
     check: Callable[[Any], bool] = _plausible(kind)
     if not check(message):
         raise Malformed(f"not a valid {kind.__name__}: a decimal in it is no number, or beyond 1e{MAX_EXPONENT}")

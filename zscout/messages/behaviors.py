@@ -6,7 +6,7 @@ from typing import Annotated, TypeAlias
 
 from msgspec import Meta
 
-from zscout.messages.base import Finite, Message, Metres, Radians, Seconds
+from zscout.messages.base import LIMITS, Finite, Message, Metres, Radians, Seconds
 
 MAX_BOXES = 32
 MAX_DETAIL = 200
@@ -77,3 +77,7 @@ class BuildingPoses(Message, frozen=True):
     """How many of the building's seconds pass in a real one."""
     robots: Annotated[list[Placed], Meta(max_length=MAX_ROBOTS)] = []
     people: Annotated[list[Placed], Meta(max_length=MAX_PEOPLE)] = []
+
+
+LIMITS[BehaviorSaid] = 8_192
+LIMITS[BuildingPoses] = 65_536

@@ -7,6 +7,7 @@ from typing import Annotated
 import msgspec
 
 from zscout.messages.base import (
+    LIMITS,
     MAX_COUNTER,
     MAX_ERROR,
     MAX_INCARNATION,
@@ -131,3 +132,7 @@ class Recorded(Message, frozen=True):
     bind: Annotated[str, msgspec.Meta(max_length=45)]
     """IP address that the live view listens on."""
     port: Annotated[int, msgspec.Meta(ge=1, le=65_535)]
+
+
+LIMITS[LoadReport] = 131_072
+"""256 components with the longest names."""

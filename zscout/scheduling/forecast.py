@@ -21,7 +21,7 @@ from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import ArcId, Ns, Term
 
 MAX_CHECKS = 4_000
-"""Queued ARCs, summed over all instants: bounds the time that the RCM spends."""
+"""Queued ARCs, and hundreds of bookings, summed over all instants: bounds the time that the RCM spends."""
 MAX_WAITING = 1_000
 """Queued ARCs of a forecast: the best-ranked."""
 
@@ -103,7 +103,7 @@ def forecast(
         result.reason = asking.reported if asking is not None else None
     checks = 0
     while (ends or releases or dates) and unserved:
-        checks += copy.waiting
+        checks += copy.waiting + len(booked) // 100
         if checks > MAX_CHECKS:
             break
         changes = [at for at in (copy.next_change(),) if at is not None and at > now]

@@ -397,9 +397,9 @@ class MemoryTransport(Transport):
 
         return undeclare
 
-    def ring(self, key: str, depth: int) -> tuple[Callable[[], tuple[str, bytes] | None], Undeclare]:
+    def ring(self, key: str, depth: int, most: int) -> tuple[Callable[[], tuple[str, bytes] | None], Undeclare]:
         kept: deque[tuple[str, bytes]] = deque(maxlen=depth)
-        undeclare = self.subscriber(key, lambda key, payload, _: kept.append((key, payload)))
+        undeclare = self.subscriber(key, lambda key, payload, _: kept.append((key, payload[: most + 1])))
         return (lambda: kept.popleft() if kept else None), undeclare
 
     def matching(self, key: str) -> bool:

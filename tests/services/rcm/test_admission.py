@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections import Counter
 from decimal import Decimal
 from pathlib import Path
@@ -27,9 +28,11 @@ from zscout.messages import (
     Holder,
     Notice,
     OpenRequest,
+    Unbook,
     Who,
 )
 from zscout.services.bookings.keeper import BookingKeeper
+from zscout.services.rcm import booking_handler
 from zscout.services.rcm.candidate import Candidate
 from zscout.types import Grant, Place, Term
 
@@ -372,3 +375,24 @@ async def test_a_dry_run_and_a_hand_over_pass_the_same_door() -> None:
     await eve.ask("other", "robot/a")
     with pytest.raises(Refusal, match="eve/two has room for 0 more requests, not for 1"):
         await bob.do(HandOver("two", "eve/two"))
+
+
+@pytest.mark.parametrize("what", ["records", "dates"])
+async def test_one_name_has_half_of_the_room_for_bookings(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also with what it gave up, which is kept until its last date, a year ahead at most."""
+    monkeypatch.setattr(booking_handler, "MAX_BOOKINGS" if what == "records" else "MAX_CLAIMS", 6)
+    fleet, _, _, _ = await closed("a")
+    bob, eve = (fleet.client("c", name) for name in ("bob", "eve"))
+    series = {"every": 1, "until": round(NOON) + 2 * 86_400 + 500} if what == "dates" else {}
+    told = []
+    for number in range(4 if what == "records" else 2):
+        try:
+            await do(bob, book(f"b{number}", "robot/a", at=500 + 200 * number, **series), BookingView)
+            told.append("booked")
+        except Refusal as refusal:
+            told.append(str(refusal)[:8])
+        if what == "records":
+            with contextlib.suppress(Refusal):
+                await do(bob, Unbook(f"b{number}"), BookingView)
+    assert told == [*["booked"] * (len(told) - 1), "too_many"]
+    await do(eve, book("hers", "robot/a", at=5000), BookingView)

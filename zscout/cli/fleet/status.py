@@ -222,6 +222,8 @@ class Standing:
             figures = device.figures if device is not None else {}
             if device is not None and device.health != "ok":
                 words = words if words and words[0].startswith(device.health) else [device.health, *words]
+            if frozen := figures.get("frozen_seconds"):
+                words = [*words, f"frozen: the same picture for {span(frozen)}"]
             if words or (self.every and figures):
                 rows.append((rc, "; ".join(words) or "ok", figures_text(figures)))
                 styles.append("red" if words else "")

@@ -131,10 +131,14 @@ class LiveSource:
 
     def shots(self) -> Iterator[Shot]:
         """All pictures, without end; an empty shot now and then while there are none."""
-        number, missing = 0, None
+        number, missing, frozen = 0, None, False
         while True:
             taken = self._capture.wait(number, LOOK)
             if taken is not None:
+                if bool(taken.frozen) != frozen:
+                    frozen = not frozen
+                    words = f"is frozen: the same picture for {taken.frozen:.0f} s" if frozen else "gives new pictures"
+                    self._report(f"{self.name} {words}")
                 number, at = taken.number, taken.time - self._zero
                 if missing is not None:
                     self._report(f"{self.name} gives pictures again, after {at - missing:.1f} s")

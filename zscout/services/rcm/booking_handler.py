@@ -149,12 +149,25 @@ class BookingHandler:
     def _check_room(self, record: BookingRecord) -> None:
         records, owner = self._records, record.owner
         most = self._fleet.limits.max_bookings_per_host
-        if sum(one.owner == owner and not one.unbooked for one in records) >= most:
+        own = [one for one in records if one.owner == owner]
+        if sum(not one.unbooked for one in own) >= most:
             raise Refused("too_many", f"{owner} has {most} bookings, the most allowed; cancel one")
+        if self._admission.closed:
+            self._check_share(record, own)
         if len(records) >= MAX_BOOKINGS or records.size >= MAX_KEPT:
             raise Refused("too_many", f"this fleet already has {len(records)} bookings; cancel some")
         if len(self._core.bookings()) + len(self._dates.open_dates(record)) > MAX_CLAIMS:
             raise Refused("too_many", f"{MAX_CLAIMS} dates are booked, the most allowed; repeat it less often")
+
+    def _check_share(self, record: BookingRecord, own: list[BookingRecord]) -> None:
+        """One name has half of the fleet's room at most: what was given up takes some until its last date is over."""
+        if len(own) >= MAX_BOOKINGS // 2:
+            words = f"{record.owner} has {len(own)} bookings, also those cancelled, half of what is kept"
+            raise Refused("too_many", f"{words}; ask again when some are over")
+        dates = sum(booking.owner == record.owner for booking, _ in self._core.bookings())
+        if dates + len(self._dates.open_dates(record)) > MAX_CLAIMS // 2:
+            most = MAX_CLAIMS // 2
+            raise Refused("too_many", f"{record.owner} has {dates} dates booked, {most} at most; repeat it less often")
 
     def _decide(self, ticket: Ticket, record: BookingRecord) -> bool:
         """Whether it is decided: all its dates that are kept free from now on are free, or one is not. Raises Refused
