@@ -130,6 +130,32 @@ def test_a_disk_that_is_full_is_one_line_and_exit_code_1(
     assert capsys.readouterr().err == "zscout: x.rrd can't be written: its disk is full\n"
 
 
+@pytest.mark.parametrize("name", ["v\udcff.avi", "f\udcff/v.avi", "http://127.0.0.1:9/\udcff", "/dev/v\udcff"])
+def test_a_name_that_is_not_utf8_is_one_line(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if name.endswith(".avi"):
+        Path(name).parent.mkdir(exist_ok=True)
+        Path(name).write_bytes(b"RIFF\0\0\0\0AVI ")
+    assert zscout_here("motion", "--source", name) == 2
+    error = capsys.readouterr().err
+    assert ("is not UTF-8" in error) is name.endswith(".avi")
+    assert error.startswith("zscout: ")
+    assert error.count("\n") == 1
+
+
+def test_a_folder_whose_name_is_not_utf8_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "f\udcff"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    Path("v.avi").write_bytes(b"RIFF\0\0\0\0AVI ")
+    assert zscout_here("motion", "--source", "v.avi") == 2
+    assert "or its folder is not UTF-8" in capsys.readouterr().err
+
+
 def test_why_a_recording_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "x.rrd"
     good = SimpleNamespace(flush=lambda *, timeout_sec: None)
