@@ -172,6 +172,14 @@ def test_each_failure_of_an_rtsp_camera_has_its_own_words(status: int, codec: st
         assert why_closed(server.url, TIMEOUT) == words
 
 
+def test_a_user_signs_in_to_rtsp_before_anything_is_called_wrong() -> None:
+    with RtspServer(colour, status=404, password="s:1") as server:  # noqa: S106
+        url = server.url.replace("//", "//a:s%3A1@")
+        assert why_closed(url, TIMEOUT) == "it has no such page; is the path right? (404)"
+        assert why_closed(url.replace("s%3A1", "wrong"), TIMEOUT) == "it refuses this user and password (401)"
+        assert why_closed(server.url, TIMEOUT) == "it wants a user and password (401)"
+
+
 def colour(number: int) -> NDArray[np.uint8]:
     return numbered(number, grey=False)
 
