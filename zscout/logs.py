@@ -35,7 +35,7 @@ def shortage(error: BaseException | None) -> str:
     if isinstance(error, BaseExceptionGroup):
         return next(filter(None, map(shortage, error.exceptions)), "")
     if isinstance(error, UnicodeEncodeError) and "\udc80" <= error.object[error.start] <= "\udcff":
-        return f"{ascii(error.object[:MAX_SHOWN])} is not UTF-8; rename it"
+        return f"{error.object[:MAX_SHOWN]!a} is not UTF-8; rename it"
     if isinstance(error, RuntimeError) and "start new thread" in str(error):
         error = OSError(errno.EAGAIN, "no more threads can be started")
     elif isinstance(error, MemoryError):
