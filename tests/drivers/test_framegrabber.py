@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from itertools import pairwise
+from typing import Any, cast
+
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.drivers.mjpeg import numbered
+from tests.drivers.mjpeg import MjpegServer, jpeg, numbered
+from tests.drivers.rcs import holder
+from tests.live.bench import until
+from zscout.drivers.driver import RcHandle
 from zscout.drivers.framegrabber import RATE_SPAN, FramegrabberDriver, FrameMeter, encode, is_grey, pace_of
+from zscout.mesh import Supervisor
 from zscout.messages import FrameHead
 from zscout.types import SECOND, Ns
 
@@ -119,3 +128,76 @@ def test_a_framegrabber_that_can_not_be() -> None:
     for rate, quality, sources in (*rates, (10.0, 0, {"": "0"}), (10.0, 101, {"": "0"}), (10.0, 80, dict[str, str]())):
         with pytest.raises(ValueError, match="a framegrabber has a source"):
             FramegrabberDriver(sources, rate=rate, quality=quality)
+
+
+class Handle:
+    """A device that keeps what its driver reports; somebody looks at its frames."""
+
+    name = "framegrabber/f"
+    watched = True
+
+    def __init__(self) -> None:
+        self.failed: list[str] = []
+        self.well = 0
+        self.heads: list[FrameHead] = []
+        self.supervisor = Supervisor(self.name, lambda _: None)
+
+    def frame_publisher(self) -> Handle:
+        return self
+
+    def follow(self, _changed: object) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+    def put(self, head: FrameHead, _jpeg: bytes) -> None:
+        self.heads.append(head)
+
+    def used(self, _grant: object) -> None:
+        pass
+
+    def fail(self, why: str) -> None:
+        self.failed.append(why)
+
+    def recover(self) -> None:
+        self.well += 1
+
+
+@asynccontextmanager
+async def grabbing(source: str, **how: Any) -> AsyncIterator[tuple[FramegrabberDriver, Handle]]:
+    driver, rc = FramegrabberDriver({"": source}, rate=30, quality=80, **how), Handle()
+    await driver.open(cast("RcHandle", rc))
+    yield driver, rc
+    await driver.safe()
+    await driver.close()
+    await rc.supervisor.close()
+
+
+@pytest.mark.real_time
+async def test_a_lost_framegrabber_reports_the_newest_reason_once() -> None:
+    with MjpegServer() as server:
+        server.mode = "404"
+        async with grabbing(server.url) as (_, rc):
+            await until(lambda: any("(404)" in why for why in rc.failed))
+            server.mode, server.clients = "run", 0
+            await until(lambda: "(503)" in rc.failed[-1])
+            server.clients = 8
+            await until(lambda: rc.well > 0)
+            assert all(why != newer for why, newer in pairwise(rc.failed)), rc.failed
+
+
+@pytest.mark.real_time
+async def test_a_frozen_source_ends_no_hold_and_is_in_frames_and_figures() -> None:
+    with MjpegServer(picture=lambda _: jpeg(numbered(5))) as server:
+        async with grabbing(server.url, still_after=1.0, picture_within=30.0) as (driver, rc):
+            await until(lambda: not driver._lost)
+            await driver.begin(holder(1, "look"))
+            await until(lambda: bool(rc.heads) and rc.heads[-1].frozen >= 1)
+            assert driver.figures()["frozen_seconds"] >= 1
+            assert driver._snapshot()["health"] == "frozen: the same picture for more than 1 s"
+            assert len(rc.failed) == rc.well  # none but before its first picture
+
+
+def test_a_slow_source_has_longer_until_it_is_lost() -> None:
+    assert [FramegrabberDriver({"": "0"}, rate=10, quality=80, picture_within=s)._slow for s in (1.5, 20.0)] == [0, 40]

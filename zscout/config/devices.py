@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from decimal import Decimal
-from typing import Annotated, Any, Final, TypeAlias, get_args
+from typing import Annotated, Any, Final, Literal, TypeAlias, get_args
 
 from msgspec import Meta, Struct, structs
 
@@ -133,6 +133,14 @@ class FramegrabberRc(RcTable, frozen=True, tag="framegrabber"):
     ] = None
     rate: Annotated[float, key("Published at most.", 0.1, 60, unit="frames/s")] = 10.0
     quality: Annotated[int, key("Of the JPEG.", 1, 100)] = 80
+    picture_within: Annotated[Ns, seconds("0.5", "600", "From one picture of the source to the next at most.")] = (
+        3 * SECOND // 2
+    )
+    still_after: Annotated[
+        Ns | None,
+        seconds("0", "86400", "Of the same picture, to the bit: the source is frozen. 0: never. 10 but for files."),
+    ] = None
+    transport: Annotated[Literal["tcp", "udp"], key("Of `rtsp://`; `udp` falls back to TCP.", example="udp")] = "tcp"
 
     @property
     def by_video(self) -> Mapping[str, str]:

@@ -13,6 +13,8 @@ import re
 import stat
 import threading
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -22,6 +24,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from zscout.drivers.source_fault import REMEDY, UNDECODABLE, why_closed
 from zscout.mesh import clock
 from zscout.types import SECOND
 
@@ -38,6 +41,11 @@ STALLED: Final = 0.8
 """A read that failed after this share of its timeout ran into it; one that failed sooner was cut off."""
 MISSES: Final = 3
 """Reads in a row that may fail: FFmpeg gives up a picture that it can't make out, and reads on."""
+STILL_AFTER: Final = 10.0
+"""Seconds of pictures that are all the same after which a camera counts as frozen: sensors have noise."""
+OPTIONS: Final = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+ASKING: Final = 2.0
+"""Seconds that a camera's server may take to say why it gives no pictures."""
 EXIT_WAIT: Final = 2.5
 """Seconds that the end of the process waits for threads that OpenCV holds up: longer than their timeouts."""
 
@@ -52,6 +60,8 @@ class CapturedFrame:
     number: int
     time: float
     picture: NDArray[np.uint8]
+    frozen: float = 0.0
+    """For how many seconds all have been like this one, if the source counts as frozen by that."""
 
 
 class Capture:
@@ -59,9 +69,19 @@ class Capture:
 
     `source` is a device (`/dev/video0`, or its number), a URL (`http://`, `rtsp://`, ...) or else a file, which is read
     at its own rate, and from its start again when it ends. `open_timeout` and `read_timeout` are seconds; a source that
-    gives no picture for `read_timeout` is opened again. All attributes may be read from any thread."""
+    gives no picture for `read_timeout` is opened again. `still_after`: seconds of the same picture, to the last bit,
+    after which it is `frozen`; 0: never; None: STILL_AFTER for all but files. `transport` of RTSP: tcp or udp. All
+    attributes may be read from any thread."""
 
-    def __init__(self, source: str, *, open_timeout: float = 2.0, read_timeout: float = 1.5) -> None:
+    def __init__(
+        self,
+        source: str,
+        *,
+        open_timeout: float = 2.0,
+        read_timeout: float = 1.5,
+        still_after: float | None = None,
+        transport: str = "tcp",
+    ) -> None:
         self.source = source
         self.kind = kind_of(source)
         self.failed = False
@@ -74,9 +94,14 @@ class Capture:
         """How often the source was opened."""
         self.dropped = 0
         """Pictures that a newer one replaced before anybody looked at them."""
+        self.frozen = 0.0
+        """For how many seconds its pictures have all been the same; 0 while that is less than `still_after`."""
         self.stalls = 0
         """How often an open source gave nothing for `read_timeout`."""
         self._open_timeout, self._read_timeout = open_timeout, read_timeout
+        self._still_after = (0.0 if self.kind == "file" else STILL_AFTER) if still_after is None else still_after
+        self._same_since = 0.0
+        self._transport = transport
         self._stop = threading.Event()
         self._new_picture = threading.Condition()
         self._newest: CapturedFrame | None = None
@@ -130,14 +155,16 @@ class Capture:
     def _read_all(self) -> None:
         """Opens the source, and reads it until it fails or ends."""
         began = seconds()
-        video = _open(self.source, self.kind, self._open_timeout, self._read_timeout)
+        with _TRANSPORT.of(self._transport, self.source):
+            video = _open(self.source, self.kind, self._open_timeout, self._read_timeout)
         try:
             if not video.isOpened():
                 self._set_health(self._why_closed(seconds() - began))
                 return
             self.opened += 1
-            if self.number == 0:
-                self.health, self.failed = "open, no picture yet", False
+            if self.health == "not open yet":
+                self.health = "open, no picture yet"
+            before = self.number
             period = _file_period(video) if self.kind == "file" else 0.0
             misses = 0
             while not self._stop.is_set():
@@ -155,45 +182,62 @@ class Capture:
                     waited = seconds() - asked
                     if misses < MISSES and waited < STALLED * self._read_timeout:
                         continue
-                    self._ended(waited)
+                    self._ended(video, waited, any_picture=self.number > before)
                     return
                 misses = 0
-                if picture.dtype != np.uint8 or picture.shape[0] * picture.shape[1] > MAX_PIXELS:
-                    self._set_health(f"the pictures of {shown(self.source)} are too large, or not of 8 bits")
+                height, width = picture.shape[:2]
+                if picture.dtype != np.uint8 or height * width > MAX_PIXELS:
+                    size = f"{width} by {height} pixels; at most {MAX_PIXELS // 1_000_000} million can be"
+                    wrong = size if picture.dtype == np.uint8 else "not of 8 bits"
+                    self._set_health(f"the pictures of {shown(self.source)} are {wrong}")
                     return
                 self._keep(np.asarray(picture, np.uint8))
         finally:
             video.release()
 
     def _keep(self, picture: NDArray[np.uint8]) -> None:
-        if self.health != "ok":
-            log.info("%s gives pictures", shown(self.source))
+        now, was = seconds(), self.frozen
+        if self._newest is None or not _same(picture, self._newest.picture):
+            self._same_since = now
+        still = now - self._same_since
+        self.frozen = still if self._still_after and still >= self._still_after else 0.0
+        health = f"frozen: the same picture for more than {self._still_after:g} s" if self.frozen else "ok"
+        if self.frozen and not was:
+            log.warning("%s is %s", shown(self.source), health)
+        elif self.health != health:
+            log.info("%s gives %spictures", shown(self.source), "new " if was else "")
         with self._new_picture:
             if not self._taken:
                 self.dropped += 1
             self._taken = False
             self.number += 1
-            self._newest = CapturedFrame(self.number, seconds(), picture)
-            self.health, self.failed = "ok", False
+            self._newest = CapturedFrame(self.number, now, picture, self.frozen)
+            self.health, self.failed = health, False
             self._new_picture.notify_all()
 
-    def _ended(self, waited: float) -> None:
+    def _ended(self, video: cv2.VideoCapture, waited: float, *, any_picture: bool) -> None:
         """A source that was open gives no more pictures."""
-        if self.kind == "file":
+        name = shown(self.source)
+        if codec := self.number == 0 and UNDECODABLE.get(_codec(video)):
+            self._set_health(f"{name} sends {codec}, which can't be decoded here; {REMEDY}")
+        elif self.kind == "file":
             if self.number == 0:
-                self._set_health(f"there is no picture in {shown(self.source)}")
+                self._set_health(f"there is no picture in {name}")
         elif waited >= STALLED * self._read_timeout:
             self.stalls += 1
-            self._set_health(f"no picture from {shown(self.source)} for {self._read_timeout:g} s")
-        else:
-            self._set_health(f"{shown(self.source)} was cut off")
+            self._set_health(f"no picture from {name} for {self._read_timeout:g} s")
+        elif not any_picture:  # else it is opened again at once, as a camera of stills is for each
+            self._set_health(f"{name} was cut off")
 
     def _why_closed(self, waited: float) -> str:
         name = shown(self.source)
         if self.kind == "url":
-            if waited >= STALLED * self._open_timeout:
-                return f"{name} did not answer within {self._open_timeout:g} s"
-            return f"{name} can't be opened: does its server run, and is the address right?"
+            late = waited >= STALLED * self._open_timeout
+            why = None if self._stop.is_set() else why_closed(self.source, min(ASKING, self._open_timeout))
+            if late and (why is None or "did not answer" in why):
+                slow = "" if why else "; if it gives pictures as rarely, raise picture_within"
+                return f"{name} did not answer within {self._open_timeout:g} s{slow}"
+            return f"{name} can't be opened: {why or 'it sends nothing that OpenCV can decode'}"
         path = _device_path(self.source) if self.kind == "device" else Path(self.source)
         try:
             mode = path.stat().st_mode
@@ -225,6 +269,45 @@ def _stop_all() -> None:
         capture.stop(max(0.0, end - seconds()))
 
 
+class _Transport:
+    """OpenCV takes the transport of RTSP from the environment alone, as it opens: sources of one transport are opened
+    side by side, those of another in turn."""
+
+    def __init__(self) -> None:
+        self._turn = threading.Lock()
+        self._changed = threading.Condition()
+        self._given: str | None = None
+        self._now, self._opening = "tcp", 0
+
+    @contextmanager
+    def of(self, transport: str, source: str) -> Iterator[None]:
+        if not source.lower().startswith("rtsp"):
+            yield
+            return
+        with self._turn, self._changed:
+            self._changed.wait_for(lambda: not self._opening or self._now == transport)
+            if transport != self._now:
+                if transport == "udp":
+                    self._given = os.environ.get(OPTIONS)
+                    # With the last, FFmpeg itself falls back to TCP.
+                    os.environ[OPTIONS] = f"{self._given or 'fflags;discardcorrupt'}|rtsp_transport;udp+tcp"
+                elif self._given is not None:
+                    os.environ[OPTIONS] = self._given
+                else:
+                    del os.environ[OPTIONS]
+                self._now = transport
+            self._opening += 1
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._opening -= 1
+                self._changed.notify_all()
+
+
+_TRANSPORT: Final = _Transport()
+
+
 def kind_of(source: str) -> Literal["device", "file", "url"]:
     """What a source is, by its form alone."""
     if (source.isascii() and source.isdigit()) or source.startswith("/dev/"):
@@ -246,17 +329,24 @@ def shown(source: str) -> str:
     return f"{parts.scheme}://{host}{port}{parts.path}"
 
 
+def is_utf8(name: str) -> bool:
+    """Whether OpenCV may be given this name: it ends the process at one with other bytes."""
+    return not any("\ud800" <= char <= "\udfff" for char in name)
+
+
 def _open(source: str, kind: str, open_timeout: float, read_timeout: float) -> cv2.VideoCapture:
     # These are read when a backend is first used. FFmpeg would complain about every torn picture on the
     # node's own stderr (-8: quiet), and hands out half a picture as a whole one unless set to discard it
     # (TCP for RTSP is what OpenCV itself asks for). Without OpenCV's lock around it one silent server held up
     # the opening of all other sources; FFmpeg has needed none since 4.0.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "rtsp_transport;tcp|fflags;discardcorrupt")
+    os.environ.setdefault(OPTIONS, "rtsp_transport;tcp|fflags;discardcorrupt")
     os.environ.setdefault("OPENCV_FFMPEG_IS_THREAD_SAFE", "1")
     os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(max(1, round(read_timeout))))
     if "OPENCV_LOG_LEVEL" not in os.environ:
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    if not is_utf8(source):
+        return cv2.VideoCapture()
     if kind == "device":
         return cv2.VideoCapture(str(_device_path(source)), cv2.CAP_V4L2)
     # One thread to decode: several would each hold a picture back.
@@ -265,6 +355,17 @@ def _open(source: str, kind: str, open_timeout: float, read_timeout: float) -> c
         options += [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(1000 * open_timeout)]
         options += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(1000 * read_timeout)]
     return cv2.VideoCapture(source, cv2.CAP_FFMPEG, options)
+
+
+def _same(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
+    """Whether two pictures are the same to the last bit. A few of their pixels settle it for most."""
+    few = slice(None, None, 16)
+    return one.shape == other.shape and np.array_equal(one[few, few], other[few, few]) and np.array_equal(one, other)
+
+
+def _codec(video: cv2.VideoCapture) -> str:
+    code = int(video.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF
+    return code.to_bytes(4, "little").decode("ascii", "replace").strip("\0 ").lower()
 
 
 def _device_path(source: str) -> Path:

@@ -37,9 +37,11 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LOST_AFTER: Final = 5.0
-"""Seconds without a picture after which a framegrabber that is held is lost."""
+"""Seconds without a picture after which a framegrabber that is held is lost; a slow source has longer."""
 TRY_NEXT: Final = 5.0
-"""Seconds that a lost framegrabber tries one of several sources."""
+"""Seconds that a lost framegrabber tries one of several sources, likewise."""
+PICTURE_WITHIN: Final = 1.5
+OPEN_TIMEOUT: Final = 2.0
 OPENING: Final = 1.0
 """Seconds that a node waits for a first picture before it offers the RC as lost."""
 LOOK: Final = 0.02
@@ -62,18 +64,36 @@ RATE_SPAN: Final = 3.0
 
 class FramegrabberDriver(Driver):
     """`sources` are what `Capture` takes, by the video RC that each shows; {"": source} where there is only
-    one, whatever it shows. At most `rate` frames a second are published, with JPEG `quality` 1..100.
+    one, whatever it shows. At most `rate` frames a second are published, with JPEG `quality` 1..100. `picture_within`:
+    seconds from one picture to the next at most; `still_after` and `transport` as `Capture` takes them.
 
     Commands: `tune` (`to`: a video RC, where the gang does not settle it), `snapshot` (its present state)."""
 
     Options = FramegrabberRc
 
-    def __init__(self, sources: Mapping[str, str], *, rate: float, quality: int) -> None:
+    def __init__(
+        self,
+        sources: Mapping[str, str],
+        *,
+        rate: float,
+        quality: int,
+        picture_within: float = PICTURE_WITHIN,
+        still_after: float | None = None,
+        transport: str = "tcp",
+    ) -> None:
         if not sources or not 0 < rate < math.inf or not 1 <= quality <= 100:
             raise ValueError("a framegrabber has a source, a rate above 0 and a quality of 1 to 100")
         self._sources = dict(sources)
         self._receives = ", ".join(sorted(sources))
         self._rate, self._quality = rate, quality
+        self._slow = 2 * picture_within if picture_within > PICTURE_WITHIN else 0.0
+        # Before it gives the first, FFmpeg looks at three pictures.
+        opening = max(OPEN_TIMEOUT, 2 * self._slow)
+        self._capturing = partial(
+            Capture, open_timeout=opening, read_timeout=picture_within, still_after=still_after, transport=transport
+        )
+        self._faults: dict[str, str] = {}
+        """Of each source that failed: the newest reason."""
         self._meter = FrameMeter()
         self._holder: Holder | None = None
         self._source: str | None = None
@@ -91,7 +111,15 @@ class FramegrabberDriver(Driver):
 
     @classmethod
     def configured(cls, options: Any) -> Self:
-        return cls(options.by_video, rate=options.rate, quality=options.quality)
+        still = options.still_after
+        return cls(
+            options.by_video,
+            rate=options.rate,
+            quality=options.quality,
+            picture_within=options.picture_within / SECOND,
+            still_after=None if still is None else still / SECOND,
+            transport=options.transport,
+        )
 
     async def open(self, rc: RcHandle) -> None:
         self._rc = rc
@@ -101,8 +129,7 @@ class FramegrabberDriver(Driver):
 
     async def _try_sources(self) -> None:
         """Opens its sources until one has a picture. Where none has, it is lost from the beginning."""
-        end, missing = seconds() + OPENING, list[str]()
-        self._lost = True
+        end, self._lost = seconds() + OPENING, True
         for source in sorted(self._sources):
             capture = self._open(source)
             while capture.number == 0 and not capture.failed and seconds() < end:  # noqa: ASYNC110 - a thread's
@@ -112,8 +139,13 @@ class FramegrabberDriver(Driver):
                 self._close_unless_needed()
                 self._before.clear()
                 return
-            missing.append(capture.health)
-        self._rc.fail(f"no picture: {'; '.join(missing)}")
+            self._faults[source] = capture.health
+        self._fail()
+
+    def _fail(self) -> None:
+        names = [name for name in self._faults if name]
+        about = f" of {names[0]}" if len(names) == 1 else ""
+        self._rc.fail(f"no picture{about}: {'; '.join(self._faults.values())}")
 
     async def close(self) -> None:
         self._lost = False
@@ -162,6 +194,7 @@ class FramegrabberDriver(Driver):
             "dropped": totals["dropped"],
             "opened": totals["opened"],
             "stalls": totals["stalls"],
+            "frozen_seconds": round(self._capture.frozen) if self._capture is not None else 0,
             "too_large": meter.too_large,
             "width": meter.width,
             "height": meter.height,
@@ -216,7 +249,7 @@ class FramegrabberDriver(Driver):
     def _open(self, source: str) -> Capture:
         self._let_go()
         self._source = source
-        capture = self._capture = Capture(self._sources[source])
+        capture = self._capture = self._capturing(self._sources[source])
         if self._watching is None or self._watching.done():
             self._watching = self._rc.supervisor.spawn(self._watch_over())
         return capture
@@ -252,16 +285,22 @@ class FramegrabberDriver(Driver):
                 self._silent = 0.0
                 if self._lost and capture.number > 0:
                     self._lost = False
+                    self._faults.clear()
                     self._rc.recover()
                     self._close_unless_needed()
             seen, last = newest, now
             if self._lost:
-                if self._silent > TRY_NEXT and self._holder is None:
+                name = self._source or ""
+                if capture.failed and self._faults.get(name) != capture.health:
+                    self._faults[name] = capture.health
+                    self._fail()
+                if self._silent > max(TRY_NEXT, self._slow) and self._holder is None:
                     self._try_next()
-            elif self._holder is not None and self._silent > LOST_AFTER:
+            elif self._holder is not None and self._silent > (patience := max(LOST_AFTER, self._slow)):
                 self._lost = True
                 about = f" of {self._source}" if self._source else ""
-                self._rc.fail(f"no picture{about} for {LOST_AFTER:g} s: {capture.health}")
+                self._faults = {self._source or "": capture.health}
+                self._rc.fail(f"no picture{about} for {patience:g} s: {capture.health}")
             await asyncio.sleep(CHECK)
 
     def _try_next(self) -> None:
@@ -382,7 +421,8 @@ class FramePump:
             return
         height, width = captured.picture.shape[:2]
         number = self._head.number + captured.number
-        head = structs.replace(self._head, number=number, time=captured.time, width=width, height=height)
+        frozen = round(captured.frozen, 1)
+        head = structs.replace(self._head, number=number, time=captured.time, width=width, height=height, frozen=frozen)
         with self._lock:
             now = seconds()
             if not self._stopped and now - captured.time <= MAX_AGE:

@@ -225,6 +225,8 @@ def _device_names(path: str) -> Iterator[str]:
 def _network_names(url: str) -> Iterator[str]:
     """A port of a host, by all addresses of the host; this host has one name for all of its own."""
     parts = urlsplit(url)
+    if not parts.hostname or parts.port is None:
+        raise ValueError(f"it names no host and port, as {parts.scheme}://host:7002 does")
     for family, kind, _, _, to in socket.getaddrinfo(parts.hostname, parts.port, type=socket.SOCK_DGRAM):
         address = ip_address(str(to[0]).partition("%")[0])
         if isinstance(address, IPv6Address) and address.ipv4_mapped:

@@ -156,6 +156,8 @@ class FrameHead(Message, frozen=True):
     """The hold under which it was taken; none while the framegrabber is free."""
     source: str = ""
     """The video RC to which the framegrabber is tuned, if it knows several."""
+    frozen: Seconds = 0.0
+    """For how long the source has sent this same picture, where it counts as frozen by that."""
 
 
 LIMITS[RcState] = MAX_HELD

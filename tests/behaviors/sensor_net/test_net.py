@@ -203,6 +203,27 @@ def test_who_moves_with_his_hold_goes_on_and_who_lost_it_on_the_way_looks_again(
     assert (scout.hider._robot.phase, scout.task) == (phase, "watch")
 
 
+def test_a_frozen_picture_is_an_alert_at_its_beginning_and_ends_no_turn() -> None:
+    scout = Scout()
+    scout.held(0.0)
+    scout.hider._robot.phase = "hidden"
+    scout.released(0.5)
+    scout.held(1.0)
+    scout.hider._robot.phase = "hidden"
+    still = np.random.default_rng(0).integers(90, 110, (ROWS, COLUMNS), np.uint8)
+    steps = []
+    for number in range(20):
+        scout.frozen = 10.0 + number
+        steps.append(scout.see(1 + number, still, "video/a"))
+    assert [step.alert for step in steps] == [True] + 19 * [False]
+    assert {(step.doing, step.blind, step.over) for step in steps} == {("blind", False, False)}
+    assert steps[5].detail == "frozen: the same picture for 15 s"
+    scout.frozen = 0.0
+    scout.see(22.0, np.add(still, 1, dtype=np.uint8), "video/a")
+    scout.frozen = 10.0
+    assert scout.see(23.0, still, "video/a").alert
+
+
 def test_what_moves_after_a_while_of_bad_pictures_is_another_event() -> None:
     scout = Scout()
     scout.held(0.0)

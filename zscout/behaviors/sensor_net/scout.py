@@ -155,6 +155,8 @@ class Scout:
         self._task: Task = "hide"  # of the present hold
         self._alerts = 0  # count before the present turn
         self._turns: deque[bool] = deque(maxlen=LATELY)  # for each recent turn to watch: True if it saw motion
+        self.frozen = 0.0  # seconds for which the source has sent the same picture, if it counts as frozen: see `see`
+        self._was_frozen = False  # at the last look
         self._held = self.no_signal = False  # no_signal: the last hold ended without even snow
 
     @property
@@ -196,7 +198,7 @@ class Scout:
         self.alerts.rest()
 
     def see(self, now: float, picture: Picture | None, channel: str) -> Step:
-        """Take the newest picture, or None, from the robot on this video channel."""
+        """Take the newest picture, or None, from the robot on this video channel; set `frozen` before."""
         defect = garbled(picture) if picture is not None else None
         good = picture is not None and defect is None
         blind = self.blindness.see(now, good, channel, came=picture is not None)
@@ -208,6 +210,11 @@ class Scout:
             # Blind: later motion is another event.
             edge = self.alerts.see(now, False)
             return Step(0, 0, 0, "blind", "no good picture", quiet=edge == "end")
+        began, self._was_frozen = bool(self.frozen) and not self._was_frozen, bool(self.frozen)
+        if self.frozen:
+            # Nothing moves in a frozen picture: people must know, and motion after it is another event.
+            edge, words = self.alerts.see(now, False), f"frozen: the same picture for {self.frozen:.0f} s"
+            return Step(0, 0, 0, "blind", words, alert=began, quiet=edge == "end")
         seen = self._detector.see(now, picture)
         edge, count = self.alerts.see(now, seen.moving), self.alerts.count
         if self.alerts.moving:
