@@ -329,6 +329,11 @@ def shown(source: str) -> str:
     return f"{parts.scheme}://{host}{port}{parts.path}"
 
 
+def is_utf8(name: str) -> bool:
+    """Whether OpenCV may be given this name: it ends the process at one with other bytes."""
+    return not any("\ud800" <= char <= "\udfff" for char in name)
+
+
 def _open(source: str, kind: str, open_timeout: float, read_timeout: float) -> cv2.VideoCapture:
     # These are read when a backend is first used. FFmpeg would complain about every torn picture on the
     # node's own stderr (-8: quiet), and hands out half a picture as a whole one unless set to discard it
@@ -340,6 +345,8 @@ def _open(source: str, kind: str, open_timeout: float, read_timeout: float) -> c
     os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(max(1, round(read_timeout))))
     if "OPENCV_LOG_LEVEL" not in os.environ:
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    if not is_utf8(source):
+        return cv2.VideoCapture()
     if kind == "device":
         return cv2.VideoCapture(str(_device_path(source)), cv2.CAP_V4L2)
     # One thread to decode: several would each hold a picture back.
