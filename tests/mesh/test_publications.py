@@ -15,7 +15,10 @@ import pytest
 from tests.hang import HANG
 from tests.mesh.both_meshes import FRAMES, LONG, NEWS, Ping, Pong, World, Zenoh
 from tests.mesh.kit import until
+from zscout import messages
 from zscout.keyexpr import BadName
+from zscout.mesh.exchange import LatestByKey
+from zscout.mesh.session import KEPT_BY_KEY
 from zscout.mesh.transport import Quality
 from zscout.messages import MAX_FRAME, FrameHead, base
 
@@ -155,6 +158,13 @@ async def test_publications_beyond_a_full_queue_are_counted_as_missed(world: Wor
 
 async def test_what_is_too_large_waits_nowhere(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(base.LIMITS, Ping, 100)
+    waiting, put = list[int](), LatestByKey.put
+
+    def noted(self: LatestByKey, key: str, payload: bytes) -> bool:
+        waiting.append(len(payload))
+        return put(self, key, payload)
+
+    monkeypatch.setattr(LatestByKey, "put", noted)
     a, b = await world.open("a", "b")
     polled = a.poll_latest(NEWS, Ping)
     heard: list[int] = []
@@ -162,18 +172,27 @@ async def test_what_is_too_large_waits_nowhere(world: World, monkeypatch: pytest
     await world.declared()
     large = b'{"number":1,"x":"' + b"x" * 100_000 + b'"}'
     b._transport.put(NEWS, large, Ping)
-    waiting = list[int]()
-
-    def arrived() -> bool:
-        waiting[:] = [len(arg) for item in a._inbox.items for arg in item.args if isinstance(arg, bytes)]
-        return bool(waiting)
-
-    await world.occupied(arrived)
+    await world.occupied(lambda: waiting)
     assert waiting == [101]
     b.put(NEWS, Ping(2))
     await until(lambda: heard)
     await until(lambda: list(polled.each()) == [(NEWS, Ping(2))])
     assert heard == [2]
+
+
+async def test_where_the_newest_counts_one_publisher_has_a_share(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(base, "NEWEST_COUNTS", {Ping})
+    monkeypatch.setattr(messages, "NEWEST_COUNTS", {Ping})
+    a, b = await world.open("a", "b")
+    heard = dict[str, list[int]]()
+    subscription = a.subscribe("test/*", Ping, lambda key, ping: heard.setdefault(key, []).append(ping.number))
+    await world.declared()
+    for number in range(100):
+        b.put("test/flood", Ping(number))
+    b.put("test/other", Ping(1))
+    await world.occupied(lambda: subscription.missed == 100 - KEPT_BY_KEY)
+    await until(lambda: len(heard) == 2)
+    assert heard == {"test/flood": [*range(KEPT_BY_KEY - 1), 99], "test/other": [1]}
 
 
 async def test_poll_latest_keeps_the_latest(world: World) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, Generic, TypeVar
@@ -180,6 +180,40 @@ class HostShares:
             self._counts[host] -= 1
             if not self._counts[host]:
                 del self._counts[host]
+
+
+class LatestByKey:
+    """Publications that wait, by key: at most `most` of one key, of which the last is replaced by what comes after it,
+    so that no publisher takes all the time. None: any number. Used on any thread."""
+
+    def __init__(self, most: int | None) -> None:
+        self._most, self._lock, self._kept = most, threading.Lock(), dict[str, deque[bytes]]()
+
+    def put(self, key: str, payload: bytes) -> bool:
+        """Return False if it took the place of one that waits."""
+        with self._lock:
+            kept = self._kept.setdefault(key, deque())
+            if self._most is not None and len(kept) >= self._most:
+                kept[-1] = payload
+                return False
+            kept.append(payload)
+            return True
+
+    def take(self, key: str) -> bytes:
+        return self._pop(key, 0)
+
+    def withdraw(self, key: str) -> None:
+        """Take back the last."""
+        self._pop(key, -1)
+
+    def _pop(self, key: str, at: int) -> bytes:
+        with self._lock:
+            kept = self._kept[key]
+            payload = kept[at]
+            del kept[at]
+            if not kept:
+                del self._kept[key]
+            return payload
 
 
 class Declaration:

@@ -25,6 +25,7 @@ from zscout.mesh.exchange import (
     Declaration,
     HostShares,
     IncomingQuery,
+    LatestByKey,
     PolledSubscription,
     Publisher,
     Refused,
@@ -46,6 +47,7 @@ BURST = 256  # items handled in a row at most
 BURST_S = 0.02  # seconds after which a burst ends: timers and other services run between bursts
 SHARE = 16  # queries of one host in the common order; its surplus waits until that is empty
 RING_DEPTH = 32
+KEPT_BY_KEY = 16  # publications on one key that wait, where the newest counts: of more, the latest
 MAX_OF_ONE_KEY = 8  # answers to one question, as of the processes of one host: further ones are not read
 LINK_PERIOD = 1.0  # seconds between two checks that each linked session shows its declarations
 MAX_SESSIONS = 4_096  # sessions remembered
@@ -466,12 +468,18 @@ class Mesh:
         state, handlers = Backlog(depth=depth), list[Callable[[str, Any], None]]()
         most = messages.largest(kind, limit)
 
+        waiting = LatestByKey(KEPT_BY_KEY if kind in messages.NEWEST_COUNTS else None)
+
         def on_sample(name: str, payload: bytes, _: bytes | None) -> None:
             # One that is too large waits cut, to be refused.
-            if not self._inbox.offer(state, handle, name, payload[: most + 1]):
+            if not waiting.put(name, payload[: most + 1]):
+                state.missed += 1
+            elif not self._inbox.offer(state, handle, name):
+                waiting.withdraw(name)
                 state.missed += 1
 
-        def handle(name: str, payload: bytes) -> None:
+        def handle(name: str) -> None:
+            payload = waiting.take(name)
             if not handlers:
                 return
             try:

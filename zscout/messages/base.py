@@ -107,6 +107,10 @@ LIMITS: dict[Any, int] = {}
 """Bytes of one message of that kind, where they are fewer than of others."""
 
 
+NEWEST_COUNTS: set[Any] = set()
+"""Kinds of publications of which the newest on a key tells all: of many that wait some are left out."""
+
+
 class Malformed(ValueError):
     """A payload that is not the message it should be; the text names what and where."""
 

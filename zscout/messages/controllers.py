@@ -6,7 +6,18 @@ from typing import Annotated, Any, TypeAlias
 
 from msgspec import Meta
 
-from zscout.messages.base import LIMITS, MAX_HELD, MAX_NEEDS, Amounts, Elapsed, Message, Problem, Seconds, VersionText
+from zscout.messages.base import (
+    LIMITS,
+    MAX_HELD,
+    MAX_NEEDS,
+    NEWEST_COUNTS,
+    Amounts,
+    Elapsed,
+    Message,
+    Problem,
+    Seconds,
+    VersionText,
+)
 from zscout.messages.scheduling import Holder, Parameters
 from zscout.types import NO_TERM, Grant, Term
 
@@ -161,3 +172,4 @@ class FrameHead(Message, frozen=True):
 
 
 LIMITS[RcState] = MAX_HELD
+NEWEST_COUNTS.add(RcState)

@@ -11,6 +11,7 @@ from zscout.messages.base import (
     MAX_COUNTER,
     MAX_ERROR,
     MAX_INCARNATION,
+    NEWEST_COUNTS,
     Bytes,
     Elapsed,
     Figure,
@@ -136,3 +137,4 @@ class Recorded(Message, frozen=True):
 
 LIMITS[LoadReport] = 131_072
 """256 components with the longest names."""
+NEWEST_COUNTS.add(LoadReport)
