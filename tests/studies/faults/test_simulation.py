@@ -118,6 +118,16 @@ def test_without_terms_on_disk_a_fleet_that_starts_anew_leads_in_lower_ones() ->
 
 
 @pytest.mark.slow
+def test_who_is_protected_stays_so_under_the_next_leader() -> None:
+    size = Size(clients=8, components=1, span=23.0)
+    faults = [Fault(3.0 + 2.5 * number, 1.0, "kill", (f"h{number % 3}/node",)) for number in range(8)]
+    assert simulate(6, size, faults).broken == []
+    with without("protected"):
+        [broken] = simulate(6, size, faults).broken
+    assert "is preempted, though it was protected" in broken
+
+
+@pytest.mark.slow
 def test_what_is_left_of_the_faults_of_a_failing_run_fails_alike() -> None:
     with without("reopen"):
         failed = next(result for seed in SEEDS if (result := simulate(seed)).broken)
