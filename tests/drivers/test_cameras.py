@@ -207,8 +207,7 @@ def test_a_source_that_sends_one_picture_for_ever_is_frozen(kind: str, caplog: p
     shared = Shared()
     how = {"still_after": 0.3, "read_timeout": TIMEOUT}
     with serving(kind, shared) as url, capturing(url, **how) as capture:
-        until(lambda: capture.frozen > 0)
-        assert capture.health == "frozen: the same picture for more than 0.3 s"
+        until(lambda: capture.health == "frozen: the same picture for more than 0.3 s" and capture.frozen > 0)
         assert not capture.failed
         assert later(capture).frozen >= 0.3
         shared.still = False
