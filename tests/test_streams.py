@@ -82,7 +82,7 @@ def test_json_is_the_same_for_every_encoding(monkeypatch: pytest.MonkeyPatch, en
     value = {"comment": WORDS, "rate": Decimal("1.5"), "file": "v\udcff.avi"}
     for shown in (value, {"comment": WORDS}):
         print_json(shown)
-    found = [json.loads(line) for line in written.getvalue().decode(encoding).splitlines()]
+    found = [json.loads(line) for line in written.getvalue().decode("utf-8").splitlines()]
     assert found == [value | {"rate": 1.5}, {"comment": WORDS}]
 
 

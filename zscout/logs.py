@@ -15,6 +15,8 @@ _Fault = tuple[type[BaseException], BaseException, TracebackType | None] | tuple
 FORM: Final = "%(asctime)s %(levelname)s %(message)s"
 
 
+MAX_SHOWN: Final = 200
+"""Characters of a name."""
 REMEDIES: Final = {
     errno.ENOSPC: "free some",
     errno.EDQUOT: "free some",
@@ -28,10 +30,12 @@ REMEDIES: Final = {
 
 
 def shortage(error: BaseException | None) -> str:
-    """In words, what this host lacks for what has failed, and the remedy; empty for other errors, where the traceback
-    may help."""
+    """In words, what this host lacks for what has failed, or the name of a file that is no text, and the remedy; empty
+    for other errors, where the traceback may help."""
     if isinstance(error, BaseExceptionGroup):
         return next(filter(None, map(shortage, error.exceptions)), "")
+    if isinstance(error, UnicodeEncodeError) and "\udc80" <= error.object[error.start] <= "\udcff":
+        return f"{error.object[:MAX_SHOWN]!a} is not UTF-8; rename it"
     if isinstance(error, RuntimeError) and "start new thread" in str(error):
         error = OSError(errno.EAGAIN, "no more threads can be started")
     elif isinstance(error, MemoryError):

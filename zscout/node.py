@@ -143,13 +143,15 @@ async def run_services(
             stack.push_async_callback(keeping.close)
         authority = Authority(node.fleet)
         components = ComponentHost(mesh, node.fleet, node.components, fail, authority=authority)
+        recorder = RecorderProcess(node.recorder, node.fleet, node.host) if node.recorder is not None else None
         if node.load:
             files = reload.in_force if reload is not None else FilesInForce(rights_of(node))
-            reporter = LoadReporter(mesh, node.labels, components.running, files, tree=node.load == "tree")
+            reporter = LoadReporter(
+                mesh, node.labels, components.running, files, tree=node.load == "tree", recorder=recorder
+            )
             reporter.start()
             stack.push_async_callback(reporter.stop)
-        if node.recorder is not None:
-            recorder = RecorderProcess(node.recorder, node.fleet, node.host)
+        if recorder is not None:
             await recorder.start()
             stack.push_async_callback(recorder.stop)
         candidate: Candidate | None = None

@@ -56,6 +56,9 @@ def print_json(value: Any, stream: IO[str] | None = None) -> None:
         text = _JSON.encode(value).decode()
     except UnicodeEncodeError:  # the name of a file that is no text
         text = json.dumps(msgspec.to_builtins(value, builtin_types=(Decimal,)), default=float)
+    # JSON is UTF-8, whatever the stream has, or ASCII.
+    if not text.isascii() and (getattr(stream or sys.stdout, "encoding", None) or "utf-8").lower() != "utf-8":
+        text = "".join(char if char.isascii() else escaped(char) for char in text)
     print_line(text if text.isprintable() else "".join(c if c.isprintable() else escaped(c) for c in text), stream)
 
 

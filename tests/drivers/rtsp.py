@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import re
 import socket
 import struct
@@ -33,10 +34,13 @@ def interleaved(client: socket.socket, packet: bytes) -> None:
 
 class RtspServer:
     """Serves `picture(number)`, 20 a second, to whoever asks; a context manager. `status` other than 200 answers each
-    DESCRIBE so; `codec` is what the description names. `transports` are those that were asked for, `tcp` or `udp`."""
+    DESCRIBE so, to user `a` alone where there is a `password`; `codec` is what the description names. `transports` are
+    those that were asked for, `tcp` or `udp`."""
 
-    def __init__(self, picture: Callable[[int], NDArray[np.uint8]], *, status: int = 200, codec: str = "JPEG") -> None:
-        self.picture, self.status, self.codec = picture, status, codec
+    def __init__(
+        self, picture: Callable[[int], NDArray[np.uint8]], *, status: int = 200, codec: str = "JPEG", password: str = ""
+    ) -> None:
+        self.picture, self.status, self.codec, self.password = picture, status, codec, password
         self.transports: list[str] = []
         self._closing = threading.Event()
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -73,13 +77,14 @@ class RtspServer:
                     number = re.search(r"CSeq: *(\d+)", text, re.IGNORECASE)
                     more_heads, body, status = "", "", 200
                     if "DESCRIBE " in text:
-                        status = self.status
+                        status = self.status if self._lets_in(text) else 401
                         kind = 26 if self.codec == "JPEG" else 96
                         body = (
                             "v=0\r\no=- 1 1 IN IP4 127.0.0.1\r\ns=x\r\nc=IN IP4 0.0.0.0\r\nt=0 0\r\n"
                             f"m=video 0 RTP/AVP {kind}\r\na=rtpmap:{kind} {self.codec}/90000\r\na=control:track1\r\n"
                         )
                         more_heads = "Content-Type: application/sdp\r\n"
+                        more_heads += 'WWW-Authenticate: Digest realm="cam", nonce="n1"\r\n' * (status == 401)
                     elif "SETUP " in text:
                         asked = re.search(r"Transport: *(.*)", text, re.IGNORECASE)
                         asks = asked[1].strip() if asked else ""
@@ -100,6 +105,16 @@ class RtspServer:
                     if "PLAY " in text and send is not None:
                         threading.Thread(target=self._stream, args=(send, gone), daemon=True).start()
         gone.set()
+
+    def _lets_in(self, text: str) -> bool:
+        given = re.search(r'uri="([^"]*)".*response="(\w+)"', text)
+
+        def md5(words: str) -> str:
+            return hashlib.md5(words.encode()).hexdigest()  # noqa: S324 - as RFC 2617 has it
+
+        return not self.password or (
+            given is not None and given[2] == md5(f"{md5(f'a:cam:{self.password}')}:n1:{md5(f'DESCRIBE:{given[1]}')}")
+        )
 
     def _stream(self, send: Callable[[bytes], object], gone: threading.Event) -> None:
         sequence = number = 0

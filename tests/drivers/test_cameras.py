@@ -172,6 +172,14 @@ def test_each_failure_of_an_rtsp_camera_has_its_own_words(status: int, codec: st
         assert why_closed(server.url, TIMEOUT) == words
 
 
+def test_a_user_signs_in_to_rtsp_before_anything_is_called_wrong() -> None:
+    with RtspServer(colour, status=404, password="s:1") as server:  # noqa: S106
+        url = server.url.replace("//", "//a:s%3A1@")
+        assert why_closed(url, TIMEOUT) == "it has no such page; is the path right? (404)"
+        assert why_closed(url.replace("s%3A1", "wrong"), TIMEOUT) == "it refuses this user and password (401)"
+        assert why_closed(server.url, TIMEOUT) == "it wants a user and password (401)"
+
+
 def colour(number: int) -> NDArray[np.uint8]:
     return numbered(number, grey=False)
 
@@ -199,8 +207,7 @@ def test_a_source_that_sends_one_picture_for_ever_is_frozen(kind: str, caplog: p
     shared = Shared()
     how = {"still_after": 0.3, "read_timeout": TIMEOUT}
     with serving(kind, shared) as url, capturing(url, **how) as capture:
-        until(lambda: capture.frozen > 0)
-        assert capture.health == "frozen: the same picture for more than 0.3 s"
+        until(lambda: capture.health == "frozen: the same picture for more than 0.3 s" and capture.frozen > 0)
         assert not capture.failed
         assert later(capture).frozen >= 0.3
         shared.still = False

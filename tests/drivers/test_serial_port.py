@@ -31,6 +31,9 @@ from zscout.types import SECOND
 pytestmark = pytest.mark.real_time
 CLONE_NEWNET = 0x40000000
 ALL_BYTES = bytes(range(256))
+_NET = os.getpid() % 16_384 * 4
+NEAR, FAR = (f"198.18.{_NET >> 8}.{_NET % 256 + end}" for end in (1, 2))
+"""Addresses of this process alone: others run these tests on the same machine."""
 
 
 class Peer:
@@ -198,7 +201,7 @@ async def test_what_is_too_old_when_its_turn_comes_is_not_written() -> None:
 
 @pytest.fixture
 def away() -> Iterator[str]:
-    """A network namespace at the end of a cable of this machine, at 198.51.100.2; see `reach`."""
+    """A network namespace at the end of a cable of this machine, at FAR; see `reach`."""
     try:
         check()
     except NoNamespaces as why:
@@ -207,9 +210,9 @@ def away() -> Iterator[str]:
     ip("netns", "add", space)
     try:
         ip("link", "add", near, "type", "veth", "peer", "name", "far", "address", "02:00:00:00:00:02", "netns", space)
-        ip("addr", "add", "198.51.100.1/30", "dev", near)
+        ip("addr", "add", f"{NEAR}/30", "dev", near)
         ip("link", "set", near, "up")
-        ip("-n", space, "addr", "add", "198.51.100.2/30", "dev", "far")
+        ip("-n", space, "addr", "add", f"{FAR}/30", "dev", "far")
         ip("-n", space, "link", "set", "far", "up")
         reach(space)
         yield space
@@ -220,16 +223,16 @@ def away() -> Iterator[str]:
 
 def reach(space: str, address: str = "02:00:00:00:00:02") -> None:
     """With a wrong hardware address, what is sent there is lost without a word."""
-    ip("neigh", "replace", "198.51.100.2", "lladdr", address, "nud", "permanent", "dev", f"{space}n")
+    ip("neigh", "replace", FAR, "lladdr", address, "nud", "permanent", "dev", f"{space}n")
 
 
 @pytest.mark.live
 @pytest.mark.slow
 @pytest.mark.parametrize("speaks", [False, True], ids=["socket", "rfc2217"])
 async def test_a_peer_that_goes_without_a_word_gets_nothing_old_when_it_is_back(away: str, speaks: bool) -> None:
-    with peer(speaks=speaks, space=away, host="198.51.100.2") as there:
+    with peer(speaks=speaks, space=away, host=FAR) as there:
         ear = Ear()
-        line = line_to(there.url.replace("127.0.0.1", "198.51.100.2"), ear)
+        line = line_to(there.url.replace("127.0.0.1", FAR), ear)
         await ear.until(lambda: ear.told == ["up"])
         assert line.write(encode(HaltPacket(1, 0)))
         await met(lambda: there.packets)
@@ -253,9 +256,9 @@ async def test_a_peer_that_goes_without_a_word_gets_nothing_old_when_it_is_back(
 @pytest.mark.live
 @pytest.mark.slow
 async def test_a_silent_peer_is_noticed_though_nothing_is_written(away: str) -> None:
-    with peer(space=away, host="198.51.100.2") as there:
+    with peer(space=away, host=FAR) as there:
         ear = Ear()
-        line = line_to(there.url.replace("127.0.0.1", "198.51.100.2"), ear)
+        line = line_to(there.url.replace("127.0.0.1", FAR), ear)
         await ear.until(lambda: ear.told == ["up"])
         await asyncio.to_thread(reach, away, NOWHERE)
         await ear.until(lambda: len(ear.told) > 1)
@@ -331,6 +334,7 @@ def test_what_is_wrong_with_a_port_is_said_in_plain_words() -> None:
             ("rfc2217://no-such-host.invalid:1", "names a host that is not known"),
             (f"rfc2217://127.0.0.1:{there.port}?timeout=0.1", "does not speak RFC 2217"),
             ("hwgrep://no such device", "is not there; is it plugged in?"),
+            ("socket://mast", "fails: it names no host and port, as socket://host:7002 does"),
         ):
             assert words in failure(url)
     for error, words in (

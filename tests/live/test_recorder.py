@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
@@ -23,7 +23,7 @@ from rerun.chunk import RrdReader
 
 from tests.hang import HANG
 from tests.live import bench
-from tests.live.lab import Lab
+from tests.live.lab import Lab, awaited
 from tests.ports import free_port
 from tests.services.recorder.paper_run import PERSON, USER, colours, events, lanes, rows
 from zscout.behaviors.client.arc import hold
@@ -458,3 +458,38 @@ def test_a_recorder_joins_beside_its_node() -> None:
     assert own.connect == ("tcp/10.0.0.2:7447", "tcp/127.0.0.1:7447", "tls/[::1]:7448#x=y")
     assert beside(MeshConfig()) == MeshConfig()
     assert beside(MeshConfig(relay=("north", "south"))) == MeshConfig(site="north")
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """The folder `runs`, on a disk of 300 kB."""
+    runs = tmp_path / "runs"
+    runs.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=300k", "none", str(runs)]
+    if subprocess.run(command, check=False, capture_output=True).returncode:
+        pytest.skip("only root may mount a small disk")
+    yield runs
+    subprocess.run(["umount", "--lazy", runs], check=True)
+
+
+@pytest.mark.slow
+async def test_a_recorder_whose_disk_is_full_says_so_in_status(small_disk: Path, tmp_path: Path) -> None:
+    async with Lab(tmp_path) as lab:
+        lab.node("a", "robot/a", extra=recorder())
+        await lab.begun("crew")
+        await recording(lab)
+        with (small_disk / "filler").open("wb", 0) as file, suppress(OSError):
+            while file.write(bytes(4096)):
+                pass
+
+        async def unrecorded() -> dict[str, str]:
+            done = await lab.zscout("status", "--json")
+            return dict(msgspec.json.decode(done.stdout)["unrecorded"])
+
+        told = await awaited(unrecorded, bool, lambda: lab.log("a"))
+        assert list(told) == ["a"]
+        assert "can't be written" in told["a"]
+        assert "can't be written" in (await lab.zscout("status")).stdout
+        lab.nodes["a"].terminate()
+        assert await asyncio.to_thread(lab.nodes["a"].wait, HANG) == 0
+        assert "Traceback" not in lab.log("a")

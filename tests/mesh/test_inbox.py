@@ -112,6 +112,28 @@ async def test_of_questions_one_of_each_host_is_let_in_before_asks_that_have_com
     assert handled == ["q0", "q1", "ask", "q2", "q3", "q4"]
 
 
+async def test_of_questions_that_were_set_aside_each_has_a_burst() -> None:
+    """What it takes comes after the burst, as a step of the leader; its heartbeats come between two."""
+    box, bursts = Inbox(asyncio.get_running_loop()), list[list[str]]()
+
+    def answer(text: str) -> None:
+        assert box.after is not None
+        if not box.after:
+            bursts.append([])
+            box.after.append(lambda: None)
+        bursts[-1].append(text)
+
+    def concern(text: str) -> None:
+        if not box.behind(Lane.QUESTION, "viewer", answer, text):
+            answer(text)
+
+    for number in range(4):
+        assert box.offer(Backlog(), concern, f"q{number}", host="viewer", lane=Lane.ASK)
+    await until(lambda: sum(map(len, bursts)) == 4)
+    assert max(map(len, bursts)) <= 2
+    assert len(bursts) >= 3
+
+
 @pytest.mark.real_time
 async def test_a_burst_is_short_whatever_its_handlers_do() -> None:
     box, handled = Inbox(asyncio.get_running_loop()), list[int]()

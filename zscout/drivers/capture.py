@@ -200,9 +200,9 @@ class Capture:
         if self._newest is None or not _same(picture, self._newest.picture):
             self._same_since = now
         still = now - self._same_since
-        self.frozen = still if self._still_after and still >= self._still_after else 0.0
-        health = f"frozen: the same picture for more than {self._still_after:g} s" if self.frozen else "ok"
-        if self.frozen and not was:
+        frozen = still if self._still_after and still >= self._still_after else 0.0
+        health = f"frozen: the same picture for more than {self._still_after:g} s" if frozen else "ok"
+        if frozen and not was:
             log.warning("%s is %s", shown(self.source), health)
         elif self.health != health:
             log.info("%s gives %spictures", shown(self.source), "new " if was else "")
@@ -211,8 +211,8 @@ class Capture:
                 self.dropped += 1
             self._taken = False
             self.number += 1
-            self._newest = CapturedFrame(self.number, now, picture, self.frozen)
-            self.health, self.failed = health, False
+            self._newest = CapturedFrame(self.number, now, picture, frozen)
+            self.health, self.failed, self.frozen = health, False, frozen
             self._new_picture.notify_all()
 
     def _ended(self, video: cv2.VideoCapture, waited: float, *, any_picture: bool) -> None:
@@ -329,6 +329,11 @@ def shown(source: str) -> str:
     return f"{parts.scheme}://{host}{port}{parts.path}"
 
 
+def is_utf8(name: str) -> bool:
+    """Whether OpenCV may be given this name: it ends the process at one with other bytes."""
+    return not any("\ud800" <= char <= "\udfff" for char in name)
+
+
 def _open(source: str, kind: str, open_timeout: float, read_timeout: float) -> cv2.VideoCapture:
     # These are read when a backend is first used. FFmpeg would complain about every torn picture on the
     # node's own stderr (-8: quiet), and hands out half a picture as a whole one unless set to discard it
@@ -340,6 +345,8 @@ def _open(source: str, kind: str, open_timeout: float, read_timeout: float) -> c
     os.environ.setdefault("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", str(max(1, round(read_timeout))))
     if "OPENCV_LOG_LEVEL" not in os.environ:
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    if not is_utf8(source):
+        return cv2.VideoCapture()
     if kind == "device":
         return cv2.VideoCapture(str(_device_path(source)), cv2.CAP_V4L2)
     # One thread to decode: several would each hold a picture back.
@@ -350,10 +357,14 @@ def _open(source: str, kind: str, open_timeout: float, read_timeout: float) -> c
     return cv2.VideoCapture(source, cv2.CAP_FFMPEG, options)
 
 
-def _same(one: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
-    """Whether two pictures are the same to the last bit. A few of their pixels settle it for most."""
+def _same(picture: NDArray[np.uint8], other: NDArray[np.uint8]) -> bool:
+    """Return True if two pictures are the same to the last bit. A few of their pixels settle it for most."""
     few = slice(None, None, 16)
-    return one.shape == other.shape and np.array_equal(one[few, few], other[few, few]) and np.array_equal(one, other)
+    return (
+        picture.shape == other.shape
+        and np.array_equal(picture[few, few], other[few, few])
+        and np.array_equal(picture, other)
+    )
 
 
 def _codec(video: cv2.VideoCapture) -> str:

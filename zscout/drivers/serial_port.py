@@ -1,8 +1,8 @@
 """One port of pyserial, by any of its names: a device, a link to one, or a URL. Blocking.
 
-What the other end does not take within TIMEOUT is discarded, never sent later: the system's own count of bytes that no
-device or peer has taken is looked at, TCP gives up after as long, and a connection that failed is reset. A pty has no
-such count: up to 4,095 bytes wait at its other end unseen."""
+Bytes that the other end does not take within TIMEOUT are discarded, never sent later: the system's own count of bytes
+that no device or peer has taken is looked at, TCP gives up after as long, and a connection that failed is reset. A pty
+has no such count: up to 4,095 bytes wait at its other end unseen."""
 
 from __future__ import annotations
 
@@ -82,8 +82,8 @@ _NUMBER: Final = re.compile(r"(?:\[Errno |\()(\d+)[],]")
 
 class SerialPort:
     """`url` is anything that pyserial's `serial_for_url` takes; `dtr`, `rts`: how these lines are from its opening on,
-    None: as pyserial has them. It may be opened again after `close`. Methods raise whatever pyserial lets through:
-    see `plain`."""
+    None: as pyserial has them. It may be opened again after `close`. Methods raise any exception that pyserial lets
+    through: see `plain`."""
 
     def __init__(self, url: str, baud: int, *, dtr: bool | None = None, rts: bool | None = None) -> None:
         self.url = url
@@ -91,7 +91,7 @@ class SerialPort:
         self._port: Any = None
         self._locked = ExitStack()
         self._recent: deque[tuple[Ns, int]] = deque()
-        """What was written within TIMEOUT: when, and bytes."""
+        """The writes within TIMEOUT: instant and size."""
         self._source = 0
         """The local TCP port of a connection that failed. A peer that has not noticed lets go of it, and takes a new
         one, when that comes from the same port."""
@@ -164,7 +164,7 @@ class SerialPort:
         return 0
 
     def close(self, *, discard: bool) -> None:
-        """`discard` what was not taken: it would arrive late."""
+        """`discard` the bytes that were not taken: they would arrive late."""
         connection = self._socket
         with suppress(Exception):
             if connection is None:
@@ -225,6 +225,8 @@ def _device_names(path: str) -> Iterator[str]:
 def _network_names(url: str) -> Iterator[str]:
     """A port of a host, by all addresses of the host; this host has one name for all of its own."""
     parts = urlsplit(url)
+    if not parts.hostname or parts.port is None:
+        raise ValueError(f"it names no host and port, as {parts.scheme}://host:7002 does")
     for family, kind, _, _, to in socket.getaddrinfo(parts.hostname, parts.port, type=socket.SOCK_DGRAM):
         address = ip_address(str(to[0]).partition("%")[0])
         if isinstance(address, IPv6Address) and address.ipv4_mapped:
@@ -246,7 +248,7 @@ def _keep_lines(fd: int) -> None:
 
 
 def plain(error: Exception) -> str:
-    """What is wrong with a port, for people who do not know pyserial."""
+    """The fault of a port, in words that follow its name, for people who do not know pyserial."""
     if isinstance(error, InUse):
         return str(error)
     text = str(error)

@@ -9,8 +9,11 @@ import re
 import socket
 import ssl
 import urllib.request
+from base64 import b64encode
 from collections.abc import Mapping
-from typing import Final
+from contextlib import suppress
+from types import SimpleNamespace
+from typing import Any, Final
 from urllib.error import HTTPError, URLError
 from urllib.parse import SplitResult, unquote, urlsplit, urlunsplit
 
@@ -108,13 +111,12 @@ def _http(parts: SplitResult, timeout: float) -> str | None:
 def _rtsp(parts: SplitResult, timeout: float) -> str | None:
     host, port = parts.hostname or "", parts.port or 554
     bare = urlunsplit(("rtsp", parts.netloc.rpartition("@")[2], parts.path, parts.query, ""))
-    ask = f"DESCRIBE {bare} RTSP/1.0\r\nCSeq: 1\r\nAccept: application/sdp\r\nUser-Agent: {AGENT}\r\n\r\n"
-    with socket.create_connection((host, port), timeout) as connection:
-        connection.sendall(ask.encode())
-        reply = b""
-        while len(reply) < MAX_REPLY and not _whole(reply) and (more := connection.recv(4096)):
-            reply += more
+    ask = f"DESCRIBE {bare} RTSP/1.0\r\nCSeq: 1\r\nAccept: application/sdp\r\nUser-Agent: {AGENT}\r\n"
+    reply = _reply(host, port, ask, timeout)
     first = re.match(rb"RTSP/\d\.\d (\d{3})", reply)
+    if first is not None and first[1] == b"401" and parts.username is not None:
+        reply = _reply(host, port, ask + _signed(reply, bare, parts), timeout)
+        first = re.match(rb"RTSP/\d\.\d (\d{3})", reply)
     if first is None:
         return "it hung up without an answer" if not reply else "it does not speak RTSP"
     if (status := int(first[1])) >= 300:
@@ -126,6 +128,32 @@ def _rtsp(parts: SplitResult, timeout: float) -> str | None:
         if codec.lower() in UNDECODABLE:
             return f"it sends {UNDECODABLE[codec.lower()]}, which can't be decoded here; {REMEDY}"
     return None
+
+
+def _reply(host: str, port: int, ask: str, timeout: float) -> bytes:
+    with socket.create_connection((host, port), timeout) as connection:
+        connection.sendall(f"{ask}\r\n".encode())
+        reply = b""
+        while len(reply) < MAX_REPLY and not _whole(reply) and (more := connection.recv(4096)):
+            reply += more
+    return reply
+
+
+def _signed(reply: bytes, url: str, parts: SplitResult) -> str:
+    """The header by which a user signs in, as the server wants it; empty where it wants what is not known here."""
+    user, password = unquote(parts.username or ""), unquote(parts.password or "")
+    wanted = re.findall(rb"^WWW-Authenticate: *(\w+) +(.*?)\r?$", reply, re.IGNORECASE | re.MULTILINE)
+    for way, challenge in wanted:
+        if way.lower() == b"digest":
+            passwords = urllib.request.HTTPPasswordMgrWithDefaultRealm()
+            passwords.add_password(None, url, user, password)
+            asked: Any = SimpleNamespace(full_url=url, selector=url, data=None, get_method=lambda: "DESCRIBE")
+            given = urllib.request.parse_keqv_list(urllib.request.parse_http_list(challenge.decode("latin-1")))
+            with suppress(ValueError, URLError):
+                signed = urllib.request.AbstractDigestAuthHandler(passwords).get_authorization(asked, given)
+                return f"Authorization: Digest {signed}\r\n"
+    basic = any(way.lower() == b"basic" for way, _ in wanted)
+    return f"Authorization: Basic {b64encode(f'{user}:{password}'.encode()).decode()}\r\n" if basic else ""
 
 
 def _whole(reply: bytes) -> bool:

@@ -70,6 +70,8 @@ class LoadReport(Message, frozen=True):
     """Digest of the rights that the node enforces; empty: none."""
     fault: Annotated[str, msgspec.Meta(max_length=MAX_ERROR)] = ""
     """Why the node uses older settings than its files have, with file and key; empty: it does not."""
+    recorder: Annotated[str, msgspec.Meta(max_length=MAX_ERROR)] = ""
+    """Why the node's recorder writes nothing; empty: it writes, or there is none."""
 
 
 class RankAsk(Message, frozen=True):

@@ -112,8 +112,11 @@ class Picture:
         assert self.state is not None
         self.state.rcs.append(view)
         self.hosts[at].tokens.add(Token(at, Role.RC, name, "i"))
-        health, rate = options.get("health", "ok"), float(options.get("rate", 0))
-        self.health[name] = RcState(name, at, "i", shared, health=health, figures={"rate": rate} if rate else {})
+        figures: dict[str, float] = {
+            figure: float(options[figure]) for figure in ("rate", "frozen_seconds") if figure in options
+        }
+        health = options.get("health", "ok")
+        self.health[name] = RcState(name, at, "i", shared, health=health, figures=figures)
         if (kept := options.get("kept")) is not None:
             start = round(NOW.timestamp()) + {"maintenance": -60, "booked": 3600}[kept]
             date = BookedDate(start, start + 120, "open")

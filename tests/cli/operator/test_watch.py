@@ -5,19 +5,26 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
 import pytest
+from rerun import RecordingStream
 from rerun.chunk import RrdReader
 
 from tests.behaviors.perception.scenes import Scene, box_of, overlap
 from tests.cli.tools import COMMAND, Terminal, end, zscout_here
 from tests.drivers.mjpeg import MjpegServer, jpeg
 from tests.hang import HANG
+from zscout.cli.operator import picture_recording
+from zscout.services.recorder.drawing import unwritten
 
 RATE = 10.0
 COMES, GOES = 5.0, 7.0
@@ -113,6 +120,81 @@ def test_a_recording_that_cannot_be_written_is_refused(
     told = capsys.readouterr().err
     assert "--record: can't record to" in told
     assert "name a file that can be written" in told
+
+
+def test_a_disk_that_is_full_is_one_line_and_exit_code_1(
+    video: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(picture_recording, "unwritten", lambda *_: "x.rrd can't be written: its disk is full")
+    assert zscout_here("motion", "--source", video, "--record", tmp_path / "x.rrd") == 1
+    assert capsys.readouterr().err == "zscout: x.rrd can't be written: its disk is full\n"
+
+
+@pytest.mark.parametrize("name", ["v\udcff.avi", "f\udcff/v.avi", "http://127.0.0.1:9/\udcff", "/dev/v\udcff"])
+def test_a_name_that_is_not_utf8_is_one_line(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if name.endswith(".avi"):
+        Path(name).parent.mkdir(exist_ok=True)
+        Path(name).write_bytes(b"RIFF\0\0\0\0AVI ")
+    assert zscout_here("motion", "--source", name) == 2
+    error = capsys.readouterr().err
+    assert ("is not UTF-8" in error) is name.endswith(".avi")
+    assert error.startswith("zscout: ")
+    assert error.count("\n") == 1
+
+
+def test_a_folder_whose_name_is_not_utf8_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "f\udcff"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    Path("v.avi").write_bytes(b"RIFF\0\0\0\0AVI ")
+    assert zscout_here("motion", "--source", "v.avi") == 2
+    assert "or its folder is not UTF-8" in capsys.readouterr().err
+
+
+def test_why_a_recording_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "x.rrd"
+    good = SimpleNamespace(flush=lambda *, timeout_sec: None)
+    dead = SimpleNamespace(flush=Mock(side_effect=RuntimeError("its writer ended")))
+    assert unwritten(cast("RecordingStream", good), file, 1) == ""
+    assert "x.rrd can't be written (its writer ended)" in unwritten(cast("RecordingStream", dead), file, 1)
+    monkeypatch.setattr("os.statvfs", lambda _: SimpleNamespace(f_bavail=2, f_frsize=4096))
+    assert unwritten(cast("RecordingStream", dead), file, 1).endswith(
+        "x.rrd can't be written: its disk is full; free some"
+    )
+
+
+HANGING = """if True:
+    import ctypes, sys
+    from zscout.cli.main import main
+    from zscout.cli.operator import picture_recording, watch
+
+    def hang(*_, **__):
+        mutex = ctypes.create_string_buffer(64)
+        print("hangs", flush=True)
+        for _ in range(2):
+            ctypes.CDLL(None).pthread_mutex_lock(mutex)
+
+    watch.PATIENCE = 0.1
+    picture_recording.WatchRecording.seen = hang
+    main(sys.argv[1:])"""
+"""A recording in which Rerun never returns; no signal handler of Python's runs then."""
+
+
+@pytest.mark.live
+@pytest.mark.slow
+def test_a_signal_ends_it_though_its_recording_hangs(video: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-c", HANGING, "motion", "--source", str(video)]
+    command += ["--record", str(tmp_path / "x.rrd")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "hangs\n"
+        process.terminate()
+        assert process.wait(HANG) == 128 + signal.SIGTERM
 
 
 @pytest.fixture

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from zscout.services.journal import journal as journal_module
 from zscout.services.journal.accounts import accounts
 from zscout.services.journal.journal import Journal
 from zscout.services.journal.merging import Span
-from zscout.services.journal.store import FILE
+from zscout.services.journal.store import FILE, JournalStore
 from zscout.services.rcm.candidate import Candidate, CandidateParts
 from zscout.testing.memory import MemoryMesh
 from zscout.types import SECOND, Grant
@@ -301,4 +302,26 @@ async def test_bad_questions_are_refused(tmp_path: Path) -> None:
     for asked, code in (({"rc": "robot"}, "bad_name"), ({"limit": 0}, "malformed")):
         with pytest.raises(Refusal, match=code):
             await told.ask(**asked)
+    await told.close()
+
+
+async def test_questions_take_one_thread_of_those_that_all_share(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a few long ones keep bookings and terms from the disk."""
+    told, _ = await telling(tmp_path, "x")
+    answering, most = 0, 0
+    whole = JournalStore.answer
+
+    def slow(*args: Any) -> History:
+        nonlocal answering, most
+        answering += 1
+        most = max(most, answering)
+        time.sleep(0.01)
+        answering -= 1
+        return whole(*args)
+
+    monkeypatch.setattr(JournalStore, "answer", slow)
+    assert len(await asyncio.gather(*(told.ask() for _ in range(5)))) == 5
+    assert most == 1
     await told.close()

@@ -134,6 +134,11 @@ class FleetView:
         loads = {name: host.load for name, host in sorted(self.hosts.items()) if host.has(Role.LOAD)}
         return {name: load.fault for name, load in loads.items() if load is not None and load.fault}
 
+    def unrecorded(self) -> dict[str, str]:
+        """By host: why its node's recorder writes nothing."""
+        loads = {name: host.load for name, host in sorted(self.hosts.items()) if host.has(Role.LOAD)}
+        return {name: load.recorder for name, load in loads.items() if load is not None and load.recorder}
+
     async def quiet(self) -> None:
         """Returns when no host has come into sight for a while: links are made one after another."""
         deadline = self.mesh.now() + round(FIND_LOADS * SECOND)

@@ -145,6 +145,7 @@ class Standing:
             rows.append(("roles", "they are only advisory: set [security], so that names are proved"))
         rows += [("roles", words) for words in differing(self._own_rights(), self.fleet_view.rights())]
         rows += [("files", f"{host} uses older settings: {fault}") for host, fault in self.fleet_view.faults().items()]
+        rows += [("recorder", f"{host}: {why}") for host, why in self.fleet_view.unrecorded().items()]
         clocks = sorted(self._clocks().items())
         rows += [("clock", f"{booked.clock_words(host, differs)}; set it") for host, differs in clocks]
         if (versions := mixture(self._versions())) is not None:
@@ -231,8 +232,9 @@ class Standing:
     def as_object(self) -> dict[str, Any]:
         """The output of `--json`, spans in seconds and memory in bytes; `rcm` is null if no node leads. `advisory`:
         rights are listed and not enforced; `rights`: hosts by the digest of those they enforce, `own_rights`: that of
-        this fleet file; `faults`: why a host uses older settings than its files have; `ending`: certificates that end
-        soon; `clocks`: how far hosts' clocks differ from fleet time; `booked_soon`: dates of bookings within 24 h."""
+        this fleet file; `faults`: why a host uses older settings than its files have; `unrecorded`: why a host's
+        recorder writes nothing; `ending`: certificates that end soon; `clocks`: how far hosts' clocks differ from fleet
+        time; `booked_soon`: dates of bookings within 24 h."""
         chosen, versions = self.selection(), self._versions()
         state, homes, now = chosen.state, self._homes(), self.fleet_view.mesh.now()
         holds, views, queue = (state.holds, state.rcs, state.queue) if state is not None else ([], [], [])
@@ -260,6 +262,7 @@ class Standing:
             "rights": [{"digest": digest, "hosts": hosts} for digest, hosts in self.fleet_view.rights().items()],
             "own_rights": self._own_rights(),
             "faults": self.fleet_view.faults(),
+            "unrecorded": self.fleet_view.unrecorded(),
             "ending": [{"name": name, "ends_in": left} for name, left in self.fleet_view.ending().items()],
             "clocks": self._clocks(),
             "booked_soon": booked.soon(self.booked),

@@ -13,15 +13,19 @@ import rerun.blueprint as rrb
 from numpy.typing import NDArray
 
 from zscout.behaviors.perception.motion import Box
+from zscout.cli.common import Failed
 from zscout.keyexpr import new_instance
 from zscout.services.recorder.blueprint import APPLICATION, page
 from zscout.services.recorder.colours import OPERATOR, OTHER
-from zscout.services.recorder.drawing import Drawing, clean_text, disconnect
+from zscout.services.recorder.drawing import Drawing, clean_text, disconnect, unwritten
 from zscout.services.recorder.timeline import TimelineError
 
 MEMORY: Final = "100MB"
 """What is kept for a viewer that opens late."""
 DISCONNECT_SECONDS: Final = 3.0
+FLUSH_SECONDS: Final = 3.0
+CHECK_EVERY: Final = 1 << 22
+"""Bytes of pictures between two looks whether the file can be written."""
 WIDTH: Final = 640
 """Columns of a picture of a watch; larger ones are reduced."""
 QUALITY: Final = 75
@@ -46,6 +50,7 @@ class PictureRecording(Drawing):
         """`port` must be free. Raises TimelineError where `file` can't be written."""
         self._recording = rr.RecordingStream(APPLICATION, recording_id=f"{command}-{new_instance()}")
         super().__init__(self._recording)
+        self._file = file
         self.url = f"rerun+http://127.0.0.1:{port}/proxy" if port is not None else ""
         """Where a viewer finds it, if it is served."""
         layout = page(
@@ -74,14 +79,20 @@ class PictureRecording(Drawing):
     def picture(self, at: float, jpeg: bytes) -> None:
         self.log(at, "picture", rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
 
+    def check(self) -> None:
+        """Blocks until the file has all that was logged. Raises Failed where it can't be written."""
+        if self._file is not None and (why := unwritten(self._recording, self._file, FLUSH_SECONDS)):
+            raise Failed(why)
+
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        if self.url:
+    def __exit__(self, kind: object, *_: object) -> None:
+        try:
+            if kind is None:
+                self.check()
+        finally:
             disconnect(self._recording, DISCONNECT_SECONDS)
-        else:
-            self._recording.disconnect()
 
 
 class WatchRecording(PictureRecording):
@@ -101,6 +112,8 @@ class WatchRecording(PictureRecording):
                 size = (WIDTH, max(1, round(height * scale)))
                 picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
             jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+            if self._bytes // CHECK_EVERY != (self._bytes + len(jpeg)) // CHECK_EVERY:
+                self.check()
             self._bytes += len(jpeg)
             self.picture(at, jpeg)
         shapes = [[side * scale for side in box] for box in boxes] or np.zeros((0, 4))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
-from collections.abc import Callable
-from contextlib import ExitStack
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Final
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
     from zscout.cli.operator.picture_recording import WatchRecording
     from zscout.cli.operator.watch_source import LiveSource, VideoFile
 
+PATIENCE: Final = 8.0
+"""Seconds from a signal to the end, for what was recorded to be written."""
 DRAWN: Final = 0.1
 """Seconds from one live line to the next."""
 
@@ -80,6 +84,7 @@ def motion(source: str, as_json: bool, record: Path | None, limit: float | None)
         ended_by.append(number)
 
     with ExitStack() as stack:
+        stack.enter_context(_ended_by_signals())
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             # What a shell or nohup made this process ignore stays ignored.
             if signal.getsignal(number) is not signal.SIG_IGN:
@@ -90,6 +95,7 @@ def motion(source: str, as_json: bool, record: Path | None, limit: float | None)
         opened = open_source(source, report.say)
         stack.callback(opened.close)
         if record is not None:
+            os.environ.setdefault("RUST_LOG", "off")  # Rerun's words: what fails is reported here
             from zscout.cli.operator.picture_recording import WatchRecording
             from zscout.services.recorder.timeline import TimelineError
 
@@ -102,6 +108,30 @@ def motion(source: str, as_json: bool, record: Path | None, limit: float | None)
     report.summary()
     if ended_by:
         raise common.Interrupted(ended_by[0])
+
+
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """A signal ends this process in the end, though its main thread hangs in a library and can't handle it."""
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    over, before = threading.Event(), signal.set_wakeup_fd(writing, warn_on_full_buffer=False)
+
+    def insist() -> None:
+        while numbers := os.read(reading, 1):
+            if numbers[0] in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP) and not over.wait(PATIENCE):
+                os._exit(128 + numbers[0])
+
+    thread = threading.Thread(target=insist, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        signal.set_wakeup_fd(before)
+        os.close(writing)
+        thread.join()
+        os.close(reading)
 
 
 def _watch(source: VideoFile | LiveSource, report: _WatchReport, over: Callable[[float], bool]) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from zscout.behaviors.perception.motion import MAX_SIDE
 from zscout.config.strict import BadInput, quoted
-from zscout.drivers.capture import FILE_RATE, FILE_RATES, MAX_PIXELS, MISSES, Capture, kind_of, seconds, shown
+from zscout.drivers.capture import FILE_RATE, FILE_RATES, MAX_PIXELS, MISSES, Capture, is_utf8, kind_of, seconds, shown
 
 OPEN_TIMEOUT: Final = 5.0
 READ_TIMEOUT: Final = 2.0
@@ -60,6 +60,10 @@ class VideoFile:
             why = (error.strerror if isinstance(error, OSError) else None) or error
             raise BadInput(f"{quoted(self.name)} can't be read ({why}); name a video file, a URL or a device") from None
         nothing = BadInput(f"there is no video in {quoted(self.name)}; name a file that FFmpeg can read")
+        if not is_utf8(str(path.absolute())):
+            raise BadInput(
+                f"the name of {quoted(self.name)} or its folder is not UTF-8, which OpenCV can't open; rename it"
+            )
         # FFmpeg draws a text as a picture, and follows playlists to wherever they point.
         if not head or not head.translate(None, TEXT):
             raise nothing

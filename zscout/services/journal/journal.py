@@ -72,6 +72,7 @@ class Journal:
         self._read_at: Ns = 0
         self._used_last = False  # true with an RC's last report on an ended hold
         self._ending = asyncio.Event()
+        self._reading = asyncio.Lock()
         self._declared: list[Declaration] = []
 
     def start(self) -> None:
@@ -219,7 +220,9 @@ class Journal:
     async def _answer(self, query: IncomingQuery[HistoryAsk]) -> None:
         asked, now = query.message, self._wall()
         try:
-            answer = await asyncio.to_thread(self._store.answer, self._mesh.me.host, asked, now)
+            # The store answers one by one: more threads of those that all share would only wait for it.
+            async with self._reading:
+                answer = await asyncio.to_thread(self._store.answer, self._mesh.me.host, asked, now)
         except Unwritable as error:
             query.refuse(Problem("no_journal", str(error)))
             return

@@ -17,6 +17,7 @@ from zscout.messages import MAX_ERROR, LoadReport
 from zscout.services.node import host_figures
 from zscout.services.node.process_use import Running, TreeMeter, TreeUse, UseMeter, faded
 from zscout.services.node.reload import FilesInForce
+from zscout.services.recorder.process import RecorderProcess
 from zscout.types import VERSION
 
 log = logging.getLogger("zscout.load")
@@ -48,8 +49,9 @@ class LoadReporter:
         files: FilesInForce | None = None,
         *,
         tree: bool = False,
+        recorder: RecorderProcess | None = None,
     ) -> None:
-        self.mesh, self._files = mesh, files
+        self.mesh, self._files, self._recorder = mesh, files, recorder
         self._tree = tree
         self._labels, self._running = tuple(labels), running
         self._pause = RESTARTS[0]
@@ -79,7 +81,9 @@ class LoadReporter:
         self._publisher.close()
 
     def _with_files(self, report: LoadReport) -> LoadReport:
-        """With what the node says of its certificate and of its files."""
+        """With what the node says of its certificate, of its files and of its recorder."""
+        if self._recorder is not None:
+            report = replace(report, recorder=self._recorder.fault[:MAX_ERROR])
         if (files := self._files) is not None:
             report = replace(report, rights=files.rights, fault=files.fault[:MAX_ERROR])
         own, now = self.mesh.validity, datetime.now(UTC)

@@ -27,6 +27,7 @@ from zscout.services.recorder.process import (
     BAD_SETTINGS,
     MEGABYTE,
     RecorderJob,
+    RecorderReport,
     Recording,
     decode_job,
     new_recording,
@@ -40,7 +41,7 @@ try:
 
     from zscout.services.recorder.finish import Job
     from zscout.services.recorder.recorder import Recorder, RecorderFailed
-    from zscout.services.recorder.timeline import Timeline
+    from zscout.services.recorder.timeline import Timeline, TimelineError
 except ImportError as error:
     if not (missing := how_to_get(error)):
         raise
@@ -56,6 +57,8 @@ MAX_PART: Final = 250 * MEGABYTE
 """Bytes, likewise."""
 CHECK_EVERY: Final = 30.0
 """Seconds between two looks at that, and at the limit of all recordings."""
+LOOK_EVERY: Final = 2.0
+"""Seconds between two looks whether the file can be written."""
 
 
 def main() -> None:
@@ -66,12 +69,22 @@ def main() -> None:
         with os.fdopen(os.dup(1), "wb") as out:
             os.dup2(2, 1)
             job = decode_job(sys.stdin.buffer.readline(MAX_JOB))
-            asyncio.run(_record(job, out))
+            try:
+                asyncio.run(_record(job, out))
+            except TimelineError as error:
+                _report(out, str(error))
+                raise
     except (BadInput, MeshError) as error:
         log.error("%s", error)  # noqa: TRY400 - one clear line
         sys.exit(BAD_SETTINGS if isinstance(error, BadInput) else 1)
     except RecorderFailed:
         sys.exit(1)
+
+
+def _report(out: BinaryIO, fault: str) -> None:
+    with suppress(OSError):  # nobody reads it any more
+        out.write(msgspec.json.encode(RecorderReport(fault=fault)) + b"\n")
+        out.flush()
 
 
 async def _record(job: RecorderJob, out: BinaryIO) -> None:
@@ -99,7 +112,7 @@ async def _record(job: RecorderJob, out: BinaryIO) -> None:
             out.flush()
             where, past = files.where if job.joined else None, settings.past / SECOND
             recorder = Recorder(mesh, fleet, timeline, settings.frames, where, past)
-            rolling = asyncio.create_task(files.keep(recorder))
+            rolling = asyncio.create_task(files.keep(recorder, out))
             try:
                 await recorder.run(stop)
             finally:
@@ -131,15 +144,25 @@ class _Files:
     def prune(self) -> None:
         prune(self._settings.path, self._fleet.name, limit=self._settings.limit * MEGABYTE)
 
-    async def keep(self, recorder: Recorder) -> None:
-        """Goes on in another file now and then, and removes the oldest. Does not return."""
+    async def keep(self, recorder: Recorder, out: BinaryIO) -> None:
+        """Goes on in another file now and then, also where this one can't be written, which is reported at once, and
+        removes the oldest. Does not return."""
+        fault, due = "", time.monotonic() + CHECK_EVERY
         while True:
-            await asyncio.sleep(CHECK_EVERY)
+            await asyncio.sleep(min(LOOK_EVERY, CHECK_EVERY))
+            before, fault = fault, await asyncio.to_thread(self.timeline.unwritten)
+            if bool(fault) != bool(before):
+                _report(out, fault)
+                log.log(logging.ERROR if fault else logging.INFO, "%s", fault or f"records to {self.path}")
+            if time.monotonic() < due:
+                continue
+            due = time.monotonic() + CHECK_EVERY
             try:
-                if time.monotonic() - self._began >= PART or self.path.stat().st_size >= MAX_PART:
+                if fault or time.monotonic() - self._began >= PART or self.path.stat().st_size >= MAX_PART:
                     await self._roll(recorder.now())
             except (OSError, BadInput) as error:
-                log.warning("the recording goes on in the same file: %s", error)
+                if not fault:
+                    log.warning("the recording goes on in the same file: %s", error)
             self.prune()
 
     async def _roll(self, at: float) -> None:

@@ -6,10 +6,13 @@ replaced."""
 from __future__ import annotations
 
 import math
+import os
 import re
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
+from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -20,6 +23,8 @@ from zscout.services.recorder.blueprint import TIME, WALL_TIME
 from zscout.services.recorder.colours import OPERATOR, OTHER, PALE
 from zscout.types import clean
 
+ROOM: Final = 1 << 16
+"""Bytes: with less a disk is full."""
 MAX_SECONDS: Final = 9e9
 """Rerun counts nanoseconds in 64 bits."""
 CURVE_TICK: Final = 5.0
@@ -172,6 +177,20 @@ class Drawing:
         self.pass_points()
         for stream in self.streams:
             stream.flush(timeout_sec=seconds)
+
+
+def unwritten(stream: rr.RecordingStream, path: Path, seconds: float) -> str:
+    """Why what was logged is not in the file after so many seconds; empty: it is. Rerun's writer ends at its first
+    error, and only a flush shows that."""
+    try:
+        stream.flush(timeout_sec=seconds)
+    except (RuntimeError, ValueError) as error:
+        with suppress(OSError):
+            found = os.statvfs(path)
+            if found.f_bavail * found.f_frsize < ROOM:
+                return f"{path} can't be written: its disk is full; free some"
+        return f"{path} can't be written ({error}); name another place"
+    return ""
 
 
 def disconnect(stream: rr.RecordingStream, seconds: float) -> bool:

@@ -64,6 +64,15 @@ class Recording(msgspec.Struct, frozen=True):
     """Where a viewer finds it live."""
 
 
+class RecorderReport(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Any such line: a Recording, or later whether that can be written."""
+
+    file: str = ""
+    url: str | None = None
+    fault: str = ""
+    """Why it can't be written; empty: it can."""
+
+
 def encode_job(job: RecorderJob) -> bytes:
     return msgspec.json.encode(job, enc_hook=str) + b"\n"
 
@@ -138,6 +147,8 @@ class RecorderProcess:
     def __init__(self, recorder: RecorderConfig, fleet: Fleet, host: str) -> None:
         self._job = encode_job(RecorderJob(recorder, msgspec.structs.replace(fleet, mesh=beside(fleet.mesh)), host))
         self._child: asyncio.subprocess.Process | None = None
+        self.fault = ""
+        """Why nothing is recorded; empty where it is."""
         # A node goes on without its recorder: what fails here is logged.
         self._supervisor = Supervisor("the recorder's process", lambda _: None)
 
@@ -169,11 +180,13 @@ class RecorderProcess:
             if code in (0, BAD_SETTINGS):
                 words = "was ended" if code == 0 else "can't run with these settings"
                 log.warning("the recorder %s; this node goes on without it", words)
+                self.fault = self.fault or f"the recorder {words}; see the node's log"
                 return
             failures = 1 if time.monotonic() - began >= LONG_ENOUGH else failures + 1
             log.warning("the recorder ended with code %d", code)
             await asyncio.sleep(PAUSE)
         log.error("the recorder failed %d times in a row and is given up; everything else goes on", RESTARTS)
+        self.fault = self.fault or f"the recorder failed {RESTARTS} times in a row; see the node's log"
 
     async def _record(self) -> int:
         """One life of the recorder; returns its exit code."""
@@ -190,6 +203,9 @@ class RecorderProcess:
         with suppress(ConnectionError, ValueError):  # it ended before that: the code says more
             child.stdin.write(self._job)
             await child.stdin.drain()
-            recording = msgspec.json.decode(await child.stdout.readline(), type=Recording)
-            log.info("records to %s, live at %s", recording.file, recording.url)
+            while line := await child.stdout.readline():
+                report = msgspec.json.decode(line, type=RecorderReport)
+                self.fault = report.fault
+                if report.file:
+                    log.info("records to %s, live at %s", report.file, report.url)
         return await child.wait()

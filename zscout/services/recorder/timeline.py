@@ -27,7 +27,16 @@ from zscout.services.recorder.blueprint import (
 )
 from zscout.services.recorder.bookings import BookingTracker
 from zscout.services.recorder.colours import ABSENT, OPERATOR, OTHER, PALETTE, STATES, faded
-from zscout.services.recorder.drawing import MAX_EVENT, Drawing, HolderRow, Lanes, clean_text, disconnect, with_detail
+from zscout.services.recorder.drawing import (
+    MAX_EVENT,
+    Drawing,
+    HolderRow,
+    Lanes,
+    clean_text,
+    disconnect,
+    unwritten,
+    with_detail,
+)
 from zscout.services.recorder.finish import Job, finish
 from zscout.services.recorder.hosts import HostTracker
 from zscout.services.recorder.past import PastBar, PastLane
@@ -185,6 +194,12 @@ class Timeline(Drawing):
         self._past_here = False
         self._contended = {entity: since for entity, since in self._contended.items() if at - since <= CONTENDED}
         return Job(old, layout) if disconnect(before, DISCONNECT_SECONDS) else None
+
+    def unwritten(self) -> str:
+        """Why the file can't be written, empty while it can. Blocks until it has what was logged."""
+        if self._file is None or self._path is None or self.closed:
+            return ""
+        return unwritten(self._file, self._path, FLUSH_SECONDS)
 
     def holders(self, at: float, rc: str, holders: Sequence[HolderRow], absent: str = "") -> None:
         """From `at` on, the device (`kind/name`) is held by exactly these requests; by nobody if empty. `absent`: the
