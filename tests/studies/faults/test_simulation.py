@@ -42,7 +42,7 @@ a leader lost at once what it got there. At 3656 RCs of two hosts used up all te
 963496 RCs beside a liar were lost that had promised another candidate."""
 MISSED = {
     "order": 1, "grant": 8, "safe first": 1, "snapshots": 8, "step down": 4, "reopen": 8, "places": 5,
-    "believed": 70, "settling": 8, "deadline": 8, "once": 10, "sealed": 10, "copied": 3,
+    "withdrawn": 55, "believed": 70, "settling": 8, "deadline": 8, "once": 10, "sealed": 10, "copied": 3,
     "dates": 503, "merged": 3, "caught up": 4, "one stands": 33, "awaited": 3003, "had again": 13, "dates first": 113,
     "fleet time": 4, "late": 173, "slewed": 3, "door": 5, "clamped": 5, "certified": 5, "managers": 5,
     "words": 6, "doubted": 46, "sealed terms": 56, "back": 76, "budget": 6,
@@ -115,6 +115,16 @@ def test_without_terms_on_disk_a_fleet_that_starts_anew_leads_in_lower_ones() ->
     with without("kept"):
         [broken] = simulate(6, size, faults).broken
     assert "h0/node leads in" in broken
+
+
+@pytest.mark.slow
+def test_who_is_protected_stays_so_under_the_next_leader() -> None:
+    size = Size(clients=8, components=1, span=23.0)
+    faults = [Fault(3.0 + 2.5 * number, 1.0, "kill", (f"h{number % 3}/node",)) for number in range(8)]
+    assert simulate(6, size, faults).broken == []
+    with without("protected"):
+        [broken] = simulate(6, size, faults).broken
+    assert "is preempted, though it was protected" in broken
 
 
 @pytest.mark.slow
