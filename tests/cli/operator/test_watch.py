@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import signal
 import subprocess
 import sys
@@ -91,7 +92,10 @@ def test_a_recording_has_pictures_boxes_and_events(video: Path, tmp_path: Path) 
         ("notes.txt", "there is no video in"),
         ("empty.avi", "there is no video in"),
         ("", "--source is empty"),
-        ("http://127.0.0.1:1/video", "can't be opened: does its server run, and is the address right?"),
+        (
+            "http://127.0.0.1:1/video",
+            "can't be opened: nothing listens there; does its server run, and is the port right?",
+        ),
         ("/dev/video97", "can't be opened: No such file or directory"),
         ("tiny.avi", "are 4 by 4 pixels; each side must have 8 to"),
     ],
@@ -130,10 +134,19 @@ def test_a_disk_that_is_full_is_one_line_and_exit_code_1(
     assert capsys.readouterr().err == "zscout: x.rrd can't be written: its disk is full\n"
 
 
-@pytest.mark.parametrize("name", ["v\udcff.avi", "f\udcff/v.avi", "http://127.0.0.1:9/\udcff", "/dev/v\udcff"])
+@pytest.mark.parametrize(
+    "name",
+    ["v\udcff.avi", "f\udcff/v.avi", "http://127.0.0.1:9/\udcff", "/dev/v\udcff"],
+    ids=["a file", "its folder", "an address", "a device"],  # a worker's messages are UTF-8
+)
 def test_a_name_that_is_not_utf8_is_one_line(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
+    caplog.set_level(logging.CRITICAL, "zscout.drivers.capture")  # a test's report, which has its log, is UTF-8
     monkeypatch.chdir(tmp_path)
     if name.endswith(".avi"):
         Path(name).parent.mkdir(exist_ok=True)
