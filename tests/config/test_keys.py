@@ -201,6 +201,8 @@ RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
             "baud": _number("9600", "300", "1_000_000", "299", "1_000_001"),
             "settle": SETTLE,
             "bound": _number("0.25", "0.01", "10", "0.009", "11"),
+            "dtr": Key(None, ("true", "false"), ("1", '"on"')),
+            "rts": Key(None, ("true", "false"), ("1", '"on"')),
         },
     ),
     "robot": (
@@ -225,6 +227,9 @@ RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
             "rate": _number("10.0", "0.1", "60", "0.09", "61"),
             "settle": SETTLE,
             "quality": _number("80", "1", "100", "0", "101"),
+            "picture_within": _number("1.5", "0.5", "600", "0.4", "601"),
+            "still_after": Key(None, ("0", "86_400", '"30s"'), ("-1", "86_401", '"never"')),
+            "transport": Key('"tcp"', ('"udp"',), ('"http"', "1")),
         },
     ),
 }

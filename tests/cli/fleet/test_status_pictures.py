@@ -180,6 +180,7 @@ class Picture:
             ending=dict,
             rights=dict,
             faults=dict,
+            unrecorded=dict,
             stale=lambda host: False,
         )
         devices = cast("Devices", SimpleNamespace(known=lambda: self.health))
