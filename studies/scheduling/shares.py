@@ -15,7 +15,7 @@ from random import Random
 from typing import Final, NamedTuple
 
 from studies.scheduling.programs import ProgramJob, Use, play
-from zscout.config.scheduling_policy import FairShares, SchedulingPolicy
+from zscout.config.scheduling_policy import PATIENCE, FairShares, SchedulingPolicy
 from zscout.types import SECOND, Ns, RcName
 
 DAY: Final[Ns] = 86_400 * SECOND
@@ -64,7 +64,8 @@ def play_week(job: Week) -> WeekTrial:
     times = [random.randrange(DAYS * DAY // SECOND) * SECOND for _ in range(BURSTS)]
     bursty = [iter([_job(random, WEEK_RCS, MEAN, at)]) for at in times for _ in range(BURST)]
     weights = {} if job.fair else {STEADY: EQUAL, BURSTY: EQUAL}
-    policy = SchedulingPolicy(fair_shares=FairShares(DAY, weights))
+    # A patience that follows the runtimes is longer than these waits: then nobody is due.
+    policy = SchedulingPolicy(patience=PATIENCE, fair_shares=FairShares(DAY, weights))
     return WeekTrial(job, play(WEEK_RCS, {STEADY: steady, BURSTY: bursty}, policy, DAYS * DAY))
 
 
