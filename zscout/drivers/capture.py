@@ -182,7 +182,7 @@ class Capture:
                     waited = seconds() - asked
                     if misses < MISSES and waited < STALLED * self._read_timeout:
                         continue
-                    self._ended(video, waited, any_picture=self.number > before)
+                    self._ended(video, waited, pictures=self.number - before)
                     return
                 misses = 0
                 height, width = picture.shape[:2]
@@ -215,7 +215,7 @@ class Capture:
             self.health, self.failed, self.frozen = health, False, frozen
             self._new_picture.notify_all()
 
-    def _ended(self, video: cv2.VideoCapture, waited: float, *, any_picture: bool) -> None:
+    def _ended(self, video: cv2.VideoCapture, waited: float, *, pictures: int) -> None:
         """A source that was open gives no more pictures."""
         name = shown(self.source)
         if codec := self.number == 0 and UNDECODABLE.get(_codec(video)):
@@ -226,7 +226,7 @@ class Capture:
         elif waited >= STALLED * self._read_timeout:
             self.stalls += 1
             self._set_health(f"no picture from {name} for {self._read_timeout:g} s")
-        elif not any_picture:  # else it is opened again at once, as a camera of stills is for each
+        elif pictures != 1:  # a camera of stills is opened for each
             self._set_health(f"{name} was cut off")
 
     def _why_closed(self, waited: float) -> str:
