@@ -413,14 +413,19 @@ class ZenohTransport(Transport):
         return _undeclare(self._session.declare_subscriber(key, _direct(on_zenoh_sample)))
 
     def ring(self, key: str, depth: int, most: int) -> tuple[Callable[[], tuple[str, bytes] | None], Undeclare]:
-        kept: deque[tuple[str, bytes]] = deque(maxlen=depth)
+        kept: deque[zenoh.Sample] = deque(maxlen=depth)
 
         def keep(sample: zenoh.Sample) -> None:
             if _is_publication(sample) and len(sample.payload) <= most:
-                kept.append((str(sample.key_expr), sample.payload.to_bytes()))
+                kept.append(sample)
+
+        def take() -> tuple[str, bytes] | None:
+            # Copied here only: most are replaced by a newer one before.
+            sample = kept.popleft() if kept else None
+            return None if sample is None else (str(sample.key_expr), sample.payload.to_bytes())
 
         subscriber = self._session.declare_subscriber(key, _direct(keep))
-        return (lambda: kept.popleft() if kept else None), _undeclare(subscriber)
+        return take, _undeclare(subscriber)
 
     def token(self, key: str) -> Undeclare:
         return _undeclare(self._session.liveliness().declare_token(key))

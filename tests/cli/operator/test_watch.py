@@ -234,6 +234,8 @@ def test_a_camera_that_breaks_off_is_opened_again_and_ctrl_c_ends_with_a_summary
     )
     assert process.stdout is not None
     assert process.stderr is not None
+    hangs = threading.Timer(HANG, process.kill)
+    hangs.start()
     try:
         told = ""
         while "gives pictures again" not in told:
@@ -246,6 +248,7 @@ def test_a_camera_that_breaks_off_is_opened_again_and_ctrl_c_ends_with_a_summary
         _, rest = process.communicate(timeout=HANG)
         told += rest
     finally:
+        hangs.cancel()
         process.kill()
         process.wait()
     assert process.returncode == 130
