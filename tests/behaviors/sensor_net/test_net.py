@@ -203,13 +203,19 @@ def test_who_moves_with_his_hold_goes_on_and_who_lost_it_on_the_way_looks_again(
     assert (scout.hider._robot.phase, scout.task) == (phase, "watch")
 
 
-def test_a_frozen_picture_is_an_alert_at_its_beginning_and_ends_no_turn() -> None:
+def a_hidden_scout() -> Scout:
+    """In its first turn to watch."""
     scout = Scout()
     scout.held(0.0)
     scout.hider._robot.phase = "hidden"
     scout.released(0.5)
     scout.held(1.0)
     scout.hider._robot.phase = "hidden"
+    return scout
+
+
+def test_a_frozen_picture_is_an_alert_at_its_beginning_and_ends_no_turn() -> None:
+    scout = a_hidden_scout()
     still = np.random.default_rng(0).integers(90, 110, (ROWS, COLUMNS), np.uint8)
     steps = []
     for number in range(20):
@@ -225,12 +231,7 @@ def test_a_frozen_picture_is_an_alert_at_its_beginning_and_ends_no_turn() -> Non
 
 
 def test_what_moves_after_a_while_of_bad_pictures_is_another_event() -> None:
-    scout = Scout()
-    scout.held(0.0)
-    scout.hider._robot.phase = "hidden"
-    scout.released(0.5)
-    scout.held(1.0)
-    scout.hider._robot.phase = "hidden"
+    scout = a_hidden_scout()
     assert scout.alerts.see(1.0, True) == "start"
     snow = np.random.default_rng(0).integers(0, 255, (ROWS, COLUMNS), np.uint8)
     steps = [scout.see(1 + number / 4, snow, "video/a") for number in range(1, 20)]
