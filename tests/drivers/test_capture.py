@@ -107,6 +107,16 @@ def test_each_picture_is_given_once_and_read_ones_are_not_dropped() -> None:
         assert capture.dropped - dropped <= capture.number - last - 1
 
 
+def test_a_stream_that_is_cut_off_is_told_of(caplog: pytest.LogCaptureFixture) -> None:
+    """Only a camera of stills ends after each picture."""
+    with MjpegServer(rate=20) as server, capturing(server.url) as capture:
+        until(lambda: capture.number >= 3)
+        server.cut()
+        until(lambda: capture.opened >= 2)
+        picture_of(capture, capture.number)
+    assert any(record.getMessage().endswith("was cut off") for record in caplog.records)
+
+
 def test_a_stalled_stream_is_opened_again() -> None:
     with MjpegServer() as server, capturing(server.url, read_timeout=0.4) as capture:
         before = later(capture)
