@@ -166,6 +166,7 @@ def test_every_key_of_a_fleet_file() -> None:
         max_payload = 4096
         max_running_per_host = 5
         max_runtime = "1d12h"
+        max_booking = "2d"
         max_bookings_per_host = 7
         [timing]
         heartbeat = 0.1
@@ -178,7 +179,9 @@ def test_every_key_of_a_fleet_file() -> None:
         name="lab",
         candidates=("anvil", "bench"),
         strategy="adaptive",
-        scheduling=SchedulingPolicy("after_min_runtime", 7, 0.5, 5 * SECOND // 2, "all", 5, 129_600 * SECOND),
+        scheduling=SchedulingPolicy(
+            "after_min_runtime", 7, 0.5, 5 * SECOND // 2, "all", 5, 129_600 * SECOND, 172_800 * SECOND
+        ),
         mesh=MeshConfig(
             listen=("tcp/0.0.0.0:0", "tls/[::]:7447", "tcp/anvil.lab:7447#iface=eth0"),
             connect=("quic/10.0.0.2:7447", "udp/[fe80::1]:1", "ws/bench:65535"),
@@ -187,7 +190,7 @@ def test_every_key_of_a_fleet_file() -> None:
             interface="eth0,wlan0",
             lease=2.0,
         ),
-        limits=RcmLimits(1, 2, 3, 4, 4096, 5, 129_600 * SECOND, 7),
+        limits=RcmLimits(1, 2, 3, 4, 4096, 5, 129_600 * SECOND, 172_800 * SECOND, 7),
         timing=Timing(SECOND // 10, 5 * SECOND, 3 * SECOND // 10, 5 * SECOND // 4),
         min_runtime=90 * SECOND,
     )
@@ -208,6 +211,7 @@ def test_fair_shares_are_off_unless_the_file_says_so() -> None:
 
 def test_nobody_is_protected_for_longer_than_a_hold_lasts() -> None:
     assert fleet('[limits]\nmax_runtime = "30s"').min_runtime == 30 * SECOND
+    assert fleet('[limits]\nmax_runtime = "30s"').scheduling.max_booking == 30 * SECOND
 
 
 def test_the_fleet_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -81,6 +81,7 @@ FLEET: Final[Mapping[str, Mapping[str, Key]]] = {
         "max_payload": _number("65_536", "1_024", "16_777_216", "1_023", "16_777_217"),
         "max_running_per_host": _number("0", "1", "100_000", "-1", "100_001"),
         "max_runtime": _number("0.0", "1", "31_622_400", "-1", "31_622_401"),
+        "max_booking": _number("0.0", "1", "31_622_400", "-1", "31_622_401"),
     },
     "timing": {
         "heartbeat": _number("0.5", "0.05", "1.4", "0.04", "11"),

@@ -15,6 +15,7 @@ from tests.scheduling.validate import validate
 from tests.scheduling.workloads import voter
 from tests.thorough import times
 from zscout.config.scheduling_policy import RcQuota, SchedulingPolicy, StrategyName
+from zscout.scheduling.booking import Booking, Dates
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import play_instant
 from zscout.scheduling.model import (
@@ -280,11 +281,18 @@ def test_nobody_is_given_more_than_the_longest_time(strategy: StrategyName) -> N
     assert running(core) == {"next"}
 
 
-def inherited(policy: SchedulingPolicy, now: Ns, wanted: ArcRequest, start: Ns = 0) -> tuple[Core, list[Effect]]:
+def booked(name: str, start: int, seconds: int, rc: str = "robot/a") -> Booking:
+    """`start`: seconds after the beginning of the story."""
+    return Booking(name, {rc: {}}, 1, start * SECOND, seconds * SECOND, SECOND, 0, owner="h")
+
+
+def inherited(
+    policy: SchedulingPolicy, now: Ns, wanted: ArcRequest, start: Ns = 0, *known: Event
+) -> tuple[Core, list[Effect]]:
     """A core that takes the lead now, where this holds since `start`; and what comes of that."""
     core, old = Core(policy=policy), Term(1, "rcm/a")
     stands = RecoveredHold(wanted, Place(old, 1), Grant(old, 1), start, start + wanted.min_runtime)
-    return core, core.handle(now, RcJoined("robot/a", sharable=False), LeadTaken(Term(2, "rcm/b"), (stands,)))
+    return core, core.handle(now, RcJoined("robot/a", sharable=False), *known, LeadTaken(Term(2, "rcm/b"), (stands,)))
 
 
 def test_the_longest_time_is_counted_from_the_beginning_of_the_hold_whoever_leads_and_has_it() -> None:
@@ -299,6 +307,29 @@ def test_a_hold_that_is_too_long_already_ends_with_the_first_who_says_so() -> No
     policy = SchedulingPolicy(max_runtime=20 * SECOND)
     _, effects = inherited(policy, 30 * SECOND, request("long", "robot/a", seconds=60))
     assert ended(effects) == [("long", Outcome.COMPLETED, "limit", False)]
+
+
+def test_a_booked_hold_lasts_until_its_booking_ends_whoever_leads() -> None:
+    policy = SchedulingPolicy(max_runtime=20 * SECOND, max_booking=60 * SECOND)
+    core, booking = core_of("adaptive", policy, "robot/a"), booked("b", 10, 60)
+    mine = structs.replace(request("mine", "robot/a", seconds=60), booking="b")
+    core.handle(0, Dates((booking,)), Requested(mine))
+    core.handle(10 * SECOND, Tick())
+    assert not ended(core.handle(70 * SECOND - 1, Tick(), Requested(request("rival", "robot/a"))))
+    core, _ = inherited(policy, 40 * SECOND, mine, 10 * SECOND, Dates((booking,)))
+    assert not ended(core.handle(70 * SECOND - 1, Tick()))
+    # The next leader may not know of the booking yet: what the RCs say stands.
+    core, _ = inherited(policy, 40 * SECOND, mine, 10 * SECOND)
+    assert not ended(core.handle(70 * SECOND - 1, Tick()))
+    assert [outcome for _, outcome, _, _ in ended(core.handle(70 * SECOND, Tick()))] == [Outcome.COMPLETED]
+
+
+def test_a_kept_hold_that_outlasts_its_booking_ends_after_the_longest_time() -> None:
+    core = limited("adaptive", "robot/a")
+    mine = structs.replace(request("mine", "robot/a"), booking="b", keep=True)
+    core.handle(0, Dates((booked("b", 0, 10),)), Requested(mine))
+    assert not ended(core.handle(20 * SECOND - 1, Tick()))
+    assert ended(core.handle(20 * SECOND, Tick())) == [("mine", Outcome.COMPLETED, "limit", False)]
 
 
 @pytest.mark.parametrize("strategy", ALL)

@@ -111,6 +111,9 @@ class RcmLimits(Struct, frozen=True, forbid_unknown_fields=True):
     max_runtime: Annotated[
         Ns, seconds("0", "31622400", "After this long every hold ends as completed, whoever's it is; 0: never.")
     ] = 0
+    max_booking: Annotated[
+        Ns, seconds("0", "31622400", "The longest booking, whose hold lasts until its end; 0: as `max_runtime`.")
+    ] = 0
     max_bookings_per_host: Annotated[int, key("Bookings of one host or person, that are not over.", 0, 1_000)] = 100
 
 
@@ -325,6 +328,7 @@ def _fleet(file: FleetFile, top: Where, folder: Path = Path()) -> Fleet:
         promise=table.promise,
         max_running_per_host=file.limits.max_running_per_host or None,
         max_runtime=file.limits.max_runtime or None,
+        max_booking=file.limits.max_booking or file.limits.max_runtime or None,
         fair_shares=_fair_shares(file, access, top / "fair_shares"),
     )
     fleet = Fleet(

@@ -64,7 +64,10 @@ class SchedulingPolicy:
     max_running_per_host: int | None = None
     """ARCs that the clients of one host may have running at one time; None: any number."""
     max_runtime: Ns | None = None
-    """Time in ns after which every hold ends as completed, kept or not, whoever's it is; None: never."""
+    """Time in ns after which every hold ends as completed, kept or not, whoever's it is; None: never. The hold of a
+    booking lasts until the booking's end at least."""
+    max_booking: Ns | None = None
+    """The longest booking in ns; None: any."""
     rc_quotas: Mapping[str, tuple[RcQuota, ...]] = field(default_factory=dict)
     """By owner: the quotas that bind it."""
     barred: Mapping[str, tuple[str, ...]] = field(default_factory=dict)

@@ -31,7 +31,7 @@ from zscout.messages import (
 from zscout.rcm.authority import Authority
 from zscout.rcm.places import Places, arc_id
 from zscout.scheduling.model import ArcRequest, ArcStatus
-from zscout.types import ArcId, ClientId, Need, Params, Place, RcName
+from zscout.types import SECOND, ArcId, ClientId, Need, Params, Place, RcName
 
 MAX_PRIORITY: Final = 1_000_000
 
@@ -192,8 +192,12 @@ class Admission:
         request = self.form(asked, sender)
         if isinstance(wanted, Book) and wanted.maintenance:
             self.authority.check_operator(sender, "put devices in maintenance")
-        else:
-            self.authority.check_ask(sender.host, request, lambda _: 0)
+            return
+        self.authority.check_ask(sender.host, request, lambda _: 0)
+        key = "max_booking" if self.limits.max_booking else "max_runtime"
+        if (most := getattr(self.limits, key)) and request.min_runtime > most:
+            wished, allowed = (f"{span / SECOND:g} s" for span in (request.min_runtime, most))
+            raise Refused("bad_date", f"the booking is {wished} long; book at most {allowed} ([limits] {key})")
 
     def check_owner(self, sender: Sender, record: BookingRecord, what: str) -> None:
         if sender.host != record.owner:

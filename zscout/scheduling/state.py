@@ -107,9 +107,9 @@ class SchedulerState:
         arc.rcs = tuple(self.rcs_in(arc.mask))
 
     def new_arc(self, request: ArcRequest, place: Place) -> Arc:
-        """An ARC that neither waits nor runs yet. `max_runtime` of the policy caps its minimum runtime, also in
-        ranks and reservations."""
-        longest = self.policy.max_runtime
+        """An ARC that neither waits nor runs yet. `max_runtime` of the policy (`max_booking` for a booked ARC) caps its
+        minimum runtime, also in ranks and reservations."""
+        longest = self.policy.max_booking if request.booking in self.claims else self.policy.max_runtime
         if longest is not None and request.min_runtime > longest:
             request = structs.replace(request, min_runtime=longest)
         patterns = tuple(filter(is_pattern, request.needs))
@@ -451,9 +451,12 @@ class SchedulerState:
     def charged(self) -> dict[str, float]:
         return {} if self.shares is None else self.shares.charged()
 
-    def longest(self, start: Ns) -> Ns | None:
+    def _last(self, arc: Arc, start: Ns, end: Ns) -> Ns | None:
+        """When `max_runtime` ends a hold: not before its booking is over."""
         limit = self.policy.max_runtime
-        return None if limit is None else start + limit
+        if limit is None:
+            return None
+        return max(start + limit, end) if arc.request.booking else start + limit
 
     def hold(self, arc: Arc, grant: Grant, start: Ns, end: Ns, protected_from: Ns | None = None) -> Hold:
         """A hold granted to `arc` then. `protected_from`: as reported of one that goes on."""
@@ -469,7 +472,7 @@ class SchedulerState:
         else:
             is_due = 0 < arc.patience <= waited - arc.told
             protected_from = start if is_due else start + max(0, budget - arc.lost)
-        return Hold(grant, start, end, below, self.longest(start), protected_from)
+        return Hold(grant, start, end, below, self._last(arc, start, end), protected_from)
 
     def quota_left(self, arc: Arc) -> int | None:
         quota = self.policy.max_running_per_host

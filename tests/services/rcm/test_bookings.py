@@ -13,7 +13,7 @@ from tests.services.rcm.booked_fleet import NOON, BookedFleet, book, booked, do,
 from tests.services.rcm.kit import Refusal, request
 from zscout.messages import BookingView, FindSlots, Release, SlotsTold, Unbook
 from zscout.services.rcm.rcm import Rcm
-from zscout.types import Place, Term
+from zscout.types import SECOND, Place, Term
 
 
 async def test_a_booking_is_kept_by_another_candidate_and_taken_up_at_its_date() -> None:
@@ -101,6 +101,32 @@ async def test_votes_decide_about_a_sharable_rc() -> None:
     radio.accept = None
     with pytest.raises(Refusal, match="busy"):
         await do(client, book("e", "radio/rf0:1", at=55, seconds=10), BookingView)
+
+
+async def test_a_booking_longer_than_a_hold_may_be_is_refused_with_both_numbers() -> None:
+    fleet = BookedFleet("x")
+    fleet.fleet = replace(fleet.fleet, limits=replace(fleet.fleet.limits, max_runtime=50 * SECOND))
+    await led(fleet, "x")
+    client = fleet.client("one")
+    too_long = r"bad_date.*100 s long; book at most 50 s \(\[limits\] max_runtime\)"
+    with pytest.raises(Refusal, match=too_long):
+        await do(client, book("b", "robot/a", at=50), BookingView)
+    with pytest.raises(Refusal, match=too_long):
+        await do(client, FindSlots("s", request("s", "robot/a").needs, 0, Decimal(100), within=1_000), SlotsTold)
+    await do(client, book("b", "robot/a", at=50, seconds=50), BookingView)
+    await do(client, book("m", "robot/b", at=50, maintenance=True, patience=Decimal(100)), BookingView)
+    assert {*await fleet.bookings()} == {"b", "m"}
+
+
+async def test_bookings_may_have_a_longest_time_of_their_own() -> None:
+    fleet = BookedFleet("x")
+    limits = replace(fleet.fleet.limits, max_runtime=50 * SECOND, max_booking=100 * SECOND)
+    fleet.fleet = replace(fleet.fleet, limits=limits)
+    await led(fleet, "x")
+    client = fleet.client("one")
+    await do(client, book("b", "robot/a", at=50), BookingView)
+    with pytest.raises(Refusal, match=r"bad_date.*101 s long; book at most 100 s \(\[limits\] max_booking\)"):
+        await do(client, book("c", "robot/a", at=500, seconds=101), BookingView)
 
 
 async def test_of_bookings_that_wait_for_votes_no_more_are_made_than_are_allowed_and_each_once() -> None:
