@@ -128,6 +128,21 @@ def test_no_hold_ends_to_make_room(strategy: StrategyName) -> None:
     assert held(asked, strategy) == {"runs": {"dev/b"}, "any": {"dev/a"}}
 
 
+@pytest.mark.parametrize("strategy", ALL)
+def test_an_arc_that_moves_to_what_a_victim_gives_up_has_it_for_itself(strategy: StrategyName) -> None:
+    """`any` moves to dev/a1, which `runs` gives up for `named`: `other` can't move there for `late`."""
+    asked = Situation(["robot/x", "dev/a1", "dev/a2", "dev/b"])
+    asked.running = [(request("runs", "robot/x", "dev/a1", priority=0, seconds=99), {}, 40)]
+    asked.asked = [
+        request("any", "dev/a$*", priority=2, seconds=1),
+        request("named", "robot/x", "dev/a2", priority=2, seconds=5),
+        request("other", "dev/*", seconds=7),
+        request("late", "dev/b", seconds=9),
+        request("low", "dev/*", priority=0),
+    ]
+    assert held(asked, strategy) == {"any": {"dev/a1"}, "named": {"robot/x", "dev/a2"}, "other": {"dev/b"}}
+
+
 # At random
 
 

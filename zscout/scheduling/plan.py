@@ -230,8 +230,10 @@ class _DryRun:
     def _leave(self, arc: Arc) -> None:
         arc.hold = None
         for rc in arc.rcs:
-            del self._holders_of(rc)[arc.id]
-        self.state.busy &= ~arc.mask
+            holders = self._holders_of(rc)
+            del holders[arc.id]
+            if not holders:  # an ARC that moves takes the RC of a victim before this ends
+                self.state.busy &= ~rc.bit
         self._count(arc, -1)
 
     def _count(self, arc: Arc, by: int) -> None:
