@@ -140,13 +140,13 @@ class LeaderPlayer:
                 stimuli += self._stimuli(*words)
         if not stimuli and "wait" not in line:
             return []
-        lines, out = list[str](), self.leader.step(self.now, stimuli)
+        lines, out, begun = list[str](), self.leader.step(self.now, stimuli), False
         while True:
             told = [*self._told(out)]
-            lines += ["--", *told] if lines and told else told
+            lines += ["--", *told] if lines and told and not begun else told
             if not out.more:
                 return lines
-            out = self.leader.step(self.now)
+            begun, out = out.begun, self.leader.step(self.now)
 
     # In
 

@@ -1,14 +1,15 @@
 """The leading RCM as one pure step: stimuli in, an Outbox out. No clock, task, logger or mesh.
 
-A step is one instant of the core: operations that arrive together, or one other stimulus. What follows in another
-instant is put before the stimuli that wait, and the Outbox says that there is more."""
+A step is one instant of the core: operations that arrive together, or one other stimulus. Where these grant or end holds,
+it takes two steps: programs and RCs wait for the first, which returns answers to grants and the publication. What follows
+in another instant is put before the stimuli that wait, and the Outbox says that there is more."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Final
+from typing import Final, NamedTuple
 
 from msgspec.structs import replace
 
@@ -42,6 +43,15 @@ CONTINUED: Final = frozenset({model.LeadTaken, model.Adopted, model.Vouched, mod
 
 
 BOOKINGS: Final = (messages.Book, messages.Unbook, messages.FindSlots)
+
+
+class _Decided(NamedTuple):
+    """An instant, granted and published."""
+
+    events: Sequence[model.Event]
+    effects: Sequence[model.Effect]
+    notified: Collection[ArcId]
+    """ARCs whose clients know of their grants."""
 
 
 class Leader:
@@ -81,18 +91,32 @@ class Leader:
         self._core_wake: Ns | None = None
         self._now: Ns = 0
         self._out = steps.Outbox()
+        self._decided: _Decided | None = None
+        """The instant of which only the urgent part has been returned."""
 
     def step(self, now: Ns, stimuli: Iterable[steps.Stimulus] = ()) -> steps.Outbox:
-        """One instant: of what waits, as much as is decided together."""
+        """Return the urgent part of an instant that takes as much as is decided together; or the rest of the last one."""
+        self._queue.extend(stimuli)
+        if self._decided is not None:
+            decided, self._decided = self._decided, None
+            self._follow_up(decided)
+            return self._end()
         self._now, out = now, steps.Outbox()
         self._out = out
         self._bookings.at(now)
-        self._queue.extend(stimuli)
         if self._wake is not None and self._wake <= now and not self._waking:
             self._waking = True
             self._queue.append(steps.Due.DEADLINES)
-        if events := self._next():
-            self._decide(events)
+        if (events := self._next()) and (decided := self._grant(events)) is not None:
+            if out.granted or out.publication is not None:
+                self._decided = decided
+                return out.urgent()
+            self._follow_up(decided)
+        return self._end()
+
+    def _end(self) -> steps.Outbox:
+        """Return the Outbox of an instant that is over."""
+        out = self._out
         self._queue.extendleft(reversed(out.then))
         out.then = []
         times = [self._core_wake, *[part.next for part in self._parts]]
@@ -264,12 +288,18 @@ class Leader:
     # Out: one instant
 
     def _decide(self, events: Sequence[model.Event], named: Collection[RcName] | None = None) -> None:
-        """RCs that are `named` are published, whatever becomes of them."""
+        """Decide a whole instant in one step."""
+        if (decided := self._grant(events, named)) is not None:
+            self._follow_up(decided)
+
+    def _grant(self, events: Sequence[model.Event], named: Collection[RcName] | None = None) -> _Decided | None:
+        """Decide an instant, up to its publication. RCs that are `named` are published, whatever becomes of them.
+        Return None where nothing changes."""
         lost = [event.client for event in events if isinstance(event, model.ClientLost)]
         for client in lost:
             self._recovered.pop(client, None)
         if named is None and len(lost) == len(events) and not any(map(self.core.arcs_of, lost)):
-            return  # clients that asked for nothing change nothing
+            return None  # clients that asked for nothing change nothing
         now, out, registry, operations = self._now, self._out, self.registry, self.operations
         ended = registry.ended
         events = [event for event in events if not (isinstance(event, model.Adopted) and ended(event.held.request.arc))]
@@ -288,6 +318,12 @@ class Leader:
                     notified.add(arc)
         out.reopened, registry.traced = registry.traced, []
         self._publish(effects, named, operations.instant.left)
+        return _Decided(events, effects, notified)
+
+    def _follow_up(self, decided: _Decided) -> None:
+        """What an instant leads to beside its grants and its publication."""
+        events, effects, notified = decided
+        now, out, registry, operations = self._now, self._out, self.registry, self.operations
         self._note(events)
         answered = notified | operations.waiting.keys()
         out.notices += registry.report(now, effects, answered, operations.instant.given_up)

@@ -273,7 +273,18 @@ class Outbox(Struct):
     wake: Ns | None = None
     """The next step is due then at the latest."""
     more: bool = False
-    """Another step is due at once: stimuli are left."""
+    """Another step is due at once: stimuli are left, or the rest of this instant."""
+    begun: bool = False
+    """The rest of this instant follows from the next step."""
+
+    def urgent(self) -> Outbox:
+        """Take out what is carried out first, up to the publication."""
+        part = Outbox(more=True, begun=True)
+        for name in _URGENT:
+            setattr(part, name, getattr(self, name))
+            setattr(self, name, [])
+        part.publication, self.publication = self.publication, None
+        return part
 
     def merge(self, part: Outbox) -> list[Event]:
         """Take over all that a part lists. Its events are returned: they are to be decided."""
@@ -283,6 +294,7 @@ class Outbox(Struct):
         return part.events
 
 
+_URGENT: Final = ("at_once", "higher", "disbelieved", "granted", "grant_notices", "reopened")
 _LISTS: Final = tuple(
     name for name in Outbox.__struct_fields__ if name != "events" and isinstance(getattr(Outbox(), name), list)
 )
