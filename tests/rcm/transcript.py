@@ -18,8 +18,9 @@
     wait                                          time has passed
 
 All commands of a line, joined by `;`, are one burst. `--` stands between its steps. A TERM is a counter: the leader's
-own is 9. Changes of holders are numbered: a publication has the number of its last one, a grant that of its own. The
-log of requests is written some 0.1 s late, so it appears with the next stimulus."""
+own is 9. Changes of holders, ends included, are numbered: a publication has the number of its last change, a grant that
+of its own. Places have numbers of their own. `holds RC HOST` without more: that RC holds nothing. The log of requests is
+written some 0.1 s late, so it appears with the first stimulus after that. `at once` answers need no instant."""
 
 from __future__ import annotations
 
@@ -140,13 +141,15 @@ class LeaderPlayer:
                 stimuli += self._stimuli(*words)
         if not stimuli and "wait" not in line:
             return []
-        lines, out, begun = list[str](), self.leader.step(self.now, stimuli), False
-        while True:
-            told = [*self._told(out)]
-            lines += ["--", *told] if lines and told and not begun else told
-            if not out.more:
-                return lines
-            begun, out = out.begun, self.leader.step(self.now)
+        lines, more = list[str](), True
+        while more:
+            told = list[str]()
+            for out in self.leader.step(self.now, stimuli):
+                told += self._told(out)
+                more = out.more
+            stimuli = []
+            lines += ["--", *told] if lines and told else told
+        return lines
 
     # In
 

@@ -1,13 +1,13 @@
 """The leading RCM as one pure step: stimuli in, an Outbox out. No clock, task, logger or mesh.
 
-A step is one instant of the core: operations that arrive together, or one other stimulus. Where these grant or end holds,
-it takes two steps: programs and RCs wait for the first, which returns answers to grants and the publication. What follows
-in another instant is put before the stimuli that wait, and the Outbox says that there is more."""
+A step is one instant of the core: operations that arrive together, or one other stimulus. Its Outbox comes in parts:
+grants are answered and published before the rest is computed. What follows in another instant is put before the
+stimuli that wait, and the last part says that there is more."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
@@ -45,11 +45,12 @@ CONTINUED: Final = frozenset({model.LeadTaken, model.Adopted, model.Vouched, mod
 BOOKINGS: Final = (messages.Book, messages.Unbook, messages.FindSlots)
 
 
-class _Decided(NamedTuple):
-    """An instant, granted and published."""
+class _Instant(NamedTuple):
+    """One that is decided."""
 
     events: Sequence[model.Event]
     effects: Sequence[model.Effect]
+    named: Collection[RcName] | None
     notified: Collection[ArcId]
     """ARCs whose clients know of their grants."""
 
@@ -91,38 +92,30 @@ class Leader:
         self._core_wake: Ns | None = None
         self._now: Ns = 0
         self._out = steps.Outbox()
-        self._decided: _Decided | None = None
-        """The instant of which only the urgent part has been returned."""
 
-    def step(self, now: Ns, stimuli: Iterable[steps.Stimulus] = ()) -> steps.Outbox:
-        """Return the urgent part of an instant that takes as much as is decided together; or the rest of the last one."""
-        self._queue.extend(stimuli)
-        if self._decided is not None:
-            decided, self._decided = self._decided, None
-            self._follow_up(decided)
-            return self._end()
+    def step(self, now: Ns, stimuli: Iterable[steps.Stimulus] = ()) -> Iterator[steps.Outbox]:
+        """Decide one instant, and yield its Outbox in parts. Carry out each before taking the next; a leader that stops
+        leading takes no further part."""
         self._now, out = now, steps.Outbox()
         self._out = out
         self._bookings.at(now)
+        self._queue.extend(stimuli)
         if self._wake is not None and self._wake <= now and not self._waking:
             self._waking = True
             self._queue.append(steps.Due.DEADLINES)
-        if (events := self._next()) and (decided := self._grant(events)) is not None:
-            if out.granted or out.publication is not None:
-                self._decided = decided
-                return out.urgent()
-            self._follow_up(decided)
-        return self._end()
-
-    def _end(self) -> steps.Outbox:
-        """Return the Outbox of an instant that is over."""
-        out = self._out
+        if (events := self._next()) and (instant := self._grant(events)) is not None:
+            if out.granted or out.grant_notices:
+                yield out.take(steps.ANSWERS)
+            self._publish_instant(instant)
+            if out.publication is not None:
+                yield out.take(steps.PUBLISHED)
+            self._follow_up(instant)
         self._queue.extendleft(reversed(out.then))
         out.then = []
         times = [self._core_wake, *[part.next for part in self._parts]]
         out.wake = self._wake = min([at for at in times if at is not None], default=None)
         out.more = bool(self._queue)
-        return out
+        yield out
 
     # In: the events of the next instant
 
@@ -288,13 +281,13 @@ class Leader:
     # Out: one instant
 
     def _decide(self, events: Sequence[model.Event], named: Collection[RcName] | None = None) -> None:
-        """Decide a whole instant in one step."""
-        if (decided := self._grant(events, named)) is not None:
-            self._follow_up(decided)
+        """An instant in one part. RCs that are `named` are published, whatever becomes of them."""
+        if (instant := self._grant(events, named)) is not None:
+            self._publish_instant(instant)
+            self._follow_up(instant)
 
-    def _grant(self, events: Sequence[model.Event], named: Collection[RcName] | None = None) -> _Decided | None:
-        """Decide an instant, up to its publication. RCs that are `named` are published, whatever becomes of them.
-        Return None where nothing changes."""
+    def _grant(self, events: Sequence[model.Event], named: Collection[RcName] | None = None) -> _Instant | None:
+        """Answers and notices to programs whose ARCs are granted. Return None where nothing changes."""
         lost = [event.client for event in events if isinstance(event, model.ClientLost)]
         for client in lost:
             self._recovered.pop(client, None)
@@ -316,13 +309,15 @@ class Leader:
                 if arc not in over:
                     out.grant_notices.append(registry.notice(now, arc))
                     notified.add(arc)
-        out.reopened, registry.traced = registry.traced, []
-        self._publish(effects, named, operations.instant.left)
-        return _Decided(events, effects, notified)
+        return _Instant(events, effects, named, notified)
 
-    def _follow_up(self, decided: _Decided) -> None:
+    def _publish_instant(self, instant: _Instant) -> None:
+        self._out.reopened, self.registry.traced = self.registry.traced, []
+        self._publish(instant.effects, instant.named, self.operations.instant.left)
+
+    def _follow_up(self, instant: _Instant) -> None:
         """What an instant leads to beside its grants and its publication."""
-        events, effects, notified = decided
+        events, effects, _, notified = instant
         now, out, registry, operations = self._now, self._out, self.registry, self.operations
         self._note(events)
         answered = notified | operations.waiting.keys()

@@ -5,7 +5,7 @@ names in them were checked as they came in, those within holds and requests are 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from enum import Enum, auto
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -273,17 +273,14 @@ class Outbox(Struct):
     wake: Ns | None = None
     """The next step is due then at the latest."""
     more: bool = False
-    """Another step is due at once: stimuli are left, or the rest of this instant."""
-    begun: bool = False
-    """The rest of this instant follows from the next step."""
+    """Another step is due at once: stimuli are left."""
 
-    def urgent(self) -> Outbox:
-        """Take out what is carried out first, up to the publication."""
-        part = Outbox(more=True, begun=True)
-        for name in _URGENT:
+    def take(self, names: Iterable[str]) -> Outbox:
+        """Take these fields out, as a part of its own."""
+        part = Outbox()
+        for name in names:
             setattr(part, name, getattr(self, name))
-            setattr(self, name, [])
-        part.publication, self.publication = self.publication, None
+            setattr(self, name, None if name == "publication" else [])
         return part
 
     def merge(self, part: Outbox) -> list[Event]:
@@ -294,7 +291,8 @@ class Outbox(Struct):
         return part.events
 
 
-_URGENT: Final = ("at_once", "higher", "disbelieved", "granted", "grant_notices", "reopened")
+ANSWERS: Final = ("at_once", "higher", "disbelieved", "granted", "grant_notices")
+PUBLISHED: Final = ("reopened", "publication")
 _LISTS: Final = tuple(
     name for name in Outbox.__struct_fields__ if name != "events" and isinstance(getattr(Outbox(), name), list)
 )

@@ -271,8 +271,10 @@ class Rcm:
             more = self.supervisor.active
             while more:
                 stimuli, self._coming = self._coming, []
-                out = self.leader.step(self.mesh.now(), stimuli)
-                more = self._carry_out(out) and (out.more or bool(self._coming))
+                for out in self.leader.step(self.mesh.now(), stimuli):
+                    if not self._carry_out(out):
+                        return
+                    more = out.more or bool(self._coming)
         except Exception as error:  # noqa: BLE001 - it is logged there
             self.supervisor.fail(error)
         finally:
