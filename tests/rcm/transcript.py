@@ -19,7 +19,7 @@
 
 All commands of a line, joined by `;`, are one burst. `--` stands between its steps. A TERM is a counter: the leader's
 own is 9. Changes of holders, ends included, are numbered: a publication has the number of its last change, a grant that
-of its own. Places have numbers of their own. `holds RC HOST` without more: that RC holds nothing. The log of requests is
+of its own. Places have numbers of their own. `holds RC HOST` without more: it holds nothing. The log of requests is
 written some 0.1 s late, so it appears with the first stimulus after that. `at once` answers need no instant."""
 
 from __future__ import annotations
