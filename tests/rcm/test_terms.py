@@ -56,6 +56,14 @@ def test_a_host_is_believed_alone_once_and_ever_more_seldom() -> None:
     assert terms.doubted_until("cart", now) == now + DOUBT
 
 
+def test_a_host_that_alone_showed_a_leader_in_vain_is_doubted_once_the_leader_had_a_silence_to_appear() -> None:
+    terms, silence = known(), 10
+    terms.doubt("cart", terms.highest, NOW)
+    doubted = [at for at in (0, silence - 1, silence, DOUBT - 1, DOUBT) if terms.is_doubted("cart", NOW + at, silence)]
+    assert doubted == [silence, DOUBT - 1]
+    assert not terms.is_doubted("anvil", NOW + silence, silence)
+
+
 @pytest.mark.parametrize("by", ["a leader", "another host"])
 def test_a_host_that_was_right_is_believed_again(by: str) -> None:
     terms = known()

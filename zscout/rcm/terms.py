@@ -127,10 +127,14 @@ class Terms:
             return 0
         if until := self.doubted_until(host, now):
             return until
+        self.doubt(host, term, now)
+        return 0
+
+    def doubt(self, host: HostName, term: Term, now: Ns) -> None:
+        """Only RCs of `host` showed `term`, or a leader of it."""
         before = self._doubts.get(host, _Doubt(NO_TERM, 0, 0))
         times = 0 if now - before.until > FORGIVEN_AFTER else before.times
         self._doubts[host] = _Doubt(term, now + (DOUBT << min(times, MAX_DOUBLINGS)), times + 1, now)
-        return 0
 
     def _vindicate(self, host: HostName, term: Term, now: Ns) -> None:
         doubt = self._doubts.get(host)
@@ -151,8 +155,12 @@ class Terms:
 
     def is_led_nowhere(self, term: Term, host: HostName, now: Ns, silence: Ns) -> bool:
         """Return True if only `host` shows `term`, and it had no leader for a silence: its RCs can see none."""
+        return self.is_doubted(host, now, silence) and self._doubts[host].term == term
+
+    def is_doubted(self, host: HostName, now: Ns, silence: Ns) -> bool:
+        """Return True if the leader that `host` alone shows has had a silence to show itself."""
         doubt = self._doubts.get(host)
-        return doubt is not None and doubt.term == term and doubt.since + silence <= now < doubt.until
+        return doubt is not None and doubt.since + silence <= now < doubt.until
 
     def doubted_until(self, host: HostName, now: Ns) -> Ns:
         """Until when `host` is not believed alone; 0: it is."""

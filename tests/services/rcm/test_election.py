@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from zscout.services.rcm.election import CALM, RETRY, SETTLE, TURN, Election
+from zscout.services.rcm.election import CALM, RETRY, SETTLE, TURN, WAITS, Election, views
 from zscout.types import SECOND, Ns, Term
 
 SILENCE = 2 * SECOND
@@ -137,6 +137,10 @@ def test_a_leader_counts_while_it_has_a_token_and_speaks() -> None:
 JITTER = 0.7
 
 
+def hosts(*sights: bool) -> dict[str, bool]:
+    return {f"h{number}": sees for number, sees in enumerate(sights)}
+
+
 def test_who_is_deposed_waits_twice_as_long_each_time_until_all_is_calm() -> None:
     """While it hears of the other: it goes on speaking."""
     seen, waits, at = election(), [], LATER
@@ -145,7 +149,7 @@ def test_who_is_deposed_waits_twice_as_long_each_time_until_all_is_calm() -> Non
         waited = at
         while True:
             seen.published(Term(7, "x"), waited)
-            if not seen.must_wait([False, False], [], waited):
+            if not seen.must_wait(hosts(False, False), False, waited):
                 break
             waited += SECOND // 10
         waits.append((waited - at) / SILENCE)
@@ -154,7 +158,7 @@ def test_who_is_deposed_waits_twice_as_long_each_time_until_all_is_calm() -> Non
     at += CALM + 1
     seen.deposed(at, JITTER)
     seen.published(Term(7, "x"), at + SILENCE)
-    assert not seen.must_wait([False], [], at + SILENCE)
+    assert not seen.must_wait(hosts(False), False, at + SILENCE)
 
 
 @pytest.mark.parametrize(
@@ -167,58 +171,57 @@ def test_who_is_deposed_waits_twice_as_long_each_time_until_all_is_calm() -> Non
 def test_who_was_deposed_waits_only_for_a_leader_that_is_there(others: list[bool], waits: bool) -> None:
     seen = election()
     seen.deposed(LATER, JITTER)
-    assert seen.must_wait(others, [], LATER + SILENCE // 2) == waits
+    assert seen.must_wait(hosts(*others), False, LATER + SILENCE // 2) == waits
 
 
 def test_who_was_deposed_and_sees_nobody_else_waits_as_well() -> None:
     """A client may have told it of the higher term, which it would tell the other leader of the next one in turn."""
     seen = election()
     seen.deposed(LATER, JITTER)
-    assert seen.must_wait([], [False], LATER + SILENCE // 2)
-    assert not seen.must_wait([], [False], LATER + SILENCE)
+    assert seen.must_wait({}, False, LATER + SILENCE // 2)
+    assert not seen.must_wait({}, False, LATER + SILENCE)
 
 
 def test_who_has_stood_still_waits_where_nobody_tells_of_a_leader() -> None:
     """It lost the leader's token first: the others' follow."""
     seen = election()
     seen.stood_still(LATER)
-    assert not seen.must_wait([False], [], LATER)
-    assert seen.must_wait([], [], LATER)
-    assert not seen.must_wait([], [], LATER + SILENCE)
+    assert not seen.must_wait(hosts(False), False, LATER)
+    assert seen.must_wait({}, False, LATER)
+    assert not seen.must_wait({}, False, LATER + SILENCE)
 
 
 @pytest.mark.parametrize(
     ("others", "own", "lost", "waits"),
     [
-        pytest.param([True, True, False], [], [], True, id="most of them see a leader"),
-        pytest.param([True, False], [True, True], [], False, id="half of them do not, and its own do not count"),
-        pytest.param([], [True], [], True, id="only its own answer, and see one: once more a silence"),
-        pytest.param([], [False], [], False, id="only its own answer, and see none"),
-        pytest.param([], [], [], False, id="there are none"),
-        pytest.param([], [], ["a"], False, id="the leader's host has gone"),
-        pytest.param([], [], ["a", "c"], True, id="others have gone with the leader's: it may be this host"),
+        pytest.param([True, True, False], False, [], True, id="most of them see a leader"),
+        pytest.param([True, False], True, [], False, id="half of them do not, and its own do not count"),
+        pytest.param([], True, [], True, id="only its own answer, and see one: once more a silence"),
+        pytest.param([], False, [], False, id="only its own answer, and see none; or there are none"),
+        pytest.param([], False, ["a"], False, id="the leader's host has gone"),
+        pytest.param([], False, ["a", "c"], True, id="others have gone with the leader's: it may be this host"),
     ],
 )
-def test_who_may_be_cut_off_waits(others: list[bool], own: list[bool], lost: list[str], waits: bool) -> None:
+def test_who_may_be_cut_off_waits(others: list[bool], own: bool, lost: list[str], waits: bool) -> None:
     seen = election()
     for host in ("a", "c"):
         seen.candidate(host, alive=True, now=START)
     for host in lost:
         seen.candidate(host, alive=False, now=LATER)
-    assert seen.must_wait(others, own, LATER) == waits
+    assert seen.must_wait(hosts(*others), own, LATER) == waits
     if not others:
         # Nobody else will tell: it is as long as a leader may be silent.
-        assert not seen.must_wait(others, own, LATER + SILENCE)
+        assert not seen.must_wait(hosts(*others), own, LATER + SILENCE)
 
 
 def test_who_waited_alone_once_does_so_anew_after_a_leader_was_seen() -> None:
     seen = election()
     seen.candidate("c", alive=True, now=START)
     seen.candidate("c", alive=False, now=LATER)
-    assert seen.must_wait([], [False], LATER)
+    assert seen.must_wait({}, False, LATER)
     seen.leader("i", "a", alive=True, now=LATER + SECOND)
     seen.stood_still(LATER + 3 * SILENCE)
-    assert seen.must_wait([], [False], LATER + 3 * SILENCE)
+    assert seen.must_wait({}, False, LATER + 3 * SILENCE)
 
 
 @pytest.mark.parametrize(
@@ -244,3 +247,47 @@ def test_links_come_back_for_a_silence(happens: list[Sight], returning: bool) ->
         one(seen)
     assert seen.links_return(LATER + SILENCE) == returning
     assert not seen.links_return(LATER + SILENCE + 1)
+
+
+@pytest.mark.parametrize(
+    ("sights", "others", "own"),
+    [
+        pytest.param([("c", True)] * 50 + [("d", False), ("e", False)], (1, 3), False, id="50 RCs are one host"),
+        pytest.param([("c", True), ("c", True), ("c", False)], (1, 1), False, id="most RCs of a host decide"),
+        pytest.param([("c", True), ("c", False)], (0, 1), False, id="half of them do not"),
+        pytest.param([("b", True), ("c", False)], (0, 1), True, id="this host's count apart"),
+        pytest.param([("", True)] * 9 + [("c", False)], (0, 1), False, id="unknown hosts beside a known one"),
+        pytest.param([("", True), ("", True), ("b", False)], (1, 1), False, id="unknown hosts alone are one"),
+        pytest.param([], (0, 0), False, id="nobody answers"),
+    ],
+)
+def test_each_host_has_one_view(sights: list[tuple[str, bool]], others: tuple[int, int], own: bool) -> None:
+    found, of_this_host = views(sights, "b")
+    assert ((sum(found.values()), len(found)), of_this_host) == (others, own)
+
+
+BOUND = WAITS + SILENCE
+NOBODY: Sight = lambda _: None  # noqa: E731
+LAST = LATER + BOUND - 1
+
+
+@pytest.mark.parametrize(
+    ("meanwhile", "in_vain"),
+    [
+        pytest.param(NOBODY, True, id="nothing"),
+        pytest.param(heard("x", LATER), True, id="the leader was heard last before that"),
+        pytest.param(heard("x", LAST), False, id="this candidate hears a leader"),
+        pytest.param(came("x", LAST), False, id="this candidate sees a leader"),
+        pytest.param(lambda seen: seen.waited_in_vain({}, LAST), True, id="it does not answer for a while"),
+        pytest.param(lambda seen: seen.waited_in_vain(hosts(False), LAST), False, id="it sees none for a while"),
+        pytest.param(lambda seen: seen.waited_in_vain(hosts(True, True), LAST), False, id="another one sees one too"),
+        pytest.param(lambda seen: seen.waited_in_vain({"z": True}, LAST), False, id="another one is alone"),
+    ],
+)
+def test_one_host_that_alone_shows_a_leader_is_believed_for_a_while(meanwhile: Sight, in_vain: bool) -> None:
+    seen = election()
+    for at in (LATER, LAST):
+        assert not seen.waited_in_vain(hosts(True), at)
+    meanwhile(seen)
+    assert seen.waited_in_vain(hosts(True), LATER + BOUND) == in_vain
+    assert not seen.waited_in_vain(hosts(True, True), LATER + 9 * BOUND)

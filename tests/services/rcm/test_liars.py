@@ -7,14 +7,16 @@ from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
 from tests.mesh.kit import until
 from tests.services.rcm.kit import FakeClient, FakeFleet, FakeRc, Refusal, there
 from zscout.mesh import IncomingQuery
-from zscout.messages import MAX_COUNTER, ClientRequests, Grants, OpenRequest, RcAsk
+from zscout.messages import MAX_COUNTER, ClientRequests, Grants, OpenRequest, RcAsk, RcState
 from zscout.rcm.places import Places
 from zscout.services.rcm.candidate import Candidate
+from zscout.services.rcm.election import WAITS
 from zscout.services.rcm.term_file import FILE, TermFile
 from zscout.types import NO_TERM, SECOND, Place, Term
 
@@ -138,6 +140,75 @@ async def test_rcs_that_claim_to_see_the_leader_of_their_term_delay_one_election
     await until(lambda: candidate.rcm is None)
     within = fleet.fleet.silence / SECOND + SERVED
     await until(lambda: candidate.known > FAR and "robot/a" in there(candidate), within=within)
+
+
+async def test_a_host_whose_rcs_showed_a_term_before_its_leader_spoke_is_believed() -> None:
+    """RCs promise a term before anybody leads in it."""
+    fleet = a_fleet()
+    term = Term(4, "x")
+    fleet.rc("robot/b", term=term)
+    candidate = fleet.candidate("h1")
+    await until(lambda: candidate.known == term)
+    assert candidate.terms.doubted_until("devices", candidate.mesh.now())
+    fleet.watcher.publisher(fleet.watcher.keys.grants, Grants).put(Grants(term, 1, 0, 0.5))
+    await until(lambda: not candidate.terms.doubted_until("devices", candidate.mesh.now()), within=0.1)
+
+
+class LiarOfHost(FakeRc):
+    """May say that it is at another host."""
+
+    host = ""
+
+    def state(self, **more: Any) -> RcState:
+        return msgspec.structs.replace(super().state(**more), host=self.host or self.mesh.me.host)
+
+
+def liars(fleet: FakeFleet, count: int, *, elsewhere: bool = False) -> list[LiarOfHost]:
+    """RCs of one node, which always see a leader."""
+    found = [LiarOfHost(fleet.mesh("cart", f"g{number}"), f"gripper/g{number}", leader=True) for number in range(count)]
+    for number, liar in enumerate(found):
+        liar.host = f"elsewhere{number}" if elsewhere else ""
+        liar.start()
+    return found
+
+
+@pytest.mark.parametrize("elsewhere", [False, True], ids=["at its host", "at others by their word"])
+async def test_many_rcs_of_one_host_that_see_a_leader_keep_nobody_from_leading(elsewhere: bool) -> None:
+    fleet = a_fleet()
+    fleet.fleet = msgspec.structs.replace(fleet.fleet, candidates=("h1", "h2"))
+    first = await led(fleet)
+    second, _ = fleet.candidate("h2"), liars(fleet, 20, elsewhere=elsewhere)
+    await until(lambda: second.election.sees_leader(second.mesh.now()))
+    fleet.network.kill(first.mesh)
+    await until(lambda: "robot/a" in there(second), within=SERVED)
+
+
+async def test_a_host_that_alone_shows_a_leader_delays_one_change_of_leader_for_a_while() -> None:
+    """It is not believed alone after that."""
+    fleet = FakeFleet("h1", "h2", closed=True)
+    bound, silence = (WAITS + fleet.fleet.silence) / SECOND, fleet.fleet.silence / SECOND
+    first, _ = fleet.candidate("h1"), liars(fleet, 3)
+    await until(lambda: there(first), within=bound + SERVED)
+    second = fleet.candidate("h2")
+    await until(lambda: second.known == first.known)
+    fleet.network.kill(first.mesh)
+    began = second.mesh.now()
+    await until(lambda: there(second), within=bound + SERVED)
+    assert (second.mesh.now() - began) / SECOND >= bound
+    fleet.watcher.publisher(fleet.watcher.keys.grants, Grants).put(Grants(Term(9, "x"), 1, 0, 0.5))
+    await until(lambda: second.rcm is None)
+    await until(lambda: there(second), within=1.3 * silence + SERVED)
+
+
+async def test_without_certificates_a_host_that_alone_shows_a_leader_is_believed() -> None:
+    """Where two hosts are cut from each other, one that sees both knows better."""
+    fleet = FakeFleet("h1", "h2")
+    first, rc, second = fleet.candidate("h1"), fleet.rc("robot/a"), fleet.candidate("h2")
+    await until(lambda: second.election.sees_leader(second.mesh.now()))
+    rc.leader = True
+    fleet.cut(first.mesh, second.mesh)
+    await asyncio.sleep(3 * WAITS / SECOND)
+    assert second.rcm is None
 
 
 async def test_rcs_of_two_hosts_use_up_no_terms() -> None:

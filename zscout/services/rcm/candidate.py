@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple, TypeVar
@@ -42,21 +42,19 @@ from zscout.services.placement.ledger import PlacementLedger
 from zscout.services.placement.load_balancer import LoadBalancer
 from zscout.services.rcm.booking_sharing import credible
 from zscout.services.rcm.digest import HoldListener
-from zscout.services.rcm.election import Election, Setbacks
+from zscout.services.rcm.election import WAITS, Election, Setbacks, views
 from zscout.services.rcm.inventory import Inventory
 from zscout.services.rcm.learned import Learned
 from zscout.services.rcm.observed_runtimes import RuntimeObserver
 from zscout.services.rcm.rcm import Parts, Rcm
 from zscout.services.rcm.term_file import KeptTerm, TermDisk
-from zscout.types import NO_TERM, SECOND, Ns, RcName, Term
+from zscout.types import NO_TERM, SECOND, HostName, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
 
 R = TypeVar("R")
 
 UNSEEN = "RCs of other hosts see an RCM, and this candidate does not"
-WAITS = 4.0
-"""Seconds for which a candidate waits for a leader that only others see: longer than RCs believe in one that went."""
 
 
 class CandidateParts(NamedTuple):
@@ -187,6 +185,7 @@ class Candidate:
     def _on_grants(self, _key: str, grants: Grants) -> None:
         known = grants.term == self.known and (self.rcm is None or self.rcm.term == self.known)
         if known or self._see(Word(grants.term, Source.LEADER)).believed:
+            self.terms.led(grants.term, self.mesh.now())
             self.election.published(grants.term, self.mesh.now())
             self.learned.hear(self.mesh.now(), grants)
 
@@ -260,31 +259,44 @@ class Candidate:
             replies = await asked
         states = [state for state, _ in self._credible(replies, lambda state: keys.rc_state(state.rc))]
         before = self.known
-        states = await self._hear_rcs(states, tokens)
+        heard = self._hear_rcs(states, tokens)
         if self.known > before:
             self.election.rivalled(self.mesh.now())
             return True
+        states, now = [state for _, state in heard], self.mesh.now()
         self.terms.goes_above |= await self._divided(states)
-        host = self.mesh.me.host
-        others = [bool(state.leader) for state in states if state.host != host]
-        own = [bool(state.leader) for state in states if state.host == host]
-        if self.election.must_wait(others, own, self.mesh.now()):
-            log.info("%d of %d RCs of other hosts still see a leader: waiting", sum(others), len(others))
-            if sum(others) * 2 > len(others):
-                self.mesh.suspicions.suspect(UNSEEN, patience=WAITS)
+        others, own = views(((host, state.leader) for host, state in heard), self.mesh.me.host)
+        if self.terms.secured and self._is_disbelieved(others, heard, now):
+            others = dict.fromkeys(others, False)
+        if self.election.must_wait(others, own, now):
+            log.info("%d of %d other hosts still see a leader: waiting", sum(others.values()), len(others))
+            if sum(others.values()) * 2 > len(others):
+                self.mesh.suspicions.suspect(UNSEEN, patience=WAITS / SECOND)
             return True
         return False
 
-    async def _hear_rcs(self, states: list[RcState], tokens: list[Token]) -> list[RcState]:
-        """Take the terms of RCs. Return those that do not count as absent for what they show."""
-        hosts = {(token.name, token.instance): token.host for token in tokens}
-        words = [Word(state.term, Source.RC, state.rc, hosts.get((state.rc, state.instance), "")) for state in states]
+    def _is_disbelieved(self, others: Mapping[HostName, bool], heard: list[tuple[HostName, RcState]], now: Ns) -> bool:
+        """Return True if only one other host answers, and nobody else saw the leader that it shows."""
+        if self.election.waited_in_vain(others, now):
+            [host] = others
+            if host and not self.terms.doubted_until(host, now):
+                log.warning("no longer waiting for a leader: only %s shows one", host)
+                self.terms.doubt(host, max(state.term for at, state in heard if at == host), now)
+            return True
+        return len(others) == 1 and all(self.terms.is_doubted(host, now, self.fleet.silence) for host in others)
+
+    def _hear_rcs(self, states: list[RcState], tokens: list[Token]) -> list[tuple[HostName, RcState]]:
+        """Take the terms of RCs. Return those that do not count as absent for what they show, each with its host: with
+        `[security]` that of its token."""
+        seen = {(token.host, token.name, token.instance) for token in tokens}
         now, silence = self.mesh.now(), self.fleet.silence
-        return [
-            state
-            for state, word in zip(states, words, strict=True)
-            if not self._see(word).absent_until and not self.terms.is_led_nowhere(word.term, word.host, now, silence)
-        ]
+        heard = list[tuple[HostName, RcState]]()
+        for state in states:
+            proven = state.host if (state.host, state.rc, state.instance) in seen else ""
+            absent = self._see(Word(state.term, Source.RC, state.rc, proven)).absent_until
+            if not absent and not self.terms.is_led_nowhere(state.term, proven, now, silence):
+                heard.append((proven if self.terms.secured else state.host, state))
+        return heard
 
     async def _divided(self, states: list[RcState]) -> bool:
         """Whether an RC that is seen obeys a term which is absurd to others: they are told why this one goes above."""

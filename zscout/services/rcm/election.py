@@ -6,8 +6,9 @@ that two that do not see each other do not take turns over RCs that see both."""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 from zscout.types import SECOND, HostName, Ns, Term
 
@@ -24,6 +25,9 @@ CALM = 10 * SECOND
 ALONE = 2
 """Silences for which a deposed candidate waits at most that sees nobody else: its own RCs wait as well."""
 MAX_DOUBLINGS = 5
+WAITS: Ns = 4 * SECOND
+"""A candidate waits so long for a leader that only others see until it reopens its session. A leader that lives shows
+itself within a silence after that. RCs see one that died for a shorter time."""
 BACKOFF, MAX_BACKOFF = 1.0, 30.0
 """Seconds until a candidate that failed becomes one again: doubled each time, at most."""
 BACKOFF_RESET_AFTER: Ns = 60 * SECOND
@@ -44,6 +48,26 @@ class Setbacks:
         """A candidacy failed: the seconds until the next one."""
         self._failures = 1 if now - self._began > BACKOFF_RESET_AFTER else self._failures + 1
         return min(BACKOFF * 2.0 ** (self._failures - 1), MAX_BACKOFF)
+
+
+def views(sights: Iterable[tuple[HostName, bool]], me: HostName) -> tuple[dict[HostName, bool], bool]:
+    """For each other host, and for this one: whether most of its RCs see a leader. RCs of one host share its view of
+    the mesh. RCs of unknown hosts ("") count as one host, and only if no other host answers."""
+    said = defaultdict[HostName, list[bool]](list)
+    for host, sees in sights:
+        said[host].append(sees)
+    found = {host: sum(seen) * 2 > len(seen) for host, seen in said.items()}
+    own = found.pop(me, False)
+    if len(found) > 1:
+        found.pop("", None)
+    return found, own
+
+
+class _Lone(NamedTuple):
+    """The only other host that answers, and since when it has shown a leader."""
+
+    host: HostName
+    since: Ns
 
 
 class Election:
@@ -71,6 +95,7 @@ class Election:
         """When one of them came back last."""
         self._stood_still: Ns | None = None
         self._alone_since: Ns | None = None
+        self._lone: _Lone | None = None
         self.led_by: HostName | None = None
         """The host of the leader that was seen last."""
 
@@ -127,23 +152,38 @@ class Election:
         """This process has just gone on: what it sees go may have missed it, and not the other way round."""
         self._stood_still = now
 
-    def must_wait(self, others: Sequence[bool], own: Sequence[bool], now: Ns) -> bool:
-        """Whether to wait, by what RCs of other hosts and of this one say of a leader: whether they see one.
+    def waited_in_vain(self, others: Mapping[HostName, bool], now: Ns) -> bool:
+        """Return True if the only other host that answers has shown a leader for so long that this candidate would have
+        seen it. The time begins again when this candidate sees or hears a leader; no answer at all does not stop it."""
+        if not others:
+            return False
+        if list(others.values()) != [True]:
+            self._lone = None
+            return False
+        [host] = others
+        lone = self._lone
+        if lone is None or lone.host != host or (self._heard is not None and self._heard > lone.since):
+            lone = self._lone = _Lone(host, now)
+        return now - lone.since >= WAITS + self.silence
 
-        RCs of this host share its view of the mesh: they count only where no other answers. Where it may be this
-        host that is cut off, that is once more a silence."""
+    def must_wait(self, others: Mapping[HostName, bool], own: bool, now: Ns) -> bool:
+        """Return True if RCs show a leader: most other hosts do (`views`), or this host (`own`).
+
+        This host's RCs count only if no other host answers: they see what it sees. If this host may be cut off,
+        the candidate waits for one more silence."""
+        sights = others.values()
         if others:
             self._alone_since = None
-            yields = now < self._yields_until and (self.heard_within(self.silence, now) or any(others))
-            return yields or sum(others) * 2 > len(others)
+            yields = now < self._yields_until and (self.heard_within(self.silence, now) or any(sights))
+            return yields or sum(sights) * 2 > len(sights)
         if (
             self._led
             and self._deposed is not None
             and now < min(self._yields_until, self._deposed + ALONE * self.silence)
         ):
-            # Who deposed this candidate goes on, though nobody who could say so is seen: the two would take turns.
+            # The RCM that deposed this candidate continues, though nobody who shows it is seen: they would take turns.
             return True
-        if sum(own) * 2 <= len(own) and not self._was_away(now) and self._alone_since is None:
+        if not own and not self._was_away(now) and self._alone_since is None:
             return False
         self._alone_since = now if self._alone_since is None else self._alone_since
         return now - self._alone_since < self.silence
