@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.hang import HANG
-from tests.live.closed import ClosedLab
+from tests.live.closed import ROLES, ClosedLab
 from tests.live.lab import PatientClient
 from zscout.behaviors.client.arc import hold
 from zscout.keyexpr import Role, Sender, Token
@@ -23,9 +24,11 @@ pytestmark = [pytest.mark.live, pytest.mark.slow]
 
 
 @asynccontextmanager
-async def beside(folder: Path, name: str, client: str) -> AsyncIterator[tuple[ClosedLab, PatientClient, ZenohMesh]]:
+async def beside(
+    folder: Path, name: str, client: str, **how: Any
+) -> AsyncIterator[tuple[ClosedLab, PatientClient, ZenohMesh]]:
     """A fleet of one node that leads, an honest client, and the session of a member that lies."""
-    async with ClosedLab(folder) as lab:
+    async with ClosedLab(folder, **how) as lab:
         lab.node("anvil", "robot/a")
         bob = await lab.person("bob")
         await lab.ready(bob, "robot/a")
@@ -36,8 +39,8 @@ async def beside(folder: Path, name: str, client: str) -> AsyncIterator[tuple[Cl
             await mesh.close()
 
 
-async def serve(bob: PatientClient) -> None:
-    async with asyncio.timeout(HANG), hold(bob, "survey", {"robot/a": {}}):
+async def serve(bob: PatientClient, rc: str = "robot/a") -> None:
+    async with asyncio.timeout(HANG), hold(bob, "survey", {rc: {}}):
         pass
 
 
@@ -131,4 +134,31 @@ async def test_a_node_whose_rc_claims_terms_moves_the_fleet_once(tmp_path: Path)
             await serve(bob)
         assert before.term < after.term == (await lab.ready(bob, "robot/a")).term
         claiming.cancel()
+        del declared
+
+
+async def test_a_node_with_many_made_up_rcs_that_see_a_leader_keeps_nobody_from_leading(tmp_path: Path) -> None:
+    """Its host alone says so: the one candidate that is left waits for a while, and leads."""
+    roles = f'{ROLES}bench = ["gripper/*"]\n'
+    async with beside(tmp_path, "cart", "liar", roles=roles, lease=1.0) as (lab, bob, cart):
+        lab.node("bench", "gripper/b")
+        before = await lab.ready(bob, "robot/a", "gripper/b")
+
+        def answer(rc: str, query: IncomingQuery[RcAsk]) -> None:
+            query.answer(RcState(rc, "cart", "1", False, query.message.promise or before.term, leader=True))
+
+        names = [f"radio/r{number}" for number in range(50)]
+        declared = [
+            (
+                cart.serve(cart.keys.rc_state(rc), RcAsk, partial(answer, rc)),
+                cart.alive(Token("cart", Role.RC, rc, "1")),
+            )
+            for rc in names
+        ]
+        await lab.ready(bob, *names)
+        await lab.candidates(bob, "anvil", "bench")
+        lab.nodes["anvil"].kill()
+        await lab.state(bob, lambda state: state.term > before.term)
+        await serve(bob, "gripper/b")
+        assert "only cart shows one" in lab.log("bench")
         del declared
