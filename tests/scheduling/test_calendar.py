@@ -19,10 +19,12 @@ from zscout.scheduling import calendar
 from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.booking import Booking, BookingBound, BookingConflict, BookingThreatened, Dates
 from zscout.scheduling.capacity import excess
+from zscout.scheduling.claim_index import ClaimIndex
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import play_instant
 from zscout.scheduling.model import (
     ArcRequest,
+    Claim,
     Effect,
     Event,
     Granted,
@@ -37,6 +39,7 @@ from zscout.scheduling.model import (
     VoteOverdue,
     WakeAt,
 )
+from zscout.scheduling.reservations import Reservations
 from zscout.types import SECOND, Ns, Term
 
 
@@ -263,3 +266,26 @@ def test_an_instant_is_bounded_and_asks_for_the_next(monkeypatch: pytest.MonkeyP
         checked.clear()
     assert instants >= 2_000 // calendar.WORK
     assert not [effect for effect in effects if isinstance(effect, BookingThreatened)]
+
+
+def test_the_first_gap_between_dates_is_found_by_a_look_at_each_once_or_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A request that fits between none of them was compared with 15 dates at each of them: a second of the leader for
+    2,000 dates and one forecast."""
+    looked, found = 0, ClaimIndex.booked
+
+    def counted(index: ClaimIndex, *args: Any) -> list[Claim]:
+        nonlocal looked
+        looked += len(claims := found(index, *args))
+        return claims
+
+    monkeypatch.setattr(ClaimIndex, "booked", counted)
+    core, hour, count = Core(Adaptive()), 3600 * SECOND, 200
+    dates = (
+        Booking(f"d{number}", {"robot/a": {}}, 0, (48 + 2 * number) * hour, hour, hour, 0) for number in range(count)
+    )
+    core.handle(0, RcJoined("robot/a", sharable=False), Dates(tuple(dates)), LeadTaken(Term(1, "x")))
+    core.handle(0, Requested(ArcRequest("long", "h/c", {"robot/a": {}}, 0, 50 * hour)))
+    core.handle(24 * hour, Tick())
+    looked = 0
+    assert Reservations(core._state).starts == [(48 + 2 * count - 1) * hour]
+    assert count <= looked < 2 * count

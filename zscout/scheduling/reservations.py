@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from bisect import insort
+from collections.abc import Iterator
 from operator import attrgetter
 from typing import Final, NamedTuple, TypeAlias
 
@@ -124,20 +125,20 @@ class Reservations:
 
     def _beside_bookings(self, arc: Arc, rcs: list[Rc], start: Ns, order: Order) -> Ns:
         """The earliest time from `start` at which `arc` meets no booking."""
-        while (blocking := self._meets(arc, rcs, start, order)) is not None:
-            start = blocking  # each booking is passed once, as time only increases
+        while blocking := [end for rc in rcs for end in self._blocking(arc, rc, start, order)]:
+            start = max(blocking)  # until then `arc` would meet that booking, whenever it starts
         return start
 
-    def _meets(self, arc: Arc, rcs: list[Rc], start: Ns, order: Order) -> Ns | None:
-        """The end of a booking in the way of `arc` if it starts then."""
-        for rc in rcs:
-            for promise in self.before(rc, order, start, arc.ends(start)):
-                if promise.booked is None:
-                    continue
-                beside = rc.sharable and not promise.excludes
-                if not (beside and self._votes.accepts(rc.name, frozenset((promise.arc.id, arc.id)))):
-                    return promise.booked
-        return None
+    def _blocking(self, arc: Arc, rc: Rc, start: Ns, order: Order) -> Iterator[Ns]:
+        """The ends of bookings of `rc` in the way of `arc` if it starts then."""
+        if not rc.bit & self._state.dates.claimed:
+            return
+        for claim in self._state.dates.booked(rc, start, arc.ends(start)):
+            booking = claim.booking
+            if order_of(self._state, booking) < order:
+                beside = rc.sharable and not booking.maintenance
+                if not (beside and self._votes.accepts(rc.name, frozenset((claim.arc.id, arc.id)))):
+                    yield booking.end
 
     def _reserve(self, arc: Arc, order: Order) -> None:
         rcs = self._rcs(arc, order)
