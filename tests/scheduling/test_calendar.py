@@ -220,12 +220,12 @@ def test_a_silent_rc_is_asked_again_at_times_and_its_dates_stand() -> None:
     assert len([effect for effect in effects if isinstance(effect, Propose)]) == 2, "the others, once it answers"
 
 
-def _counting(name: str, counted: Counter[str]) -> Callable[..., Any]:
+def counting(name: str, counted: Counter[str]) -> Callable[..., Any]:
     method = getattr(calendar.Calendar, name)
 
-    def count(*args: Any) -> Any:
+    def count(*args: Any, **more: Any) -> Any:
         counted[name] += 1
-        return method(*args)
+        return method(*args, **more)
 
     return count
 
@@ -234,7 +234,7 @@ def test_a_change_is_followed_up_where_it_overlaps_only(monkeypatch: pytest.Monk
     """Counted, as an instant beside 1,000 dates must not take longer than beside ten."""
     looked_at = Counter[str]()
     for name in ("_report_danger", "_obstacle"):
-        monkeypatch.setattr(calendar.Calendar, name, _counting(name, looked_at))
+        monkeypatch.setattr(calendar.Calendar, name, counting(name, looked_at))
     fleet, dates = Fleet(), many(1_000)
     fleet.send(RcJoined(RADIO, sharable=True), Dates(dates))
     assert max(looked_at.values()) < 10_000
@@ -255,7 +255,7 @@ def test_a_change_is_followed_up_where_it_overlaps_only(monkeypatch: pytest.Monk
 
 def test_an_instant_is_bounded_and_asks_for_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
     checked = Counter[str]()
-    monkeypatch.setattr(calendar.Calendar, "_report_danger", _counting("_report_danger", checked))
+    monkeypatch.setattr(calendar.Calendar, "_report_danger", counting("_report_danger", checked))
     core = Core(Adaptive())
     effects = core.handle(0, RcJoined("robot/a", sharable=False), Dates(many(2_000, "robot/a", apart=4 * SECOND)))
     core.handle(0, LeadTaken(Term(1, "x")))

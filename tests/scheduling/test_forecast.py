@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import random
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from typing import Any
 
 import pytest
 from hypothesis import given, settings
+from msgspec import structs
 
+from tests.scheduling.seeds import in_parts
+from tests.scheduling.test_bookings import POLICY, ROBOTS, booking, maintenance, vote
+from tests.scheduling.test_calendar import counting
 from tests.scheduling.workloads import voter, workloads
 from tests.thorough import times
+from zscout.scheduling import calendar
 from zscout.scheduling import forecast as forecasts
 from zscout.scheduling.adaptive import Adaptive
-from zscout.scheduling.booking import Booked, Booking
+from zscout.scheduling.booking import Booked, Booking, Dates
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast, play_instant
-from zscout.scheduling.model import ArcRequest, Event, Granted, HoldEnded, Outcome, RcJoined, Requested, Tick
+from zscout.scheduling.model import ArcRequest, Event, Granted, HoldEnded, LeadTaken, Outcome, RcJoined, Requested, Tick
 from zscout.simulation.workload import Workload
-from zscout.types import SECOND, ArcId, Ns
+from zscout.types import SECOND, ArcId, Ns, Params, Term
 
 
 def request(arc: str, *rcs: str, priority: int = 0, seconds: int = 1, keep: bool = False) -> ArcRequest:
@@ -123,3 +130,64 @@ def test_bookings_and_maintenance_are_played_through() -> None:
         if isinstance(effect, Granted)
     }
     assert starts == {"afterwards": 25 * SECOND, "behind": 10 * SECOND, "lapsed": 7 * SECOND}
+
+
+@pytest.mark.parametrize("seeds", in_parts(range(times(100)), quick=2, size=50))
+def test_dates_that_the_copy_gets_as_they_come_near_change_nothing(
+    seeds: Sequence[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of RCs by name without votes: what a vote or a pattern adds is an estimate in both."""
+    asked = foretold = 0
+    for seed in seeds:
+        draw, core = random.Random(f"near {seed}"), Core(Adaptive(), POLICY)  # noqa: S311
+        dates = [
+            structs.replace(
+                made := make(draw, number, 0),
+                start=draw.randint(1, 600),
+                needs={need: {} for need in made.needs if need in ROBOTS} or {"robot/a": {}},
+            )
+            for number, make in enumerate([booking] * 40 + [maintenance] * 2)
+        ]
+        joined = [RcJoined(rc, sharable=False) for rc in ROBOTS]
+        chain_of(core, 0, *joined, Dates(tuple(dates)), LeadTaken(Term(1, "x")))
+        for now in range(1, 61):
+            chain_of(core, now, Tick())
+            if draw.random() < 0.8:
+                continue
+            wanted: dict[str, Params] = {rc: {} for rc in draw.sample(ROBOTS, draw.randint(1, 2))}
+            new = ArcRequest(f"a{now}", "h/c", wanted, draw.randint(0, 2), draw.randint(1, 20), draw.random() < 0.2)
+            found = forecast(core, now, new)
+            with monkeypatch.context() as patched:
+                patched.setattr(forecasts, "NEAR", 10**6)
+                assert forecast(core, now, new) == found, (seed, now)
+            chain_of(core, now, Requested(new))
+            asked, foretold = asked + 1, foretold + len(found.starts)
+    assert foretold > asked
+
+
+def chain_of(core: Core, now: Ns, *events: Event) -> None:
+    for _ in play_instant(core, now, events, vote):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("seconds", "entered", "begun"),
+    [
+        pytest.param(60, 4, 0, id="a request that starts at once"),
+        pytest.param(4_000_000, 500, 250, id="one that fits between no two dates"),
+    ],
+)
+def test_a_forecast_beside_many_dates_is_short(
+    seconds: int, entered: int, begun: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Counted: dates that the copy gets, and dates that begin in it; 2,000 were copied for each forecast."""
+    done = Counter[str]()
+    for name in ("book", "take_up"):
+        monkeypatch.setattr(calendar.Calendar, name, counting(name, done))
+    core, hour = Core(Adaptive()), 3600 * SECOND
+    dates = [Booking(f"d{n}", {"robot/a": {}}, 0, (24 + 2 * n) * hour, hour, hour, 0) for n in range(500)]
+    core.handle(0, RcJoined("robot/a", sharable=False), Dates(tuple(dates)), LeadTaken(Term(1, "x")))
+    done.clear()
+    forecast(core, SECOND, request("new", "robot/a", seconds=seconds))
+    assert done["book"] <= entered
+    assert done["take_up"] <= begun

@@ -11,7 +11,7 @@ and a `Tick` at the latest when `WakeAt` asks for it."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Container, Iterable
 
 from msgspec.structs import replace
 
@@ -170,9 +170,11 @@ class Core:
         """Return True if this core may have given out `place`, or the term is another."""
         return place.term != self.term or place.arrival <= self._arrivals
 
-    def as_events(self, term: Term, limit: int | None = None) -> tuple[list[model.Event], model.LeadTaken]:
+    def as_events(
+        self, term: Term, limit: int | None = None, *, without: Container[str] = ()
+    ) -> tuple[list[model.Event], model.LeadTaken]:
         """The events that bring another core to this state, in a term of its own, with the best-ranked `limit` of the
-        queue (None: all)."""
+        queue (None: all), and `without` these bookings."""
         state = self._state
         joined: list[model.Event] = [
             model.RcJoined(rc.name, rc.sharable) if rc.present else model.RcLost(rc.name, why=rc.absence)
@@ -193,7 +195,7 @@ class Core:
             for arc in state.running.values()
             if arc.hold is not None
         )
-        joined += [Booked(claim.booking) for claim in state.claims.values()]
+        joined += [Booked(claim.booking) for name, claim in state.claims.items() if name not in without]
         queued = (*state.queued.values(), *state.held_back.values()) if limit is None else self._best_ranked(limit)
         waiting = tuple(
             model.Requested(arc.request, arc.place, arc.since, model.WaitSoFar(arc.patience, arc.lost, arc.told))

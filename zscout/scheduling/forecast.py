@@ -7,11 +7,12 @@ lasts as planned."""
 from __future__ import annotations
 
 import itertools
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 from zscout.scheduling import model
-from zscout.scheduling.booking import Booking
+from zscout.scheduling.booking import Booked, Booking
 from zscout.scheduling.calendar import request_for
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, Effect, Event, Granted, Hold, HoldEnded, Outcome, Propose, Released
@@ -21,7 +22,11 @@ from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import ArcId, Ns, Term
 
 MAX_CHECKS = 4_000
-"""Queued ARCs, and hundreds of bookings, summed over all instants: bounds the time that the RCM spends."""
+"""Queued ARCs, summed over all instants: bounds the time that the RCM spends."""
+DATE_CHECKS = 20
+"""A date that begins costs as much as checks of so many queued ARCs."""
+NEAR = 4
+"""Open bookings are entered in a forecast this many times the longest runtime ahead, at least 2."""
 MAX_WAITING = 1_000
 """Queued ARCs of a forecast: the best-ranked."""
 
@@ -54,11 +59,17 @@ def forecast(
     usually do."""
     # A copy, as a strategy may keep unfinished searches.
     copy = Core(STRATEGIES[core.strategy.name](), core.policy)
-    joined, lead = core.as_events(Term(core.term.counter + 1, "forecast"), MAX_WAITING)
+    booked = {booking.id: (booking, arc is None) for booking, arc in core.bookings()}
+    own = "" if newcomer is None else newcomer.booking
+    later = {name: booking for name, (booking, is_open) in booked.items() if is_open and name != own}
+    joined, lead = core.as_events(Term(core.term.counter + 1, "forecast"), MAX_WAITING, without=later)
     result = Forecast()
     ends = {held.request.arc: held.end for held in lead.recovered_holds}
     releases: dict[ArcId, Ns] = {}  # likely times of release
-    booked = {booking.id: (booking, arc is None) for booking, arc in core.bookings()}
+    asked = [held.request for held in lead.recovered_holds] + [queued.request for queued in lead.waiting]
+    asked += [newcomer] if newcomer is not None else []
+    runtimes_of = [request.min_runtime for request in asked] + [booking.runtime for booking, _ in booked.values()]
+    coming = _Coming(later.values(), max(runtimes_of, default=0))
     dates = sorted(
         (at, name) for name, (booking, is_open) in booked.items() for at in _dates(booking, now, is_open=is_open)
     )
@@ -95,7 +106,7 @@ def forecast(
 
     for held in lead.recovered_holds:
         expect(held.request, Hold(held.grant, held.start, held.end))
-    step([*joined, lead])
+    step([*joined, *coming.until(now), lead])
     if newcomer is not None:
         unserved.add(newcomer.arc)
         step([model.Requested(newcomer)], newcomer.arc)
@@ -103,19 +114,46 @@ def forecast(
         result.reason = asking.reported if asking is not None else None
     checks = 0
     while (ends or releases or dates) and unserved:
-        checks += copy.waiting + len(booked) // 100
+        checks += copy.waiting
         if checks > MAX_CHECKS:
             break
         changes = [at for at in (copy.next_change(),) if at is not None and at > now]
         now = max(now, min((*ends.values(), *releases.values(), *(date for date, _ in dates[:1]), *changes)))
-        events: list[Event] = [model.Tick(), *(Released(arc) for arc, at in releases.items() if at <= now)]
+        events: list[Event] = [
+            *coming.until(now),
+            model.Tick(),
+            *(Released(arc) for arc, at in releases.items() if at <= now),
+        ]
         while dates and dates[0][0] <= now:
             date, name = dates.pop(0)
             booking, is_open = booked[name]
             if is_open and date == booking.start and not booking.maintenance:
                 events.append(model.Requested(request_for(booking)))
+                checks += DATE_CHECKS
         step(events)
     return result
+
+
+class _Coming:
+    """Open bookings that the copy does not know yet: it gets them as they come near, so that a forecast of the next
+    hours costs no copy of a year.
+
+    Whatever starts now is over within `reach`, the longest runtime. A reservation that an unknown booking would move
+    begins later than that: it holds nothing back that starts now."""
+
+    def __init__(self, bookings: Iterable[Booking], reach: Ns) -> None:
+        self._left = deque(sorted(bookings, key=lambda booking: (booking.start, booking.id)))
+        self._reach = reach
+        self._known_until: Ns = 0
+
+    def until(self, now: Ns) -> list[Event]:
+        """Those that the copy has to know from now on."""
+        if now + 2 * self._reach > self._known_until:
+            self._known_until = now + NEAR * self._reach
+        near = list[Event]()
+        while self._left and self._left[0].start <= self._known_until:
+            near.append(Booked(self._left.popleft()))
+        return near
 
 
 def _dates(booking: Booking, now: Ns, *, is_open: bool) -> list[Ns]:
