@@ -152,6 +152,18 @@ def test_no_instant_is_worth_less_than_priority_makes_it(seeds: range) -> None:
         check_worth(seed)
 
 
+@pytest.mark.parametrize(
+    "seed",
+    [
+        pytest.param(7770, id="a veto after a device was chosen for the ARC that is vetoed"),
+        pytest.param(13699, id="a veto after a set was taken that it would have spared"),
+        pytest.param(19674, id="a set that frees an ARC to preempt what another group was granted"),
+    ],
+)
+def test_no_instant_that_once_was_is_worth_less(seed: int) -> None:
+    check_worth(seed)
+
+
 def check_worth(seed: int) -> None:
     situation = random_situation(seed)
     least = decide(situation, "priority")

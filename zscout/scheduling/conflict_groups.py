@@ -159,8 +159,8 @@ def take_all(
     decided: Sequence[tuple[ConflictGroup, Decision]],
     actions: Actions,
 ) -> tuple[int, BindingPlan]:
-    """Take these sets; the bits that are off limits to a pass after that, and its plan. A group with an ARC that this
-    pass would end again is left to it."""
+    """Take these sets; the bits that are off limits to a pass after that, and its plan. Where that pass
+    would end a hold of this instant, or might after a veto, the group that has its ARC is left to it, else all are."""
     held = union(group.off_limits for group, chosen in decided if chosen == "open")
     taken = [(group, chosen) for group, chosen in decided if isinstance(chosen, int)]
     while taken and plan is not NO_PLAN:
@@ -170,7 +170,8 @@ def take_all(
         if not after.dropped:
             plan = after
             break
-        taken = [(group, chosen) for group, chosen in taken if not any(arc.id in after.dropped for arc in group.arcs)]
+        kept = [(group, chosen) for group, chosen in taken if not any(arc.id in after.dropped for arc in group.arcs)]
+        taken = kept if len(kept) < len(taken) else []
     for group, chosen in taken:
         group.take(chosen, actions, plan)
     return held, plan

@@ -4,11 +4,12 @@ A pass:
 
 1. Take the candidates, in groups without a common RC (`conflict_groups.py`).
 2. Find each group's best set, counting unknown votes as yes: by branch and bound where quick, else by CP-SAT if
-   OR-tools is installed (the extra `optimal`), else by local search.
+   OR-tools is installed (the extra `optimal`), else by local search. With patterns, a group whose planned set is as
+   good is left to step 5.
 3. Ask the unknown votes that the set needs; until they are in, the group is off limits. A veto rules out that set of
    holders and every larger set: back to 2.
 4. Take the set: preempt its victims, start its ARCs.
-5. Run a pass of `priority` over the rest: it starts none, and reports their reasons.
+5. Run a pass of `priority` over the rest: by name it starts none, and reports their reasons.
 
 A set's value is the vector of (ARC, RC) pairs in use by priority, highest first (`packing.py`). OR-tools is imported
 at first use, because it is large. The solver has a deterministic clock and one worker: the same problem always gives
@@ -157,21 +158,22 @@ class Optimal(Strategy):
 
 
 def decide(group: ConflictGroup, actions: Actions) -> Decision:
-    """The best set of a group."""
+    """The best set of a group, where `priority` plans none that is as good."""
     proposals = None
     while proposals is None:
         if group.moves or group.waits or len(group.nogoods) > MAX_VETOES:
             return "left"
         # None: ruled out by a known veto; each round bars at least one more set.
         problem = group.problem()
-        proposals = group.missing_votes(chosen := best(problem))
+        chosen = best(problem)
+        if group.planned is not None and problem.key(chosen) <= problem.key(group.planned):
+            return "left"
+        proposals = group.missing_votes(chosen)
     if proposals:
         for rc, holders in proposals:
             actions.propose(rc, holders)
         return "open"
-    if group.flickers(chosen) or (group.planned is not None and problem.key(chosen) < problem.key(group.planned)):
-        return "left"
-    return chosen
+    return "left" if group.flickers(chosen) else chosen
 
 
 def best(problem: PackingProblem) -> int:

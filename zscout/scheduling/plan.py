@@ -37,7 +37,7 @@ class BindingPlan(NamedTuple):
     bound: Mapping[ArcId, Mapping[Need, RcName]] = {}  # of the ARCs with patterns that start
     started: Set[ArcId] = frozenset()
     ended: Set[ArcId] = frozenset()  # running ARCs; some start on other RCs
-    dropped: Set[ArcId] = frozenset()  # those given to start that others would end
+    dropped: Set[ArcId] = frozenset()  # those granted at this instant, or given to start, that others may end
     mask: int = 0  # bits of the RCs of those that start,
     moved: int = 0  # and of those of them that end before, on other RCs
     unknown: Sequence[tuple[Rc, HolderSet]] = ()  # the votes counted as yes on which bindings may depend
@@ -61,7 +61,7 @@ class _DryRun:
         self.state, self.reserved = state, reserved
         self._started: dict[ArcId, Arc] = {}
         self._ended: dict[ArcId, tuple[Arc, Hold, Mapping[Need, RcName]]] = {}
-        self._dropped: set[ArcId] = set()  # those to start that others end
+        self._dropped: set[ArcId] = set()
         self._holders: dict[int, dict[ArcId, Arc]] = {}  # by bit: as before the run
         self._heap: list[tuple[Rank, int, Arc, Watched | None]] = []
         self._walked: set[Watched] = set()
@@ -195,6 +195,10 @@ class _DryRun:
         victims = admissible.victims
         if admissible.presumed:
             self._presumed[arc.id] = union(other.mask for other in (arc, *victims)), admissible.presumed
+            for rc, holders in admissible.presumed:
+                sharers = (rc.holders[holder] for holder in holders & rc.holders.keys())
+                self._drop(sharer for sharer in sharers if sharer.preemptible_by(arc, self.state.now))
+        self._drop(victims)
         for victim in victims:
             self._end(victim)
         self._start(arc)
@@ -209,9 +213,11 @@ class _DryRun:
             heapq.heappush(self._heap, (arc.rank, 0, arc, None))
         if self._started.pop(arc.id, None) is None:
             self._ended[arc.id] = arc, arc.hold, arc.bound
-        elif arc.id not in self._ended:
-            self._dropped.add(arc.id)
         self._leave(arc)
+
+    def _drop(self, arcs: Iterable[Arc]) -> None:
+        """Note which of these ARCs, that end or would with a veto, are granted at this instant."""
+        self._dropped |= {arc.id for arc in arcs if arc.hold is not None and arc.hold.start == self.state.now}
 
     def _start(self, arc: Arc) -> None:
         self._started[arc.id] = arc
