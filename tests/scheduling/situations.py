@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from fractions import Fraction
 
+from msgspec import structs
+
 from zscout.config.scheduling_policy import DEFAULT, SchedulingPolicy, StrategyName
 from zscout.scheduling.capacity import excess
 from zscout.scheduling.conflict_groups import density
@@ -27,6 +29,7 @@ from zscout.scheduling.model import (
     Vote,
 )
 from zscout.scheduling.strategies import STRATEGIES
+from zscout.simulation.workload import Arrival, Workload, WorkloadRc
 from zscout.types import SECOND, Grant, Need, Params, Place, RcName, Term
 
 OLD, NEW = Term(1, "rcm/a"), Term(2, "rcm/b")
@@ -106,7 +109,8 @@ def less(worth: dict[int, int], least: dict[int, int]) -> bool:
 PATTERNS = (("dev/*",), ("dev/*", "dev/*#2"), ("dev/a$*",), ("cam/*",), ("cam/*", "dev/*"), ("dev/a$*", "dev/*"))
 
 
-def random_situation(seed: int, *, patterns: bool = True) -> Situation:
+def random_situation(seed: int, *, patterns: bool = True, asks: tuple[int, int] = (1, 7)) -> Situation:
+    """`asks`: the least and most ARCs that are asked."""
     draw = random.Random(seed)  # noqa: S311
     exclusive = [f"dev/{letter}{number}" for letter in "ab" for number in range(draw.randint(1, 2))]
     exclusive += [f"cam/{number}" for number in range(draw.randint(0, 2))]
@@ -153,5 +157,18 @@ def random_situation(seed: int, *, patterns: bool = True) -> Situation:
                 for rc in taken & used.keys():
                     used[rc] += next(iter(p for n, p in asked.needs.items() if n.startswith("radio"))).get("rate", 0)
                 found.running.append((asked, bound, start))
-    found.asked = [request(f"asks{number}") for number in range(draw.randint(1, 7))]
+    found.asked = [request(f"asks{number}") for number in range(draw.randint(*asks))]
     return found
+
+
+def random_stream(seed: int) -> tuple[Workload, SchedulingPolicy]:
+    """ARCs of three hosts one after the other, in half of the streams by pattern."""
+    draw = random.Random(f"stream {seed}")  # noqa: S311
+    found = random_situation(seed, patterns=seed % 2 == 0, asks=(10, 40))
+    rcs = [WorkloadRc(rc) for rc in found.exclusive]
+    rcs += [WorkloadRc(rc, sharable=True, capacity=capacity) for rc, capacity in found.capacity.items()]
+    at, arrivals = 0, []
+    for asked in found.asked:
+        at += draw.choice((0, 0, 1, 3, 9, 20)) * SECOND
+        arrivals.append(Arrival(at, structs.replace(asked, client=f"h{draw.randint(0, 2)}/c")))
+    return Workload(tuple(rcs), tuple(arrivals)), found.policy

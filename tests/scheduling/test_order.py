@@ -9,9 +9,10 @@ import pytest
 from msgspec import structs
 
 from tests.scheduling.oracle import best_by_rank
-from tests.scheduling.situations import Situation, decide, less, random_situation
+from tests.scheduling.situations import Situation, decide, less, random_situation, random_stream
 from tests.thorough import times
 from zscout.config.scheduling_policy import SchedulingPolicy, StrategyName
+from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.model import ArcRequest
 from zscout.scheduling.strategies import STRATEGIES
 from zscout.simulation.replay import replay
@@ -143,6 +144,58 @@ def test_an_arc_that_moves_to_what_a_victim_gives_up_has_it_for_itself(strategy:
     assert held(asked, strategy) == {"any": {"dev/a1"}, "named": {"robot/x", "dev/a2"}, "other": {"dev/b"}}
 
 
+def asked_at(at: int, *needs: str, arc: str, priority: int = 1, seconds: int, rate: int = 0) -> Arrival:
+    found = request(arc, *needs, priority=priority, seconds=seconds)
+    shares: dict[str, Params] = {need: {"rate": Fraction(rate)} if need == "radio" else {} for need in needs}
+    return Arrival(at * SECOND, structs.replace(found, needs=shares))
+
+
+def starts(rcs: list[WorkloadRc], *asked: Arrival) -> list[tuple[str, int]]:
+    """The holds under `adaptive`, each with its start in seconds."""
+    played = replay(Workload(tuple(rcs), asked), strategy=Adaptive(), policy=SchedulingPolicy(patience=40 * SECOND))
+    return [(hold.arc, hold.start // SECOND) for hold in played.holds]
+
+
+def test_a_vote_on_what_is_reserved_keeps_lower_ranks_waiting() -> None:
+    """`high` may pass `starves`, if the radio accepts both; `low` has to wait for that vote."""
+    radio = WorkloadRc("radio", sharable=True, capacity={"rate": Fraction(6)})
+    found = starts(
+        [WorkloadRc("robot"), WorkloadRc("dev"), radio],
+        asked_at(0, "robot", arc="holds", priority=2, seconds=100),
+        asked_at(1, "robot", "radio", arc="starves", priority=2, seconds=10, rate=5),
+        asked_at(50, "dev", "radio", arc="high", priority=2, seconds=60, rate=1),
+        asked_at(50, "dev", arc="low", seconds=5),
+    )
+    assert found == [("holds", 0), ("high", 50), ("starves", 100), ("low", 110)]
+
+
+def test_a_vote_on_what_is_reserved_keeps_larger_sets_waiting() -> None:
+    """`left` and `right` are a larger set than `narrow`, but `high` may get dev/a."""
+    radio = WorkloadRc("radio", sharable=True, capacity={"rate": Fraction(6)})
+    found = starts(
+        [*map(WorkloadRc, ("robot", "dev/a", "dev/b", "dev/c", "dev/d")), radio],
+        asked_at(0, "robot", arc="holds", priority=2, seconds=100),
+        asked_at(1, "robot", "radio", arc="starves", priority=2, seconds=10, rate=5),
+        asked_at(50, "dev/a", "radio", arc="high", priority=2, seconds=60, rate=1),
+        asked_at(50, "dev/b", "dev/c", arc="narrow", seconds=9),
+        asked_at(50, "dev/a", "dev/b", arc="left", seconds=10),
+        asked_at(50, "dev/c", "dev/d", arc="right", seconds=10),
+    )
+    assert found == [("holds", 0), ("high", 50), ("narrow", 50), ("right", 59), ("starves", 100), ("left", 110)]
+
+
+def test_what_a_start_makes_free_of_a_reservation_goes_to_the_best_rank() -> None:
+    """dev/1 is reserved for `starves`, which gets dev/2: then it is for `high`, though `low` would be over in time."""
+    found = starts(
+        [WorkloadRc("dev/1"), WorkloadRc("dev/2")],
+        asked_at(0, "dev/1", "dev/2", arc="holds", priority=2, seconds=25),
+        asked_at(1, "dev/*", arc="starves", priority=2, seconds=10),
+        asked_at(2, "dev/1", arc="high", seconds=60),
+        asked_at(3, "dev/1", arc="low", priority=0, seconds=5),
+    )
+    assert found == [("holds", 0), ("high", 25), ("starves", 25), ("low", 85)]
+
+
 # At random
 
 
@@ -172,6 +225,15 @@ def check_worth(seed: int) -> None:
         found = decide(situation, strategy)
         assert not found.flickered, (seed, strategy)
         assert not less(found.worth(strategy), least.worth(strategy)), (seed, strategy)
+
+
+@pytest.mark.parametrize("seeds", [range(368, 373), pytest.param(range(times(300)), marks=pytest.mark.slow)])
+def test_nobody_is_granted_and_ended_in_one_instant_of_a_stream(seeds: range) -> None:
+    for seed in seeds:
+        for strategy in ALL:
+            work, policy = random_stream(seed)
+            holds = replay(work, strategy=STRATEGIES[strategy](), policy=policy).holds
+            assert not [hold.arc for hold in holds if hold.start == hold.end], (seed, strategy)
 
 
 TAGS = "abcd"

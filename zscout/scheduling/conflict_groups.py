@@ -30,12 +30,15 @@ SCALE: Final = 1 << 32
 
 def undecided_arcs(
     state: SchedulerState, reserved: Reservations | None = None, limit: int | None = None, plan: BindingPlan = NO_PLAN
-) -> list[Arc] | None:
+) -> tuple[list[Arc], int] | None:
     """The queued ARCs that might start, best-ranked first, then the running ARCs that might end; None: over `limit`.
-    ARCs are bound as planned; the others to what these leave, as far as possible."""
+    ARCs are bound as planned; the others to what these leave, as far as possible. And bits of the RCs of others, which
+    wait for votes on what is reserved."""
     if state.by_pattern:
         bind_all(state, reserved, plan.mask)
-    return _Search(state, reserved, plan).run(limit)
+    search = _Search(state, reserved, plan)
+    found = search.run(limit)
+    return None if found is None else (found, search.asked)
 
 
 class _Search:
@@ -48,6 +51,7 @@ class _Search:
         self._called: set[Watched] = set()  # those with a watcher in the heap
         self._started: Counter[str] = Counter()  # by owner with a quota: ARCs that might start
         self._taken: Counter[str] = Counter()  # by owner with a quota: RCs of these ARCs
+        self.asked = 0  # bits of RCs of ARCs that wait for a vote on what is reserved
         self._shared_taken = 0  # sharable RCs where one ARC already passed the starving ones; a second was not checked
 
     def run(self, limit: int | None) -> list[Arc] | None:
@@ -108,7 +112,10 @@ class _Search:
         if reserved is None or not arc.mask & reserved.bits:
             return False
         shared = arc.mask & reserved.bits & self.state.sharable
-        if shared & self._shared_taken or reserved.conflict(arc) is not None:
+        conflict = reserved.conflict(arc)
+        if conflict is not None and conflict.proposal and conflict.rc.name not in self.votes.unresponsive:
+            self.asked |= arc.mask
+        if shared & self._shared_taken or conflict is not None:
             return True
         if not arc.starving:
             self._shared_taken |= shared
@@ -140,9 +147,10 @@ def conflict_groups(
     """The groups with a choice, best-ranked first; none if more than `limit` ARCs could start.
 
     One ARC, or one queued ARC without sharable RCs in its group, leaves no choice: `priority` starts it."""
+    arcs, asked = undecided_arcs(state, reserved, limit, plan) or ((), 0)
     return [
-        ConflictGroup(state, members, reserved, plan)
-        for members in split(undecided_arcs(state, reserved, limit, plan) or ())
+        ConflictGroup(state, members, reserved, plan, asked)
+        for members in split(arcs)
         if len(members) > 1
         and (sum(arc.hold is None for arc in members) > 1 or any(arc.mask & state.sharable for arc in members))
     ]
@@ -239,8 +247,14 @@ def _one_group(arcs: Sequence[Arc]) -> bool:
 
 class ConflictGroup:
     def __init__(
-        self, state: SchedulerState, arcs: list[Arc], reserved: Reservations | None = None, plan: BindingPlan = NO_PLAN
+        self,
+        state: SchedulerState,
+        arcs: list[Arc],
+        reserved: Reservations | None = None,
+        plan: BindingPlan = NO_PLAN,
+        asked: int = 0,
     ) -> None:
+        """`asked`: bits of RCs that others may get by votes that are out."""
         self.state, self.votes = state, state.votes
         now = state.now
         first = {arc.id for arc in arcs if reserved is not None and reserved.goes_first(arc)}
@@ -266,8 +280,8 @@ class ConflictGroup:
         """The set of the plan as bits of item numbers. None: as by name, the plan is not needed."""
         self.moves = False
         """`priority` would end an ARC and start it on other RCs, perhaps of these: no set expresses that."""
-        self.waits = bool(self.mask & plan.off_limits)
-        """Votes are out on which its bindings depend."""
+        self.waits = bool(self.mask & (plan.off_limits | asked))
+        """Votes are out on which its bindings depend, or who may have its RCs."""
         if plan is not NO_PLAN:
             stay = (arc.id in plan.started if arc.hold is None else arc.id not in plan.ended for arc in self.arcs)
             self.planned = sum(1 << number for number, stays in enumerate(stay) if stays)

@@ -12,8 +12,9 @@ A pass:
    d. `a` starts.
 4. Index `a` by its obstacle, or preempt its victims and start it; check the ARCs that this affects.
 
-An unknown vote leaves a check undecided. The RCs that an undecided check would take or free are *off limits* for lower
-ranks, and so are those of a check that this stops; all others continue.
+An unknown vote leaves a check undecided, and so does a reservation (`reservations.py`) if this pass has changed any:
+the next pass finds them again. The RCs that an undecided check would take or free are *off limits* for lower ranks, and
+so are those of a check that this stops; all others continue.
 
 **Why a pass can run again at any time.** An RC taken by a lower rank never makes a higher rank possible (a lower rank
 only preempts holders that the higher one would preempt too, and votes are monotone). So an answer runs the next pass,
@@ -192,7 +193,11 @@ class Pass:
                 self.index.put(arc, ArcState.READY)
                 self.actions.wait(arc, reason if silent else VOTING, settled=silent)
                 self.actions.propose(rc, proposal)
+                if not silent:
+                    self._put_off_limits(self._within_reach(arc, check), arc.rank)
             case Inadmissible(rc, reason, _, early):
+                if reason.code is ReasonCode.RESERVED and self.reserved is not None and not self.reserved.current:
+                    self._put_off_limits(self._within_reach(arc, check), arc.rank)
                 pattern = _pattern_of(arc, rc)
                 if pattern is None:
                     if early:
@@ -240,14 +245,17 @@ class Pass:
                 self._changed_here |= self._take_changes(arc.rank)
 
     def _defer(self, arc: Arc, check: AdmissionCheck, state: ArcState) -> None:
-        footprint = check.footprint()
+        footprint = self._within_reach(arc, check)
         if arc.patterns:
             # Always checked again: another RC may serve it, if the one that is asked refuses.
-            footprint |= alternatives(self.state, arc)
             self.index.put(arc, ArcState.READY)
         else:
             self.index.put(arc, state, footprint, check.masked_obstacles())
         self._put_off_limits(footprint, arc.rank)
+
+    def _within_reach(self, arc: Arc, check: AdmissionCheck) -> int:
+        """Bits of the RCs that the ARC would take or free."""
+        return check.footprint() | (alternatives(self.state, arc) if arc.patterns else 0)
 
     def _still_deferred(self, arc: Arc, footprint: int) -> bool:
         """Return True if a repeated check would be undecided again."""
