@@ -24,6 +24,7 @@ from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import MeshError
 from zscout.node import NodeFailed, run_services
 from zscout.services.metrics.server import MetricsServer
+from zscout.services.node import local_rcs
 from zscout.services.node.component_host import ComponentHost
 from zscout.testing.memory import MemoryNetwork
 
@@ -52,7 +53,7 @@ def test_an_rc_that_fails_ends_its_node(
     node: Node, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     driver = Faulty()
-    monkeypatch.setattr(node_module, "driver_for", lambda _rc: driver)
+    monkeypatch.setattr(local_rcs, "driver_for", lambda _rc: driver)
 
     async def story() -> None:
         network = MemoryNetwork()
@@ -87,7 +88,7 @@ def test_a_driver_that_fails_as_it_is_opened_ends_its_node(
         async def open(self, _rc: RcHandle) -> None:
             raise KeyError("a fault of the driver")
 
-    monkeypatch.setattr(node_module, "driver_for", lambda _rc: Unopened())
+    monkeypatch.setattr(local_rcs, "driver_for", lambda _rc: Unopened())
 
     async def story() -> None:
         mesh = MemoryNetwork().open("f", Sender("anvil", "node"))
@@ -192,11 +193,12 @@ def test_a_node_ends_though_a_thread_of_a_driver_hangs_in_its_device(tmp_path: P
     program = (
         "import asyncio, sys, time\n"
         "from zscout import node\n"
+        "from zscout.services.node import local_rcs\n"
         "from zscout.drivers.generic import ExclusiveDriver\n"
         "class Hung(ExclusiveDriver):\n"
         "    async def safe(self):\n"
         "        await asyncio.to_thread(time.sleep, 10_000)\n"
-        "node.driver_for = lambda _rc: Hung()\n"
+        "local_rcs.driver_for = lambda _rc: Hung()\n"
         "node.main(sys.argv[1:])\n"
     )
     lab = Lab(tmp_path)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import functools
 import logging
 import os
 import signal
@@ -23,17 +24,11 @@ import uvloop
 
 from zscout import __version__
 from zscout.config.certificates import PLACES_KEY, read_places_key
-from zscout.config.devices import RobotRc
-from zscout.config.fleet import Fleet
+from zscout.config.fleet import Fleet, RcmLimits
 from zscout.config.local_users import is_stranger, listeners, user_name
 from zscout.config.node import CalendarConfig, MetricsConfig, Node, default_node, load_node
 from zscout.config.state_folder import state_folder
 from zscout.config.strict import BadInput
-from zscout.drivers.confirm_server import ConfirmServer
-from zscout.drivers.last_holder import LastHolderFile, UnknownLastHolder
-from zscout.drivers.lock import only_here
-from zscout.drivers.registry import driver_for, driver_name
-from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.logs import log_to_stderr, shortage
 from zscout.mesh import Mesh, MeshError, ZenohMesh
@@ -45,6 +40,7 @@ from zscout.services.journal.journal import Journal
 from zscout.services.metrics.node_figures import NodeFigures
 from zscout.services.node.component_host import ComponentHost
 from zscout.services.node.load_reporter import LoadReporter
+from zscout.services.node.local_rcs import LocalRcs, RcNotOpened
 from zscout.services.node.reload import FilesInForce, Reload, rights_of
 from zscout.services.node.service_manager import ServiceManager
 from zscout.services.notify.notifier import Notifier
@@ -62,6 +58,9 @@ log = logging.getLogger("zscout.node")
 LOOK_FOR_TWIN = 0.5
 ALONE_AFTER = 3.0
 """Seconds after which a node that is linked to nobody says so."""
+
+LIMITS = [f"limits.{name}" for name in RcmLimits.__struct_fields__ if name != "max_payload"]
+"""Keys that a running leader takes."""
 
 THREADS_END = 5.0
 """Seconds that threads of drivers have to end once all else has."""
@@ -84,10 +83,10 @@ async def run_services(
 ) -> None:
     """The services of a node, until `stop` or until one fails. The recorder, the load reporter and the
     candidate start again by themselves; an RC and the component host end the node, and all in order. Raises BadInput
-    before anything begins where an RC's driver can't be had."""
+    where an RC's driver is missing."""
     me, failures = mesh.me, list[Exception]()
     manager = manager or ServiceManager()
-    drivers = {spec.name: driver_for(spec) for spec in node.rcs}
+    folder = functools.cache(functools.partial(state_folder, node.fleet.name, me.host, node.state))
 
     def fail(error: Exception) -> None:
         failures.append(error)
@@ -103,44 +102,24 @@ async def run_services(
         mesh.watch_links()
         token = mesh.alive(Token(me.host, Role.NODE, me.client, new_instance()))
         stack.callback(token.close)
-        lease = node.fleet.timing.hold_lease / SECOND
-        kept = state_folder(node.fleet.name, me.host, node.state) if node.rcs or node.candidate else None
-        confirmations = ConfirmServer(mesh) if node.rcs else None
-        rcs: list[ResourceController] = []
-        # Robots end first: their last word goes through a radio, which may be one of this node.
-        for spec in sorted(node.rcs, key=lambda spec: isinstance(spec, RobotRc)):
-            stack.enter_context(only_here(node.fleet.name, me.host, spec.name, kept))
-            driver = drivers[spec.name]
-            rc = ResourceController(
-                mesh,
-                spec.name,
-                driver,
-                hold_lease=lease,
-                settle=spec.settle / SECOND,
-                last_holder=LastHolderFile(kept, spec.name) if kept is not None else UnknownLastHolder(),
-                stall=stall,
-                confirmations=confirmations,
-                on_failure=fail,
-            )
-            try:
-                await rc.start()
-            except MeshError:
-                raise
-            except Exception as error:
-                log.exception("%s can't be opened", spec.name)
-                raise NodeFailed(f"{spec.name} can't be opened: {error!r}; see the log") from error
-            stack.push_async_callback(rc.stop)
-            rcs.append(rc)
-            log.info("runs %s (%s)", spec.name, driver_name(spec))
-        keeper = BookingKeeper(
-            mesh, BookingFile(kept, node.fleet.name) if kept is not None else None, candidate=node.candidate
-        )
-        if rcs and not node.candidate:
-            # Where RCs are, copies are.
-            keeping = Supervisor("what keeps bookings", fail)
-            keeper.start(keeping)
-            stack.callback(keeper.stop)
-            stack.push_async_callback(keeping.close)
+        rcs = LocalRcs(mesh, node, folder, stall, fail)
+        stack.push_async_callback(rcs.stop)
+        try:
+            await rcs.start()
+        except RcNotOpened as error:
+            raise NodeFailed(str(error)) from error
+        copies: BookingKeeper | None = None
+
+        def keep_copies() -> None:
+            """Keep copies of the fleet's bookings where RCs are. A candidate does so anyway."""
+            nonlocal copies
+            if copies is None and rcs.controllers and not node.candidate:
+                copies, keeping = _keeper(mesh, node, folder()), Supervisor("what keeps bookings", fail)
+                copies.start(keeping)
+                stack.callback(copies.stop)
+                stack.push_async_callback(keeping.close)
+
+        keep_copies()
         authority = Authority(node.fleet)
         components = ComponentHost(mesh, node.fleet, node.components, fail, authority=authority)
         recorder = RecorderProcess(node.recorder, node.fleet, node.host) if node.recorder is not None else None
@@ -158,7 +137,7 @@ async def run_services(
         figures = NodeFigures(node, mesh, rcs)
         listeners: list[HoldListener] = [figures.holds] if node.metrics is not None else []
         if node.candidate:
-            journal, runtimes = None, RuntimeObserver()
+            journal, runtimes, kept = None, RuntimeObserver(), folder()
             if kept is not None and node.fleet.may_lead(me.host) and not node.journal.off:
                 silence = node.fleet.silence / SECOND
                 journal = Journal(mesh, kept, node.journal, silence, on_opened=runtimes.recall)
@@ -171,7 +150,7 @@ async def run_services(
                 listeners,
                 journal,
                 runtimes,
-                keeper,
+                _keeper(mesh, node, kept),
                 TermFile(kept, node.fleet.name) if kept is not None else None,
             )
             if node.notify is not None:
@@ -196,16 +175,23 @@ async def run_services(
         if reload is not None:
             reload.takes(lambda new: components.take(new.components), "components")
 
-            def take_rights(new: Node) -> None:
+            def take_fleet(new: Node) -> None:
                 authority.reload(new.fleet)
                 figures.holds.take(new.fleet.access)
                 if candidate is not None:
-                    candidate.on_reload()
+                    candidate.on_reload(new.fleet)
                 mesh.admit(new.fleet.access.members())
 
-            reload.takes(take_rights, "roles", "groups", "access", "quotas", "ceilings")
+            async def take_rcs(new: Node) -> None:
+                try:
+                    await rcs.take(new)
+                finally:
+                    keep_copies()
+
+            reload.takes(take_fleet, "roles", "groups", "access", "quotas", "ceilings", "devices", *LIMITS)
+            reload.takes(take_rcs, "rc")
             reloading = asyncio.create_task(reload.serve(manager, status))
-            stack.callback(reloading.cancel)
+            stack.push_async_callback(_cancelled, reloading)
         manager.ready(status)
         alone = asyncio.get_running_loop().call_later(ALONE_AFTER, _say_if_alone, mesh)
         stack.callback(alone.cancel)
@@ -214,6 +200,17 @@ async def run_services(
         manager.stopping("ends in order")
     if failures:
         raise NodeFailed(f"a service failed: {failures[0]!r}; see the log") from failures[0]
+
+
+def _keeper(mesh: Mesh, node: Node, folder: Path | None) -> BookingKeeper:
+    disk = BookingFile(folder, node.fleet.name) if folder is not None else None
+    return BookingKeeper(mesh, disk, candidate=node.candidate)
+
+
+async def _cancelled(task: asyncio.Task[None]) -> None:
+    """Cancel a task, and wait for its end."""
+    task.cancel()
+    await asyncio.wait({task})
 
 
 async def _serve_figures(metrics: MetricsConfig, figures: NodeFigures) -> Callable[[], Awaitable[None]]:

@@ -59,13 +59,13 @@ RUNS = client(asked(grant=Grant(TERM, 5)))
 
 def plain() -> Admission:
     fleet = default_fleet()
-    return Admission(fleet.limits, Authority(fleet), Places("test", None, LATER))
+    return Admission(Authority(fleet), Places("test", None, LATER))
 
 
 def secured() -> Admission:
     access = AccessPolicy(Roles(client=("h",), manager=("m",)))
     fleet = structs.replace(default_fleet(), security=Path("keys"), access=access)
-    return Admission(fleet.limits, Authority(fleet), Places("test", None, LATER))
+    return Admission(Authority(fleet), Places("test", None, LATER))
 
 
 def recover_plain(states: list[RcState], clients: list[ClientRequests], now: Ns) -> RecoveredState:

@@ -23,7 +23,7 @@ from zscout.types import SECOND, Term
 def a_roster(lease: float = 1.0) -> Roster:
     fleet, term = default_fleet(), Term(1, "rcm")
     fleet = structs.replace(fleet, mesh=structs.replace(fleet.mesh, lease=lease))
-    admission = Admission(fleet.limits, Authority(fleet), Places("lab", None, term))
+    admission = Admission(Authority(fleet), Places("lab", None, term))
     return Roster(Keys("lab"), "leader", fleet, term, ExpectedDevices({}), admission, lambda _: None, 0)
 
 

@@ -125,7 +125,7 @@ class LeaderPlayer:
         fleet = structs.replace(default_fleet(), access=access, security=Path("keys") if secured else None)
         self.fleet, self.authority, keys = fleet, Authority(fleet), Keys("lab", closed=secured)
         core = Core(STRATEGIES["adaptive"](), self.authority.bound(fleet.scheduling))
-        self.admission = Admission(fleet.limits, self.authority, Places("lab", None, OWN))
+        self.admission = Admission(self.authority, Places("lab", None, OWN))
         roster = Roster(keys, "leader", fleet, OWN, ExpectedDevices({}), self.admission, core.arc, self.now)
         door = Door(ExpectedDevices({}), roster, 0)
         self.keys, self.leader = keys, Leader(fleet, core, self.admission, roster, door, NoBookings(), None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import ipaddress
 import os
 import re
@@ -115,6 +116,14 @@ class RcmLimits(Struct, frozen=True, forbid_unknown_fields=True):
         Ns, seconds("0", "31622400", "The longest booking, whose hold lasts until its end; 0: as `max_runtime`.")
     ] = 0
     max_bookings_per_host: Annotated[int, key("Bookings of one host or person, that are not over.", 0, 1_000)] = 100
+
+    def bound(self, policy: SchedulingPolicy) -> SchedulingPolicy:
+        return dataclasses.replace(
+            policy,
+            max_running_per_host=self.max_running_per_host or None,
+            max_runtime=self.max_runtime or None,
+            max_booking=self.max_booking or self.max_runtime or None,
+        )
 
 
 class Timing(Struct, frozen=True, forbid_unknown_fields=True):
@@ -320,17 +329,15 @@ def _fleet(file: FleetFile, top: Where, folder: Path = Path()) -> Fleet:
             f'is "{table.promise}", but only "adaptive" with some patience promises anything',
             'write strategy = "adaptive" and a patience above 0, or promise = "equals"',
         )
-    policy = SchedulingPolicy(
+    unbound = SchedulingPolicy(
         preempt=table.preempt,
         operator_priority=table.operator_priority,
         preempt_budget=table.preempt_budget,
         patience="runtimes" if table.patience is None else table.patience or None,
         promise=table.promise,
-        max_running_per_host=file.limits.max_running_per_host or None,
-        max_runtime=file.limits.max_runtime or None,
-        max_booking=file.limits.max_booking or file.limits.max_runtime or None,
         fair_shares=_fair_shares(file, access, top / "fair_shares"),
     )
+    policy = file.limits.bound(unbound)
     fleet = Fleet(
         name=table.name,
         candidates=table.candidates,

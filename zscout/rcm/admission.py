@@ -76,8 +76,12 @@ class LetIn:
 class Admission:
     """The limits of a fleet, the rights of its names, and the places of one term."""
 
-    def __init__(self, limits: RcmLimits, authority: Authority, places: Places) -> None:
-        self.limits, self.authority, self.places = limits, authority, places
+    def __init__(self, authority: Authority, places: Places) -> None:
+        self.authority, self.places = authority, places
+
+    @property
+    def limits(self) -> RcmLimits:
+        return self.authority.limits
 
     @property
     def closed(self) -> bool:

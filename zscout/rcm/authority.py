@@ -32,21 +32,23 @@ OPERATORS: Final[frozenset[Rank]] = frozenset({"operator"})
 
 
 class Authority:
-    """The rights of all names, as the fleet file has them at present."""
+    """The rights of all names and the limits, as the fleet file has them at present."""
 
     def __init__(self, fleet: Fleet) -> None:
         self._policy, self.enforced = fleet.access, fleet.security is not None
+        self.limits = fleet.limits
         self._operator_priority = fleet.operator_priority
         self.placed: Mapping[ComponentId, Placement] = {}
         """The components as the placer published them."""
 
     def reload(self, fleet: Fleet) -> None:
-        """Takes the rights of a fleet file that was read anew."""
-        self._policy = fleet.access
+        """Take the rights and limits of a fleet file that was read again."""
+        self._policy, self.limits = fleet.access, fleet.limits
 
     def bound(self, policy: SchedulingPolicy) -> SchedulingPolicy:
-        """The policy, with what the scheduler has to see to: groups, quotas of RCs, and what no pattern is bound to.
-        Who is in several groups counts in the first."""
+        """Return the policy with the rights and limits that the scheduler enforces. A name in several groups counts in
+        the first."""
+        policy = self.limits.bound(policy)
         if policy.fair_shares is not None:
             # Backwards, so that the first group of a name stands last.
             listed = reversed([*self._policy.groups.items()])

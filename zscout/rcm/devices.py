@@ -74,12 +74,20 @@ class ExpectedDevices:
         """Homes of all devices."""
         self.version = 0
         """Grows with whatever is worth remembering."""
-        for host, rcs in declared.items():
-            for rc in rcs:
-                self._devices.setdefault(rc, _Device()).homes[host] = Home(declared=True)
-                self._count += 1
+        self.declare(declared)
 
     # In
+
+    def declare(self, declared: Mapping[HostName, Collection[RcName]]) -> None:
+        """Expect the devices of a fleet file, in place of those of the last one."""
+        for device in self._devices.values():
+            for home in device.homes.values():
+                home.declared = False
+        for host, rcs in declared.items():
+            for rc in rcs:
+                if (expected := self._home(rc, host)) is not None:
+                    expected.declared = True
+        self.version += 1
 
     def came(self, token: Token) -> None:
         home = self._home(token.name, token.host)

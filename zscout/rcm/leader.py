@@ -259,7 +259,7 @@ class Leader:
         """What RCs alone reported, and a client does not ask for, it gave up where no RCM heard of it; else its own
         word is the one that counts."""
         known = self._recovered.pop(answer.client, set()) & {*self.core.arcs_of(answer.client)}
-        listed = {asked.id: asked for asked in answer.requests[: self._fleet.limits.max_requests_per_client]}
+        listed = {asked.id: asked for asked in answer.requests[: self.admission.limits.max_requests_per_client]}
         events = list[model.Event]()
         for arc in filter(None, map(self.core.arc, sorted(known))):
             if (request := listed.get(request_id(arc.id))) is None:

@@ -200,7 +200,7 @@ async def test_what_is_asked_again_while_it_runs_is_not_refused_for_what_was_low
     bob, ada = fleet.client("one", "bob"), fleet.client("three", "ada")
     held = await bob.ask("held", "robot/a", seconds=600)
     leader._authority.reload(structs.replace(fleet.fleet, access=AccessPolicy(ROLES, access={"robot/a": ("ada",)})))
-    leader.on_reload()
+    leader.on_reload(leader.fleet)
     again = await bob.ask("held", "robot/a", seconds=600, grant=held.grant, rcs=held.rcs)
     assert again.grant == held.grant
     # The rights count once it would be queued again.

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from zscout.config.node import Node
-from zscout.drivers.resource_controller import ResourceController
 from zscout.mesh import Mesh
 from zscout.services.metrics.figures import HoldFigures, Samples
+from zscout.services.node.local_rcs import LocalRcs
 from zscout.services.rcm.candidate import Candidate
 from zscout.types import VERSION
 
@@ -15,7 +13,7 @@ from zscout.types import VERSION
 class NodeFigures:
     """Read in the event loop, so that all figures are of one moment."""
 
-    def __init__(self, node: Node, mesh: Mesh, rcs: Sequence[ResourceController]) -> None:
+    def __init__(self, node: Node, mesh: Mesh, rcs: LocalRcs) -> None:
         self._node, self._mesh, self._rcs = node, mesh, rcs
         self.candidate: Candidate | None = None
         self.holds = HoldFigures(node.fleet.access)
@@ -24,9 +22,9 @@ class NodeFigures:
         found: Samples = {
             "zscout_info": {(self._node.fleet.name, self._mesh.me.host, VERSION): 1},
             "zscout_links": {(): self._mesh.links()},
-            "zscout_commands_total": {(rc.name,): rc.tally.answered for rc in self._rcs},
+            "zscout_commands_total": {(rc.name,): rc.tally.answered for rc in self._rcs.controllers},
             "zscout_commands_refused_total": {
-                (rc.name, code): count for rc in self._rcs for code, count in rc.tally.refused().items()
+                (rc.name, code): count for rc in self._rcs.controllers for code, count in rc.tally.refused().items()
             },
         }
         return found if self.candidate is None else found | self._of_candidate(self.candidate)

@@ -5,6 +5,7 @@ Services register tables and a function (`Reload.takes`). A bad file changes not
 from __future__ import annotations
 
 import asyncio
+import inspect
 import logging
 import signal
 from collections.abc import Callable, Iterator, Mapping
@@ -44,7 +45,8 @@ class Reload:
         self._asked = asyncio.Event()
 
     def takes(self, take: Callable[[Node], object], *tables: str) -> None:
-        """Call `take` in the event loop with settings changed in these tables; its errors are logged, old ones stay."""
+        """Call `take` in the event loop with settings changed in these tables or keys; it may return an awaitable. Its
+        errors are logged, and old settings stay."""
         self._takers.append((frozenset(tables), take))
 
     def on_hangup(self) -> None:
@@ -78,10 +80,10 @@ class Reload:
         changed = {key for key in self._taken.keys() | said.keys() if self._taken.get(key) != said.get(key)}
         took, faults = set[str](), list[str]()
         for tables, take in self._takers:
-            keys = {key for key in changed if _table(key) in tables}
+            keys = {key for key in changed if key in tables or _table(key) in tables}
             try:
-                if keys:
-                    take(node)
+                if keys and inspect.isawaitable(taking := take(node)):
+                    await taking
             except Exception as error:
                 log.exception("the new [%s] can't be taken", "], [".join(sorted(set(map(_table, keys)))))
                 faults.append(f"{_listed(keys)}: can't be taken: {error!r}; restart this node")

@@ -148,7 +148,7 @@ class BookingHandler:
 
     def _check_room(self, record: BookingRecord) -> None:
         records, owner = self._records, record.owner
-        most = self._fleet.limits.max_bookings_per_host
+        most = self._admission.limits.max_bookings_per_host
         own = [one for one in records if one.owner == owner]
         if sum(not one.unbooked for one in own) >= most:
             raise Refused("too_many", f"{owner} has {most} bookings, the most allowed; cancel one")

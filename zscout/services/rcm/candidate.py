@@ -157,8 +157,9 @@ class Candidate:
         except Exception as error:  # noqa: BLE001 - it is logged there
             supervisor.fail(error)
 
-    def on_reload(self) -> None:
-        """The rights have changed."""
+    def on_reload(self, fleet: Fleet) -> None:
+        """The rights, limits or devices of the fleet file have changed."""
+        self.inventory.devices.declare(fleet.devices)
         if self.rcm is not None:
             self.rcm.on_reload()
 
@@ -384,7 +385,7 @@ class Candidate:
     ) -> bool:
         places = Places(self.fleet.name, self._parts.places_key, term)
         self.learned.keeper.records.take(record for one in kept for record in one.records)
-        admission = Admission(self.fleet.limits, self._authority, places)
+        admission = Admission(self._authority, places)
         home_of, record_of = self.inventory.devices.home_of, self.learned.keeper.records.get
         recovered = take_over(states, open_requests, self.mesh.now(), admission, home_of, record_of)
         for remark in recovered.remarks:

@@ -109,7 +109,7 @@ class Rcm:
         self.supervisor = Supervisor(f"the RCM of term {term.counter}", on_failure)
         authority = parts.authority or Authority(fleet)
         core = Core(STRATEGIES[fleet.strategy](), authority.bound(fleet.scheduling))
-        admission = Admission(fleet.limits, authority, parts.places or Places(fleet.name, None, term))
+        admission = Admission(authority, parts.places or Places(fleet.name, None, term))
         self.inventory = parts.inventory or Inventory(mesh, fleet)
         devices, me, now = self.inventory.devices, mesh.me.host, mesh.now()
         roster = Roster(mesh.keys, me, fleet, term, devices, admission, core.arc, now)
