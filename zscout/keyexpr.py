@@ -71,6 +71,26 @@ def check_need(need: str) -> str:
     return need
 
 
+def of_host(host: str) -> str:
+    """All RCs of a host, as maintenance names them: `@anvil`."""
+    return f"@{host}"
+
+
+def host_in(need: str) -> str | None:
+    """`anvil` of `@anvil`; None for other needs."""
+    return need[1:] if need.startswith("@") else None
+
+
+@lru_cache(REMEMBERED)
+def check_maintained(need: str) -> str:
+    """`need` itself if maintenance may name it: an RC, a pattern for all RCs that match it, or `@<host>` for all RCs of
+    a host. Raises BadName otherwise."""
+    if (host := host_in(need)) is None:
+        return check_need(need)
+    check_name(host, "host")
+    return need
+
+
 @lru_cache(REMEMBERED)
 def matcher(need: str) -> Callable[[str], bool]:
     """A test of RC names for a pattern, which matches as Zenoh's key expressions do."""

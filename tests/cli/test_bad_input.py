@@ -93,8 +93,10 @@ book robot/a --for 1h --at 9:00 --patience 2h | --patience is longer than the bo
 book robot/a --for 1h --at 9:00 --zone Berlin | --zone: "Berlin" is not a time zone of the IANA database; did you mean
 book robot/a robot/a --for 1h --at 9:00 | robot/a is named twice; name each device once, with all its parameters after
 book robot/a --for 1h --at 9:00 --name 'a b' | --name "a b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
-maintain robot/* --for 1h --at 9:00 | robot/* is a pattern; name each device for maintenance
-maintain robot/a robot/a --for 1h --at 9:00 | zscout: robot/a is named twice; name each device once
+maintain 'robot/a b' --for 1h --at 9:00 | device name "a b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
+maintain 'a b' --for 1h --at 9:00 | host "a b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
+maintain anvil anvil --for 1h --at 9:00 | zscout: anvil is named twice; name each device and host once
+maintain robot/a robot/a --for 1h --at 9:00 | zscout: robot/a is named twice; name each device and host once
 slots robot/a --for 1h --within 500d | --within: 500 d is out of range; write 1.0 s to 366 d
 slots robot/a --for 1h --limit 0 | --limit: 0 is out of range; write 1 to 50
 bookings --date nosuch | --date: "nosuch" is not a date;

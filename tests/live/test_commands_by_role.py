@@ -39,7 +39,7 @@ WORDS: Final[dict[str, tuple[str, ...]]] = {
     "component migrate": ("beat", "--to", "cart", "--yes"),
     "component stop": ("beat", "--yes"),
     "take": ("robot/b", "--yes", "--", "true"),
-    "maintain": ("robot/b", "--at", "LATER 10:00", "--for", "1h"),
+    "maintain": ("robot/b", "--at", "LATER 10:00", "--for", "1h", "--yes"),
     "drain": ("cart",),
     "uncordon": ("cart",),
 }

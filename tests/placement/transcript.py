@@ -8,6 +8,7 @@ report HOST ...                         from now on it reports so        silent 
 kind KIND cpu=X [memory=MB]             what a kind is known to use
 place NAME [kind=K] [restart=R] [hosts=A,B] [labels=A,B] [memory=MB] [policy=P] [metric=M] [n=ANY]
 end NAME       move NAME [HOST]         drain HOST       uncordon HOST       tick
+maintained [HOST ...]                   the hosts in maintenance, from now on
 start NAME INC HOST ok|refused|failed|unknown [movable] [final] [bad_params] [REASON]
 stop NAME INC HOST done|said|unknown    `done`: and its token is gone; `said`: that is all
 moved NAME INC HOST moved|refused|unknown [dead=S] [REASON]
@@ -38,6 +39,7 @@ from zscout.placement.events import (
     HostJoined,
     HostLost,
     Inherited,
+    Maintained,
     MoveAnswered,
     PlacementRefused,
     PlacerEffect,
@@ -118,7 +120,7 @@ class PlacerPlayer:
 
     def lead(self, counter: int, *, rebalance: bool) -> list[PlacerEvent]:
         records = tuple(self.placer.components.values())
-        cordoned = frozenset(self.balancer.cordoned)
+        cordoned = self.placer.cordoned - {*self.placer.maintained}  # as candidates keep it
         self.balancer.cordoned.clear()
         self.placer, self.wake = Placer(self.balancer, counter, PlacementPolicy(rebalance=rebalance)), None
         return [Inherited(records, cordoned)]
@@ -142,6 +144,8 @@ class PlacerPlayer:
             case "silent", host:
                 del self.reports[host]
                 return None
+            case "maintained", *hosts:
+                return Maintained(frozenset(hosts))
             case "kind", kind, *options:
                 known = settings(options, "cpu", "memory")
                 memory = int(known.get("memory", 64)) * MEGABYTE

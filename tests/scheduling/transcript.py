@@ -1,7 +1,7 @@
 """Stories of the scheduling core as text (see `tests/transcripts.py`). Its commands:
 
     at TIME                                    sets the clock for what follows; `at TIME COMMAND` too
-    join RC [sharable]                         leave RC [REASON]            lost CLIENT
+    join RC [sharable] [host=NAME]             leave RC [REASON]            lost CLIENT
     ask ARC NEED,... [priority=N] [runtime=S] [client=NAME] [keep] [place=TERM.N]
     cancel ARC          release ARC            handover ARC CLIENT NEW_NAME    tick
     vote N yes|no [REASON]                     overdue N
@@ -9,7 +9,8 @@
     standing ARC ... grant=TERM.N start=S      waiting ARC ...              for the `lead` that follows
     adopt ARC ... grant=TERM.N start=S         place ARC TERM.N             unconfirmed ARC TERM.N RC,...
     lead TERM
-    book ID NEED,... start=S [runtime=S] [patience=S] [priority=N] [since=S] [bound=RC,...] [maintenance] [tentative]
+    book ID NEED,... start=S [runtime=S] [patience=S] [priority=N] [since=S] [bound=RC,...] [tentative]
+        [maintenance] [urgent]                 which may name a host: `@anvil`
     unbook ID [now]     redate ID S            slots ID NEED,... start=S until=S [runtime=S] [priority=N] [bookings]
     strategy NAME [patience=S] [half_life=S]   a new core; without it, it is `priority`; a half-life: with fair shares
 
@@ -48,7 +49,7 @@ from zscout.types import Grant, Ns, Params, Place, Term
 if TYPE_CHECKING:
     from zscout.config.scheduling_policy import StrategyName
 
-_NEED = re.compile(r"([\w.-]+/[\w.*#-]+)(?:\{([^}]*)\})?")
+_NEED = re.compile(r"([\w.-]+/[\w.*#-]+|@\w+)(?:\{([^}]*)\})?")
 
 
 @dataclass
@@ -123,7 +124,9 @@ class CorePlayer:
             "place": lambda: model.PlaceShown(first, _place(second)),
             "unconfirmed": lambda: model.Unconfirmed(first, Grant(*_place(words[0])), tuple(words[1].split(","))),
             "reachable": lambda: model.Reachable(first),
-            "join": lambda: model.RcJoined(first, sharable=_flag(second, "sharable")),
+            "join": lambda: model.RcJoined(
+                first, "sharable" in words, settings([word for word in words if "=" in word], "host").get("host", "")
+            ),
             "leave": lambda: model.RcLost(first, second) if second else model.RcLost(first),
             "lost": lambda: model.ClientLost(first),
             "cancel": lambda: model.Cancelled(first),
@@ -164,6 +167,7 @@ def _booking(text: str, now: Ns) -> tuple[Booking, dict[str, str]]:
         dict(zip(patterns, bound, strict=bool(bound))),
         owner="host",
         maintenance="maintenance" in text.split(),
+        urgent="urgent" in text.split(),
     )
     return booking, options
 
@@ -182,7 +186,7 @@ def _request(text: str) -> tuple[model.ArcRequest, dict[str, str]]:
             raise ValueError(f"not a need: {need}")
         pairs = (pair.split("=") for pair in (match[2] or "").split())
         wanted[match[1]] = {key: Fraction(value) for key, value in pairs}
-    words = (word for word in rest if word not in {"keep", "maintenance", "bookings", "tentative"})
+    words = (word for word in rest if word not in {"keep", "maintenance", "urgent", "bookings", "tentative"})
     known = "priority runtime client place grant start booking patience since bound until"
     options = settings(words, *known.split())
     request = model.ArcRequest(

@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any, Final
+from zoneinfo import ZoneInfo
 
 import click
 from msgspec import structs
@@ -15,10 +16,11 @@ from zscout.behaviors.client.client import QUERY_TIMEOUT, Client
 from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common, completion, ownership
 from zscout.cli.common import F, Failed, Parsed
-from zscout.cli.dates import parse_zone, span_words
+from zscout.cli.dates import date_words, parse_zone, span_words
 from zscout.cli.ownership import User
 from zscout.config.strict import BadInput, quoted
-from zscout.messages import BookedDate, BookingsAsk, BookingsTold, BookingView
+from zscout.keyexpr import host_in, of_host
+from zscout.messages import MAX_AHEAD, BookedDate, BookingsAsk, BookingsTold, BookingView
 from zscout.terminal import clean, clock, span
 
 SHOWN_ID: Final = 8
@@ -86,12 +88,27 @@ def soon(told: BookingsTold | None) -> int:
 def in_maintenance(told: BookingsTold | None) -> dict[str, str]:
     """Whose maintenance each RC is in now, and until when: `greased (ada@desk) until 14:30`."""
     return {
-        rc: clean(f"{booking.name} ({whose(booking)}) until {clock(date.end - told.time, at_latest=True)}")
+        rc: clean(f"{booking.name} ({whose(booking)}) until {_end(booking, date, told)}")
         for booking in (told.bookings if told is not None else ())
         for date in booking.dates
         if told is not None and booking.maintenance and date.start <= told.time < date.end
-        for rc in booking.needs
+        for rc in booking.maintained or booking.needs
     }
+
+
+def _end(booking: BookingView, date: BookedDate, told: BookingsTold) -> str:
+    lasts = booking.runtime >= MAX_AHEAD
+    return "cancelled" if lasts else clock(date.end - told.time, at_latest=True)
+
+
+def maintenance_of(told: BookingsTold, host: str) -> list[tuple[BookingView, BookedDate]]:
+    """The maintenance of all devices of a host that lasts now."""
+    return [
+        (booking, date)
+        for booking in told.bookings
+        for date in booking.dates
+        if booking.maintenance and of_host(host) in booking.needs and date.start <= told.time < date.end
+    ]
 
 
 def coming(told: BookingsTold | None) -> dict[str, str]:
@@ -163,8 +180,20 @@ def whose(booking: BookingView) -> str:
 def rcs_words(booking: BookingView, date: BookedDate | None = None) -> str:
     """`robot/arm1, framegrabber/fg1 for framegrabber/*, radio/rf0 (command_rate=5)`."""
     bound = date.bound if date is not None else {}
-    names = {need: f"{bound[need]} for {need}" if need in bound else need for need in booking.needs}
+    names = {need: f"{bound[need]} for {need}" if need in bound else need_words(need) for need in booking.needs}
     return ", ".join(common.with_amounts(names[need], booking.needs[need]) for need in sorted(booking.needs))
+
+
+def when_words(booking: BookingView, date: BookedDate, zone: ZoneInfo | None) -> str:
+    """`Tue 2026-12-01 14:00 to 16:00`, or until it is cancelled."""
+    lasts = booking.maintenance and booking.runtime >= MAX_AHEAD
+    return f"{date_words(date.start, zone)} until cancelled" if lasts else span_words(date.start, date.end, zone)
+
+
+def need_words(need: str) -> str:
+    """`robot/arm1`, `all devices of anvil` for `@anvil`."""
+    host = host_in(need)
+    return need if host is None else f"all devices of {host}"
 
 
 def in_words(seconds: float) -> str:
@@ -178,7 +207,7 @@ def state_words(booking: BookingView, date: BookedDate) -> str:
 
 def _next(booking: BookingView) -> str:
     date = next(iter(booking.dates), None)
-    return span_words(date.start, date.end, None) if date is not None else "without a date within 60 days"
+    return when_words(booking, date, None) if date is not None else "without a date within 60 days"
 
 
 def clock_words(host: str, differs: float) -> str:

@@ -108,6 +108,13 @@ async def needs(mesh: Mesh, _parameter: str) -> Iterable[str]:
 
 
 @_on_mesh
+async def maintained(mesh: Mesh, _parameter: str) -> Iterable[str]:
+    """Devices and hosts."""
+    rcs, hosts_ = await asyncio.gather(_rc_names(mesh), _named(mesh, "node"))
+    return {*rcs, *hosts_}
+
+
+@_on_mesh
 async def arcs(mesh: Mesh, _parameter: str) -> Iterable[str]:
     return _arc_names(await _state(mesh))
 

@@ -52,8 +52,8 @@ HEADINGS: Final[Headings] = {
     },
     "Operate": {
         "node": ("node:main", "Run this host's part of a fleet (the same as zscout-node)."),
-        "drain": ("cli.components.moves:drain", "Move components off a host, and place none there."),
-        "uncordon": ("cli.components.moves:uncordon", "Use a drained host again."),
+        "drain": ("cli.operator.drain:drain", "Empty a host of components and holds, and grant none there."),
+        "uncordon": ("cli.operator.drain:uncordon", "Use a drained host again."),
         "doctor": ("cli.fleet.doctor:doctor", "Find out why there is no link, no leader or no device."),
         "cert": ("cli.fleet.cert:cert", "Make, renew and show the certificates of a secured fleet."),
         "completion": ("cli.completion:completion", "Print the completion script for bash, zsh or fish."),

@@ -57,10 +57,11 @@ async def ask_for_others(client: Client, others: Iterable[str], verb: str, *, ye
     await confirm(f"{what}; {verb} {it}?", f"{what}; to {verb} {it} all the same, add --yes", "nothing was done")
 
 
-async def confirm(question: str, unasked: str, no: str) -> None:
-    """Ask on stderr. Raises Failed: `no` for any answer but y, `unasked` if there is no terminal."""
+async def confirm(question: str, unasked: str, no: str, *, code: int | None = None) -> None:
+    """Ask on stderr. Raises Failed: `no` for any answer but y; `unasked`, with this exit code, if there is no
+    terminal."""
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
-        raise Failed(unasked)
+        raise Failed(unasked, code)
     sys.stderr.write(f"{clean(question)} [y/N] ")
     sys.stderr.flush()
     if (await _answer()).strip().lower() not in ("y", "yes"):

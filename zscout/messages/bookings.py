@@ -65,7 +65,11 @@ class _Booking(Message, frozen=True):
     every: Days = 0
     until: Instant | None = None
     maintenance: bool = False
-    """Nobody is to hold any of them then: a drain with a date, which nobody takes up."""
+    """Nobody is to hold any of them then: a drain with a date, which nobody takes up. `needs` may have patterns, which
+    mean all RCs that match, and `@<host>` for all RCs of a host, on which no component is placed meanwhile. One as long
+    as MAX_AHEAD lasts until it is given up."""
+    urgent: bool = False
+    """Maintenance preempts holds within their minimum runtimes as well."""
     who: Who | None = None
 
 
@@ -144,6 +148,8 @@ class BookingView(_Booking, frozen=True):
     unbooked: bool = False
     dates: list[BookedDate] = []
     dropped: Dates = []
+    maintained: list[ShortText] = []
+    """The RCs that maintenance of patterns and hosts has now."""
 
 
 class BookingsAsk(Message, frozen=True):

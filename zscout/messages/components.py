@@ -285,10 +285,11 @@ class Placement(Message, frozen=True):
 
 
 class Placements(Message, frozen=True):
-    """Components by name, and the hosts on which nothing is placed. Also published at each change: then only
-    what has changed, and `forgotten` names what the placer keeps no longer."""
+    """Components by name, and the hosts on which nothing is placed, some for as long as they are in maintenance. Also
+    published at each change: then only what has changed, and `forgotten` names what the placer keeps no longer."""
 
     term: Term = NO_TERM
     components: list[Placement] = []
     cordoned: list[str] = []
     forgotten: list[str] = []
+    maintained: list[str] = []

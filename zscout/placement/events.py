@@ -93,9 +93,18 @@ class Inherited:
     cordoned: frozenset[HostName] = frozenset()
 
 
+@dataclass(frozen=True, slots=True)
+class Maintained:
+    """The hosts in maintenance now: they are cordoned for as long."""
+
+    hosts: frozenset[HostName]
+
+
 _Request: TypeAlias = messages.PlacementOperation | messages.DrainHost | messages.UncordonHost
 _Answer: TypeAlias = StartAnswered | StopAnswered | MoveAnswered | ComponentsListed
-PlacerEvent: TypeAlias = _Request | _Answer | TokenAppeared | TokenVanished | HostJoined | HostLost | Inherited
+PlacerEvent: TypeAlias = (
+    _Request | _Answer | TokenAppeared | TokenVanished | HostJoined | HostLost | Inherited | Maintained
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,6 +29,7 @@ MOVES_PER_HOST: Final = 2
 class Migrations:
     def __init__(self, state: PlacementState, lifecycle: Lifecycle) -> None:
         self.state, self.lifecycle = state, lifecycle
+        self.maintained: frozenset[HostName] = frozenset()  # hosts in maintenance
 
     def request(self, component: ComponentId, to: HostName | None) -> None:
         state = self.state
@@ -273,12 +274,26 @@ class Migrations:
                     f"{len(cordoned)} hosts are drained, the most allowed; use one again with zscout uncordon",
                 )
                 return
-        cordoned.add(host)
-        state.rankings.begin(state.now)
-        state.drain_soon(host)
+        self._cordon(host)
+
+    def maintain(self, hosts: frozenset[HostName]) -> None:
+        """Hosts are drained while they are in maintenance, known or not."""
+        before, self.maintained = self.maintained, hosts
+        for host in sorted(hosts - before):
+            self._cordon(host)
+        for host in sorted(before - hosts):
+            self.uncordon(host)
+
+    def _cordon(self, host: HostName) -> None:
+        self.state.balancer.cordoned.add(host)
+        self.state.rankings.begin(self.state.now)
+        self.state.drain_soon(host)
 
     def uncordon(self, host: HostName) -> None:
         state = self.state
+        if host in self.maintained:
+            state.refuse(host, "in_maintenance", f"{host} is in maintenance; end that with zscout booking cancel")
+            return
         state.balancer.cordoned.discard(host)
         state.rankings.begin(state.now)
         for record in state.components.values():

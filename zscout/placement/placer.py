@@ -51,6 +51,11 @@ class Placer:
     def cordoned(self) -> frozenset[HostName]:
         return frozenset(self._state.balancer.cordoned)
 
+    @property
+    def maintained(self) -> list[HostName]:
+        """The hosts that are cordoned for as long as they are in maintenance."""
+        return sorted(self._migrations.maintained)
+
     def handle(self, now: Ns, *batch: events.PlacerEvent) -> list[events.PlacerEffect]:
         """Apply one instant's events, or only the time. Raises ValueError if `now` goes backwards."""
         state = self._state
@@ -82,6 +87,8 @@ class Placer:
                 self._migrations.drain(host)
             case UncordonHost(host):
                 self._migrations.uncordon(host)
+            case events.Maintained(hosts):
+                self._migrations.maintain(hosts)
             case events.StartAnswered():
                 self._start_answered(event)
             case events.StopAnswered(component, incarnation, _, done):

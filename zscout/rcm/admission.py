@@ -13,7 +13,7 @@ from typing import Final, Protocol, TypeAlias
 from msgspec.structs import replace
 
 from zscout.config.fleet import RcmLimits
-from zscout.keyexpr import BadName, Sender, check_name, check_need, is_pattern, matcher
+from zscout.keyexpr import BadName, Sender, check_maintained, check_name, check_need, is_pattern, matcher
 from zscout.messages import (
     MAX_PARAMS,
     Amounts,
@@ -131,7 +131,18 @@ class Admission:
         except (BadName, ValueError) as error:
             raise Refused("bad_request", str(error)) from None
 
-    def _check_needs(self, needs: Mapping[Need, Amounts], priority: int) -> None:
+    def _check_maintenance(self, wanted: Book) -> None:
+        """Raises Refused."""
+        try:
+            self._check_needs(wanted.needs, wanted.priority, check_maintained)
+            for params in wanted.needs.values():
+                exact_amounts(params)
+        except ValueError as error:
+            raise Refused("bad_request", str(error)) from None
+
+    def _check_needs(
+        self, needs: Mapping[Need, Amounts], priority: int, check: Callable[[str], str] = check_need
+    ) -> None:
         """Raises ValueError, BadName."""
         if not needs:
             raise ValueError("needs is empty; name at least one device")
@@ -140,7 +151,7 @@ class Admission:
         if not -MAX_PRIORITY <= priority <= MAX_PRIORITY:
             raise ValueError(f"priority must lie between -{MAX_PRIORITY} and {MAX_PRIORITY}")
         for name, params in needs.items():
-            check_need(name)
+            check(name)
             if len(params) > MAX_PARAMS:
                 raise ValueError(f"{name} has more than {MAX_PARAMS} parameters")
             for parameter in params:
@@ -192,11 +203,12 @@ class Admission:
 
     def check_booking(self, wanted: Book | FindSlots, sender: Sender) -> None:
         """Raises Refused for an invalid booking, or one that `sender` may not make."""
-        asked = Foresee(wanted.id, wanted.id, wanted.needs, wanted.priority, wanted.runtime)
-        request = self.form(asked, sender)
         if isinstance(wanted, Book) and wanted.maintenance:
             self.authority.check_operator(sender, "put devices in maintenance")
+            self._check_maintenance(wanted)
             return
+        asked = Foresee(wanted.id, wanted.id, wanted.needs, wanted.priority, wanted.runtime)
+        request = self.form(asked, sender)
         self.authority.check_ask(sender.host, request, lambda _: 0)
         key = "max_booking" if self.limits.max_booking else "max_runtime"
         if (most := getattr(self.limits, key)) and request.min_runtime > most:

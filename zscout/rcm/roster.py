@@ -743,7 +743,7 @@ def _is_of(message: Any, token: Token) -> bool:
 
 def _presence(state: RcState) -> RcJoined | RcLost:
     health = state.health[:MAX_HEALTH]
-    return RcJoined(state.rc, state.sharable) if health == "ok" else RcLost(state.rc, why=health)
+    return RcJoined(state.rc, state.sharable, state.host) if health == "ok" else RcLost(state.rc, why=health)
 
 
 def discrepancies(

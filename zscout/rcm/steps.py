@@ -261,6 +261,8 @@ class Outbox(Struct):
     keep: list[Keep] = []
     """Those that are kept before they are answered."""
     dangers: list[BookedDanger] = []
+    drained: list[frozenset[HostName]] = []
+    """The hosts in maintenance, if they have changed; the last counts."""
     log: list[str] = []
     strange: list[tuple[str, str]] = []
     """Warnings, each with its subject: of one subject not too many are logged."""

@@ -4,21 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
+from typing import Final
 
 from msgspec import Struct
 
-from zscout.keyexpr import is_pattern
-from zscout.messages import Who
+from zscout.keyexpr import host_in, is_pattern, matcher
+from zscout.messages import MAX_AHEAD, Who
 from zscout.scheduling.needs import check_request
 from zscout.scheduling.reason import Party, Reason
-from zscout.types import ArcId, Need, Ns, Params, RcName
+from zscout.types import SECOND, ArcId, HostName, Need, Ns, Params, RcName
+
+UNTIL_GIVEN_UP: Final[Ns] = MAX_AHEAD * SECOND
+"""Maintenance as long as this has no end in sight."""
 
 
 class Booking(Struct, frozen=True):
     """All of `needs` at once, for `runtime` ns from `start`. Its owner's request takes it up, or it lapses `patience`
     ns after the date.
 
-    Raises ValueError as `needs.check_request` does, and for maintenance of patterns."""
+    Maintenance names RCs, patterns of which it has all RCs that match, and hosts (`keyexpr.of_host`).
+
+    Raises ValueError as `needs.check_request` does."""
 
     id: str
     needs: Mapping[Need, Params]
@@ -35,11 +41,28 @@ class Booking(Struct, frozen=True):
     who: Who | None = None
     maintenance: bool = False
     """Keeps each RC free of all other holders meanwhile; it is never taken up and has no patience."""
+    urgent: bool = False
+    """Maintenance also preempts holds within their minimum runtimes, whatever their priority."""
 
     def __post_init__(self) -> None:
         check_request(f"booking {self.id}", self.needs, self.runtime)
-        if self.maintenance and (patterns := sorted(filter(is_pattern, self.needs))):
-            raise ValueError(f"booking {self.id}: maintenance needs devices by name, not {patterns[0]}")
+
+    @property
+    def until(self) -> Ns | None:
+        """Its end; None: it lasts until it is given up."""
+        return None if self.maintenance and self.runtime >= UNTIL_GIVEN_UP else self.end
+
+    @property
+    def hosts(self) -> set[HostName]:
+        """The hosts that maintenance names."""
+        return {host for host in map(host_in, self.needs) if host is not None} if self.maintenance else set()
+
+    def maintains(self, rc: RcName, host: HostName) -> bool:
+        """Return True if maintenance has this RC, offered by this host."""
+        return any(
+            need == rc or (matcher(need)(rc) if is_pattern(need) else host_in(need) == host != "")
+            for need in self.needs
+        )
 
     @property
     def end(self) -> Ns:
@@ -123,12 +146,13 @@ class BookingConflict(Struct, frozen=True):
 
 
 class BookingStatus(Struct, frozen=True):
-    """An active booking, its ARC, and the RCs bound to its patterns."""
+    """An active booking, its ARC, and the RCs bound to its patterns; of maintenance all its RCs."""
 
     booking: Booking
     arc: ArcId | None
     bound: Mapping[Need, RcName]
+    maintained: tuple[RcName, ...] = ()
 
     @property
     def is_unbound(self) -> bool:
-        return not self.bound and any(map(is_pattern, self.booking.needs))
+        return not self.booking.maintenance and not self.bound and any(map(is_pattern, self.booking.needs))

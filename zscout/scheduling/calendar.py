@@ -22,6 +22,7 @@ from typing import Final
 
 from msgspec.structs import replace
 
+from zscout.keyexpr import host_in, is_pattern
 from zscout.scheduling.booking import (
     Booking,
     BookingBound,
@@ -103,7 +104,9 @@ class Calendar:
         self.certain_from: Ns = 0  # dates before this are uncertain: no booking begins or expires for good
 
     def stand_in(self, booking: Booking) -> Arc:
-        """An ARC that represents a booking until it is taken up."""
+        """An ARC that represents a booking until it is taken up. That of maintenance has no RCs: its claim has them."""
+        if booking.maintenance:
+            return Arc(request_for(booking), Place(NO_TERM, 0), 0)
         arc = self._state.new_arc(request_for(booking), Place(NO_TERM, 0))
         if arc.patterns:
             self._state.bind(arc, booking.bound)
@@ -144,13 +147,36 @@ class Calendar:
             state = BookingState.USED if booking.maintenance else BookingState.LAPSED
             self._emit(BookingChanged(booking.id, state))
             return
-        arc = self.stand_in(booking)
-        claim = Claim(booking, arc, arc.mask, tentative)
+        claim = Claim(booking, self.stand_in(booking), 0, tentative)
+        claim.kept = self._kept(claim)
         self._state.dates.add(claim)
         if booking.maintenance:
-            overlapping = (self._state.dates.of(rc, booking.start, booking.end) for rc in self._state.rcs_in(arc.mask))
-            self._keep_others(arc.mask, chain.from_iterable(overlapping))
+            self._free_from_patterns(claim, claim.kept)
         self._offer(claim)
+
+    def _kept(self, claim: Claim) -> int:
+        """Bits of the RCs of a claim that is not held: for maintenance of patterns and hosts those known now."""
+        booking, state = claim.booking, self._state
+        if not booking.maintenance:
+            return claim.arc.mask
+        named = state.mask(need for need in booking.needs if not is_pattern(need) and host_in(need) is None)
+        return named | union(rc.bit for rc in state.rcs.values() if booking.maintains(rc.name, rc.host))
+
+    def _free_from_patterns(self, claim: Claim, mask: int) -> None:
+        """Rebind the patterns of bookings that have some of these RCs during maintenance."""
+        dates, booking = self._state.dates, claim.booking
+        overlapping = (dates.of(rc, booking.start, booking.end) for rc in self._state.rcs_in(mask))
+        self._keep_others(mask, chain.from_iterable(overlapping))
+
+    def _extend_maintenance(self, rc: Rc) -> None:
+        """Maintenance of patterns and hosts has an RC that came, and no longer one that left its host for another."""
+        for claim in list(self._state.maintenance.values()):
+            kept = claim.kept | rc.bit if claim.booking.maintains(rc.name, rc.host) else claim.kept & ~rc.bit
+            if kept != claim.kept:
+                claim.kept = kept
+                self._state.dates.put(claim)
+                self._free_from_patterns(claim, kept & rc.bit)
+                self._look_again((claim.booking.id,))
 
     def unbook(self, booking: str, *, at_present: bool) -> None:
         if (claim := self._state.claims.get(booking)) is not None:
@@ -277,19 +303,21 @@ class Calendar:
                 self._end(claim, BookingState.LAPSED)
 
     def in_maintenance(self) -> Iterator[tuple[Claim, Rc, Arc]]:
-        """Holders that maintenance ends: of equal or lower priority, past their minimum runtimes. The caller may end
-        them meanwhile."""
+        """Holders that maintenance ends: of equal or lower priority, past their minimum runtimes; all, if it is urgent.
+        The caller may end them meanwhile."""
         now = self._state.now
         for claim in self._state.maintenance.values() if self._state.maintenance else ():
             for rc in self._state.rcs_in(claim.kept) if claim.booking.start <= now else ():
                 for holder in list(rc.holders.values()):
-                    if holder.priority <= claim.booking.priority and holder.past_min_runtime(now):
+                    due = holder.priority <= claim.booking.priority and holder.past_min_runtime(now)
+                    if due or claim.booking.urgent:
                         yield claim, rc, holder
 
     def rc_lost(self, rc: Rc) -> None:
         self._keep_others(rc.bit, self._state.dates.of(rc, self._state.now))
 
     def rc_joined(self, rc: Rc) -> None:
+        self._extend_maintenance(rc)
         self._look_again(claim.booking.id for claim in self._state.dates.of(rc, self._state.now))
         self._look_again(self._lost)
         self._look_again(self._unbound)
@@ -452,7 +480,7 @@ class Calendar:
         """A date stands again."""
         claim.booking = replace(claim.booking, start=claim.date)
         claim.arc = self.stand_in(claim.booking)
-        claim.kept, claim.tentative = claim.arc.mask, False
+        claim.kept, claim.tentative = self._kept(claim), False
         self._state.dates.add(claim)
         self._look_again((claim.booking.id,))
         self._offer(claim)

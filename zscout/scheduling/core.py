@@ -27,7 +27,7 @@ from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.scheduling.slots import SlotsFound, slots
 from zscout.scheduling.state import SchedulerState, Strategy
 from zscout.scheduling.votes import HolderSet
-from zscout.types import NO_TERM, ArcId, ClientId, Grant, Ns, Place, RcName, Term
+from zscout.types import NO_TERM, ArcId, ClientId, Grant, HostName, Ns, Place, RcName, Term
 
 
 class Core:
@@ -177,7 +177,7 @@ class Core:
         queue (None: all), and `without` these bookings."""
         state = self._state
         joined: list[model.Event] = [
-            model.RcJoined(rc.name, rc.sharable) if rc.present else model.RcLost(rc.name, why=rc.absence)
+            model.RcJoined(rc.name, rc.sharable, rc.host) if rc.present else model.RcLost(rc.name, why=rc.absence)
             for rc in state.rcs.values()
             if rc.present or rc.absence
         ]
@@ -233,7 +233,13 @@ class Core:
         if (claim := self._state.claims.get(name)) is None:
             return None
         bound = claim.booking.bound if claim.arc.hold is None else claim.arc.bound
-        return BookingStatus(claim.booking, claim.arc.id if claim.is_taken else None, bound)
+        maintained = tuple(rc.name for rc in self._state.rcs_in(claim.kept)) if claim.booking.maintenance else ()
+        return BookingStatus(claim.booking, claim.arc.id if claim.is_taken else None, bound, maintained)
+
+    def drained(self) -> frozenset[HostName]:
+        """The hosts in maintenance now."""
+        begun = (claim.booking for claim in self._state.maintenance.values() if claim.date <= self._state.now)
+        return frozenset().union(*(booking.hosts for booking in begun))
 
     def charged(self) -> dict[str, float]:
         return self._state.charged()
@@ -273,10 +279,10 @@ class Core:
                 self._votes.answer(proposal, accept=accept, reason=reason)
             case model.VoteOverdue(proposal):
                 self._votes.overdue(proposal, self._state.now)
-            case model.RcJoined(rc, sharable):
+            case model.RcJoined(rc, sharable, host):
                 if self._state.rc(rc).present:
                     self._lose_rc(rc, "it started anew")
-                self._state.join(rc, sharable=sharable)
+                self._state.join(rc, sharable=sharable, host=host)
                 self._calendar.rc_joined(self._state.rc(rc))
                 self._state.readmit(rc)
             case model.RcReported(rc, ended, rules_changed):
@@ -529,8 +535,9 @@ class Core:
     def _begin_maintenance(self) -> None:
         for claim, rc, arc in self._calendar.in_maintenance():
             if arc.hold is not None:
-                party = claim.booking.party._replace(until=claim.booking.end)
-                self._end_hold(arc, Outcome.COMPLETED, Reason(ReasonCode.MAINTENANCE, (rc.name,), (party,)))
+                outcome = Outcome.COMPLETED if arc.past_min_runtime(self._state.now) else Outcome.PREEMPTED
+                party = claim.booking.party._replace(until=claim.booking.until)
+                self._end_hold(arc, outcome, Reason(ReasonCode.MAINTENANCE, (rc.name,), (party,)))
 
     def start(self, arc: Arc) -> None:
         grant = Grant(self.term, self.number())

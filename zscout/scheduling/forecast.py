@@ -7,6 +7,7 @@ lasts as planned."""
 from __future__ import annotations
 
 import itertools
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -68,11 +69,15 @@ def forecast(
     releases: dict[ArcId, Ns] = {}  # likely times of release
     asked = [held.request for held in lead.recovered_holds] + [queued.request for queued in lead.waiting]
     asked += [newcomer] if newcomer is not None else []
-    runtimes_of = [request.min_runtime for request in asked] + [booking.runtime for booking, _ in booked.values()]
+    runtimes_of = [request.min_runtime for request in asked] + [
+        booking.runtime for booking, _ in booked.values() if not booking.maintenance
+    ]
     coming = _Coming(later.values(), max(runtimes_of, default=0))
     dates = sorted(
         (at, name) for name, (booking, is_open) in booked.items() for at in _dates(booking, now, is_open=is_open)
     )
+    # What follows maintenance without an end is not known.
+    unknown = min((booking.end for booking, _ in booked.values() if booking.until is None), default=math.inf)
     unserved = {queued.request.arc for queued in lead.waiting}  # queued ARCs that have not started within the forecast
 
     def expect(request: ArcRequest, hold: Hold) -> None:
@@ -119,6 +124,8 @@ def forecast(
             break
         changes = [at for at in (copy.next_change(),) if at is not None and at > now]
         now = max(now, min((*ends.values(), *releases.values(), *(date for date, _ in dates[:1]), *changes)))
+        if now >= unknown:
+            break
         events: list[Event] = [
             *coming.until(now),
             model.Tick(),

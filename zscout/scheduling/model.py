@@ -259,6 +259,7 @@ class Rc:
     present: bool = False
     sharable: bool = False
     absence: str = ""  # the reason while absent, if known
+    host: str = ""  # its host, or the last one while absent
     holders: dict[ArcId, Arc] = field(default_factory=dict)
     demand: list[Rank] = field(default_factory=list)  # of the queued ARCs that name it, best first
     watchers: list[Rank] = field(default_factory=list)
@@ -351,6 +352,7 @@ class VoteOverdue(Struct, frozen=True):
 class RcJoined(Struct, frozen=True):
     rc: RcName
     sharable: bool
+    host: str = ""
 
 
 class RcReported(Struct, frozen=True):

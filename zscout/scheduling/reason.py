@@ -131,7 +131,7 @@ class Reason(NamedTuple):
             return _vetoed(self, until)
         text = _TEXTS[self.code](self)
         if self.code is ReasonCode.MAINTENANCE:
-            text += _last(self.by[0], until)
+            text += _last(self.by[0], until) + self.by[0].comment
         return text if self.pattern is None else f"no {self.pattern} is to be had: {text}"
 
 

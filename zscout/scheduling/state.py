@@ -162,8 +162,9 @@ class SchedulerState:
         for arcs in (self.queued, self.held_back, self.running):
             yield from arcs.values()
 
-    def join(self, name: RcName, *, sharable: bool) -> None:
+    def join(self, name: RcName, *, sharable: bool, host: str = "") -> None:
         rc = self.rc(name)
+        rc.host = host
         if self.shares is not None and not rc.present:
             self.shares.count_absent(rc, self.queued.values(), 1)
         rc.present, rc.sharable, rc.absence = True, sharable, ""

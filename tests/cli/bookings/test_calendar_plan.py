@@ -155,14 +155,19 @@ def test_a_pattern_that_is_written_twice_is_two_rcs() -> None:
         parse_needs("robot/a,robot/a", "--needs")
 
 
-def test_maintenance_is_of_rcs_by_name() -> None:
+def test_maintenance_is_of_rcs_patterns_and_hosts() -> None:
     event = "DTSTART:20261201T080000Z\nDURATION:PT1H"
     (one,) = plan_of(event, maintenance=True).wanted
     assert one.book is not None
     assert one.book.maintenance
     assert one.book.patience == 3600
-    refused = plan_of(event, maintenance=True, needs=(("robot/*", {}),))
-    assert skipped(refused) == ["arm 1: name each device for maintenance; patterns are not allowed (failed)"]
+    for need in ("robot/*", "@anvil"):
+        own = event.replace("DTSTART", f"X-ZSCOUT-NEEDS:{need}\nDTSTART")
+        (one,) = plan_of(own, maintenance=True, needs=()).wanted
+        assert one.book is not None
+        assert one.book.needs == {need: {}}
+    plain = plan_of(event.replace("DTSTART", "X-ZSCOUT-NEEDS:@anvil\nDTSTART"), needs=())
+    assert skipped(plain) == ['arm 1: device "@anvil" is not valid; write kind/name, as in robot/scout33 (failed)']
 
 
 @pytest.mark.parametrize(

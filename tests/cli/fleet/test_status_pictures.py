@@ -21,6 +21,7 @@ from zscout.cli.fleet.status import Standing
 from zscout.config.access import AccessPolicy
 from zscout.keyexpr import Role, Token
 from zscout.messages import (
+    MAX_AHEAD,
     BookedDate,
     BookingsTold,
     BookingView,
@@ -88,6 +89,7 @@ class Picture:
         self.hosts: dict[str, Host] = {}
         self.health: dict[str, RcState] = {}
         self.booked = BookingsTold(NOW.timestamp())
+        self.cordoned = set[str]()
 
     def batch(self, line: str) -> list[str]:
         for command in line.split(" & "):
@@ -118,19 +120,22 @@ class Picture:
         health = options.get("health", "ok")
         self.health[name] = RcState(name, at, "i", shared, health=health, figures=figures)
         if (kept := options.get("kept")) is not None:
-            start = round(NOW.timestamp()) + {"maintenance": -60, "booked": 3600}[kept]
-            date = BookedDate(start, start + 120, "open")
+            start = round(NOW.timestamp()) + {"maintenance": -60, "drained": -60, "booked": 3600}[kept]
+            self.cordoned |= {at} if kept == "drained" else set()
+            length = MAX_AHEAD if kept == "drained" else 120
+            date = BookedDate(start, start + length, "open")
             view_of = BookingView(
                 id="b1",
                 owner="anvil",
-                name="service",
-                needs={name: {}},
+                name=f"drain-{at}" if kept == "drained" else "service",
+                needs={f"@{at}" if kept == "drained" else name: {}},
                 start=date.start,
                 priority=0,
-                runtime=Decimal(120),
+                runtime=Decimal(length),
                 patience=Decimal(0),
-                maintenance=kept == "maintenance",
+                maintenance=kept != "booked",
                 dates=[date],
+                maintained=[name] if kept == "drained" else [],
             )
             self.booked.bookings.append(view_of)
 
@@ -173,7 +178,7 @@ class Picture:
         seen = SimpleNamespace(
             client=SimpleNamespace(fleet=fleet),
             mesh=SimpleNamespace(links=lambda: 2, now=lambda: 0),
-            placer=SimpleNamespace(cordoned=set()),
+            placer=SimpleNamespace(cordoned=self.cordoned),
             hosts=self.hosts,
             all_hosts=lambda: dict(sorted(self.hosts.items())),
             tokens=lambda role: [token for host in self.hosts.values() for token in host.tokens if token.role == role],

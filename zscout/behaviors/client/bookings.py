@@ -83,6 +83,7 @@ class BookingsClient:
         every: int = 0,
         until: datetime | None = None,
         maintenance: bool = False,
+        urgent: bool = False,
         comment: str = "",
     ) -> BookingView:
         """Book all of `needs` together, from `start` on for `runtime` seconds. Return when a second host has stored
@@ -94,7 +95,9 @@ class BookingsClient:
         - `every`: repeat it every so many days, at the same hour in the zone of `start`, whose zone must be a
           `ZoneInfo`.
         - `until`: repeat it no later than this, at most a year from now.
-        - `maintenance`: keep the devices free of holders. Needs the rights of an operator.
+        - `maintenance`: keep the devices free of holders. A pattern means all devices that match it, and `@anvil` all
+          devices of the host anvil, which gets no components meanwhile. Needs the rights of an operator.
+        - `urgent`: maintenance also ends holds within their minimum runtimes.
 
         Raises RequestRefused, with `code` `not_free` if a device is taken; RcmSilent if no leader answers;
         ValueError for a bad date or span of time."""
@@ -116,6 +119,7 @@ class BookingsClient:
                 every=every,
                 until=None if until is None else _whole_second(until),
                 maintenance=maintenance,
+                urgent=urgent,
                 who=self._who(comment),
             ),
             BookingView,

@@ -28,9 +28,12 @@ from zscout.cli.booked import (
     rcs_words,
     short,
     state_words,
+    when_words,
     zone_option,
 )
+from zscout.cli.bookings.displaced import Displaced
 from zscout.cli.common import F, Failed, Parsed
+from zscout.cli.components import placing
 from zscout.cli.dates import (
     DATE_FORMS,
     EVERY_FORMS,
@@ -46,12 +49,12 @@ from zscout.cli.dates import (
     remarks,
     span_words,
 )
-from zscout.cli.ownership import User
+from zscout.cli.ownership import User, yes_option
 from zscout.cli.requests.options import Needs, gather_needs, parse_comment, parse_duration, parse_need
 from zscout.cli.requests.request import MAX_PRIORITY
-from zscout.config.strict import BadInput
-from zscout.keyexpr import check_name, check_rc, is_pattern, valid_name
-from zscout.messages import MAX_AHEAD, BookingRecord, BookingsTold, BookingView, Who
+from zscout.config.strict import BadInput, quoted
+from zscout.keyexpr import check_name, check_need, host_in, is_pattern, of_host, valid_name
+from zscout.messages import MAX_AHEAD, WINDOW, BookingRecord, BookingsTold, BookingView, Who
 from zscout.services.bookings.dates import dates
 from zscout.terminal import clean, many, span
 
@@ -68,10 +71,9 @@ DATE: Final = Parsed("date", parse_date)
 DURATION: Final = Parsed("duration", parse_duration)
 
 
-def _rc(text: str, _option: str) -> str:
-    if is_pattern(text):
-        raise BadInput(f"{text} is a pattern; name each device for maintenance")
-    return check_rc(text)
+def _maintained(text: str, _option: str) -> str:
+    """A device, a pattern, or a host, which has no kind before it."""
+    return check_need(text) if "/" in text else of_host(check_name(text, "host"))
 
 
 def date_options(command: F) -> F:
@@ -136,32 +138,42 @@ async def book(needs: Any, priority: int, patience: Decimal | None, **rest: Any)
       zscout book robot/arm1 --for 45m --at "tomorrow 9:00" --name demo --priority 3 --comment 'visitors'
       zscout book robot/arm1 --for 2h --at "tue 14:00" --every week --until 2027-03-31 --zone Europe/Berlin
     """
-    await _make(gather_needs(needs), priority=priority, patience=patience, maintenance=False, **rest)
+    await _make(gather_needs(needs), priority=priority, patience=patience, maintenance=False, yes=True, **rest)
 
 
 @click.command()
 @click.argument(
-    "rcs", nargs=-1, required=True, type=Parsed("rc", _rc), metavar="DEVICE...", shell_complete=completion.needs
+    "needs",
+    nargs=-1,
+    required=True,
+    type=Parsed("need", _maintained),
+    metavar="DEVICE|HOST...",
+    shell_complete=completion.maintained,
 )
+@yes_option
 @date_options
 @common.runs
-async def maintain(rcs: Sequence[str], **rest: Any) -> None:
+async def maintain(needs: Sequence[str], yes: bool, **rest: Any) -> None:
     """Reserve devices for maintenance, as an operator: a drain with a date.
 
+    A pattern means all devices that match it, a HOST all its devices; the host gets no components meanwhile.
     Maintenance is a booking at the fleet's operator priority that no request can use. Requests that would not be over
     by its date do not start on the devices; requests that wait are shown until when. `zscout booking cancel` ends it
     early.
+
+    It prints whom it displaces, holds and bookings, and asks on stderr; if stdin is not a terminal, add --yes (exit
+    code 2).
 
     \b
     Examples:
       zscout maintain robot/arm1 --at now --for 1h && zscout booking cancel maintenance
       zscout maintain robot/arm1 --at "sat 8:00" --for 4h --comment 'new gripper'
-      zscout maintain robot/arm1 robot/arm2 --at "mon 7:00" --for 30m --every week --until 2027-03-31
+      zscout maintain 'robot/*' anvil --at "mon 7:00" --for 30m --every week --until 2027-03-31
     """
-    if twice := [rc for rc in rcs if rcs.count(rc) > 1]:
-        raise BadInput(f"{twice[0]} is named twice; name each device once")
+    if twice := [need for need in needs if needs.count(need) > 1]:
+        raise BadInput(f"{twice[0].removeprefix('@')} is named twice; name each device and host once")
     priority = common.the_fleet().operator_priority
-    await _make({rc: {} for rc in rcs}, priority=priority, patience=None, maintenance=True, **rest)
+    await _make({need: {} for need in needs}, priority=priority, patience=None, maintenance=True, yes=yes, **rest)
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,6 +227,12 @@ class Asked:
         more = len(notes) - MAX_REMARKS
         return [*notes[:MAX_REMARKS], f"and {more} more like that"] if more > 0 else notes
 
+    def spans(self, now: float) -> list[tuple[float, float]]:
+        """Its dates within 60 days."""
+        first, length = int(self.start.at.timestamp()), float(self.runtime)
+        starts = dates(self._record(), now - length, now + WINDOW) if self.every else [first]
+        return [(start, start + length) for start in starts or [first]]
+
     def _record(self) -> BookingRecord:
         until = None if self.last is None else int(self.last.timestamp())
         at = int(self.start.at.timestamp())
@@ -238,6 +256,7 @@ async def _make(
     priority: int,
     patience: Decimal | None,
     maintenance: bool,
+    yes: bool,
     as_json: bool,
 ) -> None:
     zone = zone or host_zone()
@@ -256,6 +275,11 @@ async def _make(
         asked = Asked.of(at, runtime, every, until, zone, told.time, float(late))
         own = [booking for booking in told.bookings if is_own(booking, me)]
         default = "maintenance" if maintenance else _named_after(needs)
+        displaced = {}
+        if maintenance:
+            cost = await _displaced(client, needs, asked, priority, told)
+            await cost.agree(name or default, yes=yes)
+            displaced = {"displaced": cost.as_json()}
         terms: dict[str, Any] = {"priority": priority, "comment": comment}
         try:
             booking = await BookingsClient(client).book(
@@ -275,11 +299,24 @@ async def _make(
             raise Failed(await _instead(client, refused, needs, asked, priority)) from None
         twice = any(one.name == booking.name and one.id != booking.id for one in own)
         if as_json:
-            terminal.print_json(booking_json(booking, me) | {"remarks": asked.remarks()})
+            terminal.print_json(booking_json(booking, me) | {"remarks": asked.remarks()} | displaced)
             return
         _print(booking, asked, told)
         if twice:
             terminal.print_line(f"you have another booking called {booking.name}: name it by its id, {short(booking)}")
+
+
+async def _displaced(client: Client, needs: Needs, asked: Asked, priority: int, told: BookingsTold) -> Displaced:
+    """Whom maintenance displaces. Raises BadInput for an unknown host."""
+    state = await common.state_of(client)
+    hosts = {view.host for view in state.rcs if view.host}
+    for host in filter(None, map(host_in, needs)):
+        if host not in hosts and host not in (hosts := hosts | await placing.nodes_of(client.mesh)):
+            names = hosts | {view.rc for view in state.rcs}
+            raise BadInput(
+                f"unknown host {quoted(host)}{common.hint_at(host, names, 'and there are none', 'there are')}"
+            )
+    return Displaced(needs, asked.spans(told.time), priority, state, told)
 
 
 def _named_after(needs: Needs) -> str:
@@ -316,7 +353,7 @@ def _print(booking: BookingView, asked: Asked, told: BookingsTold) -> None:
         terminal.print_line(note)
     for one in booking.dates:
         if one.danger or one.state == "conflict":
-            text = f"{span_words(one.start, one.end, zone)}: {state_words(booking, one)}"
+            text = f"{when_words(booking, one, zone)}: {state_words(booking, one)}"
             click.secho(clean(text), fg="yellow")
     if booking.maintenance:
         terminal.print_line(f"to end it early: zscout booking cancel {bounded(booking.name)}")

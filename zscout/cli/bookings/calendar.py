@@ -32,7 +32,7 @@ from zscout.cli.requests.options import gather_needs, parse_duration, parse_need
 from zscout.cli.requests.request import MAX_PRIORITY
 from zscout.config.state_folder import write_durably
 from zscout.config.strict import BadInput, quoted, read_bytes
-from zscout.keyexpr import Role, check_rc, is_pattern
+from zscout.keyexpr import Role, check_rc, host_in, is_pattern
 from zscout.messages import Book, BookingView, Unbook
 from zscout.services.bookings.calendar_text import CalendarSelection, calendar_text
 from zscout.terminal import Table, clean, many
@@ -97,9 +97,10 @@ async def export(rc: str | None, owner: str | None, out: str | None, folder: Pat
 def _write_all(folder: Path, fleet: str, bookings: list[BookingView], rcs: Iterable[str]) -> tuple[int, int]:
     """How many files are new, and how many there are. Raises Failed."""
     bound = {rc for one in bookings for date in one.dates for rc in date.bound.values()}
-    named = {need for one in bookings for need in one.needs if not is_pattern(need)}
+    maintained = {rc for one in bookings for rc in one.maintained}
+    named = {need for one in bookings for need in one.needs if not is_pattern(need) and host_in(need) is None}
     selections = {CalendarSelection(), *(CalendarSelection(one.owner) for one in bookings if one.owner)}
-    selections |= {CalendarSelection(rc=rc) for rc in {*rcs, *bound, *named}}
+    selections |= {CalendarSelection(rc=rc) for rc in {*rcs, *bound, *named, *maintained}}
     selections |= {CalendarSelection(path.stem) for path in folder.glob("owner/*.ics")}
     selections |= {CalendarSelection(rc=f"{path.parent.name}/{path.stem}") for path in folder.glob("rc/*/*.ics")}
     # A kind may consist of dots.

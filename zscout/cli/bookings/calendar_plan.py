@@ -26,7 +26,7 @@ from zscout.cli.bookings.calendar_file import CalendarEvent, Moment
 from zscout.cli.bookings.recurrence import occurrences
 from zscout.cli.requests.options import Needs, gather_needs, parse_need
 from zscout.config.strict import BadInput
-from zscout.keyexpr import BadName, check_need, is_pattern, valid_name
+from zscout.keyexpr import BadName, check_maintained, check_need, host_in, valid_name
 from zscout.messages import MAX_AHEAD, MAX_BOOKINGS, MAX_COMMENT, Book, Instant, Who
 from zscout.services.bookings.dates import DAY
 
@@ -134,11 +134,16 @@ def _needs(event: CalendarEvent, options: ImportOptions) -> Needs:
             pairs += needs
     if not pairs:
         named = event.needs.split() or [text for text in event.resources if _is_need(text)]
-        pairs = [parse_need(text) for text in named]
-    found = gather_needs([*dict(pairs).items()])
-    if options.maintenance and any(map(is_pattern, found)):
-        raise BadInput("name each device for maintenance; patterns are not allowed")
-    return found
+        pairs = [_host(text) if options.maintenance and host_in(text) else parse_need(text) for text in named]
+    return gather_needs([*dict(pairs).items()])
+
+
+def _host(text: str) -> tuple[str, dict[str, Decimal]]:
+    """All devices of a host. Raises BadInput."""
+    try:
+        return check_maintained(text), {}
+    except BadName as error:
+        raise BadInput(str(error)) from None
 
 
 def _is_need(text: str) -> bool:

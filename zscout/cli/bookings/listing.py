@@ -28,12 +28,13 @@ from zscout.cli.booked import (
     short,
     state_words,
     utc,
+    when_words,
     whose,
     zone_option,
 )
 from zscout.cli.bookings.book import DATE
 from zscout.cli.common import Failed
-from zscout.cli.dates import WrittenDate, date_words, every_words, host_zone, in_zone, span_words
+from zscout.cli.dates import WrittenDate, date_words, every_words, host_zone, in_zone
 from zscout.cli.ownership import User, ask_for_others, yes_option
 from zscout.config.strict import BadInput
 from zscout.keyexpr import is_pattern, matcher
@@ -122,7 +123,7 @@ async def show(booking: str, zone: ZoneInfo | None, as_json: bool) -> None:
     terminal.print_line(clean(head))
     for date in found.dates:
         bound = f", {rcs_words(found, date)}" if date.bound else ""
-        terminal.print_line(clean(f"  {span_words(date.start, date.end, zone)}: {state_words(found, date)}{bound}"))
+        terminal.print_line(clean(f"  {when_words(found, date, zone)}: {state_words(found, date)}{bound}"))
     if not found.dates:
         terminal.print_line(clean(f"  first on {date_words(found.start, zone)}"))
 
@@ -171,7 +172,7 @@ def _table(found: Sequence[BookingView], me: User, zone: ZoneInfo | None, *, eve
 
 
 def _row(booking: BookingView, date: BookedDate, zone: ZoneInfo | None) -> Sequence[str]:
-    when = span_words(date.start, date.end, zone)
+    when = when_words(booking, date, zone)
     names = (booking.name, short(booking), whose(booking), when, state_words(booking, date), str(booking.priority))
     return (*names, _repeated(booking, zone), rcs_words(booking, date))
 

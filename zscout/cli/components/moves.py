@@ -1,9 +1,6 @@
-"""`zscout component migrate`, `drain` and `uncordon`: have components go on elsewhere, empty a host, use it again."""
+"""`zscout component migrate`: a component continues on another host."""
 
 from __future__ import annotations
-
-import sys
-from collections.abc import Sequence
 
 import click
 
@@ -13,9 +10,8 @@ from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common
 from zscout.cli.components import placing
 from zscout.cli.ownership import yes_option
-from zscout.cli.requests.options import timeout_option
 from zscout.config.strict import BadInput
-from zscout.messages import DrainHost, MigrateComponent, Placement, Placements, UncordonHost
+from zscout.messages import MigrateComponent, Placement
 
 
 @click.command()
@@ -86,87 +82,3 @@ async def _moved(placer: PlacerClient, shown: placing.Progress, before: Placemen
     elif to == record.host:
         return record
     raise common.Failed(f"{name} was not moved: it {placing.standing(record)}; {placing.remedy(record)}")
-
-
-@click.command()
-@placing.host_argument
-@timeout_option("Wait this long until it is empty, then exit with 1.")
-@common.json_option("Print one JSON object.")
-@common.runs
-async def drain(host: str, timeout: float | None, as_json: bool) -> None:
-    """Place nothing on a host any more, and move away every component that can be moved.
-
-    Ends when no movable component is left; exit code 1 names those that stay, and why. The host stays cordoned, also
-    after Ctrl-C or --timeout, until zscout uncordon.
-
-    \b
-    Examples:
-      zscout drain anvil && ssh anvil sudo reboot
-      zscout drain anvil --timeout 2m
-    """
-    cordoned = f"{host} stays cordoned; to use it again: zscout uncordon {host}"
-    async with placing.connected("drain", as_json=as_json) as (_, shown, placer):
-        at_first = {one.component for one in _there(placer, host)}
-
-        def late() -> str:
-            left = terminal.span(timeout or 0)
-            return f"{host} is not empty after {left}: {_words(_there(placer, host))}; {cordoned}"
-
-        async with shown.within(timeout, late, cordoned):
-            try:
-                drained = await placer.request(DrainHost(host), Placements)
-            except RequestRefused as refused:
-                lines = await placing.absent(placer.mesh, [host]) if refused.code == "unknown_host" else ()
-                raise next(map(common.Failed, lines), refused) from None
-            placer.take(*drained.components)
-            # What is not running yet is moved when it does.
-            while leaving := [one for one in _there(placer, host) if one.movable or one.state != "running"]:
-                shown.update(f"{host}: {_words(leaving)}")
-                await placer.wait_changed()
-        stay = _there(placer, host)
-        records = [one for name in sorted(at_first) if (one := placer.placements.get(name)) is not None]
-        moved = [one for one in records if one.host not in (host, None) and one.state == "running"]
-    if as_json:
-        went, stays = ([placing.placement_object(one) for one in some] for some in (moved, stay))
-        terminal.print_json({"host": host, "moved": went, "stay": stays})
-    for one in moved:
-        shown.say(f"{one.component} went to {one.host}{placing.out_of_work(one)}")
-    if stay:
-        raise common.Failed(f"{host} is not empty: {_words(stay)}; end them with zscout component stop; {cordoned}")
-    shown.say(f"{host} is empty; {cordoned}")
-
-
-@click.command()
-@placing.host_argument
-@common.json_option("Print one JSON object.")
-@common.runs
-async def uncordon(host: str, as_json: bool) -> None:
-    """Use a drained host again. Components that left it do not move back by themselves.
-
-    \b
-    Example:
-      zscout uncordon anvil
-    """
-    async with placing.connected("uncordon", as_json=as_json) as (_, _, placer):
-        if host not in placer.cordoned:
-            for line in await placing.absent(placer.mesh, [host]):
-                terminal.print_line(f"zscout: {line}", sys.stderr)
-        uncordoned = await placer.request(UncordonHost(host), Placements)
-    if as_json:
-        terminal.print_json({"host": host, "components": list(map(placing.placement_object, uncordoned.components))})
-    else:
-        terminal.print_line(f"{host} is used again")
-
-
-def _there(placer: PlacerClient, host: str) -> list[Placement]:
-    found = (one for _, one in sorted(placer.placements.items()))
-    return [one for one in found if host in (one.host, one.to) and one.state not in placing.OVER]
-
-
-def _words(some: Sequence[Placement]) -> str:
-    words = []
-    for one in some:
-        why = one.reason or ("" if one.movable else "it can't be moved")
-        stays = "stays" + (f" ({why})" if why else "")
-        words.append(f"{one.component} {stays if one.state == 'running' else placing.standing(one)}")
-    return ", ".join(words)

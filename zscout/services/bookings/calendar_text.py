@@ -43,7 +43,7 @@ class CalendarSelection(NamedTuple):
             view
             for view in bookings
             if self.owner in (None, view.owner)
-            and (self.rc is None or self.rc in view.needs or _may_have(view, self.rc))
+            and (self.rc is None or self.rc in (*view.needs, *view.maintained) or _may_have(view, self.rc))
         ]
 
 
@@ -79,7 +79,7 @@ def calendar_text(fleet: str, bookings: Iterable[BookingView], selection: Calend
 
 def _may_have(view: BookingView, rc: str) -> bool:
     """Return True if it has `rc` for a pattern, or may get it."""
-    bound = {name for date in view.dates for name in date.bound.values()}
+    bound = {name for date in view.dates for name in date.bound.values()} or view.maintained
     return rc in bound if bound else any(is_pattern(need) and matcher(need)(rc) for need in view.needs)
 
 
@@ -193,7 +193,7 @@ def _event(fleet: str, view: BookingView, start: Instant | datetime, told: Booke
     words = f"{view.name} ({view.owner})" if view.owner else view.name
     event.add("SUMMARY", clean(f"maintenance: {words}" if view.maintenance else words))
     bound = told.bound if told is not None else {}
-    rcs = [bound.get(need, need.partition("#")[0]) for need in sorted(view.needs)]
+    rcs = view.maintained or [bound.get(need, need.partition("#")[0]) for need in sorted(view.needs)]
     event.add("LOCATION", ", ".join(rcs))
     event.add("RESOURCES", rcs)
     event.add("CATEGORIES", rcs)

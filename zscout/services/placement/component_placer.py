@@ -33,7 +33,8 @@ PUBLISH_AT_ONCE: Final = 200  # components in one publication
 
 
 class ComponentPlacer:
-    """The placer of one term. `inherited` comes from its predecessor; stop it after `on_failure`."""
+    """The placer of one term. `inherited` comes from its predecessor, `maintained` are the hosts in maintenance. Stop
+    it after `on_failure`."""
 
     def __init__(
         self,
@@ -44,6 +45,7 @@ class ComponentPlacer:
         inherited: events.Inherited,
         on_failure: Callable[[Exception], object],
         authority: Authority | None = None,
+        maintained: frozenset[HostName] = frozenset(),
     ) -> None:
         self.mesh, self.term = mesh, term
         self._core = Placer(balancer.core, term.counter, fleet.placement)
@@ -52,10 +54,10 @@ class ComponentPlacer:
             self._core, term, mesh.keys, authority or Authority(fleet), self._supervisor, self._feed
         )
         self._nodes = NodeClient(mesh, fleet.placement.start_timeout)
-        self._inherited = inherited
+        self._known = events.Maintained(maintained), inherited
         self._instances: dict[HostName, set[str]] = {}  # living instances of each host's node
         self._unlisted: set[HostName] = set()  # hosts that have not listed their components
-        self._cordoned: frozenset[HostName] = frozenset()  # as published last
+        self._published = self._core.cordoned, self._core.maintained  # as of the last publication
         self._declarations = ExitStack()
         self._wake: TimerHandle | None = None
 
@@ -63,7 +65,7 @@ class ComponentPlacer:
         keys, mesh, guard = self.mesh.keys, self.mesh, self._supervisor.guard
         self._publisher = mesh.publisher(keys.placements, Placements)
         self._declarations.callback(self._publisher.close)
-        self._feed(self._inherited)
+        self._feed(*self._known)
         for declared in (
             mesh.watch(keys.alive_any(Role.NODE), guard(self._on_node)),
             mesh.watch(keys.alive_any(Role.COMPONENT), guard(self._on_component)),
@@ -74,6 +76,10 @@ class ComponentPlacer:
         ):
             self._declarations.callback(declared.close)
         self._supervisor.call_later(BEGIN, self._requests.open)
+
+    def maintain(self, hosts: frozenset[HostName]) -> None:
+        """These hosts are in maintenance now: nothing is placed there, and components leave."""
+        self._feed(events.Maintained(hosts))
 
     def stop(self) -> None:
         """Stop placing. Components run on for the next placer."""
@@ -131,7 +137,7 @@ class ComponentPlacer:
                     self._wake_at(at)
                 case _:
                     self._supervisor.spawn(self._command(effect))
-        if changed or self._cordoned != self._core.cordoned:
+        if changed or self._published != (self._core.cordoned, self._core.maintained):
             self._publish(changed)
         return refusals
 
@@ -157,12 +163,12 @@ class ComponentPlacer:
             self._feed()
 
     def _publish(self, changed: dict[str, Placement | None]) -> None:
-        self._cordoned = self._core.cordoned
+        cordoned, maintained = self._published = self._core.cordoned, self._core.maintained
         statuses = [status for status in changed.values() if status is not None]
         forgotten = [name for name, status in changed.items() if status is None]
         for first in range(0, max(1, len(statuses)), PUBLISH_AT_ONCE):
             some = statuses[first : first + PUBLISH_AT_ONCE]
-            self._publisher.put(Placements(self.term, some, sorted(self._cordoned), forgotten))
+            self._publisher.put(Placements(self.term, some, sorted(cordoned), forgotten, maintained))
             forgotten = []
         for status in statuses:
             log.info("%s", describe(status))

@@ -51,7 +51,7 @@ class PlacementLedger:
         if published.term < self.term or absurd(published.term, self.term):
             return
         self.term = published.term
-        self._cordoned = frozenset(published.cordoned)
+        self._cordoned = frozenset(published.cordoned) - {*published.maintained}
         for placement in published.components:
             component = check_name(placement.component, "component")
             if len(self.placements) < 2 * MAX_PLACED or component in self.placements:
@@ -75,7 +75,7 @@ class PlacementLedger:
                 listed = reply.message
                 fresh = [known for known in listed.components if known.component not in self._current]
                 try:
-                    self._on_placements("", Placements(listed.term, fresh, listed.cordoned))
+                    self._on_placements("", Placements(listed.term, fresh, listed.cordoned, [], listed.maintained))
                 except BadName as error:
                     log.warning("ignored a list of placements: %s", error)
                 return

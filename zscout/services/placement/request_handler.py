@@ -134,7 +134,7 @@ class PlacerRequestHandler:
         """All components, or the ones of a name or a host."""
         components = sorted(self._placer.components.items())
         found = [status for name, status in components if component in (None, name) and host in (None, status.host)]
-        return messages.Placements(self.term, found, sorted(self._placer.cordoned))
+        return messages.Placements(self.term, found, sorted(self._placer.cordoned), maintained=self._placer.maintained)
 
     def _timed_out(self, query: PlacerQuery) -> None:
         waiting = self._pop(query)

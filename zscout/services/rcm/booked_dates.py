@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from zscout.keyexpr import check_need
+from zscout.keyexpr import check_maintained, check_need
 from zscout.messages import (
     MAX_AHEAD,
     WINDOW,
@@ -119,7 +119,7 @@ class BookedDates:
         is none."""
         record = date.record
         for need in record.needs:
-            check_need(need)
+            (check_maintained if record.maintenance else check_need)(need)
         runtime = duration(record.runtime, "runtime")
         return Booking(
             date.id,
@@ -134,6 +134,7 @@ class BookedDates:
             record.name,
             record.who,
             maintenance=record.maintenance,
+            urgent=record.urgent,
         )
 
     def dated(self, request: ArcRequest) -> ArcRequest:
@@ -339,7 +340,7 @@ class BookedDates:
         return [date for date in self.open_dates(record) if self._core.booking(date.id) is not None]
 
     def view(self, record: BookingRecord) -> BookingView:
-        told, runtime = [], round(record.runtime)
+        told, runtime, maintained = [], round(record.runtime), list[RcName]()
         for date in self.open_dates(record):
             kept, by = self._core.booking(date.id), self._conflicts.get(date.id)
             taken = kept.arc if kept is not None else None
@@ -349,8 +350,10 @@ class BookedDates:
                 danger = "a shared device has not yet answered whether it can carry it"
             bound = dict(kept.bound) if kept is not None else date.bound
             told.append(BookedDate(date.start, date.start + runtime, state, bound, taken, danger))
-        fields = {name: getattr(record, name) for name in BookingView.__struct_fields__ if name != "dates"}
-        return BookingView(**fields, dates=told)
+            if kept is not None and record.needs.keys() != {*kept.maintained}:
+                maintained = sorted(kept.maintained)
+        fields = {name: getattr(record, name) for name in BookingView.__struct_fields__ if hasattr(record, name)}
+        return BookingView(**fields, dates=told, maintained=maintained)
 
 
 def start_of(name: str) -> Instant | None:

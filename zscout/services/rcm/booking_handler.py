@@ -8,7 +8,7 @@ from decimal import Decimal
 from typing import Final
 
 from zscout.config.fleet import Fleet
-from zscout.keyexpr import BadName, Sender, check_name, is_pattern, matcher
+from zscout.keyexpr import BadName, Sender, check_name, host_in, is_pattern, matcher
 from zscout.messages import (
     MAX_AHEAD,
     MAX_BOOKINGS,
@@ -99,7 +99,8 @@ class BookingHandler:
             return
         self._admission.check_booking(wanted, sender)
         record = self._record(wanted, sender)
-        self._door.check(self._now, wanted.needs, may_wait=False)
+        named = {need: amounts for need, amounts in wanted.needs.items() if host_in(need) is None}
+        self._door.check(self._now, named, may_wait=False)
         self._try(_Undecided(ticket, lambda: self._is_made(ticket, record.id, sender) or self._decide(ticket, record)))
 
     def _is_made(self, ticket: Ticket, booking: str, sender: Sender) -> bool:
@@ -117,8 +118,8 @@ class BookingHandler:
             check_name(wanted.name, "name of the booking")
             zone_of(wanted.zone)
             runtime, patience = duration(wanted.runtime, "runtime"), duration(wanted.patience, "patience")
-            if wanted.maintenance and any(map(is_pattern, wanted.needs)):
-                raise ValueError("name each device for maintenance; patterns are not allowed")
+            if wanted.urgent and not wanted.maintenance:
+                raise ValueError("only maintenance can be urgent")
         except (BadName, ValueError) as error:
             raise Refused("bad_request", str(error)) from None
         self._check_length(wanted.runtime)
@@ -201,12 +202,18 @@ class BookingHandler:
         others = [
             one
             for one, _ in self._core.bookings()
-            if one.start < claim.end and claim.start < one.end and _share(one, claim)
+            if one.start < claim.end and claim.start < one.end and self._share(one, claim)
         ]
         names = [f"{one.label or one.id} of {one.owner} ({', '.join(one.needs)})" for one in others[:NAMED]]
         more = f" and {len(others) - NAMED} more" if len(others) > NAMED else ""
         why = f"booked then: {'; '.join(names)}{more}" if names else "held, in maintenance or promised to who waits"
         return f"not all of {', '.join(date.record.needs)} are free at {told(date.start, date.record.zone)}: {why}"
+
+    def _share(self, one: Booking, other: Booking) -> bool:
+        """Return True if `other` needs an RC that `one` has."""
+        status = self._core.booking(one.id)
+        names = {*one.needs, *one.bound.values(), *(() if status is None else status.maintained)}
+        return any(rc in names or (is_pattern(rc) and any(map(matcher(rc), names))) for rc in other.needs)
 
     def _answer_kept(self, ticket: Ticket, record: BookingRecord, *, withdraw: bool = False) -> None:
         """Answers once it is kept; `withdraw`: forgets it where it can't be."""
@@ -353,16 +360,12 @@ class BookingHandler:
         for record in self._records:
             if record.unbooked or (owner is not None and record.owner != owner):
                 continue
-            if rc is not None and not any(
-                need == rc or (is_pattern(need) and matcher(need)(rc)) for need in record.needs
-            ):
+            named = rc is None or any(need == rc or (is_pattern(need) and matcher(need)(rc)) for need in record.needs)
+            if not named and not record.maintenance:
                 continue
             view = self._dates.view(record)
+            if not named and rc not in view.maintained:
+                continue
             if view.dates or (record.every and (record.until or 0) > self._dates.time + WINDOW):
                 views.append(view)
         return sorted(views, key=lambda view: (view.dates[0].start if view.dates else 1 << 60, view.id))
-
-
-def _share(one: Booking, other: Booking) -> bool:
-    names = {*one.needs, *one.bound.values()}
-    return any(rc in names or (is_pattern(rc) and any(matcher(rc)(name) for name in names)) for rc in other.needs)

@@ -24,7 +24,7 @@ from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.bookings.records import Records
 from zscout.services.rcm.booked_dates import BookedDates, Date
 from zscout.services.rcm.booking_handler import BookingHandler
-from zscout.types import SECOND, Ns
+from zscout.types import SECOND, HostName, Ns
 
 SLACK: Final[Ns] = SECOND // 100
 """Timers may be a little early."""
@@ -47,8 +47,8 @@ class _Due(Enum):
 
 
 class Bookings:
-    """Before `settles_at` not all dates of the fleet are known: after a restart of all its hosts, each knows its own
-    only."""
+    """`drained`: the hosts in maintenance. Before `settles_at` not all dates of the fleet are known: after a restart of
+    all its hosts, each knows its own only."""
 
     def __init__(
         self,
@@ -61,6 +61,7 @@ class Bookings:
         runtimes: RuntimeEstimator | None,
         settles_at: Ns,
     ) -> None:
+        self._core, self.drained = core, frozenset[HostName]()
         self._adaptive = fleet.strategy == "adaptive"
         self._strategy, self._records, self.clock, self.settles_at = fleet.strategy, records, clock, settles_at
         self.dates = BookedDates(core, records, clock)
@@ -162,6 +163,9 @@ class Bookings:
             self._tell_soon()
         if Dates in kinds:
             self._once(_Due.LOOK, GATHERS)
+        if (drained := self._core.drained()) != self.drained:
+            self.drained = drained
+            self.dates.out.drained.append(drained)
         if self.handler.undecided and kinds & {Vote, VoteOverdue}:
             self._once(_Due.TRY, BALLOTS)
         return self._out()

@@ -102,7 +102,8 @@ class Candidate:
         self._kept = KeptTerm(disk, self.terms)
         self.rcm: Rcm | None = None
         self.balancer: LoadBalancer | None = None
-        """Beside the RCM, while this node leads."""
+        self.placer: ComponentPlacer | None = None
+        """These two are beside the RCM, while this node leads."""
         self.terms_led = 0
         self.tally = Tally()
         """How operations ended that its RCMs were asked for."""
@@ -178,7 +179,7 @@ class Candidate:
             self._stop_leading()
 
     def _stop_leading(self) -> None:
-        self.rcm = self.balancer = None
+        self.rcm = self.balancer = self.placer = None
         self._leading.close()
 
     # What is seen
@@ -412,6 +413,7 @@ class Candidate:
                 self.learned.runtimes.estimator,
                 self._disbelieved,
                 self._parts.on_danger,
+                self._on_drained,
             ),
         )
         self._leading.callback(rcm.stop)
@@ -428,11 +430,18 @@ class Candidate:
         rcm.start(recovered)
         balancer = self.balancer = LoadBalancer(self.mesh, self._failed)
         inherited = self.ledger.inherited()
-        placer = ComponentPlacer(self.mesh, self.fleet, term, balancer, inherited, self._failed, self._authority)
+        maintained = rcm.bookings.drained
+        placer = self.placer = ComponentPlacer(
+            self.mesh, self.fleet, term, balancer, inherited, self._failed, self._authority, maintained
+        )
         for service in (balancer, placer):
             self._leading.callback(service.stop)
             service.start()
         return True
+
+    def _on_drained(self, hosts: frozenset[HostName]) -> None:
+        if self.placer is not None:
+            self.placer.maintain(hosts)
 
 
 def _refusal(reply: Reply[RcState] | Reply[ClientRequests], promise: Term) -> tuple[str, Term] | None:

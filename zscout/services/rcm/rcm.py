@@ -40,7 +40,7 @@ from zscout.services.rcm.booking_sharing import BookingSharing
 from zscout.services.rcm.bookings import Bookings, bookings_of
 from zscout.services.rcm.digest import HoldDigest, HoldListener
 from zscout.services.rcm.inventory import Inventory
-from zscout.types import SECOND, Ns, RcName, Term
+from zscout.types import SECOND, HostName, Ns, RcName, Term
 
 log = logging.getLogger(__name__)
 
@@ -67,6 +67,8 @@ class Parts(NamedTuple):
     """Called when no RC has joined, and one obeys an RCM of so low a term that this one is none to it."""
     on_danger: Callable[[BookedDanger], object] = lambda _: None
     """Called with dangers of bookings that last."""
+    on_drained: Callable[[frozenset[HostName]], object] = lambda _: None
+    """Called with the hosts in maintenance when they change."""
 
 
 class Alarm:
@@ -312,6 +314,8 @@ class Rcm:
             words = f"is in danger: {danger.why}" if danger.why else "is safe again"
             log.warning("booking %s of %s %s", danger.record.name, danger.record.owner, words)
             self._parts.on_danger(danger)
+        for drained in out.drained[-1:]:
+            self._parts.on_drained(drained)
         for text in out.log:
             log.info("%s", text)
         for subject, text in out.strange:

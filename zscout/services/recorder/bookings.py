@@ -139,7 +139,7 @@ def _gone(gone: Iterable[Dated], known: Container[str], now: float) -> Iterator[
 
 
 def _rcs(booking: BookingView, date: BookedDate) -> list[str]:
-    return list(dict.fromkeys(date.bound.get(need, need) for need in booking.needs))
+    return booking.maintained or list(dict.fromkeys(date.bound.get(need, need) for need in booking.needs))
 
 
 def _subject(booking: BookingView) -> str:

@@ -1,0 +1,212 @@
+"""`zscout drain` and `uncordon`: empty a host of components and holds, use it again.
+
+A host is drained by maintenance of all its devices that lasts until it is cancelled: nodes keep it as they keep
+bookings, and the placer cordons the host for as long."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from typing import Final
+
+import click
+from msgspec.structs import replace
+
+from zscout import terminal
+from zscout.behaviors.client.bookings import BookingsClient
+from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.placer_client import PlacerClient
+from zscout.behaviors.client.request import RequestRefused
+from zscout.cli import common
+from zscout.cli.booked import ask_bookings, explained, free_name, is_own, maintenance_of
+from zscout.cli.bookings.book import MAX_NAMED
+from zscout.cli.components import placing
+from zscout.cli.ownership import User
+from zscout.cli.requests.options import parse_comment, timeout_option
+from zscout.cli.requests.request import MAX_PRIORITY
+from zscout.cli.requests.waiting import hold_json, request_words
+from zscout.keyexpr import of_host
+from zscout.messages import MAX_AHEAD, DrainHost, Grants, HoldView, Placement, Placements, UncordonHost, Who
+from zscout.terminal import clean, clock
+from zscout.types import Grant
+
+OLDER: Final = "the leader is of an older version"
+CANT: Final = {"wrong_strategy": 'only strategy "adaptive" drains them', "bad_request": OLDER, "bad_name": OLDER}
+"""Why a leader can't drain devices, by the code of its refusal."""
+
+
+@click.command()
+@placing.host_argument
+@click.option("--wait", is_flag=True, help="Wait until its devices are free.")
+@click.option("--now", is_flag=True, help="End holds of its devices at once; their requests wait, at their places.")
+@timeout_option("Wait this long until it is empty, then exit with 1.")
+@click.option(
+    "--comment", type=common.Parsed("text", parse_comment), default="", help="A comment, shown to requests that wait."
+)
+@common.json_option("Print one JSON object.")
+@common.runs
+async def drain(host: str, wait: bool, now: bool, timeout: float | None, comment: str, as_json: bool) -> None:
+    """Grant the devices of a host to no request any more, place no component there, and move components away.
+
+    Holds end when their minimum runtimes are over, with --now at once. Waits until no movable component is left, with
+    --wait, --now or --timeout until the devices are free too. Exit code 1 names the components and holds that are
+    left, and why or until when. The host stays drained, also after Ctrl-C or --timeout and when it restarts, until
+    zscout uncordon.
+
+    \b
+    Examples:
+      zscout drain anvil --wait && ssh anvil sudo reboot
+      zscout drain anvil --now --comment 'new disk'
+      zscout drain anvil --timeout 2m
+    """
+    cordoned = f"{host} stays cordoned; to use it again: zscout uncordon {host}"
+    async with placing.connected("drain", as_json=as_json) as (client, shown, placer):
+        leftovers = _Leftovers(client, placer, host)
+        at_first = {placement.component for placement in leftovers.components()}
+        waits = wait or now or timeout is not None
+
+        def late() -> str:
+            return f"{host} is not empty after {terminal.span(timeout or 0)}: {leftovers.words()}; {cordoned}"
+
+        async with shown.within(timeout, late, cordoned):
+            granted = await _close(client, placer, host, urgent=now, comment=comment)
+            changed = client.mesh.subscribe(
+                client.mesh.keys.grants, Grants, lambda _, grants: placer.changed.set() if grants.revoked else None
+            )
+            await leftovers.look()
+            while leftovers.leaving() or (waits and leftovers.holds):
+                shown.update(f"{host}: {leftovers.words()}")
+                await placer.wait_changed()
+                await leftovers.look()
+            changed.close()
+        stay, holds = leftovers.components(), leftovers.holds
+        records = [known for name in sorted(at_first) if (known := placer.placements.get(name)) is not None]
+        moved = [record for record in records if record.host not in (host, None) and record.state == "running"]
+    if as_json:
+        went, stays = ([placing.placement_object(record) for record in some] for some in (moved, stay))
+        held = [hold_json(hold) | {"rcs": leftovers.rcs_of(hold)} for hold in holds]
+        terminal.print_json({"host": host, "moved": went, "stay": stays, "held": held})
+    for record in moved:
+        shown.say(f"{record.component} went to {record.host}{placing.out_of_work(record)}")
+    if stay or holds:
+        ends = ["end them with zscout component stop"] if stay else []
+        ends += ["wait for holds with --wait, or end them with --now"] if holds and not granted else []
+        raise common.Failed("; ".join((f"{host} is not empty: {leftovers.words()}", *ends, cordoned)))
+    still = f"; its devices are still granted: {granted}" if granted and leftovers.rcs else ""
+    shown.say(f"{host} is empty{still}; {cordoned}")
+
+
+@click.command()
+@placing.host_argument
+@common.json_option("Print one JSON object.")
+@common.runs
+async def uncordon(host: str, as_json: bool) -> None:
+    """Use a drained host and its devices again. Components that left it do not move back by themselves.
+
+    \b
+    Example:
+      zscout uncordon anvil
+    """
+    async with placing.connected("uncordon", as_json=as_json) as (client, _, placer):
+        if host not in placer.cordoned:
+            for line in await placing.absent(placer.mesh, [host]):
+                terminal.print_line(f"zscout: {line}", sys.stderr)
+        told, bookings = await ask_bookings(client), BookingsClient(client)
+        try:
+            for booking, date in maintenance_of(told, host):
+                if len(booking.needs) == 1:
+                    await bookings.unbook(booking.id, date.start if booking.every else None)
+            uncordoned = await placer.request(UncordonHost(host), Placements)
+        except RequestRefused as refused:
+            raise explained(refused) from None
+    if as_json:
+        terminal.print_json({"host": host, "components": list(map(placing.placement_object, uncordoned.components))})
+    else:
+        terminal.print_line(f"{host} is used again")
+
+
+async def _close(client: Client, placer: PlacerClient, host: str, *, urgent: bool, comment: str) -> str:
+    """Put the host in maintenance until that is cancelled. Where the leader can't, only components leave, and it
+    returns why. Raises Failed, RequestRefused."""
+    told, me, bookings = await ask_bookings(client), User.of(client), BookingsClient(client)
+    drains = [booking for booking, _ in maintenance_of(told, host) if booking.runtime >= MAX_AHEAD]
+    is_drained = any(booking.urgent or not urgent for booking in drains)
+    try:
+        if not is_drained:
+            await _check_host(client, placer, host)
+            # The name of the booking says all.
+            client.who = replace(client.who or Who(), command="")
+            await bookings.book(
+                {of_host(host): {}},
+                datetime.fromtimestamp(int(told.time), UTC),
+                MAX_AHEAD,
+                name=free_name(f"drain-{host}"[:MAX_NAMED], [one for one in told.bookings if is_own(one, me)]),
+                priority=MAX_PRIORITY,
+                maintenance=True,
+                urgent=urgent,
+                comment=comment,
+            )
+            for booking in drains:
+                await bookings.unbook(booking.id)
+        await placer.refresh()
+    except RequestRefused as refused:
+        if refused.code not in CANT:
+            raise explained(refused) from None
+        placer.take(*(await placer.request(DrainHost(host), Placements)).components)
+        return CANT[refused.code]
+    return ""
+
+
+async def _check_host(client: Client, placer: PlacerClient, host: str) -> None:
+    """Raises Failed for a host that is neither on the mesh nor known by a device or a component."""
+    state = await common.state_of(client)
+    if host not in {view.host for view in state.rcs} | {known.host for known in placer.placements.values()}:
+        for line in await placing.absent(placer.mesh, [host]):
+            raise common.Failed(line)
+
+
+class _Leftovers:
+    """The components and holds that are left on a host."""
+
+    def __init__(self, client: Client, placer: PlacerClient, host: str) -> None:
+        self._client, self._placer, self._host = client, placer, host
+        self.holds: list[HoldView] = []
+        self.rcs: set[str] = set()
+        self._until: dict[Grant, str] = {}
+
+    async def look(self) -> None:
+        """Ask the leader for the holds; without an answer they remain as they were."""
+        if (state := await self._client.state()) is None:
+            return
+        self.rcs = {view.rc for view in state.rcs if view.host == self._host}
+        self.holds = [hold for hold in state.holds if self.rcs & hold.needs.keys()]
+        for hold in self.holds:
+            # Always the same words for one end: in a pipe each change is a line.
+            if hold.remaining > 0:
+                self._until.setdefault(hold.grant, f" until {clock(hold.remaining, at_latest=True)}")
+
+    def rcs_of(self, hold: HoldView) -> list[str]:
+        return sorted(self.rcs & hold.needs.keys())
+
+    def components(self) -> list[Placement]:
+        found = (placement for _, placement in sorted(self._placer.placements.items()))
+        return [one for one in found if self._host in (one.host, one.to) and one.state not in placing.OVER]
+
+    def leaving(self) -> list[Placement]:
+        """A component that does not run yet is moved when it does."""
+        return [one for one in self.components() if one.movable or one.state != "running"]
+
+    def words(self) -> str:
+        return clean(", ".join((*self._held(), *map(_component_words, self.components()))))
+
+    def _held(self) -> Iterator[str]:
+        for hold in self.holds:
+            holder = request_words(hold.arc, hold.who, hold.client)
+            yield f"{holder} holds {', '.join(self.rcs_of(hold))}{self._until.get(hold.grant, '')}"
+
+
+def _component_words(placement: Placement) -> str:
+    why = placement.reason or ("" if placement.movable else "it can't be moved")
+    stays = "stays" + (f" ({why})" if why else "")
+    return f"{placement.component} {stays if placement.state == 'running' else placing.standing(placement)}"
