@@ -173,7 +173,9 @@ def test_who_would_run_into_maintenance_is_told_until_when(fleet: CliFleet) -> N
     waiting, said_first = fleet.begun("request waits", "request", "robot/c", "--min-runtime", "20m")
     try:
         waits = said_first[-1]
-        assert re.search(r"^request waits: maintenance of robot/c by .*, until .* at the latest; starts at ", waits)
+        assert re.search(
+            r"^request waits: maintenance of robot/c by .*, until .* at the latest: new gripper; starts at ", waits
+        )
     finally:
         end(waiting)
     assert fleet.zscout("request", "robot/c", "--min-runtime", "1m", "--", "true").returncode == 0, "it is over by then"

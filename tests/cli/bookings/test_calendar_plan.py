@@ -163,10 +163,10 @@ def test_maintenance_is_of_rcs_patterns_and_hosts() -> None:
     assert one.book.patience == 3600
     for need in ("robot/*", "@anvil"):
         own = event.replace("DTSTART", f"X-ZSCOUT-NEEDS:{need}\nDTSTART")
-        (one,) = plan_of(own, maintenance=True, needs=()).wanted
+        (one,) = plan_of(own, maintenance=True, mapped={}).wanted
         assert one.book is not None
         assert one.book.needs == {need: {}}
-    plain = plan_of(event.replace("DTSTART", "X-ZSCOUT-NEEDS:@anvil\nDTSTART"), needs=())
+    plain = plan_of(event.replace("DTSTART", "X-ZSCOUT-NEEDS:@anvil\nDTSTART"), mapped={})
     assert skipped(plain) == ['arm 1: device "@anvil" is not valid; write kind/name, as in robot/scout33 (failed)']
 
 

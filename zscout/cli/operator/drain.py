@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from datetime import UTC, datetime
 from typing import Final
 
@@ -69,17 +70,18 @@ async def drain(host: str, wait: bool, now: bool, timeout: float | None, comment
         def late() -> str:
             return f"{host} is not empty after {terminal.span(timeout or 0)}: {leftovers.words()}; {cordoned}"
 
-        async with shown.within(timeout, late, cordoned):
-            granted = await _close(client, placer, host, urgent=now, comment=comment)
-            changed = client.mesh.subscribe(
-                client.mesh.keys.grants, Grants, lambda _, grants: placer.changed.set() if grants.revoked else None
-            )
+        def revoked(_key: str, grants: Grants) -> None:
+            if grants.revoked:
+                placer.changed.set()
+
+        granted = await _close(client, placer, host, urgent=now, comment=comment)
+        with closing(client.mesh.subscribe(client.mesh.keys.grants, Grants, revoked)):
             await leftovers.look()
-            while leftovers.leaving() or (waits and leftovers.holds):
-                shown.update(f"{host}: {leftovers.words()}")
-                await placer.wait_changed()
-                await leftovers.look()
-            changed.close()
+            async with shown.within(timeout, late, cordoned):
+                while leftovers.leaving() or (waits and leftovers.holds):
+                    shown.update(f"{host}: {leftovers.words()}")
+                    await placer.wait_changed()
+                    await leftovers.look()
         stay, holds = leftovers.components(), leftovers.holds
         records = [known for name in sorted(at_first) if (known := placer.placements.get(name)) is not None]
         moved = [record for record in records if record.host not in (host, None) and record.state == "running"]
