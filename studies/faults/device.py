@@ -4,6 +4,7 @@ The promises about a device are checked here, where they count, and not by what 
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -30,6 +31,12 @@ class Device:
     """Who drives it, and in which process the driver is that let them."""
     programs: dict[Grant, str] = field(default_factory=dict)
     """Programs that touch it past its driver, by grant: whose they are."""
+    now: Callable[[], float] = lambda: 0.0
+    """Virtual time, of which no process has a clock."""
+    starts: float = 0.0
+    """Seconds from the beginning of a hold until it is ready."""
+    ready: dict[Grant, float] = field(default_factory=dict)
+    """By grant: from when on its holder could use it, in virtual time."""
     done: set[str] = field(default_factory=set)
     """The commands of programs that it has carried out."""
     newest: tuple[Process, Grant] | None = None
@@ -128,6 +135,25 @@ class WatchedExclusive(_Watched, ExclusiveDriver):
     def __init__(self, device: Device) -> None:
         super().__init__()
         self.device = device
+        self.begin_within = 1.5 * device.starts
+        self._ready_at = 0.0
+
+    async def begin(self, holder: Holder) -> None:
+        self._ready_at = asyncio.get_running_loop().time() + self.device.starts
+        self.device.ready[holder.grant] = self.device.now() + self.device.starts
+        await super().begin(holder)
+
+    def begins_for(self) -> float:
+        return max(0.0, self._ready_at - asyncio.get_running_loop().time())
+
+    async def carry_on(self, before: Holder, after: Holder) -> None:
+        if (ready := self.device.ready.get(before.grant)) is not None:
+            self.device.ready[after.grant] = ready
+        await super().begin(after)
+
+    async def safe(self) -> None:
+        self._ready_at = 0.0
+        await super().safe()
 
 
 class WatchedCapacity(_Watched, CapacityDriver):

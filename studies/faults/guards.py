@@ -25,8 +25,8 @@ from zscout.drivers.repeated import CommandMemory
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Sender
 from zscout.mesh.renewal import Suspicions
-from zscout.messages import BookingRecord, OpenRequest, Problem, Who
-from zscout.rcm import recovery, roster, terms
+from zscout.messages import BookingRecord, Holder, OpenRequest, Problem, Who
+from zscout.rcm import leader, recovery, roster, terms
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
 from zscout.rcm.leader import Leader
@@ -239,8 +239,8 @@ def _none_recovered(*_: object) -> list[Any]:
     return []
 
 
-def _at_its_end(_held: object, end: Ns) -> Ns:
-    return end
+def _at_its_end(held: Mapping[str, Holder], now: Ns) -> Ns:
+    return now + max(round(holder.remaining * SECOND) for holder in held.values())
 
 
 GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
@@ -340,6 +340,10 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         ),
         "protected": Guard(
             "who is protected stays so under the next leader", {(recovery, "_protected_from"): _at_its_end}
+        ),
+        "begun": Guard("a hold's time begins when its devices have begun", {(leader, "beginnings"): _none_recovered}),
+        "begun heard": Guard(
+            "an RC ends no hold by time that waits for another device", {(HoldTable, "_retime"): _nothing}
         ),
         "withdrawn": Guard(
             "what nobody asks for is given back",

@@ -42,6 +42,9 @@ LEFT_OVER: Final = 7.0
 PROTECTED: Final = 1.0
 """Seconds for which a leader may not believe yet that only operators preempt a hold, as was told first."""
 
+UNUSED: Final = 0.3
+"""Seconds of a hold's time that may be over before its program learns that its devices are ready."""
+
 LOSSES: Final = ("lost", "client_lost")
 
 Rank: TypeAlias = tuple[int, Ns, Place]
@@ -219,6 +222,15 @@ class Promises:
             self._dropped[full] = self._now()
         if arc.outcome == "client_lost" and not arc.open:
             self._broken(f"{name} lives, and was dropped")
+
+    def had_its_time(self, name: str, arc: OpenArc, rcs: Sequence[str], ready: Collection[float | None]) -> None:
+        """A hold that no fault touched ends after its time. `ready`: since when each of its slow devices could be
+        used."""
+        since = max((self._now() if at is None else at for at in ready), default=-math.inf)
+        had = self._now() - since
+        if had < float(arc.min_runtime) - UNUSED:
+            asked = f"{had:.1f} of {arc.min_runtime} s"
+            self._broken(f"{name} {arc.name} could use {' '.join(rcs)} for {asked}: the rest it lost to their start")
 
     def _follow_hand_over(self, name: str, arc: OpenArc, held: tuple[str, list[str]], *, touched: bool) -> None:
         """What the old client held as it let go, the new one holds, unless it was taken by an RCM that knew of it."""

@@ -74,6 +74,8 @@ DEVICES: Final[Mapping[str, Mapping[str, Fraction] | None]] = {
     "framegrabber/f": None,
     "radio/r": {"rate": Fraction(10)},
 }
+SLOW: Final[Mapping[str, float]] = {"robot/a": 4.0, "framegrabber/f": 1.0}
+"""Seconds that some devices need to start, in runs that have slow ones."""
 DRIFT: Final = 0.001
 """By which clocks run apart at most."""
 SERVED_WITHIN: Final = 60.0
@@ -117,6 +119,8 @@ class Size:
     """Certificates are there, and members lie about terms."""
     bookers: int = 0
     """Programs that book, give up and take up."""
+    slow: bool = False
+    """Two devices need time to start for a holder."""
     forger: bool = False
     """Names are proven, and one that has a certificate lists, reports and keeps what is not so."""
 
@@ -124,7 +128,7 @@ class Size:
     def of(cls, seed: int) -> Size:
         """Every tenth run is a long one of many, every tenth one of moves that fail, every tenth one of programs that
         touch devices past their RCs, every tenth one with a thief, one with liars, every fifth one of bookings, every
-        twentieth one with a forger."""
+        twentieth one with a forger, every fortieth one of devices that start slowly."""
         match seed % 10:
             case 3 | 4:
                 return cls(bookers=2, clients=3, faults=4, span=40.0)
@@ -140,6 +144,8 @@ class Size:
                 return cls(liars=True)
             case 5 if seed % 20 == 5:
                 return cls(forger=True)
+            case 5 if seed % 40 == 35:
+                return cls(slow=True)
         return cls()
 
 
@@ -512,7 +518,8 @@ class Simulation:
         mesh_token.close()
 
     def _device(self, rc: str) -> Device:
-        return Device(rc, DEVICES[rc], self.broken, self.log)
+        starts = SLOW.get(rc, 0.0) if self.size.slow else 0.0
+        return Device(rc, DEVICES[rc], self.broken, self.log, now=lambda: self.loop.now, starts=starts)
 
     async def _offer(
         self, name: str, device: Device, mesh: MemoryMesh, stall: StallWatch, confirmations: ConfirmServer | None = None
@@ -579,9 +586,14 @@ class Simulation:
             self.log(f"{arc.name} {arc.state} {arc.outcome or ''} {arc.reason}")
             self.booked.news(arc, self._leading_hosts())
             grant, since, rcs = began.get(arc.id, (None, 0.0, []))
-            self.promises.told(
-                name, arc, client.internals.term, touched=self.excuses.felt(since, name, *rcs, *arc.rcs, *arc.needs)
-            )
+            touched = self.excuses.felt(since, name, *rcs, *arc.rcs, *arc.needs)
+            self.promises.told(name, arc, client.internals.term, touched=touched)
+            slow = [self.devices[rc] for rc in rcs if self.devices[rc].starts]
+            if slow and grant is not None and arc.grant is None:
+                del began[arc.id]
+                if arc.outcome == "completed" and not touched:
+                    ready = [device.ready.get(grant) for device in slow]
+                    self.promises.had_its_time(name, arc, rcs, ready)
             if arc.grant is not None and arc.grant != grant:
                 began[arc.id] = arc.grant, self.loop.now - START, arc.rcs
 

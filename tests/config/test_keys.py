@@ -171,13 +171,15 @@ CHANNELS: Final = '{ "video/ch1" = 1 }'
 SOURCES: Final = '{ "video/ch1" = "/dev/video0" }'
 ACTIVATION: Final = _number("0.0", "0.5", "3600", "-1", "3601")
 SETTLE: Final = _number("5.0", "0.5", "60", "0.4", "61")
+BEGIN_WITHIN: Final = Key(None, ("0", "86_400", '"2m"'), ("-1", "86_401", "nan"))
 RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
-    "exclusive": ('name = "robot/a"', {"activation": ACTIVATION, "settle": SETTLE}),
+    "exclusive": ('name = "robot/a"', {"activation": ACTIVATION, "settle": SETTLE, "begin_within": BEGIN_WITHIN}),
     "capacity": (
         'name = "radio/a"\ncapacity = { rate = 10 }',
         {
             "capacity": Key(None, ("{ rate = 0.1, width = 2 }",), ("{}", "{ rate = -1 }", '{ "a b" = 1 }', "10")),
             "settle": SETTLE,
+            "begin_within": BEGIN_WITHIN,
             "activation": ACTIVATION,
         },
     ),
@@ -192,6 +194,7 @@ RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
             "every": _number("10.0", "0.5", "3600", "0.4", "3601"),
             "timeout": _number("5.0", "0.1", "600", "0.09", "601"),
             "settle": SETTLE,
+            "begin_within": BEGIN_WITHIN,
             "activation": ACTIVATION,
         },
     ),
@@ -201,6 +204,7 @@ RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
             "port": Key(None, ('"loop://"',), ('""', "1")),
             "baud": _number("9600", "300", "1_000_000", "299", "1_000_001"),
             "settle": SETTLE,
+            "begin_within": BEGIN_WITHIN,
             "bound": _number("0.25", "0.01", "10", "0.009", "11"),
             "dtr": Key(None, ("true", "false"), ("1", '"on"')),
             "rts": Key(None, ("true", "false"), ("1", '"on"')),
@@ -215,11 +219,12 @@ RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
                 "{}", (CHANNELS,), ('{ "robot/b" = 1 }', '{ "video/ch1" = 0 }', '{ "video/a" = 1, "video/b" = 1 }')
             ),
             "settle": SETTLE,
+            "begin_within": BEGIN_WITHIN,
             "warm_up": _number("2.0", "0", "60", "-1", "61"),
             "dead_man": _number("0.5", "0.05", "5", "0.04", "5.1"),
         },
     ),
-    "video": ('name = "video/a"', {"settle": SETTLE}),
+    "video": ('name = "video/a"', {"settle": SETTLE, "begin_within": BEGIN_WITHIN}),
     "framegrabber": (
         'name = "framegrabber/a"\nsource = "/dev/video0"',
         {
@@ -227,6 +232,7 @@ RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
             "sources": Key(None, (), ("{}", '{ "robot/a" = "b" }')),
             "rate": _number("10.0", "0.1", "60", "0.09", "61"),
             "settle": SETTLE,
+            "begin_within": BEGIN_WITHIN,
             "quality": _number("80", "1", "100", "0", "101"),
             "picture_within": _number("1.5", "0.5", "600", "0.4", "601"),
             "still_after": Key(None, ("0", "86_400", '"30s"'), ("-1", "86_401", '"never"')),

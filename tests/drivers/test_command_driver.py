@@ -184,6 +184,25 @@ async def test_a_start_that_fails_loses_the_device_with_its_last_line_until_it_w
         await rc.until("ok")
 
 
+async def test_a_start_that_fails_again_and_again_is_tried_ever_more_slowly_and_says_so(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(command_driver, "AGAIN", (0.05, 0.3))
+    clock = asyncio.get_running_loop().time
+    # That its health is good again at once makes no difference.
+    async with play(start="exit 3", health="true", safe="true", every=0.01) as (driver, rc):
+        for pause in (0.05, 0.1, 0.2, 0.3, 0.3):
+            rc.said.clear()
+            await driver.begin(holder(1))
+            await rc.until("start ended with exit code 3")
+            failed = clock()
+            await over(driver)
+            await rc.until("ok")
+            assert clock() - failed > 0.9 * pause
+            said = rc.said[0]
+        assert said == "start ended with exit code 3 (5 times in a row; tried again in 0.3 s)"
+
+
 async def test_a_device_that_can_not_be_made_safe_is_lost_and_tried_until_it_is() -> None:
     async with play(safe="test -e there") as (_driver, rc):
         assert rc.health.startswith("safe ended with exit code 1")

@@ -44,7 +44,7 @@ async def test_a_slow_start_is_waited_for_and_told_of(tmp_path: Path, lab: Lab) 
     held = await lab.zscout("request", "psu/bench:voltage=12", *program)
     assert held.returncode == 0, held.stderr
     assert told.read_text().splitlines()[:2] == ['{"voltage": 12.0}', "enter"]
-    assert "and waits: psu/bench is starting; wait at most " in held.stderr
+    assert "starting, ready in about " in held.stderr
     for asked, why in (
         ({"voltage": 31}, "can never start: voltage 31 of 30 at psu/bench"),
         ({"current": 1}, "psu/bench has no parameter current; it has voltage"),

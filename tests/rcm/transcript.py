@@ -2,8 +2,8 @@
 
     at TIME                                       sets the clock for what follows; `at TIME COMMAND` too
     secured NAME=client|operator ...                a new leader, with [security] and these roles
-    holds RC HOST [ID CLIENT TERM.N RC,... [priority=N] [remaining=S] [place=TERM.N]]
-                                                  what an RC answered to the takeover
+    holds RC HOST [begins=S] [ID CLIENT TERM.N RC,... [priority=N] [remaining=S] [place=TERM.N]
+                                                  [waits=S]]: what an RC answered to the takeover
     lists CLIENT [ID NEED,... [priority=N] [place=TERM.N] [grant=TERM.N]]
                                                   what a client answered to it
     lead                                          takes over what was answered
@@ -65,7 +65,7 @@ from zscout.scheduling.strategies import STRATEGIES
 from zscout.types import Grant, Ns, Place, Term
 
 OWN = Term(9, "new")
-OPTIONS = ("priority", "runtime", "remaining", "place", "grant", "rcs")
+OPTIONS = ("priority", "runtime", "remaining", "place", "grant", "rcs", "waits")
 
 
 class NoBookings:
@@ -200,7 +200,10 @@ class LeaderPlayer:
         return Token(client.host, Role.CLIENT, client.client, "1")
 
     def _state(self, rc: str, host: str, *words: str) -> RcState:
-        holders = []
+        holders, known = [], dict[str, Any]()
+        if words and words[0].startswith("begins="):
+            known = {"begin_within": float(words[0].partition("=")[2]), "settle": 5.0}
+            words = words[1:]
         if words:
             id_, client, grant, rcs = words[:4]
             more = settings(words[4:], *OPTIONS)
@@ -208,8 +211,10 @@ class LeaderPlayer:
             remaining, priority = float(more.get("remaining", 60)), int(more.get("priority", 0))
             held = Grant(*_pair(grant))
             holder = Holder(id_, id_, client, held, place, rcs.split(","), Decimal(60), remaining, priority=priority)
+            if "waits" in more:
+                holder = structs.replace(holder, waits=float(more["waits"]))
             holders.append(holder)
-        return RcState(rc, host, f"{host}-1", sharable=False, holders=holders)
+        return RcState(rc, host, f"{host}-1", sharable=False, holders=holders, **known)
 
     def _requests(self, client: str, *words: str) -> ClientRequests:
         return ClientRequests(client, [self._ask(*words, kind=OpenRequest)] if words else [], OWN)
@@ -247,7 +252,9 @@ class LeaderPlayer:
         if out.publication is not None:
             number = f"{out.publication.term.counter}.{out.publication.seq}"
             for rc, held in out.publication.rcs.items():
-                holders = ", ".join(f"{holder.id} of {holder.client} by {_grant(holder.grant)}" for holder in held)
+                holders = ", ".join(
+                    f"{holder.id} of {holder.client} by {_grant(holder.grant)}{_waits(holder)}" for holder in held
+                )
                 yield f"publish {number}: {rc}: {holders or 'nobody'}"
             for over in out.publication.revoked:
                 yield f"publish {number}: {over.id} of {over.client} is over ({over.outcome}): {over.reason}"
@@ -278,10 +285,14 @@ def _notice(notice: Notice) -> str:
 
 def _state(notice: Notice) -> str:
     if notice.state == "running" and notice.grant is not None:
-        return f"running by {_grant(notice.grant)} on {', '.join(notice.rcs)}"
+        return f"running by {_grant(notice.grant)} on {', '.join(notice.rcs)}{_waits(notice)}"
     place = f" at place {notice.place.term.counter}.{notice.place.arrival}" if notice.place is not None else ""
     why = notice.problem.message if isinstance(notice.problem, Problem) else notice.reason
     return f"{notice.state}{place}{f' ({notice.outcome})' if notice.outcome else ''}{f': {why}' if why else ''}"
+
+
+def _waits(told: Holder | Notice) -> str:
+    return "" if told.waits is None else f", which begin within {told.waits:g} s, then {told.remaining:g} s"
 
 
 def _grant(grant: Grant) -> str:

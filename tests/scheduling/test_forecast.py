@@ -23,7 +23,18 @@ from zscout.scheduling.adaptive import Adaptive
 from zscout.scheduling.booking import Booked, Booking, Dates
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast, play_instant
-from zscout.scheduling.model import ArcRequest, Event, Granted, HoldEnded, LeadTaken, Outcome, RcJoined, Requested, Tick
+from zscout.scheduling.model import (
+    ArcRequest,
+    Event,
+    Granted,
+    HoldEnded,
+    LeadTaken,
+    Outcome,
+    RcBegins,
+    RcJoined,
+    Requested,
+    Tick,
+)
 from zscout.simulation.workload import Workload
 from zscout.types import SECOND, ArcId, Ns, Params, Term
 
@@ -51,6 +62,21 @@ def test_a_kept_hold_is_foretold_to_yield_after_its_time() -> None:
     core.handle(0, Requested(request("kept", "robot/a", seconds=5, keep=True)))
     core.handle(0, Requested(request("next", "robot/a")))
     assert forecast(core, 0).starts == {"next": 5 * SECOND}
+
+
+def test_starts_are_foretold_with_the_time_that_devices_need_to_begin() -> None:
+    core, job = Core(), request("job", "dut/slow", seconds=6)
+    core.handle(0, RcJoined("dut/slow", sharable=False, begin_within=20 * SECOND))
+    (granted, *_) = core.handle(0, Requested(job))
+    assert isinstance(granted, Granted)
+    core.handle(0, RcBegins("dut/slow", 20 * SECOND, {granted.grant: 15 * SECOND}))
+    core.handle(0, Requested(request("next", "dut/slow", seconds=5)))
+    foretold = forecast(core, 0, request("last", "dut/slow", seconds=7))
+    assert foretold.starts == {"next": 21 * SECOND, "last": (21 + 20 + 5) * SECOND}
+    assert foretold.begin_within == 20 * SECOND
+    # It begins sooner than it might have.
+    core.handle(3 * SECOND, RcBegins("dut/slow", 20 * SECOND, {granted.grant: None}))
+    assert forecast(core, 3 * SECOND).starts == {"next": 9 * SECOND}
 
 
 @settings(max_examples=times(60))

@@ -1,12 +1,13 @@
 """Stories of the scheduling core as text (see `tests/transcripts.py`). Its commands:
 
     at TIME                                    sets the clock for what follows; `at TIME COMMAND` too
-    join RC [sharable] [host=NAME]             leave RC [REASON]            lost CLIENT
+    join RC [sharable] [host=NAME] [begins=S|unknown]                       lost CLIENT
+    leave RC [REASON]   waits RC ARC S         begun RC ARC
     ask ARC NEED,... [priority=N] [runtime=S] [client=NAME] [keep] [place=TERM.N]
     cancel ARC          release ARC            handover ARC CLIENT NEW_NAME    tick
     vote N yes|no [REASON]                     overdue N
     rules RC            ended RC ARC,...
-    standing ARC ... grant=TERM.N start=S      waiting ARC ...              for the `lead` that follows
+    standing ARC ... grant=TERM.N start=S [waits=RC:S]  waiting ARC ...              for the `lead` that follows
     adopt ARC ... grant=TERM.N start=S         place ARC TERM.N             unconfirmed ARC TERM.N RC,...
     lead TERM
     book ID NEED,... start=S [runtime=S] [patience=S] [priority=N] [since=S] [bound=RC,...] [tentative]
@@ -14,8 +15,9 @@
     unbook ID [now]     redate ID S            slots ID NEED,... start=S until=S [runtime=S] [priority=N] [bookings]
     strategy NAME [patience=S] [half_life=S]   a new core; without it, it is `priority`; a half-life: with fair shares
 
-What is unbooked `now` can't be at present. What is `bound` are the RCs kept for the patterns, in their order. A NEED
-is `kind/name`, with parameters `kind/name{rate=5 width=0.1}`; a TERM is `COUNTER:RCM`.
+`begins` is the bound on how long an RC needs to begin; `waits`: an ARC waits for it for S seconds at most. What is
+unbooked `now` can't be at present. What is `bound` are the RCs kept for the patterns, in their order. A NEED is
+`kind/name`, with parameters `kind/name{rate=5 width=0.1}`; a TERM is `COUNTER:RCM`.
 """
 
 from __future__ import annotations
@@ -58,6 +60,7 @@ class CorePlayer:
 
     core: Core = field(default_factory=Core)
     now: Ns = 0
+    bounds: dict[str, Ns | None] = field(default_factory=dict)
     standing: list[model.RecoveredHold] = field(default_factory=list)
     waiting: list[model.Requested] = field(default_factory=list)
 
@@ -72,6 +75,8 @@ class CorePlayer:
                 return self.slots(" ".join(words[1:]))
             if words and (event := self.event(words[0], " ".join(words[1:]))) is not None:
                 events.append(event)
+                if isinstance(event, model.RcJoined):
+                    self.bounds[event.rc] = event.begin_within
         if not events:
             return []
         decided = self.core.handle(self.now, *events)
@@ -90,6 +95,12 @@ class CorePlayer:
             lines.append(f"free from {seconds(slot.start)} to {seconds(slot.latest)}{bound}")
         lines += [f"unknown {rc.name}: {', '.join(sorted(holders))}" for rc, holders in told.unknown]
         return lines or ["none"]
+
+    def begins(self, rc: str, name: str, until: Ns | None) -> model.RcBegins:
+        arc = self.core.arc(name)
+        if arc is None or arc.hold is None:
+            raise ValueError(f"{name} holds nothing")
+        return model.RcBegins(rc, self.bounds[rc], {arc.hold.grant: until})
 
     def event(self, verb: str, rest: str) -> model.Event | None:
         first, _, second = rest.partition(" ")
@@ -124,9 +135,9 @@ class CorePlayer:
             "place": lambda: model.PlaceShown(first, _place(second)),
             "unconfirmed": lambda: model.Unconfirmed(first, Grant(*_place(words[0])), tuple(words[1].split(","))),
             "reachable": lambda: model.Reachable(first),
-            "join": lambda: model.RcJoined(
-                first, "sharable" in words, settings([word for word in words if "=" in word], "host").get("host", "")
-            ),
+            "join": lambda: _join(first, words),
+            "waits": lambda: self.begins(first, words[0], self.now + ns(words[1])),
+            "begun": lambda: self.begins(first, words[0], None),
             "leave": lambda: model.RcLost(first, second) if second else model.RcLost(first),
             "lost": lambda: model.ClientLost(first),
             "cancel": lambda: model.Cancelled(first),
@@ -145,11 +156,22 @@ class CorePlayer:
         return others[verb]()
 
 
+def _join(rc: str, words: list[str]) -> model.RcJoined:
+    options = settings((word for word in words if word != "sharable"), "begins", "host")
+    known, host = options.get("begins", "0"), options.get("host", "")
+    return model.RcJoined(rc, "sharable" in words, host, None if known == "unknown" else ns(known))
+
+
 def _held(text: str) -> model.RecoveredHold:
     request, options = _request(text)
     start = ns(options["start"])
     grant, place = Grant(*_place(options["grant"])), _place(options["place"])
-    return model.RecoveredHold(request, place, grant, start, start + request.min_runtime)
+    waits: dict[str, Ns | None] = {}
+    if "waits" in options:
+        rc, _, until = options["waits"].partition(":")
+        waits[rc] = ns(until)
+    end = max(start, waits.get(rc, start) or start) + request.min_runtime if waits else start + request.min_runtime
+    return model.RecoveredHold(request, place, grant, start, end, waits=waits)
 
 
 def _booking(text: str, now: Ns) -> tuple[Booking, dict[str, str]]:
@@ -187,7 +209,7 @@ def _request(text: str) -> tuple[model.ArcRequest, dict[str, str]]:
         pairs = (pair.split("=") for pair in (match[2] or "").split())
         wanted[match[1]] = {key: Fraction(value) for key, value in pairs}
     words = (word for word in rest if word not in {"keep", "maintenance", "urgent", "bookings", "tentative"})
-    known = "priority runtime client place grant start booking patience since bound until"
+    known = "priority runtime client place grant start booking patience since bound until waits"
     options = settings(words, *known.split())
     request = model.ArcRequest(
         arc=arc,
@@ -230,6 +252,8 @@ def _print(effect: model.Effect) -> str:
         case model.Granted(arc=arc, client=client, grant=grant, rcs=rcs, start=start, end=end):
             span = f"from {seconds(start)} " + ("on" if end is None else f"to {seconds(end)}")
             return f"grant {arc} to {client} ({_grant(grant)}): {', '.join(rcs)} {span}"
+        case model.HoldTimed(arc=arc, grant=grant, waits=waits):
+            return f"hold {arc} ({_grant(grant)}) " + ("begins" if waits is None else f"begins by {seconds(waits)}")
         case model.HoldEnded(arc=arc, grant=grant, outcome=outcome, reason=reason, requeued=requeued, by=by):
             took = f" by {by}" if by is not None else ""
             tail = "; queued again" if requeued else ""

@@ -41,6 +41,12 @@ class AnyRc(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     settle: Annotated[
         Ns, seconds("0.5", "60", "A program that touches the device past its RC must end within, and a safe state.")
     ] = SETTLE
+    begin_within: Annotated[
+        Ns | None,
+        seconds(
+            "0", "86400", "The longest time from a grant until the device is ready. Without it: what its driver says."
+        ),
+    ] = None
 
 
 class RcTable(AnyRc, frozen=True, tag_field="driver"):

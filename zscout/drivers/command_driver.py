@@ -45,6 +45,11 @@ AGAIN: Final = (1.0, 60.0)
 """Seconds until a device that failed is tried again: the first time, and the longest."""
 
 
+def _pause(failures: int) -> float:
+    """Seconds until it is tried again, after so many failures before the last."""
+    return min(AGAIN[0] * 2.0 ** min(failures, 16), AGAIN[1])
+
+
 @dataclass(frozen=True, slots=True)
 class Ended:
     """How a command ended."""
@@ -65,6 +70,7 @@ class CommandDriver(Driver):
     def __init__(self, rc: CommandRc) -> None:
         super().__init__(rc)
         self.activation = rc.activation / SECOND
+        self.begin_within = rc.timeout / SECOND if rc.start else 0.0
         self._told = rc
         self._holder: Holder | None = None
         """Who holds it."""
@@ -79,6 +85,8 @@ class CommandDriver(Driver):
         """Why it can't be held."""
         self._failed_starts = 0
         """In a row."""
+        self._not_before = 0.0
+        """After a failed start, it is not offered before then, by the loop's clock."""
         self._looked = asyncio.Event()
         self._news = asyncio.Event()
         """It was lost."""
@@ -115,9 +123,13 @@ class CommandDriver(Driver):
         ended = await self._run("start", self._told.start, holder)
         self._start_seconds = ended.seconds
         if ended.problem:
+            pause = _pause(self._failed_starts)
             self._failed_starts += 1
-            self._unsure = ended.problem
-            self._lose(ended.problem)
+            self._unsure, why = ended.problem, ended.problem
+            self._not_before = asyncio.get_running_loop().time() + pause
+            if self._failed_starts > 1:
+                why += f" ({self._failed_starts} times in a row; tried again in {pause:g} s)"
+            self._lose(why)
         else:
             self._failed_starts = 0
 
@@ -175,9 +187,10 @@ class CommandDriver(Driver):
                     continue
             if self._stands_by:
                 tries = 0
-            again = min(AGAIN[0] * 2.0 ** min(max(tries, self._failed_starts - 1), 16), AGAIN[1])
+            again = _pause(tries)
             tries += 1
-            await asyncio.sleep(again if every is None or self._unsure else min(again, every))
+            again = again if every is None or self._unsure else min(again, every)
+            await asyncio.sleep(max(again, self._not_before - asyncio.get_running_loop().time()))
 
     async def _look(self) -> None:
         """Makes it safe where its state is not known, and looks whether it is well."""
@@ -193,7 +206,7 @@ class CommandDriver(Driver):
             why = self._unsure or ended.problem  # a start may have failed before it
         if why:
             self._lose(why)
-        elif self._lost:
+        elif self._lost and asyncio.get_running_loop().time() >= self._not_before:
             self._lost = ""
             self._rc.recover()
 

@@ -74,7 +74,10 @@ class Driver:
     """True if nodes with other devices of the same hold may command the device under its grant. A radio is commanded by
     the node of a robot, for example."""
     activation: float = 0.0
-    """Seconds after a grant until the device is fully usable, such as the warm-up time of a camera."""
+    """Seconds after a grant until the device is fully usable, such as the warm-up time of a camera. The holder's
+    runtime passes meanwhile."""
+    begin_within: float = 0.0
+    """The longest time in seconds that `begins_for` returns for a hold that begins."""
 
     def __init__(self, options: Any = None) -> None:
         """Keep `options`, an instance of `Options`. Raise ValueError with one line if they are bad. Open the device
@@ -97,8 +100,8 @@ class Driver:
         """A hold begins. Spawn what takes time, and return its duration from `begins_for`."""
 
     def begins_for(self) -> float:
-        """Seconds, at most, until the device is ready for the hold that began. Until 0 the holder waits, and
-        commands other than `stop` and `halt` are refused as `settling`."""
+        """Seconds, at most, until the device is ready for the hold that began. Until 0 the holder waits, its runtime
+        does not pass, and commands other than `stop` and `halt` are refused as `settling`."""
         return 0.0
 
     async def carry_on(self, before: Holder, after: Holder) -> None:

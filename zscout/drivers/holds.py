@@ -10,6 +10,8 @@ The rules, all of them:
   snapshot may add a hold that was missed; it ends nothing.
 - A command is obeyed only under exactly a grant that is held now, from the client that holds it.
 - A hold ends here by itself when its time is over, or when nothing of an RCM was received for the hold lease.
+- Its time begins when the device has begun for it, and where other devices of it have not (`waits` in a publication),
+  when the leader publishes that they have.
 - A promise given to a term is kept: no lower one is obeyed again.
 - The program of a direct hold touches the device past this RC. When such a hold, once confirmed here, ends in any way
   but its own client's release or a hand-over, the RC settles: nothing is obeyed under grants that began after that end,
@@ -19,8 +21,9 @@ The rules, all of them:
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from msgspec import structs
@@ -41,11 +44,41 @@ class HoldEntry:
     """A holder, and when its minimum runtime is over on this host's clock."""
 
     holder: Holder
+    """As published last."""
     end: Ns
     since: int = 0
     """Counts beginnings and ends: a hold is held back by what settles since before it."""
     gone_by: Ns | None = None
     """Of a direct one that was confirmed: by then its program is gone, if it is not confirmed again."""
+    begun: bool = True
+    """The device has begun for it."""
+    protected_from: Ns | None = None
+    """From then on only operators preempt it."""
+
+    @property
+    def is_timed(self) -> bool:
+        """Return True if its time runs: all its devices have begun."""
+        return self.begun and self.holder.waits is None
+
+    def is_over(self, now: Ns) -> bool:
+        return self.is_timed and now >= self.end and not self.holder.keep
+
+    def take(self, holder: Holder, now: Ns) -> None:
+        """What was published of it, at its beginning or as its devices have begun."""
+        self.holder, self.end = holder, now + round(holder.remaining * SECOND)
+        if holder.protected_from is not None:
+            self.protected_from = self.end - round(holder.protected_from * SECOND)
+
+    def state(self, now: Ns, waits: Ns | None) -> Holder:
+        """As it is now. `waits`: for how long this device has not begun, at most."""
+        if self.is_timed:
+            return structs.replace(self.holder, remaining=(self.end - now) / SECOND)
+        # All of its time is left. What protects it does not wait.
+        left, protected = self.holder.remaining, None
+        if self.protected_from is not None:
+            protected = left - (self.protected_from - now) / SECOND
+        until = None if waits is None else waits / SECOND
+        return structs.replace(self.holder, protected_from=protected, waits=until)
 
 
 class Settling(NamedTuple):
@@ -125,8 +158,9 @@ def _named(holder: Holder) -> str:
 
 
 class HoldTable:
-    def __init__(self, rc: str, *, hold_lease: Ns, settle: Ns = 0, instance: str = "") -> None:
-        self.rc, self.instance = rc, instance
+    def __init__(self, rc: str, *, hold_lease: Ns, settle: Ns = 0, instance: str = "", begins: bool = False) -> None:
+        """`begins`: the caller reports when the device has `begun` for a holder."""
+        self.rc, self.instance, self._begins = rc, instance, begins
         self.hold_lease, self.settle = hold_lease, settle
         self.term: Term = NO_TERM
         """The newest term received or promised."""
@@ -186,6 +220,8 @@ class HoldTable:
                 change.announce = True
             elif grant not in self.held:
                 self._begin(holder, change, now)
+            else:
+                self._retime(holder, now)
         return change
 
     def apply_snapshot(
@@ -206,9 +242,12 @@ class HoldTable:
         change.announce = any(grant not in known for grant in self.held)
         self._awaited.clear()
         for view in state.holds:
-            if self.rc not in view.needs or view.grant in self.held or view.grant in self._ended:
+            if self.rc not in view.needs or view.grant in self._ended:
                 continue
             holder = carried(view, Holder, rcs=sorted(view.needs), params=view.needs[self.rc])
+            if view.grant in self.held:
+                self._retime(holder, now)
+                continue
             # An ARC has one hold: its older one is over.
             older = [grant for grant, held in self.held.items() if _arc(held.holder) == _arc(holder)]
             others = [held.holder for grant, held in self.held.items() if grant not in older]
@@ -261,7 +300,7 @@ class HoldTable:
         for grant, held in list(self.held.items()):
             if lease_over:
                 self._remove(grant, "lease: no leader published for too long", change, now, expired="lease")
-            elif now >= held.end and not held.holder.keep:
+            elif held.is_over(now):
                 self._remove(grant, "its time is over", change, now, expired="time")
         for grant in [grant for grant, settling in self.settling.items() if now >= settling.gone_by]:
             self._leave(grant, change)
@@ -269,7 +308,7 @@ class HoldTable:
 
     def next_expiry(self) -> Ns | None:
         """When `expire` should be called next."""
-        ends = [held.end for held in self.held.values() if not held.holder.keep]
+        ends = [held.end for held in self.held.values() if held.is_timed and not held.holder.keep]
         if self.held:
             ends.append(self.last_contact + self.hold_lease)
         return min([*ends, *(settling.gone_by for settling in self.settling.values())], default=None)
@@ -338,7 +377,7 @@ class HoldTable:
         newer = (grant.term, grant.seq) > (self.term, self.seq) and not absurd(grant.term, self.term)
         if held is not None and held.holder.client != client:
             code, why = "wrong_client", f"{self.rc} is held by {_named(held.holder)}, not by {client}"
-        elif held is not None and now >= held.end and not held.holder.keep:
+        elif held is not None and held.is_over(now):
             code, why = "ended", f"the hold of {self.rc} is over: its time is up"
         elif held is not None:
             return None
@@ -353,19 +392,37 @@ class HoldTable:
             code, why = "not_holder", f"{self.rc} is held by {holders}"
         return Problem(code, why, self.term)
 
-    def holders(self, now: Ns) -> list[Holder]:
-        """The holders, with the time that each has left now."""
-        return [structs.replace(held.holder, remaining=(held.end - now) / SECOND) for held in self.held.values()]
+    def holders(self, now: Ns, waits: Mapping[Grant, Ns] = MappingProxyType({})) -> list[Holder]:
+        """The holders, with the time that each has left now. `waits`: for how long the device has not begun for one,
+        at most."""
+        return [held.state(now, waits.get(grant)) for grant, held in self.held.items()]
+
+    # Beginning
+
+    def begun(self, grant: Grant, now: Ns, *, late: bool = False) -> None:
+        """The device has begun for a hold in force. `late`: not at its grant, so that its time begins now."""
+        entry = self.held[grant]
+        if not entry.begun:
+            entry.begun = True
+            if late and entry.holder.waits is None:
+                entry.end = now + round(entry.holder.remaining * SECOND)
+
+    def _retime(self, holder: Holder, now: Ns) -> None:
+        """The leader publishes a hold in force again: its devices have begun, or not yet."""
+        entry = self.held[holder.grant]
+        if (entry.holder.waits is None) is not (holder.waits is None):
+            entry.take(holder, now)
 
     # Changes
 
     def _begin(self, holder: Holder, change: HoldChange, now: Ns) -> None:
         self._events += 1
-        entry = HoldEntry(holder, now + round(holder.remaining * SECOND), self._events)
+        entry = HoldEntry(holder, now, self._events, begun=not self._begins)
+        entry.take(holder, now)
         for before in change.entries:
             if goes_on(before.holder, holder):
                 # It goes on: it is held back by no more than it was, and its program may be the one of before.
-                entry.since, entry.gone_by = before.since, before.gone_by
+                entry.since, entry.gone_by, entry.begun = before.since, before.gone_by, before.begun
         self.held[holder.grant] = entry
         change.began.append(holder)
         change.stayed = len(self.held) > len(change.began)

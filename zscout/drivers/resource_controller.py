@@ -30,6 +30,7 @@ from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Superv
 from zscout.mesh.renewal import UNHEARD
 from zscout.mesh.supervision import StallWatch
 from zscout.mesh.terms import LastTerms
+from zscout.scheduling.reason import starting
 from zscout.types import NO_TERM, SECOND, VERSION, Grant, Ns, Term
 
 if TYPE_CHECKING:
@@ -61,13 +62,18 @@ LOOK_PERIOD = 0.5
 """Seconds between two looks at whether leaders that are seen are heard, and ask."""
 FIGURES_PERIOD = 1.0
 """Seconds between two publications of changed figures."""
+SAYS_WAITS: Final = 0.05
+"""Seconds after which an RC that has not begun for a new holder publishes that this one waits."""
+LOOK_BEGUN: Final = 0.1
+"""Seconds between two looks at whether a device has begun."""
 SAY_AGAIN = 10.0
 """Seconds after which an RC publishes its state though nothing has changed: who missed a change hears of it then."""
 
 
 class ResourceController:
     """One RC: its keys, its holds and its driver. Where it fails, not its driver, it leaves the mesh, makes
-    its device safe and calls `on_failure`. `hold_lease` and `settle` are in seconds; `last_holder` outlives it;
+    its device safe and calls `on_failure`. `hold_lease`, `settle` and `begin_within` (None: what its driver says) are
+    in seconds; `last_holder` outlives it;
     `confirmations` is that of all RCs of its process, its own if there is none."""
 
     def __init__(
@@ -79,6 +85,7 @@ class ResourceController:
         hold_lease: float,
         stall: StallWatch,
         settle: float = SETTLE,
+        begin_within: float | None = None,
         last_holder: LastHolder | None = None,
         confirmations: ConfirmServer | None = None,
         on_failure: Callable[[Exception], object] = lambda _error: None,
@@ -86,7 +93,10 @@ class ResourceController:
         self.mesh, self.name, self.driver = mesh, name, driver
         self.instance = new_instance()
         lease, self._settle = round(hold_lease * SECOND), round(settle * SECOND)
-        self.holds = HoldTable(name, hold_lease=lease, settle=self._settle, instance=self.instance)
+        self.holds = HoldTable(name, hold_lease=lease, settle=self._settle, instance=self.instance, begins=True)
+        self._begin_within = begin_within
+        self._longest_begin = 0.0
+        """Seconds: the longest that its driver has announced for a hold."""
         self._last_holder, self._noting = last_holder or LastHolder(), asyncio.Lock()
         self._confirmations = confirmations or ConfirmServer(mesh)
         self.rules = 0
@@ -116,6 +126,12 @@ class ResourceController:
         """Holds that have begun at the driver."""
         self._held_back: dict[Grant, messages.Holder] = {}
         """Those that have not yet: a former holder's program may be there still, or the device is being made safe."""
+        self._entered: set[Grant] = set()
+        """Of those, the ones whose `begin` has returned: the device may still be starting."""
+        self._waits_said: set[Grant] = set()
+        """Holds that it has published as waiting for their device."""
+        self._beginning: asyncio.Task[None] | None = None
+        """Looks when its device has begun."""
         self._making_safe: asyncio.Task[None] | None = None
         self._safe_by: Ns = 0
         """When that must be done."""
@@ -239,6 +255,12 @@ class ResourceController:
         self.health = "ok"
         self.publish()
 
+    @property
+    def begin_within(self) -> float:
+        """Seconds, at most, from a grant until it has begun, without what settles."""
+        own = self._begin_within
+        return max(self.driver.begin_within, self._longest_begin) if own is None else own
+
     def publish(self, ended: list[messages.EndedHold] | None = None) -> None:
         self._published, self._use.news = self.mesh.now(), False
         self._state.put(self._rc_state(ended or []))
@@ -300,6 +322,8 @@ class ResourceController:
         query.answer(self._rc_state([]))
 
     def _rc_state(self, ended: list[messages.EndedHold], *, leaving: bool = False) -> messages.RcState:
+        waits = {} if leaving else self._waits()
+        self._waits_said |= waits.keys()
         # A leader counts while it publishes: its token outlives a program that hangs.
         return messages.RcState(
             rc=self.name,
@@ -309,7 +333,7 @@ class ResourceController:
             term=self.holds.term,
             # An RCM takes what one that knows all does not name for lost.
             seq=0 if self._missed else self.holds.seq,
-            holders=self.holders(),
+            holders=self.holds.holders(self.mesh.now(), waits),
             ended=ended,
             health=self.health,
             rules=self.rules,
@@ -320,6 +344,7 @@ class ResourceController:
             duplicate_of=self.instances.duplicate_of,
             leaving=leaving,
             settle=self._settle / SECOND,
+            begin_within=self.begin_within,
             parameters=None if leaving else self.driver.parameters(),
             version=VERSION,
             used=self._use.told(self.mesh.now()),
@@ -465,7 +490,7 @@ class ResourceController:
             and (left := self.driver.begins_for())
             and query.message.do.get("name") not in NEVER_HELD_BACK
         ):
-            return messages.Problem("settling", f"{self.name} is starting; wait at most {left:.1f} s", left=left)
+            return messages.Problem("settling", f"{self.name} is {starting(left)}", left=left)
         return problem
 
     def _waited(self, query: CommandQuery) -> Ns:
@@ -502,6 +527,7 @@ class ResourceController:
         before = {one.grant for one in change.removed} & self._at_driver
         going_on = change.going_on
         self._at_driver -= before
+        self._entered -= before
         for holder in change.removed:
             self._held_back.pop(holder.grant, None)
         # A device that still serves others, or goes on in another hold, stays as it is.
@@ -535,6 +561,48 @@ class ResourceController:
         if holder.direct:
             self._use.direct_began(holder.grant, self.mesh.now())
         await self._guard(how)
+        self._entered.add(holder.grant)
+        if left := self.driver.begins_for():
+            self._longest_begin = max(self._longest_begin, left)
+            if self._waits():
+                self.publish()
+            if self._beginning is None or self._beginning.done():
+                self._beginning = self.supervisor.spawn(self._look_until_begun())
+        else:
+            self._note_begun()
+
+    async def _look_until_begun(self) -> None:
+        while left := self.driver.begins_for():  # noqa: ASYNC110 - a driver reports no event
+            await asyncio.sleep(min(left, LOOK_BEGUN))
+        self._note_begun()
+
+    def _note_begun(self) -> None:
+        """The device has begun for all holders that are at its driver: from now on their time runs."""
+        now, late = self.mesh.now(), self._waits_said & self._entered
+        for grant in self._entered & self.holds.held.keys():
+            self.holds.begun(grant, now, late=grant in late)
+        self._waits_said -= late
+        if late:
+            self.publish()
+        self._set_timer()
+
+    def _say_waits(self) -> None:
+        if self._waits().keys() - self._waits_said:
+            self.publish()
+
+    def _waits(self) -> dict[Grant, Ns]:
+        """For how long its device has not begun for a holder, at most."""
+        waits: dict[Grant, Ns] = {}
+        now, bound = self.mesh.now(), round(self.begin_within * SECOND)
+        for grant, entry in self.holds.held.items():
+            if entry.begun:
+                continue
+            if grant in self._entered:
+                waits[grant] = max(1, round(self.driver.begins_for() * SECOND))
+            else:
+                safe = 0 if self._making_safe is None else self._safe_by
+                waits[grant] = max(0, max(self.holds.settles(grant) or 0, safe) - now) + bound
+        return waits
 
     async def _make_safe(self) -> None:
         """Makes the device safe. Where that takes its time, it goes on beside what comes next, which it holds back."""
@@ -573,12 +641,15 @@ class ResourceController:
         if change.named is not None:
             self.instances.take(change.named, change.named_host)
         if change or change.settled:
+            self._waits_said -= {holder.grant for holder in change.removed}
             for holder in change.removed:
                 self._use.hold_ended(holder.grant, self.mesh.now())
             for holder in change.began:
                 self._use.hold_began(holder.grant)
             if change.began and change.interrupts:
                 self._warm_at = self.mesh.now() + round(self.driver.activation * SECOND)
+            if change.began:
+                self.supervisor.call_later(SAYS_WAITS, self._say_waits)
             self.queue.put_change(change)
             self.queue.resume(lambda query: query.message.grant in self.holds.held)
         self._missed |= change.reread

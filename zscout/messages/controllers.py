@@ -150,6 +150,8 @@ class RcState(Message, frozen=True):
     parameters: Parameters | None = None
     """All bandwidth parameters that it knows; None: it does not say."""
     version: VersionText = ""
+    begin_within: Elapsed | None = None
+    """Seconds, at most, from a grant until it has begun, without what settles; absent: it knows nothing of `waits`."""
     used: Annotated[list[HoldUse], Meta(max_length=MAX_USES)] = []
     """Under grants that it holds, and that ended within the last half minute; of others it does not say."""
 

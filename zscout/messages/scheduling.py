@@ -203,6 +203,8 @@ class Foresight(Message, frozen=True):
     preempts: list[str] = []
     """Names of the ARCs that it would preempt at once."""
     reason: str = ""
+    begin_within: Elapsed = 0.0
+    """Seconds that its devices need to begin, at most: its runtime counts from then."""
     victims: list[ReasonParty] = []
     """The same ARCs, and whose they are."""
     why: ReasonInfo | None = None
@@ -235,7 +237,7 @@ class Notice(_ArcParty, frozen=True):
     bound: dict[str, str] = {}
     """While it runs: the RC that meets each of its patterns."""
     remaining: Seconds | None = None
-    """Seconds until its minimum runtime is over."""
+    """Seconds until its minimum runtime is over; with `waits` from when its devices have begun."""
     starts_in: Seconds | None = None
     """While it is queued, where the client asked for estimates: seconds until it will start if nothing else
     comes; None where it will not as things stand, or not within what can be forecast."""
@@ -248,6 +250,8 @@ class Notice(_ArcParty, frozen=True):
     """While it runs: where its RCs are, by RC, as far as that is known."""
     booking: BookingRef = ""
     """The date of a booking that it has taken up: `<id>@<start>`."""
+    waits: Elapsed | None = None
+    """While it runs and devices of it have not begun: seconds, at most, until they have."""
     problem: Problem | None = None
     """Why it ended, where an RCM that took the lead refuses what its client listed."""
 
@@ -264,6 +268,9 @@ class _Hold(_ArcParty, frozen=True, kw_only=True):
     booking: BookingRef = ""
     protected_from: Seconds | None = None
     """From when so many seconds of its minimum runtime remain, only operators preempt it; None: no such rule."""
+    waits: Elapsed | None = None
+    """Seconds, at most, until its devices have begun: `remaining` counts from then. From an RC: until this one has.
+    None: begun."""
 
 
 class Holder(_Hold, frozen=True):

@@ -25,7 +25,7 @@ from zscout.rcm.operations import Operations
 from zscout.rcm.places import request_id
 from zscout.rcm.recovery import RecoveredState, listed_by, removed, vouched
 from zscout.rcm.request_log import REMEMBERED, RequestLog, reason_info
-from zscout.rcm.roster import Roster, discrepancies
+from zscout.rcm.roster import Roster, beginnings, discrepancies
 from zscout.rcm.state_view import holders_of
 from zscout.scheduling import model
 from zscout.scheduling.core import Core
@@ -250,10 +250,12 @@ class Leader:
         """Makes an RC and the core agree: what the RC lost has ended, what is too much there is revoked."""
         rc = state.rc
         current = state.term == self.term and state.seq >= self._named.get(rc, 0)
-        ended, superfluous = discrepancies(state, self.core.holders(rc), self._now, current=current)
+        holders = self.core.holders(rc)
+        ended, superfluous = discrepancies(state, holders, self._now, current=current)
         if superfluous:
             self._out.then.append(steps.Name(rc))
-        return [model.RcReported(rc, ended)] if ended else []
+        events: list[model.Event] = [model.RcReported(rc, ended)] if ended else []
+        return events + beginnings(state, holders, self._now, self._fleet.timing.hold_lease)
 
     def _on_requests(self, answer: messages.ClientRequests) -> list[model.Event]:
         """What RCs alone reported, and a client does not ask for, it gave up where no RCM heard of it; else its own
@@ -378,7 +380,7 @@ class Leader:
         """Publishes all holders of the RCs that were granted or revoked, if any were and as far as they have joined;
         with `rcs` in any case, and those of `rcs` as well. `left`: ARCs whose programs are gone by their own client's
         word."""
-        changed = [effect for effect in effects if isinstance(effect, (model.Granted, model.HoldEnded))]
+        changed = [e for e in effects if isinstance(e, (model.Granted, model.HoldTimed, model.HoldEnded))]
         if not changed and rcs is None:
             return
         now, concerned = self._now, set[RcName]()
@@ -387,7 +389,7 @@ class Leader:
             concerned.update(effect.rcs)
             if isinstance(effect, model.HoldEnded):
                 revoked.append(_revocation(effect, self.registry.name(effect.arc), now, left))
-            elif effect.waited is not None:
+            elif isinstance(effect, model.Granted) and effect.waited is not None:
                 begun.append((effect.grant.seq, effect.waited / SECOND))
         number = self.core.seq if self.core.seq > self.seq else self.core.number()
         # One that has not joined holds what is not known here: to name it would end that.

@@ -380,6 +380,7 @@ class Operations:
             id=asked.id,
             arc=asked.arc,
             starts_in=None if start is None else (start - now) / SECOND,
+            begin_within=expected.begin_within / SECOND,
             preempts=[self._registry.name(victim) for victim in expected.preempts],
             reason=str(expected.reason or ""),
             victims=[party_info(Party(one.arc, one.name, one.priority, one.who), now) for one in victims],

@@ -38,6 +38,8 @@ from zscout.rcm.places import arc_id, request_id
 from zscout.scheduling.model import Adopted, ArcRequest, ArcStatus, RecoveredHold, Released, Requested, Vouched
 from zscout.types import NO_TERM, SECOND, ArcId, ClientId, Grant, HostName, Need, Ns, Params, Place, RcName
 
+LONGEST_LEASE: Final[Ns] = 60 * SECOND
+"""Bounds what an RC reports of its beginning."""
 REMOVED: Final = "the fleet file, which names its owner under no role"
 
 
@@ -81,7 +83,24 @@ class RecoveredState:
 
 def aged(state: RcState, by: Ns) -> RcState:
     """What an RC answered that long ago, as it would answer now."""
-    return replace(state, holders=[replace(one, remaining=one.remaining - by / SECOND) for one in state.holders])
+    return replace(state, holders=[_aged(holder, by / SECOND) for holder in state.holders])
+
+
+def _aged(holder: Holder, by: float) -> Holder:
+    if holder.waits is None:
+        return replace(holder, remaining=holder.remaining - by)
+    protected = None if holder.protected_from is None else holder.protected_from + by
+    return replace(holder, waits=max(0.0, holder.waits - by), protected_from=protected)
+
+
+def begin_within(state: RcState) -> Ns | None:
+    """The longest time from a grant until an RC has begun, without what settles; None: it does not say."""
+    return None if state.begin_within is None else round(state.begin_within * SECOND)
+
+
+def longest_begin(state: RcState, hold_lease: Ns) -> Ns:
+    """After this an RC that says how long it begins must have begun, whatever settled before."""
+    return (begin_within(state) or 0) + hold_lease + round((state.settle or 0) * SECOND)
 
 
 def take_over(
@@ -273,7 +292,7 @@ def recover(
         if mine is None and (status := known(arc)) is not None and status.vouched:
             mine = Listed(status.request, status.place)
         try:
-            hold = _hold(arc, held, some, mine, now, admission)
+            hold = _hold(arc, held, some, mine, now, admission, _waits(held, result.rcs, now))
         except (BadName, ValueError) as error:
             result.remarks.append(f"the hold of {arc} is not carried on: {str(error)[:MAX_ERROR]}")
             continue
@@ -294,11 +313,18 @@ def recover(
 
 
 def _hold(
-    arc: ArcId, held: Mapping[RcName, Holder], some: Holder, mine: Listed | None, now: Ns, admission: Admission
+    arc: ArcId,
+    held: Mapping[RcName, Holder],
+    some: Holder,
+    mine: Listed | None,
+    now: Ns,
+    admission: Admission,
+    waits: Mapping[RcName, Ns | None],
 ) -> RecoveredHold | None:
     """A hold as these RCs report it (`some`: the most telling of them), with the request of its client if that
     answered; None: the client asks for something else. Raises BadName, ValueError."""
-    end = now + round(min(holder.remaining for holder in held.values()) * SECOND)
+    left = round(min(holder.remaining for holder in held.values()) * SECOND)
+    end = max([now, *filter(None, waits.values())]) + left
     direct = any(holder.direct for holder in held.values()) or (mine is not None and mine.request.direct)
     bound: Mapping[Need, RcName] = some.bound
     place: Place | None = some.place
@@ -317,13 +343,26 @@ def _hold(
         place = some.place if mine.expects else mine.place
     request = admission.clamped(request)
     vouched = not admission.closed or mine is not None
-    start, protected = end - request.min_runtime, _protected_from(held, end)
-    return RecoveredHold(request, place, some.grant, start, end, bound, vouched, protected)
+    start, protected = min(now, end - request.min_runtime), _protected_from(held, now)
+    return RecoveredHold(request, place, some.grant, start, end, bound, vouched, protected, waits)
 
 
-def _protected_from(held: Mapping[RcName, Holder], end: Ns) -> Ns | None:
-    left = [holder.protected_from for holder in held.values() if holder.protected_from is not None]
-    return end - round(min(left) * SECOND) if left else None
+def _waits(held: Mapping[RcName, Holder], states: Mapping[RcName, RcState], now: Ns) -> dict[RcName, Ns | None]:
+    """The RCs that have not begun, with when they begin at the latest; empty if one of them does not know of that."""
+    if any(states[rc].begin_within is None for rc in held):
+        return {}
+    most = {rc: longest_begin(states[rc], LONGEST_LEASE) for rc in held}
+    waits = {rc: holder.waits for rc, holder in held.items() if holder.waits is not None}
+    return {rc: now + min(round(left * SECOND), most[rc]) for rc, left in waits.items()}
+
+
+def _protected_from(held: Mapping[RcName, Holder], now: Ns) -> Ns | None:
+    protected = [
+        round((holder.remaining - holder.protected_from) * SECOND)
+        for holder in held.values()
+        if holder.protected_from is not None
+    ]
+    return now + max(protected) if protected else None
 
 
 def _agree(needs: Mapping[Need, Params], bound: Mapping[Need, RcName], held: Mapping[RcName, Holder]) -> bool:

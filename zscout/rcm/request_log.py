@@ -19,8 +19,8 @@ from zscout.rcm.roster import Roster
 from zscout.rcm.steps import Outbox
 from zscout.scheduling.core import Core
 from zscout.scheduling.forecast import forecast
-from zscout.scheduling.model import ArcStatus, Dropped, Effect, Granted, HoldEnded, Outcome, Queued
-from zscout.scheduling.reason import ITS_CLIENT, Party, Reason, ended, waits
+from zscout.scheduling.model import ArcStatus, Dropped, Effect, Granted, HoldEnded, HoldTimed, Outcome, Queued
+from zscout.scheduling.reason import ITS_CLIENT, Party, Reason, ended, starting, waits
 from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.types import SECOND, ArcId, Grant, Ns, RcName
 
@@ -161,7 +161,7 @@ class RequestLog:
         if arc is None:
             return self._ending(arc_id) or self._notice(arc_id, "ended", reason="no such request is open")
         request, hold = arc.request, arc.hold
-        known = {
+        known: dict[str, Any] = {
             "priority": request.priority,
             "who": request.who,
             "booking": request.booking,
@@ -169,12 +169,11 @@ class RequestLog:
             "seal": self._places.seal(arc.place, arc_id),
         }
         if hold is not None:
-            remaining = (hold.end - now) / SECOND
+            remaining, left = hold.remaining(now) / SECOND, hold.starting(now)
             rcs, bound = sorted(arc.needs), dict(arc.bound)
             hosts = {rc: host for rc, (_, host) in self._roster.named(arc.needs).items()}
-            return self._notice(
-                arc_id, "running", grant=hold.grant, rcs=rcs, bound=bound, remaining=remaining, hosts=hosts, **known
-            )
+            known |= {"bound": bound, "hosts": hosts, "waits": None if left is None else left / SECOND}
+            return self._notice(arc_id, "running", grant=hold.grant, rcs=rcs, remaining=remaining, **known)
         return self._notice(
             arc_id,
             "queued",
@@ -237,6 +236,10 @@ class RequestLog:
                     # An ARC that ended in the same instant has only that notice.
                     if arc not in answered and self._core.arc(arc) is not None:
                         notices.append(self.notice(now, arc))
+                case HoldTimed(arc=arc, waits=waits) if self._core.is_running(arc):
+                    about = "is ready: its devices have begun" if waits is None else starting((waits - now) / SECOND)
+                    self.record(now, arc, about)
+                    notices.append(self.notice(now, arc))
                 case HoldEnded(arc=arc) | Dropped(arc=arc):
                     notice = self._close(now, effect)
                     if isinstance(effect, Dropped) or arc not in given_up:

@@ -12,6 +12,7 @@ from enum import Enum
 from typing import Any, Final
 
 from msgspec import Struct
+from msgspec.structs import replace
 
 from zscout.config.devices import SETTLE
 from zscout.config.fleet import Fleet
@@ -20,11 +21,11 @@ from zscout.messages import ClientRequests, Problem, RcAsk, RcState, disbelieved
 from zscout.rcm.admission import Admission
 from zscout.rcm.deadlines import Deadlines
 from zscout.rcm.devices import ExpectedDevices
-from zscout.rcm.recovery import adopted, aged, gangs_of
+from zscout.rcm.recovery import adopted, aged, begin_within, gangs_of, longest_begin
 from zscout.rcm.sight import MAX_TOKENS, Sight
 from zscout.rcm.steps import ClientFound, ClientListed, Compare, Name, Outbox, Question, Resume, Why
 from zscout.rcm.terms import Source, Word
-from zscout.scheduling.model import ArcStatus, ClientLost, RcJoined, RcLost, RcReported
+from zscout.scheduling.model import ArcStatus, ClientLost, RcBegins, RcJoined, RcLost, RcReported
 from zscout.types import SECOND, ArcId, ClientId, Grant, HostName, Ns, RcName, Term
 
 PROBE_PERIOD: Final[Ns] = SECOND
@@ -43,6 +44,8 @@ NEAR_END: Final[Ns] = SECOND // 20
 SHUNNED: Final = "its host alone shows a term in which nobody leads"
 PRESENT_PART: Final = 0.05
 """Others answer a leader that is not away within this part of the mesh lease: a later answer may follow its return."""
+BEGIN_AGAIN: Final[tuple[Ns, Ns]] = SECOND, 60 * SECOND
+"""An RC that did not begin in time is granted again after the first, doubled each time in a row, up to the second."""
 MAX_WITNESSES: Final = 3
 """Hosts that are asked whether this one is away."""
 
@@ -59,6 +62,8 @@ class _Due(Enum):
     DROP_UNSEEN = "RCs and tokens had a lease to show themselves"
     SHUNNED = "an RC no longer counts as absent for the term that it shows"
     JOIN_ALL = "RCs away from home may join"
+    BEGUN = "an RC should have begun for a holder"
+    GRANT_AGAIN = "an RC that did not begin may be granted again"
 
 
 @dataclass(slots=True, eq=False)
@@ -91,6 +96,12 @@ class _Rc:
     """It counts as present, and its token disappeared while this leader was away."""
     missed: bool = False
     """It is expected, this term has not seen it, and has reported so."""
+    waiting: frozenset[Grant] = frozenset()
+    """Holds for which it has not begun, by its last report."""
+    overdue: tuple[str, str] | None = None
+    """Its instance that did not begin in time, and the reason: it counts as lost for a while."""
+    failures: int = 0
+    """How often that was so in a row."""
 
 
 class Roster:
@@ -141,6 +152,7 @@ class Roster:
         alone = all(state.host == self.sight.me for state in (*joined, *waiting))
         for state in joined:
             self._rcs[state.rc].joined = state
+            self._follow_begin(self._rcs[state.rc], state)
         for state in (*joined, *waiting):
             self._rcs[state.rc].named = state.instance, state.host
         for state in waiting:
@@ -302,6 +314,10 @@ class Roster:
                     self._leave_out(token)
                 case _Due.DROP_UNSEEN, _:
                     self._drop_unseen()
+                case _Due.BEGUN, (name, grant):
+                    self._judge_begin(self._rcs[name], grant)
+                case _Due.GRANT_AGAIN, (name, overdue) if self._rcs[name].overdue is overdue:
+                    self._grant_again(self._rcs[name])
                 case _Due.JOIN_ALL, _:
                     for rc in self._rcs.values():
                         self._ask_others(rc)
@@ -631,6 +647,8 @@ class Roster:
         for state in states:
             rc = self._rcs[state.rc]
             rc.joined, rc.named = state, (state.instance, state.host)
+            rc.waiting, rc.overdue = frozenset(), None
+            self._follow_begin(rc, state)
         joined = {name for name, rc in self._rcs.items() if rc.joined is not None}
         holds, remarks = adopted(states, joined, self._now, self._admission, self._known)
         self._out.events += [*map(_presence, states), *holds]
@@ -655,6 +673,9 @@ class Roster:
             self._out.then.append(Name(state.rc))
         if known is None or known.instance != state.instance:
             return
+        self._follow_begin(rc, state)
+        if rc.overdue is not None and rc.overdue[0] == state.instance and state.health == "ok":
+            state = replace(state, health=rc.overdue[1])
         rc.joined = state
         if state.leaving and state.instance not in rc.tokens:
             self._drop(state.rc)
@@ -664,12 +685,39 @@ class Roster:
         else:
             if known.health != "ok" or known.sharable != state.sharable:
                 self._out.events.append(_presence(state))
+            if state.begin_within != known.begin_within:
+                self._out.events.append(RcBegins(state.rc, begin_within(state)))
             if state.rules != known.rules:
                 self._out.events.append(RcReported(state.rc, rules_changed=True))
             self._out.then.append(Compare(state))
             if state.duplicate_of:
                 # Whatever made it stand by: it is the one that is meant.
                 self._out.then.append(Name(state.rc))
+
+    def _follow_begin(self, rc: _Rc, state: RcState) -> None:
+        """Give an RC that has not begun for a holder as long as it says that it needs at most."""
+        waiting = frozenset(holder.grant for holder in state.holders if holder.waits is not None)
+        held = {holder.grant for holder in state.holders}
+        if (rc.waiting - waiting) & held:
+            rc.failures = 0
+        for grant in sorted(waiting - rc.waiting):
+            self._set(longest_begin(state, self._timing.hold_lease), _Due.BEGUN, (state.rc, grant))
+        rc.waiting = waiting
+
+    def _judge_begin(self, rc: _Rc, grant: Grant) -> None:
+        state = rc.joined
+        if state is None or grant not in rc.waiting or rc.overdue is not None:
+            return
+        rc.overdue = state.instance, f"it did not begin within {state.begin_within or 0:g} s"
+        pause = min(BEGIN_AGAIN[0] << min(rc.failures, 16), BEGIN_AGAIN[1])
+        rc.failures += 1
+        self._set(pause, _Due.GRANT_AGAIN, (state.rc, rc.overdue))
+        self._report(rc, state)
+
+    def _grant_again(self, rc: _Rc) -> None:
+        overdue, rc.overdue = rc.overdue, None
+        if rc.joined is not None and overdue is not None and rc.joined.health == overdue[1]:
+            self._report(rc, replace(rc.joined, health="ok"))
 
     # What follows
 
@@ -743,7 +791,9 @@ def _is_of(message: Any, token: Token) -> bool:
 
 def _presence(state: RcState) -> RcJoined | RcLost:
     health = state.health[:MAX_HEALTH]
-    return RcJoined(state.rc, state.sharable, state.host) if health == "ok" else RcLost(state.rc, why=health)
+    if health != "ok":
+        return RcLost(state.rc, why=health)
+    return RcJoined(state.rc, state.sharable, state.host, begin_within(state))
 
 
 def discrepancies(
@@ -768,3 +818,14 @@ def discrepancies(
 
     lost = tuple(arc.id for grant, arc in known.items() if is_lost(grant, arc))
     return lost, current and unknown
+
+
+def beginnings(state: RcState, holders: Iterable[ArcStatus], now: Ns, hold_lease: Ns) -> list[RcBegins]:
+    """For which of its `holders` in the core an RC has not begun, or has since."""
+    bound, known = begin_within(state), {arc.hold.grant: arc.hold for arc in holders if arc.hold is not None}
+    waits = {holder.grant: holder.waits for holder in state.holders if holder.grant in known}
+    if bound is None or all(waits[grant] is None and known[grant].waits is None for grant in waits):
+        return []
+    most = longest_begin(state, hold_lease)
+    until = {grant: None if left is None else now + min(round(left * SECOND), most) for grant, left in waits.items()}
+    return [RcBegins(state.rc, bound, until)]

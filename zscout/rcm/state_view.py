@@ -136,12 +136,13 @@ def _held(arc: ArcStatus, hold: Hold, now: Ns) -> dict[str, Any]:
     return {
         **_of(arc),
         "grant": hold.grant,
-        "remaining": (hold.end - now) / SECOND,
+        "remaining": hold.remaining(now) / SECOND,
+        "waits": waits_in(hold, now),
         "keep": arc.request.keep,
         "bound": dict(arc.bound),
         "direct": arc.request.direct,
         "continues": arc.request.continues,
-        "protected_from": _protected_from(hold),
+        "protected_from": _protected_from(hold, now),
     }
 
 
@@ -153,9 +154,16 @@ def holders_of(arcs: Iterable[ArcStatus], rc: str, now: Ns) -> list[messages.Hol
     ]
 
 
-def _protected_from(hold: Hold) -> float | None:
-    is_protected = hold.protected_below is not None and hold.protected_from < hold.end
-    return (hold.end - hold.protected_from) / SECOND if is_protected else None
+def waits_in(hold: Hold, now: Ns) -> float | None:
+    """Seconds until the devices of a hold have begun, at most; None: they have."""
+    return None if (left := hold.starting(now)) is None else left / SECOND
+
+
+def _protected_from(hold: Hold, now: Ns) -> float | None:
+    # Its devices may begin at once: its minimum runtime would be over then.
+    end = now + hold.remaining(now)
+    is_protected = hold.protected_below is not None and hold.protected_from < end
+    return (end - hold.protected_from) / SECOND if is_protected else None
 
 
 def _hold_view(arc: ArcStatus, hold: Hold, now: Ns, runtimes: RuntimeEstimator | None) -> messages.HoldView:

@@ -31,8 +31,11 @@ from zscout.types import NO_TERM, ArcId, ClientId, Grant, HostName, Ns, Place, R
 
 
 class Core:
-    def __init__(self, strategy: Strategy | None = None, policy: SchedulingPolicy = DEFAULT) -> None:
-        self.strategy = strategy or Priority()
+    def __init__(
+        self, strategy: Strategy | None = None, policy: SchedulingPolicy = DEFAULT, *, foretells: bool = False
+    ) -> None:
+        """`foretells`: RCs report nothing, so each is taken to begin as late as its bound allows."""
+        self.strategy, self._foretells = strategy or Priority(), foretells
         self._state = SchedulerState(policy, adaptive=self.strategy.name == "adaptive")
         self._votes = self._state.votes
         self.term: Term = NO_TERM
@@ -177,7 +180,9 @@ class Core:
         queue (None: all), and `without` these bookings."""
         state = self._state
         joined: list[model.Event] = [
-            model.RcJoined(rc.name, rc.sharable, rc.host) if rc.present else model.RcLost(rc.name, why=rc.absence)
+            model.RcJoined(rc.name, rc.sharable, rc.host, rc.begin_within)
+            if rc.present
+            else model.RcLost(rc.name, why=rc.absence)
             for rc in state.rcs.values()
             if rc.present or rc.absence
         ]
@@ -279,9 +284,10 @@ class Core:
                 self._votes.answer(proposal, accept=accept, reason=reason)
             case model.VoteOverdue(proposal):
                 self._votes.overdue(proposal, self._state.now)
-            case model.RcJoined(rc, sharable, host):
+            case model.RcJoined(rc, sharable, host, begin_within):
                 if self._state.rc(rc).present:
                     self._lose_rc(rc, "it started anew")
+                self._state.set_begin_within(rc, begin_within)
                 self._state.join(rc, sharable=sharable, host=host)
                 self._calendar.rc_joined(self._state.rc(rc))
                 self._state.readmit(rc)
@@ -291,6 +297,8 @@ class Core:
                         self._end_hold(self._state.running[arc], Outcome.LOST, Reason(ReasonCode.RC_ENDED, (rc,)))
                 if rules_changed:
                     self._votes.forget_rc(rc)
+            case model.RcBegins():
+                self._begin(event)
             case model.RcLost(rc, reason, why):
                 self._lose_rc(rc, why or reason)
                 self._state.rc(rc).absence = why
@@ -471,11 +479,18 @@ class Core:
             self._remove(arc)
             self._queue_anew(told.request, place)
             return
+        held = model.RecoveredHold(
+            told.request,
+            place,
+            hold.grant,
+            hold.start,
+            hold.end,
+            told.bound,
+            protected_from=hold.protected_from,
+            waits={**arc.waits},
+        )
         self._state.stop(arc)
         self._forget(arc)
-        held = model.RecoveredHold(
-            told.request, place, hold.grant, hold.start, hold.end, told.bound, protected_from=hold.protected_from
-        )
         arc = self._take_up(held)
         if arc.hold is not None:
             self._effects.append(self._granted(arc, arc.hold))
@@ -501,6 +516,9 @@ class Core:
         if arc.patterns:
             self._state.bind(arc, held.bound)
         hold = self._state.hold(arc, held.grant, held.start, held.end, held.protected_from)
+        arc.waits = {**held.waits}
+        if (waits := max(filter(None, held.waits.values()), default=None)) is not None:
+            hold = replace(hold, waits=waits, last=self._state.last(arc, waits, held.end))
         absent = [rc.name for rc in self._state.rcs_in(arc.mask & ~self._state.present)]
         taken = [rc.name for rc in self._state.rcs_in(arc.mask & self._state.busy)]
         other = self._state.at_place(arc.place)
@@ -525,6 +543,8 @@ class Core:
 
     def _expire(self) -> None:
         for arc in self._state.expired_arcs():
+            if not arc.runs:
+                continue  # its devices have not begun: its end is set once they have
             if arc.hold is not None and arc.hold.last is not None and arc.hold.last <= self._state.now:
                 self._end_hold(arc, Outcome.COMPLETED, Reason(ReasonCode.LIMIT), requeue=False)
             elif arc.request.keep:
@@ -542,12 +562,36 @@ class Core:
     def start(self, arc: Arc) -> None:
         grant = Grant(self.term, self.number())
         now, state = self._state.now, self._state
-        hold = state.hold(arc, grant, now, arc.ends(now))
+        hold = state.hold(arc, grant, now, arc.ends(now) if self._foretells else arc.ends_after(now, now))
         if not arc.preemptions:
             state.runtimes.count(arc.owner, arc.request.min_runtime)
         waited = 0 if arc.state is ArcState.NEW else now - arc.since
         self._state.start(arc, hold)
         self._effects.append(self._granted(arc, hold, waited))
+
+    def _begin(self, reported: model.RcBegins) -> None:
+        """Count the runtimes of the holds of an RC from when the last RC of each has begun."""
+        self._state.set_begin_within(reported.rc, reported.begin_within)
+        for arc in list(self._state.rc(reported.rc).holders.values()):
+            if arc.hold is None or arc.hold.grant not in reported.holds:
+                continue
+            until, waits = reported.holds[arc.hold.grant], reported.rc in arc.waits
+            if (waits and arc.waits[reported.rc] is None) or (until is None and not waits):
+                continue  # it has begun, and does so once
+            arc.waits[reported.rc] = until
+            self._time(arc, arc.hold)
+
+    def _time(self, arc: Arc, hold: Hold) -> None:
+        """Set the end of a hold by when its RCs begin."""
+        now, waits = self._state.now, arc.waits_until
+        if waits == hold.waits or (waits is not None and abs(waits - (hold.waits or 0)) < model.WAITS_SLACK):
+            return
+        begun = now if waits is None else max(now, waits)
+        end = arc.ends_after(hold.start, begun)
+        last = self._state.last(arc, begun, end)
+        self._state.retime(arc, replace(hold, end=end, last=last, waits=waits))
+        rcs = tuple(sorted(arc.needs))
+        self._effects.append(model.HoldTimed(arc.id, arc.request.client, hold.grant, rcs, waits))
 
     def preempt(self, arc: Arc, by: Arc) -> bool:
         done = arc.past_min_runtime(self._state.now)

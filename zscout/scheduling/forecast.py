@@ -50,6 +50,8 @@ class Forecast:
     starts: dict[ArcId, Ns] = field(default_factory=dict)
     """A missing ARC never starts from the present state, or not within the forecast."""
     preempts: list[ArcId] = field(default_factory=list)
+    begin_within: Ns = 0
+    """The longest time that the newcomer's devices need to begin."""
     reason: Reason | None = None  # the newcomer's first reason to wait; None if it starts at once
 
 
@@ -59,7 +61,7 @@ def forecast(
     """Play a copy of `core` forward from `now`, with `newcomer` asking at once. With `runtimes` holds end when they
     usually do."""
     # A copy, as a strategy may keep unfinished searches.
-    copy = Core(STRATEGIES[core.strategy.name](), core.policy)
+    copy = Core(STRATEGIES[core.strategy.name](), core.policy, foretells=True)
     booked = {booking.id: (booking, arc is None) for booking, arc in core.bookings()}
     own = "" if newcomer is None else newcomer.booking
     later = {name: booking for name, (booking, is_open) in booked.items() if is_open and name != own}
@@ -98,6 +100,8 @@ def forecast(
                     if running is not None and running.hold is not None:
                         ends[arc] = running.hold.end
                         expect(running.request, running.hold)
+                        if newcomer is not None and arc == newcomer.arc:
+                            result.begin_within = max(0, ends[arc] - start - running.request.min_runtime)
                 case HoldEnded(arc=arc, outcome=outcome, by=by, requeued=requeued):
                     ends.pop(arc, None)
                     releases.pop(arc, None)

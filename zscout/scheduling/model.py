@@ -40,6 +40,9 @@ HOLD_BACK: Final[Ns] = SECOND
 MAX_HOLD_BACK: Final[Ns] = 30 * SECOND
 """up to this."""
 
+WAITS_SLACK: Final[Ns] = SECOND
+"""A smaller change of when devices begin at the latest is not reported."""
+
 Rank: TypeAlias = tuple[int, int, Ns, Place, ArcId]
 """Sort key, best first: priority (negated), position of the group (`fair_shares.py`), minimum runtime, place, id."""
 
@@ -86,7 +89,8 @@ class ArcRequest(Struct, frozen=True):
 
 
 class Hold(Struct, frozen=True):
-    """A grant in force. `end`: end of the minimum runtime; with `keep` the hold outlasts it."""
+    """A grant in force. `end`: end of the minimum runtime, the latest possible while it `waits`; with `keep` the hold
+    outlasts it."""
 
     grant: Grant
     start: Ns
@@ -95,6 +99,16 @@ class Hold(Struct, frozen=True):
     """From `protected_from` to `end` only this priority or higher preempts it; None: any higher priority."""
     last: Ns | None = None
     protected_from: Ns = 0
+    waits: Ns | None = None
+    """While devices of it have not begun: when the last one begins at the latest. Its runtime counts from then."""
+
+    def remaining(self, now: Ns) -> Ns:
+        """What is left of the minimum runtime; all of it while devices have not begun."""
+        return self.end - (now if self.waits is None else max(now, self.waits))
+
+    def starting(self, now: Ns) -> Ns | None:
+        """The time until its devices have begun, at most; None: they have."""
+        return None if self.waits is None else max(0, self.waits - now)
 
 
 class ArcState(StrEnum):
@@ -159,6 +173,9 @@ class Arc:
     bound: Mapping[Need, RcName] = field(default_factory=dict)
     """The RC of each pattern (`patterns.py`), while it runs or is checked. Empty if some pattern has none."""
     claim: Claim | None = None  # the active booking that it has taken up
+    waits: dict[RcName, Ns | None] = field(default_factory=dict)
+    """While it runs: the RCs that could not begin at its grant, with when they begin at the latest; None: one has begun
+    since."""
     position: int = 0  # the position of its group (`fair_shares.py`); while it runs, as of its start
     vouched: bool = True  # by its client; False: only RCs have reported it, and it is not charged
     late: Ns = 0  # delay that its group's share adds to its waiting time (`reservations.py`)
@@ -189,10 +206,36 @@ class Arc:
         """When it begins to starve, if it waits (`reservations.py`)."""
         return self.since + self.late + self.patience // 2
 
+    @property
+    def begin_within(self) -> Ns:
+        """The greatest bound of its RCs on the time from the grant until they have begun; 0 where one has none."""
+        most: Ns = 0
+        for rc in self.rcs:
+            if rc.begin_within is None:
+                return 0
+            most = max(most, rc.begin_within)
+        return most
+
     def ends(self, start: Ns) -> Ns:
-        """The end of its minimum runtime, or of its booking, if it starts then."""
-        end = start + self.request.min_runtime
+        """The latest end of its minimum runtime, or of its booking, if it is granted then."""
+        return self.ends_after(start, start + self.begin_within)
+
+    def ends_after(self, start: Ns, begun: Ns) -> Ns:
+        """The end of its minimum runtime, or of its booking, if it is granted at `start` and its devices begin then."""
+        end = begun + self.request.min_runtime
         return end if self.claim is None or start >= self.claim.booking.end else self.claim.booking.end
+
+    @property
+    def waits_until(self) -> Ns | None:
+        """When the last of its RCs begins, at the latest; None: all have begun, or one knows no such bound."""
+        if not self.waits or any(rc.begin_within is None for rc in self.rcs):
+            return None
+        return max((until for until in self.waits.values() if until is not None), default=None)
+
+    @property
+    def runs(self) -> bool:
+        """Return True if the time of its hold passes: its devices have begun, or the end of its booking stands."""
+        return self.hold is not None and (self.hold.waits is None or self.claim is not None)
 
     def move_to(self, state: ArcState) -> None:
         if state not in TRANSITIONS[self.state]:
@@ -214,7 +257,7 @@ class Arc:
 
     def past_min_runtime(self, now: Ns) -> bool:
         """Return True for a kept hold past its minimum runtime: equal priority may preempt it."""
-        return self.hold is not None and self.request.keep and now >= self.hold.end
+        return self.hold is not None and self.request.keep and now >= self.hold.end and self.runs
 
     def preemptible_by(self, other: Arc, now: Ns) -> bool:
         if self.priority >= other.priority:
@@ -225,7 +268,9 @@ class Arc:
     def protected_below(self, now: Ns) -> int | None:
         """Priorities below this can't preempt its hold now; None: any higher priority can."""
         hold = self.hold
-        return hold.protected_below if hold is not None and hold.protected_from <= now < hold.end else None
+        if hold is None or now < hold.protected_from or (now >= hold.end and self.runs):
+            return None
+        return hold.protected_below
 
 
 @dataclass(slots=True, eq=False)
@@ -260,6 +305,8 @@ class Rc:
     sharable: bool = False
     absence: str = ""  # the reason while absent, if known
     host: str = ""  # its host, or the last one while absent
+    begin_within: Ns | None = 0
+    """The longest time from a grant until it has begun, without what settles. None: an RC that knows no such bound."""
     holders: dict[ArcId, Arc] = field(default_factory=dict)
     demand: list[Rank] = field(default_factory=list)  # of the queued ARCs that name it, best first
     watchers: list[Rank] = field(default_factory=list)
@@ -353,6 +400,17 @@ class RcJoined(Struct, frozen=True):
     rc: RcName
     sharable: bool
     host: str = ""
+    begin_within: Ns | None = 0
+    """As in `Rc`."""
+
+
+class RcBegins(Struct, frozen=True):
+    """An RC reports how long it needs to begin. `holds`: by grant, until when its holder waits at the latest; None: the
+    RC has begun."""
+
+    rc: RcName
+    begin_within: Ns | None
+    holds: Mapping[Grant, Ns | None] = {}
 
 
 class RcReported(Struct, frozen=True):
@@ -416,6 +474,8 @@ class RecoveredHold(Struct, frozen=True):
     vouched: bool = True
     protected_from: Ns | None = None
     """As its RCs report it; None: they do not."""
+    waits: Mapping[RcName, Ns | None] = {}
+    """The RCs that have not begun (`Arc.waits`): `end` counts from the last one's bound."""
 
     def __post_init__(self) -> None:
         patterns = {need for need in self.request.needs if is_pattern(need)}
@@ -462,7 +522,7 @@ class Tick(Struct, frozen=True):
 
 
 _ArcEvent: TypeAlias = Requested | Cancelled | Released | ClientLost | PlaceShown | Unconfirmed | Reachable | HandedOver
-_RcEvent: TypeAlias = Vote | VoteOverdue | RcJoined | RcReported | RcLost
+_RcEvent: TypeAlias = Vote | VoteOverdue | RcJoined | RcReported | RcBegins | RcLost
 Event: TypeAlias = _ArcEvent | _RcEvent | LeadTaken | Adopted | Vouched | Dates | Booked | Unbooked | Redated | Tick
 
 
@@ -496,6 +556,16 @@ class Granted(Struct, frozen=True):
     end: Ns | None
     waited: Ns | None = None
     """ns in the queue before; None for a hold that only continues."""
+
+
+class HoldTimed(Struct, frozen=True):
+    """The runtime of a hold begins at `waits` at the latest, as its devices are being started; None: it begins now."""
+
+    arc: ArcId
+    client: ClientId
+    grant: Grant
+    rcs: tuple[RcName, ...]
+    waits: Ns | None
 
 
 class HoldEnded(Struct, frozen=True):
@@ -534,7 +604,7 @@ class WakeAt(Struct, frozen=True):
 
 
 _BookingEffect: TypeAlias = BookingChanged | BookingThreatened | BookingBound | BookingConflict
-Effect: TypeAlias = Propose | Granted | HoldEnded | Queued | Dropped | _BookingEffect | WakeAt
+Effect: TypeAlias = Propose | Granted | HoldTimed | HoldEnded | Queued | Dropped | _BookingEffect | WakeAt
 
 
 class ArcStatus(Struct, frozen=True):

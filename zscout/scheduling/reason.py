@@ -181,6 +181,11 @@ def ended(outcome: str, reason: str, why: Reason | ReasonInfo | None) -> str:
     return reason if why is not None and why.code in _OUTCOMES else f"{word}: {reason}" if reason else word
 
 
+def starting(left: float) -> str:
+    """A hold whose devices have begun in `left` seconds at the latest."""
+    return f"starting, ready in about {max(1, round(left))} s"
+
+
 def of_rcs(code: ReasonCode, rcs: Sequence[RcName], detail: str = "") -> Reason:
     return Reason(code, tuple(rcs[:SHOWN]), number=len(rcs), detail=detail)
 

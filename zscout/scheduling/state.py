@@ -358,11 +358,28 @@ class SchedulerState:
         assert hold is not None, arc.id  # noqa: S101
         self._remove_running(arc)
         arc.hold = None
+        arc.waits.clear()
         if arc.claim is not None:
             self.dates.put(arc.claim)
         self.busy &= ~arc.mask
         self.index.freed |= arc.mask
         return hold
+
+    def retime(self, arc: Arc, hold: Hold) -> None:
+        """Give a running ARC's hold another end."""
+        before, arc.hold = arc.known_end(), hold
+        for end in (hold.end, hold.last):
+            if end is not None:
+                heapq.heappush(self._ends, (end, arc.id))
+        self.index.freed |= arc.mask
+        self._grow(arc.mask, max(before, arc.known_end()))
+
+    def set_begin_within(self, name: RcName, begin_within: Ns | None) -> None:
+        rc = self.rc(name)
+        if rc.begin_within != begin_within:
+            rc.begin_within = begin_within
+            self.index.freed |= rc.bit
+            self._grow(rc.bit)
 
     def expired_arcs(self) -> Iterator[Arc]:
         """The running ARCs whose minimum or longest time is over, once each; the caller may end others meanwhile."""
@@ -452,7 +469,7 @@ class SchedulerState:
     def charged(self) -> dict[str, float]:
         return {} if self.shares is None else self.shares.charged()
 
-    def _last(self, arc: Arc, start: Ns, end: Ns) -> Ns | None:
+    def last(self, arc: Arc, start: Ns, end: Ns) -> Ns | None:
         """When `max_runtime` ends a hold: not before its booking is over."""
         limit = self.policy.max_runtime
         if limit is None:
@@ -473,7 +490,7 @@ class SchedulerState:
         else:
             is_due = 0 < arc.patience <= waited - arc.told
             protected_from = start if is_due else start + max(0, budget - arc.lost)
-        return Hold(grant, start, end, below, self._last(arc, start, end), protected_from)
+        return Hold(grant, start, end, below, self.last(arc, start, end), protected_from)
 
     def quota_left(self, arc: Arc) -> int | None:
         quota = self.policy.max_running_per_host

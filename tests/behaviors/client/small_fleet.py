@@ -7,6 +7,8 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any
 
+from msgspec.structs import replace
+
 from tests.mesh.kit import until
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.request import OpenArc
@@ -94,6 +96,13 @@ def transport_of(mesh: Mesh) -> MemoryTransport:
     transport = mesh._transport.current
     assert isinstance(transport, MemoryTransport)
     return transport
+
+
+def make_older(rc: ResourceController) -> None:
+    """From now on it says nothing of when it begins for a holder, as RCs did before 0.3."""
+    own = rc._rc_state
+    rc._rc_state = lambda *told, **how: replace(own(*told, **how), begin_within=None)  # type: ignore[method-assign]
+    rc.publish()
 
 
 def begin_move(old: Client, new: Client) -> None:

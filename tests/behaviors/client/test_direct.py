@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.behaviors.client.small_fleet import FLEET, OTHER, RC, held, small_fleet
+from tests.behaviors.client.small_fleet import FLEET, OTHER, RC, held, make_older, small_fleet
 from tests.mesh.kit import until
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.direct import DirectHold
@@ -129,9 +129,22 @@ async def test_a_hold_that_an_rc_has_not_confirmed_for_a_hold_lease_is_over_what
         assert await one.granted(arc) not in (None, held.grant)
 
 
+async def test_who_waits_for_a_program_to_leave_has_its_full_time_after_that() -> None:
+    async with small_fleet("one", "two") as (_, (one, two)):
+        await enter(one, "first", keep=True)
+        arc = await two.request("second", {RC: {}}, priority=1, min_runtime=2, keep=False)
+        grant, asked = arc.grant, two.mesh.now()
+        assert await two.granted(arc, confirmed=True) == grant
+        assert (two.mesh.now() - asked) / SECOND >= SETTLE - 0.1
+        assert seconds(arc.end, two) == pytest.approx(2, abs=0.2)
+
+
 @pytest.mark.parametrize("keep", [False, True])
 async def test_who_could_not_enter_in_its_time_is_queued_with_its_full_minimum_runtime(keep: bool) -> None:
+    """Where an RC knows nothing of when a hold's time begins."""
     async with small_fleet("one", "two", "three") as (fleet, (one, two, three)):
+        make_older(fleet.rcs[0])
+        await asyncio.sleep(1)
         await enter(one, "first", keep=True)
         arc = await two.request("second", {RC: {}}, priority=1, min_runtime=2, keep=keep)
         first_grant, place = arc.grant, arc._place

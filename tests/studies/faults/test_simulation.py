@@ -21,7 +21,7 @@ from tests.studies.tools import STUDIES
 
 SEEDS = [seed for seed in range(1, 200) if seed % 10 != 9]
 """Small runs; every tenth is one of many programs."""
-QUICK = [1, 2, 3, 4, 5, 6, 8, 10, 13, 15, 47, 103]
+QUICK = [1, 2, 3, 4, 5, 6, 8, 10, 13, 15, 35, 47, 103]
 """Seeds that break a promise without most of the guards below: of each size one at least, but of 47 only moves fail."""
 FOUND = [
     1923, 302274, 302324, 302513, 400894, 407164, 434963, 435554, 440263, 502073, 517214, 519734, 550493, 567963,
@@ -44,8 +44,8 @@ MISSED = {
     "order": 1, "grant": 8, "safe first": 1, "snapshots": 8, "step down": 4, "reopen": 8, "places": 5,
     "withdrawn": 55, "believed": 70, "settling": 8, "deadline": 8, "once": 10, "sealed": 10, "copied": 3,
     "dates": 503, "merged": 3, "caught up": 4, "one stands": 33, "awaited": 3003, "had again": 13, "dates first": 113,
-    "fleet time": 4, "late": 173, "slewed": 3, "door": 5, "clamped": 5, "certified": 5, "managers": 5,
-    "words": 6, "doubted": 46, "sealed terms": 56, "back": 76, "budget": 6,
+    "fleet time": 4, "late": 173, "slewed": 3, "door": 5, "clamped": 85, "certified": 5, "managers": 5,
+    "begun": 35, "begun heard": 35, "words": 6, "doubted": 46, "sealed terms": 56, "back": 76, "budget": 6,
 }  # fmt: skip
 """Guards without which some promise breaks within a few runs, and the seed of docs/promises.md, which is tried first;
 `python -m studies faults --without` tries the others."""

@@ -70,8 +70,8 @@ class Held:
 
     @property
     def remaining(self) -> float:
-        """Seconds left of the minimum runtime."""
-        return (self.arc.end - self.now()) / SECOND
+        """Seconds left of the minimum runtime: all of it while devices are starting."""
+        return (self.arc.end - max(self.now(), self.arc.ready or 0)) / SECOND
 
     @property
     def completed(self) -> bool:
@@ -82,9 +82,9 @@ class Held:
 
     @property
     def settling(self) -> bool:
-        """True while some devices are not ready yet. If none of the time is left when they are, the request is
-        repeated."""
-        return self.arc._settling == self.grant
+        """True while some devices are not ready yet. The runtime begins when they are. (Where a device is of a zscout
+        before 0.4 it passes meanwhile; if none is left then, the request is repeated.)"""
+        return self.arc._settling == self.grant or (self.active and self.arc.ready is not None)
 
     async def confirmed(self) -> bool:
         """Wait until all devices have confirmed the hold, which they do once they are ready. False if the hold

@@ -121,6 +121,9 @@ class Confirmations:
             if grant in self._direct:
                 self._direct[grant].keep_confirming(self._on_unsure)
             if arc._settling == grant:
+                if arc.ready is None:
+                    # What the leader published of its start may have been missed: until when is it?
+                    await self._rcm.ask(arc)
                 arc._settling = None
                 self._store.notify(arc)
             return
@@ -221,7 +224,7 @@ class Confirmations:
                 if arc._settling != grant:
                     arc._settling, arc.reason = grant, refused.message
                     self._store.notify(arc)
-                if not arc.keep and self._mesh.now() >= arc.end:
+                if arc._is_over(self._mesh.now()):
                     return refused
                 deadline, pause = self._mesh.now() + round(CONFIRM_TIMEOUT * SECOND), BACKOFF[0]
                 await asyncio.sleep(min(LOOK_AGAIN, refused.left if refused.left is not None else LOOK_AGAIN))

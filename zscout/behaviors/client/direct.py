@@ -157,14 +157,14 @@ class DirectHold:
             if now >= self.sure_until:
                 on_unsure(self)
                 return
-            if not self.arc.keep and now >= self.arc.end:
+            if self.arc._is_over(now):
                 self.end()
                 return
             if now >= due:
                 due = now + self._lease // CONFIRMS
                 for rc in self.rcs:
                     self._spawn(self._confirm(rc))
-            ends = [due, self.sure_until, *([] if self.arc.keep else [self.arc.end])]
+            ends = [due, self.sure_until, *([] if self.arc.keep or self.arc.ready is not None else [self.arc.end])]
             await asyncio.sleep(max(0.001, (min(ends) - self._now()) / SECOND))
 
     async def _confirm(self, rc: RcName) -> None:

@@ -111,7 +111,9 @@ class OpenArc:
     hosts: dict[str, str] = field(default_factory=dict)
     """The host of each device, as far as the leader names it."""
     end: Ns = 0
-    """When the minimum runtime of the present hold is over."""
+    """When the minimum runtime of the present hold is over, at the latest."""
+    ready: Ns | None = None
+    """While devices of the present hold are starting: when they are ready, at the latest. Its runtime begins then."""
     since: Ns = 0
     """When `state` began."""
     _waits_since: Ns | None = None
@@ -148,6 +150,10 @@ class OpenArc:
         arc.since, arc._waits_since = now, now - round(request.waited * SECOND)
         return arc
 
+    def _is_over(self, now: Ns) -> bool:
+        """Whether the time of the present hold is over by this host's clock."""
+        return not self.keep and self.ready is None and now >= self.end
+
     @property
     def open(self) -> bool:
         """False once it has ended, was refused or belongs to another client."""
@@ -182,7 +188,8 @@ class OpenArc:
             self.grant = notice.grant
             self.bound, self.rcs = bound, sorted(bound.get(need, need) for need in self.needs)
             self.hosts = notice.hosts
-            self.end = now + round((notice.remaining or 0.0) * SECOND)
+            self.ready = None if notice.waits is None else now + round(notice.waits * SECOND)
+            self.end = (self.ready or now) + round((notice.remaining or 0.0) * SECOND)
         return True
 
     def _binding(self, notice: Notice) -> dict[str, str] | None:
@@ -198,7 +205,7 @@ class OpenArc:
 
     def _close(self, ending: HoldEnd, now: Ns) -> None:
         if self.grant is not None:
-            self.grant, self._ending, self._waits_since = None, ending, now
+            self.grant, self._ending, self._waits_since, self.ready = None, ending, now, None
         elif self._waits_since is None:
             self._waits_since = now
 

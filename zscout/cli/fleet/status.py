@@ -21,7 +21,7 @@ from zscout.cli.requests.waiting import comment, reason_text, request_words, who
 from zscout.config.access import AccessPolicy
 from zscout.keyexpr import Role
 from zscout.messages import BookingsTold, HoldView, Notice, RcmState, RcState, RcView, WaitView, version_words
-from zscout.scheduling.reason import person
+from zscout.scheduling.reason import person, starting
 from zscout.terminal import Table, clock, many, span
 from zscout.types import SECOND, VERSION, Ns
 
@@ -351,7 +351,9 @@ def running(state: RcmState, operator_priority: int, *, plain: bool) -> Table:
     for hold in sorted(state.holds, key=lambda hold: (-hold.priority, -hold.held)):
         since = f"{clock(-hold.held)} ({span(hold.held)})"
         until = f"{clock(hold.remaining, at_latest=True)} ({span(hold.remaining)})"
-        if hold.keep:
+        if hold.waits is not None:
+            until = starting(hold.waits)
+        elif hold.keep:
             until = f"{until}, keeps" if hold.remaining > 0 else "kept"
         if hold.ends_in is not None:
             until = f"{until}, likely {clock(hold.ends_in)}"

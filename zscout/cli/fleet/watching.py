@@ -30,6 +30,7 @@ PASSING: Final = frozenset(
     {
         "held",
         "remaining",
+        "waits",
         "waited",
         "starts_in",
         "yields_in",

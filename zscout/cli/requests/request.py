@@ -29,7 +29,7 @@ from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text
 from zscout.config.strict import BadInput
 from zscout.mesh.supervision import done_within
 from zscout.messages import Foresight, RcmState, StateAsk, version_words
-from zscout.scheduling.reason import waits
+from zscout.scheduling.reason import starting, waits
 from zscout.terminal import LiveLine, clean, clock, print_json, print_line, span
 from zscout.types import SECOND, VERSION, Ns
 
@@ -330,7 +330,10 @@ async def _foresee(client: Client, wanted: HoldOptions) -> int:
     if foretold is None:
         raise common.NobodyThere(f"the leader of fleet {client.fleet.name} did not answer; try again")
     if wanted.as_json:
-        found = {name: getattr(foretold, name) for name in ("starts_in", "preempts", "victims", "reason", "why")}
+        found = {
+            name: getattr(foretold, name)
+            for name in ("starts_in", "begin_within", "preempts", "victims", "reason", "why")
+        }
         print_json({"arc": wanted.name, **found})
     else:
         for line in _words(foretold):
@@ -347,6 +350,8 @@ def _words(foretold: Foresight) -> Iterator[str]:
         yield f"until then: {reason}"
     else:
         yield f"{foretold.arc} would start at once"
+    if start is not None and foretold.begin_within:
+        yield f"then it is {starting(foretold.begin_within)}"
     if foretold.preempts:
         told = [request_words(victim.arc, victim.who, victim.client) for victim in foretold.victims]
         yield f"it would preempt {', '.join(told or foretold.preempts)}"
@@ -399,7 +404,7 @@ class Report(LiveLine):
             arc = self._arc
             if arc is None:
                 self.draw(f"{self._name}: asking the leader")
-            elif arc.state == "running" and arc._settling == arc.grant:
+            elif arc.state == "running" and (arc._settling == arc.grant or arc.ready is not None):
                 self._show_settling(arc)
             elif arc.state in ("asking", "queued") and arc.reason:
                 news = arc._last != self._seen if self.watched else _how(arc) != self._printed
@@ -415,9 +420,11 @@ class Report(LiveLine):
         longest = self._client.fleet.scheduling.max_runtime
         while True:
             self.changed.clear()
-            left = (arc.end - self._mesh.now()) / SECOND
+            now = self._mesh.now()
+            left = (arc.end - now) / SECOND
             protected = left > 0 or not arc.keep
             rest = _yours(arc, left, longest) if protected else f"for {span(self._since(arc))}, {_kept(longest)}"
+            rest = rest if arc.ready is None else starting((arc.ready - now) / SECOND)
             self.draw(f"{arc.name} holds {_held_text(arc)}: {rest}\n  Ctrl-C gives back")
             await done_within(REFRESH if self.watched else None, self.changed.wait())
 
@@ -459,12 +466,14 @@ class Report(LiveLine):
         )
 
     def _show_settling(self, arc: OpenArc) -> None:
-        text = f"{arc.name} is granted {_held_text(arc)}, and waits {span(self._since(arc))}: {arc.reason}"
-        self.draw(text)
+        ready_in = None if arc.ready is None else round(max(0, arc.ready - self._mesh.now()) / SECOND, 3)
+        why = arc.reason if ready_in is None else starting(ready_in)
+        self.draw(f"{arc.name} is granted {_held_text(arc)}, and waits {span(self._since(arc))}: {why}")
         if self._printed != arc.grant:
             self._printed = arc.grant
-            text = "" if self.watched else f"{arc.name} is granted {_held_text(arc)}, and waits: {arc.reason}"
-            self.event("settling", text, id=arc.id, rcs=arc.rcs, grant=arc.grant, reason=arc.reason)
+            text = "" if self.watched else f"{arc.name} is granted {_held_text(arc)}, and waits: {why}"
+            details = {"grant": arc.grant, "reason": why, "ready_in": ready_in}
+            self.event("settling", text, id=arc.id, rcs=arc.rcs, **details)
 
     def _since(self, arc: OpenArc) -> float:
         return (self._mesh.now() - arc.since) / SECOND

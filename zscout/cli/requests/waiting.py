@@ -12,7 +12,7 @@ from zscout.cli import common
 from zscout.cli.device_words import absence
 from zscout.keyexpr import is_pattern, matcher
 from zscout.messages import HoldView, RcmState, ReasonInfo, ReasonParty, WaitView, Who
-from zscout.scheduling.reason import named, person, reason_of
+from zscout.scheduling.reason import named, person, reason_of, starting
 from zscout.terminal import clean, clock, span
 from zscout.types import SECOND
 
@@ -131,6 +131,8 @@ def hold_words(hold: Mapping[str, Any], priority: int) -> str:
 def _until(hold: Mapping[str, Any], priority: int) -> str:
     """Until when the hold is protected from a request of this priority, or lasts."""
     stays, left = hold["keep"] and priority < hold["priority"], hold["remaining"]
+    if (waits := hold.get("waits")) is not None:
+        return f"{starting(waits)}, then {span(left)}" + (" at least" if stays else "")
     if left <= 0:
         return "kept for as long as it wants" if stays else "its minimum runtime is over"
     end = f"until {clock(left, at_latest=True)} ({span(left)})"
@@ -143,4 +145,5 @@ def hold_json(hold: HoldView) -> dict[str, Any]:
     """A hold for programs."""
     names = ("arc", "id", "client", "who", "priority", "keep", "protected_from")
     fields = {name: getattr(hold, name) for name in names}
+    fields["waits"] = None if hold.waits is None else round(hold.waits, 3)
     return fields | {"held": round(hold.held, 3), "remaining": round(hold.remaining, 3)}

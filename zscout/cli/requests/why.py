@@ -24,6 +24,7 @@ from zscout.cli.requests.waiting import (
     request_words,
 )
 from zscout.messages import HistoryAsk, HoldView, RcAsk, RcmState, RcState, WaitView
+from zscout.scheduling.reason import starting
 
 MAX_DESCRIBED: Final = 20
 """Requests of one name."""
@@ -158,7 +159,9 @@ def _print_standing(arc: dict[str, Any]) -> None:
         _say(f"{who} has run since {_past(arc['held'])}", bold=True, fg="green")
         _say(names)
         left = "its minimum runtime is over"
-        if arc["remaining"] > 0:
+        if arc["waits"] is not None:
+            left = f"{starting(arc['waits'])}; its minimum runtime of {runtime} begins then"
+        elif arc["remaining"] > 0:
             left = f"until {_end(arc['remaining'])}, its minimum runtime of {runtime}"
         after = "; it keeps what it has after that" if arc["keep"] else ""
         _say(f"  {left}{after}")

@@ -94,6 +94,7 @@ class LocalRcs:
             driver,
             hold_lease=self._node.fleet.timing.hold_lease / SECOND,
             settle=spec.settle / SECOND,
+            begin_within=None if spec.begin_within is None else spec.begin_within / SECOND,
             last_holder=LastHolderFile(folder, spec.name) if folder is not None else UnknownLastHolder(),
             stall=self._stall,
             confirmations=self._confirmations,

@@ -19,7 +19,7 @@ from zscout.messages import (
     WaitView,
     absurd,
 )
-from zscout.scheduling.reason import ReasonCode, ended, reason_of, short_names, waits_for_others
+from zscout.scheduling.reason import ReasonCode, ended, reason_of, short_names, starting, waits_for_others
 from zscout.services.recorder.drawing import HolderRow, with_person
 from zscout.services.recorder.timeline import Timeline
 from zscout.types import NO_TERM, Grant, Term, clean
@@ -46,6 +46,8 @@ class _Request:
     state: str = ""
     detail: str = ""
     grant: Grant | None = None
+    starts: bool = False
+    """Its devices have not begun."""
     last: tuple[Term, int] = field(default=(NO_TERM, 0))
     """The newest notice."""
 
@@ -202,14 +204,19 @@ class RequestTracker:
 
     def _runs(self, at: float, hold: Holder | HoldView) -> None:
         request = self._track((hold.client, hold.id), hold)
-        if request is None or request.grant == hold.grant:
+        if request is None or (request.grant == hold.grant and request.starts is (hold.waits is not None)):
             return
-        request.grant, request.preempted = hold.grant, False
+        begins = request.grant == hold.grant
+        request.grant, request.preempted, request.starts = hold.grant, False, hold.waits is not None
         operator = hold.priority >= self.operator_priority
         who = f"{request.who} ({request.command})" if request.who and request.command else request.who
         details = [f"priority {hold.priority}", f"min {float(hold.min_runtime):g} s", *filter(None, [who])]
+        if hold.waits is not None:
+            details.insert(0, starting(hold.waits))
         self._set(at, request, "running", " · ".join(details), operator)
         runs = f"{request.label} runs on {', '.join(sorted(_rcs_of(hold)))}"
+        if begins:
+            runs = f"{request.label} is {'ready' if hold.waits is None else starting(hold.waits)}"
         self.timeline.event(at, runs, operator=operator)
 
     def _waits(self, at: float, request: _Request, reason: str, why: ReasonInfo | None) -> None:
