@@ -20,7 +20,7 @@ from zscout.cli.dates import date_words, parse_zone, span_words
 from zscout.cli.ownership import User
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import host_in, of_host
-from zscout.messages import MAX_AHEAD, BookedDate, BookingsAsk, BookingsTold, BookingView
+from zscout.messages import BookedDate, BookingsAsk, BookingsTold, BookingView
 from zscout.terminal import clean, clock, span
 
 SHOWN_ID: Final = 8
@@ -97,8 +97,7 @@ def in_maintenance(told: BookingsTold | None) -> dict[str, str]:
 
 
 def _end(booking: BookingView, date: BookedDate, told: BookingsTold) -> str:
-    lasts = booking.runtime >= MAX_AHEAD
-    return "cancelled" if lasts else clock(date.end - told.time, at_latest=True)
+    return "cancelled" if booking.lasting else clock(date.end - told.time, at_latest=True)
 
 
 def maintenance_of(told: BookingsTold, host: str) -> list[tuple[BookingView, BookedDate]]:
@@ -186,8 +185,9 @@ def rcs_words(booking: BookingView, date: BookedDate | None = None) -> str:
 
 def when_words(booking: BookingView, date: BookedDate, zone: ZoneInfo | None) -> str:
     """`Tue 2026-12-01 14:00 to 16:00`, or until it is cancelled."""
-    lasts = booking.maintenance and booking.runtime >= MAX_AHEAD
-    return f"{date_words(date.start, zone)} until cancelled" if lasts else span_words(date.start, date.end, zone)
+    if booking.lasting:
+        return f"{date_words(date.start, zone)} until cancelled"
+    return span_words(date.start, date.end, zone)
 
 
 def need_words(need: str) -> str:

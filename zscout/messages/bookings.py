@@ -66,10 +66,11 @@ class _Booking(Message, frozen=True):
     until: Instant | None = None
     maintenance: bool = False
     """Nobody is to hold any of them then: a drain with a date, which nobody takes up. `needs` may have patterns, which
-    mean all RCs that match, and `@<host>` for all RCs of a host, on which no component is placed meanwhile. One as long
-    as MAX_AHEAD lasts until it is given up."""
+    mean all RCs that match, and `@<host>` for all RCs of a host, on which no component is placed meanwhile."""
     urgent: bool = False
     """Maintenance preempts holds within their minimum runtimes as well."""
+    lasting: bool = False
+    """Maintenance until it is given up: the leader puts its end off. So what is left of it is forgotten soon."""
     who: Who | None = None
 
 

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import Final
 
 from msgspec import Struct
 
 from zscout.keyexpr import host_in, is_pattern, matcher
-from zscout.messages import MAX_AHEAD, Who
+from zscout.messages import Who
 from zscout.scheduling.needs import check_request
 from zscout.scheduling.reason import Party, Reason
-from zscout.types import SECOND, ArcId, HostName, Need, Ns, Params, RcName
-
-UNTIL_GIVEN_UP: Final[Ns] = MAX_AHEAD * SECOND
-"""Maintenance as long as this has no end in sight."""
+from zscout.types import ArcId, HostName, Need, Ns, Params, RcName
 
 
 class Booking(Struct, frozen=True):
@@ -43,6 +39,8 @@ class Booking(Struct, frozen=True):
     """Keeps each RC free of all other holders meanwhile; it is never taken up and has no patience."""
     urgent: bool = False
     """Maintenance also preempts holds within their minimum runtimes, whatever their priority."""
+    lasting: bool = False
+    """Maintenance whose end is put off until it is given up."""
 
     def __post_init__(self) -> None:
         check_request(f"booking {self.id}", self.needs, self.runtime)
@@ -50,7 +48,7 @@ class Booking(Struct, frozen=True):
     @property
     def until(self) -> Ns | None:
         """Its end; None: it lasts until it is given up."""
-        return None if self.maintenance and self.runtime >= UNTIL_GIVEN_UP else self.end
+        return None if self.lasting else self.end
 
     @property
     def hosts(self) -> set[HostName]:

@@ -57,6 +57,7 @@ def request_for(booking: Booking) -> ArcRequest:
         booking.needs,
         booking.priority,
         booking.runtime,
+        keep=booking.lasting,
         label=booking.label,
         booking=booking.id,
         who=booking.who,

@@ -25,7 +25,7 @@ from collections.abc import Iterator
 from operator import attrgetter
 from typing import Final, NamedTuple, TypeAlias
 
-from zscout.scheduling.booking import UNTIL_GIVEN_UP, Booking
+from zscout.scheduling.booking import Booking
 from zscout.scheduling.model import Arc, Rc, union
 from zscout.scheduling.reason import Reason, ReasonCode
 from zscout.scheduling.state import SchedulerState
@@ -323,7 +323,7 @@ class Reservations:
 
 def kept_for(rc: Rc, reservation: Reservation) -> Reason:
     if reservation.excludes:
-        until = None if reservation.arc.request.min_runtime >= UNTIL_GIVEN_UP else reservation.booked
+        until = None if reservation.arc.request.keep else reservation.booked
         party = reservation.arc.party._replace(until=until)
         return Reason(ReasonCode.MAINTENANCE, (rc.name,), (party,))
     code = ReasonCode.RESERVED if reservation.booked is None else ReasonCode.BOOKED

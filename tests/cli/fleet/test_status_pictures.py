@@ -21,7 +21,6 @@ from zscout.cli.fleet.status import Standing
 from zscout.config.access import AccessPolicy
 from zscout.keyexpr import Role, Token
 from zscout.messages import (
-    MAX_AHEAD,
     BookedDate,
     BookingsTold,
     BookingView,
@@ -122,8 +121,7 @@ class Picture:
         if (kept := options.get("kept")) is not None:
             start = round(NOW.timestamp()) + {"maintenance": -60, "drained": -60, "booked": 3600}[kept]
             self.cordoned |= {at} if kept == "drained" else set()
-            length = MAX_AHEAD if kept == "drained" else 120
-            date = BookedDate(start, start + length, "open")
+            date = BookedDate(start, start + 120, "open")
             view_of = BookingView(
                 id="b1",
                 owner="anvil",
@@ -131,11 +129,12 @@ class Picture:
                 needs={f"@{at}" if kept == "drained" else name: {}},
                 start=date.start,
                 priority=0,
-                runtime=Decimal(length),
+                runtime=Decimal(120),
                 patience=Decimal(0),
                 maintenance=kept != "booked",
                 dates=[date],
                 maintained=[name] if kept == "drained" else [],
+                lasting=kept == "drained",
             )
             self.booked.bookings.append(view_of)
 

@@ -11,14 +11,22 @@ import pytest
 from tests.mesh.kit import until
 from tests.services.rcm.booked_fleet import NOON, BookedFleet, book, booked, do, states
 from tests.services.rcm.kit import FakeClient, Refusal, request
-from zscout.messages import MAX_AHEAD, Book, BookingView, Unbook
+from zscout.messages import WINDOW, Book, BookingView, Unbook
+from zscout.services.bookings.dates import last_end
 
-YEAR = Decimal(MAX_AHEAD)
+SPAN = Decimal(WINDOW)
 
 
 def drained(fleet: BookedFleet, name: str = "d", need: str = "@devices", **more: Any) -> Book:
     """From now on, until it is given up."""
-    terms = {"priority": 1_000_000, "start": round(fleet.time()), "runtime": YEAR, "patience": YEAR, **more}
+    terms = {
+        "priority": 1_000_000,
+        "start": round(fleet.time()),
+        "runtime": SPAN,
+        "patience": SPAN,
+        "lasting": True,
+        **more,
+    }
     return Book(id=name, name=name, needs={need: {}}, maintenance=True, **terms)
 
 
@@ -84,7 +92,13 @@ async def test_a_drain_outlives_its_leader_and_the_next_places_nothing_there() -
 async def test_a_host_in_maintenance_at_a_date_is_cordoned_for_that_time() -> None:
     fleet, (leader,) = await booked("x")
     client = fleet.client("one")
-    terms: dict[str, Any] = {"start": round(NOON + 50), "runtime": Decimal(20), "patience": Decimal(20), "priority": 10}
+    terms: dict[str, Any] = {
+        "start": round(NOON + 50),
+        "runtime": Decimal(20),
+        "patience": Decimal(20),
+        "lasting": False,
+        "priority": 10,
+    }
     await do(client, drained(fleet, **terms), BookingView)
     placer = leader.placer
     assert placer is not None
@@ -108,14 +122,33 @@ async def test_bookings_on_a_drained_host_are_in_conflict_until_it_is_used_again
     assert states((await fleet.bookings())["b"]) == ["open"]
 
 
+async def test_a_drain_lasts_and_what_is_left_of_it_is_forgotten_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in ("booked_dates", "booking_handler"):
+        monkeypatch.setattr(f"zscout.services.rcm.{module}.WINDOW", 60)
+    fleet, (leader, _) = await booked("x", "y")
+    client = fleet.client("one")
+    await do(client, drained(fleet, runtime=Decimal(60), patience=Decimal(60)), BookingView)
+    assert leader.placer is not None
+    for number in range(9):
+        await asyncio.sleep(20)
+        [date] = (await fleet.bookings())["d"].dates
+        assert date.start <= fleet.time() < date.end - 29
+        assert (await client.ask(f"late{number}", "robot/a")).state == "queued"
+        assert leader.placer._core.cordoned == {"devices"}
+    await do(client, Unbook("d"), BookingView)
+    [record] = fleet.disks["y"].records
+    assert record.unbooked
+    assert last_end(record) <= fleet.time() + 60
+
+
 @pytest.mark.parametrize(
     ("need", "more", "why"),
     [
         ("robot/x", {}, "unknown_device"),
         ("camera/*", {}, "unknown_device.*no device matches camera/*"),
         ("@a b", {}, "bad_request.*host"),
-        ("@devices", {"maintenance": False}, "bad_request.*device"),
-        ("robot/a", {"maintenance": False, "urgent": True}, "bad_request.*only maintenance can be urgent"),
+        ("@devices", {"maintenance": False, "lasting": False}, "bad_request.*device"),
+        ("robot/a", {"maintenance": False}, "bad_request.*only maintenance can be urgent or lasting"),
     ],
 )
 async def test_maintenance_of_what_is_unknown_or_malformed_is_refused(

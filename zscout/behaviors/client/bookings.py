@@ -84,6 +84,7 @@ class BookingsClient:
         until: datetime | None = None,
         maintenance: bool = False,
         urgent: bool = False,
+        lasting: bool = False,
         comment: str = "",
     ) -> BookingView:
         """Book all of `needs` together, from `start` on for `runtime` seconds. Return when a second host has stored
@@ -98,6 +99,7 @@ class BookingsClient:
         - `maintenance`: keep the devices free of holders. A pattern means all devices that match it, and `@anvil` all
           devices of the host anvil, which gets no components meanwhile. Needs the rights of an operator.
         - `urgent`: maintenance also ends holds within their minimum runtimes.
+        - `lasting`: maintenance until it is cancelled; `runtime` is 60 days, and the leader puts its end off.
 
         Raises RequestRefused, with `code` `not_free` if a device is taken; RcmSilent if no leader answers;
         ValueError for a bad date or span of time."""
@@ -120,6 +122,7 @@ class BookingsClient:
                 until=None if until is None else _whole_second(until),
                 maintenance=maintenance,
                 urgent=urgent,
+                lasting=lasting,
                 who=self._who(comment),
             ),
             BookingView,

@@ -28,7 +28,7 @@ from zscout.cli.requests.options import parse_comment, timeout_option
 from zscout.cli.requests.request import MAX_PRIORITY
 from zscout.cli.requests.waiting import hold_json, request_words
 from zscout.keyexpr import of_host
-from zscout.messages import MAX_AHEAD, DrainHost, Grants, HoldView, Placement, Placements, UncordonHost, Who
+from zscout.messages import WINDOW, DrainHost, Grants, HoldView, Placement, Placements, UncordonHost, Who
 from zscout.terminal import clean, clock
 from zscout.types import Grant
 
@@ -132,7 +132,7 @@ async def _close(client: Client, placer: PlacerClient, host: str, *, urgent: boo
     """Put the host in maintenance until that is cancelled. Where the leader can't, only components leave, and it
     returns why. Raises Failed, RequestRefused."""
     told, me, bookings = await ask_bookings(client), User.of(client), BookingsClient(client)
-    drains = [booking for booking, _ in maintenance_of(told, host) if booking.runtime >= MAX_AHEAD]
+    drains = [booking for booking, _ in maintenance_of(told, host) if booking.lasting]
     is_drained = any(booking.urgent or not urgent for booking in drains)
     try:
         if not is_drained:
@@ -142,11 +142,12 @@ async def _close(client: Client, placer: PlacerClient, host: str, *, urgent: boo
             await bookings.book(
                 {of_host(host): {}},
                 datetime.fromtimestamp(int(told.time), UTC),
-                MAX_AHEAD,
+                WINDOW,
                 name=free_name(f"drain-{host}"[:MAX_NAMED], [one for one in told.bookings if is_own(one, me)]),
                 priority=MAX_PRIORITY,
                 maintenance=True,
                 urgent=urgent,
+                lasting=True,
                 comment=comment,
             )
             for booking in drains:

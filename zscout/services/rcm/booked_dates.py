@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
+from decimal import Decimal
 from functools import partial
 from operator import attrgetter
 from typing import NamedTuple
@@ -135,6 +136,7 @@ class BookedDates:
             record.who,
             maintenance=record.maintenance,
             urgent=record.urgent,
+            lasting=record.lasting,
         )
 
     def dated(self, request: ArcRequest) -> ArcRequest:
@@ -171,6 +173,22 @@ class BookedDates:
     def until_another(self) -> float:
         """Seconds until what is repeated has one more date within 60 days; infinite where nothing is."""
         return min((known.next for known in self._expanded.values()), default=math.inf) - WINDOW - self.time
+
+    def _lasting(self) -> list[BookingRecord]:
+        """Maintenance without an end."""
+        return [
+            record for record in self._records if record.lasting and not record.unbooked and _end(record) > self.time
+        ]
+
+    def until_renewal(self) -> float:
+        """Seconds until maintenance without an end is to be put off; infinite where there is none."""
+        return min(map(_end, self._lasting()), default=math.inf) - WINDOW / 2 - self.time
+
+    def renew(self) -> None:
+        """Have maintenance without an end begin again for 60 days, where half of that is over."""
+        for record in self._lasting():
+            if _end(record) - self.time <= WINDOW / 2:
+                self.change(record, start=int(self.time), runtime=Decimal(WINDOW), patience=Decimal(WINDOW))
 
     def _lapsed(self, date: Date) -> bool:
         """Whether nobody took it up in time: that follows from the time alone, and is not kept."""
@@ -360,6 +378,11 @@ def start_of(name: str) -> Instant | None:
     """When the date begins that the core calls so, as others may tell of it; None: it is none."""
     _, _, start = name.partition("@")
     return int(start) if start.isascii() and start.isdecimal() and len(start) <= MAX_DIGITS else None
+
+
+def _end(record: BookingRecord) -> float:
+    """The end of what is not repeated."""
+    return record.start + float(record.runtime)
 
 
 def _ahead(record: BookingRecord) -> float:

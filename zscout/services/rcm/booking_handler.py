@@ -118,8 +118,10 @@ class BookingHandler:
             check_name(wanted.name, "name of the booking")
             zone_of(wanted.zone)
             runtime, patience = duration(wanted.runtime, "runtime"), duration(wanted.patience, "patience")
-            if wanted.urgent and not wanted.maintenance:
-                raise ValueError("only maintenance can be urgent")
+            if (wanted.urgent or wanted.lasting) and not wanted.maintenance:
+                raise ValueError("only maintenance can be urgent or lasting")
+            if wanted.lasting and (wanted.every or wanted.runtime != WINDOW):
+                raise ValueError(f"lasting maintenance is not repeated, and its runtime is {WINDOW} s")
         except (BadName, ValueError) as error:
             raise Refused("bad_request", str(error)) from None
         self._check_length(wanted.runtime)

@@ -42,6 +42,8 @@ class _Due(Enum):
     """What is repeated may have one more date within 60 days."""
     LOOK = auto()
     """It is found out when that is."""
+    RENEW = auto()
+    """Maintenance without an end is to be put off."""
     TRY = auto()
     TELL = auto()
 
@@ -70,6 +72,7 @@ class Bookings:
         self._set: set[_Due] = set()
         """Those of which there is one at a time."""
         self._another: Ns | None = None
+        self._renewal: Ns | None = None
         self._told: dict[str, str] = {}
         """Dangers that were reported, by date."""
         self._once(_Due.NEWS, 0)
@@ -180,6 +183,9 @@ class Bookings:
                 case (_Due.ANOTHER, at) if at == self._another:
                     self._another = None
                     self._once(_Due.NEWS, 0)
+                case (_Due.RENEW, at) if at == self._renewal and self.settled:
+                    self.dates.renew()
+                    self._once(_Due.NEWS, 0)
                 case (_Due.LOOK, _):
                     self._await_another()
                 case (_Due.TRY, _):
@@ -205,7 +211,11 @@ class Bookings:
         self._await_another()
 
     def _await_another(self) -> None:
-        """What is repeated is to have its dates in time."""
+        """What is repeated is to have its dates in time, and maintenance without an end is to last."""
+        renewal, self._renewal = self.dates.until_renewal(), None
+        if math.isfinite(renewal):
+            self._renewal = self.dates.now + round(max(0.0, renewal) * SECOND) + SLACK
+            self._deadlines.set(self._renewal, (_Due.RENEW, self._renewal))
         until, self._another = self.dates.until_another(), None
         if math.isfinite(until):
             self._another = self.dates.now + round(max(0.0, until) * SECOND) + SLACK
