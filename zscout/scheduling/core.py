@@ -12,6 +12,7 @@ and a `Tick` at the latest when `WakeAt` asks for it."""
 from __future__ import annotations
 
 from collections.abc import Collection, Container, Iterable
+from typing import Final
 
 from msgspec.structs import replace
 
@@ -28,6 +29,8 @@ from zscout.scheduling.slots import SlotsFound, slots
 from zscout.scheduling.state import SchedulerState, Strategy
 from zscout.scheduling.votes import HolderSet
 from zscout.types import NO_TERM, ArcId, ClientId, Grant, HostName, Ns, Place, RcName, Term
+
+NO_HOSTS: Final = frozenset[HostName]()
 
 
 class Core:
@@ -243,6 +246,8 @@ class Core:
 
     def drained(self) -> frozenset[HostName]:
         """The hosts in maintenance now."""
+        if not self._state.maintenance:
+            return NO_HOSTS
         begun = (claim.booking for claim in self._state.maintenance.values() if claim.date <= self._state.now)
         return frozenset().union(*(booking.hosts for booking in begun))
 

@@ -74,7 +74,7 @@ class Displaced:
         }
 
     async def agree(self, name: str, *, yes: bool) -> None:
-        """Print it on stderr, and ask if somebody is displaced. Raises Failed for a no, BadInput without a terminal."""
+        """Print it on stderr, and ask if anything is displaced. Raises Failed for a no, BadInput without a terminal."""
         for line in self.lines():
             print_line(clean(f"{name} {line}"), sys.stderr)
         if self and not yes:

@@ -143,7 +143,7 @@ async def _close(client: Client, placer: PlacerClient, host: str, *, urgent: boo
                 {of_host(host): {}},
                 datetime.fromtimestamp(int(told.time), UTC),
                 WINDOW,
-                name=free_name(f"drain-{host}"[:MAX_NAMED], [one for one in told.bookings if is_own(one, me)]),
+                name=free_name(f"drain-{host}"[:MAX_NAMED], [own for own in told.bookings if is_own(own, me)]),
                 priority=MAX_PRIORITY,
                 maintenance=True,
                 urgent=urgent,
@@ -194,11 +194,12 @@ class _Leftovers:
 
     def components(self) -> list[Placement]:
         found = (placement for _, placement in sorted(self._placer.placements.items()))
-        return [one for one in found if self._host in (one.host, one.to) and one.state not in placing.OVER]
+        here = (known for known in found if self._host in (known.host, known.to))
+        return [known for known in here if known.state not in placing.OVER]
 
     def leaving(self) -> list[Placement]:
         """A component that does not run yet is moved when it does."""
-        return [one for one in self.components() if one.movable or one.state != "running"]
+        return [known for known in self.components() if known.movable or known.state != "running"]
 
     def words(self) -> str:
         return clean(", ".join((*self._held(), *map(_component_words, self.components()))))
