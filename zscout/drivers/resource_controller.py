@@ -598,7 +598,7 @@ class ResourceController:
             if entry.begun:
                 continue
             if grant in self._entered:
-                waits[grant] = max(1, round(self.driver.begins_for() * SECOND))
+                waits[grant] = max(1, min(round(self.driver.begins_for() * SECOND), bound))
             else:
                 safe = 0 if self._making_safe is None else self._safe_by
                 waits[grant] = max(0, max(self.holds.settles(grant) or 0, safe) - now) + bound

@@ -695,14 +695,16 @@ class Roster:
                 self._out.then.append(Name(state.rc))
 
     def _follow_begin(self, rc: _Rc, state: RcState) -> None:
-        """Give an RC that has not begun for a holder as long as it says that it needs at most."""
-        waiting = frozenset(holder.grant for holder in state.holders if holder.waits is not None)
-        held = {holder.grant for holder in state.holders}
-        if (rc.waiting - waiting) & held:
+        """Give an RC that has not begun for a holder as long as it says that it needs at most, a hold lease and its
+        `settle`."""
+        lease, held = self._timing.hold_lease, {holder.grant for holder in state.holders}
+        waits = {holder.grant: holder.waits for holder in state.holders if holder.waits is not None}
+        if (rc.waiting - waits.keys()) & held:
             rc.failures = 0
-        for grant in sorted(waiting - rc.waiting):
-            self._set(longest_begin(state, self._timing.hold_lease), _Due.BEGUN, (state.rc, grant))
-        rc.waiting = waiting
+        for grant in sorted(waits.keys() - rc.waiting):
+            left = min(round(waits[grant] * SECOND), longest_begin(state, lease))
+            self._set(left + lease + round((state.settle or 0) * SECOND), _Due.BEGUN, (state.rc, grant))
+        rc.waiting = frozenset(waits)
 
     def _judge_begin(self, rc: _Rc, grant: Grant) -> None:
         state = rc.joined
