@@ -524,6 +524,7 @@ class Core:
         arc.waits = {**held.waits}
         if (waits := max(filter(None, held.waits.values()), default=None)) is not None:
             hold = replace(hold, waits=waits, last=self._state.last(arc, waits, held.end))
+            arc.lost = 0  # what it lost before is not known, as the leader before knew when it was granted
         absent = [rc.name for rc in self._state.rcs_in(arc.mask & ~self._state.present)]
         taken = [rc.name for rc in self._state.rcs_in(arc.mask & self._state.busy)]
         other = self._state.at_place(arc.place)

@@ -71,7 +71,8 @@ async def test_a_program_has_its_time_after_the_start_of_its_devices(
 ) -> None:
     async with small_fleet("one", kind=SlowFleet) as (fleet, (one,)):
         began = seconds(one)
-        async with hold(one, "job", needs, min_runtime=RUNS, keep=False, confirmed=True, direct=direct) as held:
+        how = {"min_runtime": RUNS, "keep": False, "confirmed": True, "direct": direct, "timeout": 2 * STARTS}
+        async with hold(one, "job", needs, **how) as held:  # type: ignore[arg-type]
             entered = seconds(one)
             assert entered - began == pytest.approx(STARTS, abs=0.3)
             assert held.remaining == pytest.approx(RUNS, abs=0.2)
@@ -88,7 +89,7 @@ async def test_two_plain_requests_take_turns() -> None:
         began, entered = seconds(one), []
 
         async def work(client: Client) -> None:
-            async with hold(client, "job", {RC: {}}, min_runtime=RUNS, keep=False, confirmed=True):
+            async with hold(client, "job", {RC: {}}, min_runtime=RUNS, keep=False, confirmed=True, timeout=4 * STARTS):
                 entered.append(seconds(client) - began)
                 await asyncio.sleep(2 * RUNS)
 
@@ -142,7 +143,9 @@ async def test_a_change_of_leader_while_devices_start_costs_nothing() -> None:
 
 
 async def test_what_is_handed_over_goes_on_starting() -> None:
-    async with small_fleet("old", "new", kind=SlowFleet) as (_, (old, new)):
+    async with small_fleet("old", "new", kind=SlowFleet) as (fleet, (old, new)):
+        assert isinstance(fleet, SlowFleet)
+        fleet.oven.starts = 20.0
         began = seconds(old)
         await asked(old, "job", BOTH, min_runtime=10)
         await asyncio.sleep(5)
@@ -151,11 +154,11 @@ async def test_what_is_handed_over_goes_on_starting() -> None:
         arc = await asked(new, "job", BOTH, min_runtime=10)
         await until(lambda: arc.ready is not None)
         await until(lambda: arc.ready is None, within=2 * STARTS)
-        assert seconds(new) - began == pytest.approx(STARTS, abs=0.3)
+        assert seconds(new) - began == pytest.approx(20, abs=0.3)
         assert arc.grant is not None
         assert (await new.command(RC, arc.grant, ECHO)).result == 7
         await until(lambda: not arc.open, within=2 * RUNS)
-        assert seconds(new) - began == pytest.approx(STARTS + 10, abs=0.5)
+        assert seconds(new) - began == pytest.approx(20 + 10, abs=0.5)
 
 
 async def test_with_a_device_that_knows_none_of_this_the_whole_hold_runs_from_its_grant() -> None:
