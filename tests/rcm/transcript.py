@@ -292,7 +292,10 @@ def _state(notice: Notice) -> str:
 
 
 def _waits(told: Holder | Notice) -> str:
-    return "" if told.waits is None else f", which begin within {told.waits:g} s, then {told.remaining:g} s"
+    if told.waits is None:
+        return ""
+    then = f"then {told.remaining:g} s" if isinstance(told, Holder) else f"until {told.remaining:g} s from now"
+    return f", which begin within {told.waits:g} s, {then}"
 
 
 def _grant(grant: Grant) -> str:

@@ -237,7 +237,7 @@ class Notice(_ArcParty, frozen=True):
     bound: dict[str, str] = {}
     """While it runs: the RC that meets each of its patterns."""
     remaining: Seconds | None = None
-    """Seconds until its minimum runtime is over; with `waits` from when its devices have begun."""
+    """Seconds until its minimum runtime is over; with `waits`, at the latest."""
     starts_in: Seconds | None = None
     """While it is queued, where the client asked for estimates: seconds until it will start if nothing else
     comes; None where it will not as things stand, or not within what can be forecast."""

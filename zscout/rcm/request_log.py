@@ -169,7 +169,7 @@ class RequestLog:
             "seal": self._places.seal(arc.place, arc_id),
         }
         if hold is not None:
-            remaining, left = hold.remaining(now) / SECOND, hold.starting(now)
+            remaining, left = (hold.end - now) / SECOND, hold.starting(now)
             rcs, bound = sorted(arc.needs), dict(arc.bound)
             hosts = {rc: host for rc, (_, host) in self._roster.named(arc.needs).items()}
             known |= {"bound": bound, "hosts": hosts, "waits": None if left is None else left / SECOND}

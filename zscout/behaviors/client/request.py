@@ -189,7 +189,7 @@ class OpenArc:
             self.bound, self.rcs = bound, sorted(bound.get(need, need) for need in self.needs)
             self.hosts = notice.hosts
             self.ready = None if notice.waits is None else now + round(notice.waits * SECOND)
-            self.end = (self.ready or now) + round((notice.remaining or 0.0) * SECOND)
+            self.end = now + round((notice.remaining or 0.0) * SECOND)
         return True
 
     def _binding(self, notice: Notice) -> dict[str, str] | None:
