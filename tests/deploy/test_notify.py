@@ -97,7 +97,7 @@ async def test_hangup_reads_the_files_again_and_never_ends_the_node(lab: Lab) ->
             ("max = 3", "max = 4", "SIGHUP: took components.max"),
             ("max = 4", "max = 0", "the settings of before stay"),
             ("max = 0", "max = 4", "SIGHUP: the files say what they said"),
-            ("robot/a", "robot/b", "SIGHUP: restart this node to take rc.robot/a, rc.robot/b"),
+            ("robot/a", "robot/b", "SIGHUP: took rc.robot/a, rc.robot/b"),
         ):
             file.write_text(file.read_text().replace(old, new))
             node.send_signal(signal.SIGHUP)

@@ -212,8 +212,8 @@ class Core:
         return joined, model.LeadTaken(term, recovered_holds, waiting, self.charged(), patience=self.patience)
 
     def slots(self, wanted: Booking, until: Ns, limit: int, *, bookings_only: bool = False) -> SlotsFound:
-        """The first `limit` times between the start of `wanted` and `until` at which it would be kept.
-        `bookings_only` ignores holds and queue."""
+        """The first `limit` times between the start of `wanted`, which is no maintenance, and `until` at which it would
+        be kept. `bookings_only` ignores holds and queue."""
         arc = self._calendar.stand_in(wanted)
         return slots(self._state, wanted, arc, until, limit, bookings_only=bookings_only)
 

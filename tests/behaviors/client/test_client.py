@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import replace as with_policy
 
 import pytest
 from msgspec.structs import replace
@@ -269,8 +268,8 @@ async def test_what_others_released_is_not_asked_for_again() -> None:
 
 @pytest.mark.parametrize("keep", [True, False])
 async def test_the_fleet_s_longest_time_ends_it(*, keep: bool) -> None:
-    policy = with_policy(FLEET.scheduling, max_runtime=100 * SECOND)
-    async with small_fleet("one", config=replace(FLEET, scheduling=policy)) as (fleet, (one,)):
+    limits = replace(FLEET.limits, max_runtime=100 * SECOND)
+    async with small_fleet("one", config=replace(FLEET, limits=limits)) as (fleet, (one,)):
         began = one.mesh.now()
         async with hold(one, "first", {RC: {}}, keep=keep, min_runtime=None if keep else LONG) as held:
             assert held.remaining < 101
