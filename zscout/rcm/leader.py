@@ -46,7 +46,7 @@ BOOKINGS: Final = (messages.Book, messages.Unbook, messages.FindSlots)
 
 
 class _Instant(NamedTuple):
-    """One that is decided."""
+    """A decided instant: what its answers, publication and follow-up are made of."""
 
     events: Sequence[model.Event]
     effects: Sequence[model.Effect]

@@ -83,7 +83,7 @@ class Held:
     @property
     def settling(self) -> bool:
         """True while some devices are not ready yet. The runtime begins when they are. (Where a device is of a zscout
-        before 0.4 it passes meanwhile; if none is left then, the request is repeated.)"""
+        before 0.3 it passes meanwhile; if none is left then, the request is repeated.)"""
         return self.arc._settling == self.grant or (self.active and self.arc.ready is not None)
 
     async def confirmed(self) -> bool:
