@@ -199,6 +199,24 @@ async def test_what_is_too_old_when_its_turn_comes_is_not_written() -> None:
         await line.stop()
 
 
+@pytest.mark.parametrize(("taken_at", "is_same"), [("127.0.0.2", True), ("127.0.0.1", False)])
+def test_after_a_failure_it_comes_from_the_same_port_where_that_is_free(taken_at: str, is_same: bool) -> None:
+    with peer() as there:
+        port = SerialPort(there.url, 9600)
+        first = source_of(port)
+        # Another program's, as any of them may have it before the port is opened again.
+        with socket.create_server((taken_at, first[1])):
+            assert (source_of(port) == first) is is_same
+
+
+def source_of(port: SerialPort) -> Any:
+    """The local end of a connection that is opened, and fails."""
+    port.open()
+    source = port._socket.getsockname()
+    port.close(discard=True)
+    return source
+
+
 @pytest.fixture
 def away() -> Iterator[str]:
     """A network namespace at the end of a cable of this machine, at FAR; see `reach`."""

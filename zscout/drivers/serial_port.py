@@ -92,9 +92,9 @@ class SerialPort:
         self._locked = ExitStack()
         self._recent: deque[tuple[Ns, int]] = deque()
         """The writes within TIMEOUT: instant and size."""
-        self._source = 0
-        """The local TCP port of a connection that failed. A peer that has not noticed lets go of it, and takes a new
-        one, when that comes from the same port."""
+        self._source: Any = None
+        """The local address and TCP port of a connection that failed. A peer that has not noticed lets go of it, and
+        takes a new one, when that comes from the same port."""
 
     def open(self) -> None:
         import serial
@@ -171,7 +171,7 @@ class SerialPort:
                 if discard:
                     self._port.reset_output_buffer()
             elif discard:
-                self._source = connection.getsockname()[1]
+                self._source = connection.getsockname()
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         with suppress(Exception):
             self._port.close()
@@ -198,15 +198,16 @@ class SerialPort:
                 for level, option, value in OPTIONS:
                     if hasattr(socket, option):
                         connection.setsockopt(getattr(socket, level), getattr(socket, option), value)
-                if self._source:
+                if self._source is not None:
                     connection.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                    connection.bind(("", self._source))
+                    with suppress(OSError):  # in use, or its interface is gone: from any port, then
+                        connection.bind(self._source)
                 connection.settimeout(CONNECT)
                 connection.connect(to)
             except OSError as error:
                 connection.close()
-                if error.errno in (errno.EADDRINUSE, errno.EADDRNOTAVAIL):
-                    self._source = 0
+                if error.errno == errno.EADDRNOTAVAIL:
+                    self._source = None
                 failed = error
             else:
                 connection.settimeout(TIMEOUT)
