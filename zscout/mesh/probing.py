@@ -42,6 +42,7 @@ LINK: Final = 0.8
 LIST: Final = 1.0  # seconds for links to a plain mesh, and for its tokens
 MAX_HEARD: Final = 64  # processes called
 MAX_TOKENS: Final = 10_000
+LOOPBACKS: Final = {"127.0.0.1", "::1"}
 _ALERT: Final = re.compile(r"alert ([a-z ]*[a-z])")
 _ADDRESS: Final = re.compile(r"(tcp|tls)/([^#?]+):(\d+)(?:[?#].*)?")
 
@@ -104,7 +105,9 @@ async def heard(config: MeshConfig) -> list[Heard]:
                 elif not (zid := str(hello.zid)).startswith(MEETING):
                     addresses = tuple(address for address in hello.locators if "[fe80:" not in address)
                     hosts = {match[2].strip("[]") for at in addresses if (match := _ADDRESS.match(at))}
-                    found[zid] = Heard(zid, addresses, bool(hosts & own), str(hello.whatami) == "router")
+                    # Every host has loopback: by its own it is known only if it has no other address.
+                    here = bool((hosts - LOOPBACKS or hosts) & own)
+                    found[zid] = Heard(zid, addresses, here, str(hello.whatami) == "router")
     except (zenoh.ZError, OSError, RuntimeError):  # no interface for it, or no room
         pass
     return list(found.values())

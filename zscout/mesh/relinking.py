@@ -110,7 +110,11 @@ class Relinking:
 
     def _greet(self) -> None:
         """Look for all peers: none needs a link from here, and others may not know this process."""
-        found = self._scout(GREET_TIMEOUT)
+        try:
+            found = self._scout(GREET_TIMEOUT)
+        except zenoh.ZError as error:  # no interface is up, not even loopback
+            log.debug("looking for peers failed: %s", error)
+            return
         with self._lock:
             for peer in found.keys() - {self._own}:
                 self._lost.setdefault(peer, _Lost(time.monotonic(), together=True))

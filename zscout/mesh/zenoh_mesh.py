@@ -30,6 +30,7 @@ from zscout.config.fleet import Fleet, MeshConfig, load_fleet
 from zscout.config.strict import BadInput
 from zscout.keyexpr import FleetMember, Keys, Sender, access_control
 from zscout.logs import shortage
+from zscout.mesh import interfaces
 from zscout.mesh.exchange import MeshError
 from zscout.mesh.relinking import MEETING, Relinking
 from zscout.mesh.renewal import RenewableTransport
@@ -61,7 +62,7 @@ QUERY: Any = {"target": zenoh.QueryTarget.ALL, "consolidation": zenoh.Consolidat
 MAX_QUERIERS = 256  # per session: Zenoh never frees a key's declaration
 MAX_MESSAGE = 17_000_000  # bytes: a little more than zscout's largest message
 LOOK_AT_FILES = 2.0  # seconds between two checks for renewed certificates and changed rights
-ANY_TLS = "tls/0.0.0.0:0"
+ANY, ANY_TLS = "tcp/[::]:0", "tls/0.0.0.0:0"
 T = TypeVar("T")
 _PORT = re.compile(r":\d+$")
 
@@ -73,13 +74,15 @@ class Security(NamedTuple):
 
 
 def zenoh_config(config: MeshConfig, security: Security | None = None) -> zenoh.Config:
-    """The Zenoh settings for a `[mesh]` table, for one session."""
+    """The Zenoh settings for a `[mesh]` table, for one session that is opened now."""
+    known, found = known_to_zenoh(), interfaces.addresses()
+    v6_group = config.multicast_address.startswith("[")
     settings: dict[str, Any] = {
         "mode": "router" if config.relay else "peer",
         "id": increasing_id(),
         "scouting/multicast/enabled": config.multicast,
         "scouting/multicast/address": config.multicast_address,
-        "scouting/multicast/interface": config.interface,
+        "scouting/multicast/interface": config.interface if v6_group else interfaces.scouting(config.interface, found),
         "scouting/delay": SCOUTING_DELAY_MS,
         # Of two peers always the same one makes the only link (docs/zenoh.md).
         "scouting/multicast/autoconnect_strategy": GREATER_CONNECTS,
@@ -98,10 +101,11 @@ def zenoh_config(config: MeshConfig, security: Security | None = None) -> zenoh.
     if config.relay:
         regions = [{"filters": [{"region_names": [site]}]} for site in config.relay]
         settings["gateway"] = {"south": regions}
-    if config.listen:
-        settings["listen/endpoints"] = list(config.listen)
-    elif security is not None:
-        settings["listen/endpoints"] = [ANY_TLS]
+    listen = list(config.listen) or ([ANY_TLS] if security is not None else [])
+    if found != known:
+        listen = interfaces.listening(listen or [ANY], found)
+    if listen:
+        settings["listen/endpoints"] = listen
     if config.connect:
         settings["connect/endpoints"] = list(config.connect)
     if security is not None:
@@ -110,6 +114,12 @@ def zenoh_config(config: MeshConfig, security: Security | None = None) -> zenoh.
     for key, value in settings.items():
         result.insert_json5(key, json.dumps(value))
     return result
+
+
+@functools.cache
+def known_to_zenoh() -> frozenset[interfaces.HostAddress]:
+    """The addresses of this host when Zenoh's settings were made first: it reads them about then, and never again."""
+    return interfaces.addresses()
 
 
 def _closed(security: Security) -> dict[str, Any]:
@@ -167,7 +177,7 @@ class _Door:
 
 class ZenohMesh(Mesh):
     _door: _Door
-    _watching: asyncio.Task[NoReturn] | None = None
+    _watching: tuple[asyncio.Task[NoReturn], ...] = ()
 
     @classmethod
     async def open(cls, fleet: Fleet, me: Sender, *, follow: bool = True) -> Self:
@@ -175,7 +185,7 @@ class ZenohMesh(Mesh):
         Raises MeshError if an address can't be had, BadInput for bad certificates."""
         config, keys = fleet.mesh, Keys(fleet.name, closed=fleet.security is not None)
         security = None if fleet.security is None else _security(fleet, keys, me)
-        door = _Door(security)
+        door, found = _Door(security), interfaces.addresses()
         openings = [lambda: _open(config, door.security)]
         if config.listen:
             # Until the old session frees its ports, one on other ports learns the peers from it.
@@ -188,13 +198,30 @@ class ZenohMesh(Mesh):
         if security is not None:
             mesh.validity = security.certificates
             rights = RightsFile(fleet.file, fleet.access) if follow and fleet.file is not None else None
-            mesh._watching = asyncio.create_task(mesh._watch_files(security.certificates, rights))
+            mesh._watching = (asyncio.create_task(mesh._watch_files(security.certificates, rights)),)
+        mesh._watching += (asyncio.create_task(mesh._watch_interfaces(found)),)
         return mesh
 
     async def close(self) -> None:
-        if self._watching is not None:
-            self._watching.cancel()
+        for task in self._watching:
+            task.cancel()
         await super().close()
+
+    async def _watch_interfaces(self, used: frozenset[interfaces.HostAddress]) -> NoReturn:
+        """Reopen the session for each address that appears: Zenoh uses those alone that it was opened with."""
+        before = used
+        while True:
+            await asyncio.sleep(interfaces.LOOK_EVERY)
+            if self._transport.behind:
+                self._transport.renew()
+            now = await asyncio.wrap_future(in_thread("reads addresses", interfaces.addresses))
+            if now == before and now != used:
+                appeared, words = now - used, interfaces.change(used, now)
+                log.warning("%s%s", words, ": reopening the mesh session" if appeared else "")
+                used = now
+                if appeared:
+                    self._transport.take_settings()
+            before = now
 
     async def _watch_files(self, known: Certificates, rights: RightsFile | None) -> NoReturn:
         """Warn before certificates end, and reopen the session once these or the rights have changed: it keeps those
@@ -203,8 +230,6 @@ class ZenohMesh(Mesh):
         warned = ""
         while True:
             await asyncio.sleep(LOOK_AT_FILES)
-            if self._transport.behind:
-                self._transport.renew()
             if rights is not None and (access := await asyncio.wrap_future(in_thread("reads rights", rights.changed))):
                 if not access.ranks_of(self.me.host):
                     log.warning("%s has no role in the fleet file any more: its requests stay unanswered", self.me.host)
