@@ -22,22 +22,23 @@ from zscout.services.bookings.dates import dates, last_end
 from zscout.services.bookings.fleet_clock import DIFFERS, SAME
 from zscout.services.bookings.keeper import BookingKeeper, Disk
 from zscout.services.bookings.records import KEEP, Records
-from zscout.services.rcm.booked_dates import STEPPED
 from zscout.types import SECOND, ArcId, Grant, Ns, Place, Term
 
 if TYPE_CHECKING:
     from zscout.services.rcm.rcm import Rcm
 
-RUNS_APART: Final = 0.012
-"""Of the time: by which fleet time may be faster or slower than virtual time, slewed on a clock that is not true."""
+RUNS_APART: Final = 0.0011
+"""Of the time: by which fleet time may be faster or slower than virtual time, on a clock that is not true."""
 AGREE: Final = 0.5
 """Seconds by which the fleet time of a leader may differ, as it begins, from one that it goes on."""
 AT_ITS_DATE: Final = 1.5
 """Seconds after its date, or after it was taken up if that was later, within which a booking is held."""
 NOT_EXACT: Final[Ns] = SECOND // 4
-"""By how much a date may be put off, as fleet time is slewed."""
+"""By how much a date may be put off, as another leader's fleet time differs."""
 EARLY: Final = 0.5
-"""By which who has taken up a booking may begin before its date: fleet time is slewed."""
+"""By which who has taken up a booking may begin before its date, likewise."""
+STEPPED: Final[Ns] = SECOND
+"""By more than this fleet time moves only by a correction, or where another one goes on."""
 GIVEN_UP: Final = 0.1
 """Seconds within which a leader that has heard that a booking is given up keeps nothing for it."""
 
@@ -85,8 +86,8 @@ class Fact:
 
 class BookingPromises:
     """`broken(text)` is told of a promise that was not kept. `keepers`: of processes that live, by host; `disks`: of
-    all hosts; `calm`: there is no fault now; `inside`
-    calls something as code of the process of a host's node."""
+    all hosts; `wall`: the clock of each; `calm`: there is no fault now; `inside` calls something as code of the process
+    of a host's node."""
 
     def __init__(
         self,
@@ -94,12 +95,13 @@ class BookingPromises:
         now: Callable[[], float],
         keepers: Mapping[str, BookingKeeper],
         disks: Mapping[str, Disk],
+        wall: Callable[[str], float],
         candidates: list[str],
         calm: Callable[[], bool],
         inside: Callable[[str, Callable[[], Any]], Any],
     ) -> None:
         self._broken, self.now, self._calm, self._inside = broken, now, calm, inside
-        self._keepers, self._disks, self._candidates = keepers, disks, candidates
+        self._keepers, self._disks, self._wall, self._candidates = keepers, disks, wall, candidates
         self.lives: dict[str, Life] = {}
         self.facts: dict[tuple[str, Instant | str], Fact] = {}
         self._destroyed = 0.0
@@ -107,11 +109,11 @@ class BookingPromises:
         self._final: dict[BookingKeeper, tuple[str, dict[str, BookingRecord]]] = {}
         """What each process knew of bookings as it was looked at last, and its digest."""
         self._stepped = -1.0
-        """When a leader last took over an older fleet time."""
+        """When a leader last took over an older fleet time, or corrected its own."""
         self._times: dict[Term, _FleetTime] = {}
         """By term: that of its leader as it was looked at last."""
         self._former: list[_FleetTime] = []
-        """Those that leaders told before they took over an older one."""
+        """Those that leaders told before they took over an older one, or corrected them."""
         self._overheard: dict[Term, _FleetTime] = {}
         """By term of a leader that was gone, or stood still, as it could be looked at: what keepers heard of it."""
         self._dated: dict[Term, Ns] = {}
@@ -179,7 +181,7 @@ class BookingPromises:
             # One that has just begun to tell its fleet time was not looked at yet.
             leading = [self._inside(host, partial(_fleet_time, rcm)) for host, rcm in leaders.items()]
             told = [time for time in leading if time is not None]
-            told += [self.now() + one.ahead for one in self._times.values()]
+            told += [self.now() + one.ahead for one in (*self._times.values(), *self._former)]
             now = max(told, default=math.inf)
             if now < int(start) - EARLY:
                 self._broken(f"{arc.name} begins {int(start) - now:.1f} s before the date of {mine.book.name}")
@@ -310,8 +312,15 @@ class BookingPromises:
         age = self._inside(host, lambda: rcm.mesh.now() - rcm.bookings.clock.since) / SECOND
         told, before = _FleetTime(now, time - now, now - age), self._times.get(rcm.term)
         if before is not None and told.since >= before.since - SAME:
-            if abs(told.ahead - before.ahead) > RUNS_APART * (now - before.at) + 1e-6:
-                self._broken(f"fleet time jumps by {told.ahead - before.ahead:g} s in term {rcm.term.counter}")
+            jump = told.ahead - before.ahead
+            if abs(jump) > RUNS_APART * (now - before.at) + 1e-6:
+                # It is corrected. Hosts that have not heard of it may lead meanwhile.
+                self._stepped = now
+                self._former.append(before)
+                nearest = min(abs(self._wall(host) - time) for host in self._disks)
+                if abs(jump) < DIFFERS - AGREE or nearest > AGREE:
+                    where = f"{jump:g} s in term {rcm.term.counter}, {nearest:g} s from the next clock"
+                    self._broken(f"fleet time jumps by {where}")
         elif before is not None or self._heard.get(host, rcm.term) != rcm.term:  # itself: it told it, and stood still
             if before is not None:
                 # It began where nobody knew the time of the others, and has met them. Hosts that heard it alone may
@@ -468,9 +477,8 @@ class _FleetTime(NamedTuple):
     @classmethod
     def heard_by(cls, keeper: BookingKeeper, now: float) -> _FleetTime:
         """What a keeper has heard of its leader, who can't be looked at."""
-        time, age = keeper.time, keeper.mesh.now() - keeper.since
-        assert time is not None
-        return cls(now, time / SECOND - now, now - age / SECOND)
+        assert keeper.time is not None
+        return cls(now, keeper.time / SECOND - now, now - keeper.age)
 
     def agrees(self, before: _FleetTime) -> bool:
         return self.differs(before) <= AGREE
@@ -480,7 +488,7 @@ class _FleetTime(NamedTuple):
         return abs(self.since - before.since) <= SAME and self.differs(before) <= DIFFERS
 
     def differs(self, before: _FleetTime) -> float:
-        """By how many seconds more than it may have been slewed."""
+        """By how many seconds more than clocks run apart."""
         return abs(self.ahead - before.ahead) - 2 * RUNS_APART * (self.at - before.at)
 
 

@@ -39,7 +39,7 @@ from zscout.scheduling.calendar import Calendar
 from zscout.scheduling.model import Arc, ArcRequest
 from zscout.scheduling.state import SchedulerState
 from zscout.services.bookings import records
-from zscout.services.bookings.fleet_clock import FleetClock, wall_ns
+from zscout.services.bookings.fleet_clock import FleetClock, agreed, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.rcm import bookings, candidate
 from zscout.services.rcm.booked_dates import BookedDates
@@ -227,8 +227,10 @@ def _own_wall(keeper: BookingKeeper, _kept: Any) -> tuple[Ns, float]:
     return wall_ns(keeper.wall()), 0.0
 
 
-def _jumps(self: FleetClock, _now: Ns) -> Ns:
-    return self._aim
+def _follow(self: FleetClock, walls: Mapping[str, Ns], now: Ns) -> Ns:
+    before = self.at(now)
+    self.step(agreed(walls.values()), now)
+    return self.at(now) - before
 
 
 def _no_obstacle(*_: object) -> tuple[None, list[Any]]:
@@ -327,7 +329,7 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         ),
         "late": Guard("a late publication turns no clock back", {(BookingKeeper, "hear"): _hear_any}),
         "fleet time": Guard("a leader goes on in the time of the fleet", {(bookings, "_time"): _own_wall}),
-        "slewed": Guard("fleet time does not jump in a reign", {(FleetClock, "_slewed"): _jumps}),
+        "steady": Guard("fleet time moves only where most clocks differ from it", {(FleetClock, "correct"): _follow}),
         "dates first": Guard(
             "a leader knows of all dates before it grants",
             {(Bookings, "recovered"): _none_recovered, (Rcm, "enter"): _do_nothing},

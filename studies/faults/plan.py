@@ -63,6 +63,8 @@ OUT = (1.0, 8.0)
 MONTH: Final = 30 * 86_400
 STEP: Final = 7_200
 """Seconds by which a host's clock is set at once, at most."""
+STEPS: Final = (6, 20, STEP, 3 * 86_400)
+"""The same where those of several hosts are set: dates are skipped, or come again."""
 HEALED = 45.0
 RELINK = 1.0
 """Seconds after which links that were lost stand again, at most."""
@@ -116,7 +118,7 @@ class Fault:
             "old disk": "is out, and comes back with what its disk had early in the run",
             "restart": f"everything is out, and started anew {self.jump / 86_400:g} days later",
             "disk": "can't write to its disk",
-            "clock": f"has its clock set by {self.jump} s",
+            "clock": f"have their clocks set by {self.jump} s",
             "lie": f"has a liar ({self.message}), of terms {self.jump} higher",
             "nodes": f"all but clients is killed, and started again{' with empty disks' if self.jump else ''}",
         }[self.kind]
@@ -200,6 +202,9 @@ def draw_for_bookings(seed: int, hosts: Sequence[str], span: float, drawn: Seque
         add("disk", rng.sample(hosts, rng.choice((1, len(hosts)))), rng.uniform(2, span / 2))
     if rng.random() < 0.3:
         add("clock", [rng.choice(hosts)], 0.0, rng.randrange(-STEP, STEP))
+    if rng.random() < 0.5:
+        step = rng.choice(STEPS)
+        add("clock", rng.sample(hosts, rng.randrange(2, len(hosts) + 1)), 0.0, rng.randint(-step, step))
     return sorted(faults, key=lambda fault: fault.at)
 
 

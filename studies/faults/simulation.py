@@ -290,6 +290,7 @@ class Simulation:
             lambda: loop.now,
             self.keepers,
             self.equipment.disks,
+            self.equipment.wall,
             self.candidates_at,
             lambda: not self.present,
             lambda host, call: self.running[f"{host}/node"][0].run(call),
@@ -692,7 +693,8 @@ class Simulation:
                 self.equipment.fail(fault.whom)
                 end = partial(self.equipment.fail, fault.whom, fails=False)
             case "clock":
-                self.equipment.ahead[fault.whom[0]] += fault.jump
+                for host in fault.whom:
+                    self.equipment.ahead[host] += fault.jump
                 end = lambda: None  # noqa: E731
         self.present.append(fault)
         self._look_who_is_heard()

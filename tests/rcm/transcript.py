@@ -77,7 +77,7 @@ class NoBookings:
     def note(self, *_: Any, **__: Any) -> steps.Outbox:
         return steps.Outbox()
 
-    operation = again = kept = shared = tick = note
+    operation = again = kept = shared = set_clock = tick = note
 
     def take_up(self, ask: Ask, _sender: Any) -> str:
         return ask.booking

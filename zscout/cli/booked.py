@@ -60,8 +60,7 @@ async def ask_bookings(client: Client, rc: str | None = None) -> BookingsTold:
     told = await BookingsClient(client).list(rc=rc)
     differs = time.time() - told.time
     if abs(differs) > CLOCKS_DIFFER:
-        words = f"{span(abs(differs))} {'before' if differs > 0 else 'behind'}"
-        click.secho(f"this host's clock is {words} the fleet's; dates are by the fleet's", fg="yellow", err=True)
+        click.secho(f"this host's clock is {differs_words(differs)}; dates are by the fleet's", fg="yellow", err=True)
     return told
 
 
@@ -211,7 +210,12 @@ def _next(booking: BookingView) -> str:
 
 
 def clock_words(host: str, differs: float) -> str:
-    return f"the clock of {host} is {span(abs(differs))} {'before' if differs > 0 else 'behind'} the fleet's"
+    return f"the clock of {clean(host)} is {differs_words(differs)}"
+
+
+def differs_words(differs: float) -> str:
+    """By how many seconds a clock is ahead, in words."""
+    return f"{span(abs(differs))} {'ahead of' if differs > 0 else 'behind'} the fleet's"
 
 
 def utc(at: float) -> str:

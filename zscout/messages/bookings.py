@@ -161,8 +161,8 @@ class BookingsAsk(Message, frozen=True):
 
 
 class BookingsTold(Message, frozen=True):
-    """Bookings that are not over. `time` is the fleet's; `clocks` has, by host, by how many seconds its clock differs
-    from that, where it is more than 2."""
+    """Bookings that are not over. `time` is the fleet's; `clocks` has, by host, by how many seconds its clock is ahead
+    of that, where they differ by more than 2."""
 
     time: WallTime
     bookings: list[BookingView] = []
@@ -193,7 +193,7 @@ class ShareBookings(Message, frozen=True):
     digest: str
     records: Annotated[list[BookingRecord], msgspec.Meta(max_length=MAX_MERGED)] = []
     time: WallTime | None = None
-    """Fleet time: what was over a day before is forgotten. Absent: nothing is."""
+    """Fleet time: what was over a day before is forgotten. Absent: nothing is, as it was set lately."""
 
 
 class BookingsKept(Message, frozen=True):

@@ -325,7 +325,7 @@ class Grants(Message, frozen=True):
     time: WallTime | None = None
     """Fleet time, by which bookings have their dates."""
     time_age: Elapsed = 0.0
-    """For how many seconds that time has gone on, over changes of leader: of two that differ the older counts."""
+    """For how many seconds that time has gone on, over changes of leader and corrections: of two the older counts."""
     charged: Charged = {}
     """With fair shares, now and then: by group the RC-seconds that it lately had and others waited for. Nobody obeys
     this: candidates go on from it when they lead."""

@@ -160,8 +160,10 @@ class Leader:
                 return merge(self._bookings.again(work))
             case steps.Kept(keep, why):
                 return merge(self._bookings.kept(keep, why))
-            case steps.Shared(news):
-                return merge(self._bookings.shared(news=news))
+            case steps.Shared():
+                return merge(self._bookings.shared())
+            case steps.ClocksRead():
+                return merge(self._bookings.set_clock(work))
             case steps.Due.BOOKINGS:
                 self._waking = False
                 return merge(self._bookings.tick())

@@ -5,7 +5,7 @@ names in them were checked as they came in, those within holds and requests are 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from enum import Enum, auto
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -35,13 +35,14 @@ Answer: TypeAlias = tuple[Ticket, Struct]
 
 
 class BookedDanger(NamedTuple):
-    """A date of a booking may not be kept, and why; empty: it is safe again."""
+    """A date of a booking may not be kept, and why; empty: it is safe again. `over`: it is not kept."""
 
     record: BookingRecord
     start: Instant
     why: str
     later: int = 0
     """Dates after that of which the same is to be reported."""
+    over: bool = False
 
 
 class Keep(NamedTuple):
@@ -141,9 +142,17 @@ class Stalled(NamedTuple):
 
 
 class Shared(NamedTuple):
-    """All keepers of bookings were asked; or there is `news`: records that were not known here."""
+    """Keepers of bookings have records that were not known here."""
 
-    news: bool
+
+class ClocksRead(NamedTuple):
+    """All keepers were asked, and this was so at `at`."""
+
+    at: Ns
+    heard: tuple[float, Ns] | None
+    """The oldest fleet time that others have heard, in ns since 1970, and for how many seconds it has gone on."""
+    walls: Mapping[HostName, Ns]
+    """What hosts' clocks say, likewise."""
 
 
 class Kept(NamedTuple):
@@ -214,6 +223,7 @@ Stimulus: TypeAlias = (
     | Shunned
     | Stalled
     | Shared
+    | ClocksRead
     | Kept
     | Reloaded
     | Compare

@@ -111,7 +111,7 @@ class Unbooked(Struct, frozen=True):
 
 
 class Redated(Struct, frozen=True):
-    """A booking that is not held moves to `start`: the fleet's clock was slewed."""
+    """A booking that is not held moves to `start`: the fleet's clock was corrected."""
 
     booking: str
     start: Ns

@@ -367,6 +367,16 @@ def test_the_clock_is_told_where_that_is_known(kept: bool | None, state: list[st
     assert [found.state for found in findings(one) if found.about == "clock"] == state
 
 
+def test_clocks_that_differ_from_fleet_time_are_named_with_their_direction() -> None:
+    one = seen()
+    one.clocks = {"pi": -259_200.0, "anvil": 3.0}
+    told = [str(found) for found in findings(one) if found.about == "clock" and found.state == "note"]
+    assert told == [
+        "the clock of anvil is 3.0 s ahead of the fleet's; set it (timedatectl)",
+        "the clock of pi is 3 d behind the fleet's; set it (timedatectl)",
+    ]
+
+
 def test_advisory_roles_are_told_on_a_plain_mesh_only() -> None:
     def opens(fleet: Fleet) -> list[str]:
         told = findings(seen(fleet, certificates=certificates()))

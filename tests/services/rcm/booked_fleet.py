@@ -67,8 +67,7 @@ class BookedFleet(FakeFleet):
     def candidate(self, host: str, *_: Any, **how: Any) -> Candidate:
         disk = self.disks.setdefault(host, Disk())
         mesh = self.mesh(host)
-        ahead = self.ahead.get(host, 0.0)
-        keeper = BookingKeeper(mesh, disk, wall=lambda: self.time() + ahead)
+        keeper = BookingKeeper(mesh, disk, wall=lambda: self.time() + self.ahead.get(host, 0.0))
         parts = CandidateParts(keeper=keeper, on_danger=self.dangers.setdefault(host, []).append, **how)
         candidate = Candidate(mesh, self.fleet, parts)
         candidate.start()

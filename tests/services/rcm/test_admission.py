@@ -336,7 +336,7 @@ async def test_records_and_fleet_time_are_taken_from_managers_only() -> None:
     fleet, leader, heir, _ = await closed("a")
     keeper = BookingKeeper(fleet.mesh("devices", "node"), candidate=True, wall=lambda: fleet.time() + 86_400)
     keeper.records.take([record(book("forged", "robot/a", at=30), owner="ada")])
-    keeper._offset, keeper.since = 1_900_000_000 * 10**9, -(10**9) * 10**9
+    keeper._offset, keeper._run = 1_900_000_000 * 10**9, 900_000_000 * 10**9
     keeper.start(Supervisor("devices", lambda error: pytest.fail(str(error))))
     token = keeper.mesh.alive(Token("devices", Role.NODE, "node", "1"))
     await asyncio.sleep(10)

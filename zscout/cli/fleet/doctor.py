@@ -8,6 +8,7 @@ import asyncio
 import ctypes
 import os
 import socket
+import time
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Final
 import click
 
 from zscout import terminal
-from zscout.cli import common
+from zscout.cli import booked, common
 from zscout.cli.fleet.findings import Evidence, Finding, findings
 from zscout.cli.fleet.keys import show_keys
 from zscout.config.certificates import MAX_FILE, read_cas, read_certificates, read_places_key
@@ -174,6 +175,9 @@ async def _join(seen: Evidence, fleet: Fleet) -> None:
                 with suppress(TimeoutError):
                     async with asyncio.timeout(1.0):
                         await devices.ask()
+                if seen.state is not None and (told := await booked.look(client)) is not None:
+                    own = time.time() - told.time
+                    seen.clocks = told.clocks | ({seen.host: own} if abs(own) > booked.CLOCKS_DIFFER else {})
                 with suppress(TimeoutError):
                     async with asyncio.timeout(RELAY if fleet.mesh.site is not None else 0):
                         while not client.mesh.relays():  # noqa: ASYNC110 - nothing tells

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from typing import TYPE_CHECKING, Final, Literal
 
+from zscout.cli.booked import clock_words
 from zscout.cli.device_words import absence, ending
 from zscout.cli.fleet.status import mixture, versions
 from zscout.config.certificates import CA, PLACES_KEY, Certificates, Validity, shown
@@ -75,6 +76,8 @@ class Evidence:
     devices: Mapping[str, RcState] = field(default_factory=dict)
     clock_kept: bool | None = None
     """Whether something keeps this host's clock."""
+    clocks: Mapping[str, float] = field(default_factory=dict)
+    """By how many seconds hosts' clocks are ahead of fleet time, where they differ by more than 2."""
 
 
 def findings(seen: Evidence) -> list[Finding]:
@@ -392,6 +395,8 @@ def _clock(seen: Evidence) -> Iterator[Finding]:
         says = f"nothing keeps this host's clock, which says {shown(seen.at)}"
         needs = "dates of bookings, the journal and certificates go by it"
         yield Finding("clock", "note", says, f"{needs}; start a time service (timedatectl)")
+    for host, ahead in sorted(seen.clocks.items()):
+        yield Finding("clock", "note", clock_words(host, ahead), "set it (timedatectl)")
 
 
 def _open(seen: Evidence) -> Iterator[Finding]:

@@ -1,17 +1,19 @@
 """Fleet time: the leader's publications give all hosts the same dates. Pure.
 
-Within a reign it never jumps: it is slewed by at most 1 % towards the median of the hosts' clocks, as in `adjtime`."""
+It begins as the median of the hosts' clocks, and runs on the leader's monotonic clock. Where most of the hosts' clocks
+differ from it, it is corrected in one step: at once if a clock was set to what they say, else after a minute."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from statistics import median_high, median_low
 from typing import Final
 
-from zscout.types import SECOND, Ns
+from zscout.types import SECOND, HostName, Ns
 
-SLEW: Final = 100  # slew by one part in so many
-DIFFERS: Final = 2.0  # seconds of a host clock's error before a warning
+DIFFERS: Final = 2.0  # seconds of a host clock's error before a warning, and before a correction
+LASTS: Final[Ns] = 60 * SECOND  # time for which most clocks differ before a correction
+REMEMBERED: Final[Ns] = 3_600 * SECOND  # the clock of a silent host counts for so long
 SAME: Final = 1.0  # seconds: fleet times that began this close together are equally old
 
 
@@ -27,28 +29,51 @@ def agreed(times: Iterable[Ns], goes_on: Ns | None = None) -> Ns:
     return high if goes_on is not None and abs(high - goes_on) < abs(low - goes_on) else low
 
 
+def _differ(offset: Ns, other: Ns) -> bool:
+    return abs(offset - other) > DIFFERS * SECOND
+
+
 class FleetClock:
     """Fleet time on one host's own clock, which `now` always uses."""
 
     def __init__(self, time: Ns, now: Ns, since: Ns) -> None:
-        """`time`: ns since 1970 (UTC) at `now`; unbroken since `since` on the own clock."""
+        """`time`: ns since 1970 (UTC) at `now`; unbroken, but for corrections, since `since` on the own clock."""
         self.since = since
+        self._hosts: dict[HostName, tuple[Ns, Ns]] = {}
+        """By how much the clock of each host is ahead of the own one, and when it was read."""
+        self._doubted: tuple[Ns, Ns] | None = None
+        """What most clocks say instead, as such an offset, and since when."""
         self.step(time, now)
 
     def at(self, now: Ns) -> Ns:
         """Fleet time, in ns since 1970 (UTC)."""
-        return now + self._slewed(now)
+        return now + self._offset
 
     def step(self, time: Ns, now: Ns) -> None:
-        """Set it to `time` at `now`: before its first use, or to adopt an older one."""
-        self._offset = self._aim = time - now
-        self._set = now
+        """Set it to `time` at `now`."""
+        self._offset, self.set_at, self._doubted = time - now, now, None
 
-    def aim(self, time: Ns, now: Ns) -> None:
-        """Slew towards `time` at `now`."""
-        self._offset, self._set = self._slewed(now), now
-        self._aim = time - now
+    def correct(self, walls: Mapping[HostName, Ns], now: Ns) -> Ns:
+        """Compare it with hosts' clocks as they were read at `now`. Returns by how much it is corrected; 0: it is not.
 
-    def _slewed(self, now: Ns) -> Ns:
-        most = max(0, now - self._set) // SLEW
-        return self._offset + max(-most, min(most, self._aim - self._offset))
+        Hosts that are not among them count as they did within the last hour: whoever is alone for a while is not
+        the majority."""
+        offsets, before = {host: wall - now for host, wall in walls.items()}, self._hosts
+        self._hosts = {host: known for host, known in before.items() if now - known[1] < REMEMBERED} | {
+            host: (offset, now) for host, offset in offsets.items()
+        }
+        aim = agreed((offset for offset, _ in self._hosts.values()), self._offset)
+        if not _differ(aim, self._offset):
+            self._doubted = None
+            return 0
+        if self._doubted is None or _differ(aim, self._doubted[0]):
+            self._doubted = aim, now
+        was_set = any(
+            host in before and _differ(offset, before[host][0]) and not _differ(offset, aim)
+            for host, offset in offsets.items()
+        )
+        if not was_set and now - self._doubted[1] < LASTS:
+            return 0
+        moved = aim - self._offset
+        self.step(now + aim, now)
+        return moved

@@ -20,7 +20,7 @@ from zscout.config.state_folder import write_durably
 from zscout.config.strict import BadInput, read_bytes
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused
 from zscout.mesh.supervision import Supervisor
-from zscout.services.bookings.fleet_clock import DIFFERS, SAME, SLEW
+from zscout.services.bookings.fleet_clock import SAME
 from zscout.services.bookings.records import Records
 from zscout.types import NO_TERM, SECOND, VERSION, Ns, Term
 
@@ -32,6 +32,7 @@ MAX_SAVING: Final = 16  # answers awaiting the disk at one time
 UNASKED: Final[Ns] = 40 * SECOND
 """A keeper with a leader but no query for so long is not seen: each is asked every 30 s."""
 LEFT: Final[Ns] = 5 * SECOND  # silence after which a leader counts as new
+APART: Final = 500  # clocks of two hosts run apart by less than one part in so many
 
 
 class _BookingFile(msgspec.Struct):
@@ -99,7 +100,7 @@ class BookingKeeper:
         self.records = Records()
         self._offset: Ns | None = None  # fleet time minus the own clock, at the last publication
         self.heard: tuple[Term, Ns] = NO_TERM, 0  # term and time of that publication
-        self.since: Ns = 0  # start of its uninterrupted run, on the own clock
+        self._run: Ns = 0  # fleet time at the beginning of its run, by that publication; a correction moves it
         self._leader: tuple[Term, Ns, Ns] = NO_TERM, 0, 0
         """Present leader's term, with its first and last publication."""
         self._asked: Ns = 0  # last query of a leader
@@ -129,23 +130,20 @@ class BookingKeeper:
             declared.close()
 
     def hear(self, grants: messages.Grants) -> None:
-        """Take a publication of the leader. Implausibly early times are delayed publications, even from an earlier
-        leader: they may have waited while this process stalled. A leader that began without fleet time has a younger
-        one, until it learns ours."""
+        """Take a publication of the leader. One that was delayed, even from an earlier leader while this process
+        stalled, shows too early a time; the beginning of a run is the same however late it is read. A leader that
+        began without fleet time has a younger one, until it learns ours."""
         if grants.time is None:
             return
         self._look_whether_asked(grants)
-        now, (term, at) = self.mesh.now(), self.heard
-        offset, since = round(grants.time * SECOND) - now, now - round(grants.time_age * SECOND)
+        now, (_, at) = self.mesh.now(), self.heard
+        offset, run = round(grants.time * SECOND) - now, round((grants.time - grants.time_age) * SECOND)
         if self._offset is not None:
-            near = abs(offset - self._offset) <= DIFFERS * SECOND
-            if near or (grants.term == term and since >= self.since - SAME * SECOND):
-                # Slewed as far as possible, on a clock with as large an error.
-                offset = max(offset, self._offset - 2 * (now - at) // SLEW)
-            elif since > self.since + SAME * SECOND:
+            if abs(run - self._run) <= SAME * SECOND:
+                offset = max(offset, self._offset - (now - at) // APART)
+            elif grants.time_age < self.age - SAME:
                 return
-            since = min(since, self.since)
-        self._offset, self.heard, self.since = offset, (grants.term, now), since
+        self._offset, self._run, self.heard = offset, run, (grants.term, now)
 
     def _look_whether_asked(self, grants: messages.Grants) -> None:
         """A leader that knows bookings asks each keeper that it sees."""
@@ -160,6 +158,11 @@ class BookingKeeper:
     def time(self) -> Ns | None:
         """Fleet time here, in ns since 1970 (UTC); None: unknown."""
         return None if self._offset is None else self.mesh.now() + self._offset
+
+    @property
+    def age(self) -> float:
+        """For how many seconds that time has gone on."""
+        return 0.0 if self.time is None else max(0, self.time - self._run) / SECOND
 
     async def save(self) -> bool:
         """Return True once the present records are on disk; False without a disk, or if it fails."""
@@ -186,7 +189,7 @@ class BookingKeeper:
             self.wall(),
             own,
             time=None if heard is None else heard / SECOND,
-            time_age=0.0 if heard is None else (self.mesh.now() - self.since) / SECOND,
+            time_age=self.age,
             durable=durable,
             records=[] if own == digest else list(self.records),
             version=VERSION,

@@ -58,7 +58,8 @@ class HoldNotices:
 def booking_notice(fleet: str, danger: BookedDanger) -> Notification:
     """That a booking may not be kept, or is safe again; its date in the zone of who made it."""
     record, why, later = danger.record, danger.why, danger.later
-    title = f"zscout {fleet}: your booking {record.name} is {'in danger' if why else 'safe again'}"
+    state = "has lapsed" if danger.over else "is in danger" if why else "is safe again"
+    title = f"zscout {fleet}: your booking {record.name} {state}"
     zone: tzinfo = UTC
     with suppress(ValueError):  # not known here
         zone = zone_of(record.zone)

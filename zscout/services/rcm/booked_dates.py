@@ -4,7 +4,7 @@ stands, then what was made earlier. The core judges them; records and views say 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from decimal import Decimal
 from functools import partial
@@ -25,7 +25,7 @@ from zscout.messages import (
     duration,
     exact_amounts,
 )
-from zscout.rcm.steps import Outbox
+from zscout.rcm.steps import BookedDanger, Outbox
 from zscout.scheduling.booking import (
     Booking,
     BookingBound,
@@ -49,10 +49,7 @@ PART = 100
 """Dates that a core takes in at a time: some 5 ms."""
 MAX_DIGITS = 11
 """Of an instant."""
-STEPPED: Ns = SECOND
-"""By how much it is moved only where another time goes on."""
-REDATED: Ns = SECOND // 50
-"""By how much fleet time is slewed before dates are put right."""
+SKIPPED = "the fleet's clock was put forward past it"
 
 
 class Date(NamedTuple):
@@ -104,8 +101,8 @@ class BookedDates:
 
     @property
     def time(self) -> float:
-        """Fleet time, in seconds since 1970 (UTC)."""
-        return self.clock.at(self.now) / SECOND
+        """Fleet time, in seconds since 1970 (UTC), as the core goes by it."""
+        return self.to_fleet(self.now) / SECOND
 
     def local(self, instant: Instant) -> Ns:
         """When that is, on the core's clock."""
@@ -277,15 +274,37 @@ class BookedDates:
             self._repetitions = {name: known for name, known in self._repetitions.items() if self._records.get(name)}
         return event
 
-    def redate(self) -> tuple[list[Dates], bool]:
-        """Puts right the dates that fleet time, which was slewed, has moved; and whether another time goes on, by which
-        others may be to come."""
-        ahead = self.clock.at(self.now) - self.now
-        moved = self._dated_by - ahead
-        if abs(moved) < REDATED:
-            return [], False
+    def redate(self, *, settled: bool) -> bool:
+        """Follow a step of fleet time; return True if there was one, and all dates are to be reconciled.
+
+        By a time that is `settled`, a hold that began for a date which is not now goes on as an ordinary one, and the
+        date is over, so that it never begins again. Dates that were to come and were skipped are reported."""
+        now, ahead = self.now, self.clock.at(self.now) - self.now
+        if ahead == self._dated_by:
+            return False
         self._dated_by = ahead
-        return [self.reconcile()], abs(moved) > STEPPED
+        skipped, over = dict[str, list[Date]](), dict[str, list[Instant]]()
+        for booking, arc in self._core.bookings() if settled else ():
+            if (date := self.date(booking.id)) is None:
+                continue
+            start, status = self.local(date.start), None if arc is None else self._core.arc(arc)
+            end, lapses = start + booking.runtime, start + booking.lapses - booking.start
+            if status is not None and status.hold is not None:
+                if not start <= now < end:
+                    over.setdefault(date.record.id, []).append(date.start)
+            elif booking.start > now and (lapses if status is None else end) <= now:
+                skipped.setdefault(date.record.id, []).append(date)
+        for dates in skipped.values():
+            first = min(dates, key=lambda date: date.start)
+            self.out.dangers.append(BookedDanger(*first, SKIPPED, len(dates) - 1, over=True))
+        self._end_dates(over)
+        return True
+
+    def _end_dates(self, over: Mapping[str, Collection[Instant]]) -> None:
+        """Keep that these dates of bookings are over."""
+        for booking, starts in over.items():
+            if (record := self._records.get(booking)) is not None:
+                self.change(record, over=sorted({*record.over, *starts}))
 
     def number(self) -> Grant:
         """(term, seq) of what is made or changed now: above all that is known. Where all hosts were started anew terms
@@ -327,9 +346,7 @@ class BookedDates:
                     self._conflicts[name] = by
                 case BookingBound(booking=name, bound=bound) if (date := self.date(name)) is not None:
                     self.change(date.record, kept={**date.record.kept, date.start: dict(bound)})
-        for booking, starts in over.items():
-            if (record := self._records.get(booking)) is not None:
-                self.change(record, over=sorted({*record.over, *starts}))
+        self._end_dates(over)
         return bool(over) or lapsed
 
     def _told(self, zone: str, time: Ns) -> str:

@@ -17,7 +17,7 @@ from zscout.mesh.supervision import Supervisor, done_within
 from zscout.messages import BookingRecord, BookingsAsk, BookingsKept, BookingsTold, ShareBookings
 from zscout.rcm import steps
 from zscout.rcm.authority import Authority
-from zscout.services.bookings.fleet_clock import DIFFERS, SAME, agreed, wall_ns
+from zscout.services.bookings.fleet_clock import DIFFERS, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.bookings.records import merged
 from zscout.services.rcm.bookings import Bookings, oldest
@@ -32,6 +32,12 @@ AGAIN: Final = 5.0
 SOON: Final = 0.02
 """Seconds that changes are gathered before they are shared."""
 TIMEOUT: Final = 2.0
+PROMPT: Final[Ns] = SECOND
+"""The clock of a host counts as it is read within this time: if it took longer, the answer may have waited."""
+LOOK_AT_CLOCK: Final = 1.0
+"""Seconds from one look at the own clock to the next: if it was set, all are asked what theirs say."""
+STEADY: Final[Ns] = 600 * SECOND
+"""Bookings are forgotten by a fleet time that was not set for so long: it may be days ahead."""
 LOOK: Final = 0.5
 """Seconds within which candidates that live are found."""
 
@@ -50,8 +56,7 @@ def _aged(one: BookingsKept, seconds: float) -> BookingsKept:
 
 
 class BookingSharing:
-    """Of one term. What comes of it is given to `take`. Before the bookings are settled fleet time is what most clocks
-    say, and nothing is forgotten by it."""
+    """Of one term. What comes of it is given to `take`: records, fleet times and clocks of hosts."""
 
     def __init__(
         self,
@@ -64,9 +69,8 @@ class BookingSharing:
         take: Callable[[steps.Stimulus], None],
     ) -> None:
         self._mesh, self._term, self._keeper, self._authority = mesh, term, keeper, authority
-        self._bookings, self._clock, self._supervisor, self._give = bookings, bookings.clock, supervisor, take
+        self._bookings, self._supervisor, self._give = bookings, supervisor, take
         self._declared: list[Declaration] = []
-        self._begun = mesh.now()
         self._unshared: dict[str, BookingRecord] = {}
         self._behind = True
         """Whether some host may not have all that is known here."""
@@ -74,8 +78,8 @@ class BookingSharing:
         """By booking: why it is not kept, as it was told last."""
         self._news = asyncio.Event()
         self._sharing = asyncio.Lock()
-        self.clocks: dict[HostName, float] = {}
-        """By how many seconds the clocks of other hosts differ from fleet time, where it is too much."""
+        self._ahead: dict[HostName, Ns] = {}
+        """By how much hosts' clocks are ahead of the own monotonic one, as they were read last."""
 
     def start(self) -> None:
         """From now on it answers, and shares what it knows."""
@@ -90,6 +94,7 @@ class BookingSharing:
         self._keeper.shared.clear()
         self._supervisor.spawn(self._keep_sharing())
         self._supervisor.spawn(self._watch_others())
+        self._supervisor.spawn(self._watch_clock())
 
     def close(self) -> None:
         for declared in self._declared:
@@ -103,7 +108,13 @@ class BookingSharing:
     def _answer(self, query: IncomingQuery[BookingsAsk]) -> None:
         asked, bookings = query.message, self.bookings
         views = bookings.handler.views(asked.owner, asked.rc)
-        query.answer(BookingsTold(bookings.dates.time, views, dict(self.clocks)))
+        query.answer(BookingsTold(bookings.dates.time, views, self._clocks()))
+
+    def _clocks(self) -> dict[HostName, float]:
+        """By how many seconds hosts' clocks differ from fleet time, where it is too much."""
+        fleet = self._bookings.dates.to_fleet(0)
+        differ = {host: (ahead - fleet) / SECOND for host, ahead in self._ahead.items()}
+        return {host: seconds for host, seconds in differ.items() if abs(seconds) > DIFFERS}
 
     def _on_token(self, token: Token, alive: bool) -> None:
         if alive and token.host != self._mesh.me.host:
@@ -134,7 +145,15 @@ class BookingSharing:
             await self._keeper.shared.wait()
             self._keeper.shared.clear()
             self.catch_up()
-            self._give(steps.Shared(news=True))
+            self._give(steps.Shared())
+
+    async def _watch_clock(self) -> None:
+        ahead: Ns | None = None
+        while True:
+            before, ahead = ahead, wall_ns(self._keeper.wall()) - self._mesh.now()
+            if before is not None and abs(ahead - before) > DIFFERS * SECOND:
+                self._news.set()
+            await asyncio.sleep(LOOK_AT_CLOCK)
 
     async def _keep_sharing(self) -> None:
         while True:
@@ -143,7 +162,6 @@ class BookingSharing:
             self._news.clear()
             async with self._sharing:
                 why = await self._share()
-            self._give(steps.Shared(news=False))
             if why:
                 log.warning("bookings are kept by this host alone: %s", why)
 
@@ -151,7 +169,8 @@ class BookingSharing:
         """Tells all keepers, and hears what they know. Returns why what was told is not kept; empty: it is."""
         keeper, mesh = self._keeper, self._mesh
         sent, self._unshared = self._unshared, {}
-        time = self._clock.at(mesh.now()) / SECOND if self.bookings.settled else None
+        asked = mesh.now()
+        time = self.bookings.time if asked - self._bookings.clock.set_at >= STEADY else None
         if time is not None:
             # All forget by the time of one question: else what one has forgotten came back from another.
             keeper.records.forget_old(time)
@@ -160,7 +179,7 @@ class BookingSharing:
         saved, replies = await asyncio.gather(
             keeper.save(), mesh.ask(mesh.keys.bookings_any, question, BookingsKept, timeout=TIMEOUT)
         )
-        answers, me, why = self._take(replies, question), mesh.me.host, ""
+        answers, me, why = self._take(replies, question, asked), mesh.me.host, ""
         if sent and not any(one.candidate and one.host != me and _keeps(one, question, sent) for one in answers):
             living = await mesh.living(mesh.keys.alive_any(Role.CANDIDATE), timeout=LOOK)
             if others := sorted({token.host for token in living} - {me}):
@@ -172,8 +191,8 @@ class BookingSharing:
         self._not_kept |= dict.fromkeys(sent, why) if why else {}
         return why
 
-    def _take(self, replies: Collection[Reply[BookingsKept]], question: ShareBookings) -> list[BookingsKept]:
-        """What keepers answered."""
+    def _take(self, replies: Collection[Reply[BookingsKept]], question: ShareBookings, asked: Ns) -> list[BookingsKept]:
+        """What keepers answered to what they were `asked` then."""
         now = self._mesh.now()
         heard = credible(replies, self._mesh.keys, now)
         answers = [one for one in heard if self._authority.may_lead(one.host)]
@@ -191,21 +210,14 @@ class BookingSharing:
             for reply in replies
         )
         if changed:
-            self._give(steps.Shared(news=True))
+            self._give(steps.Shared())
             self._news.set()
-        walls = {one.host: one.wall for one in answers} | {self._mesh.me.host: self._keeper.wall()}
-        found, age = oldest(answers), (now - self._clock.since) / SECOND
-        if found is not None and found[0] > age + SAME and abs(found[1] - self._clock.at(now)) > DIFFERS * SECOND:
-            # This reign began where nobody knew the time of the others.
-            self._clock.since = now - round(found[0] * SECOND)
-            self._clock.step(found[1], now)
-        elif self.bookings.settled or age > (now - self._begun) / SECOND + SAME:
-            self._clock.aim(agreed(map(wall_ns, walls.values()), self._clock.at(now)), now)
-        else:
-            self._clock.step(agreed(map(wall_ns, walls.values())), now)
-        time = self._clock.at(now) / SECOND
-        walls |= {one.host: one.wall for one in heard}
-        self.clocks = {host: wall - time for host, wall in walls.items() if abs(wall - time) > DIFFERS}
+        prompt = credible((reply for reply in replies if reply.arrived - asked <= PROMPT), self._mesh.keys, now)
+        walls = {one.host: wall_ns(one.wall) for one in (*prompt, self._keeper.told("", durable=False))}
+        self._ahead = {host: wall - now for host, wall in walls.items()}
+        believed = {*(one.host for one in answers), self._mesh.me.host}
+        mine = {host: wall for host, wall in walls.items() if host in believed}
+        self._give(steps.ClocksRead(now, oldest(answers), mine))
         return answers
 
 

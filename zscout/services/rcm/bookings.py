@@ -14,7 +14,7 @@ from zscout.messages import Ask, BookingRecord, BookingsKept, Operation, Problem
 from zscout.rcm.admission import Admission
 from zscout.rcm.deadlines import Deadlines
 from zscout.rcm.door import Door
-from zscout.rcm.steps import Again, BookedDanger, Keep, Outbox, Proposed, Ticket
+from zscout.rcm.steps import Again, BookedDanger, ClocksRead, Keep, Outbox, Proposed, Ticket
 from zscout.scheduling.booking import BookingConflict, BookingThreatened, Dates
 from zscout.scheduling.core import Core
 from zscout.scheduling.model import ArcRequest, Effect, Event, Propose, Tick, Vote, VoteOverdue
@@ -24,7 +24,7 @@ from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.bookings.records import Records
 from zscout.services.rcm.booked_dates import BookedDates, Date
 from zscout.services.rcm.booking_handler import BookingHandler
-from zscout.types import SECOND, HostName, Ns
+from zscout.types import SECOND, HostName, Ns, span
 
 SLACK: Final[Ns] = SECOND // 100
 """Timers may be a little early."""
@@ -73,6 +73,8 @@ class Bookings:
         """Those of which there is one at a time."""
         self._another: Ns | None = None
         self._renewal: Ns | None = None
+        self._is_found_out = settles_at > 0
+        """True while fleet time is what hosts' clocks say, as nobody has heard it."""
         self._told: dict[str, str] = {}
         """Dangers that were reported, by date."""
         self._once(_Due.NEWS, 0)
@@ -148,13 +150,25 @@ class Bookings:
         self.handler.kept(keep, why)
         return self._out()
 
-    def shared(self, *, news: bool) -> Outbox:
-        """All keepers were asked; or there is news: others know what was not known here."""
-        if not news:
-            events, news = self.dates.redate()
-            self.dates.out.events += events
-        if news:
-            self._once(_Due.NEWS, 0)
+    def shared(self) -> Outbox:
+        """Others know what was not known here."""
+        self._once(_Due.NEWS, 0)
+        return self._out()
+
+    def set_clock(self, read: ClocksRead) -> Outbox:
+        """Set fleet time by what hosts have heard of it, and by their clocks."""
+        clock, (at, heard, walls) = self.clock, read
+        if heard is not None and heard[0] > self.age + SAME:
+            # This reign began where nobody knew the time of the others.
+            clock.since, self._is_found_out = at - round(heard[0] * SECOND), False
+            clock.step(heard[1], at)
+        elif self._is_found_out and not self.settled:
+            clock.step(agreed(walls.values()), at)
+        elif moved := clock.correct(walls, at):
+            words = f"{span(abs(moved) / SECOND)} {'forward' if moved > 0 else 'back'}"
+            self.dates.out.strange.append(("clock", f"fleet time is put {words}, to what most hosts' clocks say"))
+        if self.dates.redate(settled=self.settled):
+            self._reconcile()
         return self._out()
 
     def note(self, events: Collection[Event], effects: Iterable[Effect]) -> Outbox:
@@ -259,10 +273,14 @@ def bookings_of(
 
 
 def oldest(answers: Iterable[BookingsKept]) -> tuple[float, Ns] | None:
-    """Of the fleet times that hosts have heard the one that has gone on for longest: for how many seconds, and it."""
-    told = [(one.time_age, wall_ns(one.time)) for one in answers if one.time is not None]
-    age = max((age for age, _ in told), default=None)
-    return None if age is None else (age, agreed(time for other, time in told if other > age - SAME))
+    """Of the fleet times that hosts have heard the one that has gone on for longest: for how many seconds, and it. Of
+    two that did, as some hosts missed a correction, what more have heard, or what is nearer to their clocks."""
+    heard = [one for one in answers if one.time is not None]
+    age = max((one.time_age for one in heard), default=None)
+    if age is None:
+        return None
+    times = [wall_ns(one.time) for one in heard if one.time is not None and one.time_age > age - SAME]
+    return age, agreed(times, agreed(wall_ns(one.wall) for one in heard))
 
 
 def _time(keeper: BookingKeeper, kept: Sequence[BookingsKept]) -> tuple[Ns, float]:

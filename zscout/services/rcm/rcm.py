@@ -311,7 +311,8 @@ class Rcm:
         for keep in out.keep:
             supervisor.spawn(self._keep(keep))
         for danger in out.dangers:
-            words = f"is in danger: {danger.why}" if danger.why else "is safe again"
+            state = "has lapsed" if danger.over else "is in danger"
+            words = f"{state}: {danger.why}" if danger.why else "is safe again"
             log.warning("booking %s of %s %s", danger.record.name, danger.record.owner, words)
             self._parts.on_danger(danger)
         for drained in out.drained[-1:]:
