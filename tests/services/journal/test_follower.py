@@ -10,6 +10,7 @@ from zscout.messages import HoldView, JournalGap, RcmState, ReasonInfo, ReasonPa
 from zscout.services.journal.follower import (
     MAX_EARLY,
     Change,
+    ClockSet,
     EndUnheard,
     Follower,
     GapSeen,
@@ -194,3 +195,10 @@ def test_absurd_words_on_use_are_nothing_and_early_ones_are_bounded() -> None:
     told(follower, UseHeard([("robot/a", grant(number), 1.0) for number in range(MAX_EARLY + 1)]))
     assert len(told(follower, heard(100.0, published(1, [holder(0, "robot/a")])))) == 1
     assert len(told(follower, heard(100.1, published(2, [holder(1, "robot/a")])))) == 2
+
+
+def test_what_is_in_doubt_moves_with_the_clock() -> None:
+    follower = Follower(SILENT)
+    told(follower, heard(100.0, published(1, [holder(1, "robot/a")])), heard(105.0, published(3), silence=5.0))
+    assert told(follower, ClockSet(259_200.0)) == [ClockSet(259_200.0)]
+    assert told(follower, StateRead(259_306.0, state(3))) == [EndUnheard(grant(1), 259_300.0)]

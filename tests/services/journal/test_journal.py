@@ -325,3 +325,21 @@ async def test_questions_take_one_thread_of_those_that_all_share(
     assert len(await asyncio.gather(*(told.ask() for _ in range(5)))) == 5
     assert most == 1
     await told.close()
+
+
+async def test_a_hold_is_as_long_as_it_was_though_the_clock_was_set(tmp_path: Path) -> None:
+    told, _ = await telling(tmp_path, "x")
+    mesh, journal = told.candidates["x"].mesh, told.journals["x"]
+    journal._wall = lambda: mesh.now() / SECOND  # a host without a clock battery starts in 1970
+    await told.tells(lambda found: found.now < START)
+    one = told.fleet.client("one")
+    await one.ask("survey", "robot/a", seconds=600)
+    await asyncio.sleep(10)
+    journal._wall = lambda: START + mesh.now() / SECOND
+    await asyncio.sleep(10)
+    await one.do(Release("survey"))
+    (hold,) = (await told.tells(lambda found: found.holds and found.holds[0].ended)).holds
+    assert hold.ended is not None
+    assert hold.ended - hold.began == pytest.approx(20, abs=0.5)
+    assert hold.began > START
+    await told.close()

@@ -11,7 +11,7 @@ import pytest
 
 from tests.services.journal.kit import grant, past
 from zscout.messages import UNHEARD, HistoryAsk, JournalGap, ReasonParty, Who
-from zscout.services.journal.follower import Change, EndUnheard, GapSeen, HoldOver, HoldSeen, HoldUsed
+from zscout.services.journal.follower import Change, ClockSet, EndUnheard, GapSeen, HoldOver, HoldSeen, HoldUsed
 from zscout.services.journal.store import ASIDE, FILE, MAX_KEPT_GAPS, JournalStore, Unwritable
 
 BEFORE_USE = """
@@ -259,3 +259,18 @@ def test_what_another_process_has_locked_is_tried_again(tmp_path: Path) -> None:
     other.execute("COMMIT")
     commit(store, HoldSeen(past(1, NOW)))
     assert arcs(store) == [1]
+
+
+@pytest.mark.parametrize("by", [30 * DAY, -2 * DAY], ids=["forward", "back"])
+def test_a_clock_that_is_set_moves_the_beginnings_of_holds_that_stand(tmp_path: Path, by: float) -> None:
+    store = opened(tmp_path)
+    commit(store, HoldSeen(past(1, NOW - 400)))
+    store.close()
+    store = opened(tmp_path)  # that hold began by another clock
+    over = HoldOver(past(2, NOW - 20, NOW - 20, "completed", late=True))
+    commit(store, HoldSeen(past(2, NOW - 300)), over, HoldSeen(past(3, NOW - 200)), HoldSeen(past(4, NOW - 100)))
+    commit(store, EndUnheard(grant(4), NOW - 10), ClockSet(by))
+    commit(store, HoldOver(past(3, NOW + by, NOW + by, "completed", late=True)), now=NOW + by)
+    found = {hold.grant.seq: hold for hold in store.answer("anvil", HistoryAsk(), NOW + 31 * DAY).holds}
+    assert {seq: hold.began - NOW for seq, hold in found.items()} == {1: -400, 2: -300, 3: by - 200, 4: by - 100}
+    assert {seq: hold.ended - hold.began for seq, hold in found.items() if hold.ended} == {2: 280, 3: 200, 4: 90}

@@ -42,6 +42,12 @@ class UseHeard(NamedTuple):
     words: Sequence[tuple[RcName, Grant, float]]
 
 
+class ClockSet(NamedTuple):
+    """This host's clock was set, by so many seconds: what was read on it before is off by as much."""
+
+    by: float
+
+
 class HoldSeen(NamedTuple):
     hold: messages.PastHold
 
@@ -71,8 +77,8 @@ class HoldUsed(NamedTuple):
     seconds: float
 
 
-Heard: TypeAlias = PublicationHeard | StateRead | UseHeard
-Change: TypeAlias = HoldSeen | HoldOver | EndUnheard | HoldUsed | GapSeen
+Heard: TypeAlias = PublicationHeard | StateRead | UseHeard | ClockSet
+Change: TypeAlias = HoldSeen | HoldOver | EndUnheard | HoldUsed | GapSeen | ClockSet
 
 
 class Follower:
@@ -98,6 +104,13 @@ class Follower:
                 return self._read(event)
             case UseHeard():
                 return self._used(event)
+            case ClockSet():
+                return self._set_clock(event)
+
+    def _set_clock(self, event: ClockSet) -> Iterator[Change]:
+        if self._doubt is not None:
+            self._doubt += event.by
+        yield event
 
     def _heard(self, event: PublicationHeard) -> Iterator[Change]:
         at, grants = event.at, event.grants

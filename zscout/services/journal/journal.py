@@ -19,7 +19,7 @@ from zscout.keyexpr import check_need
 from zscout.mesh import Declaration, IncomingQuery, Mesh, MeshError
 from zscout.mesh.supervision import Supervisor, done_within
 from zscout.messages import Grants, HistoryAsk, JournalGap, PastHold, Problem, RcmState, RcState, StateAsk
-from zscout.services.journal.follower import Change, Follower, Heard, PublicationHeard, StateRead, UseHeard
+from zscout.services.journal.follower import Change, ClockSet, Follower, Heard, PublicationHeard, StateRead, UseHeard
 from zscout.services.journal.store import Damaged, JournalStore, Unwritable
 from zscout.types import NO_TERM, SECOND, Grant, Ns, RcName, Term
 
@@ -34,6 +34,7 @@ MAX_USES: Final = 10_000  # reports of use awaiting a commit, or remembered agai
 MAX_TOLD: Final = 5_000  # holds passed to `on_opened`
 MAX_ASKING: Final = 16  # queries answered at one time
 ENDS_WITHIN: Final = 5.0
+CLOCK_SET: Final = 2.0  # seconds by which the wall clock moves against the mesh's, if it was set
 MEGABYTE: Final = 1_000_000
 
 
@@ -61,6 +62,7 @@ class Journal:
         self._said_count = 0
         self._number: tuple[Term, int] = NO_TERM, 0
         self._at: Ns | None = None  # last publication, by the mesh's clock
+        self._ahead: float | None = None  # by how much the wall clock was ahead of that clock then
         self._first = self._heard = 0.0  # first and last publication known to this journal
         self._committed = 0.0  # publications up to here are noted as received
         self._dropped, self._dropped_since = 0, 0.0
@@ -103,14 +105,18 @@ class Journal:
     def _hear(self, grants: Grants) -> None:
         now, at, number = self._mesh.now(), self._wall(), (grants.term, grants.seq)
         silence = 0.0 if self._at is None else (now - self._at) / SECOND
+        ahead, before = at - now / SECOND, self._ahead
+        if before is not None and abs(ahead - before) > CLOCK_SET:
+            self._gather(ClockSet(ahead - before), at)
+        self._ahead = ahead
         self._at, self._heard, self._first = now, at, self._first or at
         if grants.rcs or grants.revoked or number != self._number or silence > self._silent:
-            self._gather(PublicationHeard(at, silence, grants))
+            self._gather(PublicationHeard(at, silence, grants), at)
         self._number = number
 
-    def _gather(self, event: PublicationHeard | StateRead) -> None:
+    def _gather(self, event: Heard, at: float) -> None:
         if self._weight + len(self._pending) + (weight := _weight(event)) > MAX_GATHERED:
-            self._dropped_since = self._dropped_since if self._dropped else event.at
+            self._dropped_since = self._dropped_since if self._dropped else at
             self._dropped += 1
             return
         self._weight += weight
@@ -210,7 +216,7 @@ class Journal:
             log.debug("the RCM's state was not read: %s", error)
             return
         for state in (reply.message for reply in replies if reply.message is not None):
-            self._gather(StateRead(self._wall(), state))
+            self._gather(StateRead(at := self._wall(), state), at)
 
     def _on_asked(self, query: IncomingQuery[HistoryAsk]) -> None:
         if query.message.rc is not None:
@@ -232,8 +238,12 @@ class Journal:
         query.answer(answer)
 
 
-def _weight(event: PublicationHeard | StateRead) -> int:
+def _weight(event: Heard) -> int:
     """Rough size of an event's records."""
-    if isinstance(event, StateRead):
-        return 1 + len(event.state.holds)
-    return 1 + sum(map(len, event.grants.rcs.values())) + len(event.grants.revoked)
+    match event:
+        case StateRead():
+            return 1 + len(event.state.holds)
+        case PublicationHeard():
+            return 1 + sum(map(len, event.grants.rcs.values())) + len(event.grants.revoked)
+        case _:
+            return 1

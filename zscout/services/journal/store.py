@@ -17,7 +17,7 @@ import msgspec
 
 from zscout import messages
 from zscout.keyexpr import check_need, is_pattern, matcher
-from zscout.services.journal.follower import Change, EndUnheard, GapSeen, HoldOver, HoldSeen, HoldUsed
+from zscout.services.journal.follower import Change, ClockSet, EndUnheard, GapSeen, HoldOver, HoldSeen, HoldUsed
 from zscout.types import Grant, RcName, Term
 
 log = logging.getLogger(__name__)
@@ -70,6 +70,9 @@ _ENDED: Final = f"""{_INSERT}
 _UNHEARD: Final = f"""
     UPDATE holds SET ended = max(began, ?), outcome = '{messages.UNHEARD}'
     WHERE term = ? AND rcm = ? AND seq = ? AND ended IS NULL"""  # noqa: S608 - a constant
+_CLOCK_SET: Final = f"""
+    UPDATE holds SET began = max(0, began + ?), ended = max(0, ended + ?)
+    WHERE (ended IS NULL OR outcome = '{messages.UNHEARD}') AND id > ?"""  # noqa: S608 - a constant
 _PARTY: Final = msgspec.json.Decoder(messages.ReasonParty)
 
 
@@ -88,6 +91,7 @@ class JournalStore:
         self._max_age, self._max_size = max_age, max_size
         self._db: sqlite3.Connection | None = None
         self._one = threading.Lock()
+        self._before = 0  # the last hold before this process, whose times are of another clock
 
     def open(self) -> tuple[list[Grant], float | None]:
         """Open holds and last publication of the closed journal; sets an unreadable file aside. Raises Unwritable."""
@@ -96,6 +100,7 @@ class JournalStore:
                 db = self._opened()
             except Damaged:
                 db = self._opened()
+            (self._before,) = db.execute("SELECT coalesce(max(id), 0) FROM holds").fetchone()
             rows = db.execute("SELECT term, rcm, seq FROM holds WHERE ended IS NULL ORDER BY id")
             return [Grant(Term(term, rcm), seq) for term, rcm, seq in rows], self._fact("heard")
 
@@ -106,7 +111,7 @@ class JournalStore:
                 db = self._opened()
                 with _transaction(db):
                     for change in changes:
-                        _apply(db, change)
+                        _apply(db, change, self._before)
                     db.execute("INSERT INTO facts VALUES ('since', ?) ON CONFLICT DO NOTHING", (first,))
                     db.execute("INSERT OR REPLACE INTO facts VALUES ('heard', ?)", (heard,))
                     self._prune(db, now)
@@ -275,7 +280,7 @@ def _used(db: sqlite3.Connection) -> int:
     return int((pages - free) * size)
 
 
-def _apply(db: sqlite3.Connection, change: Change) -> None:
+def _apply(db: sqlite3.Connection, change: Change, before: int) -> None:
     match change:
         case HoldSeen(hold):
             db.execute(_BEGAN, _row(hold))
@@ -285,6 +290,8 @@ def _apply(db: sqlite3.Connection, change: Change) -> None:
             db.execute(_UNHEARD, (at, term.counter, term.rcm, seq))
         case HoldUsed(grant, rc, seconds):
             _use(db, grant, rc, seconds)
+        case ClockSet(by):
+            db.execute(_CLOCK_SET, (by, by, before))
         case GapSeen(gap):
             db.execute("INSERT INTO gaps VALUES (?, ?, ?, ?)", (gap.began, gap.ended, gap.cause, gap.count))
 
