@@ -35,6 +35,7 @@ from zscout.mesh import Mesh, MeshError, ZenohMesh
 from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.messages import LoadReport
 from zscout.rcm.authority import Authority
+from zscout.services.bookings.host_clock import is_synchronised
 from zscout.services.bookings.keeper import BookingFile, BookingKeeper
 from zscout.services.journal.journal import Journal
 from zscout.services.metrics.node_figures import NodeFigures
@@ -204,7 +205,7 @@ async def run_services(
 
 def _keeper(mesh: Mesh, node: Node, folder: Path | None) -> BookingKeeper:
     disk = BookingFile(folder, node.fleet.name) if folder is not None else None
-    return BookingKeeper(mesh, disk, candidate=node.candidate)
+    return BookingKeeper(mesh, disk, candidate=node.candidate, synchronised=is_synchronised)
 
 
 async def _cancelled(task: asyncio.Task[None]) -> None:

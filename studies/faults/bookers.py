@@ -78,6 +78,8 @@ class Hosts:
         if booked and rng.random() < 0.4:
             for host in rng.sample(hosts, rng.choice((1, 1, len(hosts)))):
                 self.ahead[host] = rng.choice((-1, 1)) * rng.uniform(*HOURS_OFF)
+        self.kept = {host: rng.random() < 0.5 for host in hosts}
+        """Whether a time service keeps the clock of each, as it says."""
 
     def wall(self, host: str) -> float:
         """The clock of a host, in seconds since 1970."""

@@ -500,7 +500,11 @@ class Simulation:
         await self._offer_all(mesh, stall)
         leads = host in self.candidates_at
         keeper = BookingKeeper(
-            mesh, self.equipment.disks[host], candidate=leads, wall=partial(self.equipment.wall, host)
+            mesh,
+            self.equipment.disks[host],
+            candidate=leads,
+            wall=partial(self.equipment.wall, host),
+            synchronised=partial(self.equipment.kept.__getitem__, host),
         )
         if leads:
             self.keepers[host] = keeper

@@ -209,6 +209,8 @@ class BookingsKept(Message, frozen=True):
     durable: bool = False
     records: Annotated[list[BookingRecord], msgspec.Meta(max_length=MAX_MERGED)] = []
     version: VersionText = ""
+    synchronised: bool = False
+    """Whether a time service keeps its clock."""
 
 
 Operation: TypeAlias = RequestOperation | Book | Unbook | FindSlots

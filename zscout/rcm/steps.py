@@ -153,6 +153,8 @@ class ClocksRead(NamedTuple):
     """The oldest fleet time that others have heard, in ns since 1970, and for how many seconds it has gone on."""
     walls: Mapping[HostName, Ns]
     """What hosts' clocks say, likewise."""
+    kept: frozenset[HostName]
+    """The hosts whose clocks are kept by a time service."""
 
 
 class Kept(NamedTuple):

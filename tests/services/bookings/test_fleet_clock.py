@@ -23,10 +23,11 @@ class Story:
     def __init__(self) -> None:
         self.clock, self.now = FleetClock(NOON, 0, 0), 0
 
-    def read(self, **ahead: int) -> int:
-        """By how much fleet time is corrected."""
+    def read(self, kept: str = "", /, **ahead: int) -> int:
+        """By how much fleet time is corrected. `kept`: hosts whose clocks are synchronised."""
         self.now += ROUND
-        return self.clock.correct({host: NOON + self.now + differs for host, differs in ahead.items()}, self.now)
+        walls = {host: NOON + self.now + differs for host, differs in ahead.items()}
+        return self.clock.correct(walls, self.now, frozenset(kept))
 
     @property
     def ahead(self) -> int:
@@ -98,6 +99,18 @@ def test_who_is_alone_for_a_while_is_not_the_majority() -> None:
     for _ in range(REMEMBERED // ROUND - 1):
         assert story.read(x=DAYS) == 0
     assert [story.read(x=DAYS) for _ in range(3)] == [0, 0, DAYS]
+
+
+def test_of_two_halves_the_one_counts_whose_clocks_are_synchronised() -> None:
+    story = Story()
+    assert [story.read("y", x=0, y=DAYS) for _ in range(4)] == [0, 0, DAYS, 0]
+    assert [story.read("xy", x=0, y=DAYS) for _ in range(4)] == [0] * 4
+    story = Story()
+    assert [story.read("z", v=0, x=0, y=DAYS, z=DAYS) for _ in range(3)] == [0, 0, DAYS]
+    # It is no majority: its time service may be wrong.
+    story = Story()
+    assert [story.read("x", x=0, y=DAYS, z=DAYS) for _ in range(3)] == [0, 0, DAYS]
+    assert agreed([NOON, NOON + DAYS], kept=[NOON + DAYS]) == NOON + DAYS
 
 
 def test_one_clock_of_three_that_is_wrong_changes_nothing_much() -> None:

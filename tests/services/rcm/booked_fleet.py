@@ -49,6 +49,8 @@ class BookedFleet(FakeFleet):
         """By host, what it told of as it led."""
         self.ahead: dict[str, float] = {}
         """By how many seconds a host's clock is ahead."""
+        self.synchronised = set[str]()
+        """Hosts whose clocks are."""
         loop = asyncio.get_running_loop()
         begun = loop.time()
         self.time: Callable[[], float] = lambda: NOON + loop.time() - begun
@@ -67,7 +69,12 @@ class BookedFleet(FakeFleet):
     def candidate(self, host: str, *_: Any, **how: Any) -> Candidate:
         disk = self.disks.setdefault(host, Disk())
         mesh = self.mesh(host)
-        keeper = BookingKeeper(mesh, disk, wall=lambda: self.time() + self.ahead.get(host, 0.0))
+        keeper = BookingKeeper(
+            mesh,
+            disk,
+            wall=lambda: self.time() + self.ahead.get(host, 0.0),
+            synchronised=lambda: host in self.synchronised,
+        )
         parts = CandidateParts(keeper=keeper, on_danger=self.dangers.setdefault(host, []).append, **how)
         candidate = Candidate(mesh, self.fleet, parts)
         candidate.start()

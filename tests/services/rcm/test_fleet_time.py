@@ -99,6 +99,20 @@ async def test_the_clock_of_the_only_host_is_put_right(wrong: float, caplog: pyt
         await client.ask("again", "robot/b", seconds=600, booking="now")
 
 
+@pytest.mark.parametrize("first", ["x", "y"])
+async def test_of_two_hosts_the_one_counts_whose_clock_is_synchronised(first: str) -> None:
+    fleet = BookedFleet("x", "y")
+    fleet.ahead["x"] = -259_200.0
+    fleet.synchronised = {"y"}
+    one = fleet.candidate(first)
+    await until(lambda: one.rcm and one.rcm.bookings.settled)
+    fleet.candidate("y" if first == "x" else "x")
+    await asyncio.sleep(100)
+    told = await fleet.told()
+    assert told.time == pytest.approx(fleet.time(), abs=0.1)
+    assert [*told.clocks] == ["x"]
+
+
 async def test_who_waits_for_a_date_begins_as_the_clock_comes_to_it() -> None:
     fleet = BookedFleet("x")
     fleet.ahead["x"] = -259_200

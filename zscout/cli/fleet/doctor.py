@@ -5,7 +5,6 @@ What is made of it stands in `findings.py`."""
 from __future__ import annotations
 
 import asyncio
-import ctypes
 import os
 import socket
 import time
@@ -25,6 +24,7 @@ from zscout.config.fleet import Fleet
 from zscout.config.node import Node, load_node
 from zscout.config.strict import BadInput, read_text
 from zscout.keyexpr import valid_name
+from zscout.services.bookings.host_clock import is_synchronised
 from zscout.terminal import Table
 
 JOINED: Final = 7.0
@@ -33,10 +33,6 @@ RELAY: Final = 1.0
 """Seconds more for a link to the relay."""
 LISTENS: Final = 3
 """Addresses of one process that are called."""
-TIME_ERROR: Final = 5
-"""What adjtimex returns where nothing keeps the clock."""
-TIMEX: Final = 256
-"""Bytes that are enough for its struct on any platform."""
 STYLES: Final = {"ok": "green", "note": "yellow", "mend": "bold red"}
 
 
@@ -84,7 +80,7 @@ async def doctor(file: Path | None, only_keys: bool, as_json: bool) -> int:
 
 
 async def _look(file: Path | None) -> Evidence:
-    seen = Evidence(datetime.now(UTC), clock_kept=_clock_kept())
+    seen = Evidence(datetime.now(UTC), clock_kept=is_synchronised())
     try:
         if file is not None:
             seen.node = load_node(file)
@@ -186,12 +182,3 @@ async def _join(seen: Evidence, fleet: Fleet) -> None:
                 seen.links, seen.hosts, seen.devices = client.mesh.links(), view.hosts, devices.known()
     except (MeshError, BadInput) as error:
         seen.unjoined = str(error)
-
-
-def _clock_kept() -> bool | None:
-    """None where that can't be asked."""
-    try:
-        code = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX))
-    except (OSError, AttributeError):
-        return None
-    return None if code < 0 else code != TIME_ERROR

@@ -5,7 +5,7 @@ differ from it, it is corrected in one step: at once if a clock was set to what 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from statistics import median_high, median_low
 from typing import Final
 
@@ -21,10 +21,13 @@ def wall_ns(seconds: float) -> Ns:
     return round(seconds * SECOND)
 
 
-def agreed(times: Iterable[Ns], goes_on: Ns | None = None) -> Ns:
-    """The median of several clocks at one instant. Of two middle ones the nearer to `goes_on`, the present time, which
-    more may share; else the lower. Raises ValueError for none."""
+def agreed(times: Iterable[Ns], goes_on: Ns | None = None, kept: Collection[Ns] = ()) -> Ns:
+    """The median of several clocks at one instant. Of two middle ones the nearer to what clocks say that are `kept` by
+    a time service; else to `goes_on`, the present time, which more may share; else the lower. Raises ValueError for
+    none."""
     all_times = sorted(times)
+    if kept:
+        goes_on = agreed(kept, goes_on)
     low, high = median_low(all_times), median_high(all_times)
     return high if goes_on is not None and abs(high - goes_on) < abs(low - goes_on) else low
 
@@ -39,8 +42,8 @@ class FleetClock:
     def __init__(self, time: Ns, now: Ns, since: Ns) -> None:
         """`time`: ns since 1970 (UTC) at `now`; unbroken, but for corrections, since `since` on the own clock."""
         self.since = since
-        self._hosts: dict[HostName, tuple[Ns, Ns]] = {}
-        """By how much the clock of each host is ahead of the own one, and when it was read."""
+        self._hosts: dict[HostName, tuple[Ns, Ns, bool]] = {}
+        """By how much the clock of each host is ahead of the own one, when it was read, and whether it is kept."""
         self._doubted: tuple[Ns, Ns] | None = None
         """What most clocks say instead, as such an offset, and since when."""
         self.step(time, now)
@@ -53,16 +56,18 @@ class FleetClock:
         """Set it to `time` at `now`."""
         self._offset, self.set_at, self._doubted = time - now, now, None
 
-    def correct(self, walls: Mapping[HostName, Ns], now: Ns) -> Ns:
-        """Compare it with hosts' clocks as they were read at `now`. Returns by how much it is corrected; 0: it is not.
+    def correct(self, walls: Mapping[HostName, Ns], now: Ns, kept: Collection[HostName] = ()) -> Ns:
+        """Compare it with hosts' clocks as they were read at `now`, of which some are `kept` by a time service. Returns
+        by how much it is corrected; 0: it is not.
 
         Hosts that are not among them count as they did within the last hour: whoever is alone for a while is not
         the majority."""
         offsets, before = {host: wall - now for host, wall in walls.items()}, self._hosts
         self._hosts = {host: known for host, known in before.items() if now - known[1] < REMEMBERED} | {
-            host: (offset, now) for host, offset in offsets.items()
+            host: (offset, now, host in kept) for host, offset in offsets.items()
         }
-        aim = agreed((offset for offset, _ in self._hosts.values()), self._offset)
+        known = self._hosts.values()
+        aim = agreed((one[0] for one in known), self._offset, [one[0] for one in known if one[2]])
         if not _differ(aim, self._offset):
             self._doubted = None
             return 0

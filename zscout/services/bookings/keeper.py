@@ -91,12 +91,19 @@ class BookingFile:
 
 
 class BookingKeeper:
-    """`wall`: the host's clock, in seconds since 1970 (UTC)."""
+    """`wall`: the host's clock, in seconds since 1970 (UTC); `synchronised`: if a time service keeps it."""
 
     def __init__(
-        self, mesh: Mesh, disk: Disk | None = None, *, candidate: bool = True, wall: Callable[[], float] = time.time
+        self,
+        mesh: Mesh,
+        disk: Disk | None = None,
+        *,
+        candidate: bool = True,
+        wall: Callable[[], float] = time.time,
+        synchronised: Callable[[], bool | None] = lambda: None,
     ) -> None:
         self.mesh, self.wall, self._disk, self._candidate = mesh, wall, disk, candidate
+        self._synchronised = synchronised
         self.records = Records()
         self._offset: Ns | None = None  # fleet time minus the own clock, at the last publication
         self.heard: tuple[Term, Ns] = NO_TERM, 0  # term and time of that publication
@@ -193,6 +200,7 @@ class BookingKeeper:
             durable=durable,
             records=[] if own == digest else list(self.records),
             version=VERSION,
+            synchronised=self._synchronised() is True,
         )
 
     def _on_shared(self, query: IncomingQuery[messages.ShareBookings]) -> None:

@@ -213,11 +213,13 @@ class BookingSharing:
             self._give(steps.Shared())
             self._news.set()
         prompt = credible((reply for reply in replies if reply.arrived - asked <= PROMPT), self._mesh.keys, now)
-        walls = {one.host: wall_ns(one.wall) for one in (*prompt, self._keeper.told("", durable=False))}
+        hosts = {one.host: one for one in (*prompt, self._keeper.told("", durable=False))}
+        walls = {host: wall_ns(one.wall) for host, one in hosts.items()}
         self._ahead = {host: wall - now for host, wall in walls.items()}
         believed = {*(one.host for one in answers), self._mesh.me.host}
         mine = {host: wall for host, wall in walls.items() if host in believed}
-        self._give(steps.ClocksRead(now, oldest(answers), mine))
+        kept = frozenset(host for host in mine if hosts[host].synchronised)
+        self._give(steps.ClocksRead(now, oldest(answers), mine, kept))
         return answers
 
 

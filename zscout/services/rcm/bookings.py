@@ -157,14 +157,14 @@ class Bookings:
 
     def set_clock(self, read: ClocksRead) -> Outbox:
         """Set fleet time by what hosts have heard of it, and by their clocks."""
-        clock, (at, heard, walls) = self.clock, read
+        clock, (at, heard, walls, kept) = self.clock, read
         if heard is not None and heard[0] > self.age + SAME:
             # This reign began where nobody knew the time of the others.
             clock.since, self._is_found_out = at - round(heard[0] * SECOND), False
             clock.step(heard[1], at)
         elif self._is_found_out and not self.settled:
-            clock.step(agreed(walls.values()), at)
-        elif moved := clock.correct(walls, at):
+            clock.step(agreed(walls.values(), kept=[walls[host] for host in kept]), at)
+        elif moved := clock.correct(walls, at, kept):
             words = f"{span(abs(moved) / SECOND)} {'forward' if moved > 0 else 'back'}"
             self.dates.out.strange.append(("clock", f"fleet time is put {words}, to what most hosts' clocks say"))
         if self.dates.redate(settled=self.settled):
@@ -289,8 +289,10 @@ def _time(keeper: BookingKeeper, kept: Sequence[BookingsKept]) -> tuple[Ns, floa
     found = oldest([*kept, keeper.told("", durable=False)])
     if found is not None:
         return found[1], found[0]
-    walls = {one.host: one.wall for one in kept} | {keeper.mesh.me.host: keeper.wall()}
-    return agreed(map(wall_ns, walls.values())), 0.0
+    hosts = {one.host: one for one in (*kept, keeper.told("", durable=False))}.values()
+    return agreed(
+        (wall_ns(one.wall) for one in hosts), kept=[wall_ns(one.wall) for one in hosts if one.synchronised]
+    ), 0.0
 
 
 def _is_known(keeper: BookingKeeper, kept: Sequence[BookingsKept], fleet: Fleet) -> bool:
