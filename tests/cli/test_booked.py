@@ -102,7 +102,7 @@ def test_a_name_is_numbered_where_one_has_it_already() -> None:
     assert free_name("survey", [A, booking("z", "survey-2")]) == "survey-3"
 
 
-@pytest.mark.parametrize(("differs", "words"), [(185.0, "behind"), (-185.0, "before"), (1.0, "")])
+@pytest.mark.parametrize(("differs", "words"), [(185.0, "behind"), (-185.0, "ahead of"), (1.0, "")])
 def test_who_is_by_another_clock_than_the_fleet_is_told(
     differs: float, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -20,7 +20,7 @@ from zscout.cli.dates import date_words, parse_zone, span_words
 from zscout.cli.ownership import User
 from zscout.config.strict import BadInput, quoted
 from zscout.keyexpr import host_in, of_host
-from zscout.messages import BookedDate, BookingsAsk, BookingsTold, BookingView
+from zscout.messages import BookedDate, BookingsAsk, BookingsTold, BookingView, Correction
 from zscout.terminal import clean, clock, span
 
 SHOWN_ID: Final = 8
@@ -211,6 +211,11 @@ def _next(booking: BookingView) -> str:
 
 def clock_words(host: str, differs: float) -> str:
     return f"the clock of {clean(host)} is {differs_words(differs)}"
+
+
+def corrected_words(corrected: Correction) -> str:
+    direction = "forward" if corrected.by > 0 else "back"
+    return f"fleet time was put {span(abs(corrected.by))} {direction} at {clock(-corrected.ago)}; see your bookings"
 
 
 def differs_words(differs: float) -> str:

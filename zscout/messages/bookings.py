@@ -160,6 +160,13 @@ class BookingsAsk(Message, frozen=True):
     rc: ShortText | None = None
 
 
+class Correction(Message, frozen=True):
+    """Fleet time was put forward by so many seconds, or back (negative), to what most hosts' clocks say."""
+
+    by: Seconds
+    ago: Elapsed
+
+
 class BookingsTold(Message, frozen=True):
     """Bookings that are not over. `time` is the fleet's; `clocks` has, by host, by how many seconds its clock is ahead
     of that, where they differ by more than 2."""
@@ -167,6 +174,8 @@ class BookingsTold(Message, frozen=True):
     time: WallTime
     bookings: list[BookingView] = []
     clocks: dict[str, Seconds] = {}
+    corrected: Correction | None = None
+    """The last correction, for a day in the reign of its leader."""
 
 
 class BookingRecord(_Booking, frozen=True):

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from msgspec import structs
 from rich.cells import cell_len
 
 from tests import transcripts
@@ -24,6 +25,7 @@ from zscout.messages import (
     BookedDate,
     BookingsTold,
     BookingView,
+    Correction,
     HoldView,
     LoadReport,
     RcmState,
@@ -137,6 +139,12 @@ class Picture:
                 lasting=kept == "drained",
             )
             self.booked.bookings.append(view_of)
+
+    def clock(self, name: str, options: dict[str, str]) -> None:
+        """`NAME ahead=SECONDS` of a host, or `fleet corrected=SECONDS`."""
+        ahead = {name: float(options["ahead"])} if "ahead" in options else {}
+        corrected = Correction(float(options["corrected"]), 300.0) if "corrected" in options else self.booked.corrected
+        self.booked = structs.replace(self.booked, clocks=self.booked.clocks | ahead, corrected=corrected)
 
     def hold(self, name: str, options: dict[str, str]) -> None:
         assert self.state is not None

@@ -82,6 +82,9 @@ async def test_the_clock_of_the_only_host_is_put_right(wrong: float, caplog: pyt
     told = await fleet.told()
     assert told.time == pytest.approx(fleet.time(), abs=0.1)
     assert not told.clocks
+    assert told.corrected is not None
+    assert told.corrected.by == pytest.approx(-wrong, abs=1e-3)
+    assert told.corrected.ago < 2
     assert "fleet time is put 3 d " + ("forward" if wrong < 0 else "back") in caplog.text
     # The hold keeps its length; its date never begins again.
     (same,) = (await fleet.state()).holds

@@ -21,6 +21,7 @@ from zscout.cli.booked import (
     booking_json,
     choose,
     clock_words,
+    corrected_words,
     explained,
     is_own,
     label,
@@ -93,6 +94,8 @@ async def bookings(mine: bool, rc: str | None, at: WrittenDate | None, zone: Zon
             return
         for host, differs in sorted(told.clocks.items()):
             click.secho(clean(clock_words(host, differs)), fg="yellow", err=True)
+        if told.corrected is not None:
+            click.secho(corrected_words(told.corrected), fg="yellow", err=True)
         if not found:
             terminal.print_line("nothing is booked" + (f" on {day:%a %Y-%m-%d}" if day is not None else ""))
         else:

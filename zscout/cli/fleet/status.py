@@ -148,6 +148,8 @@ class Standing:
         rows += [("recorder", f"{host}: {why}") for host, why in self.fleet_view.unrecorded().items()]
         clocks = sorted(self._clocks().items())
         rows += [("clock", f"{booked.clock_words(host, differs)}; set it") for host, differs in clocks]
+        if self.booked is not None and self.booked.corrected is not None:
+            rows.append(("clock", booked.corrected_words(self.booked.corrected)))
         if (versions := mixture(self._versions())) is not None:
             rows.append(("versions", versions))
         return Table("Warnings", ("ABOUT", "WARNING"), rows, ["yellow"] * len(rows))

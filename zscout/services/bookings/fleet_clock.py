@@ -44,6 +44,8 @@ class FleetClock:
         self.since = since
         self._hosts: dict[HostName, tuple[Ns, Ns, bool]] = {}
         """By how much the clock of each host is ahead of the own one, when it was read, and whether it is kept."""
+        self.corrected: tuple[Ns, Ns] | None = None
+        """By how much it was corrected last, and when."""
         self._doubted: tuple[Ns, Ns] | None = None
         """What most clocks say instead, as such an offset, and since when."""
         self.step(time, now)
@@ -81,4 +83,5 @@ class FleetClock:
             return 0
         moved = aim - self._offset
         self.step(now + aim, now)
+        self.corrected = moved, now
         return moved

@@ -14,9 +14,10 @@ from msgspec.structs import replace
 from zscout.keyexpr import Keys, Role, Token
 from zscout.mesh import Declaration, IncomingQuery, Lane, Mesh, Reply
 from zscout.mesh.supervision import Supervisor, done_within
-from zscout.messages import BookingRecord, BookingsAsk, BookingsKept, BookingsTold, ShareBookings
+from zscout.messages import BookingRecord, BookingsAsk, BookingsKept, BookingsTold, Correction, ShareBookings
 from zscout.rcm import steps
 from zscout.rcm.authority import Authority
+from zscout.services.bookings.dates import DAY
 from zscout.services.bookings.fleet_clock import DIFFERS, wall_ns
 from zscout.services.bookings.keeper import BookingKeeper
 from zscout.services.bookings.records import merged
@@ -108,7 +109,12 @@ class BookingSharing:
     def _answer(self, query: IncomingQuery[BookingsAsk]) -> None:
         asked, bookings = query.message, self.bookings
         views = bookings.handler.views(asked.owner, asked.rc)
-        query.answer(BookingsTold(bookings.dates.time, views, self._clocks()))
+        query.answer(BookingsTold(bookings.dates.time, views, self._clocks(), self._corrected()))
+
+    def _corrected(self) -> Correction | None:
+        by, at = self._bookings.clock.corrected or (0, 0)
+        ago = (self._mesh.now() - at) / SECOND
+        return Correction(by / SECOND, ago) if by and ago < DAY else None
 
     def _clocks(self) -> dict[HostName, float]:
         """By how many seconds hosts' clocks differ from fleet time, where it is too much."""
