@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import random
+from collections import Counter
 from decimal import Decimal
 
 import pytest
@@ -10,7 +12,7 @@ import pytest
 from tests.mesh.kit import until
 from tests.services.rcm.booked_fleet import NOON, BookedFleet, Disk, book, booked, do, led, record, states
 from tests.services.rcm.kit import Refusal
-from zscout.messages import BookingView, OpenRequest
+from zscout.messages import WINDOW, BookingView, Cancel, OpenRequest, Release, Unbook
 from zscout.services.rcm.candidate import Candidate
 from zscout.types import Grant, Term
 
@@ -131,6 +133,22 @@ async def test_who_waits_for_a_date_begins_as_the_clock_comes_to_it() -> None:
     assert [notice.state for notice in client.notices][-1:] == ["running"]
     (hold,) = (await fleet.state()).holds
     assert fleet.time() + 100 + hold.remaining == pytest.approx(NOON + 660, abs=0.5)
+
+
+@pytest.mark.parametrize("ahead", [100 * 86_400.0, -100 * 86_400.0], ids=["forward", "back"])
+async def test_maintenance_without_an_end_lasts_though_the_clock_is_set(ahead: float) -> None:
+    fleet = BookedFleet("x")
+    await led(fleet, "x")
+    client = fleet.client("one")
+    await do(client, book("m", "robot/a", at=-1, seconds=WINDOW, maintenance=True, lasting=True), BookingView)
+    await asyncio.sleep(2)
+    fleet.ahead["x"] = ahead
+    await asyncio.sleep(2)
+    assert states((await fleet.bookings())["m"]) == ["open"]
+    assert (await client.ask("mine", "robot/a")).state == "queued"
+    await do(client, Unbook("m"), BookingView)
+    await asyncio.sleep(1)
+    assert client.notices[-1].state == "running"
 
 
 async def test_a_new_leader_goes_on_in_the_corrected_time_though_one_host_missed_it() -> None:
@@ -311,3 +329,37 @@ async def test_a_host_that_does_not_answer_turns_no_clock_back() -> None:
     assert asked
     assert x.rcm is not None
     assert x.rcm.bookings.time == pytest.approx(fleet.time(), abs=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(12))
+async def test_no_date_begins_twice_however_clocks_are_set(seed: int) -> None:
+    rng = random.Random(seed)  # noqa: S311 - what failed once must fail again
+    fleet = BookedFleet("x", "y")
+    await led(fleet, "x", "y")
+    client, begun = fleet.client("one"), Counter[str]()
+    until_ = round(NOON) + 20 * 86_400
+    await do(
+        client, book("b", "robot/a", at=60, seconds=600, patience=Decimal(300), every=1, until=until_), BookingView
+    )
+    for number in range(20):
+        ahead = fleet.ahead.get("x", 0.0)
+        try:
+            asked = await client.ask(f"r{number}", "robot/a", seconds=600, booking="b")
+        except Refusal:
+            asked = None
+        # Its date comes, or another one: it is skipped, or was before.
+        day = (NOON + 60 - fleet.time() - ahead) % 86_400
+        ahead += rng.choice((0.0, day, day - 86_400, day + 86_400 * rng.randrange(-2, 3), rng.uniform(-700, 700)))
+        fleet.ahead |= {"x": ahead, "y": ahead}
+        await asyncio.sleep(rng.choice((2, 40, 400)))
+        news = [notice for notice in client.notices if asked is not None and notice.id == asked.id]
+        running = [notice for notice in news if notice.state == "running"] or ([asked] if asked else [])
+        if running[:1] and running[0].state == "running":
+            begun[running[0].booking] += 1
+        fleet.ahead |= dict.fromkeys("xy", ahead := ahead + rng.choice((0.0, 0.0, 86_400.0, -86_400.0, -650.0)))
+        await asyncio.sleep(2)
+        if asked is not None:
+            await client.do(Release(asked.id) if rng.random() < 0.7 or not running else Cancel(asked.id))
+    assert begun
+    assert set(begun.values()) == {1}

@@ -185,7 +185,11 @@ class BookedDates:
         """Have maintenance without an end begin again for 60 days, where half of that is over."""
         for record in self._lasting():
             if _end(record) - self.time <= WINDOW / 2:
-                self.change(record, start=int(self.time), runtime=Decimal(WINDOW), patience=Decimal(WINDOW))
+                self._begin_again(record)
+
+    def _begin_again(self, record: BookingRecord) -> None:
+        """Have maintenance without an end begin now, for 60 days."""
+        self.change(record, start=int(self.time), runtime=Decimal(WINDOW), patience=Decimal(WINDOW))
 
     def _lapsed(self, date: Date) -> bool:
         """Whether nobody took it up in time: that follows from the time alone, and is not kept."""
@@ -277,8 +281,9 @@ class BookedDates:
     def redate(self, *, settled: bool) -> bool:
         """Follow a step of fleet time; return True if there was one, and all dates are to be reconciled.
 
-        By a time that is `settled`, a hold that began for a date which is not now goes on as an ordinary one, and the
-        date is over, so that it never begins again. Dates that were to come and were skipped are reported."""
+        By a time that is `settled`: a hold that began for a date which is not now continues as an ordinary one, and the
+        date is over, so that it never begins again; so does a request whose date was skipped. Dates that were skipped
+        are reported. Maintenance without an end lasts."""
         now, ahead = self.now, self.clock.at(self.now) - self.now
         if ahead == self._dated_by:
             return False
@@ -289,11 +294,13 @@ class BookedDates:
                 continue
             start, status = self.local(date.start), None if arc is None else self._core.arc(arc)
             end, lapses = start + booking.runtime, start + booking.lapses - booking.start
-            if status is not None and status.hold is not None:
-                if not start <= now < end:
-                    over.setdefault(date.record.id, []).append(date.start)
-            elif booking.start > now and (lapses if status is None else end) <= now:
+            if date.record.lasting and booking.start <= now:
+                self._begin_again(date.record)
+                continue
+            if booking.start > now and (lapses if status is None else end) <= now:
                 skipped.setdefault(date.record.id, []).append(date)
+            if status is not None and (end <= now or (status.hold is not None and now < start)):
+                over.setdefault(date.record.id, []).append(date.start)
         for dates in skipped.values():
             first = min(dates, key=lambda date: date.start)
             self.out.dangers.append(BookedDanger(*first, SKIPPED, len(dates) - 1, over=True))
