@@ -86,6 +86,25 @@ async def test_a_device_that_begins_at_once_publishes_nothing() -> None:
         assert said == []
 
 
+class Brief(Device):
+    """Begins within 20 ms."""
+
+    async def begin(self, holder: Holder) -> None:
+        await asyncio.sleep(0.02)
+        await super().begin(holder)
+
+
+async def test_so_does_one_whose_holders_follow_each_other_quickly() -> None:
+    async with play(device=Brief(), confirmed=False) as at:
+        said = states_published(at.client)
+        for number in range(2, 12):
+            # A look that was due for one came while the next began.
+            await asyncio.sleep(0.04)
+            at.rcm.publish(short(number))
+        await asyncio.sleep(1)
+        assert not [one for state in said for one in state.holders if one.waits is not None]
+
+
 async def test_a_device_that_has_begun_goes_on_in_another_client() -> None:
     async with play(short(1), device=Oven(), confirmed=False) as at:
         await until(lambda: at.rc.holds.held[grant(1)].begun)

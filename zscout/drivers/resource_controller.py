@@ -28,7 +28,7 @@ from zscout.drivers.work_queue import COMMANDS_PER_HOST, WorkQueue
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Declaration, IncomingQuery, Mesh, Refused, Reply, Supervisor, Tally
 from zscout.mesh.renewal import UNHEARD
-from zscout.mesh.supervision import StallWatch
+from zscout.mesh.supervision import Alarm, StallWatch
 from zscout.mesh.terms import LastTerms
 from zscout.scheduling.reason import starting
 from zscout.types import NO_TERM, SECOND, VERSION, Grant, Ns, Term
@@ -144,7 +144,9 @@ class ResourceController:
         self.informed = asyncio.Event()
         self._published = mesh.now()
         """When it published its state last."""
-        self._timer: asyncio.TimerHandle | None = None
+        self._alarm = Alarm(mesh.now, self.supervisor, self._expire)
+        self._waits_timer: asyncio.TimerHandle | None = None
+        """While there are holders for whom its device has not begun, and who have not been published as waiting."""
         self._stopping: asyncio.Task[None] | None = None
 
     async def start(self) -> None:
@@ -156,7 +158,7 @@ class ResourceController:
         if self._last_holder.may_be_direct:
             log.warning("%s settles: it may have been held directly before it started", self.name)
             self.holds.settle_at_start(mesh.now())
-            self._set_timer()
+            self._set_alarm()
         self._declared.append(mesh.subscribe(keys.grants, messages.Grants, guard(self._on_grants)))
         await asyncio.wait({self._read_state()})
         self.supervisor.call_later(INFORMED_WITHIN, self.informed.set)
@@ -582,11 +584,15 @@ class ResourceController:
         for grant in self._entered & self.holds.held.keys():
             self.holds.begun(grant, now, late=grant in late)
         self._waits_said -= late
+        if self._waits_timer is not None and all(entry.begun for entry in self.holds.held.values()):
+            self._waits_timer.cancel()
+            self._waits_timer = None
         if late:
             self.publish()
-        self._set_timer()
+        self._set_alarm()
 
     def _say_waits(self) -> None:
+        self._waits_timer = None
         if self._waits().keys() - self._waits_said:
             self.publish()
 
@@ -648,14 +654,14 @@ class ResourceController:
                 self._use.hold_began(holder.grant)
             if change.began and change.interrupts:
                 self._warm_at = self.mesh.now() + round(self.driver.activation * SECOND)
-            if change.began:
-                self.supervisor.call_later(SAYS_WAITS, self._say_waits)
+            if change.began and self._waits_timer is None:
+                self._waits_timer = self.supervisor.call_later(SAYS_WAITS, self._say_waits)
             self.queue.put_change(change)
             self.queue.resume(lambda query: query.message.grant in self.holds.held)
         self._missed |= change.reread
         if change.announce or change.expired_locally:
             self.publish(change.expired_locally)
-        self._set_timer()
+        self._set_alarm()
 
     def _read_state(self) -> asyncio.Task[None]:
         """Reads `rcm/state`; while that is under way it is the same reading for all who need one."""
@@ -707,13 +713,9 @@ class ResourceController:
             holds = sorted(self.holds.held)
             trace.write(self.mesh.now(), do, **known, term=self.holds.term, seq=self.holds.seq, holds=holds, **what)
 
-    def _set_timer(self) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
+    def _set_alarm(self) -> None:
         at, now = self.holds.next_expiry(), self.mesh.now()
-        if at is not None:
-            delay = (at - now) / SECOND if at > now else MIN_DELAY
-            self._timer = self.supervisor.call_later(delay, self._expire)
+        self._alarm.set(at if at is None or at > now else now + round(MIN_DELAY * SECOND))
 
     def _expire(self) -> None:
         # After a stall of our own, what the RCM published meanwhile may wait in the inbox: it goes first.

@@ -153,6 +153,8 @@ class Inbox:
                 if item.state is not None:
                     item.state.pending -= 1
                 guarded(item.call, *item.args)
+                if not (self.items or self.ready or self.surplus):
+                    break
                 # A question that was set aside may take long once the burst is over: others run before the next.
                 if self.loop.time() >= over or (item.lane is Lane.QUESTION and item.state is None):
                     break
@@ -168,12 +170,14 @@ class Inbox:
                 self.loop.call_soon(self.drain)
 
     def _next(self) -> _Item | None:
+        if len(self.items) == 1 and not self.ready and not self.surplus:
+            return self.items.popleft()  # as most do, it comes alone
         while self.items:
             self._sort(self.items.popleft())
         if not self.ready:
+            if not self.surplus:
+                return None
             self._let_in()
-        if not self.ready:
-            return None
         item = self.ready.popleft()
         if item.lane is not Lane.REPORT:
             self.shares[item.lane, item.host] -= 1
@@ -274,10 +278,10 @@ class Mesh:
 
         Without a reply the query may have been carried out, or not. Raises MeshError if it can't be sent."""
         replies: list[Reply[R]] = []
-        answers = Counter[str]()
+        answers: dict[str, int] = {}
 
         def on_reply(of: str, payload: bytes, ok: bool) -> bool:
-            answers[of] += 1
+            answers[of] = answers.get(of, 0) + 1
             if of and answers[of] > MAX_OF_ONE_KEY:
                 return False
             reply = self._read_reply(of or key, payload, ok, kind, limit)

@@ -149,6 +149,28 @@ async def done_within(seconds: float | None, work: Awaitable[object]) -> bool:
     return True
 
 
+class Alarm:
+    """One timer of a supervised service. Set for a later time it stays, and has to be set again when it goes off: most
+    deadlines are moved before they are over."""
+
+    def __init__(self, now: Callable[[], Ns], supervisor: Supervisor, ring: Callable[[], object]) -> None:
+        self._now, self._supervisor, self._ring = now, supervisor, ring
+        self._timer: asyncio.TimerHandle | None = None
+        self._at: Ns = 0
+
+    def set(self, at: Ns | None) -> None:
+        if at is None or (self._timer is not None and self._at <= at):
+            return
+        if self._timer is not None:
+            self._timer.cancel()
+        self._at = at
+        self._timer = self._supervisor.call_later(max(0.0, (at - self._now()) / SECOND), self._go_off)
+
+    def _go_off(self) -> None:
+        self._timer = None
+        self._ring()
+
+
 class HostClock:
     """Monotonic, also while the machine is suspended. Not comparable between hosts."""
 

@@ -221,8 +221,13 @@ _ONCE = json.JSONDecoder(object_pairs_hook=_unique, parse_int=str, parse_float=s
 
 def carried(message: Message, kind: type[M], **own: Any) -> M:
     """A message of `kind` with the fields that `message` has as well, and its `own`."""
-    shared = message.__struct_fields__
-    return kind(**{name: getattr(message, name) for name in kind.__struct_fields__ if name in shared} | own)
+    return kind(**{name: getattr(message, name) for name in _shared_fields(type(message), kind)} | own)
+
+
+@cache
+def _shared_fields(one: type[Message], other: type[Message]) -> list[str]:
+    names = {*one.__struct_fields__}
+    return [name for name in other.__struct_fields__ if name in names]
 
 
 def schema(kind: type) -> str:

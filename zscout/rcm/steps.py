@@ -5,8 +5,9 @@ names in them were checked as they came in, those within holds and requests are 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import Enum, auto
+from operator import attrgetter
 from typing import Any, Final, NamedTuple, TypeAlias
 
 from msgspec import Struct
@@ -288,10 +289,12 @@ class Outbox(Struct):
     """The next step is due then at the latest."""
     more: bool = False
     """Another step is due at once: stimuli are left."""
+    last: bool = True
+    """Whether it ends the instant: before it come its answers, and its publication."""
 
     def take(self, names: Iterable[str]) -> Outbox:
         """Take these fields out, as a part of its own."""
-        part = Outbox()
+        part = Outbox(last=False)
         for name in names:
             setattr(part, name, getattr(self, name))
             setattr(self, name, None if name == "publication" else [])
@@ -299,14 +302,17 @@ class Outbox(Struct):
 
     def merge(self, part: Outbox) -> list[Event]:
         """Take over all that a part lists. Its events are returned: they are to be decided."""
-        for name in _LISTS:
-            if more := getattr(part, name):
-                getattr(self, name).extend(more)
+        if part == _NOTHING:
+            return []
+        for own, more in zip(_lists_of(self), _lists_of(part), strict=True):
+            if more:
+                own.extend(more)
         return part.events
 
 
 ANSWERS: Final = ("at_once", "higher", "disbelieved", "granted", "grant_notices")
 PUBLISHED: Final = ("reopened", "publication")
-_LISTS: Final = tuple(
-    name for name in Outbox.__struct_fields__ if name != "events" and isinstance(getattr(Outbox(), name), list)
+_NOTHING: Final = Outbox()
+_lists_of: Final[Callable[[Outbox], tuple[list[Any], ...]]] = attrgetter(
+    *(name for name in Outbox.__struct_fields__ if name != "events" and isinstance(getattr(Outbox(), name), list))
 )

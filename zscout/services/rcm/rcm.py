@@ -19,7 +19,7 @@ from zscout.config.fleet import Fleet
 from zscout.keyexpr import Role, Token, client_of
 from zscout.mesh import Declaration, IncomingQuery, Lane, Mesh, MeshError, Refused, Reply, Tally
 from zscout.mesh.sparse_log import SparseLog
-from zscout.mesh.supervision import StallWatch, Supervisor
+from zscout.mesh.supervision import Alarm, StallWatch, Supervisor
 from zscout.rcm import steps
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
@@ -40,7 +40,7 @@ from zscout.services.rcm.booking_sharing import BookingSharing
 from zscout.services.rcm.bookings import Bookings, bookings_of
 from zscout.services.rcm.digest import HoldDigest, HoldListener
 from zscout.services.rcm.inventory import Inventory
-from zscout.types import SECOND, HostName, Ns, RcName, Term
+from zscout.types import SECOND, HostName, RcName, Term
 
 log = logging.getLogger(__name__)
 
@@ -69,28 +69,6 @@ class Parts(NamedTuple):
     """Called with dangers of bookings that last."""
     on_drained: Callable[[frozenset[HostName]], object] = lambda _: None
     """Called with the hosts in maintenance when they change."""
-
-
-class Alarm:
-    """One timer. Set for earlier, it stays, and is set again when it goes off: most ends are put off before they
-    come."""
-
-    def __init__(self, now: Callable[[], Ns], supervisor: Supervisor, ring: Callable[[], object]) -> None:
-        self._now, self._supervisor, self._ring = now, supervisor, ring
-        self._timer: asyncio.TimerHandle | None = None
-        self._at: Ns = 0
-
-    def set(self, at: Ns | None) -> None:
-        if at is None or (self._timer is not None and self._at <= at):
-            return
-        if self._timer is not None:
-            self._timer.cancel()
-        self._at = at
-        self._timer = self._supervisor.call_later(max(0.0, (at - self._now()) / SECOND), self._go_off)
-
-    def _go_off(self) -> None:
-        self._timer = None
-        self._ring()
 
 
 class Rcm:
@@ -299,6 +277,8 @@ class Rcm:
         self._trace(out.reopened)
         if out.publication is not None:
             self._publish(out.publication)
+        if not out.last:
+            return True
         self._notify(out.notices)
         self._answer(out.answers)
         for proposed in out.proposals:
