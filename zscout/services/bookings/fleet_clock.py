@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from statistics import median_high, median_low
-from typing import Final
+from typing import Final, NamedTuple
 
 from zscout.types import SECOND, HostName, Ns
 
 DIFFERS: Final = 2.0  # seconds of a host clock's error before a warning, and before a correction
 LASTS: Final[Ns] = 60 * SECOND  # time for which most clocks differ before a correction
 REMEMBERED: Final[Ns] = 3_600 * SECOND  # the clock of a silent host counts for so long
+MAX_HOSTS: Final = 1_000  # whose clocks count: those read last
 SAME: Final = 1.0  # seconds: fleet times that began this close together are equally old
 
 
@@ -36,14 +37,22 @@ def _differ(offset: Ns, other: Ns) -> bool:
     return abs(offset - other) > DIFFERS * SECOND
 
 
+class _Clock(NamedTuple):
+    """A host's clock as it was read last: by how much it was ahead of the own one, when, and if a time service keeps
+    it."""
+
+    offset: Ns
+    at: Ns
+    kept: bool
+
+
 class FleetClock:
     """Fleet time on one host's own clock, which `now` always uses."""
 
     def __init__(self, time: Ns, now: Ns, since: Ns) -> None:
         """`time`: ns since 1970 (UTC) at `now`; unbroken, but for corrections, since `since` on the own clock."""
         self.since = since
-        self._hosts: dict[HostName, tuple[Ns, Ns, bool]] = {}
-        """By how much the clock of each host is ahead of the own one, when it was read, and whether it is kept."""
+        self._hosts: dict[HostName, _Clock] = {}
         self.corrected: tuple[Ns, Ns] | None = None
         """By how much it was corrected last, and when."""
         self._doubted: tuple[Ns, Ns] | None = None
@@ -62,21 +71,21 @@ class FleetClock:
         """Compare it with hosts' clocks as they were read at `now`, of which some are `kept` by a time service. Returns
         by how much it is corrected; 0: it is not.
 
-        Hosts that are not among them count as they did within the last hour: whoever is alone for a while is not
+        Hosts that are not among them count as they did within the last hour: a host that is alone for a while is not
         the majority."""
         offsets, before = {host: wall - now for host, wall in walls.items()}, self._hosts
-        self._hosts = {host: known for host, known in before.items() if now - known[1] < REMEMBERED} | {
-            host: (offset, now, host in kept) for host, offset in offsets.items()
-        }
-        known = self._hosts.values()
-        aim = agreed((one[0] for one in known), self._offset, [one[0] for one in known if one[2]])
+        silent = [item for item in before.items() if item[0] not in walls and now - item[1].at < REMEMBERED]
+        latest = [(host, _Clock(offset, now, host in kept)) for host, offset in offsets.items()]
+        self._hosts = dict([*silent, *latest][-MAX_HOSTS:])
+        clocks = self._hosts.values()
+        aim = agreed((clock.offset for clock in clocks), self._offset, [clock.offset for clock in clocks if clock.kept])
         if not _differ(aim, self._offset):
             self._doubted = None
             return 0
         if self._doubted is None or _differ(aim, self._doubted[0]):
             self._doubted = aim, now
         was_set = any(
-            host in before and _differ(offset, before[host][0]) and not _differ(offset, aim)
+            host in before and _differ(offset, before[host].offset) and not _differ(offset, aim)
             for host, offset in offsets.items()
         )
         if not was_set and now - self._doubted[1] < LASTS:
