@@ -12,9 +12,10 @@ import pytest
 from tests.mesh.kit import until
 from tests.services.rcm.booked_fleet import NOON, BookedFleet, Disk, book, booked, do, led, record, states
 from tests.services.rcm.kit import Refusal
-from zscout.messages import WINDOW, BookingView, Cancel, OpenRequest, Release, Unbook
+from zscout.mesh import Reply
+from zscout.messages import WINDOW, BookingsKept, BookingView, Cancel, OpenRequest, Release, ShareBookings, Unbook
 from zscout.services.rcm.candidate import Candidate
-from zscout.types import Grant, Term
+from zscout.types import SECOND, Grant, Term
 
 
 async def kill_all(fleet: BookedFleet, candidates: list[Candidate]) -> None:
@@ -319,6 +320,18 @@ async def test_the_older_of_two_fleet_times_goes_on() -> None:
     leaders = [one.rcm for one in (again, z) if one.rcm is not None]
     assert [one.bookings.time for one in leaders] == [pytest.approx(fleet.time(), abs=0.1)]
     assert states((await fleet.bookings())["b"]) == ["open"]
+
+
+@pytest.mark.parametrize(("took", "clocks"), [(0.9, {"y": pytest.approx(-5, abs=0.1)}), (1.1, {})])
+async def test_a_clock_that_is_read_slowly_does_not_count(took: float, clocks: dict[str, float]) -> None:
+    """Its answer may have waited while the leader stood still."""
+    fleet, (x, *_) = await booked("x")
+    assert x.rcm is not None
+    sharing, now = x.rcm.sharing, x.mesh.now()
+    kept = BookingsKept("y", True, fleet.time() - 5, "digest")
+    reply = Reply(x.mesh.keys.bookings("y"), kept, arrived=now)
+    sharing._take([reply], ShareBookings(x.rcm.term, "digest"), now - round(took * SECOND))
+    assert (await fleet.told()).clocks == clocks
 
 
 async def test_a_host_that_does_not_answer_turns_no_clock_back() -> None:
