@@ -148,7 +148,7 @@ NODE: Final[Mapping[str, Mapping[str, Key]]] = {
     "notify": {
         "urls": Key("[]", ('["json://localhost"]',), ('"json://localhost"', '["none://a:secret@b"]', '["a:secret@b"]')),
         "events": Key(
-            '["yours_now", "preempted", "booking_in_danger", "certificate_ends"]',
+            '["yours_now", "preempted", "device_unwell", "booking_in_danger", "certificate_ends"]',
             ('["preempted"]',),
             ('["ended"]', '"preempted"'),
         ),
@@ -172,14 +172,20 @@ SOURCES: Final = '{ "video/ch1" = "/dev/video0" }'
 ACTIVATION: Final = _number("0.0", "0.5", "3600", "-1", "3601")
 SETTLE: Final = _number("5.0", "0.5", "60", "0.4", "61")
 BEGIN_WITHIN: Final = Key(None, ("0", "86_400", '"2m"'), ("-1", "86_401", "nan"))
+COMMON: Final[Mapping[str, Key]] = {
+    "settle": SETTLE,
+    "begin_within": BEGIN_WITHIN,
+    "tolerate": BEGIN_WITHIN,
+    "tolerate_free": Key("0.0", ("1", "86_400", '"2m"'), ("-1", "86_401", "nan")),
+    "tolerate_max": BEGIN_WITHIN,
+}
 RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
-    "exclusive": ('name = "robot/a"', {"activation": ACTIVATION, "settle": SETTLE, "begin_within": BEGIN_WITHIN}),
+    "exclusive": ('name = "robot/a"', {"activation": ACTIVATION, **COMMON}),
     "capacity": (
         'name = "radio/a"\ncapacity = { rate = 10 }',
         {
             "capacity": Key(None, ("{ rate = 0.1, width = 2 }",), ("{}", "{ rate = -1 }", '{ "a b" = 1 }', "10")),
-            "settle": SETTLE,
-            "begin_within": BEGIN_WITHIN,
+            **COMMON,
             "activation": ACTIVATION,
         },
     ),
@@ -193,8 +199,7 @@ RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
             "parameters": Key("{}", ("{ voltage = 30 }",), ("{ voltage = -1 }", '{ "a b" = 1 }', '{ voltage = "1" }')),
             "every": _number("10.0", "0.5", "3600", "0.4", "3601"),
             "timeout": _number("5.0", "0.1", "600", "0.09", "601"),
-            "settle": SETTLE,
-            "begin_within": BEGIN_WITHIN,
+            **COMMON,
             "activation": ACTIVATION,
         },
     ),
@@ -203,8 +208,7 @@ RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
         {
             "port": Key(None, ('"loop://"',), ('""', "1")),
             "baud": _number("9600", "300", "1_000_000", "299", "1_000_001"),
-            "settle": SETTLE,
-            "begin_within": BEGIN_WITHIN,
+            **COMMON,
             "bound": _number("0.25", "0.01", "10", "0.009", "11"),
             "dtr": Key(None, ("true", "false"), ("1", '"on"')),
             "rts": Key(None, ("true", "false"), ("1", '"on"')),
@@ -218,21 +222,19 @@ RC: Final[Mapping[str, tuple[str, Mapping[str, Key]]]] = {
             "channels": Key(
                 "{}", (CHANNELS,), ('{ "robot/b" = 1 }', '{ "video/ch1" = 0 }', '{ "video/a" = 1, "video/b" = 1 }')
             ),
-            "settle": SETTLE,
-            "begin_within": BEGIN_WITHIN,
+            **COMMON,
             "warm_up": _number("2.0", "0", "60", "-1", "61"),
             "dead_man": _number("0.5", "0.05", "5", "0.04", "5.1"),
         },
     ),
-    "video": ('name = "video/a"', {"settle": SETTLE, "begin_within": BEGIN_WITHIN}),
+    "video": ('name = "video/a"', COMMON),
     "framegrabber": (
         'name = "framegrabber/a"\nsource = "/dev/video0"',
         {
             "source": Key(None, ('"/dev/video1"',), ('""', "1", f'"a"\nsources = {SOURCES}')),
             "sources": Key(None, (), ("{}", '{ "robot/a" = "b" }')),
             "rate": _number("10.0", "0.1", "60", "0.09", "61"),
-            "settle": SETTLE,
-            "begin_within": BEGIN_WITHIN,
+            **COMMON,
             "quality": _number("80", "1", "100", "0", "101"),
             "picture_within": _number("1.5", "0.5", "600", "0.4", "601"),
             "still_after": Key(None, ("0", "86_400", '"30s"'), ("-1", "86_401", '"never"')),

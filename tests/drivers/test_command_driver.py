@@ -45,6 +45,9 @@ class Rc:
     def fail(self, why: str) -> None:
         self._say(why)
 
+    def unwell(self, why: str) -> None:
+        self._say(why)
+
     def recover(self) -> None:
         self._say("ok")
 

@@ -157,7 +157,7 @@ class Handle:
     def used(self, _grant: object) -> None:
         pass
 
-    def fail(self, why: str) -> None:
+    def unwell(self, why: str) -> None:
         self.failed.append(why)
 
     def recover(self) -> None:

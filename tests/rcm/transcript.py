@@ -2,7 +2,7 @@
 
     at TIME                                       sets the clock for what follows; `at TIME COMMAND` too
     secured NAME=client|operator ...                a new leader, with [security] and these roles
-    holds RC HOST [begins=S] [ID CLIENT TERM.N RC,... [priority=N] [remaining=S] [place=TERM.N]
+    holds RC HOST [begins=S] [unwell=WHY] [ID CLIENT TERM.N RC,... [priority=N] [remaining=S] [place=TERM.N]
                                                   [waits=S]]: what an RC answered to the takeover
     lists CLIENT [ID NEED,... [priority=N] [place=TERM.N] [grant=TERM.N]]
                                                   what a client answered to it
@@ -47,6 +47,7 @@ from zscout.messages import (
     Proposal,
     RcState,
     Release,
+    Unwell,
 )
 from zscout.rcm import steps
 from zscout.rcm.admission import Admission
@@ -203,6 +204,9 @@ class LeaderPlayer:
         holders, known = [], dict[str, Any]()
         if words and words[0].startswith("begins="):
             known = {"begin_within": float(words[0].partition("=")[2]), "settle": 5.0}
+            words = words[1:]
+        if words and words[0].startswith("unwell="):
+            known["unwell"] = Unwell(words[0].partition("=")[2], since=1.0, left=59.0)
             words = words[1:]
         if words:
             id_, client, grant, rcs = words[:4]

@@ -2,8 +2,9 @@
 
     at TIME                                    sets the clock for what follows; `at TIME COMMAND` too
     join RC [sharable] [host=NAME] [begins=S|unknown]                       lost CLIENT
+    unwell RC WHY       well RC
     leave RC [REASON]   waits RC ARC S         begun RC ARC
-    ask ARC NEED,... [priority=N] [runtime=S] [client=NAME] [keep] [place=TERM.N]
+    ask ARC NEED,... [priority=N] [runtime=S] [client=NAME] [keep] [place=TERM.N] [continues=ARC]
     cancel ARC          release ARC            handover ARC CLIENT NEW_NAME    tick
     vote N yes|no [REASON]                     overdue N
     rules RC            ended RC ARC,...
@@ -138,6 +139,8 @@ class CorePlayer:
             "join": lambda: _join(first, words),
             "waits": lambda: self.begins(first, words[0], self.now + ns(words[1])),
             "begun": lambda: self.begins(first, words[0], None),
+            "unwell": lambda: model.RcUnwell(first, second),
+            "well": lambda: model.RcUnwell(first),
             "leave": lambda: model.RcLost(first, second) if second else model.RcLost(first),
             "lost": lambda: model.ClientLost(first),
             "cancel": lambda: model.Cancelled(first),
@@ -210,7 +213,7 @@ def _request(text: str) -> tuple[model.ArcRequest, dict[str, str]]:
         pairs = (pair.split("=") for pair in (match[2] or "").split())
         wanted[match[1]] = {key: Fraction(value) for key, value in pairs}
     words = (word for word in rest if word not in {"keep", "maintenance", "urgent", "lasting", "bookings", "tentative"})
-    known = "priority runtime client place grant start booking patience since bound until waits"
+    known = "priority runtime client place grant start booking patience since bound until waits continues"
     options = settings(words, *known.split())
     request = model.ArcRequest(
         arc=arc,
@@ -220,6 +223,7 @@ def _request(text: str) -> tuple[model.ArcRequest, dict[str, str]]:
         min_runtime=ns(options.get("runtime", "10")),
         keep="keep" in rest,
         booking=options.get("booking", ""),
+        continues=options.get("continues", ""),
     )
     return request, options
 

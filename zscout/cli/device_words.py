@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from zscout.messages import RcView
+from zscout.messages import RcState, RcView
 from zscout.terminal import clock, span
 
 
@@ -18,6 +18,14 @@ def absence(view: RcView) -> str:
     if view.present or not view.reason:
         return ""
     return view.reason if view.gone is None else f"{view.reason} since {clock(-view.gone)}"
+
+
+def unwell(device: RcState | None) -> str:
+    """Why a device that is not lost does not work at present; empty: it does."""
+    if device is None or device.unwell is None or device.health != "ok":
+        return ""
+    said = device.unwell
+    return f"unwell since {clock(-said.since)}: {said.why}; lost in {span(max(1, said.left))} unless it recovers"
 
 
 def remarks(view: RcView) -> Iterator[str]:

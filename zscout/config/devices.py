@@ -48,6 +48,19 @@ class AnyRc(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         ),
     ] = None
 
+    tolerate: Annotated[
+        Ns | None, seconds("0", "86400", "A holder keeps it this long while it is not well. 60 for `command`, else 0.")
+    ] = None
+    tolerate_free: Annotated[Ns, seconds("0", "86400", "Free, it is unwell this long before it counts as lost.")] = 0
+    tolerate_max: Annotated[
+        Ns | None,
+        seconds(
+            "0",
+            "86400",
+            "The longest outage that a holder may announce. Without it: 3600 for `command`, else as `tolerate`.",
+        ),
+    ] = None
+
 
 class RcTable(AnyRc, frozen=True, tag_field="driver"):
     """An RC whose driver comes with zscout."""

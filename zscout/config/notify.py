@@ -22,7 +22,7 @@ MAX_URL: Final = 2_000
 """Characters."""
 MAX_NAME: Final = 64
 
-NotifyEvent = Literal["yours_now", "preempted", "booking_in_danger", "certificate_ends"]
+NotifyEvent = Literal["yours_now", "preempted", "device_unwell", "booking_in_danger", "certificate_ends"]
 EVENTS: Final[tuple[NotifyEvent, ...]] = get_args(NotifyEvent)
 Urls = Annotated[tuple[str, ...], Meta(max_length=MAX_URLS)]
 

@@ -66,6 +66,8 @@ class CommandDriver(Driver):
     health) and ZSCOUT_RC; `start` and `stop` ZSCOUT_ARC, ZSCOUT_CLIENT and ZSCOUT_PARAMETERS (JSON) as well."""
 
     Options = CommandRc
+    tolerate = 60.0
+    tolerate_max = 3_600.0
 
     def __init__(self, rc: CommandRc) -> None:
         super().__init__(rc)
@@ -166,10 +168,11 @@ class CommandDriver(Driver):
         """Whether another host's is used: somebody may hold there what is one device, and it is not to be touched."""
         return self._rc.instances.state is InstanceState.STANDS_BY
 
-    def _lose(self, why: str) -> None:
+    def _lose(self, why: str, *, for_good: bool = True) -> None:
+        """It can't be held any more, or, unless that is `for_good`, is not well."""
         if why != self._lost:
             self._lost = why
-            self._rc.fail(why)
+            (self._rc.fail if for_good else self._rc.unwell)(why)
         self._news.set()
 
     async def _keep_well(self) -> None:
@@ -198,14 +201,15 @@ class CommandDriver(Driver):
             self._unsure = "it was not made safe: it stands by"
         elif self._unsure and self._holder is None:
             self._unsure = (await self._run("safe", self._told.safe)).problem
-        why = self._unsure
-        if not why:
+        if not self._unsure:
             ended = await self._run("health", self._told.health)
             if ended.gave_way:
                 return
-            why = self._unsure or ended.problem  # a start may have failed before it
-        if why:
-            self._lose(why)
+            if ended.problem and not self._unsure:  # a start may have failed before it
+                self._lose(ended.problem, for_good=False)
+                return
+        if self._unsure:
+            self._lose(self._unsure)
         elif self._lost and asyncio.get_running_loop().time() >= self._not_before:
             self._lost = ""
             self._rc.recover()

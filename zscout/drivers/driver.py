@@ -42,6 +42,10 @@ class RcHandle(Protocol):
         """Report that the device can't serve its holders: their holds end, and the device is lost. `why`: one line
         for people."""
 
+    def unwell(self, why: str) -> None:
+        """Report that the device does not work at present, as when a test reboots it. Its holders keep it, and it is
+        granted to operators only. If it does not `recover` within the time that its table tolerates, it is lost."""
+
     def recover(self) -> None:
         """Report that the device works again."""
 
@@ -78,6 +82,11 @@ class Driver:
     runtime passes meanwhile."""
     begin_within: float = 0.0
     """The longest time in seconds that `begins_for` returns for a hold that begins."""
+
+    tolerate: float = 0.0
+    """Seconds for which a holder keeps the device while it is `unwell`. 0: it is lost at once."""
+    tolerate_max: float = 0.0
+    """The longest outage in seconds that a holder can announce."""
 
     def __init__(self, options: Any = None) -> None:
         """Keep `options`, an instance of `Options`. Raise ValueError with one line if they are bad. Open the device

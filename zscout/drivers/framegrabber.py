@@ -145,7 +145,7 @@ class FramegrabberDriver(Driver):
     def _fail(self) -> None:
         names = [name for name in self._faults if name]
         about = f" of {names[0]}" if len(names) == 1 else ""
-        self._rc.fail(f"no picture{about}: {'; '.join(self._faults.values())}")
+        self._rc.unwell(f"no picture{about}: {'; '.join(self._faults.values())}")
 
     async def close(self) -> None:
         self._lost = False
@@ -300,7 +300,7 @@ class FramegrabberDriver(Driver):
                 self._lost = True
                 about = f" of {self._source}" if self._source else ""
                 self._faults = {self._source or "": capture.health}
-                self._rc.fail(f"no picture{about} for {patience:g} s: {capture.health}")
+                self._rc.unwell(f"no picture{about} for {patience:g} s: {capture.health}")
             await asyncio.sleep(CHECK)
 
     def _try_next(self) -> None:

@@ -209,9 +209,9 @@ class RadioDriver(Driver):
         return held is not None and holds.check(grant, held.holder.client, self._rc.now()) is None
 
     def _line_up(self) -> None:
-        self._down, self._outstanding = "", 0
+        was, self._down, self._outstanding = self._down, "", 0
         self._known.set()
-        if self._rc.health != "ok":
+        if was:
             self._rc.recover()
         self._pump()
 
@@ -220,7 +220,7 @@ class RadioDriver(Driver):
         self._down = why
         self._known.set()
         self._quiet.set()
-        self._rc.fail(why)
+        self._rc.unwell(why)
 
     def _line_wrote(self) -> None:
         self._outstanding = max(0, self._outstanding - 1)

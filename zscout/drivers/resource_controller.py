@@ -23,6 +23,7 @@ from zscout.drivers.instances import Instances, InstanceState
 from zscout.drivers.last_holder import LastHolder
 from zscout.drivers.own import RcDirectory
 from zscout.drivers.repeated import CommandMemory
+from zscout.drivers.tolerance import Tolerance
 from zscout.drivers.use import UseCounter
 from zscout.drivers.work_queue import COMMANDS_PER_HOST, WorkQueue
 from zscout.keyexpr import Role, Token, new_instance
@@ -73,7 +74,7 @@ SAY_AGAIN = 10.0
 class ResourceController:
     """One RC: its keys, its holds and its driver. Where it fails, not its driver, it leaves the mesh, makes
     its device safe and calls `on_failure`. `hold_lease`, `settle` and `begin_within` (None: what its driver says) are
-    in seconds; `last_holder` outlives it;
+    in seconds; without a `tolerance` it is lost once it is not well; `last_holder` outlives it;
     `confirmations` is that of all RCs of its process, its own if there is none."""
 
     def __init__(
@@ -86,6 +87,7 @@ class ResourceController:
         stall: StallWatch,
         settle: float = SETTLE,
         begin_within: float | None = None,
+        tolerance: Tolerance | None = None,
         last_holder: LastHolder | None = None,
         confirmations: ConfirmServer | None = None,
         on_failure: Callable[[Exception], object] = lambda _error: None,
@@ -101,6 +103,7 @@ class ResourceController:
         self._confirmations = confirmations or ConfirmServer(mesh)
         self.rules = 0
         self.health = "ok"
+        self._tolerance = tolerance or Tolerance(0, 0, 0)
         self.queue, self._memory = WorkQueue(), CommandMemory()
         self.tally = Tally()
         """How its commands ended."""
@@ -237,10 +240,31 @@ class ResourceController:
         self.rules += 1
         self.publish()
 
+    def unwell(self, why: str) -> None:
+        if self.health != "ok":
+            self.fail(why)
+            return
+        news = why != self._tolerance.why
+        self._tolerance.unwell(why, self.mesh.now())
+        if not self._lost_by_now():
+            if news:
+                log.warning("%s is unwell: %s", self.name, why)
+            self.publish()
+            self._set_alarm()
+
+    def _lost_by_now(self) -> bool:
+        """Whether it has been unwell for longer than is tolerated; then it is lost."""
+        at, why = self._tolerance.lost_at, self._tolerance.why
+        if at is None or at > self.mesh.now():
+            return False
+        self.fail(why)
+        return True
+
     def fail(self, why: str) -> None:
         if why != self.health:
             log.warning("%s is lost: %s", self.name, why)
         self.health = why
+        self._tolerance.well()
         change = self.holds.fail(why, self.mesh.now())
         if change:
             self._trace("end")
@@ -252,10 +276,12 @@ class ResourceController:
         self._use.carried_out(grant, now, now)
 
     def recover(self) -> None:
-        if self.health != "ok":
+        if self.health != "ok" or self._tolerance.why:
             log.info("%s is well", self.name)
         self.health = "ok"
+        self._tolerance.well()
         self.publish()
+        self._set_alarm()
 
     @property
     def begin_within(self) -> float:
@@ -338,6 +364,7 @@ class ResourceController:
             holders=self.holds.holders(self.mesh.now(), waits),
             ended=ended,
             health=self.health,
+            unwell=self._unwell(),
             rules=self.rules,
             leader=self._hears and bool(self._leaders),
             # The driver is asked nothing any more: it may be the one that failed.
@@ -351,6 +378,17 @@ class ResourceController:
             version=VERSION,
             used=self._use.told(self.mesh.now()),
         )
+
+    @property
+    def unwell_for(self) -> float:
+        """Seconds; 0: it is well, or lost."""
+        return (self.mesh.now() - self._tolerance.since) / SECOND if self._tolerance.why else 0.0
+
+    def _unwell(self) -> messages.Unwell | None:
+        at = self._tolerance.lost_at
+        if at is None:
+            return None
+        return messages.Unwell(self._tolerance.why, self.unwell_for, max(0, at - self.mesh.now()) / SECOND)
 
     def _figures(self) -> messages.Figures:
         """No message has a number that is none."""
@@ -415,6 +453,11 @@ class ResourceController:
             # What is written to disk for it is waited for by nothing else.
             direct = self.holds.held[command.grant].holder.direct
             return asyncio.ensure_future(self._confirm_direct(query)) if direct else self._confirm(command.grant)
+        if name == "expect_outage":
+            tolerated = self._tolerance.expect(command.grant, command.do, self.mesh.now())
+            self._set_alarm()
+            self.publish()
+            return messages.Done(result={"seconds": tolerated})
         self._trace("command", grant=command.grant)
         warming = max(0.0, (self._warm_at - self.mesh.now()) / SECOND)
         if warming and not self.driver.usable_cold(command.do):
@@ -646,6 +689,9 @@ class ResourceController:
     def _apply(self, change: HoldChange) -> None:
         if change.named is not None:
             self.instances.take(change.named, change.named_host)
+        if change:
+            going_on = {grant: former.grant for grant, former in change.going_on.items()}
+            self._tolerance.changed(self.holds.held.keys(), going_on, self.mesh.now())
         if change or change.settled:
             self._waits_said -= {holder.grant for holder in change.removed}
             for holder in change.removed:
@@ -662,6 +708,7 @@ class ResourceController:
         if change.announce or change.expired_locally:
             self.publish(change.expired_locally)
         self._set_alarm()
+        self._lost_by_now()
 
     def _read_state(self) -> asyncio.Task[None]:
         """Reads `rcm/state`; while that is under way it is the same reading for all who need one."""
@@ -714,10 +761,13 @@ class ResourceController:
             trace.write(self.mesh.now(), do, **known, term=self.holds.term, seq=self.holds.seq, holds=holds, **what)
 
     def _set_alarm(self) -> None:
-        at, now = self.holds.next_expiry(), self.mesh.now()
+        ends, now = (self.holds.next_expiry(), self._tolerance.lost_at), self.mesh.now()
+        at = min((end for end in ends if end is not None), default=None)
         self._alarm.set(at if at is None or at > now else now + round(MIN_DELAY * SECOND))
 
     def _expire(self) -> None:
+        if self._lost_by_now():
+            return
         # After a stall of our own, what the RCM published meanwhile may wait in the inbox: it goes first.
         change = self.holds.expire(self.mesh.now(), lease=not self.stall.fresh())
         if change:

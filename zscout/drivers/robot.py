@@ -243,7 +243,7 @@ class RobotDriver(Driver):
     def _set_unsure(self, why: str) -> None:
         """The robot can't be stopped for now, so that it must not be driven either."""
         if self._rc.health != why:
-            self._rc.fail(why)
+            self._rc.unwell(why)
         self._unsure.set()
 
     async def _halt_until_sure(self) -> None:
@@ -271,9 +271,12 @@ class RobotDriver(Driver):
             self._set_unsure(f"{self._radio} is not there")
 
     def _on_radio_state(self, _key: str, state: RcState) -> None:
-        if state.rc == self._radio and state.health != "ok":
-            self._set_unsure(f"{self._radio}: {state.health}")
-        elif state.rc == self._radio:
+        if state.rc != self._radio:
+            return
+        why = state.health if state.health != "ok" else state.unwell.why if state.unwell is not None else ""
+        if why:
+            self._set_unsure(f"{self._radio}: {why}")
+        else:
             self._wake.set()
 
     def figures(self) -> Figures:

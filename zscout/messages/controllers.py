@@ -121,6 +121,15 @@ class HoldUse(Message, frozen=True):
     seconds: Elapsed = 0.0
 
 
+class Unwell(Message, frozen=True):
+    """Why a device does not work at present, `since` how many seconds, and how many are `left` until its RC counts as
+    lost."""
+
+    why: str
+    since: Elapsed
+    left: Elapsed
+
+
 class RcState(Message, frozen=True):
     """The state of an RC. `term`, `seq`: the newest publication received, or term promised."""
 
@@ -138,6 +147,8 @@ class RcState(Message, frozen=True):
     """Grows when what it votes by changes: earlier votes are void."""
     leader: bool = False
     """Whether it sees a leading RCM."""
+    unwell: Unwell | None = None
+    """While `health` is still ok: its holders go on, and it is granted to operators only."""
     capacity: Amounts = {}
     figures: Figures = {}
     """Rates, drops, latency and the like of the device, by name; for people, they decide nothing."""

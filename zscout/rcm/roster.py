@@ -25,7 +25,7 @@ from zscout.rcm.recovery import adopted, aged, begin_within, gangs_of, longest_b
 from zscout.rcm.sight import MAX_TOKENS, Sight
 from zscout.rcm.steps import ClientFound, ClientListed, Compare, Name, Outbox, Question, Resume, Why
 from zscout.rcm.terms import Source, Word
-from zscout.scheduling.model import ArcStatus, ClientLost, RcBegins, RcJoined, RcLost, RcReported
+from zscout.scheduling.model import ArcStatus, ClientLost, RcBegins, RcJoined, RcLost, RcReported, RcUnwell
 from zscout.types import SECOND, ArcId, ClientId, Grant, HostName, Ns, RcName, Term
 
 PROBE_PERIOD: Final[Ns] = SECOND
@@ -685,6 +685,8 @@ class Roster:
         else:
             if known.health != "ok" or known.sharable != state.sharable:
                 self._out.events.append(_presence(state))
+            elif unwell(state) != unwell(known):
+                self._out.events.append(RcUnwell(state.rc, unwell(state)))
             if state.begin_within != known.begin_within:
                 self._out.events.append(RcBegins(state.rc, begin_within(state)))
             if state.rules != known.rules:
@@ -795,7 +797,12 @@ def _presence(state: RcState) -> RcJoined | RcLost:
     health = state.health[:MAX_HEALTH]
     if health != "ok":
         return RcLost(state.rc, why=health)
-    return RcJoined(state.rc, state.sharable, state.host, begin_within(state))
+    return RcJoined(state.rc, state.sharable, state.host, begin_within(state), unwell(state))
+
+
+def unwell(state: RcState) -> str:
+    """Why an RC that is not lost does not work at present; empty: it does."""
+    return "" if state.unwell is None else state.unwell.why[:MAX_HEALTH] or "it gives no reason"
 
 
 def discrepancies(

@@ -60,11 +60,13 @@ class AdmissionCheck:
     def obstacle(self, off_limits: int) -> Inadmissible | None:
         """An RC that keeps the ARC out by itself, apart from RCs `off_limits`. Prefers a hold likely to last: that
         saves checks."""
-        for rc in self.arc.rcs:
-            if not rc.present:
-                absent = [rc for rc in self.arc.rcs if not rc.present]
-                why = rc.absence if len(absent) == 1 else absences(absent)
-                return Inadmissible(rc, of_rcs(ReasonCode.ABSENT, [rc.name for rc in absent], why))
+        if closed := self.state.closed_to(self.arc):
+            rcs = list(self.state.rcs_in(closed))
+            absent = [rc for rc in rcs if not rc.present]
+            code = ReasonCode.ABSENT if absent else ReasonCode.UNWELL
+            rcs = absent or rcs
+            why = rcs[0].absence or rcs[0].unwell if len(rcs) == 1 else absences(rcs)
+            return Inadmissible(rcs[0], of_rcs(code, [rc.name for rc in rcs], why))
         lasting: tuple[int, float, int] | None = None
         for number, (rc, holder) in enumerate(self.non_preemptible):
             if not off_limits or not rc.bit & off_limits:

@@ -88,7 +88,7 @@ class _Search:
             heapq.heappush(self._heap, following)
 
     def _might_start(self, arc: Arc) -> bool:
-        if arc.mask & ~self.state.present or (arc.patterns and not arc.bound):
+        if self.state.closed_to(arc) or (arc.patterns and not arc.bound):
             return False
         for rc in arc.rcs:
             if rc.sharable:

@@ -183,7 +183,7 @@ class Core:
         queue (None: all), and `without` these bookings."""
         state = self._state
         joined: list[model.Event] = [
-            model.RcJoined(rc.name, rc.sharable, rc.host, rc.begin_within)
+            model.RcJoined(rc.name, rc.sharable, rc.host, rc.begin_within, rc.unwell)
             if rc.present
             else model.RcLost(rc.name, why=rc.absence)
             for rc in state.rcs.values()
@@ -289,13 +289,16 @@ class Core:
                 self._votes.answer(proposal, accept=accept, reason=reason)
             case model.VoteOverdue(proposal):
                 self._votes.overdue(proposal, self._state.now)
-            case model.RcJoined(rc, sharable, host, begin_within):
+            case model.RcJoined(rc, sharable, host, begin_within, unwell):
                 if self._state.rc(rc).present:
                     self._lose_rc(rc, "it started anew")
                 self._state.set_begin_within(rc, begin_within)
                 self._state.join(rc, sharable=sharable, host=host)
+                self._state.set_unwell(rc, unwell)
                 self._calendar.rc_joined(self._state.rc(rc))
                 self._state.readmit(rc)
+            case model.RcUnwell(rc, why):
+                self._state.set_unwell(rc, why)
             case model.RcReported(rc, ended, rules_changed):
                 for arc in ended:
                     if arc in self._state.rc(rc).holders:

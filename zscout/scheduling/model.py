@@ -304,6 +304,7 @@ class Rc:
     present: bool = False
     sharable: bool = False
     absence: str = ""  # the reason while absent, if known
+    unwell: str = ""  # why it is granted to operators only, though present
     host: str = ""  # its host, or the last one while absent
     begin_within: Ns | None = 0
     """The longest time from a grant until it has begun, without what settles. None: an RC that knows no such bound."""
@@ -347,7 +348,7 @@ class PatternClass:
 
 
 def absences(rcs: Iterable[Rc]) -> str:
-    known = [f"{rc.name}: {rc.absence}" for rc in rcs if rc.absence]
+    known = [f"{rc.name}: {rc.absence or rc.unwell}" for rc in rcs if rc.absence or rc.unwell]
     more = f"; {len(known) - SHOWN} more" if len(known) > SHOWN else ""
     return "; ".join(known[:SHOWN]) + more
 
@@ -402,6 +403,7 @@ class RcJoined(Struct, frozen=True):
     host: str = ""
     begin_within: Ns | None = 0
     """As in `Rc`."""
+    unwell: str = ""
 
 
 class RcBegins(Struct, frozen=True):
@@ -411,6 +413,13 @@ class RcBegins(Struct, frozen=True):
     rc: RcName
     begin_within: Ns | None
     holds: Mapping[Grant, Ns | None] = {}
+
+
+class RcUnwell(Struct, frozen=True):
+    """A present RC is not well: its holders keep it, and only operators get it. `why` is empty once it is well."""
+
+    rc: RcName
+    why: str = ""
 
 
 class RcReported(Struct, frozen=True):
@@ -522,7 +531,7 @@ class Tick(Struct, frozen=True):
 
 
 _ArcEvent: TypeAlias = Requested | Cancelled | Released | ClientLost | PlaceShown | Unconfirmed | Reachable | HandedOver
-_RcEvent: TypeAlias = Vote | VoteOverdue | RcJoined | RcReported | RcBegins | RcLost
+_RcEvent: TypeAlias = Vote | VoteOverdue | RcJoined | RcReported | RcUnwell | RcBegins | RcLost
 Event: TypeAlias = _ArcEvent | _RcEvent | LeadTaken | Adopted | Vouched | Dates | Booked | Unbooked | Redated | Tick
 
 

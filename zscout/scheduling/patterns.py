@@ -67,7 +67,7 @@ class Choices:
         like = class_of(arc)
         self._state, self._arc, self._masks = state, arc, like.masks
         ending = set(_exclusive_victims(state, arc, arc.named_mask))
-        there = like.reach & state.present
+        there = like.reach & state.open_to(arc.priority)
         free = there & ~(closed | state.busy | state.sharable | (0 if arc.claim is None else arc.claim.kept))
         self._there, self._held = there, there & ~(free | state.sharable | usable(state, arc))
         self._best_first = [_Choice(Fitness.FREE, rc.wanted, rc.bit, rc) for rc in state.rcs_in(free)]
@@ -167,7 +167,7 @@ def usable(state: SchedulerState, arc: Arc) -> int:
     """Bits of the RCs that match, are present and not held without preemption, apart from sharable ones."""
     like = class_of(arc)
     if like.usable_of != state.version:
-        like.usable_of, like.usable = state.version, like.reach & state.present
+        like.usable_of, like.usable = state.version, like.reach & state.open_to(arc.priority)
         held = like.usable & state.busy
         while held:
             (holder,) = next(state.rcs_in(held)).holders.values()
@@ -192,7 +192,7 @@ def alternatives(state: SchedulerState, arc: Arc) -> int:
 
 def all_present(state: SchedulerState, arc: Arc) -> bool:
     """Return True if enough RCs are present for all patterns."""
-    return enough(mask & state.present for mask in class_of(arc).masks.values())
+    return enough(mask & state.open_to(arc.priority) for mask in class_of(arc).masks.values())
 
 
 def enough(masks: Iterable[int]) -> bool:
@@ -347,10 +347,11 @@ def bind_all(state: SchedulerState, reserved: Reservations | None = None, claime
 
 
 def no_match(state: SchedulerState, arc: Arc) -> Reason:
-    there = {need: state.matching_mask(need) & state.present for need in arc.patterns}
+    to = state.open_to(arc.priority)
+    there = {need: state.matching_mask(need) & to for need in arc.patterns}
     # Patterns without any RC; else all, as there are too few for all.
     short = sorted(need for need, mask in there.items() if not mask) or sorted(there)
-    lost = [rc for mask in map(state.matching_mask, short) for rc in state.rcs_in(mask & ~state.present)]
+    lost = [rc for mask in map(state.matching_mask, short) for rc in state.rcs_in(mask & ~to)]
     return of_rcs(ReasonCode.NO_MATCH, short, absences(dict.fromkeys(lost)))
 
 

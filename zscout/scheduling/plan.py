@@ -173,7 +173,7 @@ class _DryRun:
 
     def _check(self, arc: Arc) -> None:
         state = self.state
-        if arc.mask & ~state.present and not arc.patterns:
+        if not arc.patterns and state.closed_to(arc):
             return
         verdict = None
         if not arc.patterns:
@@ -268,7 +268,7 @@ class _DryRun:
             for rc in state.rcs_in(arc.named_mask & ~state.sharable & state.busy & ~self._movable)
             if not may_preempt or rc.non_preemptible_holders(arc, state.now)
         ]
-        if blocking or self._paths >= MAX_PATHS or arc.named_mask & ~state.present:
+        if blocking or self._paths >= MAX_PATHS or arc.named_mask & state.closed_to(arc):
             return False
         self._paths += 1
         paths = _Paths(state, arc, self.reserved, may_preempt=may_preempt)
@@ -346,7 +346,7 @@ class _Paths:
 
     def _place(self, arc: Arc, need: Need, wanted: Mapping[Need, int]) -> bool:
         mask = wanted[need] if arc is self._arc else class_of(arc).masks[need] & ~self._own
-        mask &= self._state.present & ~self._seen & ~self._kept_from(arc, mask)
+        mask &= self._state.open_to(arc.priority) & ~self._seen & ~self._kept_from(arc, mask)
         if free := mask & self._free:
             rc = min(self._state.rcs_in(free), key=lambda rc: (rc.wanted, rc.bit))
             self._free &= ~rc.bit

@@ -5,7 +5,7 @@ A pass:
 1. Take the changes since the last pass: RCs freed, joined or lost, new and invalidated votes.
 2. Collect the ARCs to check: the ready ones, and the first watcher of each freed RC.
 3. Check them in rank order (`AdmissionCheck`). For each, `a`:
-   a. An RC of `a` is absent, or its holder is not preempted for `a`: `a` waits.
+   a. An RC of `a` is absent, or unwell and `a` no operator's, or its holder is not preempted for `a`: `a` waits.
    b. Every sharable RC that `a` needs must accept `a` beside its holders without the exclusive victims (of exclusive
     RCs of `a`) and the preemptible sharers (of sharable RCs of `a`). Otherwise `a` waits, and nothing is preempted.
    c. Reprieve: preemptible sharers stay, in rank order, as long as the votes allow; others are preempted.
@@ -23,12 +23,12 @@ and the outcome is the same as with immediate votes.
 **Why the index may skip ARCs** (`QueueIndex`). The outcome is the same as for a pass over the whole queue, because an
 ARC is skipped only where its check would again end in "waits", stopping no other and asking nothing:
 
-- WATCHING an RC that is not off limits. (a) Absent: until it joins. (b) Exclusive, its holder not preempted: until the
-  holder ends or passes its minimum runtime. A watcher that takes the RC outranks all watchers below it, so they need no
-  check. (c) Sharable, vetoed beside the holders that are not preempted: until one of them ends or passes its minimum
-  runtime, or the RC's rules change; more holders leave a veto in force, because an RC that accepts a set accepts each
-  subset. (d) Reserved for another (`reservations.py`): until its reservations change. When the RC becomes off limits,
-  its watchers below are checked.
+- WATCHING an RC that is not off limits. (a) Absent or unwell: until it joins or is well. (b) Exclusive, its holder
+  not preempted: until the holder ends or passes its minimum runtime. A watcher that takes the RC outranks all
+  watchers below it, so they need no check. (c) Sharable, vetoed beside the holders that are not preempted: until one
+  of them ends or passes its minimum runtime, or the RC's rules change; more holders leave a veto in force, because an
+  RC that accepts a set accepts each subset. (d) Reserved for another (`reservations.py`): until its reservations
+  change. When the RC becomes off limits, its watchers below are checked.
 - PARKED before an RC that does not answer. Its check reads nothing outside its footprint; it is checked when anything
   within changes, is answered or becomes off limits, and when the RC may be asked again.
 - VOTING or DEFERRED without changes in its footprint: its RCs and the mask of its obstacles are still off limits, or it

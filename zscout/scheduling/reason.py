@@ -21,6 +21,8 @@ class ReasonCode(StrEnum):
     # An ARC waits:
     ABSENT = "absent"
     """`rcs` are not on the mesh or can't carry holders; `detail`: the cause, if known."""
+    UNWELL = "unwell"
+    """`rcs` are not well, and granted to operators only; `detail`: the cause."""
     NO_MATCH = "no_match"
     """No RC is left for the patterns in `rcs`; `detail`: why matching RCs are lost."""
     HELD = "held"
@@ -252,6 +254,9 @@ _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
         f"{why.rcs[0]} is lost: {why.detail}"
         if why.detail and why.number == 1
         else f"{_listed(why)} not on the mesh{_because(why)}"
+    ),
+    ReasonCode.UNWELL: lambda why: (
+        f"{why.rcs[0]} is unwell: {why.detail}" if why.number == 1 else f"{_listed(why)} are unwell{_because(why)}"
     ),
     ReasonCode.NO_MATCH: lambda why: f"no device on the mesh is left for {_listed(why)}{_because(why)}",
     ReasonCode.SILENT: lambda why: f"{_listed(why)} does not answer",

@@ -166,7 +166,13 @@ class Reservations:
             matching = self._state.matching(need)
             left = [rc for rc in matching if rc.present and rc not in rcs and not rc.bit & self._state.barred(arc)]
             time = max(self._state.now, self.due(arc))
-            rcs.append(min(left, key=lambda rc: (self._free_from(rc, arc, order, time), rc.bit), default=Rc(need, 0)))
+            shut = self._state.present & ~self._state.open_to(arc.priority)
+            best = min(
+                left,
+                key=lambda rc: (bool(rc.bit & shut), self._free_from(rc, arc, order, time), rc.bit),
+                default=Rc(need, 0),
+            )
+            rcs.append(best)
         return rcs
 
     def _within_quota(self, arc: Arc) -> float:

@@ -47,6 +47,7 @@ class SchedulerState:
         self._at_place: dict[Place, Arc] = {}
         """By place: the ARC considered or running. Two clients may claim one ARC, which has to run once."""
         self.present = 0
+        self.unwell = 0  # bits of the present RCs granted to operators only
         self.sharable = 0  # bits of the RCs that vote and take several holders
         self.busy = 0  # bits of the held exclusive RCs
         self.index = QueueIndex(self.band)
@@ -177,10 +178,32 @@ class SchedulerState:
         rc = self.rc(name)
         if self.shares is not None and rc.present:
             self.shares.count_absent(rc, self.queued.values(), -1)
-        rc.present = False
+        rc.present, rc.unwell = False, ""
         self.present &= ~rc.bit
+        self.unwell &= ~rc.bit
         self.index.freed |= rc.bit
         self._grow(rc.bit)
+
+    def set_unwell(self, name: RcName, why: str) -> None:
+        rc = self.rc(name)
+        rc.unwell = why
+        unwell = self.unwell | rc.bit if why and rc.present else self.unwell & ~rc.bit
+        if unwell != self.unwell:
+            self.unwell = unwell
+            self.index.freed |= rc.bit
+            self._grow(rc.bit)
+
+    def open_to(self, priority: int) -> int:
+        """Bits of the RCs that a request of this priority may be granted."""
+        return self.present & ~self.unwell if self.unwell and not self.operator(priority) else self.present
+
+    def closed_to(self, arc: Arc) -> int:
+        """Bits of the RCs of `arc` that are absent, or that it is not granted because they are unwell. An ARC that
+        continues another gets the RCs of that one."""
+        closed = arc.mask & ~self.open_to(arc.priority)
+        if closed & self.present and (continued := self.continued(arc)) is not None:
+            closed &= ~(continued.mask & self.present)
+        return closed
 
     def is_free(self, arc: Arc) -> bool:
         """Return True if a new ARC without quota or pattern finds all RCs exclusive and free, and the queue is
@@ -190,7 +213,7 @@ class SchedulerState:
         if arc.mask & self.dates.claimed:
             return False
         bound = self.policy.max_running_per_host is not None or self.policy.rc_quotas
-        return not bound and not arc.mask & ~self.present and not arc.mask & (self.busy | self.sharable)
+        return not bound and not self.closed_to(arc) and not arc.mask & (self.busy | self.sharable)
 
     def enter(self, arc: Arc) -> None:
         """Add a new ARC that starts without being queued."""
@@ -428,6 +451,9 @@ class SchedulerState:
     def take_policy(self, policy: SchedulingPolicy) -> None:
         charged, same = self.charged(), policy.fair_shares == self.policy.fair_shares
         patient = policy.patience == self.policy.patience
+        if policy.operator_priority != self.policy.operator_priority:
+            self.index.freed |= self.unwell
+            self._grow(self.unwell)
         for arc in self.by_pattern.values():  # other RCs may be barred now
             self.index.put(arc, ArcState.READY)
             self._declassify(arc)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -19,7 +20,7 @@ from zscout.config.node import default_node
 from zscout.config.strict import BadInput, Where
 from zscout.keyexpr import Role, Token
 from zscout.mesh.probing import Called, Heard
-from zscout.messages import LoadReport, RcmState, RcState, RcView, version_words
+from zscout.messages import LoadReport, RcmState, RcState, RcView, Unwell, version_words
 from zscout.types import VERSION, Term
 
 NOW = datetime(2026, 5, 1, 12, tzinfo=UTC)
@@ -342,6 +343,10 @@ def test_a_device_that_is_lost_or_double_is_told() -> None:
         hosts=leading("anvil", "robot/a"), state=led(view("robot/a", present=False)), devices={"robot/a": state}
     )
     assert the_mend(lost).says == "robot/a at anvil is lost: no such file"
+    sick = replace(state, health="ok", unwell=Unwell("it reboots", since=0.0, left=30.0))
+    unwell = seen(hosts=leading("anvil", "robot/a"), state=led(view("robot/a")), devices={"robot/a": sick})
+    assert not mends(unwell)
+    assert any(re.match(r"robot/a is unwell since .*: it reboots; lost in 30 s", one.says) for one in findings(unwell))
     both = leading("anvil", "robot/a") | host("bellows", Role.NODE, rcs=["robot/a"])
     double = seen(hosts=both, state=led(view("robot/a", duplicates=["bellows"])))
     assert not mends(double)  # one may be a substitute

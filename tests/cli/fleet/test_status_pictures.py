@@ -33,6 +33,7 @@ from zscout.messages import (
     RcView,
     ReasonInfo,
     ReasonParty,
+    Unwell,
     WaitView,
     Who,
 )
@@ -119,7 +120,8 @@ class Picture:
             figure: float(options[figure]) for figure in ("rate", "frozen_seconds") if figure in options
         }
         health = options.get("health", "ok")
-        self.health[name] = RcState(name, at, "i", shared, health=health, figures=figures)
+        sick = Unwell(options["unwell"], since=180.0, left=45.0) if "unwell" in options else None
+        self.health[name] = RcState(name, at, "i", shared, health=health, unwell=sick, figures=figures)
         if (kept := options.get("kept")) is not None:
             start = round(NOW.timestamp()) + {"maintenance": -60, "drained": -60, "booked": 3600}[kept]
             self.cordoned |= {at} if kept == "drained" else set()

@@ -60,6 +60,20 @@ def test_who_was_preempted_is_told_by_whom_and_why() -> None:
     ]
 
 
+def test_who_holds_an_unwell_device_is_notified_and_else_nobody_in_particular() -> None:
+    told: list[Notification] = []
+    notices = HoldNotices("lab", 0, told.append)
+    notices.on_unwell("dut/a", "it reboots", [of(ADA, 0).request])
+    notices.on_unwell("dut/a", "", [])
+    title = "zscout lab: dut/a is "
+    assert told == [
+        Notification(
+            "device_unwell", "ada", f"{title}unwell", "survey (ada@ws1) keeps it until it is lost: it reboots"
+        ),
+        Notification("device_unwell", "", f"{title}well again", "it is granted again"),
+    ]
+
+
 def test_whose_booking_is_in_danger_is_told_why_and_when_it_is_safe_again() -> None:
     minute, zone = Decimal(60), "Europe/Berlin"
     record = BookingRecord("b", "survey", {"robot/a": {}}, 0, 1_800_000_000, minute, minute, zone, who=ADA, owner="ws1")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
@@ -22,6 +22,8 @@ from zscout.scheduling.model import (
     LeadTaken,
     Outcome,
     RcJoined,
+    RcLost,
+    RcUnwell,
     RecoveredHold,
     Released,
     Requested,
@@ -38,12 +40,16 @@ class Heard:
 
     began: list[Began] = field(default_factory=list)
     over: list[Over] = field(default_factory=list)
+    unwell: list[tuple[str, str, list[str]]] = field(default_factory=list)
 
     def on_began(self, began: Began) -> None:
         self.began.append(began)
 
     def on_over(self, over: Over) -> None:
         self.over.append(over)
+
+    def on_unwell(self, rc: str, why: str, holders: Sequence[ArcRequest]) -> None:
+        self.unwell.append((rc, why, [request.name for request in holders]))
 
     @property
     def waits(self) -> list[tuple[str, float | None]]:
@@ -134,6 +140,19 @@ def test_what_was_foretold_first_is_compared_with_the_start() -> None:
     fleet.at(21, Requested(asked("two", "robot/a")))
     fleet.at(30, Released("h/c/one"), foretold={"h/c/two": 80 * SECOND})
     assert [one.late for one in fleet.heard.began] == [None, -50 * SECOND]
+
+
+def test_a_device_that_is_unwell_is_reported_once_with_its_holders_and_once_it_is_well() -> None:
+    fleet = Term2()
+    fleet.at(20, Requested(asked("one", "robot/a")))
+    for second, why in enumerate(("it reboots", "it still reboots", "", ""), 21):
+        fleet.at(second, RcUnwell("robot/a", why))
+    assert fleet.heard.unwell == [("robot/a", "it reboots", ["one"]), ("robot/a", "", ["one"])]
+    fleet.at(30, RcUnwell("robot/b", "it reboots"))
+    fleet.at(31, RcLost("robot/b"))
+    fleet.at(32, RcJoined("robot/b", sharable=False), RcUnwell("robot/a"))
+    fleet.at(33, RcUnwell("robot/b", "once more"))
+    assert fleet.heard.unwell[2:] == [("robot/b", "it reboots", []), ("robot/b", "once more", [])]
 
 
 def test_nothing_is_kept_of_what_has_ended() -> None:

@@ -15,16 +15,19 @@ import logging
 from collections.abc import AsyncIterator, Mapping
 from contextlib import suppress
 from decimal import Decimal
-from typing import Any
+from typing import Any, Final
 
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.direct import DirectHold
-from zscout.behaviors.client.request import HoldEnd, Needs, OpenArc, check_seconds
+from zscout.behaviors.client.request import CommandRefused, HoldEnd, Needs, OpenArc, check_seconds
 from zscout.keyexpr import is_pattern
 from zscout.messages import Done
 from zscout.types import SECOND, Grant, Ns
 
 log = logging.getLogger(__name__)
+
+UNABLE: Final = ("unknown_command", "bad_command", "warming")
+"""How a device of an older version refuses what it does not know."""
 
 
 class Revoked(Exception):
@@ -97,6 +100,25 @@ class Held:
         CommandRefused, and KeyError for a pattern that was not requested."""
         rc = self.rc(need) if is_pattern(need) else need
         return await self._client.command(rc, self.grant, do, ttl=ttl)
+
+    async def expect_outage(self, seconds: float, *, each: bool = False) -> dict[str, float]:
+        """Announce that devices will not work for a while, as when a test reboots them: they are not lost in that time.
+        With `each` this holds for every outage under this hold. Return by device how many seconds it tolerates: at most
+        its `tolerate_max`; 0 for a device that cannot. Raises CommandRefused."""
+        check_seconds("seconds", seconds)
+        do = {"name": "expect_outage", "seconds": float(seconds), "each": each}
+        tolerated = await asyncio.gather(*(self._announce(rc, do) for rc in self.rcs))
+        return dict(zip(self.rcs, tolerated, strict=True))
+
+    async def _announce(self, rc: str, do: Mapping[str, Any]) -> float:
+        try:
+            done = await self._client.command(rc, self.grant, do)
+        except CommandRefused as refused:
+            if refused.code not in UNABLE:
+                raise
+            return 0.0
+        known = done.result.get("seconds") if isinstance(done.result, dict) else None
+        return float(known) if isinstance(known, int | float) else 0.0
 
     async def resumed(self) -> None:
         """Wait while the program is being moved to another host. Returns at once otherwise."""

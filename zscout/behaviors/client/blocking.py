@@ -95,6 +95,12 @@ class BlockingHeld:
         pattern that was not requested."""
         return self._lab.run(self._held.command(need, do, ttl=ttl)).result
 
+    def expect_outage(self, seconds: float, *, each: bool = False) -> dict[str, float]:
+        """Announce that devices will not work for a while, as when a test reboots them: they are not lost in that time.
+        With `each` this holds for every outage under this hold. Return by device how many seconds it tolerates: at most
+        its `tolerate_max`; 0 for a device that cannot. Raises CommandRefused."""
+        return self._lab.run(self._held.expect_outage(seconds, each=each))
+
     async def _over_within(self, timeout: float | None) -> bool:
         return await done_within(timeout, self._held.over())
 

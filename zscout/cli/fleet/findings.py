@@ -9,7 +9,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Final, Literal
 
 from zscout.cli.booked import clock_words
-from zscout.cli.device_words import absence, ending
+from zscout.cli.device_words import absence, ending, unwell
 from zscout.cli.fleet.status import mixture, versions
 from zscout.config.certificates import CA, PLACES_KEY, Certificates, Validity, shown
 from zscout.config.strict import BadInput
@@ -350,6 +350,8 @@ def _devices(seen: Evidence) -> Iterator[Finding]:
             missing[home, absence(view) if view is not None else "", else_do].append(rc)
         elif device is not None and device.health != "ok":
             yield Finding("devices", "mend", f"{rc} at {device.host} is lost: {device.health}", "mend the device")
+        elif words := unwell(device):
+            yield Finding("devices", "note", f"{rc} is {words}", "wait, or mend the device")
         elif view is not None and not view.present:
             remedy = "is its node linked to the leader's? See the log of both"
             yield Finding("devices", "mend", f"{rc}: {absence(view) or 'its leader does not see it'}", remedy)

@@ -13,7 +13,7 @@ from msgspec import structs
 
 from zscout import terminal
 from zscout.cli import booked, common, completion
-from zscout.cli.device_words import ending, remarks
+from zscout.cli.device_words import ending, remarks, unwell
 from zscout.cli.fleet.fleet_view import Devices, FleetView, Host
 from zscout.cli.fleet.selection import Selection
 from zscout.cli.fleet.watching import Overview, show
@@ -170,18 +170,18 @@ class Standing:
         homes = self._homes()
         lost = {device.rc for device in self.devices.known().values() if device.health != "ok"}
         maintained, coming = booked.in_maintenance(self.booked), booked.coming(self.booked)
+        sick = {rc for rc, device in self.devices.known().items() if unwell(device)}
         rows, styles = [], []
         for view in state.rcs:
             holders = [hold for hold in state.holds if view.rc in hold.needs]
-            there = "held" if holders else "maintenance" if view.rc in maintained else "free"
+            free = "maintenance" if view.rc in maintained else "unwell" if view.rc in sick else "free"
+            there = "held" if holders else free
             words = there if view.present else "lost" if view.rc in lost else "absent"
             kind = "shared" if view.sharable else "exclusive"
             holds = ",\n".join(request_words(hold.arc, hold.who, hold.client, hold.needs[view.rc]) for hold in holders)
             held_by = {"maintenance": maintained, "free": coming}.get(words, {}).get(view.rc, holds)
             rows.append((view.rc, kind, words, homes.get(view.rc, "-"), held_by))
-            styles.append(
-                {"absent": "red", "lost": "red", "held": "yellow", "maintenance": "yellow", "free": "green"}[words]
-            )
+            styles.append({"absent": "red", "lost": "red", "free": "green"}.get(words, "yellow"))
         columns, spare = ("DEVICE", "USE", "STATE", "HOST", "HELD BY"), ("USE", "HOST", "HELD BY")
         return Table("Devices", columns, rows, styles, spare, beneath={"HELD BY"})
 
@@ -224,6 +224,7 @@ class Standing:
             figures = device.figures if device is not None else {}
             if device is not None and device.health != "ok":
                 words = words if words and words[0].startswith(device.health) else [device.health, *words]
+            words = [*filter(None, (unwell(device),)), *words]
             if frozen := figures.get("frozen_seconds"):
                 words = [*words, f"frozen: the same picture for {span(frozen)}"]
             if words or (self.every and figures):
@@ -251,6 +252,7 @@ class Standing:
                     {"arc": hold.arc, "id": hold.id, "client": hold.client, "who": hold.who} for hold in holders
                 ],
                 "health": device.health if device is not None else None,
+                "unwell": device.unwell if device is not None else None,
                 "figures": device.figures if device is not None else {},
                 "capacity": device.capacity if device is not None else {},
             }

@@ -176,6 +176,8 @@ class HoldOptions:
     as_json: bool
     comment: str = ""
     wait_for_device: bool = False
+    tolerate: float | None = None
+    """Seconds for which devices may be unwell under the hold; None: as each device has it."""
     booking: str = ""
     """The id of the booking that it takes up."""
 

@@ -22,7 +22,7 @@ from zscout.cli import common, completion
 from zscout.cli.booked import BOOKING
 from zscout.cli.common import Failed
 from zscout.cli.ownership import yes_option
-from zscout.cli.requests.options import CommandAfterDashes, HoldOptions, gather, hold_options
+from zscout.cli.requests.options import SECONDS, CommandAfterDashes, HoldOptions, gather, hold_options
 from zscout.cli.requests.run_command import RunningCommand, environment
 from zscout.cli.requests.taking_up import check_options, taking_up
 from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text, reason_text, request_words
@@ -54,6 +54,9 @@ REFRESH: Final = 1.0
 )
 @click.option("--keep", is_flag=True, hidden=True, help="What happens without it as well.")
 @click.option("--booking", type=BOOKING, shell_complete=completion.bookings, help="Use this booking: its name or id.")
+@click.option(
+    "--tolerate", type=SECONDS, help="Keep a device that stops working, as in a reboot, for this long each time."
+)
 @yes_option
 @click.option("--dry-run", is_flag=True, help="Only print when it would start, and what it would preempt.")
 @partial(hold_options, needs_required=False)
@@ -110,6 +113,7 @@ async def request(
       zscout request robot/scout33 --json | jq .event
       zscout request robot/scout33 --priority 5 --dry-run
       zscout request --booking survey -- sleep 7200
+      zscout request dut/board --tolerate 2m -- ./reboot-test.sh
     """
     if keep and rest["release_after"] is not None:
         raise BadInput("--keep and --release-after exclude each other; use only one of them")
@@ -189,6 +193,8 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
     report.event("granted", f"{arc.name} holds {rcs}: {_yours(arc, left, longest)}", **details)
     try:
         code = None
+        if wanted.tolerate is not None:
+            await _tolerate(wanted.tolerate, report, held)
         if wanted.command:
             code = await _run(wanted, report, held, client)
         else:
@@ -219,6 +225,13 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
             return None
         return TIME_OVER if wanted.command else 0
     return await _taken(client, wanted, report, arc)
+
+
+async def _tolerate(seconds: float, report: Report, held: Held) -> None:
+    tolerated = await held.expect_outage(seconds, each=True)
+    if less := {rc: most for rc, most in tolerated.items() if most < seconds}:
+        words = ", ".join(f"{rc} tolerates {span(most) if most else 'no outage'}" for rc, most in less.items())
+        report.event("tolerate", f"--tolerate {span(seconds)} is more than the devices allow: {words}", tolerated=less)
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 
 from zscout.config.access import AccessPolicy
 from zscout.mesh.exchange import OTHER
-from zscout.scheduling.model import Outcome
+from zscout.scheduling.model import ArcRequest, Outcome
 from zscout.services.rcm.digest import Began, Over
 from zscout.types import SECOND, ArcId, Ns, RcName
 
@@ -54,6 +54,10 @@ FAMILIES: Final[Mapping[str, MetricFamily]] = {
         "counter", ("rc",), "Time for which the RC was held, summed over its holders."
     ),
     "zscout_refusals_total": MetricFamily("counter", ("code",), "Requests and releases that the RCM refused, by why."),
+    "zscout_unwell_seconds": MetricFamily(
+        "gauge", ("rc",), "For how long the RC has been unwell; 0 while it is well, and once it is lost."
+    ),
+    "zscout_lost": MetricFamily("gauge", ("rc",), "1 while the RC counts as lost, else 0."),
     "zscout_commands_total": MetricFamily("counter", ("rc",), "Commands that the RC has answered."),
     "zscout_commands_refused_total": MetricFamily("counter", ("rc", "code"), "Commands that it refused, by why."),
 }
@@ -130,6 +134,9 @@ class HoldFigures:
         if over.outcome is Outcome.PREEMPTED:
             who = self._who(over.began)
             self._preemptions[who] = self._preemptions.get(who, 0) + 1
+
+    def on_unwell(self, rc: RcName, why: str, holders: Sequence[ArcRequest]) -> None:
+        """The RC's own node shows it."""
 
     def _who(self, began: Began) -> tuple[str, ...]:
         owner = began.request.client.partition("/")[0]

@@ -22,6 +22,8 @@ class NodeFigures:
         found: Samples = {
             "zscout_info": {(self._node.fleet.name, self._mesh.me.host, VERSION): 1},
             "zscout_links": {(): self._mesh.links()},
+            "zscout_unwell_seconds": {(rc.name,): rc.unwell_for for rc in self._rcs.controllers},
+            "zscout_lost": {(rc.name,): int(rc.health != "ok") for rc in self._rcs.controllers},
             "zscout_commands_total": {(rc.name,): rc.tally.answered for rc in self._rcs.controllers},
             "zscout_commands_refused_total": {
                 (rc.name, code): count for rc in self._rcs.controllers for code, count in rc.tally.refused().items()

@@ -18,6 +18,7 @@ from zscout.drivers.last_holder import LastHolderFile, UnknownLastHolder
 from zscout.drivers.lock import only_here
 from zscout.drivers.registry import driver_for, driver_name
 from zscout.drivers.resource_controller import ResourceController
+from zscout.drivers.tolerance import Tolerance
 from zscout.mesh import Mesh, MeshError
 from zscout.mesh.supervision import StallWatch
 from zscout.types import SECOND, RcName
@@ -95,6 +96,7 @@ class LocalRcs:
             hold_lease=self._node.fleet.timing.hold_lease / SECOND,
             settle=spec.settle / SECOND,
             begin_within=None if spec.begin_within is None else spec.begin_within / SECOND,
+            tolerance=tolerance(spec, driver),
             last_holder=LastHolderFile(folder, spec.name) if folder is not None else UnknownLastHolder(),
             stall=self._stall,
             confirmations=self._confirmations,
@@ -124,6 +126,13 @@ class LocalRcs:
             del self._running[name]
             if name in why:
                 log.info("runs %s no longer: it was %s the node file", name, why[name])
+
+
+def tolerance(spec: RcConfig, driver: Driver) -> Tolerance:
+    """What the table of an RC says, else its driver."""
+    held = round(driver.tolerate * SECOND) if spec.tolerate is None else spec.tolerate
+    most = max(held, round(driver.tolerate_max * SECOND)) if spec.tolerate_max is None else spec.tolerate_max
+    return Tolerance(held, spec.tolerate_free, most)
 
 
 def _robots_last(specs: Iterable[RcConfig]) -> list[RcConfig]:

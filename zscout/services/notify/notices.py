@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, tzinfo
 from typing import Final, NamedTuple
@@ -32,7 +32,8 @@ class Notification(NamedTuple):
 
 
 class HoldNotices:
-    """A HoldListener that tells of grants after a wait of at least `after`, and of holds that were taken away."""
+    """A HoldListener that notifies of grants after a wait of at least `after`, of holds that were taken away, and of
+    unwell devices."""
 
     def __init__(self, fleet: str, after: Ns, tell: Callable[[Notification], object]) -> None:
         self._fleet, self._after, self._tell = fleet, after, tell
@@ -53,6 +54,15 @@ class HoldNotices:
         waits = "; it waits again" if over.requeued else ""
         body = f"{_whose(request)} held {_listed(over.began.rcs)} for {span(held / SECOND)}: {over.reason}{waits}"
         self._tell(notification("preempted", _user(request), title, body))
+
+    def on_unwell(self, rc: RcName, why: str, holders: Sequence[ArcRequest]) -> None:
+        title = f"zscout {self._fleet}: {rc} is {'unwell' if why else 'well again'}"
+        for request in holders:
+            body = f"{_whose(request)} keeps it" + (f" until it is lost: {why}" if why else "")
+            self._tell(notification("device_unwell", _user(request), title, body))
+        if not holders:
+            body = f"only operators get it: {why}" if why else "it is granted again"
+            self._tell(notification("device_unwell", "", title, body))
 
 
 def booking_notice(fleet: str, danger: BookedDanger) -> Notification:

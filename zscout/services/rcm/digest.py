@@ -9,7 +9,18 @@ from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 from zscout.scheduling.core import Core
-from zscout.scheduling.model import ArcRequest, Effect, Event, Granted, HoldEnded, LeadTaken, Outcome
+from zscout.scheduling.model import (
+    ArcRequest,
+    Effect,
+    Event,
+    Granted,
+    HoldEnded,
+    LeadTaken,
+    Outcome,
+    RcJoined,
+    RcLost,
+    RcUnwell,
+)
 from zscout.scheduling.reason import Reason
 from zscout.types import ArcId, Ns, RcName
 
@@ -45,6 +56,10 @@ class HoldListener(Protocol):
 
     def on_over(self, over: Over) -> None: ...
 
+    def on_unwell(self, rc: RcName, why: str, holders: Sequence[ArcRequest]) -> None:
+        """An RC became unwell, or (empty) is well again."""
+        ...
+
 
 class HoldDigest:
     """Of one term of `core`. Its own faults, and its listeners', end it and nothing else."""
@@ -52,6 +67,7 @@ class HoldDigest:
     def __init__(self, core: Core, listeners: Sequence[HoldListener]) -> None:
         self._core, self._listeners = core, listeners
         self._held: dict[ArcId, Began] = {}
+        self._unwell: set[RcName] = set()
 
     def take(
         self,
@@ -83,6 +99,15 @@ class HoldDigest:
             match event:
                 case LeadTaken(recovered_holds=holds):
                     recovered += (held.request.arc for held in holds)
+                case RcJoined() | RcLost():
+                    self._unwell.discard(event.rc)
+                    if isinstance(event, RcJoined) and event.unwell:
+                        self._unwell.add(event.rc)
+                case RcUnwell(rc, why) if bool(why) is not (rc in self._unwell):
+                    (self._unwell.add if why else self._unwell.discard)(rc)
+                    holders = [status.request for status in self._core.holders(rc)]
+                    for listener in self._listeners:
+                        listener.on_unwell(rc, why, holders)
         for effect in effects:
             match effect:
                 case Granted(arc=arc, waited=waited):
