@@ -1,0 +1,138 @@
+"""A program that reboots its device, on a real mesh: the hold goes on, whatever becomes of leader and nodes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.live.bench import until
+from tests.live.lab import Lab, LeaderWatch, awaited
+from zscout.behaviors.client.arc import hold
+from zscout.behaviors.client.client import Client
+from zscout.messages import RcState, Unwell
+
+pytestmark = pytest.mark.live
+
+BOARD = "dut/board"
+APART = "candidate = false\n"
+LONG = 'tolerate = "5m"\n'
+SHORT = "tolerate = 0.5\n"
+
+
+def board(folder: Path, more: str = "") -> str:
+    """A device that works as long as there is no file `down`."""
+    health = f'["sh", "-c", "test ! -e {folder}/down"]'
+    return f'[[rc]]\nname = "{BOARD}"\ndriver = "command"\nhealth = {health}\nevery = 0.5\n{more}'
+
+
+async def device(lab: Lab, client: Client, so: Callable[[RcState], object]) -> RcState:
+    """Its state, as soon as it is so."""
+    return await awaited(lambda: lab.rc(client, BOARD), so)
+
+
+async def unwell(lab: Lab, client: Client) -> Unwell:
+    state = await device(lab, client, lambda state: state.unwell)
+    assert state.unwell is not None
+    assert state.health == "ok"
+    return state.unwell
+
+
+async def test_a_command_reboots_the_device_that_it_holds(tmp_path: Path, lab: Lab) -> None:
+    down, up = tmp_path / "down", tmp_path / "up"
+    lab.node("rcs", extra=board(tmp_path, LONG))
+    client = await lab.client("crew")
+    await lab.ready(client, BOARD)
+    program = f"touch {down}; until test -e {up}; do sleep 0.02; done; rm {down}; sleep 1; echo passed"
+    running = asyncio.create_task(lab.zscout("request", BOARD, "--name", "test", "--", "sh", "-c", program))
+    said = await unwell(lab, client)
+    assert said.why == "health ended with exit code 1"
+    assert 200 < said.left <= 300
+    higher = await client.request("higher", {BOARD: {}}, priority=5, min_runtime=1)
+    await until(lambda: "unwell" in higher.reason)
+    assert higher.reason == f"{BOARD} is unwell: health ended with exit code 1"
+    assert "unwell since " in (await lab.zscout("status")).stdout
+    [device] = json.loads((await lab.zscout("status", "--json")).stdout)["rcs"]
+    assert (device["health"], device["unwell"]["why"]) == ("ok", said.why)
+    await client.end(higher)
+    up.touch()
+    done = await running
+    assert (done.returncode, done.stdout) == (0, "passed\n"), done.stderr
+
+
+@pytest.mark.slow
+async def test_the_leader_dies_while_a_device_is_unwell(tmp_path: Path) -> None:
+    async with Lab(tmp_path, candidates=("a", "b")) as lab:
+        lab.node("rcs", extra=APART + board(tmp_path, LONG))
+        lab.node("a")
+        client = await lab.client("crew")
+        await lab.ready(client, BOARD)
+        lab.node("b")
+        await lab.candidates(client, "b")
+        leaders = LeaderWatch(client)
+        async with hold(client, "test", {BOARD: {}}, confirmed=True) as held:
+            (tmp_path / "down").touch()
+            await unwell(lab, client)
+            lab.signal("a", signal.SIGKILL)
+            await leaders.lost("a")
+            await lab.state(client, lambda state: state.host == "b" and bool(state.holds))
+            waits = await (await lab.client("other")).request("next", {BOARD: {}}, priority=5)
+            await until(lambda: waits.reason.startswith(f"{BOARD} is unwell"))
+            (tmp_path / "down").unlink()
+            await device(lab, client, lambda state: state.unwell is None)
+            assert held.active
+        await until(lambda: waits.grant is not None)
+
+
+@pytest.mark.slow
+async def test_a_device_is_lost_after_what_it_tolerates_and_kept_for_what_was_announced(
+    tmp_path: Path, lab: Lab
+) -> None:
+    down = tmp_path / "down"
+    lab.node("rcs", extra=board(tmp_path, SHORT + "tolerate_max = 300\n"))
+    client = await lab.client("crew")
+    await lab.ready(client, BOARD)
+    program = ("--", "sh", "-c", f"touch {down}; sleep 3; rm {down}; echo passed")
+    lost = await lab.zscout("request", BOARD, *program)
+    assert (lost.returncode, "was lost: health ended with exit code 1" in lost.stderr) == (75, True), lost.stderr
+    down.unlink(missing_ok=True)
+    await lab.ready(client, BOARD)
+    kept = await lab.zscout("request", BOARD, "--tolerate", "10m", *program)
+    assert (kept.returncode, kept.stdout) == (0, "passed\n"), kept.stderr
+    assert f"--tolerate 10 min is more than the devices allow: {BOARD} tolerates 5 min" in kept.stderr
+    async with hold(client, "test", {BOARD: {}}, confirmed=True) as held:
+        assert await held.expect_outage(20) == {BOARD: 20.0}
+        down.touch()
+        await unwell(lab, client)
+        # Free, it is lost at once.
+    await until(lambda: not held.active)
+    assert (await device(lab, client, lambda state: state.health != "ok")).unwell is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", ["killed", "frozen"])
+async def test_a_node_that_goes_loses_the_hold_and_forgets_that_its_device_is_unwell(tmp_path: Path, how: str) -> None:
+    async with Lab(tmp_path, lease=1.0, candidates=("a",)) as lab:
+        lab.node("a")
+        node = lab.node("rcs", extra=APART + board(tmp_path, LONG))
+        client = await lab.client("crew")
+        await lab.ready(client, BOARD)
+        arc = await client.request("test", {BOARD: {}}, min_runtime=60)
+        await until(lambda: arc.grant is not None)
+        (tmp_path / "down").touch()
+        await unwell(lab, client)
+        lab.signal("rcs", signal.SIGKILL if how == "killed" else signal.SIGSTOP)
+        await until(lambda: arc.state == "queued")
+        if how == "killed":
+            node.wait()
+            lab.node("rcs", extra=APART + board(tmp_path, LONG))
+        else:
+            lab.signal("rcs", signal.SIGCONT)
+        await device(lab, client, lambda state: state.health != "ok")
+        assert arc.grant is None
+        (tmp_path / "down").unlink()
+        await until(lambda: arc.grant is not None)
