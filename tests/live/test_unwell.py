@@ -42,6 +42,7 @@ async def unwell(lab: Lab, client: Client) -> Unwell:
     return state.unwell
 
 
+@pytest.mark.slow
 async def test_a_command_reboots_the_device_that_it_holds(tmp_path: Path, lab: Lab) -> None:
     down, up = tmp_path / "down", tmp_path / "up"
     lab.node("rcs", extra=board(tmp_path, LONG))
