@@ -40,6 +40,7 @@ STUDIES: Final[dict[str, Study]] = {
     "soak": Study("chaos.soak:main", "What does a fleet use after hours?", "8 h, root"),
     "overlap": Study("overlap:main", "Do two programs ever run at one exclusive device?", "10 min, root"),
     "sites": Study("sites:main", "Is nothing lost when the relay between two sites fails?", "15 min, root"),
+    "interfaces": Study("interfaces:main", "Which holds feel that interfaces come and go?", "20 min, root"),
     "guards": Study("suite:guards", "Which guards of the protocol does the quick tier of tests notice?", "30 min"),
     "coverage": Study("suite:coverage", "What do slow tests alone reach?", "40 min"),
     "booking-cost": Study("booking_cost:main", "What does a booking cost beside a bare query?", "1 min"),

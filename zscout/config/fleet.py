@@ -85,6 +85,15 @@ class MeshConfig(MeshTable, frozen=True):
 
     relay: Sites = ()
     """It joins these sites: a node's only, not that of a program on the same host."""
+    shared: tuple[str, ...] = ()
+    """Without multicast: the endpoints in the fleet file, where this host or process has others."""
+
+    @property
+    def known_by(self) -> tuple[str, ...]:
+        """What all processes of a host know this mesh by; empty if there is nothing."""
+        return (
+            (self.multicast_address,) if self.multicast else self.shared or tuple(sorted({*self.listen, *self.connect}))
+        )
 
 
 class SecurityTable(Struct, frozen=True, forbid_unknown_fields=True):
@@ -490,8 +499,9 @@ def beside(mesh: MeshConfig) -> MeshConfig:
         listen.append(f"{protocol}/{host}:0{more}")
         if int(port):
             connect.append(f"{protocol}/{_EVERYWHERE.get(host, host)}:{port}{more}")
+    own = structs.replace(mesh, listen=tuple(listen), connect=tuple(dict.fromkeys(connect)), relay=())
     site = mesh.relay[0] if mesh.relay else mesh.site
-    return structs.replace(mesh, listen=tuple(listen), connect=tuple(dict.fromkeys(connect)), site=site, relay=())
+    return structs.replace(own, site=site, shared=() if mesh.multicast else mesh.known_by)
 
 
 def ip_of(text: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:

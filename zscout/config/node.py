@@ -233,7 +233,7 @@ def _node(file: NodeFile, fleet: Fleet, folder: Path, top: Where) -> Node:
     own = {name: value for name, value in structs.asdict(file.mesh).items() if value is not None}
     if file.mesh.relay and file.mesh.site is None:
         own["site"] = None  # that of the fleet file is the site of those who do not relay
-    mesh = structs.replace(fleet.mesh, **own)
+    mesh = structs.replace(fleet.mesh, **own, shared=() if fleet.mesh.multicast else fleet.mesh.known_by)
     check_links(mesh.listen, mesh.connect, mesh.interface, top / "mesh")
     check_sites(mesh, top / "mesh")
     if mesh.relay and file.recorder is not None:

@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -32,6 +33,7 @@ from zscout.keyexpr import FleetMember, Keys, Sender, access_control
 from zscout.logs import shortage
 from zscout.mesh import interfaces
 from zscout.mesh.exchange import MeshError
+from zscout.mesh.neighbours import Meeting
 from zscout.mesh.relinking import MEETING, Relinking
 from zscout.mesh.renewal import RenewableTransport
 from zscout.mesh.session import Mesh
@@ -73,8 +75,8 @@ class Security(NamedTuple):
     members: tuple[FleetMember, ...]
 
 
-def zenoh_config(config: MeshConfig, security: Security | None = None) -> zenoh.Config:
-    """The Zenoh settings for a `[mesh]` table, for one session that is opened now."""
+def zenoh_config(config: MeshConfig, security: Security | None = None, meeting: Meeting | None = None) -> zenoh.Config:
+    """The Zenoh settings for a `[mesh]` table, for one session that is opened now; `meeting`: with its neighbours."""
     known, found = known_to_zenoh(), interfaces.addresses()
     v6_group = config.multicast_address.startswith("[")
     settings: dict[str, Any] = {
@@ -101,13 +103,18 @@ def zenoh_config(config: MeshConfig, security: Security | None = None) -> zenoh.
     if config.relay:
         regions = [{"filters": [{"region_names": [site]}]} for site in config.relay]
         settings["gateway"] = {"south": regions}
-    listen = list(config.listen) or ([ANY_TLS] if security is not None else [])
+    listen, connect = list(config.listen), list(config.connect)
+    if not listen and not (config.relay and security is None):  # Zenoh has another default for routers
+        listen = [ANY if security is None else ANY_TLS]
     if found != known:
-        listen = interfaces.listening(listen or [ANY], found)
+        listen = interfaces.listening(listen, found)
+    if meeting is not None:
+        listen.append(meeting.endpoint)
+        connect += meeting.others
     if listen:
         settings["listen/endpoints"] = listen
-    if config.connect:
-        settings["connect/endpoints"] = list(config.connect)
+    if connect:
+        settings["connect/endpoints"] = connect
     if security is not None:
         settings |= _closed(security)
     result = zenoh.Config()
@@ -186,14 +193,14 @@ class ZenohMesh(Mesh):
         config, keys = fleet.mesh, Keys(fleet.name, closed=fleet.security is not None)
         security = None if fleet.security is None else _security(fleet, keys, me)
         door, found = _Door(security), interfaces.addresses()
-        openings = [lambda: _open(config, door.security)]
+        openings = [lambda: _open(fleet.name, config, door.security)]
         if config.listen:
             # Until the old session frees its ports, one on other ports learns the peers from it.
             own = tuple(at.replace("0.0.0.0", "127.0.0.1").replace("[::]", "[::1]") for at in config.listen)  # noqa: S104
             ports = tuple(_PORT.sub(":0", at) for at in config.listen)
-            beside = replace(config, listen=ports, connect=(*config.connect, *own))
-            openings.insert(0, lambda: _open(beside, door.security))
-        mesh = cls(RenewableTransport(await _open(config, security), openings), keys, me, clock.now)
+            beside = replace(config, listen=ports, connect=(*config.connect, *own), shared=config.known_by)
+            openings.insert(0, lambda: _open(fleet.name, beside, door.security))
+        mesh = cls(RenewableTransport(await _open(fleet.name, config, security), openings), keys, me, clock.now)
         mesh._door = door
         if security is not None:
             mesh.validity = security.certificates
@@ -312,20 +319,28 @@ def open_session(settings: Callable[[], zenoh.Config]) -> zenoh.Session:
             os.unsetenv(THREADS)
 
 
-async def _open(config: MeshConfig, security: Security | None) -> Transport:
-    opening = in_thread("joins the mesh", lambda: open_session(lambda: zenoh_config(config, security)))
+async def _open(fleet: str, config: MeshConfig, security: Security | None) -> Transport:
+    met: Meeting | None = None
+    if config.known_by and not config.relay:
+        with suppress(OSError):  # multicast, and `connect`, find the neighbours
+            met = Meeting(fleet, config, "tcp" if security is None else "tls")
+    opening = in_thread("joins the mesh", lambda: open_session(lambda: zenoh_config(config, security, met)))
     try:
         session = await asyncio.wrap_future(opening)
-    except asyncio.CancelledError:
+    except BaseException:
+        if met is not None:
+            met.close()
         # In a thread: this may be the event loop's.
         opening.add_done_callback(
             lambda opened: opened.exception() or in_thread("closes the mesh", opened.result().close)
         )
         raise
+    if met is not None:
+        met.listens()
     try:
         # A relay leaves relinking to its sites, which know its address.
         relinks = config.multicast and not config.relay
-        return ZenohTransport(session, _relinking(session, config, security) if relinks else None)
+        return ZenohTransport(session, _relinking(session, config, security) if relinks else None, met)
     except BaseException:
         in_thread("closes the mesh", session.close)
         raise
@@ -359,8 +374,10 @@ def in_thread(name: str, call: Callable[[], T]) -> Future[T]:
 class ZenohTransport(Transport):
     # Callbacks are direct, on Zenoh's threads: a plain function would get its own thread per declaration and query.
 
-    def __init__(self, session: zenoh.Session, relinking: Relinking | None = None) -> None:
-        self._session, self._relinking = session, relinking
+    def __init__(
+        self, session: zenoh.Session, relinking: Relinking | None = None, meeting: Meeting | None = None
+    ) -> None:
+        self._session, self._relinking, self._meeting = session, relinking, meeting
         self._queriers: dict[tuple[str, float], zenoh.Querier] = {}  # by key and timeout
         self._asked_once: dict[tuple[str, float], None] = {}
 
@@ -378,6 +395,9 @@ class ZenohTransport(Transport):
         return len(list(self._session.info.routers_zid()))
 
     async def close(self) -> None:
+        if self._meeting is not None:
+            self._meeting.close()
+
         def close() -> None:
             if self._relinking is not None:
                 self._relinking.close()

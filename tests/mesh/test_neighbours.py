@@ -1,0 +1,102 @@
+"""Processes of one host find each other by loopback, without a network and without multicast."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import sys
+from collections.abc import Iterator
+from types import SimpleNamespace
+
+import pytest
+from msgspec.structs import replace
+
+from tests.mesh.kit import until
+from zscout.config.fleet import Fleet, MeshConfig, beside, default_fleet
+from zscout.keyexpr import Sender, new_instance
+from zscout.mesh import ZenohMesh, neighbours
+from zscout.mesh.neighbours import MAX_NEIGHBOURS, Meeting
+
+pytestmark = [pytest.mark.real_time, pytest.mark.skipif(sys.platform != "linux", reason="abstract sockets are Linux's")]
+
+
+@pytest.fixture
+def fleet() -> Iterator[Fleet]:
+    """One whose only other host is nowhere."""
+    with socket.socket() as nowhere:
+        nowhere.bind(("127.0.0.1", 0))  # held, and not listened on
+        port = nowhere.getsockname()[1]
+        mesh = MeshConfig(multicast=False, connect=(f"tcp/127.0.0.1:{port}",))
+        yield replace(default_fleet(), name=f"test-{new_instance()}", mesh=mesh)
+
+
+async def test_they_meet_by_loopback_and_again_when_a_session_is_renewed(fleet: Fleet) -> None:
+    async with (
+        await ZenohMesh.open(fleet, Sender("a", "node")) as node,
+        await ZenohMesh.open(replace(fleet, mesh=beside(fleet.mesh)), Sender("a", "program")) as program,
+    ):
+        await until(lambda: node.links() == program.links() == 1)
+        (link,) = program._transport.current._session.info.links()  # type: ignore[attr-defined]
+        assert "127.0.0.1" in link.dst
+        before = node._transport.id()
+        node._transport.renew()
+        await until(lambda: node._transport._renewing is None)
+        assert node._transport.id() != before
+        await until(lambda: program._transport.peers() == [node._transport.id()])
+
+
+async def test_two_that_begin_at_one_time_meet(fleet: Fleet) -> None:
+    both = await asyncio.gather(*(ZenohMesh.open(fleet, Sender("a", name)) for name in ("x", "y")))
+    await until(lambda: all(mesh.links() == 1 for mesh in both))
+    for mesh in both:
+        await mesh.close()
+
+
+async def test_other_meshes_are_no_neighbours(fleet: Fleet) -> None:
+    others = replace(fleet, name=f"{fleet.name}-b"), replace(fleet, mesh=replace(fleet.mesh, connect=("tcp/anvil:1",)))
+    met = [Meeting(one.name, one.mesh, "tcp") for one in (fleet, *others)]
+    tls, own = Meeting(fleet.name, fleet.mesh, "tls"), Meeting(fleet.name, fleet.mesh, "tcp")
+    assert not tls.others
+    assert [at.partition("#")[0] for at in own.others] == [met[0].endpoint]
+    for one in (*met, tls, own):
+        one.close()
+    gone = Meeting(fleet.name, fleet.mesh, "tcp")
+    gone.close()
+    assert not gone.others
+
+
+def test_nobody_else_is_given_the_port_until_zenoh_has_it(fleet: Fleet) -> None:
+    met = Meeting(fleet.name, fleet.mesh, "tcp")
+    port = int(met.endpoint.rpartition(":")[2])
+    with socket.socket() as other, pytest.raises(OSError, match="in use"):
+        other.bind(("127.0.0.1", port))
+    with socket.socket() as zenohs:
+        zenohs.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        zenohs.bind(("127.0.0.1", port))
+        zenohs.listen()
+        met.close()
+
+
+def test_names_that_are_none_and_too_many_are_left_out(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    met = Meeting(fleet.name, fleet.mesh, "tcp")
+    names = neighbours._NAMES.read_text()
+    own = next(line for line in names.splitlines() if met.endpoint.rpartition(":")[2] in line.rpartition("@")[2])
+    head = own.rpartition("-tcp-")[0]
+    met.close()
+    lines = [f"{head}-tcp-{1_000 + number}-{number}" for number in range(1, 100)]
+    bad = [f"{head}-tcp-99999-1", f"{head}-tcp-0-1", f"{head}-tcp-1-x", f"{head}-tcp-1-{10**19}", f"{head}-udp-1-1"]
+    monkeypatch.setattr(neighbours, "_NAMES", SimpleNamespace(read_text=lambda **_: "\n".join(bad + lines)))
+    met = Meeting(fleet.name, fleet.mesh, "tcp")
+    met.close()
+    assert len(met.others) == MAX_NEIGHBOURS
+    assert met.others[0].startswith("tcp/127.0.0.1:1001#")
+
+
+def test_where_names_can_t_be_read_nobody_is_found(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(**_: object) -> str:
+        raise PermissionError
+
+    monkeypatch.setattr(neighbours, "_NAMES", SimpleNamespace(read_text=fails))
+    met = Meeting(fleet.name, fleet.mesh, "tcp")
+    met.close()
+    assert met.others == []
