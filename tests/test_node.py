@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from msgspec.structs import replace
 
 from tests.hang import HANG
 from tests.live.lab import Lab
@@ -135,6 +136,45 @@ def test_a_node_that_is_told_to_stop_stops_in_peace(node: Node) -> None:
         await mesh.close()
 
     run(story())
+
+
+def test_of_two_nodes_of_one_name_that_begin_at_one_time_the_later_one_leaves(node: Node) -> None:
+    async def story() -> None:
+        network, stops = MemoryNetwork(), [asyncio.Event(), asyncio.Event()]
+        meshes = [network.open("f", Sender("anvil", "node")) for _ in stops]
+        both = [asyncio.create_task(run_services(node, mesh, stop)) for mesh, stop in zip(meshes, stops, strict=True)]
+        done, stays = await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
+        (left,) = [str(task.exception()) for task in done]
+        assert left == "a node named anvil began at the same time; end it, or set another host than anvil under [node]"
+        watcher = network.open("f", Sender("w", "watcher"))
+        seen = set[str]()
+        watcher.watch(watcher.keys.alive_any(Role.RC), lambda token, alive: seen.add(token.name) if alive else None)
+        await until(lambda: seen == {"robot/a"})
+        for stop in stops:
+            stop.set()
+        await asyncio.gather(*stays)
+        for mesh in (*meshes, watcher):
+            await mesh.close()
+
+    run(story())
+
+
+def test_two_nodes_of_one_name_that_meet_later_say_so(node: Node, caplog: pytest.LogCaptureFixture) -> None:
+    async def story() -> None:
+        network, stop = MemoryNetwork(), asyncio.Event()
+        mesh, other = network.open("f", Sender("anvil", "node")), network.open("f", Sender("anvil", "other"))
+        running = asyncio.create_task(run_services(replace(node, rcs=()), mesh, stop))
+        await until(lambda: "is on the mesh of fleet" in caplog.text)
+        token = other.alive(Token("anvil", Role.NODE, "node", "later"))
+        await until(lambda: "another node named anvil is on the mesh too; end one, or set" in caplog.text)
+        token.close()
+        stop.set()
+        await running
+        for one in (mesh, other):
+            await one.close()
+
+    with caplog.at_level(logging.INFO):
+        run(story())
 
 
 def test_a_node_that_can_not_go_on_exits_with_1(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 from ipaddress import ip_address
@@ -58,6 +59,8 @@ from zscout.types import SECOND, clean
 log = logging.getLogger("zscout.node")
 
 LOOK_FOR_TWIN = 0.5
+TWIN_SHOWN = 0.1
+"""Seconds for the token of another node to come."""
 ALONE_AFTER = 3.0
 """Seconds after which a node that is linked to nobody says so."""
 
@@ -96,14 +99,23 @@ async def run_services(
 
     async with AsyncExitStack() as stack:
         # Two nodes of one name would answer each other's questions.
-        living = await mesh.living(mesh.keys.alive_any(Role.NODE), timeout=LOOK_FOR_TWIN)
+        key, twin = mesh.keys.alive_any(Role.NODE), f"; end it, or set another host than {me.host} under [node]"
+        living = await mesh.living(key, timeout=LOOK_FOR_TWIN)
         if any(token.host == me.host for token in living):
-            raise MeshError(f"a node named {me.host} is already on the mesh; end it, or set another host under [node]")
+            raise MeshError(f"a node named {me.host} is already on the mesh{twin}")
         stall = StallWatch(mesh.now).start()
         stack.callback(stall.stop)
         mesh.watch_links()
-        token = mesh.alive(Token(me.host, Role.NODE, me.client, new_instance()))
+        # Of two that begin at one time the later one leaves.
+        own = Token(me.host, Role.NODE, me.client, f"{time.time_ns() // 1_000:x}-{new_instance()}")
+        token = mesh.alive(own)
         stack.callback(token.close)
+        await asyncio.sleep(TWIN_SHOWN)
+        living = await mesh.living(key, timeout=LOOK_FOR_TWIN)
+        if any(token.host == me.host and token.instance < own.instance for token in living):
+            raise MeshError(f"a node named {me.host} began at the same time{twin}")
+        watching = mesh.watch(key, functools.partial(_look_for_twin, own))
+        stack.callback(watching.close)
         rcs = LocalRcs(mesh, node, folder, stall, fail)
         stack.push_async_callback(rcs.stop)
         try:
@@ -202,6 +214,12 @@ async def run_services(
         manager.stopping("ends in order")
     if failures:
         raise NodeFailed(f"a service failed: {failures[0]!r}; see the log") from failures[0]
+
+
+def _look_for_twin(own: Token, other: Token, alive: bool) -> None:
+    """Both run then: each has begun where the other was not seen."""
+    if alive and other.host == own.host and other.instance != own.instance:
+        log.error("another node named %s is on the mesh too; end one, or set another host under [node]", own.host)
 
 
 def _keeper(mesh: Mesh, node: Node, folder: Path | None) -> BookingKeeper:
