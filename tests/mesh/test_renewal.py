@@ -12,7 +12,7 @@ from tests.mesh.both_meshes import ASK, LONG, NEWS, Ping, Pong, World, token
 from tests.mesh.kit import until
 from zscout.keyexpr import Role, Sender, Token
 from zscout.mesh import MeshError
-from zscout.mesh.renewal import LASTS, LONGEST, PATIENCE, SHORTEST, RenewableTransport, Suspicions
+from zscout.mesh.renewal import LASTS, LONGEST, OVERLAP, PATIENCE, SHORTEST, RenewableTransport, Suspicions
 from zscout.mesh.transport import Transport
 from zscout.testing.memory import MemoryNetwork
 from zscout.types import SECOND
@@ -83,6 +83,30 @@ async def test_settings_that_change_during_a_renewal_are_taken_after_it() -> Non
     transport.renew()
     await until(lambda: opened[-1] == "new" and transport._renewing is None)
     assert (opened, transport.behind) == (["old", "bad", "new"], False)
+    await transport.close()
+
+
+async def test_a_peer_that_links_to_the_old_session_meanwhile_is_waited_for() -> None:
+    """A network that has just come may be found by the old session first: its peers would see this process leave."""
+    network = MemoryNetwork()
+    old, fresh = network._session(), network._session()
+    peers: dict[Transport, list[str]] = {old: [], fresh: []}
+    for session in (old, fresh):
+        session.peers = lambda session=session: peers[session]  # type: ignore[method-assign, misc]
+
+    async def opening() -> Transport:
+        return fresh
+
+    transport = RenewableTransport(old, [opening])
+    transport.renew()
+    await until(lambda: transport.current is fresh)
+    peers[old].append("late")
+    await asyncio.sleep(2 * OVERLAP)
+    assert transport._renewing is not None
+    peers[fresh].append("late")
+    await asyncio.sleep(OVERLAP / 2)
+    assert transport._renewing is not None  # for it to learn what is declared
+    await until(lambda: transport._renewing is None)
     await transport.close()
 
 

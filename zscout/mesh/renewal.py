@@ -106,7 +106,7 @@ class RenewableTransport(Transport):
             for opening in self._openings:
                 fresh = await opening()
                 try:
-                    await self._linked(fresh)
+                    await self._linked(self.current, fresh)
                     old, self.current = self.current, fresh
                 except BaseException:
                     await fresh.close()
@@ -116,6 +116,9 @@ class RenewableTransport(Transport):
                     for declared in self._all():
                         declared.declare(fresh)
                     await asyncio.sleep(OVERLAP)
+                    # Peers may have linked to the old one meanwhile, as when a network has just come.
+                    if await self._linked(old, fresh):
+                        await asyncio.sleep(OVERLAP)
                 finally:
                     await old.close()
                     for declared in self._all():
@@ -132,12 +135,14 @@ class RenewableTransport(Transport):
         elif self.behind:
             self.renew()
 
-    async def _linked(self, fresh: Transport) -> None:
+    async def _linked(self, old: Transport, fresh: Transport) -> bool:
+        """Wait until `fresh` has the peers of `old`, for a while. Return True if it did not have them at once."""
         # Zenoh reports no links, but listing them costs nothing.
         tries = round(LINKED / LOOK_EVERY)
-        while tries and not set(self.current.peers()) <= {*fresh.peers(), fresh.id()}:
+        while tries and not set(old.peers()) <= {*fresh.peers(), fresh.id()}:
             tries -= 1
             await asyncio.sleep(LOOK_EVERY)
+        return tries < round(LINKED / LOOK_EVERY)
 
     def _all(self) -> list[_Declared]:
         return [declared for _, declared in sorted([*self._declared.items(), *self._tokens.items()])]
