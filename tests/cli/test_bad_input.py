@@ -93,6 +93,10 @@ book robot/a --for 1h --at 9:00 --patience 2h | --patience is longer than the bo
 book robot/a --for 1h --at 9:00 --zone Berlin | --zone: "Berlin" is not a time zone of the IANA database; did you mean
 book robot/a robot/a --for 1h --at 9:00 | robot/a is named twice; name each device once, with all its parameters after
 book robot/a --for 1h --at 9:00 --name 'a b' | --name "a b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
+maintain robot/a --broken x --well | zscout: --broken and --well exclude each other; use only one of them
+maintain robot/a --broken x --for 1h | zscout: --for can't be used with --broken, which has no date; leave it out
+maintain anvil --broken x | zscout: anvil is no device; name devices, or use zscout drain anvil
+maintain robot/a --broken '' | zscout: --broken: the reason is empty; write what is wrong
 maintain 'robot/a b' --for 1h --at 9:00 | device name "a b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
 maintain 'a b' --for 1h --at 9:00 | host "a b" is not valid; use 1 to 64 of A-Z a-z 0-9 _ . -
 maintain anvil anvil --for 1h --at 9:00 | zscout: anvil is named twice; name each device and host once

@@ -11,9 +11,11 @@ from pathlib import Path
 import pytest
 
 from tests.live.bench import until
+from tests.live.closed import ClosedLab
 from tests.live.lab import Lab, LeaderWatch, awaited
 from zscout.behaviors.client.arc import hold
-from zscout.behaviors.client.client import Client
+from zscout.behaviors.client.bookings import BookingsClient
+from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.messages import RcState, Unwell
 
 pytestmark = pytest.mark.live
@@ -81,7 +83,7 @@ async def test_the_leader_dies_while_a_device_is_unwell(tmp_path: Path) -> None:
             lab.signal("a", signal.SIGKILL)
             await leaders.lost("a")
             await lab.state(client, lambda state: state.host == "b" and bool(state.holds))
-            waits = await (await lab.client("other")).request("next", {BOARD: {}}, priority=5)
+            waits = await (await lab.client("other")).request("next", {BOARD: {}})
             await until(lambda: waits.reason.startswith(f"{BOARD} is unwell"))
             (tmp_path / "down").unlink()
             await device(lab, client, lambda state: state.unwell is None)
@@ -137,3 +139,57 @@ async def test_a_node_that_goes_loses_the_hold_and_forgets_that_its_device_is_un
         assert arc.grant is None
         (tmp_path / "down").unlink()
         await until(lambda: arc.grant is not None)
+
+
+@pytest.mark.slow
+async def test_a_holder_reports_its_device_broken_and_only_operators_get_it_until_it_is_well(lab: Lab) -> None:
+    lab.node("small", "robot/a", "robot/b")
+    client = await lab.client("crew")
+    await lab.ready(client, "robot/a", "robot/b")
+    async with hold(client, "test", {"robot/a": {}, "robot/b": {}}) as held:
+        await held.report_broken("its gripper is bent", "robot/a")
+        with pytest.raises(KeyError):
+            await held.report_broken("not mine", "robot/c")
+        assert held.active
+    waits = await (await lab.client("other")).request("next", {"robot/a": {}})
+    await until(lambda: "is broken, as" in waits.reason)
+    assert waits.reason.endswith(": its gripper is bent")
+    status = (await lab.zscout("status")).stdout
+    assert "broken: its gripper is bent (" in status
+    again = await lab.zscout("maintain", "robot/a", "--broken", "it smokes")
+    assert again.stdout == "robot/a: broken, until zscout maintain robot/a --well\n"
+    assert (await lab.zscout("request", "robot/a", "--priority", "10", "--", "true")).returncode == 0
+    assert waits.grant is None
+    well = await lab.zscout("maintain", "robot/a", "--well")
+    assert (well.returncode, well.stdout) == (0, "robot/a: granted again\n"), well.stderr
+    await until(lambda: waits.grant is not None)
+    none = await lab.zscout("maintain", "robot/a", "--well")
+    assert (none.returncode, none.stderr) == (
+        1,
+        "zscout: nobody has reported robot/a broken; see zscout booking list\n",
+    )
+
+
+@pytest.mark.slow
+async def test_in_a_secured_fleet_who_holds_a_device_and_operators_report_it_broken(tmp_path: Path) -> None:
+    async with ClosedLab(tmp_path) as lab:
+        lab.node("anvil", "robot/a", "robot/b")
+        bob, eve, ada = await lab.person("bob"), await lab.person("eve"), await lab.person("ada")
+        await lab.ready(bob, "robot/a", "robot/b")
+        async with hold(bob, "test", {"robot/a": {}}) as held:
+            for rcs in (["robot/b"], ["robot/a", "robot/b"]):
+                with pytest.raises(RequestRefused, match=r"bob \(client\) may not report devices broken .* not hold"):
+                    await BookingsClient(bob).report_broken(rcs, "no power")
+            with pytest.raises(RequestRefused, match=r"eve \(client\) may not report"):
+                await BookingsClient(eve).report_broken(["robot/a"], "no power")
+            await held.report_broken("no power")
+        [report] = (await BookingsClient(ada).list()).bookings
+        assert (report.broken, report.owner, report.priority) == (True, "bob", 10)
+        with pytest.raises(RequestRefused, match=r"eve \(client\) may not"):
+            await BookingsClient(eve).unbook(report.id)
+        async with hold(ada, "repair", {"robot/a": {}}, priority=10):
+            await BookingsClient(ada).report_broken(["robot/b"], "no light")
+        for one in (await BookingsClient(ada).list()).bookings:
+            await BookingsClient(ada).unbook(one.id)
+        async with hold(eve, "test", {"robot/a": {}, "robot/b": {}}):
+            pass

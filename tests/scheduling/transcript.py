@@ -12,7 +12,7 @@
     adopt ARC ... grant=TERM.N start=S         place ARC TERM.N             unconfirmed ARC TERM.N RC,...
     lead TERM
     book ID NEED,... start=S [runtime=S] [patience=S] [priority=N] [since=S] [bound=RC,...] [tentative]
-        [maintenance] [urgent] [lasting]       which may name a host: `@anvil`
+        [maintenance] [urgent] [lasting] [broken]       which may name a host: `@anvil`
     unbook ID [now]     redate ID S            slots ID NEED,... start=S until=S [runtime=S] [priority=N] [bookings]
     strategy NAME [patience=S] [half_life=S]   a new core; without it, it is `priority`; a half-life: with fair shares
 
@@ -194,6 +194,7 @@ def _booking(text: str, now: Ns) -> tuple[Booking, dict[str, str]]:
         maintenance="maintenance" in text.split(),
         urgent="urgent" in text.split(),
         lasting="lasting" in text.split(),
+        broken="broken" in text.split(),
     )
     return booking, options
 
@@ -212,7 +213,11 @@ def _request(text: str) -> tuple[model.ArcRequest, dict[str, str]]:
             raise ValueError(f"not a need: {need}")
         pairs = (pair.split("=") for pair in (match[2] or "").split())
         wanted[match[1]] = {key: Fraction(value) for key, value in pairs}
-    words = (word for word in rest if word not in {"keep", "maintenance", "urgent", "lasting", "bookings", "tentative"})
+    words = (
+        word
+        for word in rest
+        if word not in {"keep", "maintenance", "urgent", "lasting", "broken", "bookings", "tentative"}
+    )
     known = "priority runtime client place grant start booking patience since bound until waits continues"
     options = settings(words, *known.split())
     request = model.ArcRequest(

@@ -90,9 +90,25 @@ def in_maintenance(told: BookingsTold | None) -> dict[str, str]:
         rc: clean(f"{booking.name} ({whose(booking)}) until {_end(booking, date, told)}")
         for booking in (told.bookings if told is not None else ())
         for date in booking.dates
-        if told is not None and booking.maintenance and date.start <= told.time < date.end
+        if told is not None and booking.maintenance and not booking.broken and date.start <= told.time < date.end
         for rc in booking.maintained or booking.needs
     }
+
+
+def broken(told: BookingsTold | None) -> dict[str, str]:
+    """Why each broken RC is, and who has said so: `its gripper is bent (ada@desk)`."""
+    return {rc: _why_broken(booking) for booking in reports(told) for rc in booking.maintained or booking.needs}
+
+
+def reports(told: BookingsTold | None) -> list[BookingView]:
+    """The reports of broken devices that are in force."""
+    found = told.bookings if told is not None else []
+    return [booking for booking in found if booking.broken and not booking.unbooked]
+
+
+def _why_broken(booking: BookingView) -> str:
+    said = booking.who.comment if booking.who is not None else ""
+    return clean(f"{said or booking.name} ({whose(booking)})")
 
 
 def _end(booking: BookingView, date: BookedDate, told: BookingsTold) -> str:

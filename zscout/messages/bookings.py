@@ -71,6 +71,8 @@ class _Booking(Message, frozen=True):
     """Maintenance preempts holds within their minimum runtimes as well."""
     lasting: bool = False
     """Maintenance until it is given up: the leader puts its end off. So what is left of it is forgotten soon."""
+    broken: bool = False
+    """Lasting maintenance of broken devices: holds go on, and operators' requests are granted them."""
     who: Who | None = None
 
 

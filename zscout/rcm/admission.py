@@ -201,10 +201,13 @@ class Admission:
 
     # Bookings
 
-    def check_booking(self, wanted: Book | FindSlots, sender: Sender) -> None:
-        """Raises Refused for an invalid booking, or one that `sender` may not make."""
+    def check_booking(self, wanted: Book | FindSlots, sender: Sender, *, held: bool = False) -> None:
+        """Raises Refused for an invalid booking, or one that `sender` may not make. `held`: it reports devices broken
+        that it holds."""
         if isinstance(wanted, Book) and wanted.maintenance:
-            self.authority.check_operator(sender, "put devices in maintenance")
+            if not held:
+                what = "report devices broken that it does not hold" if wanted.broken else "put devices in maintenance"
+                self.authority.check_operator(sender, what)
             self._check_maintenance(wanted)
             return
         asked = Foresee(wanted.id, wanted.id, wanted.needs, wanted.priority, wanted.runtime)

@@ -42,6 +42,9 @@ class Booking(Struct, frozen=True):
     lasting: bool = False
     """Maintenance whose end is put off until it is given up."""
 
+    broken: bool = False
+    """Maintenance that ends no hold and keeps no operator away."""
+
     def __post_init__(self) -> None:
         check_request(f"booking {self.id}", self.needs, self.runtime)
 

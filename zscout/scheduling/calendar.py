@@ -308,7 +308,8 @@ class Calendar:
         The caller may end them meanwhile."""
         now = self._state.now
         for claim in self._state.maintenance.values() if self._state.maintenance else ():
-            for rc in self._state.rcs_in(claim.kept) if claim.booking.start <= now else ():
+            begun = claim.booking.start <= now and not claim.booking.broken
+            for rc in self._state.rcs_in(claim.kept) if begun else ():
                 for holder in list(rc.holders.values()):
                     due = holder.priority <= claim.booking.priority and holder.past_min_runtime(now)
                     if due or claim.booking.urgent:

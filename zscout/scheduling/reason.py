@@ -39,6 +39,8 @@ class ReasonCode(StrEnum):
     """The RC is booked by `by` before this would end."""
     MAINTENANCE = "maintenance"
     """The RC is in maintenance by `by`, or will be before this would end. It also ends kept holds."""
+    BROKEN = "broken"
+    """`by` has reported that the RC is broken: it is granted to operators only."""
     NOT_YET = "not_yet"
     QUOTA = "quota"
     """`detail`, its host, has its quota of ARCs running: `number`."""
@@ -267,6 +269,9 @@ _TEXTS: Final[Mapping[ReasonCode, Callable[[Reason], str]]] = {
     ),
     ReasonCode.BOOKED: lambda why: f"{why.rcs[0]} is booked by {why.by[0]} before this would be over",
     ReasonCode.MAINTENANCE: lambda why: f"maintenance of {why.rcs[0]} by {why.by[0]}",
+    ReasonCode.BROKEN: lambda why: (
+        f"{why.rcs[0]} is broken, as {person(why.by[0].who, '') or why.by[0].name} reports{why.by[0].comment}"
+    ),
     ReasonCode.NOT_YET: lambda _: "the time of its booking is still to come",
     ReasonCode.QUOTA: lambda why: f"host {why.detail} has reached its quota of running requests: {why.number}",
     ReasonCode.RC_QUOTA: lambda why: f"{why.detail} may hold {why.number} devices at one time",

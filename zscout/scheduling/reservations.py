@@ -46,6 +46,8 @@ class Reservation(NamedTuple):
     order: Order
     booked: Ns | None = None
     """The end, if it is booked."""
+    broken: bool = False
+    """Maintenance that operators' ARCs may disregard."""
 
     @property
     def excludes(self) -> bool:
@@ -115,7 +117,9 @@ class Reservations:
         if rc.bit & state.dates.claimed and (claims := state.dates.booked(rc, start, end)):
             for claim in claims:
                 booking = claim.booking
-                found.append(Reservation(claim.arc, booking.start, order_of(state, booking), booking.end))
+                found.append(
+                    Reservation(claim.arc, booking.start, order_of(state, booking), booking.end, booking.broken)
+                )
             if len(found) > 1:
                 found.sort(key=attrgetter("order"))
         return found
@@ -307,6 +311,8 @@ class Reservations:
 
     def _delays(self, arc: Arc, reservation: Reservation) -> bool:
         """Return True if `arc`, started now, would hold reserved RCs at their time, and must not."""
+        if reservation.broken and self._state.operator(arc.priority):
+            return False
         band, now = self._state.band, self._state.now
         begun = reservation.excludes and reservation.start <= now
         binds = begun or band(arc.priority) <= band(reservation.arc.priority)
@@ -328,6 +334,8 @@ class Reservations:
 
 
 def kept_for(rc: Rc, reservation: Reservation) -> Reason:
+    if reservation.broken:
+        return Reason(ReasonCode.BROKEN, (rc.name,), (reservation.arc.party,))
     if reservation.excludes:
         until = None if reservation.arc.request.keep else reservation.booked
         party = reservation.arc.party._replace(until=until)

@@ -123,7 +123,7 @@ class Picture:
         sick = Unwell(options["unwell"], since=180.0, left=45.0) if "unwell" in options else None
         self.health[name] = RcState(name, at, "i", shared, health=health, unwell=sick, figures=figures)
         if (kept := options.get("kept")) is not None:
-            start = round(NOW.timestamp()) + {"maintenance": -60, "drained": -60, "booked": 3600}[kept]
+            start = round(NOW.timestamp()) + {"maintenance": -60, "drained": -60, "broken": -60, "booked": 3600}[kept]
             self.cordoned |= {at} if kept == "drained" else set()
             date = BookedDate(start, start + 120, "open")
             view_of = BookingView(
@@ -138,7 +138,9 @@ class Picture:
                 maintenance=kept != "booked",
                 dates=[date],
                 maintained=[name] if kept == "drained" else [],
-                lasting=kept == "drained",
+                lasting=kept in ("drained", "broken"),
+                broken=kept == "broken",
+                who=Who("ada", "", "", "its gripper is bent") if kept == "broken" else None,
             )
             self.booked.bookings.append(view_of)
 

@@ -17,6 +17,7 @@ from contextlib import suppress
 from decimal import Decimal
 from typing import Any, Final
 
+from zscout.behaviors.client.bookings import BookingsClient
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.direct import DirectHold
 from zscout.behaviors.client.request import CommandRefused, HoldEnd, Needs, OpenArc, check_seconds
@@ -109,6 +110,12 @@ class Held:
         do = {"name": "expect_outage", "seconds": float(seconds), "each": each}
         tolerated = await asyncio.gather(*(self._announce(rc, do) for rc in self.rcs))
         return dict(zip(self.rcs, tolerated, strict=True))
+
+    async def report_broken(self, reason: str, *needs: str) -> None:
+        """Report devices of this hold broken (default: all), with a reason for people. Once the hold has ended they are
+        granted to operators only, until somebody runs `zscout maintain DEVICE --well`. Raises RequestRefused, KeyError
+        for what this hold does not have, ValueError for a bad reason."""
+        await BookingsClient(self._client).report_broken([self.rc(need) for need in needs] or self.rcs, reason)
 
     async def _announce(self, rc: str, do: Mapping[str, Any]) -> float:
         try:

@@ -101,6 +101,12 @@ class BlockingHeld:
         its `tolerate_max`; 0 for a device that cannot. Raises CommandRefused."""
         return self._lab.run(self._held.expect_outage(seconds, each=each))
 
+    def report_broken(self, reason: str, *needs: str) -> None:
+        """Report devices of this hold broken (default: all), with a reason for people. Once the hold has ended they are
+        granted to operators only, until somebody runs `zscout maintain DEVICE --well`. Raises RequestRefused, KeyError
+        for what this hold does not have, ValueError for a bad reason."""
+        self._lab.run(self._held.report_broken(reason, *needs))
+
     async def _over_within(self, timeout: float | None) -> bool:
         return await done_within(timeout, self._held.over())
 

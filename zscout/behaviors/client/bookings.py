@@ -14,7 +14,8 @@ From plain code: `lab.run(bookings.book(...))`, with `zscout.BookingsClient(lab.
 from __future__ import annotations
 
 import asyncio
-from datetime import datetime, timedelta
+from collections.abc import Collection
+from datetime import UTC, datetime, timedelta
 from decimal import Decimal
 from typing import Any, Final, TypeVar
 from zoneinfo import ZoneInfo
@@ -25,10 +26,11 @@ from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.identity import checked_comment
 from zscout.behaviors.client.rcm_link import BACKOFF, TRY_AGAIN
 from zscout.behaviors.client.request import Needs, RequestRefused, amounts, check_seconds
-from zscout.keyexpr import RANDOM, USERS
+from zscout.keyexpr import RANDOM, USERS, valid_name
 from zscout.mesh import Reply
 from zscout.mesh.exchange import naming_versions
 from zscout.messages import (
+    WINDOW,
     Book,
     BookingsAsk,
     BookingsTold,
@@ -49,6 +51,9 @@ TIMEOUT: Final = 15.0
 """Seconds within which some RCM answers, though the lead changes meanwhile."""
 PATIENCE: Final = 900.0
 """Seconds after its date in which a booking can be taken up, by default."""
+
+MAX_NAMED: Final = 60
+"""Characters of a default name: a number may follow."""
 
 M = TypeVar("M", bound=Message)
 
@@ -85,6 +90,7 @@ class BookingsClient:
         maintenance: bool = False,
         urgent: bool = False,
         lasting: bool = False,
+        broken: bool = False,
         comment: str = "",
     ) -> BookingView:
         """Book all of `needs` together, from `start` on for `runtime` seconds. Return when a second host has stored
@@ -100,6 +106,7 @@ class BookingsClient:
           devices of the host anvil, which gets no components meanwhile. Needs the rights of an operator.
         - `urgent`: maintenance also ends holds within their minimum runtimes.
         - `lasting`: maintenance until it is cancelled; `runtime` is 60 days, and the leader puts its end off.
+        - `broken`: lasting maintenance that ends no hold and that operators' requests disregard: see `report_broken`.
 
         Raises RequestRefused, with `code` `not_free` if a device is taken; RcmSilent if no leader answers;
         ValueError for a bad date or span of time."""
@@ -123,9 +130,29 @@ class BookingsClient:
                 maintenance=maintenance,
                 urgent=urgent,
                 lasting=lasting,
+                broken=broken,
                 who=self._who(comment),
             ),
             BookingView,
+        )
+
+    async def report_broken(self, rcs: Collection[str], reason: str) -> BookingView:
+        """Report devices broken: they are granted to operators only, until the returned booking is cancelled. Holds go
+        on. In a secured fleet an operator may report any device, others those that they hold. A device that is reported
+        already stays so. Raises RequestRefused, RcmSilent, ValueError for a bad reason."""
+        told = await self.list()
+        for booking in told.bookings:
+            if booking.broken and {*rcs} <= {*booking.needs, *booking.maintained} and not booking.unbooked:
+                return booking
+        return await self.book(
+            {rc: {} for rc in rcs},
+            datetime.fromtimestamp(int(told.time), UTC),
+            WINDOW,
+            name=valid_name(f"broken-{'-'.join(min(rcs).split('/'))}")[:MAX_NAMED],
+            maintenance=True,
+            lasting=True,
+            broken=True,
+            comment=reason,
         )
 
     async def unbook(self, booking: str, start: datetime | int | None = None) -> BookingView:

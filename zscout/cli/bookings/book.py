@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import date, datetime, time
 from decimal import Decimal
+from functools import partial
 from typing import Any, Final
 from zoneinfo import ZoneInfo
 
@@ -14,7 +15,7 @@ import click
 from msgspec.structs import replace
 
 from zscout import terminal
-from zscout.behaviors.client.bookings import PATIENCE, BookingsClient
+from zscout.behaviors.client.bookings import MAX_NAMED, PATIENCE, BookingsClient
 from zscout.behaviors.client.client import Client, RequestRefused
 from zscout.behaviors.client.identity import bounded
 from zscout.cli import common, completion
@@ -26,6 +27,7 @@ from zscout.cli.booked import (
     in_words,
     is_own,
     rcs_words,
+    reports,
     short,
     state_words,
     when_words,
@@ -64,8 +66,6 @@ A_YEAR: Final = MAX_AHEAD - 25 * 3600
 LOOK_AHEAD: Final = 7 * DAY
 """Seconds in which other times are sought where one is not free."""
 OTHERS: Final = 3
-MAX_NAMED: Final = 60
-"""Characters of a default name: a number may follow."""
 MAX_REMARKS: Final = 4
 DATE: Final = Parsed("date", parse_date)
 DURATION: Final = Parsed("duration", parse_duration)
@@ -76,7 +76,7 @@ def _maintained(text: str, _option: str) -> str:
     return check_need(text) if "/" in text else of_host(check_name(text, "host"))
 
 
-def date_options(command: F) -> F:
+def date_options(command: F, *, required: bool = True) -> F:
     """When, for how long and how often; and what both commands have besides."""
     for option in (
         common.json_option("Print one JSON object."),
@@ -87,8 +87,8 @@ def date_options(command: F) -> F:
         zone_option,
         click.option("--until", type=DATE, help="Last day or date of the repetition. Default: a year ahead."),
         click.option("--every", type=Parsed("days", parse_every), help=f"Repeat it at the same hour: {EVERY_FORMS}."),
-        click.option("--for", "runtime", type=DURATION, required=True, help="For how long: 90s, 5m, 2h, 1d12h."),
-        click.option("--at", type=DATE, required=True, help=f"When: {DATE_FORMS}."),
+        click.option("--for", "runtime", type=DURATION, required=required, help="For how long: 90s, 5m, 2h, 1d12h."),
+        click.option("--at", type=DATE, required=required, help=f"When: {DATE_FORMS}."),
     ):
         command = option(command)
     return command
@@ -150,16 +150,26 @@ async def book(needs: Any, priority: int, patience: Decimal | None, **rest: Any)
     metavar="DEVICE|HOST...",
     shell_complete=completion.maintained,
 )
+@click.option(
+    "--broken",
+    type=Parsed("text", parse_comment),
+    metavar="REASON",
+    help="Report broken devices, without a date: only operators get them until --well.",
+)
+@click.option("--well", is_flag=True, help="Report that broken devices work again.")
 @yes_option
-@date_options
+@partial(date_options, required=False)
 @common.runs
-async def maintain(needs: Sequence[str], yes: bool, **rest: Any) -> None:
+async def maintain(needs: Sequence[str], yes: bool, broken: str | None, well: bool, **rest: Any) -> None:
     """Reserve devices for maintenance, as an operator: a drain with a date.
 
     A pattern means all devices that match it, a HOST all its devices; the host gets no components meanwhile.
     Maintenance is a booking at the fleet's operator priority that no request can use. Requests that would not be over
     by its date do not start on the devices; requests that wait are shown until when. `zscout booking cancel` ends it
     early.
+
+    --broken REASON reports devices broken, from now on: holds go on, and the devices are granted to operators only
+    until --well. In a secured fleet an operator may report any device, others those that they hold.
 
     It prints whom it displaces, holds and bookings, and asks on stderr; if stdin is not a terminal, add --yes (exit
     code 2).
@@ -169,11 +179,55 @@ async def maintain(needs: Sequence[str], yes: bool, **rest: Any) -> None:
       zscout maintain robot/arm1 --at now --for 1h && zscout booking cancel maintenance
       zscout maintain robot/arm1 --at "sat 8:00" --for 4h --comment 'new gripper'
       zscout maintain 'robot/*' anvil --at "mon 7:00" --for 30m --every week --until 2027-03-31
+      zscout maintain dut/board --broken 'its power supply smokes'
+      zscout maintain dut/board --well
     """
     if twice := [need for need in needs if needs.count(need) > 1]:
         raise BadInput(f"{twice[0].removeprefix('@')} is named twice; name each device and host once")
+    if broken is not None or well:
+        await _report(needs, broken, well=well, **rest)
+        return
+    for option, given in (("--at", rest["at"]), ("--for", rest["runtime"])):
+        if given is None:
+            raise click.UsageError(f"{option} is missing")
     priority = common.the_fleet().operator_priority
     await _make({need: {} for need in needs}, priority=priority, patience=None, maintenance=True, yes=yes, **rest)
+
+
+async def _report(needs: Sequence[str], broken: str | None, *, well: bool, as_json: bool, **dates: Any) -> None:
+    """Report devices broken, or well again. Raises BadInput, Failed, RequestRefused."""
+    if broken is not None and well:
+        raise BadInput("--broken and --well exclude each other; use only one of them")
+    if broken == "":
+        raise BadInput("--broken: the reason is empty; write what is wrong")
+    mode = "--well" if well else "--broken"
+    if given := [name for name, value in dates.items() if value]:
+        option = {"runtime": "for"}.get(given[0], given[0])
+        raise BadInput(f"--{option} can't be used with {mode}, which has no date; leave it out")
+    if hosts := [host for host in map(host_in, needs) if host is not None]:
+        raise BadInput(f"{hosts[0]} is no device; name devices, or use zscout drain {hosts[0]}")
+    async with common.connected("maintain") as client:
+        client.who = replace(client.who or Who(), command="")
+        bookings, me = BookingsClient(client), User.of(client)
+        try:
+            if broken:
+                reported = [await bookings.report_broken(needs, broken)]
+            else:
+                told = await ask_bookings(client)
+                wanted = {*needs}
+                reported = [one for one in reports(told) if wanted & {*one.needs, *one.maintained}]
+                if not reported:
+                    raise Failed(f"nobody has reported {', '.join(needs)} broken; see zscout booking list")
+                reported = [await bookings.unbook(report.id) for report in reported]
+        except RequestRefused as refused:
+            raise explained(refused) from None
+    if as_json:
+        terminal.print_json({"broken" if broken else "well": [booking_json(report, me) for report in reported]})
+        return
+    for report in reported:
+        rcs = rcs_words(report)
+        then = f"until zscout maintain {' '.join(sorted(report.needs))} --well"
+        terminal.print_line(clean(f"{rcs}: broken, {then}" if broken else f"{rcs}: granted again"))
 
 
 @dataclass(frozen=True, slots=True)

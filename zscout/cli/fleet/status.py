@@ -170,18 +170,20 @@ class Standing:
         homes = self._homes()
         lost = {device.rc for device in self.devices.known().values() if device.health != "ok"}
         maintained, coming = booked.in_maintenance(self.booked), booked.coming(self.booked)
+        broken = booked.broken(self.booked)
         sick = {rc for rc, device in self.devices.known().items() if unwell(device)}
         rows, styles = [], []
         for view in state.rcs:
             holders = [hold for hold in state.holds if view.rc in hold.needs]
-            free = "maintenance" if view.rc in maintained else "unwell" if view.rc in sick else "free"
+            why = {"broken": broken, "maintenance": maintained, "unwell": sick}
+            free = next((word for word, rcs in why.items() if view.rc in rcs), "free")
             there = "held" if holders else free
             words = there if view.present else "lost" if view.rc in lost else "absent"
             kind = "shared" if view.sharable else "exclusive"
             holds = ",\n".join(request_words(hold.arc, hold.who, hold.client, hold.needs[view.rc]) for hold in holders)
-            held_by = {"maintenance": maintained, "free": coming}.get(words, {}).get(view.rc, holds)
+            held_by = {"broken": broken, "maintenance": maintained, "free": coming}.get(words, {}).get(view.rc, holds)
             rows.append((view.rc, kind, words, homes.get(view.rc, "-"), held_by))
-            styles.append({"absent": "red", "lost": "red", "free": "green"}.get(words, "yellow"))
+            styles.append({"absent": "red", "lost": "red", "broken": "red", "free": "green"}.get(words, "yellow"))
         columns, spare = ("DEVICE", "USE", "STATE", "HOST", "HELD BY"), ("USE", "HOST", "HELD BY")
         return Table("Devices", columns, rows, styles, spare, beneath={"HELD BY"})
 
@@ -216,15 +218,16 @@ class Standing:
 
     def _devices(self, chosen: Selection) -> Table:
         """Health and figures: of devices with remarks, with `every` of all that report figures."""
-        known = self.devices.known()
+        known, broken = self.devices.known(), booked.broken(self.booked)
         said = {view.rc: list(remarks(view)) for view in (self.state.rcs if self.state is not None else ())}
         rows, styles = [], []
-        for rc in filter(chosen.shows, sorted(known.keys() | said.keys())):
+        for rc in filter(chosen.shows, sorted(known.keys() | said.keys() | broken.keys())):
             device, words = known.get(rc), said.get(rc, [])
             figures = device.figures if device is not None else {}
             if device is not None and device.health != "ok":
                 words = words if words and words[0].startswith(device.health) else [device.health, *words]
-            words = [*filter(None, (unwell(device),)), *words]
+            told = f"broken: {broken[rc]}" if rc in broken else ""
+            words = [*filter(None, (unwell(device), told)), *words]
             if frozen := figures.get("frozen_seconds"):
                 words = [*words, f"frozen: the same picture for {span(frozen)}"]
             if words or (self.every and figures):

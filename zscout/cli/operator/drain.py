@@ -15,13 +15,12 @@ import click
 from msgspec.structs import replace
 
 from zscout import terminal
-from zscout.behaviors.client.bookings import BookingsClient
+from zscout.behaviors.client.bookings import MAX_NAMED, BookingsClient
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.placer_client import PlacerClient
 from zscout.behaviors.client.request import RequestRefused
 from zscout.cli import common
 from zscout.cli.booked import ask_bookings, explained, free_name, is_own, maintenance_of
-from zscout.cli.bookings.book import MAX_NAMED
 from zscout.cli.components import placing
 from zscout.cli.ownership import User
 from zscout.cli.requests.options import parse_comment, timeout_option

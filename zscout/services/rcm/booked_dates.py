@@ -134,6 +134,7 @@ class BookedDates:
             maintenance=record.maintenance,
             urgent=record.urgent,
             lasting=record.lasting,
+            broken=record.broken,
         )
 
     def dated(self, request: ArcRequest) -> ArcRequest:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from decimal import Decimal
 from typing import Final
@@ -41,7 +41,7 @@ from zscout.scheduling.runtimes import RuntimeEstimator
 from zscout.services.bookings.dates import DAY, dates, told, zone_of
 from zscout.services.bookings.records import Records
 from zscout.services.rcm.booked_dates import MAX_CLAIMS, BookedDates, Date, start_of
-from zscout.types import SECOND, Ns
+from zscout.types import SECOND, Need, Ns
 
 MAX_UNDECIDED: Final = 64
 """Operations that wait for votes, or for a keeper, at one time."""
@@ -97,11 +97,17 @@ class BookingHandler:
     def _book(self, ticket: Ticket, wanted: Book, sender: Sender) -> None:
         if self._is_made(ticket, wanted.id, sender):
             return
-        self._admission.check_booking(wanted, sender)
+        self._admission.check_booking(wanted, sender, held=wanted.broken and self._is_held(wanted.needs, sender))
         record = self._record(wanted, sender)
         named = {need: amounts for need, amounts in wanted.needs.items() if host_in(need) is None}
         self._door.check(self._now, named, may_wait=False)
         self._try(_Undecided(ticket, lambda: self._is_made(ticket, record.id, sender) or self._decide(ticket, record)))
+
+    def _is_held(self, needs: Collection[Need], sender: Sender) -> bool:
+        """Return True if requests of `sender`, or of another of its name, hold all these devices now."""
+        arcs = map(self._core.arc, {*self._core.arcs_of(str(sender)), *self._core.arcs_of_owners([sender.host])})
+        held = {rc for arc in arcs if arc is not None and arc.hold is not None for rc in arc.needs}
+        return held >= {*needs}
 
     def _is_made(self, ticket: Ticket, booking: str, sender: Sender) -> bool:
         """Answers what is asked for again. Raises Refused."""
@@ -120,6 +126,8 @@ class BookingHandler:
             runtime, patience = duration(wanted.runtime, "runtime"), duration(wanted.patience, "patience")
             if (wanted.urgent or wanted.lasting) and not wanted.maintenance:
                 raise ValueError("only maintenance can be urgent or lasting")
+            if wanted.broken and (wanted.urgent or not wanted.lasting or any(map(host_in, wanted.needs))):
+                raise ValueError("broken devices are in lasting maintenance, which is not urgent and names no host")
             if wanted.lasting and (wanted.every or wanted.runtime != WINDOW):
                 raise ValueError(f"lasting maintenance is not repeated, and its runtime is {WINDOW} s")
         except (BadName, ValueError) as error:
