@@ -330,3 +330,132 @@ def test_who_waits_in_another_thread_as_a_lab_is_closed_is_told(fleet: CliFleet)
         thread.join()
     """
     assert rest_of(script(fleet.lab, text)) == ["this lab is closed; zscout.connect() gives a new one"]
+
+
+NOTEBOOK = """
+    # As ipykernel does: an event loop runs cells, one by one.
+    import ast, asyncio, os
+
+    space = {"zscout": zscout, "say": say, "time": time}
+
+    async def cell(text):
+        await asyncio.sleep(0)
+        exec(compile(text, "cell", "exec"), space)
+
+    async def served(until):
+        while not os.path.exists(until):
+            await asyncio.sleep(0.05)
+"""
+
+
+@pytest.mark.parametrize(
+    "entering",
+    ["lab.hold('survey', {'robot/a': {}}).__enter__()", "lab.acquire('survey', {'robot/a': {}})"],
+    ids=["hold", "acquire"],
+)
+def test_a_hold_that_is_kept_across_cells_ends_no_event_loop(fleet: CliFleet, tmp_path: Path, entering: str) -> None:
+    taken = tmp_path / "taken"
+    text = (
+        NOTEBOOK
+        + f"""
+    async def kernel():
+        await cell({f"lab = zscout.connect(); held = {entering}; held.on_lost(lambda: say('called back'))"!r})
+        say("entered")
+        await served({str(taken)!r})
+        await space["held"].over()
+        say("lost", space["held"].lost)
+        try:
+            await cell("held.command('robot/a', {{'name': 'echo', 'value': 1}})")
+        except zscout.Revoked as revoked:
+            say("next use", revoked.outcome)
+        await cell("held.release(); held.release(); lab.close()")
+
+    asyncio.run(kernel())
+    """
+    )
+    notebook = script(fleet.lab, text)
+    read_until(notebook, "entered")
+    take(fleet, "robot/a", "--priority", "5")
+    taken.touch()
+    assert sorted(rest_of(notebook)) == ["called back", "lost True", "next use preempted"]
+    assert fleet.idle("robot/a")
+
+
+def test_a_suspended_body_learns_of_the_end_when_it_runs(fleet: CliFleet, tmp_path: Path) -> None:
+    taken = tmp_path / "taken"
+    text = (
+        NOTEBOOK
+        + f"""
+    async def lifespan(lab):
+        with lab.hold("survey", {{"robot/a": {{}}}}) as held:
+            say("entered")
+            await served({str(taken)!r})
+            await held.over()
+            say("lost", held.lost)
+            held.check()
+
+    async def serve(lab):
+        await asyncio.create_task(lifespan(lab))
+
+    with zscout.connect() as lab:
+        try:
+            asyncio.run(serve(lab))
+        except zscout.Revoked as revoked:
+            say(revoked.outcome)
+    """
+    )
+    app = script(fleet.lab, text)
+    read_until(app, "entered")
+    take(fleet, "robot/a", "--priority", "5")
+    taken.touch()
+    assert rest_of(app) == ["lost True", "preempted"]
+    assert fleet.idle("robot/a")
+
+
+def test_a_body_within_a_context_manager_of_ones_own_is_interrupted(fleet: CliFleet) -> None:
+    text = """
+        from contextlib import ExitStack, contextmanager
+
+        @contextmanager
+        def prepared(lab):
+            with ExitStack() as stack:
+                yield stack.enter_context(lab.hold("survey", {"robot/a": {}}))
+
+        with zscout.connect() as lab:
+            try:
+                with prepared(lab):
+                    say("entered")
+                    time.sleep(LONGER)
+            except zscout.Revoked as revoked:
+                say(revoked.outcome)
+    """
+    assert preempted(fleet, text) == ["preempted"]
+
+
+@pytest.mark.parametrize("start", ["multiprocessing", "os.fork"])
+def test_a_forked_process_is_told_to_be_spawned_and_its_parent_goes_on(fleet: CliFleet, start: str) -> None:
+    text = f"""
+        import multiprocessing, os
+
+        def child():
+            for use in (zscout.connect, lambda: lab.hold("other", {{"robot/b": {{}}}}).__enter__(), held.check):
+                try:
+                    use()
+                except (RuntimeError, zscout.MeshError) as error:
+                    say("spawn" in str(error), "fork" in str(error))
+
+        with zscout.connect() as lab, lab.hold("survey", {{"robot/a": {{}}}}) as held:
+            if {start == "os.fork"}:
+                if not (process := os.fork()):
+                    child()
+                    sys.exit(0)  # leaves the bodies of the parent's `with`
+                say(os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]))
+            else:
+                process = multiprocessing.get_context("fork").Process(target=child)
+                process.start()
+                process.join()
+                say(process.exitcode)
+            say(held.command("robot/a", {{"name": "echo", "value": 5}}, ttl=60), held.active)
+    """
+    assert rest_of(script(fleet.lab, text)) == ["True True"] * 3 + ["0", "5 True"]
+    assert fleet.idle("robot/a", "robot/b")

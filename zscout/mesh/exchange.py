@@ -29,6 +29,9 @@ R = TypeVar("R")
 S = TypeVar("S")
 
 
+SPAWN: Final = 'start it with "spawn": multiprocessing.get_context("spawn")'
+
+
 class MeshError(Exception):
     """The mesh can't be joined, or is closed; the message names the remedy."""
 

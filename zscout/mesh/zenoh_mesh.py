@@ -32,7 +32,7 @@ from zscout.config.strict import BadInput
 from zscout.keyexpr import FleetMember, Keys, Sender, access_control
 from zscout.logs import shortage
 from zscout.mesh import interfaces
-from zscout.mesh.exchange import MeshError
+from zscout.mesh.exchange import SPAWN, MeshError
 from zscout.mesh.neighbours import Meeting
 from zscout.mesh.relinking import MEETING, Relinking
 from zscout.mesh.renewal import RenewableTransport
@@ -301,6 +301,10 @@ def check_room(files: int = SESSION_FILES, threads: int = SESSION_THREADS) -> No
 
 def open_session(settings: Callable[[], zenoh.Config]) -> zenoh.Session:
     """Blocks. Raises MeshError."""
+    global _opened_in
+    if _opened_in not in (None, os.getpid()):
+        raise MeshError(f"a forked process can't join the mesh after its parent has; {SPAWN}")
+    _opened_in = os.getpid()
     try:
         check_room()
     except (OSError, RuntimeError) as error:
@@ -354,6 +358,11 @@ def _relinking(session: zenoh.Session, config: MeshConfig, security: Security | 
         return settings
 
     return Relinking(session, zenoh_config(config, security), meeting)
+
+
+_opened_in: int | None = None
+"""The process that opened a session. Zenoh's threads do not survive a fork: a session opened in the child hangs, and
+can crash the parent."""
 
 
 def in_thread(name: str, call: Callable[[], T]) -> Future[T]:

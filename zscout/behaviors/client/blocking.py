@@ -3,15 +3,20 @@
     with zscout.connect() as lab, lab.hold("survey", {"robot/scout33": {}}) as held:
         held.command("robot/scout33", {"name": "echo", "value": 1})
 
-At the end of the hold a signal (`interruption.py`) raises `Revoked` in the body: only in the main thread, and not while
-a call of a C library ignores signals. Devices obey nothing under a hold that is over, whatever the body does."""
+At the end of the hold a signal (`interruption.py`) raises `Revoked` in the body: only in the main thread, while the
+body's function is on the stack, and not while a call of a C library ignores signals. Elsewhere the next use of `held`
+raises it. Devices obey nothing under a hold that is over, whatever the body does.
+
+    held = lab.acquire("survey", {"robot/scout33": {}})  # in one cell of a notebook
+    held.release()  # in another"""
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import threading
-from collections.abc import Coroutine, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from concurrent import futures
 from contextlib import AbstractContextManager
 from types import TracebackType
@@ -24,6 +29,7 @@ from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.interruption import InterruptibleBody, interruptible, uninterrupted
 from zscout.behaviors.client.request import HoldEnd, Needs
 from zscout.config.fleet import Fleet
+from zscout.mesh.exchange import SPAWN
 from zscout.mesh.supervision import done_within
 from zscout.types import SECOND, Grant
 
@@ -32,16 +38,19 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 CLOSED: Final = "this lab is closed; zscout.connect() gives a new one"
+FORKED: Final = f"this lab belongs to the parent of this forked process; join the mesh in a new process: {SPAWN}"
 LAST_STEPS: Final = 1.0
 """Seconds in which what still runs in the loop hears that its lab is closed."""
 
 
 class BlockingHeld:
-    """A hold, inside the body of `with lab.hold(...)`."""
+    """A hold, inside the body of `with lab.hold(...)`, or from `lab.acquire(...)` to its release."""
 
-    def __init__(self, lab: Lab, held: Held) -> None:
-        self._lab, self._held = lab, held
+    def __init__(self, lab: Lab, held: Held, attempt: BlockingAttempt) -> None:
+        self._lab, self._held, self._attempt = lab, held, attempt
         self._body = InterruptibleBody(self._revoked)
+        self._raised = False
+        self._watches: set[asyncio.Task[None]] = set()
 
     @property
     def grant(self) -> Grant:
@@ -59,12 +68,37 @@ class BlockingHeld:
         return self._held.completed
 
     @property
+    def lost(self) -> bool:
+        """True once the hold is over, for whatever reason."""
+        return not self.active
+
+    def on_lost(self, callback: Callable[[], object]) -> None:
+        """Call `callback` in a thread of zscout's once the hold is over; at once if it is. What takes long there delays
+        other holds of this lab."""
+        self._lab.run(self._call_when_over(callback))
+
+    async def over(self) -> None:
+        """Wait, in any event loop, until the hold is over."""
+        self._body.waits = True
+        try:
+            await asyncio.wrap_future(self._lab.submit(self._held.over()))
+            self._body.told = True
+        finally:
+            self._body.waits = False
+
+    def release(self) -> None:
+        """Give the devices back. Does nothing for a hold that is over, or that was given back."""
+        self._attempt._leave()
+
+    @property
     def remaining(self) -> float:
         """Seconds left of the minimum runtime, in which only a higher priority preempts the hold."""
         return self._held.remaining
 
     def check(self) -> None:
-        """Raise Revoked once the hold is over."""
+        """Raise Revoked once the hold is over, and RuntimeError in a fork."""
+        if self._lab.forked:
+            raise RuntimeError(FORKED)
         if not self.active:
             self._body.told = True
             raise self._revoked()
@@ -91,8 +125,10 @@ class BlockingHeld:
 
     def command(self, need: str, do: Mapping[str, Any], *, ttl: float = 1.0) -> Any:
         """Have a held device carry out a command, and return its result. `need`: the name of the device, or the pattern
-        that it satisfies. A device that is not ready has `ttl` seconds. Raises CommandRefused, and KeyError for a
-        pattern that was not requested."""
+        that it satisfies. A device that is not ready has `ttl` seconds. Raises CommandRefused, KeyError for a pattern
+        that was not requested, and once Revoked if the hold is over."""
+        if not self._raised:
+            self.check()
         return self._lab.run(self._held.command(need, do, ttl=ttl)).result
 
     def expect_outage(self, seconds: float, *, each: bool = False) -> dict[str, float]:
@@ -107,10 +143,17 @@ class BlockingHeld:
         for what this hold does not have, ValueError for a bad reason."""
         self._lab.run(self._held.report_broken(reason, *needs))
 
+    async def _call_when_over(self, callback: Callable[[], object]) -> None:
+        over = asyncio.create_task(self._held.over())
+        self._watches.add(over)
+        over.add_done_callback(self._watches.discard)
+        over.add_done_callback(lambda task: task.cancelled() or callback())
+
     async def _over_within(self, timeout: float | None) -> bool:
         return await done_within(timeout, self._held.over())
 
     def _revoked(self) -> Revoked:
+        self._raised = True
         arc = self._held.arc
         over = HoldEnd("completed", "its minimum runtime is over") if self._held.active else None
         return Revoked(arc, over)
@@ -127,7 +170,7 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
 
     def __enter__(self) -> BlockingHeld:
         try:
-            self._held = BlockingHeld(self._lab, self._lab.run(self._granted()))
+            self._held = BlockingHeld(self._lab, self._lab.run(self._granted()), self)
             if self._interrupt and interruptible():
                 self._held._body.enter()
                 self._lab.run(self._watch_over(self._held))
@@ -142,6 +185,8 @@ class BlockingAttempt(AbstractContextManager[BlockingHeld, None]):
     ) -> None:
         held = self._held
         assert held is not None  # noqa: S101 - entered before left
+        if self._lab.forked:
+            return
         unknown = kind is None and not held.active and not held.completed and not held._body.told
         revoked = held._revoked() if unknown else None
         self._leave()
@@ -203,7 +248,7 @@ class Lab:
         self._loop = uvloop.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="zscout", daemon=True)
         self._asking = threading.Lock()
-        self._stopped = False
+        self._stopped, self._process = False, os.getpid()
         self._thread.start()
         try:
             self.client = self.run(Client.connect(name, fleet=fleet, host=host))
@@ -218,21 +263,30 @@ class Lab:
         self.close()
 
     @property
+    def forked(self) -> bool:
+        """True in a fork of the process that connected: it has neither the thread nor the connection."""
+        return self._process != os.getpid()
+
+    @property
     def closed(self) -> bool:
-        # No thread: this is a fork of the process that has it.
         """True once it was closed. Also true in a fork of the process."""
-        return self._stopped or not self._thread.is_alive()
+        return self._stopped or self.forked
+
+    def submit(self, coroutine: Coroutine[Any, Any, T]) -> futures.Future[T]:
+        """Run a coroutine in the client's event loop. Raises RuntimeError if the lab is closed, or in a fork."""
+        if self.forked:  # another thread may have had the lock
+            coroutine.close()
+            raise RuntimeError(FORKED)
+        with self._asking:
+            if not self.closed:
+                return asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+        coroutine.close()
+        raise RuntimeError(CLOSED)
 
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
         """Run a coroutine in the client's event loop, and return its result. Raises RuntimeError if the lab is closed,
         or is closed meanwhile by another thread."""
-        with self._asking:
-            if closed := self.closed:
-                coroutine.close()
-            else:
-                future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
-        if closed:
-            raise RuntimeError(CLOSED)
+        future = self.submit(coroutine)
         try:
             return future.result()
         except futures.CancelledError:
@@ -273,8 +327,8 @@ class Lab:
         waits for one of its devices. With `keep=False` it ends after `min_runtime`.
 
         When the hold ends, Revoked is raised in a body in the main thread, whatever it is doing; its `outcome` is
-        `completed` after the minimum runtime. In other threads, and with `interrupt=False`, call `held.check()` or
-        `held.wait()`.
+        `completed` after the minimum runtime. In other threads, in a body that is suspended (of a generator or a
+        coroutine), and with `interrupt=False`, the next command raises it, or `held.check()`.
 
         - `confirmed`: enter when all devices have confirmed the grant, instead of at the grant.
         - `direct`: the body also reaches its devices past zscout. After the end of the hold it has nine tenths of the
@@ -290,6 +344,13 @@ class Lab:
         how |= {"comment": comment, "direct": direct, "confirmed": confirmed, "wait_for_device": wait_for_device}
         how["booking"] = booking
         return BlockingAttempt(self, hold(self.client, name, needs, **how), interrupt=interrupt)
+
+    def acquire(self, name: str, needs: Needs, **how: Any) -> BlockingHeld:
+        """Hold devices until `release()`, across functions or cells of a notebook. Takes what `hold` takes, and raises
+        what entering that does. Nothing is interrupted at the end of the hold: `held.lost` tells, `held.on_lost` calls
+        back, and the next command raises Revoked. `close`, and the end of this process, give the devices back."""
+        attempt = self.hold(name, needs, **how, interrupt=False)
+        return attempt.__enter__()
 
     def _stop(self) -> None:
         with self._asking:
