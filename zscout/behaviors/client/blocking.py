@@ -127,7 +127,7 @@ class BlockingHeld:
         """Have a held device carry out a command, and return its result. `need`: the name of the device, or the pattern
         that it satisfies. A device that is not ready has `ttl` seconds. Raises CommandRefused, KeyError for a pattern
         that was not requested, and once Revoked if the hold is over."""
-        if not self._raised:
+        if not self._raised and not self._lab.closed:
             self.check()
         return self._lab.run(self._held.command(need, do, ttl=ttl)).result
 
