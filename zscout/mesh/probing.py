@@ -103,10 +103,11 @@ async def heard(config: MeshConfig) -> list[Heard]:
                 if (hello := scout.try_recv()) is None:
                     await asyncio.sleep(POLL)
                 elif not (zid := str(hello.zid)).startswith(MEETING):
-                    addresses = tuple(address for address in hello.locators if "[fe80:" not in address)
-                    hosts = {match[2].strip("[]") for at in addresses if (match := _ADDRESS.match(at))}
-                    # Every host has loopback: by its own it is known only if it has no other address.
-                    here = bool((hosts - LOOPBACKS or hosts) & own)
+                    hosts = {at: match[2].strip("[]") for at in hello.locators if (match := _ADDRESS.match(at))}
+                    # Every host has loopback: by that a process is known, and called, only if it has no other address.
+                    beyond = {at: host for at, host in hosts.items() if host not in LOOPBACKS} or hosts
+                    here = bool(set(beyond.values()) & own)
+                    addresses = tuple(at for at in (hosts if here else beyond) if "[fe80:" not in at)
                     found[zid] = Heard(zid, addresses, here, str(hello.whatami) == "router")
     except (zenoh.ZError, OSError, RuntimeError):  # no interface for it, or no room
         pass

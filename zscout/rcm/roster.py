@@ -355,7 +355,7 @@ class Roster:
 
     def awaits(self, now: Ns, arc: ArcId, names: Iterable[RcName]) -> bool:
         """Return True if `arc` may still turn out to hold one of these RCs: it is pending; or has not answered, and its
-        token was first seen less than a lease ago, or this term has never seen one and learned of the ARC less than a
+        token was first seen less than a lease ago, or none is seen and this term learned of the ARC less than a
         lease ago. A lease through which this leader stalled does not count."""
         self._now = now
         for name in names:
@@ -363,7 +363,7 @@ class Roster:
             if rc.pending is not None:
                 return True
             since = rc.seen
-            if since is None and rc.named is None:
+            if since is None and rc.joined is None:
                 since = self._awaited_since(arc)
             if rc.joined is None and since is not None and (now - since < self.sight.lease or self._stood_still):
                 return True

@@ -119,7 +119,7 @@ def test_who_has_no_role_is_told_so() -> None:
         (MeshConfig(multicast=False), {}, "it is off, and `connect` names nobody: no host finds another"),
         (MeshConfig(), {"interfaces": {"eth0": "Network is unreachable"}}, "(eth0: Network is unreachable)"),
         (MeshConfig(), {"interfaces": {}}, "(no interface is up for it)"),
-        (MeshConfig(), {"interfaces": {}}, '; for this host alone, write interface = "lo" in each file'),
+        (MeshConfig(), {"interfaces": {}}, "; until then this host works alone, and joins the others by itself"),
         (MeshConfig(), {"heard": []}, "nobody is heard at 224.0.0.224:7446 on eth0"),
     ],
 )

@@ -180,6 +180,21 @@ async def test_what_somebody_asked_for_long_ago_is_waited_for_whoever_believes_t
     assert (await asking).grant == later.grant
 
 
+async def test_an_rc_that_began_again_alone_is_waited_for_though_it_was_seen_before() -> None:
+    """As on a host that began before its network was there: its client's link comes before its RC's."""
+    fleet = FakeFleet()
+    fleet.rcm(5)
+    before = fleet.rc("robot/c")
+    await fleet.joined(before)
+    await before.mesh.close()
+    await asyncio.sleep(5)
+    one = fleet.client("one")
+    asking = asyncio.create_task(one.ask("other", "robot/c", grant=OTHER.grant, rcs=["robot/c"]))
+    await asyncio.sleep(0.5)
+    fleet.rc("robot/c", term=OTHER.grant.term, holders=[OTHER], instance="i2")
+    assert (await asking).grant == OTHER.grant
+
+
 async def test_a_leader_that_stood_still_waits_for_what_may_be_held_as_if_it_had_just_been_asked() -> None:
     """What has come meanwhile is not handled yet."""
     fleet, loop = FakeFleet(), asyncio.get_running_loop()

@@ -156,7 +156,7 @@ def _multicast(seen: Evidence) -> Iterator[Finding]:
             "; ".join(f"{name}: {problem}" for name, problem in seen.interfaces.items()) or "no interface is up for it"
         )
         remedy = "mend `interface` under [mesh] or the network, or name hosts under connect"
-        remedy += '; for this host alone, write interface = "lo" in each file' * (not seen.interfaces)
+        remedy += "; until then this host works alone, and joins the others by itself" * (not seen.interfaces)
         yield Finding("multicast", "note" if linked else "mend", f"it is not possible here ({why})", remedy)
     elif not seen.heard:
         remedy = (
