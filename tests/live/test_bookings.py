@@ -4,7 +4,10 @@ other, a whole fleet killed and started again."""
 from __future__ import annotations
 
 import asyncio
+import json
 import signal
+import sys
+import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -99,3 +102,44 @@ async def test_a_fleet_that_was_killed_whole_keeps_what_was_booked(tmp_path: Pat
         assert [*await listed(bookings, lambda found: bool(found))] == ["survey"]
         assert await taken_up(client, booked) > -0.5
         assert not await listed(bookings, lambda found: not found)
+
+
+WRONG_CLOCK = """
+import sys, time
+right, ahead = time.time, sys.argv.pop(1)
+time.time = lambda: right() + float(open(ahead).read())
+from zscout.node import main
+main()
+"""
+
+
+async def test_a_host_whose_clock_is_put_right_leads_in_the_right_time_and_its_hold_is_no_longer(lab: Lab) -> None:
+    ahead, file = lab.folder / "ahead", lab.folder / "anvil.toml"
+    ahead.write_text("-259200")
+    rc = '[[rc]]\nname = "robot/a"\ndriver = "exclusive"\n'
+    text = f'[node]\nhost = "anvil"\nfleet = "fleet.toml"\nstate = "{lab.folder}/kept"\n{lab.security_of("anvil")}{rc}'
+    file.write_text(text)
+    lab.nodes["anvil"] = lab.spawn([sys.executable, "-c", WRONG_CLOCK, str(ahead), str(file)], log="anvil.log")
+    client = await lab.client("program")
+    await lab.ready(client, "robot/a")
+    bookings = BookingsClient(client)
+    assert abs((await bookings.list()).time - time.time() + 259_200) < HANG
+    # Until it is known that no other host knows the time of the fleet, the leader refuses, and the clock just counts.
+    await bookings.book({"robot/a": {}}, in_seconds(3_000 - 259_200), 60, name="skipped")
+    async with hold(client, "mine", {"robot/a": {}}, min_runtime=600) as held:
+        began = time.monotonic()
+        ahead.write_text("0")
+        told = await awaited(bookings.list, lambda told: told.corrected is not None)
+        assert told.corrected is not None
+        assert abs(told.corrected.by - 259_200) < 1
+        assert abs(told.time - time.time()) < HANG
+        assert not told.clocks
+        assert held.active
+        booking = await bookings.book({"robot/a": {}}, in_seconds(3_000), 60, name="later")
+        assert [date.start - told.time < 3_600 for date in booking.dates] == [True]
+        assert [one.name for one in (await bookings.list()).bookings] == ["later"]
+        lasted = time.monotonic() - began
+    done = await awaited(lambda: lab.zscout("history", "--json"), lambda done: '"outcome":"released"' in done.stdout)
+    (past,) = json.loads(done.stdout)["holds"]
+    assert past["arc"] == "mine"
+    assert past["held"] == pytest.approx(lasted, abs=1)
