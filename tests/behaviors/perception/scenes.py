@@ -15,6 +15,8 @@ WALKER: Final = (14, 52)
 FLOOR: Final = 100
 """The row on which he walks."""
 
+Light = float | NDArray[np.float64]
+
 
 class Scene:
     """What a camera of `noise` grey levels sees. A walker's place is the middle column of him."""
@@ -27,8 +29,8 @@ class Scene:
         grain = cv2.GaussianBlur(self.rng.normal(0, 12, (HEIGHT, WIDTH)).astype(np.float32), (5, 5), 0)
         self.wall = cv2.GaussianBlur(wall, (3, 3), 0) + grain
 
-    def picture(self, walker: float | None = None, *, gain: float = 1.0, shade: float = 35.0) -> NDArray[np.uint8]:
-        """One picture; `gain` is the light's."""
+    def picture(self, walker: float | None = None, *, gain: Light = 1.0, shade: float = 35.0) -> NDArray[np.uint8]:
+        """One picture; `gain` is the light's, of all or of each line."""
         plane = self.wall
         if walker is not None:
             left, top, width, height = box_of(walker)

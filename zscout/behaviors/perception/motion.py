@@ -7,6 +7,7 @@ real camera needs:
 - Each picture is brought to the background's brightness: gain and offset by robust least squares over blocks. So
 flicker, exposure and slow light changes are no motion.
 - A pixel counts by standard deviations of its own noise, never by grey levels: no tuning.
+- Light that rolls over the picture in bands is each line's own gain.
 - Lines that fit the background when displaced are torn by the transmission.
 - A change of most of the picture at once is a switched light or a moved camera: it is learned at once.
 - Motion needs two of three pictures at about the same place, or one that is upright and clear.
@@ -29,6 +30,10 @@ from zscout.behaviors.perception.presence import Presence
 WIDTH: Final = 160  # columns of the analysed picture; larger ones are reduced to it
 MAX_SIDE: Final = 8_192
 BLOCKS: Final = 20  # blocks across for comparing brightness
+STRIPES: Final = 16  # parts of a line for finding bands of light
+DARK: Final = 8.0  # grey levels below which a part of a line has no gain of its own
+FAINT: Final = 0.5  # median grey levels of such parts below which nothing is a band
+BANDED: Final = 2.0  # largest factor of a band, up or down
 WHITE: Final = 240.0  # grey levels from which noise may be clipped, so that a pixel follows the light less
 LEARN: Final = 6.0  # seconds in which the background follows pixels without motion
 ABSORB: Final = 30.0  # seconds in which it follows motion. The variance grows by the square, and follows much sooner.
@@ -335,7 +340,28 @@ def _off(away: _Plane) -> float:
 
 
 def _levelled(grey: _Plane, mean: _Plane) -> _Plane:
-    """The picture without its gain and offset against the background."""
+    """The picture without its gain and offset against the background, and without bands of light."""
+    gain, offset = _light(grey, mean)
+    level = ((grey - np.float32(offset)) / np.float32(gain)).astype(np.float32)
+    bands = _bands(grey, mean, gain, offset)
+    if bands is None:
+        expected = np.float32(gain) * mean + np.float32(offset)
+    else:
+        even = grey / bands
+        gain, offset = _light(even, mean)
+        level = (even - np.float32(offset)) / np.float32(gain)
+        expected = bands * (np.float32(gain) * mean + np.float32(offset))
+    white = np.maximum(mean, expected) > WHITE
+    if np.any(white):
+        # White is clipped: any value between the background and the expectation fits.
+        was, should = mean[white], expected[white]
+        off = grey[white] - np.clip(grey[white], np.minimum(was, should), np.maximum(was, should))
+        level[white] = was + off / np.float32(gain)
+    return level
+
+
+def _light(grey: _Plane, mean: _Plane) -> tuple[float, float]:
+    """The picture's gain and offset against the background."""
     rows = max(2, round(BLOCKS * grey.shape[0] / grey.shape[1]))
     now = cv2.resize(grey, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
     was = cv2.resize(mean, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
@@ -344,7 +370,7 @@ def _levelled(grey: _Plane, mean: _Plane) -> _Plane:
     gain, offset = 1.0, 0.0
     for _ in range(3):
         if np.count_nonzero(fits) < 12:
-            return grey
+            return 1.0, 0.0
         x, y = was[fits], now[fits]
         spread = float(np.var(x))
         gain = float(np.mean((x - x.mean()) * (y - y.mean())) / spread) if spread > 4 else 1.0
@@ -352,15 +378,26 @@ def _levelled(grey: _Plane, mean: _Plane) -> _Plane:
         offset = float(y.mean() - gain * x.mean())
         off = np.abs(now - gain * was - offset)
         fits = lit & (off <= max(1.5, 2.5 * float(np.median(off[fits]))))
-    level = ((grey - np.float32(offset)) / np.float32(gain)).astype(np.float32)
-    expected = np.float32(gain) * mean + np.float32(offset)
-    white = np.maximum(mean, expected) > WHITE
-    if np.any(white):
-        # White is clipped: any value between the background and the expectation fits.
-        was, should = mean[white], expected[white]
-        off = grey[white] - np.clip(grey[white], np.minimum(was, should), np.maximum(was, should))
-        level[white] = was + off / np.float32(gain)
-    return level
+    return gain, offset
+
+
+def _bands(grey: _Plane, mean: _Plane, gain: float, offset: float) -> _Plane | None:
+    """The light of each line where it rolls over the picture in bands, as that of mains does; None without bands.
+
+    `gain` and `offset` explain the picture without bands, which must explain twice as much."""
+    stripes = STRIPES, grey.shape[0]
+    now = np.asarray(cv2.resize(grey, stripes, interpolation=cv2.INTER_AREA), np.float32)
+    was = np.asarray(cv2.resize(mean, stripes, interpolation=cv2.INTER_AREA), np.float32)
+    without = float(np.median(np.abs(now - np.float32(gain) * was - np.float32(offset))))
+    if without < FAINT:
+        return None
+    # What moves seldom fills half of a line's stripes.
+    middle = np.median(now / np.maximum(was, np.float32(DARK)), axis=1)
+    light = np.asarray(cv2.blur(middle, (1, 5)), np.float32).reshape(-1, 1)
+    bands = light / max(0.1, float(light.mean()))
+    if bands.max() > BANDED or bands.min() < 1 / BANDED or np.median(np.abs(now - light * was)) > 0.5 * without:
+        return None
+    return np.asarray(bands, np.float32)
 
 
 def _torn(lines: _Plane, mean: _Plane) -> bool:
