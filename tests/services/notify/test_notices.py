@@ -13,6 +13,7 @@ from zscout.scheduling.model import ArcRequest, Outcome
 from zscout.scheduling.reason import Party, Reason, ReasonCode
 from zscout.services.notify.notices import MAX_BODY, CertificateNotices, HoldNotices, Notification, booking_notice
 from zscout.services.notify.rate_limit import RateLimit
+from zscout.services.rcm.booked_dates import SKIPPED
 from zscout.services.rcm.digest import Began, Over
 from zscout.types import SECOND
 
@@ -83,6 +84,11 @@ def test_whose_booking_is_in_danger_is_told_why_and_when_it_is_safe_again() -> N
         ("zscout lab: your booking survey is in danger", "robot/a from 2027-01-15 09:00 CET on: robot/a is away"),
         ("zscout lab: your booking survey is safe again", "robot/a from 2027-01-15 09:00 CET on"),
     ]
+    skipped = booking_notice("lab", BookedDanger(record, record.start, SKIPPED, over=True))
+    assert skipped[2:] == (
+        "zscout lab: your booking survey has lapsed",
+        "robot/a from 2027-01-15 09:00 CET on: the fleet's clock was put forward past it",
+    )
     # A zone that only others know.
     mars = booking_notice("lab", BookedDanger(replace(record, zone="Mars/Olympus"), record.start, "robot/a is away", 2))
     assert mars.body == "robot/a from 2027-01-15 08:00 UTC on, and 2 later dates: robot/a is away"
