@@ -224,7 +224,7 @@ def _look_for_twin(own: Token, other: Token, alive: bool) -> None:
 
 def _keeper(mesh: Mesh, node: Node, folder: Path | None) -> BookingKeeper:
     disk = BookingFile(folder, node.fleet.name) if folder is not None else None
-    return BookingKeeper(mesh, disk, candidate=node.candidate, synchronised=is_synchronised)
+    return BookingKeeper(mesh, disk, candidate=node.candidate, wall=time.time, synchronised=is_synchronised)
 
 
 async def _cancelled(task: asyncio.Task[None]) -> None:

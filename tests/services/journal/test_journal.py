@@ -343,3 +343,22 @@ async def test_a_hold_is_as_long_as_it_was_though_the_clock_was_set(tmp_path: Pa
     assert hold.ended - hold.began == pytest.approx(20, abs=0.5)
     assert hold.began > START
     await told.close()
+
+
+async def test_nothing_is_too_old_by_a_clock_that_was_just_set(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(journal_module, "STEADY", 60 * SECOND)
+    told, _ = await telling(tmp_path, "x")
+    mesh, journal = told.candidates["x"].mesh, told.journals["x"]
+    one = told.fleet.client("one")
+    await one.ask("survey", "robot/a", seconds=5)
+    await told.tells(lambda found: found.holds and found.holds[0].ended)
+    for ahead in (10 * 365 * 86_400, 0):
+        journal._wall = lambda ahead=ahead: START + ahead + mesh.now() / SECOND  # type: ignore[misc]
+        await one.ask(f"then{ahead}", "robot/a", seconds=5)
+        await asyncio.sleep(20)
+    assert {hold.arc for hold in (await told.ask()).holds} >= {"survey", "then0"}
+    # By one that is right it is, at last.
+    journal._wall = lambda: START + 10 * 365 * 86_400 + mesh.now() / SECOND
+    await asyncio.sleep(100)
+    assert {hold.arc for hold in (await told.ask()).holds} == {"then315360000"}
+    await told.close()

@@ -91,7 +91,8 @@ class BookingFile:
 
 
 class BookingKeeper:
-    """`wall`: the host's clock, in seconds since 1970 (UTC); `synchronised`: if a time service keeps it."""
+    """`wall`: the host's clock, in seconds since 1970 (UTC); None: the present time, running on by the mesh's clock.
+    `synchronised`: if a time service keeps it."""
 
     def __init__(
         self,
@@ -99,10 +100,12 @@ class BookingKeeper:
         disk: Disk | None = None,
         *,
         candidate: bool = True,
-        wall: Callable[[], float] = time.time,
+        wall: Callable[[], float] | None = None,
         synchronised: Callable[[], bool | None] = lambda: None,
     ) -> None:
-        self.mesh, self.wall, self._disk, self._candidate = mesh, wall, disk, candidate
+        self.mesh, self._disk, self._candidate = mesh, disk, candidate
+        began = time.time() - mesh.now() / SECOND
+        self.wall = wall or (lambda: began + mesh.now() / SECOND)
         self._synchronised = synchronised
         self.records = Records()
         self._offset: Ns | None = None  # fleet time minus the own clock, at the last publication

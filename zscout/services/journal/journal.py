@@ -34,6 +34,7 @@ MAX_USES: Final = 10_000  # reports of use awaiting a commit, or remembered agai
 MAX_TOLD: Final = 5_000  # holds passed to `on_opened`
 MAX_ASKING: Final = 16  # queries answered at one time
 ENDS_WITHIN: Final = 5.0
+STEADY: Final[Ns] = 600 * SECOND  # since the wall clock was set; before, nothing is removed for its age
 CLOCK_SET: Final = 2.0  # seconds by which the wall clock moves against the mesh's, if it was set
 MEGABYTE: Final = 1_000_000
 
@@ -62,6 +63,7 @@ class Journal:
         self._said_count = 0
         self._number: tuple[Term, int] = NO_TERM, 0
         self._at: Ns | None = None  # last publication, by the mesh's clock
+        self._set_at = mesh.now()
         self._ahead: float | None = None  # by how much the wall clock was ahead of that clock then
         self._first = self._heard = 0.0  # first and last publication known to this journal
         self._committed = 0.0  # publications up to here are noted as received
@@ -107,6 +109,7 @@ class Journal:
         silence = 0.0 if self._at is None else (now - self._at) / SECOND
         ahead, before = at - now / SECOND, self._ahead
         if before is not None and abs(ahead - before) > CLOCK_SET:
+            self._set_at = now
             self._gather(ClockSet(ahead - before), at)
         self._ahead = ahead
         self._at, self._heard, self._first = now, at, self._first or at
@@ -182,6 +185,7 @@ class Journal:
             events.append(UseHeard([(*word, seconds) for word, seconds in self._uses.items()]))
             self._uses, self._used_last = {}, False
         dropped, self._dropped = self._dropped, 0
+        steady = self._mesh.now() - self._set_at > STEADY
         gap = JournalGap(self._dropped_since, self._wall(), "dropped", dropped) if dropped else None
 
         def write() -> None:
@@ -190,7 +194,7 @@ class Journal:
             if gap is not None:
                 self._pending += follower.lost(gap)
             if heard:
-                self._store.commit(self._pending, self._first, heard, self._wall())
+                self._store.commit(self._pending, self._first, heard, self._wall() if steady else 0.0)
 
         await asyncio.to_thread(write)
         self._pending, self._committed = [], heard
