@@ -19,7 +19,7 @@ from zscout.drivers.generic import ExclusiveDriver
 from zscout.drivers.resource_controller import ResourceController
 from zscout.keyexpr import Role
 from zscout.mesh.supervision import StallWatch
-from zscout.messages import LAST_TERMS, Grants, Notice, OpenRequest, RcAsk, RcState, Release
+from zscout.messages import LAST_TERMS, Cancel, Grants, Notice, OpenRequest, RcAsk, RcState, Release
 from zscout.services.rcm import candidate as candidate_module
 from zscout.services.rcm.candidate import Candidate
 from zscout.services.rcm.election import BACKOFF, MAX_BACKOFF, SETTLE
@@ -94,6 +94,9 @@ async def test_a_takeover_goes_on_with_the_patience_and_with_who_is_protected() 
     client.open = [open_request(held)]
     assert [holder.protected_from for holder in robot.holders] == [450]
     await asyncio.sleep(100)
+    other = fleet.client("two", "ws2")
+    await other.do(Cancel((await other.ask("waits", "robot/a")).id))  # an instant, by which it is worked out
+    await asyncio.sleep(11)  # it is published every 10 s
     assert (await fleet.state()).patience == 28 * 600
     fleet.network.kill(leader.mesh)
     await until(lambda: heir.rcm)
