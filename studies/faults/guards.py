@@ -23,6 +23,7 @@ from zscout.drivers.holds import HoldChange, HoldEntry, HoldTable
 from zscout.drivers.instances import Instances
 from zscout.drivers.repeated import CommandMemory
 from zscout.drivers.resource_controller import ResourceController
+from zscout.drivers.tolerance import Tolerance
 from zscout.keyexpr import Sender
 from zscout.mesh.renewal import Suspicions
 from zscout.messages import BookingRecord, Holder, OpenRequest, Problem, Who
@@ -241,6 +242,13 @@ def _none_recovered(*_: object) -> list[Any]:
     return []
 
 
+def _all_present(self: SchedulerState, _priority: int) -> int:
+    return self.present
+
+
+_lost_at_once: Final = property(lambda self: self.since if self.why else None)
+
+
 def _at_its_end(held: Mapping[str, Holder], now: Ns) -> Ns:
     return now + max(round(holder.remaining * SECOND) for holder in held.values())
 
@@ -347,6 +355,8 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         "begun heard": Guard(
             "an RC ends no hold by time that waits for another device", {(HoldTable, "_retime"): _nothing}
         ),
+        "tolerated": Guard("a device that is unwell keeps its holder", {(Tolerance, "lost_at"): _lost_at_once}),
+        "unwell": Guard("operators alone are granted an unwell device", {(SchedulerState, "open_to"): _all_present}),
         "withdrawn": Guard(
             "what nobody asks for is given back",
             {(RcmLink, "give_back"): _do_nothing, (Roster, "ask_requests"): _no_change},

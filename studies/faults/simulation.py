@@ -40,6 +40,7 @@ from zscout.config.node import ComponentsConfig
 from zscout.drivers.confirm_server import ConfirmServer
 from zscout.drivers.last_holder import LastHolder
 from zscout.drivers.resource_controller import ResourceController
+from zscout.drivers.tolerance import Tolerance
 from zscout.keyexpr import Role, Sender, Token, new_instance
 from zscout.mesh.supervision import StallWatch, Supervisor
 from zscout.messages import MAX_COUNTER, Grants
@@ -50,7 +51,7 @@ from zscout.services.rcm.candidate import Candidate, CandidateParts
 from zscout.services.rcm.rcm import Rcm
 from zscout.testing.memory import MemoryMesh, MemoryNetwork, MemoryTransport
 from zscout.testing.virtual_time import PROCESS, START, Process, VirtualTimeLoop
-from zscout.types import NO_TERM, SECOND, Grant, Term
+from zscout.types import NO_TERM, SECOND, Grant, Place, Term
 
 T = TypeVar("T")
 
@@ -74,6 +75,13 @@ DEVICES: Final[Mapping[str, Mapping[str, Fraction] | None]] = {
     "framegrabber/f": None,
     "radio/r": {"rate": Fraction(10)},
 }
+EXCLUSIVE: Final = tuple(rc for rc, capacity in DEVICES.items() if capacity is None)
+REBOOTS: Final = 8.0
+"""Seconds for which a device does not work, at most, in runs where some don't."""
+TOLERATED: Final = 60 * SECOND
+"""For how long RCs tolerate that."""
+HEARD: Final = 1.0
+"""Seconds without any fault after which a leader knows that a device is unwell, and what it granted before has come."""
 SLOW: Final[Mapping[str, float]] = {"robot/a": 4.0, "framegrabber/f": 1.0}
 """Seconds that some devices need to start, in runs that have slow ones."""
 DRIFT: Final = 0.001
@@ -121,6 +129,8 @@ class Size:
     """Programs that book, give up and take up."""
     slow: bool = False
     """Two devices need time to start for a holder."""
+    unwell: bool = False
+    """Devices do not work now and then, for a while."""
     forger: bool = False
     """Names are proven, and one that has a certificate lists, reports and keeps what is not so."""
 
@@ -128,7 +138,8 @@ class Size:
     def of(cls, seed: int) -> Size:
         """Every tenth run is a long one of many, every tenth one of moves that fail, every tenth one of programs that
         touch devices past their RCs, every tenth one with a thief, one with liars, every fifth one of bookings, every
-        twentieth one with a forger, every fortieth one of devices that start slowly."""
+        twentieth one with a forger, every fortieth one of devices that start slowly, and one of
+        devices that do not work now and then."""
         match seed % 10:
             case 3 | 4:
                 return cls(bookers=2, clients=3, faults=4, span=40.0)
@@ -146,6 +157,8 @@ class Size:
                 return cls(forger=True)
             case 5 if seed % 40 == 35:
                 return cls(slow=True)
+            case 5 if seed % 40 == 15:
+                return cls(unwell=True)
         return cls()
 
 
@@ -244,6 +257,8 @@ class Simulation:
         self.cuts: Counter[tuple[str, str]] = Counter()
         self.result = Result(seed, self.faults)
         self.idle, self.failed = asyncio.Event(), asyncio.Event()
+        self._had: dict[str, set[tuple[str, Place]]] = {}
+        """By instance of an RC: the ARCs that held it at the last look."""
 
     def _program(self, rc: str) -> str:
         return "node" if self.random.random() < 0.6 else f"rc-{rc.replace('/', '-')}"
@@ -309,13 +324,14 @@ class Simulation:
             forging = forgers.forge(mesh, DEVICES, lambda: self.work.over)
             process.main = process.run(asyncio.create_task, self._guard(forging))
         look = asyncio.create_task(self._look())
+        reboots = asyncio.create_task(self._reboot_devices())
         timers = [loop.call_later(fault.at, self._begin, fault) for fault in self.faults]
         done = asyncio.create_task(self._served())
         failed = asyncio.create_task(self.failed.wait())
         await asyncio.wait({done, failed}, return_when=asyncio.FIRST_COMPLETED)
         for timer in timers:
             timer.cancel()
-        for task in (look, done, failed):
+        for task in (look, reboots, done, failed):
             task.cancel()
         self.result.digest = self._digest.hexdigest()
         for process, mesh in tuple(self.running.values()):
@@ -418,6 +434,8 @@ class Simulation:
             calm = all(fault.kind == "double" for fault in self.present)
             lasting = dict(self.booked.look(self._leading_hosts(), calm=not self.present)) if self.bookers else {}
             self.promises.look(clients, self.rcs, self._leaders(), silence, calm=calm, lasting=lasting)
+            if self.size.unwell:
+                self._look_who_gets_unwell_devices()
             if self.size.forger:
                 for why in filter(None, map(forgers.believed, self._leaders().values())):
                     self.broken(f"a leader believes a forger: {why}")
@@ -534,6 +552,7 @@ class Simulation:
         last = self.last_holders[name] if device is self.devices[name] else LastHolder()
         how: dict[str, Any] = {"settle": SETTLE, "last_holder": last, "on_failure": self._on_failure}
         how["confirmations"] = confirmations
+        how["tolerance"] = Tolerance(TOLERATED, TOLERATED, TOLERATED) if self.size.unwell else None
         rc = ResourceController(mesh, name, driver, hold_lease=lease, stall=stall, **how)
         await rc.start()
         self.rcs[f"{mesh.me} {name}"] = rc
@@ -564,6 +583,40 @@ class Simulation:
         while True:
             mesh.put(mesh.keys.grants, Grants(term, 1, 1, FORGED_EVERY, {}, []))
             await asyncio.sleep(FORGED_EVERY)
+
+    async def _reboot_devices(self) -> None:
+        rng = random.Random(f"unwell {self.seed}")  # noqa: S311
+        while self.size.unwell and not self.work.over:
+            await asyncio.sleep(rng.uniform(1.0, REBOOTS / 2))
+            name, why = rng.choice(EXCLUSIVE), "its device reboots"
+            self._each(self._instances(name), lambda rc: rc.unwell(why))  # noqa: B023 - called before the next round
+            self.result.counts["unwell"] += 1
+            await asyncio.sleep(rng.uniform(1.0, REBOOTS))
+            self._each(self._instances(name), ResourceController.recover)
+
+    def _instances(self, name: str) -> dict[str, ResourceController]:
+        return {key: rc for key, rc in self.rcs.items() if rc.name == name}
+
+    def _look_who_gets_unwell_devices(self) -> None:
+        """Only operators, and holds that go on from another."""
+        had, self._had = (
+            self._had,
+            {
+                key: {(entry.holder.id, entry.holder.place) for entry in rc.holds.held.values()}
+                for key, rc in self.rcs.items()
+            },
+        )
+        calm = 0.0 if self.present else self.loop.now - self.calm_since
+        for key, rc in self.rcs.items():
+            process, _ = self.running[key.split()[0]]
+            unwell_for = process.run(lambda rc: rc.unwell_for, rc)
+            if key not in had or process.stopped or min(unwell_for, calm) < HEARD:
+                continue
+            for entry in rc.holds.held.values():
+                holder = entry.holder
+                goes_on = (holder.id, holder.place) in had[key] or holder.continues
+                if not goes_on and holder.priority < self.fleet.operator_priority:
+                    self.broken(f"{rc.name} begins for {holder.client} {holder.arc}, and is unwell")
 
     def _on_failure(self, error: Exception) -> None:
         self.broken(f"a service failed: {error!r}")

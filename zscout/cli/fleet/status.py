@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import AsyncExitStack
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -119,7 +119,8 @@ class Standing:
             headline = f"Fleet {fleet}: {leader} leads, term {term} ({links})"
             headline += f"; {many(count, 'booking')} within 24 h" if (count := booked.soon(self.booked)) else ""
             ranks = {f"{wait.client}/{wait.id}": number for number, wait in enumerate(self.state.queue, 1)}
-            held = running(chosen.state, self.fleet_view.client.fleet.operator_priority, plain=plain)
+            operator, maintained = self.fleet_view.client.fleet.operator_priority, booked.in_maintenance(self.booked)
+            held = running(chosen.state, operator, plain=plain, maintained=maintained)
             tables = [self._rcs(chosen.state), held, waiting(chosen.state, ranks, plain=plain)]
             tables += [] if self.names else [shares_table(self._shares())]
         tables = [self._warnings(), *tables, self._hosts(chosen), self._devices(chosen)]
@@ -353,7 +354,10 @@ def _some(hosts: Sequence[str]) -> str:
     return ", ".join(hosts[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def running(state: RcmState, operator_priority: int, *, plain: bool) -> Table:
+def running(
+    state: RcmState, operator_priority: int, *, plain: bool, maintained: Collection[str] = frozenset()
+) -> Table:
+    """`maintained`: devices in maintenance, at which a hold ends with its minimum runtime."""
     rows, styles = [], []
     for hold in sorted(state.holds, key=lambda hold: (-hold.priority, -hold.held)):
         since = f"{clock(-hold.held)} ({span(hold.held)})"
@@ -361,7 +365,8 @@ def running(state: RcmState, operator_priority: int, *, plain: bool) -> Table:
         if hold.waits is not None:
             until = starting(hold.waits)
         elif hold.keep:
-            until = f"{until}, keeps" if hold.remaining > 0 else "kept"
+            then = "keeps" if hold.needs.keys().isdisjoint(maintained) else "ends"
+            until = f"{until}, {then}" if hold.remaining > 0 else "kept"
         if hold.ends_in is not None:
             until = f"{until}, likely {clock(hold.ends_in)}"
         by, more = _by(hold, plain=plain)
