@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.behaviors.perception.scenes import HEIGHT, Scene
+from tests.behaviors.perception.scenes import HEIGHT, WIDTH, Scene
 from zscout.behaviors.perception.motion import Event, EventTracker, MotionDetector
 
 RATE = 10.0
@@ -51,3 +52,37 @@ def test_light_that_rolls_in_bands_hides_nobody(depth: float, rolls: float, line
         return scene.picture(walker, gain=1 + depth * np.sin(2 * np.pi * (rows / lines + time * rolls)))
 
     assert_walker_alone(camera)
+
+
+@pytest.mark.parametrize(("size", "comes"), [(0.6, 4.0), (0.85, 4.0), (0.85, 1.0), (1.0, 2.0), (0.75, 0.5)])
+def test_who_is_near_is_told_as_long_as_he_is_there(size: float, comes: float) -> None:
+    """Somebody comes to a door's camera from 4 s, sways before it, and is away at 12 s."""
+    scene, detector, tracker = Scene(21, noise=2.0), MotionDetector(), EventTracker()
+    coat = cv2.resize(np.random.default_rng(3).uniform(10, 120, (15, 10)), (200, 200), interpolation=cv2.INTER_CUBIC)
+    told = []
+    for time in (number / RATE for number in range(round(20 * RATE))):
+        picture = scene.picture(40 * (time - 14) - 20 if time >= 14 else None)
+        if 4 <= time < 12:
+            near = size * min(1.0, (time - 4) / comes, (12 - time) / comes)
+            high, wide = max(1, int(HEIGHT * near)), max(1, int(WIDTH * near * 0.9))
+            left = int(np.clip((WIDTH - wide) / 2 + 1.5 * np.sin(5 * time), 0, WIDTH - wide))
+            picture[HEIGHT - high :, left : left + wide] = coat[:high, :wide]
+        if ended := tracker.see(time, detector.see(time, picture)):
+            told.append(ended)
+    assert len(told) == 2
+    assert told[0].start <= 5
+    assert told[0].end >= 11
+    assert 14 <= told[1].start <= 15
+
+
+def test_light_that_is_switched_beside_somebody_near_is_learned_soon() -> None:
+    scene, detector = Scene(22), MotionDetector()
+    seen = []
+    for time in (number / RATE for number in range(round(16 * RATE))):
+        picture = scene.picture(gain=1.0 if time < 6 else np.linspace(0.4, 1.8, HEIGHT)[:, np.newaxis])
+        if 4 <= time < 8:
+            left = int(20 * (time - 4))
+            picture[40:, left : left + 40] = 30
+        seen.append((time, detector.see(time, picture).moving))
+    assert all(moving for time, moving in seen if 4.5 <= time < 5.5)
+    assert not any(moving for time, moving in seen if time >= 12)

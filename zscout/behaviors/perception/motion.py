@@ -9,7 +9,8 @@ flicker, exposure and slow light changes are no motion.
 - A pixel counts by standard deviations of its own noise, never by grey levels: no tuning.
 - Light that rolls over the picture in bands is each line's own gain.
 - Lines that fit the background when displaced are torn by the transmission.
-- A change of most of the picture at once is a switched light or a moved camera: it is learned at once.
+- A change of most of the picture at once is a switched light or a moved camera: it is learned at once. Somebody
+close to the lens is not: he grew.
 - Motion needs two of three pictures at about the same place, or one that is upright and clear.
 
 Whatever stays is learned as that pixel's noise: a person who stops is no motion after a second or two, and leaves no
@@ -60,7 +61,15 @@ SMALLEST: Final = 0.0012  # least share of the picture in a region
 BAND: Final = 5.0
 THIN: Final = 0.07  # torn lines are regions BAND times as wide as high, and no higher than this share of the picture
 ASIDE: Final = 32  # largest displacement of torn lines in columns
-UPHEAVAL: Final = 0.55  # share of changed pixels that no motion explains
+UPHEAVAL: Final = 0.55  # share of changed pixels that no motion explains, but one that grew
+NEAR: Final = (
+    0.12  # least share of the picture in motion for a person near the lens; the rest then gives light and noise
+)
+STIRS: Final = 0.02  # least share of that motion that changes, and ...
+STILL: Final = 2.0  # ... seconds without that after which the person is learned, ...
+NEAR_FOR: Final = 60.0  # ... or seconds in any case: a branch before the lens never stops
+FOLLOWS: Final = 8.0  # grey levels by which light may change from one picture to the next then
+LEFT: Final = 0.05  # least share of the picture that gives its noise
 ALL_OFF: Final = 4.0  # standard deviations of the median pixel in a picture of another scene
 UPRIGHT: Final = 0.15
 CERTAIN: Final = 0.005
@@ -130,6 +139,24 @@ class _Meanwhile:
         return np.asarray(stands[labels], np.bool_)
 
 
+class _Near:
+    """A person close to the lens: neither a change of light nor another scene, and not learned while moving."""
+
+    def __init__(self, time: float, level: _Plane, mask: NDArray[np.uint8]) -> None:
+        self.mask = mask
+        self._since = self._stirred = time
+        self._level = level
+
+    def stirs(self, time: float, level: _Plane, mask: NDArray[np.uint8], noise: float) -> bool:
+        """Take a picture and where it moves; return True unless he stands still, or has been there for long."""
+        self.mask = mask
+        # Smoothing leaves 0.6 of the noise of two pictures.
+        off = np.abs(cv2.GaussianBlur(level - self._level, (3, 3), 0)) > 0.6 * WEAK * max(FLOOR, noise)
+        if np.count_nonzero(off & (mask > 0)) >= STIRS * np.count_nonzero(mask):
+            self._level, self._stirred = level, time
+        return time - self._stirred <= STILL and time - self._since <= NEAR_FOR
+
+
 class MotionDetector:
     def __init__(self, *, outlines: bool = False) -> None:
         """With `outlines`, report moving pixels too, and fit boxes to them."""
@@ -145,6 +172,9 @@ class MotionDetector:
         self._strange = 0  # pictures since then that did not fit
         self._meanwhile: _Meanwhile | None = None  # summary of fitting pictures since then
         self._presence = Presence()
+        self._near: _Near | None = None
+        self._light = 1.0, 0.0  # gain and offset of the last picture against the background
+        self._middle = 0.0  # median deviation of the last picture
         self._sightings: deque[tuple[float, NDArray[np.uint8]]] = deque(maxlen=RECENT - 1)
 
     def see(self, time: float, picture: Picture) -> Seen:
@@ -167,7 +197,7 @@ class MotionDetector:
         if self._mean.shape != grey.shape:
             return self._begin(time, grey), None
         self._last, self._latest = time, grey
-        level = _levelled(grey, self._mean)
+        level, self._light = _levelled(grey, self._mean, self._hidden(), self._light)
         away = level - self._mean
         if self._paused:
             return self._return(time, grey, level, away, passed), None
@@ -179,9 +209,12 @@ class MotionDetector:
             return Seen(False, learning=True), None
         score, middle = self._score(away)
         mask, regions, clear = self._regions(score, level)
-        if middle > ALL_OFF or np.count_nonzero(mask) / mask.size > UPHEAVAL:
+        share = np.count_nonzero(mask) / mask.size
+        noise = float(np.median(self._variance[::4, ::4])) ** 0.5
+        stirs = self._near is not None and self._near.stirs(time, level, mask, noise)
+        if middle > ALL_OFF or (share > UPHEAVAL and not stirs):
             return self._begin(time, grey), None
-        self._learn(away, mask, passed / LEARN, passed / ABSORB)
+        self._learn(away, mask, passed / LEARN, 0.0 if stirs else passed / ABSORB)
         largest = sorted(regions.tolist(), key=lambda region: -region[cv2.CC_STAT_AREA])[:MAX_BOXES]
         height, width = picture.shape[:2]
         boxes = tuple(
@@ -194,6 +227,10 @@ class MotionDetector:
             for x, y, w, h, _ in largest
         )
         moving = self._sure(time, mask) or any(not self._stands_aside(level, region) for region in clear.tolist())
+        if not moving or share < NEAR:
+            self._near = None
+        elif self._near is None:
+            self._near = _Near(time, level, mask)
         noise = _noise(grey) if self._presence.expects(moving) else 0.0
         present = self._presence.see(time, level, self._mean, mask if moving else None, noise)
         return Seen(moving, boxes, present=present), mask
@@ -208,6 +245,7 @@ class MotionDetector:
         """Pictures pause. The first fitting one continues the background; until then nothing is reported."""
         self._sightings.clear()
         self._presence.clear()
+        self._near = None
         if self._pictures < WARM_PICTURES:
             self._mean = np.empty((0, 0), np.float32)
         elif not self._paused:
@@ -248,15 +286,27 @@ class MotionDetector:
         self._pictures, self._noise, self._paused = 1, _noise(grey), False
         self._sightings.clear()
         self._presence.clear()
+        self._near = None
         return Seen(False, learning=True)
+
+    def _hidden(self) -> NDArray[np.uint8] | None:
+        """Above 0 where somebody near was in the last picture; None without one."""
+        return None if self._near is None else _with_rim(self._near.mask)
 
     def _score(self, away: _Plane) -> tuple[_Plane, float]:
         """Standard deviations by which each pixel is off, smoothed, relative to the median, which is returned too."""
         # Neighbours have similar noise: their mean bounds one pixel's few samples from below.
         spread = np.sqrt(np.maximum(np.maximum(self._variance, cv2.blur(self._variance, (5, 5))), FLOOR**2))
         score = np.abs(cv2.GaussianBlur(away, (3, 3), 0)) / spread
+        hidden = self._hidden()
+        if hidden is None:
+            self._middle = float(np.median(score))
+        elif (left := score[hidden == 0]).size >= LEFT * score.size:
+            # He may cover more by now: the lower quartile, by what it is to the median of noise.
+            noise = float(np.quantile(left, 0.25)) * 0.674 / 0.319
+            self._middle = noise if noise <= ALL_OFF else self._middle
+        middle = self._middle
         # Smoothing leaves about 0.4 of independent noise; judge the rest by its own median.
-        middle = float(np.median(score))
         score /= middle / 0.674 if middle > 0.3 else 0.45
         return np.asarray(score, np.float32), middle
 
@@ -339,16 +389,20 @@ def _off(away: _Plane) -> float:
     return float(np.median(np.abs(cv2.GaussianBlur(away, (3, 3), 0))))
 
 
-def _levelled(grey: _Plane, mean: _Plane) -> _Plane:
-    """The picture without its gain and offset against the background, and without bands of light."""
-    gain, offset = _light(grey, mean)
+def _levelled(
+    grey: _Plane, mean: _Plane, hidden: NDArray[np.uint8] | None, last: tuple[float, float]
+) -> tuple[_Plane, tuple[float, float]]:
+    """The picture without its gain and offset against the background and without bands of light; gain and offset.
+
+    Where `hidden` is above 0, the picture shows nothing of the light; `last` are gain and offset of the one before."""
+    gain, offset = _light(grey, mean, hidden, last)
     level = ((grey - np.float32(offset)) / np.float32(gain)).astype(np.float32)
-    bands = _bands(grey, mean, gain, offset)
+    bands = _bands(grey, mean, gain, offset, hidden)
     if bands is None:
         expected = np.float32(gain) * mean + np.float32(offset)
     else:
         even = grey / bands
-        gain, offset = _light(even, mean)
+        gain, offset = _light(even, mean, hidden, last)
         level = (even - np.float32(offset)) / np.float32(gain)
         expected = bands * (np.float32(gain) * mean + np.float32(offset))
     white = np.maximum(mean, expected) > WHITE
@@ -357,10 +411,12 @@ def _levelled(grey: _Plane, mean: _Plane) -> _Plane:
         was, should = mean[white], expected[white]
         off = grey[white] - np.clip(grey[white], np.minimum(was, should), np.maximum(was, should))
         level[white] = was + off / np.float32(gain)
-    return level
+    return level, (gain, offset)
 
 
-def _light(grey: _Plane, mean: _Plane) -> tuple[float, float]:
+def _light(
+    grey: _Plane, mean: _Plane, hidden: NDArray[np.uint8] | None, last: tuple[float, float]
+) -> tuple[float, float]:
     """The picture's gain and offset against the background."""
     rows = max(2, round(BLOCKS * grey.shape[0] / grey.shape[1]))
     now = cv2.resize(grey, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
@@ -368,9 +424,14 @@ def _light(grey: _Plane, mean: _Plane) -> tuple[float, float]:
     # Black and white have no gain.
     fits = lit = (now > 4) & (now < 250)
     gain, offset = 1.0, 0.0
+    if hidden is not None:
+        lit = lit & (cv2.resize(hidden, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel() == 0)
+        gain, offset = last
+        # He may have moved on before most of the rest.
+        fits = lit & (np.abs(now - gain * was - offset) <= FOLLOWS)
     for _ in range(3):
         if np.count_nonzero(fits) < 12:
-            return 1.0, 0.0
+            return last if hidden is not None else (1.0, 0.0)
         x, y = was[fits], now[fits]
         spread = float(np.var(x))
         gain = float(np.mean((x - x.mean()) * (y - y.mean())) / spread) if spread > 4 else 1.0
@@ -381,21 +442,28 @@ def _light(grey: _Plane, mean: _Plane) -> tuple[float, float]:
     return gain, offset
 
 
-def _bands(grey: _Plane, mean: _Plane, gain: float, offset: float) -> _Plane | None:
+def _bands(grey: _Plane, mean: _Plane, gain: float, offset: float, hidden: NDArray[np.uint8] | None) -> _Plane | None:
     """The light of each line where it rolls over the picture in bands, as that of mains does; None without bands.
 
     `gain` and `offset` explain the picture without bands, which must explain twice as much."""
     stripes = STRIPES, grey.shape[0]
     now = np.asarray(cv2.resize(grey, stripes, interpolation=cv2.INTER_AREA), np.float32)
     was = np.asarray(cv2.resize(mean, stripes, interpolation=cv2.INTER_AREA), np.float32)
-    without = float(np.median(np.abs(now - np.float32(gain) * was - np.float32(offset))))
+    expected = np.float32(gain) * was + np.float32(offset)
+    shown = np.ones(now.shape, np.bool_)
+    if hidden is not None:
+        shown = cv2.resize(hidden, stripes, interpolation=cv2.INTER_AREA) == 0
+        if np.count_nonzero(shown) < shown.size / 2:
+            return None
+        now = np.where(shown, now, expected)
+    without = float(np.median(np.abs(now - expected)[shown]))
     if without < FAINT:
         return None
     # What moves seldom fills half of a line's stripes.
     middle = np.median(now / np.maximum(was, np.float32(DARK)), axis=1)
     light = np.asarray(cv2.blur(middle, (1, 5)), np.float32).reshape(-1, 1)
     bands = light / max(0.1, float(light.mean()))
-    if bands.max() > BANDED or bands.min() < 1 / BANDED or np.median(np.abs(now - light * was)) > 0.5 * without:
+    if bands.max() > BANDED or bands.min() < 1 / BANDED or np.median(np.abs(now - light * was)[shown]) > 0.5 * without:
         return None
     return np.asarray(bands, np.float32)
 
