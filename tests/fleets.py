@@ -27,6 +27,7 @@ SECURED: Final = frozenset(
         "doctor",
         "doors",
         "floods",
+        "interfaces",
         "liars",
         "sites",
     )
