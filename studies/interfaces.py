@@ -238,7 +238,7 @@ async def cycle(fleet: Fleet, change: Change) -> Cycle:
     ]
     if change == "added":
         fleet.net.on("a", "link", "del", "eth1")
-        await asyncio.sleep(DOWN / 2)
+    await asyncio.sleep(DOWN / 2)
     needless = any(event["host"] in (leads or "ab") for event in trouble)
     for host in {event["host"] for event in trouble}:
         program = fleet.programs.pop(host)
