@@ -23,6 +23,7 @@ PATIENCE: Final = 2.0  # seconds for which a contradiction must last
 UNHEARD: Final = 0.5  # seconds beyond half a hold lease of an RCM alive yet silent: holds must not lapse
 LASTS: Final = 60.0  # seconds after which a contradiction that is not repeated is forgotten
 OVERLAP: Final = 0.5  # seconds with both sessions open, for others to learn what the new one declares
+MOST_OVERLAPS: Final = 3  # until each peer of the old session was linked to the new one through an overlap
 LINKED: Final = 2.0  # seconds that the new session may take to link to the peers of the old one
 LOOK_EVERY: Final = 0.02
 SHORTEST, LONGEST = 10.0, 320.0  # seconds between renewals, doubled while they do not help
@@ -115,10 +116,13 @@ class RenewableTransport(Transport):
                     # Declare first, so that no token of this process disappears in between.
                     for declared in self._all():
                         declared.declare(fresh)
-                    await asyncio.sleep(OVERLAP)
-                    # Peers may have linked to the old one meanwhile, as when a network has just come.
-                    if await self._linked(old, fresh):
+                    # A peer may link to the old one meanwhile: a network has just come, or the peer is renewed, too.
+                    for _ in range(MOST_OVERLAPS):
+                        known = {*fresh.peers(), fresh.id()}
                         await asyncio.sleep(OVERLAP)
+                        await self._linked(old, fresh)
+                        if set(old.peers()) <= known:
+                            break
                 finally:
                     await old.close()
                     for declared in self._all():
@@ -135,14 +139,13 @@ class RenewableTransport(Transport):
         elif self.behind:
             self.renew()
 
-    async def _linked(self, old: Transport, fresh: Transport) -> bool:
-        """Wait until `fresh` has the peers of `old`, for a while. Return True if it did not have them at once."""
+    async def _linked(self, old: Transport, fresh: Transport) -> None:
+        """Wait until `fresh` has the peers of `old`, for a while."""
         # Zenoh reports no links, but listing them costs nothing.
         tries = round(LINKED / LOOK_EVERY)
         while tries and not set(old.peers()) <= {*fresh.peers(), fresh.id()}:
             tries -= 1
             await asyncio.sleep(LOOK_EVERY)
-        return tries < round(LINKED / LOOK_EVERY)
 
     def _all(self) -> list[_Declared]:
         return [declared for _, declared in sorted([*self._declared.items(), *self._tokens.items()])]
