@@ -138,8 +138,8 @@ class Size:
     def of(cls, seed: int) -> Size:
         """Every tenth run is a long one of many, every tenth one of moves that fail, every tenth one of programs that
         touch devices past their RCs, every tenth one with a thief, one with liars, every fifth one of bookings, every
-        twentieth one with a forger, every fortieth one of devices that start slowly, and one of
-        devices that do not work now and then."""
+        twentieth one with a forger, every fortieth one of devices that start slowly, every eightieth
+        one of devices that do not work now and then."""
         match seed % 10:
             case 3 | 4:
                 return cls(bookers=2, clients=3, faults=4, span=40.0)
@@ -157,7 +157,7 @@ class Size:
                 return cls(forger=True)
             case 5 if seed % 40 == 35:
                 return cls(slow=True)
-            case 5 if seed % 40 == 15:
+            case 5 if seed % 80 == 15:
                 return cls(unwell=True)
         return cls()
 
