@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tests.behaviors.perception.scenes import HEIGHT, WIDTH, Scene
+from tests.behaviors.perception.test_motion import settled
 from zscout.behaviors.perception.motion import Event, EventTracker, MotionDetector
 
 RATE = 10.0
@@ -86,3 +87,40 @@ def test_light_that_is_switched_beside_somebody_near_is_learned_soon() -> None:
         seen.append((time, detector.see(time, picture).moving))
     assert all(moving for time, moving in seen if 4.5 <= time < 5.5)
     assert not any(moving for time, moving in seen if time >= 12)
+
+
+@pytest.mark.parametrize(
+    ("place", "size", "words"),
+    [
+        ((4, 12), 0.35, "20:{minutes:02}:{seconds:02}"),
+        ((60, 116), 0.35, "20:{minutes:02}:{seconds:02}"),
+        ((30, 60), 0.5, "{minutes:02}:{seconds:02}"),
+        ((4, 12), 0.4, "{time:06.1f}"),
+    ],
+)
+def test_a_clock_in_the_picture_is_no_motion(place: tuple[int, int], size: float, words: str) -> None:
+    scene = Scene(23, noise=2.0)
+
+    def camera(time: float, walker: float | None) -> Picture:
+        picture, seconds = scene.picture(walker), int(time + 0.01)
+        text = words.format(minutes=7 + (seconds + 56) // 60, seconds=(seconds + 56) % 60, time=time)
+        for colour, thick in ((0, 3), (255, 1)):
+            cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, size, (colour,), thick)
+        return picture
+
+    assert_walker_alone(camera)
+
+
+def test_somebody_far_away_is_told() -> None:
+    """As small as a clock's digits, and slow; but the place changes."""
+    scene, detector = Scene(24, noise=1.0), settled(Scene(24, noise=1.0))
+    told = []
+    for number in range(60):
+        picture = scene.picture()
+        left = 50 + 0.3 * number
+        for column in range(int(left), int(left) + 4):
+            cover = min(1.0, column + 1 - left, left + 3 - column)
+            picture[50:57, column] = (1 - cover) * picture[50:57, column] + cover * 20
+        told.append(detector.see(4 + number / RATE, picture).moving)
+    assert any(told[:5])
+    assert sum(told) > 50
