@@ -95,7 +95,7 @@ async def bookings(mine: bool, rc: str | None, at: WrittenDate | None, zone: Zon
         for host, differs in sorted(told.clocks.items()):
             click.secho(clean(clock_words(host, differs)), fg="yellow", err=True)
         if told.corrected is not None:
-            click.secho(corrected_words(told.corrected), fg="yellow", err=True)
+            click.secho(clean(corrected_words(told.corrected)), fg="yellow", err=True)
         if not found:
             terminal.print_line("nothing is booked" + (f" on {day:%a %Y-%m-%d}" if day is not None else ""))
         else:
