@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -123,6 +124,30 @@ async def test_a_leader_that_is_asked_by_whom_it_does_not_see_joins_the_mesh_ane
         await asyncio.sleep(10)
         assert arc.state == "running"
         assert "client_lost" not in outcomes
+
+
+@pytest.mark.parametrize("direct", [False, True])
+async def test_who_can_confirm_and_not_command_joins_the_mesh_anew(direct: bool) -> None:
+    """Links came back without the key of an RC's commands: its host confirms each grant, and nobody takes a command."""
+    async with small_fleet("one") as (fleet, (one,)):
+        await until(lambda: one.leader is not None)
+        hidden: set[object] = {
+            known for known in transport_of(fleet.devices).queryables.all if f"{RC}/command" in str(known)
+        }
+        assert hidden
+        fleet.network.link(fleet.devices, one.mesh).hidden = hidden
+        arc = await one.request("first", {RC: {}}, direct=direct)
+        done: list[object] = []
+        began = one.mesh.now()
+        while not done and one.mesh.now() - began < 30 * SECOND:
+            if (grant := await one.granted(arc)) is not None and not direct:
+                with suppress(CommandRefused):
+                    done.append((await one.command(RC, grant, ECHO)).result)
+            elif grant is not None:
+                # A direct hold lasts only while it is confirmed by command.
+                await asyncio.sleep(2 * FLEET.timing.hold_lease / SECOND)
+                done += [ECHO["value"]] if arc.grant == grant else []
+        assert done == [ECHO["value"]]
 
 
 async def test_commands_go_on_while_the_process_of_an_rc_joins_the_mesh_anew() -> None:

@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 
 UNREACHED = 10.0
 """Seconds for which an RC may be granted that this client neither sees nor reaches."""
+SILENT: Final = "was granted and does not answer"
+DEAF: Final = "was granted and takes no command"
 CONFIRM_TIMEOUT = 1.0
 """Seconds within which all RCs of a grant must have confirmed it."""
 SETTLING: Final = "settling"
@@ -162,7 +164,7 @@ class Confirmations:
             groups = [self._confirm_at(arc, grant, host, rcs, direct) for host, rcs in by_host.items()]
             refusals = dict(one for group in await asyncio.gather(*groups) for one in group)
             for rc, refused in refusals.items():
-                await self._look_at_silence(rc, silent=refused is not None and refused.code == "unknown")
+                await self.look_at_silence(rc, SILENT, silent=refused is not None and refused.code == "unknown")
             # What one has confirmed is old by now if another had to settle.
             asked = [] if direct is None else direct.unanswered(self._mesh.now() - self._fleet.timing.hold_lease // 2)
             refused_by = [refusals[rc] for rc in arc.rcs if refusals.get(rc) is not None]
@@ -243,12 +245,12 @@ class Confirmations:
         except CommandRefused as refused:
             return refused.problem
 
-    async def _look_at_silence(self, rc: RcName, *, silent: bool) -> None:
+    async def look_at_silence(self, rc: RcName, what: str, *, silent: bool) -> None:
         """An RC that the RCM sees, and so should this client."""
         seen = silent and await self._mesh.living(self._mesh.keys.alive_rc(rc), timeout=CONFIRM_TIMEOUT)
         # There may be no link to one that is not seen: but for so long?
         patience = PATIENCE if seen else UNREACHED
-        self._mesh.suspicions.suspect(f"{rc} was granted and does not answer", so=silent, patience=patience)
+        self._mesh.suspicions.suspect(f"{rc} {what}", so=silent, patience=patience)
 
     async def _ask_when_reachable(self, arc: OpenArc, rcs: list[RcName]) -> None:
         """Where tokens of RCs that did not confirm go, or have gone, and come back, links are back: `arc` is held back

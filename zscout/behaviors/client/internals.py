@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from msgspec.structs import replace
 
-from zscout.behaviors.client.confirmation import NOT_HELD, Confirmations
+from zscout.behaviors.client.confirmation import DEAF, NOT_HELD, Confirmations
 from zscout.behaviors.client.direct import DirectHold
 from zscout.behaviors.client.handover import MovableClient
 from zscout.behaviors.client.request import CommandRefused, OpenArc
@@ -182,9 +182,12 @@ class ClientInternals(MovableClient):
             gone = (self.mesh.now() - began) / SECOND + AGAIN
             lost = gone if lost is None else lost  # a session that closes ends what was under way for long
             if gone >= min(timeout, ttl, lost + REJOINS):
+                if lost < timeout:  # nobody was found who takes it
+                    self.supervisor.spawn(self.confirmations.look_at_silence(rc, DEAF, silent=True))
                 raise CommandRefused(rc, Problem("unknown", "no answer; it may or may not have been done"))
             # It ended early: its RC's process may be joining the mesh anew. Under one id it is done once.
             await asyncio.sleep(AGAIN)
+        self.mesh.suspicions.suspect(f"{rc} {DEAF}", so=False)
         if reply.message is None:
             refused = CommandRefused(rc, reply.problem or Problem("unknown", "no reason given"))
             arc = next((arc for arc in self.store.open if arc.grant == grant), None)
