@@ -107,7 +107,7 @@ async def run_services(
         stack.callback(stall.stop)
         mesh.watch_links()
         # Of two that begin at one time the later one leaves.
-        own = Token(me.host, Role.NODE, me.client, f"{time.time_ns() // 1_000:x}-{new_instance()}")
+        own = Token(me.host, Role.NODE, me.client, f"{time.time_ns() // 1_000:014x}{new_instance()}")
         token = mesh.alive(own)
         stack.callback(token.close)
         await asyncio.sleep(TWIN_SHOWN)

@@ -31,7 +31,7 @@ from zscout.config.fleet import load_fleet
 from zscout.keyexpr import Role
 
 UNITS = sorted((PROJECT / "deploy" / "systemd").glob("*.service"))
-EXPOSURE = 2.0
+EXPOSURE = 2.2
 ANALYZE = pytest.mark.skipif(
     shutil.which("systemd-analyze") is None, reason="systemd-analyze is missing: install the package systemd"
 )

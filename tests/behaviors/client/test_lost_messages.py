@@ -11,8 +11,10 @@ import pytest
 
 from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, held, small_fleet, transport_of
 from tests.mesh.kit import until
+from zscout.behaviors.client.arc import hold
+from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.confirmation import CONFIRM_TIMEOUT
-from zscout.behaviors.client.internals import REJOINS
+from zscout.behaviors.client.internals import REJOINS, TOLD_WITHIN
 from zscout.behaviors.client.request import CommandRefused
 from zscout.messages import Command
 from zscout.scheduling.model import HOLD_BACK
@@ -124,6 +126,28 @@ async def test_a_leader_that_is_asked_by_whom_it_does_not_see_joins_the_mesh_ane
         await asyncio.sleep(10)
         assert arc.state == "running"
         assert "client_lost" not in outcomes
+
+
+async def test_what_was_granted_again_unheard_is_given_back_by_who_had_its_time() -> None:
+    """All notices are lost while an RC is lost and well again: the client believes in its first grant, which ends."""
+    async with small_fleet("one") as (fleet, (one,)):
+        body = asyncio.create_task(_hold_for(one, 5.0))
+        await until(lambda: fleet.rcs[0].holds.held)
+        fleet.network.disturb({"notice": Disturbance(lost=1.0)})
+        await asyncio.sleep(4)
+        fleet.rcs[0].fail("a cable is out")
+        fleet.rcs[0].recover()
+        await until(lambda: fleet.rcs[0].holds.held)
+        await body
+        fleet.network.disturb({})
+        await asyncio.sleep(TOLD_WITHIN + 0.5)
+        assert not fleet.rcs[0].holds.held
+        assert not (await fleet.state()).holds
+
+
+async def _hold_for(client: Client, seconds: float) -> None:
+    async with hold(client, "first", {RC: {}}, min_runtime=seconds, keep=False):
+        await asyncio.sleep(2 * seconds)
 
 
 @pytest.mark.parametrize("direct", [False, True])

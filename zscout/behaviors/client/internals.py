@@ -52,6 +52,8 @@ class ClientInternals(MovableClient):
         self._commanded = itertools.count(1)
         self._denied: set[Grant] = set()
         """Grants that an RC says are over, and no notice yet."""
+        self._expired: set[str] = set()
+        """Ids of ARCs that are over by this host's clock, and by no notice yet."""
 
     # On the mesh
 
@@ -161,9 +163,19 @@ class ClientInternals(MovableClient):
     def expire(self, arc: OpenArc) -> None:
         """An ARC has had its time by this host's clock: it is not asked for any more, though a direct body may clear
         up yet."""
+        if arc.grant is not None:
+            self._expired.add(arc.id)
+            self.supervisor.call_later(TOLD_WITHIN, self._give_up, arc.id)
         arc._finish("completed", "its minimum runtime is over", self.mesh.now())
         self.store.notify(arc)
         self.store.forget(arc)
+
+    def _give_up(self, request_id: str) -> None:
+        """No notice has reported the end of a hold that is over by this host's clock. The leader may have granted it
+        again meanwhile, and that notice was lost."""
+        if request_id in self._expired:
+            self._expired.discard(request_id)
+            self.supervisor.spawn(self.rcm.give_back(Release(id=request_id)))
 
     # Commands, and notices
 
@@ -208,6 +220,8 @@ class ClientInternals(MovableClient):
     def _on_notice(self, _key: str, notice: Notice) -> None:
         if not self.rcm.accept(notice.term):
             return
+        if notice.state == "ended":
+            self._expired.discard(notice.id)
         if (arc := self.store.arcs.get(notice.id)) is not None:
             self.store.take(arc, notice)
         elif not self.take_moving(notice) and notice.id not in self.store.withdrawn:
