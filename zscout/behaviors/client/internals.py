@@ -173,8 +173,9 @@ class ClientInternals(MovableClient):
     def _give_up(self, request_id: str) -> None:
         """No notice has reported the end of a hold that is over by this host's clock. The leader may have granted it
         again meanwhile, and that notice was lost."""
-        if request_id in self._expired:
-            self._expired.discard(request_id)
+        expired = request_id in self._expired
+        self._expired.discard(request_id)
+        if expired and request_id not in self.store.arcs:  # it may have been asked for anew
             self.supervisor.spawn(self.rcm.give_back(Release(id=request_id)))
 
     # Commands, and notices

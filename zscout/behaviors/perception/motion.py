@@ -63,9 +63,7 @@ BAND: Final = 5.0
 THIN: Final = 0.07  # torn lines are regions BAND times as wide as high, and no higher than this share of the picture
 ASIDE: Final = 32  # largest displacement of torn lines in columns
 UPHEAVAL: Final = 0.55  # share of changed pixels that no motion explains, but one that grew
-NEAR: Final = (
-    0.12  # least share of the picture in motion for a person near the lens; the rest then gives light and noise
-)
+NEAR: Final = 0.12  # least share of the picture in motion for a person near the lens
 STIRS: Final = 0.02  # least share of that motion that changes, and ...
 STILL: Final = 2.0  # ... seconds without that after which the person is learned, ...
 NEAR_FOR: Final = 60.0  # ... or seconds in any case: a branch before the lens never stops
