@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import os
+import random
 from contextlib import AbstractAsyncContextManager, AsyncExitStack
 from typing import Any
 
 import pytest
 
 from tests.hang import HANG
+from zscout.keyexpr import RANDOM
 from zscout.testing import run
 
 REAL = ("live", "real_time")
 """Marks of tests that run in real time; all others run in virtual time."""
+SEED = "ZSCOUT_TEST_SEED"
+"""The environment variable that gives tests in virtual time other pauses: what fails then depends on luck."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -37,6 +42,9 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     real = marked or getattr(values.get("world"), "real_time", False)
 
     async def main() -> None:
+        if not real:
+            # What failed once must fail again.
+            RANDOM.set(random.Random(os.environ.get(SEED, "") + pyfuncitem.nodeid))
         async with AsyncExitStack() as opened, asyncio.timeout(3 * HANG if real else None):
             for value in values.values():
                 if isinstance(value, AbstractAsyncContextManager):

@@ -11,6 +11,7 @@ import pytest
 
 from tests.behaviors.client.small_fleet import ECHO, FLEET, RC, held, small_fleet, transport_of
 from tests.mesh.kit import until
+from zscout.behaviors.client import rcm_link
 from zscout.behaviors.client.arc import hold
 from zscout.behaviors.client.client import Client
 from zscout.behaviors.client.confirmation import CONFIRM_TIMEOUT
@@ -128,8 +129,11 @@ async def test_a_leader_that_is_asked_by_whom_it_does_not_see_joins_the_mesh_ane
         assert "client_lost" not in outcomes
 
 
-async def test_what_was_granted_again_unheard_is_given_back_by_who_had_its_time() -> None:
+async def test_what_was_granted_again_unheard_is_given_back_by_who_had_its_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """All notices are lost while an RC is lost and well again: the client believes in its first grant, which ends."""
+    monkeypatch.setattr(rcm_link, "ASK_AGAIN", 60.0)  # the answer would tell it of the second grant
     async with small_fleet("one") as (fleet, (one,)):
         body = asyncio.create_task(_hold_for(one, 5.0))
         await until(lambda: fleet.rcs[0].holds.held)

@@ -31,6 +31,7 @@ from zscout.cli.fleet.viewer_page import ViewerPage, silent
 from zscout.config.node import MAX_PAST, PAST, RecorderConfig
 from zscout.config.strict import DURATIONS, BadInput, parse_duration, quoted
 from zscout.keyexpr import NODES
+from zscout.ports import free_port
 from zscout.services.recorder.process import BAD_SETTINGS, QUIET, RecorderJob, Recording, encode_job
 from zscout.types import SECOND, Ns
 
@@ -151,10 +152,10 @@ async def open_viewer(
         async with viewer(*WINDOW, *(["--connect"] if recording.url is not None else []), shown) as window:
             yield window, None
         return
-    page = free_port(bind, port) if port is not None else free_port(bind, WEB_PORT, 0)
+    page = serving_port(bind, port) if port is not None else serving_port(bind, WEB_PORT, 0)
     # A recording that is live elsewhere needs nothing of this viewer but its files.
     own = bind if recording.url is None else "127.0.0.1"
-    stream, files = free_port(own, stream), free_port(own, 0)
+    stream, files = serving_port(own, stream), serving_port(own, 0)
     ports = ("--web-viewer-port", str(files), "--port", str(stream))
     async with viewer("--serve-web", "--bind", own, *ports, shown, log="info") as window:
         await window.says(HOSTING)
@@ -170,7 +171,7 @@ async def open_viewer(
                 if port is not None:
                     raise
                 # Another program took it since it was found free: any other does as well.
-                page = free_port(bind, 0)
+                page = serving_port(bind, 0)
                 served = ViewerPage((here, files), allowed, bind, page)
                 await served.start()
         except OSError as error:
@@ -274,17 +275,13 @@ def _checked(file: Path) -> Path:
     return file.absolute()
 
 
-def free_port(bind: str, *ports: int) -> int:
+def serving_port(bind: str, *ports: int) -> int:
     """The first of these ports that is free, 0 for any. Raises BadInput where all are taken."""
-    family = socket.AF_INET6 if ":" in bind else socket.AF_INET
-    reason = ""
-    for port in ports:
-        try:
-            with socket.create_server((bind, port), family=family) as server:
-                return int(server.getsockname()[1])
-        except OSError as error:
-            reason = os.strerror(error.errno or 0)
-    raise BadInput(f"can't serve on {bind}, port {ports[0]} ({reason}); choose another --port or --bind")
+    try:
+        return free_port(bind, *ports)
+    except OSError as error:
+        reason = os.strerror(error.errno or 0)
+        raise BadInput(f"can't serve on {bind}, port {ports[0]} ({reason}); choose another --port or --bind") from error
 
 
 def _bracketed(address: str) -> str:

@@ -144,7 +144,8 @@ async def _stream(
     stack: AsyncExitStack, robot: str, record: Path | None, console: _Console, *, view: bool
 ) -> PictureRecording:
     """The picture's stream, and a window onto it where there is a display."""
-    from zscout.cli.fleet.view import WINDOW, free_port, has_display, viewer
+    from zscout.cli.fleet.view import WINDOW, has_display, viewer
+    from zscout.ports import free_port
 
     # Rerun takes seconds to load on a busy machine, and the operator may be in a hurry.
     await asyncio.to_thread(importlib.import_module, "zscout.cli.operator.picture_recording")

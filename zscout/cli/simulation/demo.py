@@ -50,7 +50,8 @@ class _Live:
         self._window: Child | None = None
 
     async def open(self, url: str) -> str:
-        from zscout.cli.fleet.view import WEB_PORT, free_port, open_viewer
+        from zscout.cli.fleet.view import WEB_PORT, open_viewer
+        from zscout.ports import free_port
         from zscout.services.recorder.process import Recording
 
         self._stream = urlsplit(url).port or 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import socket
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
@@ -14,6 +13,7 @@ from typing import Final, Self
 import rerun as rr
 
 from zscout.config.strict import BadInput
+from zscout.ports import free_port
 from zscout.services.recorder.blueprint import (
     APPLICATION,
     FOLDED,
@@ -397,10 +397,8 @@ class Timeline(Drawing):
 
 def _free_port(bind: str, port: int) -> int:
     """Checks address and port first: of a failure Rerun itself reports only that its thread ended."""
-    family = socket.AF_INET6 if ":" in bind else socket.AF_INET
     try:
-        with socket.create_server((bind, port), family=family) as server:
-            return int(server.getsockname()[1])
+        return free_port(bind, port)
     except OSError as error:
         raise TimelineError(
             f"can't listen on {bind}, port {port} ({os.strerror(error.errno or 0)}); "

@@ -19,9 +19,10 @@ from zscout.behaviors.sensor_net.net import HIDDEN, WATCHING
 from zscout.behaviors.teleop import Pilot, Teleop, Way
 from zscout.mesh import clock
 from zscout.messages import BehaviorSaid, BuildingPoses, ComponentSpec, Grants
+from zscout.ports import free_port
 from zscout.simulation.building.bodies import WARM_UP
 from zscout.simulation.building.node_file import RADIO, device_tables, framegrabber_name
-from zscout.simulation.demo.runner import BUILDING, HOSTS, DemoRunner, free_ports
+from zscout.simulation.demo.runner import BUILDING, HOSTS, DemoRunner
 from zscout.types import SECOND, Ns
 
 NET: Final = "place_sensor_net"
@@ -174,7 +175,7 @@ class RobotsDemo(DemoRunner):
     async def _start(self) -> Client:
         """Start the building and the nodes, and wait until all are present."""
         self.write_fleet()
-        (port,) = free_ports(1)
+        port = free_port("127.0.0.1", 0)
         line = self.folder / "radio0"
         await self.start(
             BUILDING,

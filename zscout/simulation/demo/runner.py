@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import os
-import socket
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
@@ -17,6 +16,7 @@ from zscout.behaviors.launch import LAUNCH
 from zscout.config.fleet import Fleet, load_fleet
 from zscout.keyexpr import Role, Token, new_instance
 from zscout.mesh import Mesh, Supervisor, clock
+from zscout.ports import free_port
 from zscout.simulation import DemoFailed
 from zscout.types import SECOND, Ns
 
@@ -228,7 +228,8 @@ def _list(texts: Sequence[str]) -> str:
 
 
 def free_ports(count: int) -> list[int]:
-    """Different ports that are free at this moment."""
-    with ExitStack() as stack:
-        servers = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
-        return [int(server.getsockname()[1]) for server in servers]
+    """Different ports of loopback that are free at this moment."""
+    ports: set[int] = set()
+    while len(ports) < count:
+        ports.add(free_port("127.0.0.1", 0))
+    return [*ports]
