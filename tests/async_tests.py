@@ -43,8 +43,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
 
     async def main() -> None:
         if not real:
-            # What failed once must fail again.
-            RANDOM.set(random.Random(os.environ.get(SEED, "") + pyfuncitem.nodeid))
+            RANDOM.set(random.Random(os.environ.get(SEED, "") + pyfuncitem.nodeid))  # noqa: S311 - what failed once must fail again
         async with AsyncExitStack() as opened, asyncio.timeout(3 * HANG if real else None):
             for value in values.values():
                 if isinstance(value, AbstractAsyncContextManager):
