@@ -65,6 +65,10 @@ async def test_a_command_reboots_the_device_that_it_holds(tmp_path: Path, lab: L
     up.touch()
     done = await running
     assert (done.returncode, done.stdout) == (0, "passed\n"), done.stderr
+    told = [line for line in done.stderr.splitlines() if line.startswith(f"{BOARD} is ")]
+    assert told[0].startswith(f"{BOARD} is unwell since ")
+    assert "health ended with exit code 1; lost in " in told[0]
+    assert told[1:] == [f"{BOARD} is well again"]
 
 
 @pytest.mark.slow

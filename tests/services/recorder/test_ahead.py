@@ -171,7 +171,8 @@ def test_what_changes_is_said_once_and_what_stood_before_is_not(path: Path) -> N
         news(5, tells(survey, after=5))
         film = booked("film", "robot/*", every=1, dates=danger)
         mend = booked("mend", "robot/c", start=20, hours=8, maintenance=True)
-        news(10, tells(survey, film, mend, after=10))
+        burnt = booked("burnt", "robot/d", start=0, maintenance=True, lasting=True, broken=True)
+        news(10, tells(survey, film, mend, burnt, after=10))
         film = booked("film", "robot/*", every=1, dates=[{"state": "conflict", "danger": "crew of ws2 stands"}] * 2)
         news(15, tells(booked("survey", "robot/a", "radio/rf0", dates=[{"state": "taken"}]), film, mend, after=15))
         news(20, tells(booked("film", "robot/*", every=1, dates=[{"state": "open"}]), after=20))
@@ -180,10 +181,12 @@ def test_what_changes_is_said_once_and_what_stood_before_is_not(path: Path) -> N
     assert events(path) == [
         "booking film of ws1 is made: robot/b, Fri 15 Jan, 09:00 to 10:00 UTC, and every day",
         "maintenance mend of ws1 is made: robot/c, Sat 16 Jan, 04:00 to 12:00 UTC",
+        "robot/d reported broken by ws1: burnt",
         "booking film of ws1 may not start Fri 15 Jan, 09:00 to 10:00 UTC: robot/* is gone",
         "booking survey of ws1 is taken up",
         "booking film of ws1, Fri 15 Jan, 09:00 to 10:00 UTC, can't be: crew of ws2 stands",
         "booking film of ws1, Sat 16 Jan, 09:00 to 10:00 UTC, can't be: crew of ws2 stands",
+        "robot/d no longer reported broken",
         "booking film of ws1, Fri 15 Jan, 09:00 to 10:00 UTC, stands again",
         # What was taken up is over: its ARC is spoken of.
         "booking film of ws1, Sat 16 Jan, 09:00 to 10:00 UTC, is given up",

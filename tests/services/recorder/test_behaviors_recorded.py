@@ -16,7 +16,7 @@ from rerun.blueprint.api import Container, View
 from tests.services.recorder.paper_run import colours, events, lanes, rows
 from tests.services.recorder.robot_run import NET, say
 from zscout.keyexpr import Sender
-from zscout.messages import BehaviorSaid, RcState
+from zscout.messages import BehaviorSaid, RcState, Unwell
 from zscout.services.recorder import robots
 from zscout.services.recorder.blueprint import LEGEND, Layout, RobotLayout, blueprint
 from zscout.services.recorder.colours import DOING, OTHER
@@ -167,8 +167,11 @@ def test_devices_figures_and_health(path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(robots, "MAX_SERIES", 3)
     monkeypatch.setattr(robots, "MAX_FOLLOWED", 2)
 
-    def state(at: float, rc: str, health: str = "ok", figures: dict[str, float] | None = None) -> None:
-        tracker.state(at, RcState(rc, "cart", "i", sharable=False, health=health, figures=figures or {}))
+    def state(
+        at: float, rc: str, health: str = "ok", figures: dict[str, float] | None = None, unwell: str = ""
+    ) -> None:
+        sick = Unwell(unwell, 1.0, 59.0) if unwell else None
+        tracker.state(at, RcState(rc, "cart", "i", sharable=False, health=health, unwell=sick, figures=figures or {}))
 
     with Timeline("lab", path=path) as timeline:
         tracker = timeline.robots
@@ -180,9 +183,14 @@ def test_devices_figures_and_health(path: Path, monkeypatch: pytest.MonkeyPatch)
         state(34, "radio/rf0", "unplugged")
         state(34.1, "radio/rf0", "unplugged again")
         state(35.5, "radio/rf0")
+        state(35.6, "radio/rf0")
         state(36, "radio/rf0", "unplugged for good")
         for tick in (36.25, 36.5, 36.75):
             tracker.tick(tick)
+        state(40, "lamp/desk", unwell="no answer to ping")
+        state(42, "lamp/desk")
+        state(44, "lamp/desk", unwell="no answer to ping")
+        state(46, "lamp/desk", "no answer to ping for 60 s", unwell="no answer to ping")
         assert not timeline.robots.shown.any
         assert "/device" in origins(blueprint(timeline.layout(live=False)).root_container)
     told_of_a = sorted((at, value) for _, at, value in rows(path, "/device/robot/a/rate", "Scalars:scalars"))
@@ -197,4 +205,8 @@ def test_devices_figures_and_health(path: Path, monkeypatch: pytest.MonkeyPatch)
         "radio/rf0 fails: unplugged",
         "radio/rf0 is well again",
         "radio/rf0 fails: unplugged for good",
+        "lamp/desk is unwell: no answer to ping",
+        "lamp/desk is well again",
+        "lamp/desk is unwell: no answer to ping",
+        "lamp/desk fails: no answer to ping for 60 s",
     ]

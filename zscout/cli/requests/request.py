@@ -6,7 +6,7 @@ import asyncio
 import signal
 import sys
 from collections.abc import AsyncIterator, Coroutine, Iterator
-from contextlib import asynccontextmanager, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, asynccontextmanager, closing, contextmanager, nullcontext, suppress
 from functools import partial
 from typing import IO, Any, Final
 
@@ -21,6 +21,7 @@ from zscout.behaviors.client.request import HoldEnd, OpenArc
 from zscout.cli import common, completion
 from zscout.cli.booked import BOOKING
 from zscout.cli.common import Failed
+from zscout.cli.device_words import unwell
 from zscout.cli.ownership import yes_option
 from zscout.cli.requests.options import SECONDS, CommandAfterDashes, HoldOptions, gather, hold_options
 from zscout.cli.requests.run_command import RunningCommand, environment
@@ -28,7 +29,7 @@ from zscout.cli.requests.taking_up import check_options, taking_up
 from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text, reason_text, request_words
 from zscout.config.strict import BadInput
 from zscout.mesh.supervision import done_within
-from zscout.messages import Foresight, RcmState, StateAsk, version_words
+from zscout.messages import Foresight, RcmState, RcState, StateAsk, version_words
 from zscout.scheduling.reason import starting, waits
 from zscout.terminal import LiveLine, clean, clock, print_json, print_line, span
 from zscout.types import SECOND, VERSION, Ns
@@ -195,12 +196,13 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
         code = None
         if wanted.tolerate is not None:
             await _tolerate(wanted.tolerate, report, held)
-        if wanted.command:
-            code = await _run(wanted, report, held, client)
-        else:
-            with _never_suspended(report):
-                async with report.telling(report.follow_hold(arc)):
-                    await held.over()
+        with _reporting_unwell(report, held, client):
+            if wanted.command:
+                code = await _run(wanted, report, held, client)
+            else:
+                with _never_suspended(report):
+                    async with report.telling(report.follow_hold(arc)):
+                        await held.over()
     except BaseException:
         await client.end(arc)
         report.event("ended", f"{arc.name} gave back {rcs}", outcome="released")
@@ -232,6 +234,28 @@ async def _tolerate(seconds: float, report: Report, held: Held) -> None:
     if less := {rc: most for rc, most in tolerated.items() if most < seconds}:
         words = ", ".join(f"{rc} tolerates {span(most) if most else 'no outage'}" for rc, most in less.items())
         report.event("tolerate", f"--tolerate {span(seconds)} is more than the devices allow: {words}", tolerated=less)
+
+
+@contextmanager
+def _reporting_unwell(report: Report, held: Held, client: Client) -> Iterator[None]:
+    """Report when a held device stops working, and when it works again."""
+    keys, sick = client.mesh.keys, set[str]()
+
+    def published(key: str, state: RcState) -> None:
+        ours = keys.rc_of(key) == state.rc and any(holder.grant == held.grant for holder in state.holders)
+        if not ours or state.health != "ok" or (state.unwell is not None) is (state.rc in sick):
+            return
+        sick.symmetric_difference_update({state.rc})
+        if state.unwell is not None:
+            details = {"reason": state.unwell.why, "left": round(state.unwell.left, 3)}
+            report.event("unwell", clean(f"{state.rc} is {unwell(state)}"), rc=state.rc, **details)
+        else:
+            report.event("well", f"{state.rc} is well again", rc=state.rc)
+
+    with ExitStack() as stack:
+        for rc in held.rcs:
+            stack.enter_context(closing(client.mesh.subscribe(keys.rc_state(rc), RcState, published)))
+        yield
 
 
 @contextmanager

@@ -74,7 +74,8 @@ class BookingTracker:
             if date.state not in AHEAD_OF_NOW or not (date.start < latest and now < date.end):
                 continue
             colour = MAINTENANCE if booking.maintenance else self._colour(booking.name)
-            text = f"maintenance: {booking.name}" if booking.maintenance else booking.name
+            kind = "broken" if booking.broken else "maintenance" if booking.maintenance else ""
+            text = f"{kind}: {_named(booking)}" if kind else booking.name
             taken = date.state == "taken"
             if date.state == "conflict":
                 colour, text = FAILED, f"{text}, in conflict"
@@ -107,6 +108,8 @@ def _dates(bookings: Iterable[BookingView]) -> dict[Key, Dated]:
 
 
 def _made(one: BookingView) -> Event:
+    if one.broken:
+        return f"{', '.join(_rcs(one, one.dates[0]))} reported broken by {one.owner}: {_named(one)}", "WARN"
     again = "" if not one.every else ", and every day" if one.every == 1 else f", and every {one.every} days"
     return f"{_subject(one)} is made: {', '.join(_rcs(one, one.dates[0]))}, {_span(one.dates[0])}{again}", "INFO"
 
@@ -135,7 +138,8 @@ def _gone(gone: Iterable[Dated], known: Container[str], now: float) -> Iterator[
             yield f"{_subject(one)}, {_span(date)}, is given up", "INFO"
         elif one.id not in given_up:
             given_up.add(one.id)
-            yield f"{_subject(one)} is given up", "INFO"
+            rcs = ", ".join(_rcs(one, date))
+            yield f"{rcs} no longer reported broken" if one.broken else f"{_subject(one)} is given up", "INFO"
 
 
 def _rcs(booking: BookingView, date: BookedDate) -> list[str]:
@@ -145,6 +149,11 @@ def _rcs(booking: BookingView, date: BookedDate) -> list[str]:
 def _subject(booking: BookingView) -> str:
     owner = f" of {booking.owner}" if booking.owner else ""
     return f"{'maintenance' if booking.maintenance else 'booking'} {booking.name}{owner}"
+
+
+def _named(booking: BookingView) -> str:
+    """What is broken, where that is said, or the booking's name."""
+    return (booking.broken and booking.who is not None and booking.who.comment) or booking.name
 
 
 def _span(date: BookedDate) -> str:

@@ -109,9 +109,9 @@ class RateLimiter:
 
 @dataclass(slots=True)
 class _Health:
-    words: str = "ok"
-    """As it is."""
-    shown: str = "ok"
+    words: str = ""
+    """As it is; empty: well."""
+    shown: str = ""
     """As it was shown last."""
     at: float = -HEALTH_SPACING
 
@@ -322,19 +322,22 @@ class RobotTracker:
             return
         if state.figures:
             self._draw_figures(at, state.rc, state.figures)
-        if state.rc in self._health or (state.health != "ok" and len(self._health) < MAX_FOLLOWED):
+        words = "" if state.health == "ok" else f"fails: {state.health}"
+        if not words and state.unwell is not None:
+            words = f"is unwell: {state.unwell.why}"
+        if state.rc in self._health or (words and len(self._health) < MAX_FOLLOWED):
             health = self._health.setdefault(state.rc, _Health())
-            health.words = state.health
+            health.words = words
             self._show_health(at, state.rc, health)
 
     def _show_health(self, at: float, rc: str, health: _Health) -> None:
         if health.words == health.shown or at - health.at < HEALTH_SPACING:
             return
         health.shown, health.at = health.words, at
-        if health.words == "ok":
-            self._drawing.event(at, f"{rc} is well again")
+        if health.words:
+            self._drawing.warn(at, f"{rc} {health.words}")
         else:
-            self._drawing.warn(at, f"{rc} fails: {health.words}")
+            self._drawing.event(at, f"{rc} is well again")
 
     def _draw_figures(self, at: float, rc: str, figures: Mapping[str, float]) -> None:
         """What is not a finite number is left out."""
