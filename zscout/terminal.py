@@ -52,14 +52,20 @@ _JSON: Final = msgspec.json.Encoder(decimal_format="number")
 
 def print_json(value: Any, stream: IO[str] | None = None) -> None:
     """One JSON value (structs and Decimals included) on one line, at once; all in it that could draw is escaped."""
+    text = json_text(value)
+    # JSON is UTF-8, whatever the stream has, or ASCII.
+    if not text.isascii() and (getattr(stream or sys.stdout, "encoding", None) or "utf-8").lower() != "utf-8":
+        text = "".join(char if char.isascii() else escaped(char) for char in text)
+    print_line(text, stream)
+
+
+def json_text(value: Any) -> str:
+    """The same as text."""
     try:
         text = _JSON.encode(value).decode()
     except UnicodeEncodeError:  # the name of a file that is no text
         text = json.dumps(msgspec.to_builtins(value, builtin_types=(Decimal,)), default=float)
-    # JSON is UTF-8, whatever the stream has, or ASCII.
-    if not text.isascii() and (getattr(stream or sys.stdout, "encoding", None) or "utf-8").lower() != "utf-8":
-        text = "".join(char if char.isascii() else escaped(char) for char in text)
-    print_line(text if text.isprintable() else "".join(c if c.isprintable() else escaped(c) for c in text), stream)
+    return text if text.isprintable() else "".join(c if c.isprintable() else escaped(c) for c in text)
 
 
 def print_line(text: str, stream: IO[str] | None = None) -> None:

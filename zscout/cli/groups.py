@@ -21,6 +21,14 @@ MAX_SHOWN: Final = 40
 """Characters of an unknown command that are repeated."""
 
 
+class InfraExit(Exception):
+    """A failure of zscout's own, its cause, of a command with `--infra-exit`, whose value is the exit code."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
+
+
 def at_terminal() -> bool:
     return sys.stderr.isatty()
 

@@ -14,6 +14,7 @@ import errno
 import os
 import re
 import sys
+import traceback
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -22,7 +23,7 @@ from typing import IO, Any, Final
 import click
 
 from zscout import __version__
-from zscout.cli.groups import Headings, LazyGroup, instead
+from zscout.cli.groups import Headings, InfraExit, LazyGroup, instead
 from zscout.logs import shortage
 from zscout.streams import escape_what_cannot_be_written
 
@@ -125,10 +126,13 @@ def run_command(call: Callable[[], Any], program: str = "zscout") -> Any:
         code = call()
         sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:
-        known = explain(error)
-        if known is None:
+        infra_exit = error.code if isinstance(error, InfraExit) else None
+        cause = error.__cause__ if isinstance(error, InfraExit) and error.__cause__ is not None else error
+        known = explain(cause)
+        if known is None and infra_exit is None:
             raise
-        code, line = known
+        code, line = known or (COULD_NOT, "".join(traceback.format_exception(cause)))
+        code = code if infra_exit is None else infra_exit
         if line:
             # Where nobody reads it, the code still tells.
             with suppress(OSError):

@@ -135,9 +135,11 @@ async def _agree(client: Client, wanted: HoldOptions, *, yes: bool) -> None:
         victims = {(hold.client, hold.id) for hold in (*cost.ends, *cost.may_end)}
         if victims and victims <= agreed:
             return
+        preview = {"event": "preview", "arc": wanted.name, "client": str(client.mesh.me)} | cost.as_json()
+        if wanted.events is not None:
+            wanted.events.write(preview)
         if wanted.as_json:
-            preview = {"event": "preview", "arc": wanted.name, "client": str(client.mesh.me)}
-            print_json(preview | cost.as_json(), sys.stderr if wanted.command else sys.stdout)
+            print_json(preview, sys.stderr if wanted.command else sys.stdout)
         asks = bool(victims) and not yes
         possible = sys.stdin.isatty() and sys.stderr.isatty()
         # The JSON may go down a pipe: at a question the words are wanted besides.

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from decimal import Decimal
 from functools import partial
@@ -17,17 +19,20 @@ from msgspec.structs import replace
 from zscout import messages
 from zscout.behaviors.client.identity import bounded, checked_comment
 from zscout.cli import completion
-from zscout.cli.common import F, Parsed, json_option
-from zscout.cli.requests.run_command import check_command
+from zscout.cli.common import F, Failed, Interrupted, Parsed, json_option
+from zscout.cli.groups import InfraExit
+from zscout.cli.requests.run_command import COMMAND_CODES, check_command
 from zscout.config import strict
 from zscout.config.strict import DURATIONS, BadInput, quoted
 from zscout.keyexpr import BadName, check_name, check_need, is_pattern, valid_name
 from zscout.messages import MAX_NEEDS, MAX_PARAMS, MAX_SECONDS, Who
 from zscout.scheduling.needs import check_patterns
-from zscout.terminal import span
+from zscout.terminal import json_text, span
 
 Needs = dict[str, dict[str, Decimal]]
 
+INFRA_EXIT: Final = "--infra-exit"
+EXIT_CODES: Final = range(1, 256)
 DEFAULT_NAMES: Final = ("request", "operator")
 """What ARCs of `zscout request` and `zscout take` are called that run no command."""
 MAX_ARC_NAME: Final = 200
@@ -49,8 +54,9 @@ def parse_duration(text: str, what: str, *, zero: bool = False) -> Decimal:
     return seconds
 
 
-def timeout_option(help: str) -> Callable[[F], F]:  # noqa: A002 - click's word
-    return click.option("--timeout", type=SECONDS, help=help)
+def timeout_option(help: str, *, zero: bool = False) -> Callable[[F], F]:  # noqa: A002 - click's word
+    """The `--timeout` option, in seconds; with `zero`, 0 may be written too."""
+    return click.option("--timeout", type=SECONDS_OR_0 if zero else SECONDS, help=help)
 
 
 def seconds_within(low: float, high: float) -> Parsed[float]:
@@ -67,6 +73,7 @@ def seconds_within(low: float, high: float) -> Parsed[float]:
 
 SECONDS: Final = Parsed("duration", lambda text, option: float(parse_duration(text, option)))
 """An option's duration of any length, in seconds."""
+SECONDS_OR_0: Final = Parsed("duration", lambda text, option: float(parse_duration(text, option, zero=True)))
 
 
 def parse_comment(text: str, option: str) -> str:
@@ -142,7 +149,74 @@ def gather_needs(pairs: Sequence[tuple[str, dict[str, Decimal]]]) -> Needs:
 # Commands that hold something
 
 
-class CommandAfterDashes(click.Command):
+class EventFile:
+    """Where `--json-file` writes events: a file, a FIFO with a reader, or an open descriptor."""
+
+    def __init__(self, target: str) -> None:
+        """Raises BadInput where nothing can be written there."""
+        try:
+            if target.isascii() and target.isdigit():
+                self.fd = int(target)
+                os.fstat(self.fd)
+            else:
+                # A FIFO without a reader is refused instead of waited for; a full one loses events.
+                flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NONBLOCK
+                self.fd = os.open(target, flags, 0o666)
+            os.write(self.fd, b"")
+        except (OSError, OverflowError) as error:
+            why = error.strerror if isinstance(error, OSError) else "no such descriptor"
+            raise BadInput(f"--json-file {quoted(target)} can't be written ({why}); give another file") from None
+
+    def write(self, event: Mapping[str, Any]) -> None:
+        """Write one event as a line. What zscout does does not depend on who reads it."""
+        with suppress(OSError):
+            os.write(self.fd, f"{json_text(event)}\n".encode())
+
+
+class HoldCommand(click.Command):
+    """A command with `--infra-exit` and `--json-file`: how it fails is known to both."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        ctx.meta["infra_exit"] = _infra_exit_in(args)
+        with _own_failures(ctx):
+            return super().parse_args(ctx, args)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        with _own_failures(ctx):
+            return super().invoke(ctx)
+
+
+def _infra_exit_in(args: Sequence[str]) -> int | None:
+    """The value of --infra-exit, read before all other options, any of which may be wrong. None if it has none, or
+    a bad one, which is refused with the others."""
+    for at, arg in enumerate(args):
+        name, equals, value = arg.partition("=")
+        if name == INFRA_EXIT:
+            value = value if equals else "".join(args[at + 1 : at + 2])
+            return int(value) if re.fullmatch("[0-9]{1,3}", value) and int(value) in EXIT_CODES else None
+    return None
+
+
+@contextmanager
+def _own_failures(ctx: click.Context) -> Iterator[None]:
+    """Write a failure to --json-file, and raise InfraExit for it, where these options are given."""
+    from zscout.cli.main import explain
+
+    try:
+        yield
+    except (click.exceptions.Exit, click.Abort, Interrupted):
+        raise
+    except Exception as error:
+        code, line = explain(error) or (1, repr(error))
+        if (events := ctx.meta.get("events")) is not None:
+            events.write({"event": "failed", "code": code, "reason": line.removeprefix("zscout: ")})
+        infra_exit = ctx.meta["infra_exit"]
+        if infra_exit is None or (isinstance(error, Failed) and code in COMMAND_CODES):
+            raise
+        raise InfraExit(infra_exit) from error
+
+
+class CommandAfterDashes(HoldCommand):
     """A click command that takes `-- COMMAND [ARG]...` at its end, untouched, as `ctx.meta["command"]`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -180,6 +254,12 @@ class HoldOptions:
     """Seconds for which devices may be unwell under the hold; None: as each device has it."""
     booking: str = ""
     """The id of the booking that it takes up."""
+    infra_exit: int | None = None
+    events: EventFile | None = None
+
+    def own_code(self, code: int) -> int:
+        """The exit code where it is zscout's own that would be `code`."""
+        return code if self.infra_exit is None else self.infra_exit
 
     def asked_by(self, who: Who | None) -> Who:
         """Who asks, of whom only zscout's own command is known yet: for which command, or under which name."""
@@ -218,7 +298,18 @@ def hold_options(command: F, *, needs_required: bool = True) -> F:
             help="Time from SIGTERM to SIGKILL for the command: at most, and by default, nine tenths of what devices "
             "settle (`settle`, 5 s).",
         ),
-        timeout_option("Wait this long for a grant, then exit with 1."),
+        click.option(
+            INFRA_EXIT,
+            type=click.IntRange(EXIT_CODES[0], EXIT_CODES[-1]),
+            metavar="N",
+            help="Exit with N wherever zscout fails, not the command: for 1, 2, 3, 75 and 124.",
+        ),
+        click.option(
+            "--json-file",
+            metavar="PATH|FD",
+            help="Write the events of --json to a file or an open descriptor, beside what people read.",
+        ),
+        timeout_option("Wait this long for a grant, then exit with 1; 0: try once.", zero=True),
         click.option(
             "--min-runtime",
             type=Parsed("duration", parse_duration),
@@ -238,16 +329,26 @@ def hold_options(command: F, *, needs_required: bool = True) -> F:
 
 
 def gather(
-    needs: Any, name: str | None, default_name: str = DEFAULT_NAMES[0], *, keep: bool, release_after: Any, **rest: Any
+    needs: Any,
+    name: str | None,
+    default_name: str = DEFAULT_NAMES[0],
+    *,
+    keep: bool,
+    release_after: Any,
+    json_file: str | None,
+    **rest: Any,
 ) -> HoldOptions:
     """Checks what can be checked before anybody is asked. Raises UsageError, BadInput, BadName, Failed."""
+    context = click.get_current_context()
+    if json_file is not None:
+        rest["events"] = context.meta["events"] = EventFile(json_file)
     if not needs and not rest.get("booking"):
-        raise click.UsageError("DEVICE... is missing", click.get_current_context())
+        raise click.UsageError("DEVICE... is missing", context)
     if release_after is not None:
         if rest["min_runtime"] is not None:
             raise BadInput("--release-after and --min-runtime exclude each other; use only one of them")
         keep, rest["min_runtime"] = False, release_after
-    command: tuple[str, ...] = click.get_current_context().meta["command"]
+    command: tuple[str, ...] = context.meta["command"]
     if command:
         check_command(command)
         default_name = valid_name(Path(command[0]).name)

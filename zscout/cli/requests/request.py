@@ -23,14 +23,14 @@ from zscout.cli.booked import BOOKING
 from zscout.cli.common import Failed
 from zscout.cli.device_words import unwell
 from zscout.cli.ownership import yes_option
-from zscout.cli.requests.options import SECONDS, CommandAfterDashes, HoldOptions, gather, hold_options
+from zscout.cli.requests.options import SECONDS, CommandAfterDashes, EventFile, HoldOptions, gather, hold_options
 from zscout.cli.requests.run_command import RunningCommand, environment
 from zscout.cli.requests.taking_up import check_options, taking_up
 from zscout.cli.requests.waiting import NeedContention, contention_of, hold_text, reason_text, request_words
 from zscout.config.strict import BadInput
 from zscout.mesh.supervision import done_within
 from zscout.messages import Foresight, RcmState, RcState, StateAsk, version_words
-from zscout.scheduling.reason import starting, waits
+from zscout.scheduling.reason import ReasonCode, starting, waits
 from zscout.terminal import LiveLine, clean, clock, print_json, print_line, span
 from zscout.types import SECOND, VERSION, Ns
 
@@ -39,6 +39,10 @@ TAKEN_AWAY: Final = 75
 TIME_OVER: Final = 124
 """As `timeout` has it: the command was ended because its time was over, and with a kept hold somebody waited."""
 MAX_PRIORITY: Final = 1_000_000
+ANSWERS: Final = 5.0
+"""Seconds in which a leader answers, or the next one leads and does, with --timeout 0."""
+UNDECIDED: Final = (ReasonCode.VOTING, ReasonCode.SEARCHING)
+"""How a request waits that may be granted without anything changing."""
 LAST_WORD: Final = 0.5
 """Seconds in which the RCM's word about a hold whose time is over arrives."""
 UNTIL: Final = "until somebody waits for it"
@@ -101,8 +105,9 @@ async def request(
       126  it can't be executed           127  there is no such command
       1    not granted; without a command also: taken away    3  no leader
       2    it can never start: an unknown device or parameter, or too much of one
+    With --infra-exit N it is N instead of 1, 2, 3, 75 and 124: all else is the command's own.
 
-    With a COMMAND zscout prints to stderr only.
+    With a COMMAND zscout prints to stderr only. --json-file writes what happens as JSON lines, beside that.
 
     \b
     Examples:
@@ -110,6 +115,7 @@ async def request(
       zscout request robot/scout33 --release-after 5m
       zscout request robot/scout33 radio/rf0:command_rate=5 -- sh -c 'echo I hold $ZSCOUT_RCS; sleep 50'
       zscout request framegrabber/fgrab1 --timeout 30 --again -- sleep 60
+      zscout request dut/board --timeout 0 --infra-exit 75 --json-file events.json -- ./test.sh
       zscout request 'framegrabber/*' 'framegrabber/*' robot/scout33 -- python3 -i
       zscout request robot/scout33 --json | jq .event
       zscout request robot/scout33 --priority 5 --dry-run
@@ -132,7 +138,7 @@ async def carry_out(client: Client, wanted: HoldOptions) -> int:
     """Waits, holds, runs the command, gives back. Returns the exit code. Raises Failed, RequestRefused."""
     stream = sys.stderr if wanted.command else sys.stdout
     client.who = wanted.asked_by(client.who)
-    with Report(wanted.name, client, as_json=wanted.as_json, stream=stream) as report:
+    with Report(wanted.name, client, as_json=wanted.as_json, stream=stream, events=wanted.events) as report:
         client.internals.watch(report.news)
         arc: OpenArc | None = None
         while True:
@@ -154,7 +160,8 @@ async def carry_out(client: Client, wanted: HoldOptions) -> int:
 async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc | None) -> OpenArc:
     """Until it is granted. Raises Failed where it is not."""
     try:
-        async with report.telling(report.follow_wait()), asyncio.timeout(wanted.timeout):
+        once = wanted.timeout == 0
+        async with report.telling(report.follow_wait()), asyncio.timeout(ANSWERS if once else wanted.timeout) as limit:
             if arc is None:
                 arc = await client.request(
                     wanted.name,
@@ -165,7 +172,8 @@ async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenAr
                     direct=bool(wanted.command),
                     booking=wanted.booking,
                 )
-            grant = await client.granted(arc, confirmed=True)
+            async with common.beside(_give_up_once_queued(client, arc, limit)) if once else nullcontext():
+                grant = await client.granted(arc, confirmed=True)
     except (TimeoutError, asyncio.CancelledError) as error:
         why = arc.reason if arc is not None else ""
         if arc is not None:
@@ -173,13 +181,25 @@ async def _wait(client: Client, wanted: HoldOptions, report: Report, arc: OpenAr
         if isinstance(error, asyncio.CancelledError):
             report.event("ended", f"{wanted.name} is cancelled", outcome="cancelled")
             raise
-        line = f"{wanted.name} was not granted within {span(wanted.timeout or 0)}, and is cancelled"
         report.event("ended", "", outcome="timeout", reason=why)
+        if once and arc is None:
+            raise common.NobodyThere(f"the leader of fleet {client.fleet.name} did not answer; try again") from None
+        within = "at once" if once else f"within {span(wanted.timeout or 0)}"
+        line = f"{wanted.name} was not granted {within}, and is cancelled"
         raise Failed(f"{line}: {why}" if why else line) from None
     if grant is None:
         report.event("ended", "", outcome=arc.outcome, reason=arc.reason)
         raise Failed(f"{wanted.name} was not granted: {arc.reason or arc.outcome}")
     return arc
+
+
+async def _give_up_once_queued(client: Client, arc: OpenArc, limit: asyncio.Timeout) -> None:
+    """Let `limit` pass as soon as the leader has decided that `arc` waits."""
+    loop = asyncio.get_running_loop()
+    while arc.state != "queued" or (arc.why is not None and arc.why.code in UNDECIDED):
+        limit.reschedule(None if arc.state == "running" else loop.time() + ANSWERS)
+        await client.changed(arc)
+    limit.reschedule(loop.time())
 
 
 async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc) -> int | None:
@@ -225,7 +245,7 @@ async def _use(client: Client, wanted: HoldOptions, report: Report, arc: OpenArc
         report.event("ended", f"{line}; asking anew" if again else line, **details)
         if again:
             return None
-        return TIME_OVER if wanted.command else 0
+        return wanted.own_code(TIME_OVER) if wanted.command else 0
     return await _taken(client, wanted, report, arc)
 
 
@@ -341,7 +361,7 @@ async def _taken(client: Client, wanted: HoldOptions, report: Report, arc: OpenA
     if arc.open:
         await client.end(arc)
     if wanted.command:
-        return TAKEN_AWAY
+        return wanted.own_code(TAKEN_AWAY)
     raise Failed(f"{line}; ask again{', or with a higher priority' if ending.outcome == 'preempted' else ''}")
 
 
@@ -375,7 +395,7 @@ async def _foresee(client: Client, wanted: HoldOptions) -> int:
     else:
         for line in _words(foretold):
             print_line(clean(line))
-    return 0 if foretold.starts_in is not None else 1
+    return 0 if foretold.starts_in is not None else wanted.own_code(1)
 
 
 def _words(foretold: Foresight) -> Iterator[str]:
@@ -397,9 +417,11 @@ def _words(foretold: Foresight) -> Iterator[str]:
 class Report(LiveLine):
     """Reports one request of a client on `stream`: a live line at a terminal, plain lines in a pipe, or JSON lines."""
 
-    def __init__(self, name: str, client: Client, *, as_json: bool, stream: IO[str]) -> None:
+    def __init__(
+        self, name: str, client: Client, *, as_json: bool, stream: IO[str], events: EventFile | None = None
+    ) -> None:
         super().__init__(stream, shown=not as_json)
-        self._name, self._client, self._as_json = name, client, as_json
+        self._name, self._client, self._as_json, self._events = name, client, as_json, events
         self._mesh = client.mesh
         self._arc: OpenArc | None = None
         self.changed = asyncio.Event()
@@ -412,10 +434,13 @@ class Report(LiveLine):
 
     def event(self, kind: str, text: str, /, **details: Any) -> None:
         """Reports one event: `text` for people (empty: nothing), the rest for programs."""
+        event = {"event": kind, "arc": self._name, "client": str(self._mesh.me)} | details
+        if self._events is not None:
+            self._events.write(event)
         # What a command does, and its exit code, do not depend on who reads what is said beside it.
         with suppress(OSError) if self._stream is sys.stderr else nullcontext():
             if self._as_json:
-                print_json({"event": kind, "arc": self._name, "client": str(self._mesh.me)} | details, self._stream)
+                print_json(event, self._stream)
             elif text:
                 self.print(text)
 

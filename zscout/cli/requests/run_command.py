@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 LOOK_AGAIN: Final = 0.3
 """Seconds between two looks at a terminal, which reports no changes."""
+COMMAND_CODES: Final = (NOT_EXECUTABLE, NOT_FOUND)
+"""Exit codes by which a shell says as well that it can't run a command."""
 KILLED: Final = -signal.SIGKILL
 CANT_FIND: Final = "/proc shows no processes, and one that it has started still runs: end it by hand"
 CANT_END: Final = "runs as another user and can't be ended: end it by hand"
