@@ -167,3 +167,10 @@ def test_an_alert_for_each_event() -> None:
     assert words == ["", "start", "", "", "", "end", "start"]
     alerts.rest()
     assert (alerts.see(8.1, True), alerts.count) == ("start", 3)
+
+
+def test_motion_that_is_too_short_is_no_alert() -> None:
+    alerts, moves = Alerts(), {1.0, 1.5, 5.0, 5.9, 6.9, 7.1, 20.0}
+    words = [alerts.see(at, at in moves, 2.0) for at in (1.0, 1.2, 1.5, 4.0, 5.0, 5.9, 6.9, 7.1, 8.0, 9.2, 20.0)]
+    assert words == [*[""] * 7, "start", "", "end", ""]
+    assert alerts.count == 1

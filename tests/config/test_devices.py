@@ -13,6 +13,7 @@ from zscout.config.devices import ExclusiveRc, FramegrabberRc, RadioRc, RcConfig
 from zscout.config.node import load_node
 from zscout.config.strict import BadInput
 from zscout.drivers.registry import driver_for
+from zscout.messages import MotionLimits
 from zscout.types import SECOND
 
 
@@ -86,6 +87,21 @@ BAD = {
     table("framegrabber/f", sources="{}"): (
         'rc[0].sources (framegrabber/f): is empty; add one, as in "video/ch1" = "/dev/video0"'
     ),
+    table("framegrabber/f", source='"a"', ignore='["0,0,1,1", "0,0,1,2"]'): (
+        'rc[0].ignore (framegrabber/f): "0,0,1,2" is not a region; write numbers from 0 to 1 with commas, two '
+        "opposite corners of a rectangle or three or more of a polygon, as in 0,0,0.4,0.1"
+    ),
+    table("framegrabber/f", source='"a"', ignore='["0,0,1,1,0.5"]'): (
+        'rc[0].ignore (framegrabber/f): "0,0,1,1,0.5" has 5 numbers; write x and y of two opposite corners of a '
+        "rectangle or three or more of a polygon, as in 0,0,0.4,0.1"
+    ),
+    table("framegrabber/f", source='"a"', ignore='["0,0.5,1,0.5"]'): (
+        'rc[0].ignore (framegrabber/f): "0,0.5,1,0.5" covers nothing; write two opposite corners of a rectangle or '
+        "three or more of a polygon, as in 0,0,0.4,0.1"
+    ),
+    table("framegrabber/f", source='"a"', ignore=str([",".join("0011" * 15)] * 4).replace("'", '"')): (
+        "rc[0].ignore (framegrabber/f): has 4 regions with 120 corners; at most 16 regions with 100 corners are allowed"
+    ),
     table("framegrabber/f", sources='{ ch1 = "b" }'): (
         f'rc[0].sources.ch1 (framegrabber/f): "ch1" is not the name of a device; {RC_RULE}'
     ),
@@ -116,6 +132,11 @@ def test_what_a_table_says_and_what_it_leaves_out() -> None:
     grabber = device(table("framegrabber/f", sources='{ "video/1" = "http://a/1" }', rate="2.5", quality="60"))
     assert isinstance(grabber, FramegrabberRc)
     assert (grabber.by_video, grabber.rate, grabber.quality) == ({"video/1": "http://a/1"}, 2.5, 60)
+    assert grabber.motion is None
+    limited = table("framegrabber/f", source='"a"', ignore='["0,0,0.4,0.1"]', min_area="0.01", min_duration="1.5")
+    grabber = device(limited)
+    assert isinstance(grabber, FramegrabberRc)
+    assert grabber.motion == MotionLimits([[0, 0, 0.4, 0.1]], 0.01, 1.5)
     assert device(table("robot/a", driver="exclusive")) == ExclusiveRc(name="robot/a")
 
 

@@ -18,7 +18,7 @@ from tests.live.bench import until
 from zscout.drivers.driver import RcHandle
 from zscout.drivers.framegrabber import RATE_SPAN, FramegrabberDriver, FrameMeter, encode, is_grey, pace_of
 from zscout.mesh import Supervisor
-from zscout.messages import FrameHead
+from zscout.messages import FrameHead, MotionLimits
 from zscout.types import SECOND, Ns
 
 
@@ -185,6 +185,17 @@ async def test_a_lost_framegrabber_reports_the_newest_reason_once() -> None:
             server.clients = 8
             await until(lambda: rc.well > 0)
             assert all(why != newer for why, newer in pairwise(rc.failed)), rc.failed
+
+
+@pytest.mark.real_time
+async def test_frames_tell_what_of_their_motion_is_reported() -> None:
+    limits = MotionLimits([[0, 0, 0.4, 0.1]], min_duration=2)
+    with MjpegServer() as server:
+        async with grabbing(server.url, motion=limits) as (driver, rc):
+            await until(lambda: not driver._lost)
+            await driver.begin(holder(1, "look"))
+            await until(lambda: bool(rc.heads))
+            assert rc.heads[0].motion == limits
 
 
 @pytest.mark.real_time

@@ -4,13 +4,15 @@ What other drivers may be told is known where they are loaded: `drivers/registry
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from decimal import Decimal
 from typing import Annotated, Any, Final, Literal, TypeAlias, get_args
 
 from msgspec import Meta, Struct, structs
 
 from zscout.config.strict import Where, amounts, check_name, check_rc_name, convert, key, quoted, seconds
+from zscout.messages import MAX_REGION, MAX_REGIONS, MotionLimits
 from zscout.types import MAX_CHANNEL, MAX_ROBOT, SECOND, Ns
 
 MAX_CHANNELS: Final = 64
@@ -27,6 +29,14 @@ AN_ID: Final = "that its packets carry, as in id = 33"
 A_RADIO: Final = 'that carries its halt, as in radio = "radio/rf0"'
 A_COMMAND: Final = 'safe = ["psu", "off"]'
 A_SOURCE: Final = 'source = "/dev/video0", or a table sources'
+
+MAX_CORNERS: Final = 100
+"""Of all regions of one framegrabber: each frame carries them."""
+MAX_MIN_AREA: Final = 0.5
+MAX_MIN_DURATION: Final = 60
+A_REGION: Final = "two opposite corners of a rectangle or three or more of a polygon, as in 0,0,0.4,0.1"
+
+_SHARE: Final = re.compile(r"[0-9]{1,3}(\.[0-9]{0,9})?|\.[0-9]{1,9}", re.ASCII)
 
 Words: TypeAlias = tuple[str, ...]
 """A program and its arguments; no shell reads them."""
@@ -160,11 +170,23 @@ class FramegrabberRc(RcTable, frozen=True, tag="framegrabber"):
         seconds("0", "86400", "Of the same picture, to the bit: the source is frozen. 0: never. 10 but for files."),
     ] = None
     transport: Annotated[Literal["tcp", "udp"], key("Of `rtsp://`; `udp` falls back to TCP.", example="udp")] = "tcp"
+    ignore: Annotated[
+        tuple[str, ...], key("Regions in which motion does not count.", most=MAX_REGIONS, example=["0,0,0.4,0.1"])
+    ] = ()
+    min_area: Annotated[float, key("Least share of the picture in one moving thing.", 0, MAX_MIN_AREA)] = 0.0
+    min_duration: Annotated[Ns, seconds("0", str(MAX_MIN_DURATION), "Shorter motion is not reported.")] = 0
 
     @property
     def by_video(self) -> Mapping[str, str]:
         """The source of each video RC; "" alone where one serves for all."""
         return {"": self.source} if self.source is not None else self.sources or {}
+
+    @property
+    def motion(self) -> MotionLimits | None:
+        """None without limits."""
+        regions = [parse_region(text) for text in self.ignore]
+        limits = MotionLimits(regions, self.min_area, self.min_duration / SECOND)
+        return limits if limits != MotionLimits() else None
 
 
 BuiltInRc: TypeAlias = ExclusiveRc | CapacityRc | CommandRc | RadioRc | RobotRc | VideoRc | FramegrabberRc
@@ -242,6 +264,32 @@ def _check_rc(rc: BuiltInRc, at: Where) -> None:
             for video, source in (rc.sources or {}).items():
                 check_rc_name(video, at / "sources" / video, "video")
                 _check_source(source, at / "sources" / video, f'"{video}" = "/dev/video0"')
+            try:
+                check_regions([parse_region(region) for region in rc.ignore], at / "ignore")
+            except ValueError as error:
+                raise (at / "ignore").bad(*str(error).rsplit("; ", 1)) from None
+
+
+def parse_region(text: str) -> list[float]:
+    """The numbers of a region: x and y of each corner in turn, as shares of the picture's width and height from the
+    upper left. Two corners are opposite ones of a rectangle. Raises ValueError."""
+    parts = text.split(",")
+    numbers = [float(part) for part in parts if _SHARE.fullmatch(part.strip()) and float(part) <= 1]
+    if len(numbers) < len(parts):
+        raise ValueError(f"{quoted(text)} is not a region; write numbers from 0 to 1 with commas, {A_REGION}")
+    if len(numbers) % 2 or not 4 <= len(numbers) <= MAX_REGION:
+        raise ValueError(f"{quoted(text)} has {len(numbers)} numbers; write x and y of {A_REGION}")
+    if len({*numbers[::2]}) < 2 or len({*numbers[1::2]}) < 2:
+        raise ValueError(f"{quoted(text)} covers nothing; write {A_REGION}")
+    return [round(number, 4) for number in numbers]
+
+
+def check_regions(regions: Sequence[list[float]], at: Where) -> None:
+    """Refuses more than the head of a frame holds. Raises BadInput."""
+    corners = sum(map(len, regions)) // 2
+    if len(regions) > MAX_REGIONS or corners > MAX_CORNERS:
+        what = f"has {len(regions)} regions with {corners} corners"
+        raise at.bad(what, f"at most {MAX_REGIONS} regions with {MAX_CORNERS} corners are allowed")
 
 
 def _check_source(text: str, at: Where, example: str) -> None:

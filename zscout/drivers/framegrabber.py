@@ -28,7 +28,7 @@ from zscout.drivers.airtime import Bucket
 from zscout.drivers.capture import Capture, CapturedFrame, seconds
 from zscout.drivers.driver import Driver, RcHandle
 from zscout.mesh import Refused
-from zscout.messages import MAX_FRAME, Figures, FrameHead, Holder, Parameter
+from zscout.messages import MAX_FRAME, Figures, FrameHead, Holder, MotionLimits, Parameter
 from zscout.types import SECOND
 
 if TYPE_CHECKING:
@@ -65,7 +65,8 @@ RATE_SPAN: Final = 3.0
 class FramegrabberDriver(Driver):
     """`sources` are what `Capture` takes, by the video RC that each shows; {"": source} where there is only
     one, whatever it shows. At most `rate` frames a second are published, with JPEG `quality` 1..100. `picture_within`:
-    seconds from one picture to the next at most; `still_after` and `transport` as `Capture` takes them.
+    seconds from one picture to the next at most; `still_after` and `transport` as `Capture` takes them. `motion`: sent
+    with each frame, for whoever detects motion in it.
 
     Commands: `tune` (`to`: a video RC, where the gang does not settle it), `snapshot` (its present state)."""
 
@@ -80,12 +81,13 @@ class FramegrabberDriver(Driver):
         picture_within: float = PICTURE_WITHIN,
         still_after: float | None = None,
         transport: str = "tcp",
+        motion: MotionLimits | None = None,
     ) -> None:
         if not sources or not 0 < rate < math.inf or not 1 <= quality <= 100:
             raise ValueError("a framegrabber has a source, a rate above 0 and a quality of 1 to 100")
         self._sources = dict(sources)
         self._receives = ", ".join(sorted(sources))
-        self._rate, self._quality = rate, quality
+        self._rate, self._quality, self._motion = rate, quality, motion
         self._slow = 2 * picture_within if picture_within > PICTURE_WITHIN else 0.0
         # Before it gives the first, FFmpeg looks at three pictures.
         opening = max(OPEN_TIMEOUT, 2 * self._slow)
@@ -119,6 +121,7 @@ class FramegrabberDriver(Driver):
             picture_within=options.picture_within / SECOND,
             still_after=None if still is None else still / SECOND,
             transport=options.transport,
+            motion=options.motion,
         )
 
     async def open(self, rc: RcHandle) -> None:
@@ -241,7 +244,9 @@ class FramegrabberDriver(Driver):
         capture = self._capture
         if capture is None or source != self._source:
             capture = self._open(source)
-        head = FrameHead(self._before["number"], time=0, width=0, height=0, grant=holder.grant, source=source)
+        head = FrameHead(
+            self._before["number"], 0, width=0, height=0, grant=holder.grant, source=source, motion=self._motion
+        )
         used = partial(self._rc.used, holder.grant)
         rate, quality = self._rate, self._quality
         self._pump = FramePump(self._publisher, capture, self._meter, head, used, rate=rate, quality=quality)

@@ -28,6 +28,13 @@ MAX_USES = 256
 """Grants of which one state tells how long the RC was used under them."""
 MAX_FRAME = 2_000_000
 """Bytes of one frame."""
+MAX_REGIONS = 16
+MAX_REGION = 64
+"""Numbers of one region."""
+Share: TypeAlias = Annotated[float, Meta(ge=0, le=1)]
+Region: TypeAlias = Annotated[list[Share], Meta(min_length=4, max_length=MAX_REGION)]
+"""x and y of each corner in turn, as shares of the picture's width and height; two corners are opposite ones of a
+rectangle."""
 Figures: TypeAlias = Annotated[dict[str, float], Meta(max_length=MAX_FIGURES)]
 
 
@@ -167,6 +174,16 @@ class RcState(Message, frozen=True):
     """Under grants that it holds, and that ended within the last half minute; of others it does not say."""
 
 
+class MotionLimits(Message, frozen=True):
+    """What of a camera's motion is reported."""
+
+    ignore: Annotated[list[Region], Meta(max_length=MAX_REGIONS)] = []
+    """Regions of the picture in which motion does not count."""
+    min_area: Share = 0.0
+    """Of the picture, in one moving thing."""
+    min_duration: Elapsed = 0.0
+
+
 class FrameHead(Message, frozen=True):
     """What is attached to a frame; the payload itself is the JPEG."""
 
@@ -182,6 +199,7 @@ class FrameHead(Message, frozen=True):
     """The video RC to which the framegrabber is tuned, if it knows several."""
     frozen: Seconds = 0.0
     """For how long the source has sent this same picture, where it counts as frozen by that."""
+    motion: MotionLimits | None = None
 
 
 LIMITS[RcState] = MAX_HELD

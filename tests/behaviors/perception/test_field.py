@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 
 import cv2
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from tests.behaviors.perception.scenes import HEIGHT, WIDTH, Scene
 from tests.behaviors.perception.test_motion import settled
 from zscout.behaviors.perception.motion import Event, EventTracker, MotionDetector
+from zscout.messages import MotionLimits
 
 RATE = 10.0
 COMES = 6.0
@@ -22,9 +24,10 @@ Camera = Callable[[float, float | None], Picture]
 """What it shows at a time, with the walker at a column or without him."""
 
 
-def events(camera: Camera, *, rate: float = RATE) -> Iterator[Event]:
+def events(camera: Camera, *, rate: float = RATE, limits: MotionLimits | None = None) -> Iterator[Event]:
     """The camera's scene, in which somebody walks from COMES for five seconds, and one more."""
-    detector, tracker = MotionDetector(), EventTracker()
+    limits = limits or MotionLimits()
+    detector, tracker = MotionDetector(limits=limits), EventTracker(limits.min_duration)
     for number in range(round((COMES + 6) * rate)):
         time = number / rate
         walker = 40 * (time - COMES) - 20 if COMES <= time < COMES + 5 else None
@@ -34,8 +37,8 @@ def events(camera: Camera, *, rate: float = RATE) -> Iterator[Event]:
         yield last
 
 
-def assert_walker_alone(camera: Camera) -> None:
-    told = list(events(camera))
+def assert_walker_alone(camera: Camera, limits: MotionLimits | None = None) -> None:
+    told = list(events(camera, limits=limits))
     assert len(told) == 1
     assert COMES <= told[0].start <= COMES + 1
     assert told[0].end >= COMES + 3.5
@@ -124,3 +127,59 @@ def test_somebody_far_away_is_told() -> None:
         told.append(detector.see(4 + number / RATE, picture).moving)
     assert any(told[:5])
     assert sum(told) > 50
+
+
+def road(scene: Scene, time: float, walker: float | None) -> Picture:
+    """With a road, on the left, on which something is moving in every second second."""
+    picture = scene.picture(walker)
+    if time % 2 >= 1:
+        top = int(20 + 60 * (time % 2 - 1))
+        picture[top : top + 20, 2:14] = 20
+    return picture
+
+
+ROAD: list[float] = [0, 0, 0.1, 1.0]
+
+
+@pytest.mark.parametrize("region", [ROAD, [0, 0, 0.1, 0, 0.1, 1, 0, 1]])
+def test_motion_in_an_ignored_region_does_not_count(region: list[float]) -> None:
+    scene, limits = Scene(25), MotionLimits([region])
+    assert any(event.start < COMES - 1 for event in events(lambda *at: road(scene, *at)))
+    assert_walker_alone(lambda *at: road(scene, *at), limits)
+
+
+@pytest.mark.parametrize("size", [(160, 120), (320, 240)])
+def test_an_ignored_region_has_no_outlines(size: tuple[int, int]) -> None:
+    scene, detector = Scene(26), MotionDetector(outlines=True, limits=MotionLimits([[0.5, 0, 1, 1]]))
+    for number in range(60):
+        picture = cv2.resize(scene.picture(None if number < 50 else 80), size, interpolation=cv2.INTER_NEAREST)
+        seen = detector.see(number / RATE, np.asarray(picture, np.uint8))
+    assert seen.mask is not None
+    assert np.any(seen.mask)
+    assert not np.any(seen.mask[:, size[0] // 2 :])
+    assert all(box.x + box.width <= size[0] // 2 for box in seen.boxes)
+
+
+def test_light_and_noise_are_told_by_what_is_not_ignored() -> None:
+    """Most of the picture is a street at night, with its own lights."""
+    scene = Scene(27)
+
+    def camera(time: float, walker: float | None) -> Picture:
+        picture = scene.picture(walker, gain=1 + 0.2 * math.sin(time))
+        picture[:50] = np.clip(picture[:50] * (1.5 + math.sin(9 * time)), 0, 255)
+        return picture
+
+    assert_walker_alone(camera, MotionLimits([[0, 0, 1, 0.42]]))
+
+
+@pytest.mark.parametrize(("min_area", "told"), [(0.0, True), (0.01, True), (0.06, False)])
+def test_what_is_smaller_than_asked_for_is_left_out(min_area: float, told: bool) -> None:
+    """A walker has 3.8 % of the picture."""
+    scene, limits = Scene(28), MotionLimits(min_area=min_area)
+    assert bool([*events(lambda _, walker: scene.picture(walker), limits=limits)]) == told
+
+
+@pytest.mark.parametrize(("min_duration", "told"), [(0.0, True), (3.0, True), (6.0, False)])
+def test_what_is_shorter_than_asked_for_is_left_out(min_duration: float, told: bool) -> None:
+    scene, limits = Scene(29), MotionLimits(min_duration=min_duration)
+    assert bool([*events(lambda _, walker: scene.picture(walker), limits=limits)]) == told

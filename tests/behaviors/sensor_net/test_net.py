@@ -8,10 +8,12 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from tests.behaviors.perception.scenes import Scene
 from zscout.behaviors.perception.lens import COLUMNS, ROWS
 from zscout.behaviors.sensor_net.net import ABSENCE_TIMEOUT, RETRY, Effect, SensorNet, StartRobot
 from zscout.behaviors.sensor_net.place_robot import Slots
 from zscout.behaviors.sensor_net.scout import LATELY, Scout
+from zscout.messages import MotionLimits
 
 STORIES = {
     "all that are wanted begin once they are there": """
@@ -238,3 +240,21 @@ def test_what_moves_after_a_while_of_bad_pictures_is_another_event() -> None:
     assert {step.doing for step in steps} == {"blind"}
     assert [step.quiet for step in steps].count(True) == 1
     assert scout.alerts.see(6.0, True) == "start"
+
+
+@pytest.mark.parametrize(
+    ("limits", "alerts"),
+    [
+        (None, 1),
+        (MotionLimits([[0, 0, 1, 0.2]], 0.01, 1.0), 1),
+        (MotionLimits([[0, 0, 1, 1]]), 0),
+        (MotionLimits(min_area=0.3), 0),
+        (MotionLimits(min_duration=5.0), 0),
+    ],
+)
+def test_a_scout_keeps_to_what_its_framegrabber_says_of_motion(limits: MotionLimits | None, alerts: int) -> None:
+    scout, scene = a_hidden_scout(), Scene(4)
+    for number in range(40):
+        scout.limit(limits)
+        scout.see(2 + number / 5, scene.picture(6 * (number - 15) if 15 < number < 35 else None), "video/a")
+    assert scout.alerts.count == alerts

@@ -85,6 +85,49 @@ def test_a_recording_has_pictures_boxes_and_events(video: Path, tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (["--ignore", "0,0,0.5,1", "--ignore", "0.5,0,1,0,1,1,.5,1"], 0),
+        (["--ignore", "0,0,1,0.2", "--min-area", "0.01", "--min-duration", "0.5"], 1),
+        (["--min-area", "0.1"], 0),
+        (["--min-duration", "5s"], 0),
+    ],
+)
+def test_people_limit_what_is_told(
+    options: list[str], told: int, video: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert zscout_here("motion", "--source", video, "--json", *options) == 0
+    assert capsys.readouterr().out.count("\n") == told
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("--ignore", "0,0,1", '--ignore: "0,0,1" has 3 numbers; write x and y of two opposite corners of a rectangle'),
+        ("--ignore", "10,10,90,40", '--ignore: "10,10,90,40" is not a region; write numbers from 0 to 1 with commas'),
+        ("--ignore", "0,0,0,1", '--ignore: "0,0,0,1" covers nothing; write'),
+        ("--ignore", "nan,0,1,1", '--ignore: "nan,0,1,1" is not a region'),
+        ("--min-area", "2", "--min-area"),
+        ("--min-duration", "-1", "--min-duration"),
+        ("--min-duration", "2h", "--min-duration: 2 h is out of range; write 0.0 s to 1 min"),
+    ],
+)
+def test_a_limit_that_can_not_be_is_one_line(
+    option: str, value: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert zscout_here("motion", "--source", "x.avi", option, value) == 2
+    told = capsys.readouterr().err
+    assert words in told
+    assert told.count("\n") == 1
+
+
+def test_too_many_regions_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert zscout_here("motion", "--source", "x.avi", *["--ignore", "0,0,1,1"] * 17) == 2
+    words = "--ignore: has 17 regions with 34 corners; at most 16 regions with 100 corners are allowed"
+    assert words in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ("source", "words"),
     [
         ("none.avi", "can't be read (No such file or directory); name a video file"),

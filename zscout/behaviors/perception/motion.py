@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from zscout.behaviors.perception.outline import Mask, Outlines
 from zscout.behaviors.perception.presence import Presence
+from zscout.messages import MotionLimits
 
 WIDTH: Final = 160  # columns of the analysed picture; larger ones are reduced to it
 MAX_SIDE: Final = 8_192
@@ -161,8 +162,11 @@ class _Near:
 
 
 class MotionDetector:
-    def __init__(self, *, outlines: bool = False) -> None:
-        """With `outlines`, report moving pixels too, and fit boxes to them."""
+    def __init__(self, *, outlines: bool = False, limits: MotionLimits | None = None) -> None:
+        """With `outlines`, report moving pixels too, and fit boxes to them. Durations are the trackers' to limit."""
+        self._limits = limits or MotionLimits()
+        self._ignored: Mask | None = None  # 255 where motion does not count; None without such regions
+        self._smallest = max(SMALLEST, self._limits.min_area)
         self._outlines = Outlines() if outlines else None
         self._mean: _Plane = np.empty((0, 0), np.float32)
         self._variance = self._mean
@@ -192,6 +196,8 @@ class MotionDetector:
                 self._outlines.learn(picture, 1.0 / self._pictures)
             return seen
         mask = self._outlines.trace(picture, regions, passed / LEARN)
+        if self._ignored is not None:
+            mask[self._drawn(picture.shape[1], picture.shape[0]) > 0] = 0
         return seen._replace(boxes=tuple(_fitted(box, mask) for box in seen.boxes), mask=mask)
 
     def _look(self, time: float, picture: Picture, passed: float) -> tuple[Seen, Mask | None]:
@@ -200,7 +206,9 @@ class MotionDetector:
         if self._mean.shape != grey.shape:
             return self._begin(time, grey), None
         self._last, self._latest = time, grey
-        level, self._light = _levelled(grey, self._mean, self._hidden(), self._light)
+        level, self._light = _levelled(grey, self._mean, self._hidden(), self._light, self._ignored)
+        if self._ignored is not None:
+            np.copyto(level, self._mean, where=self._ignored > 0)
         away = level - self._mean
         if self._paused:
             return self._return(time, grey, level, away, passed), None
@@ -212,7 +220,7 @@ class MotionDetector:
             return Seen(False, learning=True), None
         score, middle = self._score(away)
         mask, regions, clear = self._regions(score, level)
-        share = np.count_nonzero(mask) / mask.size
+        share = np.count_nonzero(mask) / (mask.size if self._ignored is None else max(1, np.sum(self._ignored == 0)))
         noise = float(np.median(self._variance[::4, ::4])) ** 0.5
         stirs = self._near is not None and self._near.stirs(time, level, mask, noise)
         if middle > ALL_OFF or (share > UPHEAVAL and not stirs):
@@ -284,7 +292,21 @@ class MotionDetector:
         self._variance = np.where(another, np.maximum(self._variance, np.float32(noise)), self._variance)
         return Seen(False)
 
+    def _drawn(self, width: int, height: int) -> Mask:
+        """255 in the ignored regions of a picture of this size."""
+        drawn = np.zeros((height, width), np.uint8)
+        for region in self._limits.ignore:
+            corners = np.array(region).reshape(-1, 2) * (width, height)
+            if len(corners) == 2:
+                (left, top), (right, bottom) = corners
+                corners = np.array([(left, top), (right, top), (right, bottom), (left, bottom)])
+            # A pixel's middle is at its number.
+            cv2.fillPoly(drawn, [np.rint(corners - 0.5).astype(np.int32)], (255,))
+        return drawn
+
     def _begin(self, time: float, grey: _Plane) -> Seen:
+        if self._limits.ignore and (self._ignored is None or self._ignored.shape != grey.shape):
+            self._ignored = self._drawn(grey.shape[1], grey.shape[0])
         self._mean, self._latest = grey.copy(), grey
         self._variance = np.full_like(grey, FLOOR**2)
         self._begun = self._last = time
@@ -305,7 +327,8 @@ class MotionDetector:
         score = np.abs(cv2.GaussianBlur(away, (3, 3), 0)) / spread
         hidden = self._hidden()
         if hidden is None:
-            self._middle = float(np.median(score))
+            shown = score if self._ignored is None else score[self._ignored == 0]
+            self._middle = float(np.median(shown)) if shown.size else 0.0
         elif (left := score[hidden == 0]).size >= LEFT * score.size:
             # He may cover more by now: the lower quartile, by what it is to the median of noise.
             noise = float(np.quantile(left, 0.25)) * 0.674 / 0.319
@@ -333,7 +356,7 @@ class MotionDetector:
         stats: _Regions = np.asarray(found, np.int32)
         strong = np.bincount(labels.ravel(), weights=(score > STRONG).ravel(), minlength=count)
         area = stats[:, cv2.CC_STAT_AREA]
-        keep = (area >= SMALLEST * score.size) & (strong >= 0.15 * area)
+        keep = (area >= self._smallest * score.size) & (strong >= 0.15 * area)
         # A thin band along the lines is a transmission fault.
         for region in np.flatnonzero(keep & (stats[:, cv2.CC_STAT_HEIGHT] <= THIN * score.shape[0])):
             wide = stats[region, cv2.CC_STAT_WIDTH] > BAND * stats[region, cv2.CC_STAT_HEIGHT]
@@ -421,19 +444,27 @@ def _off(away: _Plane) -> float:
 
 
 def _levelled(
-    grey: _Plane, mean: _Plane, hidden: NDArray[np.uint8] | None, last: tuple[float, float]
+    grey: _Plane,
+    mean: _Plane,
+    hidden: NDArray[np.uint8] | None,
+    last: tuple[float, float],
+    ignored: NDArray[np.uint8] | None = None,
 ) -> tuple[_Plane, tuple[float, float]]:
     """The picture without its gain and offset against the background and without bands of light; gain and offset.
 
-    Where `hidden` is above 0, the picture shows nothing of the light; `last` are gain and offset of the one before."""
-    gain, offset = _light(grey, mean, hidden, last)
+    Where `hidden` or `ignored` is above 0, the picture shows nothing of the light; `last` are gain and offset of the
+    one before."""
+    gain, offset = _light(grey, mean, hidden, last, ignored)
     level = ((grey - np.float32(offset)) / np.float32(gain)).astype(np.float32)
+    near = hidden
+    if ignored is not None:
+        hidden = ignored if hidden is None else hidden | ignored
     bands = _bands(grey, mean, gain, offset, hidden)
     if bands is None:
         expected = np.float32(gain) * mean + np.float32(offset)
     else:
         even = grey / bands
-        gain, offset = _light(even, mean, hidden, last)
+        gain, offset = _light(even, mean, near, last, ignored)
         level = (even - np.float32(offset)) / np.float32(gain)
         expected = bands * (np.float32(gain) * mean + np.float32(offset))
     white = np.maximum(mean, expected) > WHITE
@@ -446,14 +477,21 @@ def _levelled(
 
 
 def _light(
-    grey: _Plane, mean: _Plane, hidden: NDArray[np.uint8] | None, last: tuple[float, float]
+    grey: _Plane,
+    mean: _Plane,
+    hidden: NDArray[np.uint8] | None,
+    last: tuple[float, float],
+    ignored: NDArray[np.uint8] | None,
 ) -> tuple[float, float]:
     """The picture's gain and offset against the background."""
     rows = max(2, round(BLOCKS * grey.shape[0] / grey.shape[1]))
     now = cv2.resize(grey, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
     was = cv2.resize(mean, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel().astype(np.float64)
     # Black and white have no gain.
-    fits = lit = (now > 4) & (now < 250)
+    lit = (now > 4) & (now < 250)
+    if ignored is not None:
+        lit &= cv2.resize(ignored, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel() == 0
+    fits = lit
     gain, offset = 1.0, 0.0
     if hidden is not None:
         lit = lit & (cv2.resize(hidden, (BLOCKS, rows), interpolation=cv2.INTER_AREA).ravel() == 0)
@@ -511,20 +549,28 @@ def _torn(lines: _Plane, mean: _Plane) -> bool:
 class EventTracker:
     """Turns a MotionDetector's results into events, each returned once, at its end."""
 
-    def __init__(self) -> None:
-        self.current: Event | None = None  # the present event, so far
+    def __init__(self, min_duration: float = 0.0) -> None:
+        """Shorter events, in seconds, are left out."""
+        self._shortest = min_duration
+        self._event: Event | None = None  # the present event, so far
         self._most = 0
         self._first: tuple[float, tuple[Box, ...]] | None = None  # a sighting that the next picture may confirm
+
+    @property
+    def current(self) -> Event | None:
+        """The present event, so far, once it is long enough."""
+        event = self._event
+        return event if event is not None and event.end - event.start >= self._shortest else None
 
     def see(self, time: float, seen: Seen) -> Event | None:
         """Take the result at `time`, which never goes back; return the event that had ended before, if any."""
         ended = self.quiet(time)
         recent = self._first is not None and time - self._first[0] <= MEMORY
         if not seen.moving:
-            if seen.boxes and self.current is None and not recent:
+            if seen.boxes and self._event is None and not recent:
                 self._first = time, seen.boxes
             return ended
-        event = self.current
+        event = self._event
         if event is None:
             # A confirmed event began with its first sighting.
             start, boxes = self._first if self._first is not None and recent else (time, ())
@@ -535,20 +581,19 @@ class EventTracker:
             self._most = covered
             event = event._replace(peak=time, boxes=seen.boxes)
         area = around((event.area, *seen.boxes))
-        self.current = event._replace(end=time, area=area, frames=event.frames + 1)
+        self._event = event._replace(end=time, area=area, frames=event.frames + 1)
         return ended
 
     def quiet(self, time: float) -> Event | None:
         """No picture came until `time`: return the event that this ends, if any."""
-        event = self.current
-        if event is None or time - event.end <= GAP:
+        if self._event is None or time - self._event.end <= GAP:
             return None
-        self.current = self._first = None
+        event, self._event, self._first = self.current, None, None
         return event
 
     def close(self) -> Event | None:
         """The watch is over: return the unfinished event, if any."""
-        event, self.current = self.current, None
+        event, self._event = self.current, None
         return event._replace(going_on=True) if event is not None else None
 
 

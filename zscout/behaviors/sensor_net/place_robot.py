@@ -224,6 +224,8 @@ class RobotTask(Behavior):
         if picture is not None and picture.shape != (ROWS, COLUMNS):
             across, down = picture.shape[1] / COLUMNS, picture.shape[0] / ROWS
             picture = np.asarray(cv2.resize(picture, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA), np.uint8)
+        if frame and picture is not None:
+            self.place.scout.limit(frame.head.motion)
         self.place.scout.frozen = frame.head.frozen if frame and picture is not None else 0.0
         step = self.place.scout.see(self.place.now(context), picture, robot.video)
         if step.blind:

@@ -15,6 +15,7 @@ from zscout.behaviors.perception.garble import garbled
 from zscout.behaviors.perception.hiding.hider import Hider
 from zscout.behaviors.perception.lens import Picture
 from zscout.behaviors.perception.motion import Box, MotionDetector
+from zscout.messages import MotionLimits
 
 NO_PICTURE_TIMEOUT: Final = 10.0  # seconds from a hold's start, or the last picture, until the robot counts as unseen
 
@@ -48,14 +49,19 @@ class Alerts:
     def __init__(self) -> None:
         self.count = 0
         self._last: float | None = None  # last motion of the present event
+        self._spell: tuple[float, float] | None = None  # first and last motion, with pauses shorter than QUIET
 
     @property
     def moving(self) -> bool:
         return self._last is not None
 
-    def see(self, now: float, moving: bool) -> str:
-        """`start` or `end` of an event, else empty."""
+    def see(self, now: float, moving: bool, min_duration: float = 0.0) -> str:
+        """`start` or `end` of an event, else empty. One starts once motion has gone on for `min_duration` seconds."""
         if moving:
+            first, last = self._spell or (now, now)
+            self._spell = now if now - last >= QUIET else first, now
+            if now - self._spell[0] < min_duration and self._last is None:
+                return ""
             began, self._last = self._last is None, now
             self.count += began
             return "start" if began else ""
@@ -66,7 +72,7 @@ class Alerts:
 
     def rest(self) -> None:
         """The watch ended: later motion is another event."""
-        self._last = None
+        self._last = self._spell = None
 
 
 class Blindness:
@@ -152,6 +158,7 @@ class Scout:
         self.alerts = Alerts()
         self.blindness = Blindness(NO_PICTURE_TIMEOUT)
         self._detector = MotionDetector()
+        self._limits: MotionLimits | None = None
         self._task: Task = "hide"  # of the present hold
         self._alerts = 0  # count before the present turn
         self._turns: deque[bool] = deque(maxlen=LATELY)  # for each recent turn to watch: True if it saw motion
@@ -181,7 +188,7 @@ class Scout:
         self._alerts = self.alerts.count
         if self._task == "hide":
             self._turns.clear()
-            self._detector = MotionDetector()
+            self._detector = MotionDetector(limits=self._limits)
         else:
             # The robot is probably where it was: keep its background.
             self._detector.pause()
@@ -196,6 +203,11 @@ class Scout:
         self.no_signal = self.blindness.end(now)
         self.hider.interrupted(now)
         self.alerts.rest()
+
+    def limit(self, limits: MotionLimits | None) -> None:
+        """What of the motion in later pictures counts."""
+        if limits != self._limits:
+            self._limits, self._detector = limits, MotionDetector(limits=limits)
 
     def see(self, now: float, picture: Picture | None, channel: str) -> Step:
         """Take the newest picture, or None, from the robot on this video channel; set `frozen` before."""
@@ -216,7 +228,8 @@ class Scout:
             edge, words = self.alerts.see(now, False), f"frozen: the same picture for {self.frozen:.0f} s"
             return Step(0, 0, 0, "blind", words, alert=began, quiet=edge == "end")
         seen = self._detector.see(now, picture)
-        edge, count = self.alerts.see(now, seen.moving), self.alerts.count
+        least = self._limits.min_duration if self._limits is not None else 0.0
+        edge, count = self.alerts.see(now, seen.moving, least), self.alerts.count
         if self.alerts.moving:
             return Step(0, 0, 0, "alert", f"motion {count}", tuple(seen.boxes), alert=edge == "start")
         if seen.present:

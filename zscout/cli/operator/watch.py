@@ -18,9 +18,11 @@ from click.shell_completion import CompletionItem
 
 from zscout import terminal
 from zscout.cli import common
-from zscout.cli.requests.options import SECONDS
-from zscout.config.strict import BadInput
+from zscout.cli.requests.options import SECONDS, seconds_within
+from zscout.config.devices import MAX_MIN_AREA, MAX_MIN_DURATION, check_regions, parse_region
+from zscout.config.strict import BadInput, Where
 from zscout.mesh import clock
+from zscout.messages import MotionLimits
 from zscout.terminal import LiveLine, many, span
 from zscout.types import SECOND
 
@@ -33,6 +35,13 @@ PATIENCE: Final = 8.0
 """Seconds from a signal to the end, for what was recorded to be written."""
 DRAWN: Final = 0.1
 """Seconds from one live line to the next."""
+
+
+def _region(text: str, option: str) -> list[float]:
+    try:
+        return parse_region(text)
+    except ValueError as error:
+        raise BadInput(f"{option}: {error}") from None
 
 
 def sources(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[CompletionItem]:
@@ -59,21 +68,47 @@ def sources(_ctx: click.Context, _param: click.Parameter, incomplete: str) -> li
     help="Write pictures, boxes and events as a Rerun recording; look at it with `zscout view FILE`.",
 )
 @click.option("--limit", type=SECONDS, help="End after this much of the source. Default: at its end, or at Ctrl-C.")
-def motion(source: str, as_json: bool, record: Path | None, limit: float | None) -> None:
+@click.option(
+    "--ignore",
+    metavar="X,Y,X,Y...",
+    type=common.Parsed("region", _region),
+    multiple=True,
+    help="Ignore motion in this region. Its corners are shares of the picture's width and height, from 0 to 1: two "
+    "opposite corners of a rectangle, or three or more of a polygon. Can be repeated.",
+)
+@click.option(
+    "--min-area",
+    type=click.FloatRange(0, MAX_MIN_AREA),
+    default=0.0,
+    help="Ignore things below this share of the picture.",
+)
+@click.option("--min-duration", type=seconds_within(0, MAX_MIN_DURATION), default="0", help="Leave out shorter events.")
+def motion(
+    source: str,
+    as_json: bool,
+    record: Path | None,
+    limit: float | None,
+    ignore: tuple[list[float], ...],
+    min_area: float,
+    min_duration: float,
+) -> None:
     """Report motion: one line for each event, when the event ends.
 
     A file is read whole, as fast as possible, by its own time stamps; of a URL or camera the newest picture counts, and
     it is opened again when it fails. An event ends when nothing moved for a second. Its `start`, `end` and `peak` are
     seconds of the source; `boxes`, [x, y, width, height] in its pixels, surround motion at the peak; `area` surrounds
     all motion; `frames` counts the pictures with motion. The detector adapts to the scene and needs no tuning;
-    docs/watching.md describes what it can do.
+    docs/watching.md describes what it can do. The keys of a framegrabber in the node file are named as the options are.
 
     \b
     Examples:
       zscout motion --source /dev/video0
       zscout motion --source http://127.0.0.1:8080/1.mjpg --json | jq 'select(.frames > 10)'
       zscout motion --source /dev/video0 --limit 600 --record garden.rrd
+      zscout motion --source garden.avi --ignore 0,0,0.4,0.1 --min-area 0.01 --min-duration 2
     """
+    check_regions(ignore, Where("--ignore"))
+    limits = MotionLimits(list(ignore), min_area, min_duration)
     ended_by: list[int] = []
     begun = False
 
@@ -104,7 +139,7 @@ def motion(source: str, as_json: bool, record: Path | None, limit: float | None)
             except TimelineError as error:
                 raise BadInput(f"--record: {error}") from None
         begun = True
-        _watch(opened, report, lambda time: bool(ended_by) or (limit is not None and time > limit))
+        _watch(opened, report, limits, lambda time: bool(ended_by) or (limit is not None and time > limit))
     report.summary()
     if ended_by:
         raise common.Interrupted(ended_by[0])
@@ -134,10 +169,12 @@ def _ended_by_signals() -> Iterator[None]:
         os.close(reading)
 
 
-def _watch(source: VideoFile | LiveSource, report: _WatchReport, over: Callable[[float], bool]) -> None:
+def _watch(
+    source: VideoFile | LiveSource, report: _WatchReport, limits: MotionLimits, over: Callable[[float], bool]
+) -> None:
     from zscout.behaviors.perception.motion import EventTracker, MotionDetector
 
-    detector, tracker = MotionDetector(outlines=True), EventTracker()
+    detector, tracker = MotionDetector(outlines=True, limits=limits), EventTracker(limits.min_duration)
     for time, picture in source.shots():
         if over(time):
             break

@@ -63,7 +63,7 @@ def seconds_within(low: float, high: float) -> Parsed[float]:
     """An option's duration, in seconds."""
 
     def parse(text: str, option: str) -> float:
-        seconds = float(parse_duration(text, option))
+        seconds = float(parse_duration(text, option, zero=low == 0))
         if not low <= seconds <= high:
             raise BadInput(f"{option}: {span(seconds)} is out of range; write {span(low)} to {span(high)}")
         return seconds
