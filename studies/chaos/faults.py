@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from studies.chaos.work import CLIENTS, HOSTS, NODES, RC_HOSTS
+from studies.chaos.work import CLIENTS, HOSTS, NODES, OWN_CLIENTS, RC_HOSTS
 
 SECOND: Final = 1_000_000_000
 LEASE: Final = 1.0
@@ -20,10 +20,10 @@ class Fault:
 
     kind: str
     how: str
-    """kill, freeze, cut or cable."""
+    """kill, freeze, cut, cable or address."""
     lasts: float
     hosts: tuple[str, ...] = ()
-    """That are killed, frozen or unplugged."""
+    """That are killed, frozen, unplugged or without an address."""
     ways: frozenset[Way] = frozenset()
     began: int = 0
     at: int = 0
@@ -122,13 +122,15 @@ KINDS: Final[dict[str, tuple[int, Callable[[random.Random, str], Fault]]]] = {
     "two frozen": (2, _two_frozen),
     "cut": (4, _any("cut", *HOSTS)),
     "unplugged": (2, _any("cable", *HOSTS)),
+    "readdressed": (2, _any("address", *NODES, *OWN_CLIENTS)),
     "partition": (4, _ways(groups)),
     "pair": (5, _ways(_pair)),
     "one way": (3, _ways(_one_way)),
     "blackout": (1, _blackout),
     "client killed": (1, _any("kill", *CLIENTS)),
 }
-"""Of each kind its share, and how one is made from a random source and the host that leads."""
+"""Of each kind its share, and how one is made from a random source and the host that leads. Only zscout's own programs
+follow their host to another address: the page of the protocol asks nobody else to."""
 
 
 def draw(rng: random.Random, kinds: list[str], leader: str) -> Fault:

@@ -9,7 +9,7 @@ import signal
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final, Protocol
@@ -71,12 +71,15 @@ class Net:
         self.cuts: set[tuple[str, str]] = set()
         """From, to."""
         self.unplugged: set[str] = set()
+        self._addresses = {host: f"10.83.0.{number}" for number, host in enumerate(self.hosts, 1)}
+        self._further = (f"10.83.{high}.{low}" for high in range(1, 255) for low in range(1, 255))
+        """Addresses that no host has had."""
 
     def space(self, host: str) -> str:
         return f"{self.mark}-{host}"
 
     def address(self, host: str) -> str:
-        return f"10.83.0.{self.hosts.index(host) + 1}"
+        return self._addresses[host]
 
     def _hardware(self, host: str) -> str:
         return f"02:00:00:00:00:{self.hosts.index(host) + 1:02x}"
@@ -94,7 +97,7 @@ class Net:
             inner = ("peer", "name", "eth0", "address", self._hardware(host), "netns", space)
             ip("link", "add", port, "type", "veth", *inner)
             ip("link", "set", port, "master", self.mark, "up")
-            ip("-n", space, "addr", "add", f"{self.address(host)}/24", "dev", "eth0")
+            ip("-n", space, "addr", "add", f"{self.address(host)}/16", "dev", "eth0")
             ip("-n", space, "link", "set", "lo", "up")
             ip("-n", space, "link", "set", "eth0", "up")
             self._configure(host)
@@ -143,6 +146,18 @@ class Net:
         self._configure(host)
         self.cuts = {way for way in self.cuts if way[0] != host}
 
+    def take_address(self, host: str) -> None:
+        ip("-n", self.space(host), "addr", "flush", "dev", "eth0")
+
+    def give_address(self, host: str) -> None:
+        """Another one than it had."""
+        self._addresses[host] = next(self._further)
+        ip("-n", self.space(host), "addr", "add", f"{self.address(host)}/16", "dev", "eth0")
+        self._configure(host)
+        others = [other for other in self.hosts if other != host]
+        self._batch({other: self._way(other, host, whole=(other, host) not in self.cuts) for other in others})
+        self.cuts = {way for way in self.cuts if way[0] != host}
+
     def close(self) -> None:
         remove(self.mark)
 
@@ -177,13 +192,14 @@ class Links:
     """Which TCP links between hosts stand, from the kernel's tables. One that is retransmitting does not stand yet."""
 
     def __init__(self, net: Net) -> None:
-        self._names = {net.address(host): host for host in net.hosts}
+        self._net = net
 
     def standing(self, pids: dict[str, int]) -> dict[frozenset[str], frozenset[int]]:
         """By pair of hosts: the ports of the links that stand between them."""
         ends: dict[tuple[str, str], set[tuple[int, int]]] = {}
+        names = {self._net.address(host): host for host in self._net.hosts}
         for host, pid in pids.items():
-            for here, there, peer in self._connections(pid):
+            for here, there, peer in self._connections(pid, names):
                 ends.setdefault((host, peer), set()).add((here, there))
         found = {}
         for (host, peer), ports in ends.items():
@@ -192,14 +208,15 @@ class Links:
                 found[frozenset((host, peer))] = frozenset(port for pair in both for port in pair)
         return found
 
-    def _connections(self, pid: int) -> Iterable[tuple[int, int, str]]:
+    @staticmethod
+    def _connections(pid: int, names: Mapping[str, str]) -> Iterable[tuple[int, int, str]]:
         lines = []
         for table in ("tcp", "tcp6"):  # who listens on both has its links in the second
             with suppress(OSError):
                 lines += Path(f"/proc/{pid}/net/{table}").read_text().splitlines()[1:]
         for line in lines:
             words = line.split()
-            peer = self._names.get(_address(words[2]))
+            peer = names.get(_address(words[2]))
             if words[3] == ESTABLISHED and peer is not None and int(words[6], 16) == 0:
                 yield int(words[1].split(":")[1], 16), int(words[2].split(":")[1], 16), peer
 

@@ -254,6 +254,8 @@ class Fleet:
                 self.processes.signal(host, signal.SIGSTOP)
             elif fault.how == "cable":
                 self.net.unplug(host)
+            elif fault.how == "address":
+                self.net.take_address(host)
         fault.at = now()
 
     def mend(self, fault: Fault) -> None:
@@ -267,6 +269,8 @@ class Fleet:
                 self.processes.signal(host, signal.SIGCONT)
             elif fault.how == "cable":
                 self.net.plug_in(host)
+            elif fault.how == "address":
+                self.net.give_address(host)
             elif host in RC_HOSTS:
                 self.mark("mended", host, since=fault.at)
         self._down -= set(fault.hosts)

@@ -31,6 +31,7 @@ from zscout.rcm import leader, recovery, roster, terms
 from zscout.rcm.admission import Admission
 from zscout.rcm.authority import Authority
 from zscout.rcm.leader import Leader
+from zscout.rcm.operations import Operations
 from zscout.rcm.places import Places
 from zscout.rcm.request_log import RequestLog
 from zscout.rcm.roster import Roster
@@ -273,6 +274,14 @@ GUARDS: Final[Mapping[str, Guard]] = MappingProxyType(
         ),
         "snapshots": Guard("what a snapshot adds passes the RC's own vote", {(ResourceController, "_carries"): _yes}),
         "once": Guard("a command that arrives again is not carried out again", {(CommandMemory, "is_new"): _yes}),
+        "denied": Guard(
+            "of two holds of an ARC that are reported, its client's word counts",
+            {
+                (Operations, "_denied"): _nothing,
+                (RequestLog, "_is_of_another"): _nothing,
+                (Roster, "_is_disputed"): _nothing,
+            },
+        ),
         "door": Guard("what clients list passes the door of what they ask for", {(Admission, "check"): _nothing}),
         "clamped": Guard("what RCs report is no more than its client may ask for", {(Admission, "clamped"): _as_told}),
         "certified": Guard("who asks has the name of its certificate", {(Authority, "known_as"): _as_it_says}),

@@ -230,8 +230,8 @@ class Leader:
             self.roster.expect(now, request.client)
             if request.client not in recovered.answered:
                 self._recover(request)
-        for arc, rcs in recovered.believed.items():
-            registry.believe(arc, rcs)
+        for arc, (grant, rcs) in recovered.believed.items():
+            registry.believe(arc, grant, rcs)
         bookings = self._bookings
         waiting = tuple(replace(asked, request=bookings.dated(asked.request)) for asked in recovered.waiting)
         certain = 0 if bookings.settled else bookings.settles_at
@@ -271,7 +271,9 @@ class Leader:
             elif not arc.vouched:
                 try:
                     own = listed_by(answer.client, request, self.admission, self._bookings.record)
-                    events.append(vouched(arc, own, self.admission))
+                    events.append(word := vouched(arc, own, self.admission))
+                    if word.bound is None and own.grant is not None:
+                        self.registry.believe(arc.id, own.grant, own.rcs)
                 except (Refused, BadName) as error:
                     self._out.strange.append((answer.client, f"{answer.client} lists what can't be: {error}"))
                     events.append(model.Released(arc.id, f"the leader, as it is no valid request: {error}"))

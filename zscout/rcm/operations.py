@@ -215,7 +215,12 @@ class Operations:
     def _ask(self, asked: OperationAsked, ask: Ask, sender: Sender, client: ClientId) -> None:
         self._check_term(ask, sender, client)
         arc, now, answers = arc_id(client, ask.id), self._now, self._out.at_once
-        undecided = self._may_hold(arc, ask) and self._roster.awaits(now, arc, ask.rcs)
+        denied = self._denied(arc, ask, sender)
+        if denied is not None and ask.grant is not None:
+            self._registry.believe(arc, ask.grant, ask.rcs)
+            self.instant.touched.add(arc)
+            self.instant.shown.append(denied)
+        undecided = (denied is not None or self._may_hold(arc, ask)) and self._roster.awaits(now, arc, ask.rcs)
         undecided = undecided or bool(ask.booking and not self._bookings.settled)
         if undecided and len(self._deferred) < MAX_BATCH:
             self._defer(asked)
@@ -312,6 +317,17 @@ class Operations:
             return False
         known = self.core.arc(arc)
         return (known is None or known.hold is None) and not self._registry.ended(arc)
+
+    def _denied(self, arc: ArcId, ask: Ask, sender: Sender) -> model.Vouched | None:
+        """The word of a client that believes in another grant of an earlier RCM than an RC has reported, and for other
+        RCs; None: it is not so."""
+        known = self.core.arc(arc)
+        if known is None or known.vouched or known.hold is None or ask.grant in (None, known.hold.grant):
+            return None
+        if ask.grant.term >= self.core.term or ask.unconfirmed or ask.unserved:
+            return None
+        word = vouched(known, Listed(self._admission.form(ask, sender), None), self._admission)
+        return word if word.bound is None else None
 
     def _standing(self, now: Ns, arc: ArcId, ask: Ask) -> Notice:
         """How an open ARC stands, for a client that may not have heard how its last hold ended."""

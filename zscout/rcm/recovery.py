@@ -66,8 +66,8 @@ class RecoveredState:
     waiting: list[Requested] = field(default_factory=list)
     expected: dict[str, set[ClientId]] = field(default_factory=dict)
     """By request id: the clients to which it is to be handed over, as they say."""
-    believed: dict[ArcId, Sequence[RcName]] = field(default_factory=dict)
-    """Of what waits: the RCs that its client believes to hold. They may not have answered yet."""
+    believed: dict[ArcId, tuple[Grant, Sequence[RcName]]] = field(default_factory=dict)
+    """Of what waits: the grant in which its client believes, and its RCs. They may not have answered yet."""
     answered: set[ClientId] = field(default_factory=set)
     """The clients that have said what they ask for."""
     charged: Mapping[str, float] = field(default_factory=dict)
@@ -238,7 +238,7 @@ def _enter(
             let_in.add(request, waits=True)
             result.waiting.append(Requested(request, known.place, now - round(known.waited * SECOND)))
             if known.grant is not None:
-                result.believed[request.arc] = known.rcs
+                result.believed[request.arc] = known.grant, known.rcs
 
 
 # Reported holds

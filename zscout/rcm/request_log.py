@@ -67,6 +67,7 @@ class _Request:
     until: Ns | None = None
     """It ended, and is remembered until then."""
     believed: Collection[RcName] = ()
+    believes: Grant | None = None
     """RCs that its client believes to hold since an earlier term, which may yet report that."""
     foretold: Ns | None = None
     """The first start that its client was notified of."""
@@ -108,9 +109,10 @@ class RequestLog:
         if known is not None and self._core.is_queued(arc):
             self._requests[renamed].foretold = known.foretold
 
-    def believe(self, arc: ArcId, rcs: Collection[RcName]) -> None:
-        """The client of a waiting ARC believes that it holds these RCs."""
-        self._requests[arc].believed = rcs
+    def believe(self, arc: ArcId, grant: Grant, rcs: Collection[RcName]) -> None:
+        """The client of a waiting ARC believes that it holds these RCs by this grant."""
+        known = self._requests[arc]
+        known.believes, known.believed = grant, rcs
 
     def name(self, arc: ArcId) -> str:
         known = self._requests.get(arc)
@@ -129,6 +131,12 @@ class RequestLog:
         if known is None or status is None or status.hold is not None:
             return False
         return self._roster.awaits(now, arc, known.believed)
+
+    def _is_of_another(self, now: Ns, ended: HoldEnded) -> bool:
+        """Return True if an RC had reported this hold, and the ARC's client believes in one that RCs may yet report."""
+        known = self._requests.get(ended.arc)
+        believes = None if known is None else known.believes
+        return believes not in (None, ended.grant) and self.may_be_held(now, ended.arc)
 
     def reopens(self, arc: ArcId, unserved: Grant | None = None) -> bool:
         """Return True if `arc` ended only because its client seemed lost, or had its time under the grant `unserved`
@@ -233,8 +241,10 @@ class RequestLog:
                         if known.foretold is not None:
                             self.foretold[arc] = known.foretold
                         known.ending = known.foretold = None
-                    # An ARC that ended in the same instant has only that notice.
-                    if arc not in answered and self._core.arc(arc) is not None:
+                    # An ARC that ended in the same instant has only that notice; a client whose word is awaited
+                    # may know of another hold.
+                    status = self._core.arc(arc)
+                    if arc not in answered and status is not None and status.vouched:
                         notices.append(self.notice(now, arc))
                 case HoldTimed(arc=arc, waits=waits) if self._core.is_running(arc):
                     about = "is ready: its devices have begun" if waits is None else starting((waits - now) / SECOND)
@@ -242,7 +252,9 @@ class RequestLog:
                     notices.append(self.notice(now, arc))
                 case HoldEnded(arc=arc) | Dropped(arc=arc):
                     notice = self._close(now, effect)
-                    if isinstance(effect, Dropped) or arc not in given_up:
+                    if isinstance(effect, HoldEnded) and self._is_of_another(now, effect):
+                        self._changed[arc] = None
+                    elif isinstance(effect, Dropped) or arc not in given_up:
                         notices.append(notice)
                 case Queued(arc=arc, settled=True) if self._core.is_queued(arc):
                     self._changed[arc] = None

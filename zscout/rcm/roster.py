@@ -21,6 +21,7 @@ from zscout.messages import ClientRequests, Problem, RcAsk, RcState, disbelieved
 from zscout.rcm.admission import Admission
 from zscout.rcm.deadlines import Deadlines
 from zscout.rcm.devices import ExpectedDevices
+from zscout.rcm.places import arc_id
 from zscout.rcm.recovery import adopted, aged, begin_within, gangs_of, longest_begin
 from zscout.rcm.sight import MAX_TOKENS, Sight
 from zscout.rcm.steps import ClientFound, ClientListed, Compare, Name, Outbox, Question, Resume, Why
@@ -630,17 +631,28 @@ class Roster:
             joined = {other for other in gangs if self._rcs[other].joined is not None}
             missing = gangs - joined - pending.keys()
             together = [pending[other] for other in gangs & pending.keys()]
-            patient = any(waiting.patient for waiting in together) or any(self._rcs[other].tokens for other in missing)
+            disputed = any(self._is_disputed(waiting.state) for waiting in together)
+            patient = disputed or any(waiting.patient for waiting in together)
+            patient = patient or any(self._rcs[other].tokens for other in missing)
             # They join together: the last to answer may be the first whose links came back.
             waited = min(waiting.waited for waiting in together)
             over = waited >= (self.sight.lease if patient else self._timing.rebuild)
-            if not missing or over or pending[name].waited >= MAX_LEASES_PENDING * self.sight.lease:
+            if not (missing or disputed) or over or pending[name].waited >= MAX_LEASES_PENDING * self.sight.lease:
                 for other in gangs & pending.keys():
                     self._rcs[other].pending = None
                 admitted = [pending.pop(other) for other in sorted(gangs & pending.keys())]
                 self._admit([aged(waiting.state, self._now - waiting.since) for waiting in admitted])
         if settled:
             self._out.then.append(Resume())
+
+    def _is_disputed(self, state: RcState) -> bool:
+        """Return True if another RC has reported another hold for an ARC that it holds, whose client has not answered:
+        any node may claim what is not its own."""
+        for holder in state.holders:
+            known = self._known(arc_id(holder.client, holder.id))
+            if known is not None and not known.vouched and known.hold is not None and known.hold.grant != holder.grant:
+                return True
+        return False
 
     def _admit(self, states: list[RcState]) -> None:
         """Let RCs join. Holds of which every RC of the gang that has joined reports exactly this grant continue."""

@@ -133,6 +133,14 @@ def test_no_binding_makes_another_rc_of_one_that_was_named() -> None:
     assert (known.rcs, known.bound) == (["robot/x"], {})
 
 
+def test_a_hold_of_other_devices_that_some_node_reports_ends_none() -> None:
+    known = arc("robot/x")
+    known._take(RUNS, NOW)
+    assert not known._take(msgspec.structs.replace(AGAIN, rcs=["robot/y"]), NOW)
+    assert (known.state, known.grant) == ("running", FIRST)
+    assert known._take(msgspec.structs.replace(AGAIN, rcs=["robot/x"]), NOW)
+
+
 def test_what_the_client_ends_itself() -> None:
     lost, given_up = arc(), arc()
     for known in (lost, given_up):

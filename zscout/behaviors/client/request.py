@@ -193,11 +193,14 @@ class OpenArc:
         return True
 
     def _binding(self, notice: Notice) -> dict[str, str] | None:
-        """The RC that meets each pattern, each another one; None: this is no binding of what was asked."""
+        """The RC that meets each pattern, each another one; None: this is no binding of what was asked for, or some node
+        has reported a hold of other RCs."""
         bound = {need: notice.bound.get(need, "") for need in self.needs if is_pattern(need)}
-        if notice.state != "running" or not bound:
+        if notice.state != "running":
             return {}
         rcs = {bound.get(need, need) for need in self.needs}
+        if notice.rcs and {*notice.rcs} != rcs:
+            return None
         with suppress(BadName):
             if len(rcs) == len(self.needs) and all(matcher(need)(check_rc(rc)) for need, rc in bound.items()):
                 return bound
