@@ -193,8 +193,8 @@ class OpenArc:
         return True
 
     def _binding(self, notice: Notice) -> dict[str, str] | None:
-        """The RC that meets each pattern, each another one; None: this is no binding of what was asked for, or some node
-        has reported a hold of other RCs."""
+        """The RC that meets each pattern, each another one; None: this is no binding of what was asked for, or it is of
+        other RCs, as some node has reported it."""
         bound = {need: notice.bound.get(need, "") for need in self.needs if is_pattern(need)}
         if notice.state != "running":
             return {}
